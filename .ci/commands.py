@@ -1,0 +1,79 @@
+"""Write docs/commands.md from the help of every command, or check it.
+
+Examples
+--------
+::
+
+    python .ci/commands.py           # write
+    python .ci/commands.py --check   # exit with 1 if the page is out of date
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from locatk.cli.app import app
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "commands.md"
+
+HEAD = """\
+# Commands
+
+<!-- Made by `python .ci/commands.py` from the commands' own help; do not edit. -->
+
+Results are on stdout, talk and progress on stderr. `--json` gives one object on stdout, with a
+`version`, and nothing else there. No command writes over a file without `--overwrite`. Errors
+are one line with a hint.
+
+| exit status | meaning |
+|---|---|
+| 0 | done |
+| 1 | failed |
+| 2 | wrong usage |
+| 3 | finished, but something was lost or left unsolved, and it says what |
+
+`NO_COLOR` is honoured. Completion for bash: `eval "$(_LOCATK_COMPLETE=bash_source locatk)"`
+(also `zsh_source`, `fish_source`).
+"""
+
+
+def commands(
+    command: click.Command, name: str, parent: click.Context | None = None
+) -> Iterator[tuple[str, str]]:
+    """Name and help of ``command`` and of all below it."""
+    # The width is fixed: the page must not depend on the terminal.
+    context = click.Context(command, info_name=name, parent=parent, terminal_width=90)
+    context.help_option_names = ["-h", "--help"]
+    yield context.command_path, command.get_help(context)
+    if isinstance(command, click.Group):
+        for child in command.list_commands(context):
+            found = command.get_command(context, child)
+            assert found is not None
+            yield from commands(found, child, context)
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [HEAD]
+    for name, text in commands(app, "locatk"):
+        parts.append(f"\n## {name}\n\n```\n{text.rstrip()}\n```\n")
+    return "".join(parts)
+
+
+def main() -> int:
+    text = page()
+    if "--check" in sys.argv[1:]:
+        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
+            print(f"{PAGE} is out of date; run: python .ci/commands.py", file=sys.stderr)
+            return 1
+        return 0
+    PAGE.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

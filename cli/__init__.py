@@ -1,0 +1,1 @@
+"""The `locatk` command: parses, calls, prints. No mathematics."""

@@ -1,0 +1,121 @@
+"""The `locatk` command: a group that loads a command's module when it is called.
+
+``locatk --help`` prints the table below and imports none of the modules, so that it
+opens at once; tests/cli/test_app.py holds that, and that the two agree.
+"""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+from locatk.cli import console, failures
+
+COMMANDS = {
+    "import": ("locatk.cli.import_", "Turn recordings of other tools into a session."),
+    "simulate": ("locatk.cli.simulate", "Make a session with known truth, without hardware."),
+    "info": ("locatk.cli.info", "Say what is in a session, a solution or an artifact."),
+    "calibrate": ("locatk.cli.calibrate", "Make a better artifact from recordings."),
+    "solve": ("locatk.cli.solve", "Solve recorded sessions into poses."),
+    "eval": ("locatk.cli.eval", "Compare poses with the truth."),
+    "export": ("locatk.cli.export", "Write poses for other tools."),
+    "demo": ("locatk.cli.demo", "Simulate, solve and evaluate, to see that all works."),
+    "bench": ("locatk.cli.bench", "Measure what the project promises, on published data."),
+}
+"""Name of a command to its module and short help. The module holds it as ``command``."""
+
+TERMINATED = 143
+
+
+class LazyGroup(click.Group):
+    """Group of :data:`COMMANDS`, each imported when it is first needed."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in COMMANDS:
+            return None
+        command: click.Command = importlib.import_module(COMMANDS[name][0]).command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, short) for name, (_, short) in COMMANDS.items()])
+
+    def shell_complete(
+        self, ctx: click.Context, incomplete: str
+    ) -> list[click.shell_completion.CompletionItem]:
+        # click's own would import every command for its short help.
+        from click.shell_completion import CompletionItem
+
+        names = [
+            CompletionItem(name, help=short)
+            for name, (_, short) in COMMANDS.items()
+            if name.startswith(incomplete)
+        ]
+        return [*names, *click.Command.shell_complete(self, ctx, incomplete)]
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """As click's, with every error reported by :mod:`locatk.cli.failures`."""
+        if not standalone_mode:
+            return super().main(args, prog_name, complete_var, False, **extra)
+        console.reset()
+        try:
+            status = super().main(args, prog_name, complete_var, False, **extra)
+        except Exception as error:
+            status = failures.report(error)
+        sys.exit(status if isinstance(status, int) else 0)
+
+
+def _show_version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value:
+        from locatk.formats.output import tool_version
+
+        click.echo(f"locatk {tool_version()}")
+        ctx.exit()
+
+
+@click.group(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_show_version,
+    help="Show the version and exit.",
+)
+def app() -> None:
+    """Localization that needs no satellite, no motion capture and no expensive sensor.
+
+    Record or simulate a session, solve it into poses, compare them with the truth.
+
+    \b
+    Examples:
+      locatk demo
+      locatk simulate lighthouse -o run.mcap
+      locatk solve run.mcap -o solved.mcap
+      locatk eval solved.mcap --truth run.mcap
+    """
+
+
+def main() -> None:
+    """Entry point of the `locatk` script."""
+    # As an exception, so that files in the making are removed.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    app(prog_name="locatk")

@@ -1,0 +1,59 @@
+"""``locatk calibrate``: recordings in, a better artifact out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from locatk.cli import console, options
+from locatk.cli.solve import scene_option
+
+
+@click.group(short_help="Make a better artifact from recordings.")
+def command() -> None:
+    """Make a better artifact from recordings.
+
+    \b
+    Examples:
+      locatk calibrate scene run.mcap -o scene.toml
+    """
+
+
+@command.command(short_help="Solve where the Lighthouse stations are.")
+@options.input_argument("session")
+@options.output("Scene to write (.toml).")
+@options.method
+@scene_option
+@options.overwrite
+@options.as_json
+@options.verbosity
+def scene(
+    session: Path,
+    output: Path,
+    method: str | None,
+    scene: str | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Solve the Lighthouse stations of SESSION and write them as a scene.
+
+    Later sessions in the same place use it with `locatk solve --artifact`.
+
+    \b
+    Examples:
+      locatk calibrate scene run.mcap -o scene.toml
+      locatk calibrate scene run.mcap -o scene.toml --scene two-3d
+      locatk solve later.mcap -o solved.mcap --artifact scene.toml
+    """
+    from locatk.cli.solve import entry, show
+    from locatk.cli.systems import Request, solve_session
+    from locatk.formats import artifacts
+
+    options.guard_output(output, overwrite=overwrite, inputs=[session])
+    with console.working("Solving"):
+        solved = solve_session(session, Request(method=method, scene=scene))
+    artifacts.write_scene(output, solved.solution.artifact, overwrite=overwrite)
+    show(session, output, solved)
+    if as_json:
+        console.emit_json({"version": 1, "sessions": [entry(session, output, solved)]})

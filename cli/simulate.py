@@ -1,0 +1,128 @@
+"""``locatk simulate``: sessions with known truth, before buying anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from locatk.cli import console, options
+
+
+@click.group(short_help="Make a session with known truth, without hardware.")
+def command() -> None:
+    """Make a session with known truth, without hardware.
+
+    \b
+    Examples:
+      locatk simulate lighthouse -o run.mcap
+    """
+
+
+@command.command(short_help="Robots driving under Lighthouse stations.")
+@options.output("Session to write (.mcap), with the truth in it.")
+@click.option("--robots", type=click.IntRange(1), default=1, show_default=True)
+@click.option("--stations", type=click.IntRange(1, 16), default=2, show_default=True)
+@click.option(
+    "--planar/--3d",
+    "planar",
+    default=True,
+    show_default=True,
+    help="Robots on the floor, or moved through space.",
+)
+@click.option(
+    "--duration",
+    "duration_s",
+    type=click.FloatRange(min=0, min_open=True),
+    default=30.0,
+    show_default=True,
+    metavar="SECONDS",
+)
+@click.option(
+    "--noise-udeg",
+    type=click.FloatRange(min=0),
+    default=300.0,
+    show_default=True,
+    help="Standard deviation of an angle, in millionths of a degree.",
+)
+@click.option(
+    "--occlusion",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.0,
+    show_default=True,
+    help="Share of the time in which a station is hidden from a robot.",
+)
+@click.option(
+    "--outliers",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.0,
+    show_default=True,
+    help="Share of sweeps that are wrong: jumps and reflections.",
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@options.overwrite
+@options.as_json
+@options.verbosity
+def lighthouse(
+    output: Path,
+    robots: int,
+    stations: int,
+    planar: bool,
+    duration_s: float,
+    noise_udeg: float,
+    occlusion: float,
+    outliers: float,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Simulate robots that drive under Lighthouse stations into a session with truth.
+
+    The same options and seed give the same sweeps. The session holds markers, as a user
+    would measure them, but not the stations: those are for the solver to find.
+
+    \b
+    Examples:
+      locatk simulate lighthouse -o run.mcap
+      locatk simulate lighthouse -o swarm.mcap --robots 20 --stations 4 --duration 60
+      locatk simulate lighthouse -o hard.mcap --3d --occlusion 0.2 --outliers 0.02 --seed 7
+    """
+    import math
+
+    from locatk.core.lighthouse import simulate
+    from locatk.formats import observations
+
+    options.guard_output(output, overwrite=overwrite)
+    with console.working("Simulating"):
+        simulated = simulate.simulate(
+            simulate.SimulationOptions(
+                robots=robots,
+                stations=stations,
+                planar=planar,
+                duration_s=duration_s,
+                noise_rad=math.radians(noise_udeg * 1e-6),
+                occlusion=occlusion,
+                outliers=outliers,
+                seed=seed,
+            )
+        )
+        observations.write_session(
+            output,
+            system="lighthouse",
+            sweeps=simulated.sweeps,
+            scene=simulated.scene,
+            truth=simulated.truth,
+            overwrite=overwrite,
+        )
+    truth_poses = sum(len(trajectory) for trajectory in simulated.truth)
+    console.result(f"Wrote {output}: {len(simulated.sweeps)} sweeps, {truth_poses} truth poses")
+    if as_json:
+        console.emit_json(
+            {
+                "version": 1,
+                "output": output,
+                "sweeps": len(simulated.sweeps),
+                "devices": list(simulated.sweeps.devices),
+                "truth_poses": truth_poses,
+            }
+        )

@@ -1,0 +1,167 @@
+"""``locatk solve``: sessions in, poses out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console, failures, options
+from locatk.core.errors import LocatkError
+
+if TYPE_CHECKING:
+    from locatk.cli.systems import Solved
+
+SCENES = ("auto", "one-planar", "two-planar", "two-3d")
+
+scene_option = click.option(
+    "--scene",
+    type=click.Choice(SCENES),
+    default=None,
+    help="Lighthouse: stations and geometry to assume. [default: auto, decided from the data]",
+)
+
+
+@click.command(short_help="Solve recorded sessions into poses.")
+@options.sessions
+@options.output("Solution to write (.mcap); with several sessions, the folder for them.")
+@options.method
+@scene_option
+@options.artifact
+@click.option(
+    "--save-scene",
+    type=options.PATH,
+    metavar="FILE",
+    help="Write the solved scene as an artifact (.toml) too, for --artifact.",
+)
+@options.overwrite
+@options.as_json
+@options.verbosity
+def command(
+    sessions: tuple[Path, ...],
+    output: Path,
+    method: str | None,
+    scene: str | None,
+    artifact: Path | None,
+    save_scene: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Solve SESSIONS and write the poses to OUTPUT.
+
+    The exit status is 3 where a session could not be solved, or a device in it has no
+    pose; the rest is written all the same.
+
+    \b
+    Examples:
+      locatk solve run.mcap -o solved.mcap
+      locatk solve run.mcap -o solved.mcap --method paper --json
+      locatk solve first.mcap -o solved.mcap --save-scene scene.toml
+      locatk solve day/*.mcap -o solved/ --artifact scene.toml
+    """
+    from locatk.cli.systems import Request, solve_session
+    from locatk.formats import artifacts, solutions
+
+    outputs = plan_outputs(sessions, output)
+    if save_scene is not None and len(sessions) > 1:
+        raise click.UsageError("--save-scene needs exactly one session.")
+    for path in [*outputs, *([save_scene] if save_scene else [])]:
+        options.guard_output(path, overwrite=overwrite, inputs=sessions)
+
+    request = Request(method=method, scene=scene, artifact=artifact)
+    entries: list[dict[str, Any]] = []
+    losses: list[str] = []
+    with console.progress(sessions, "Solving") as bar:
+        for session, target in zip(bar, outputs, strict=True):
+            try:
+                solved = solve_session(session, request)
+                solutions.write_solution(
+                    target, solved.solution, source=session, overwrite=overwrite
+                )
+                if save_scene is not None:
+                    artifacts.write_scene(save_scene, solved.solution.artifact, overwrite=overwrite)
+            except LocatkError as error:
+                if len(sessions) == 1:
+                    raise
+                losses.append(failures.describe(error))
+                entries.append({"session": session, "error": error.message, "hint": error.hint})
+                continue
+            entries.append(entry(session, target, solved))
+            losses += [
+                f"{session}: no pose for {trajectory.device}"
+                for trajectory in solved.solution.trajectories
+                if len(trajectory) == 0
+            ]
+            if not solved.solution.trajectories:
+                losses.append(f"{session}: no pose at all")
+            show(session, target, solved)
+
+    if as_json:
+        console.emit_json({"version": 1, "sessions": entries})
+    if losses:
+        for loss in losses[1:]:
+            console.warn(loss)
+        if all("error" in item for item in entries):
+            raise click.ClickException(losses[0])
+        raise failures.Incomplete(losses[0])
+
+
+def plan_outputs(sessions: tuple[Path, ...], output: Path) -> list[Path]:
+    """Where each session's solution goes: ``output``, or a file of the session's name in it.
+
+    A folder for several sessions is made.
+    """
+    if len(sessions) == 1 and not output.is_dir():
+        return [output]
+    twins = [name for name, count in Counter(p.stem for p in sessions).items() if count > 1]
+    if twins:
+        raise click.UsageError(f"Several sessions have the name {twins[0]!r}.")
+    options.make_folder(output)
+    return [output / f"{session.stem}.mcap" for session in sessions]
+
+
+def entry(session: Path, output: Path | None, solved: Solved) -> dict[str, Any]:
+    """One session of ``--json`` (ARCHITECTURE 4; docs/commands.md)."""
+    solution = solved.solution
+    return {
+        "session": session,
+        "system": solution.system,
+        "method": solution.method,
+        "output": output,
+        "poses": solution.poses,
+        "rejected": solution.rejected,
+        "solve_s": solved.solve_s,
+        "detections": solution.detections,
+        "devices": {t.device: len(t) for t in solution.trajectories},
+        "notes": list(solution.notes),
+        "facts": solution.facts,
+    }
+
+
+def show(session: Path, output: Path | None, solved: Solved) -> None:
+    """The same for people: a line, a table of devices, and what must be known."""
+    solution = solved.solution
+    where = f" -> {output}" if output else ""
+    console.result(
+        f"{session}{where}: {solution.poses} poses, {solution.system} by {solution.method}, "
+        f"{solved.solve_s:.3g} s"
+    )
+    rows = [(t.device, len(t), *_spread(t.sigma)) for t in solution.trajectories]
+    if rows:
+        console.result(
+            console.table(("device", "poses", "sigma x", "sigma y", "sigma z [mm]"), rows)
+        )
+    rejected = ", ".join(f"{count} {reason}" for reason, count in solution.rejected.items())
+    console.result(f"rejected: {rejected or 'nothing'}")
+    for note in solution.notes:
+        console.result(f"note: {note}")
+
+
+def _spread(sigma: Any) -> list[str]:
+    """Median standard deviation of x, y and z in mm, `-` where it is not known."""
+    import numpy as np
+
+    known = [column[np.isfinite(column)] for column in sigma[:, :3].T]
+    return [f"{1e3 * np.median(column):.2f}" if len(column) else "-" for column in known]

@@ -1,0 +1,109 @@
+"""The table of systems: how a session of each is read, solved and its artifact kept.
+
+Open to others through the entry-point group ``locatk.systems``, whose entries point to
+a function like :func:`lighthouse`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from locatk.core.errors import FormatError, LocatkError
+
+if TYPE_CHECKING:
+    from locatk.core.solution import Solution
+    from locatk.formats.session import Session
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked of a solver; None where he leaves it to the solver."""
+
+    method: str | None = None
+    scene: str | None = None
+    artifact: Path | None = None
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A solution, and the seconds that solving alone took."""
+
+    solution: Solution
+    solve_s: float
+
+
+Solver = Callable[["Session", Request], Solved]
+
+
+def lighthouse(session: Session, request: Request) -> Solved:
+    """Solve a session of Lighthouse sweeps."""
+    from locatk.core import lighthouse
+    from locatk.core.lighthouse.scene import Scene
+    from locatk.formats import artifacts, observations
+
+    sweeps = observations.read_sweeps(session)
+    if request.artifact is not None:
+        scene = artifacts.read_scene(request.artifact)
+    else:
+        scene = observations.read_scene(session) or Scene()
+    odometry = observations.read_odometry(session)
+    options = _given(lighthouse.SolveOptions, {"method": request.method, "scene": request.scene})
+    start = time.perf_counter()
+    solution = lighthouse.solve(sweeps, scene, options, odometry=odometry)
+    return Solved(solution, time.perf_counter() - start)
+
+
+SYSTEMS: dict[str, Solver] = {"lighthouse": lighthouse}
+
+
+def solve_session(path: Path, request: Request) -> Solved:
+    """Solve the session at ``path`` with the system that its metadata names.
+
+    Raises
+    ------
+    FormatError
+        It is no session of locatk, or nobody knows its system.
+    LocatkError
+        Whatever reading and solving raise.
+    """
+    from locatk.formats.session import Session
+
+    session = Session.open(path)
+    kind = session.facts.get("kind")
+    if kind != "session":
+        raise FormatError(
+            f"a {kind}, not a session" if kind else "not a session of locatk",
+            file=path,
+            hint="Give a session made by `locatk import` or `locatk simulate`",
+        )
+    try:
+        return _solver(session)(session, request)
+    except LocatkError as error:
+        if error.file is None:  # a solver knows arrays, not files
+            error.file = str(path)
+        raise
+
+
+def _solver(session: Session) -> Solver:
+    name = session.facts.get("system", "")
+    if name in SYSTEMS:
+        return SYSTEMS[name]
+    from importlib.metadata import entry_points
+
+    for entry in entry_points(group="locatk.systems", name=name):
+        solver: Solver = entry.load()
+        return solver
+    raise FormatError(
+        f"no solver for the system {name!r}",
+        file=session.path,
+        hint=f"Known systems: {', '.join(SYSTEMS)}",
+    )
+
+
+def _given(options: Callable[..., Any], values: dict[str, str | None]) -> Any:
+    """``options`` from the values that the user gave, its own defaults for the rest."""
+    return options(**{name: value for name, value in values.items() if value is not None})

@@ -1,0 +1,1 @@
+"""Pure computation on numpy arrays: no files, no terminal, no clock."""

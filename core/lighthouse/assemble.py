@@ -1,0 +1,371 @@
+"""Stations and points from nothing but angles: up to scale, in a frame of its own.
+
+Two stations with the most common sight start; planar and spatial explanations compete;
+the others are resected one by one; a bundle adjustment ends it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import DegenerateError
+from locatk.core.lighthouse import twoview
+from locatk.core.lighthouse.angles import rays as rays_of
+from locatk.core.lighthouse.bundle import Adjustment, Rig, adjust
+from locatk.core.lighthouse.calibration import Calibration, ideal_angles
+from locatk.core.lighthouse.locate import Fixes, locate
+from locatk.core.lighthouse.resection import resect_in_space, resect_on_plane
+
+Array = NDArray[np.float64]
+
+BUNDLE_POINTS = 1500
+"""Moments in the bundle adjustment, at most: more do not sharpen a scene whose error is
+its calibration, and cost time."""
+
+START_POINTS = 300
+"""Moments with which candidate rigs are compared."""
+
+FEW = 60
+"""Places below which upright arrangements are tried as well."""
+
+SAME_PLACE = 1e-3
+"""Rays closer than this (as tangents) saw one place: 2 mm at 2 m."""
+
+FLAT = 3e-3
+"""Median miss of a homography, as a tangent, up to which a scene counts as planar."""
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Stations up to scale.
+
+    Attributes
+    ----------
+    adjustment : Adjustment
+        The bundle adjustment over ``chosen``; in a planar scene z = 0 is the plane of the
+        photodiodes and z is up.
+    stations : tuple of int
+        Columns of the stations that were solved, ascending; a station that shares too few
+        places with the others is left out.
+    chosen : (k,) int ndarray
+        Indices of the moments that took part.
+    planar : bool
+    facts : dict
+        What was decided, with the figures it was decided on.
+    """
+
+    adjustment: Adjustment
+    stations: tuple[int, ...]
+    chosen: NDArray[np.int64]
+    planar: bool
+    facts: dict[str, object]
+
+
+def assemble(
+    angles: Array,
+    calibrations: tuple[Calibration, ...],
+    *,
+    sigma: float,
+    planar: bool | None = None,
+    seed: int = 0,
+) -> Assembly:
+    """Solve for two or more stations.
+
+    Parameters
+    ----------
+    angles : (m, s, 2) ndarray
+        Observed rotor angles in radians, ``nan`` where not seen; s >= 2.
+    calibrations : tuple of Calibration
+        One a station; generic ones are refined.
+    sigma : float
+        Standard deviation of an angle with what calibration leaves unmodelled, in radians.
+    planar : bool, optional
+        Whether all photodiodes lie on one plane; decided from the data when None.
+    seed : int
+        For the random samples: same input and seed, same answer.
+
+    Raises
+    ------
+    DegenerateError
+        The moments do not determine the stations: too few places, all on a line, all on a
+        plane (for ``planar=False``), or stations without common sight.
+    """
+    rays = np.stack(
+        [
+            rays_of(ideal_angles(angles[:, i], c), c.tilts)
+            for i, c in enumerate(calibrations)
+        ],
+        axis=1,
+    )
+    seen = np.isfinite(rays[..., 0])
+    i, j = _best_pair(seen)
+    joint = np.flatnonzero(seen[:, i] & seen[:, j])
+    a, b = rays[joint, i], rays[joint, j]
+    _require_places(a, b, 4)
+
+    facts: dict[str, object] = {}
+    flat, on_plane = twoview.agree_on_plane(a, b, seed)
+    planar, agreed = _decide(a, b, flat, on_plane, planar, seed, facts)
+    _require_places(a[agreed], b[agreed], 4 if planar else 8)
+    if not planar:
+        miss = twoview.homography_residuals(twoview.fit_homography(a[agreed], b[agreed]),
+                                            a[agreed], b[agreed])
+        if np.sqrt(np.median(miss**2)) < SAME_PLACE / 2:
+            raise DegenerateError(
+                "all places lie on one plane, which does not determine a scene in space",
+                hint="move the photodiode up and down as well, or use --scene two-planar",
+            )
+    pair = (calibrations[i], calibrations[j])
+    starts = (
+        _planar_starts(a[agreed], b[agreed], pair)
+        if planar
+        else _spatial_starts(a[agreed], b[agreed], pair)
+    )
+    if not starts:
+        raise DegenerateError(
+            "no arrangement of two stations explains the angles",
+            hint="check that the channels of the stations are those of the recording",
+        )
+    inside = joint[agreed]
+    best = _choose(angles[inside][:, [i, j]], starts, planar, sigma, facts)
+    return _extend(angles, rays, calibrations, best, (i, j), inside, planar, sigma, facts)
+
+
+def _best_pair(seen: NDArray[np.bool_]) -> tuple[int, int]:
+    joint = {p: np.count_nonzero(seen[:, p[0]] & seen[:, p[1]])
+             for p in combinations(range(seen.shape[1]), 2)}
+    pair = max(joint, key=lambda p: joint[p])
+    if joint[pair] == 0:
+        raise DegenerateError(
+            "no moment was seen by two stations at once",
+            hint="put the stations so that their views overlap",
+        )
+    return pair
+
+
+def _require_places(a: Array, b: Array, number: int) -> None:
+    """Refuse views with fewer distinct places than needed, or all on one line."""
+    cells = np.unique(np.rint(np.c_[a[:, 1:], b[:, 1:]] / SAME_PLACE), axis=0)
+    spread = np.linalg.svd(np.c_[a[:, 1:], b[:, 1:]] - np.mean(np.c_[a[:, 1:], b[:, 1:]], axis=0),
+                           compute_uv=False) / np.sqrt(max(len(a), 1)) if len(a) else np.zeros(4)
+    if len(a) == 0 or spread[0] < 2 * SAME_PLACE:
+        raise DegenerateError(
+            "the photodiodes stood still: one place does not determine a scene",
+            hint="drive around while recording",
+        )
+    if len(cells) < number:
+        raise DegenerateError(
+            f"{len(cells)} places seen by two stations do not determine a scene",
+            hint=f"record at least {number} places, better 20",
+        )
+    if len(spread) < 2 or spread[1] < SAME_PLACE:
+        raise DegenerateError(
+            "all places lie on one line, which does not determine a scene",
+            hint="drive a curve while recording",
+        )
+
+
+def _decide(
+    a: Array,
+    b: Array,
+    flat: Array,
+    on_plane: NDArray[np.bool_],
+    planar: bool | None,
+    seed: int,
+    facts: dict[str, object],
+) -> tuple[bool, NDArray[np.bool_]]:
+    """Whether the places lie on a plane, and which correspondences agree with that."""
+    share = float(np.mean(on_plane))
+    median = float(np.median(twoview.homography_residuals(flat, a, b)))
+    facts["plane_share"] = share
+    facts["plane_median_rad"] = median
+    if planar is None:
+        planar = median < FLAT
+        facts["planar_decided_by"] = "data"
+    else:
+        facts["planar_decided_by"] = "option"
+    if planar:
+        return True, on_plane
+    if len(a) < 8:
+        raise DegenerateError(
+            f"{len(a)} places off one plane do not determine a scene in space",
+            hint="record at least 8 places, better 20",
+        )
+    _, agreed = twoview.agree_in_space(a, b, seed)
+    return False, agreed
+
+
+def _planar_starts(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
+    """Rigs with the plane at z = 0 in which all points lie before both stations."""
+    rigs = []
+    for rotation, translation, normal in twoview.split_homography(twoview.fit_homography(a, b)):
+        depth = a @ normal
+        local = a / depth[:, None]
+        ahead = (depth > 0) & ((local @ rotation.T + translation)[:, 0] > 0)
+        if np.mean(ahead) < 0.9:
+            continue
+        height = 1.0 / np.linalg.norm(normal)
+        up = -normal * height
+        forward = np.eye(3)[0] - up[0] * up
+        forward = forward / np.linalg.norm(forward)
+        level = np.stack([forward, np.cross(up, forward), up])
+        first = np.array([0.0, 0.0, height])
+        second = first - level @ rotation.T @ translation
+        if second[2] <= 0:  # on the other side of the floor
+            continue
+        points = local @ level.T + first
+        points[:, 2] = 0.0
+        rigs.append(
+            Rig(np.stack([first, second]), np.stack([level, level @ rotation.T]), pair, points)
+        )
+    return rigs
+
+
+def _spatial_starts(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
+    """Rigs in the first station's axes in which most points lie before both stations."""
+    motions = twoview.split_essential(twoview.fit_epipolar(a, b))
+    # Few places in a narrow field make the essential matrix loose; the plane through them
+    # is then the better start.
+    for rotation, translation, _ in twoview.split_homography(twoview.fit_homography(a, b)):
+        motions.append((rotation, translation / np.linalg.norm(translation)))
+    if len(a) < FEW:
+        motions += twoview.upright_motions(a, b)
+    rigs = []
+    for rotation, translation in motions:
+        depth, other = twoview.triangulate(a, b, rotation, translation)
+        ahead = (depth > 0) & (other > 0) & (depth < 100)
+        if np.mean(ahead) < 0.7:
+            continue
+        depth = np.where(ahead, depth, np.median(depth[ahead]))
+        rigs.append(
+            Rig(
+                np.stack([np.zeros(3), -rotation.T @ translation]),
+                np.stack([np.eye(3), rotation.T]),
+                pair,
+                a * depth[:, None],
+            )
+        )
+    return rigs
+
+
+def _choose(
+    angles: Array, starts: list[Rig], planar: bool, sigma: float, facts: dict[str, object]
+) -> Rig:
+    """The start that explains the angles best; of two that do, the upright one.
+
+    A homography has two valid readings. Noise-free they predict the same angles, so that
+    only the world decides: stations stand or hang upright, with little roll (the paper's
+    conditions on the signs of n and t say as much).
+    """
+    some = np.unique(np.linspace(0, len(angles) - 1, START_POINTS).astype(int))
+    tried = []
+    for rig in starts:
+        small = Rig(rig.positions, rig.rotations, rig.calibrations, rig.points[some])
+        # All residuals count in full: a soft loss would let a bad start stay bad.
+        done = adjust(
+            angles[some], small, sigma=sigma, planar=planar, soft=1.0, iterations=60
+        )
+        tried.append((done.cost, _roll(done.rig.rotations) if planar else 0.0, done))
+        # In space only one arrangement fits; with many places a fit is no accident.
+        if not planar and len(some) >= FEW and done.cost < len(some):
+            break
+    cheapest = min(cost for cost, _, _ in tried)
+    fitting = [t for t in tried if t[0] <= 2.0 * cheapest + 1e-9]
+    _, _, done = min(fitting, key=lambda t: (t[1], t[0]))
+    if planar:
+        facts["candidates"] = [
+            {
+                "cost": float(c),
+                "roll_deg": float(np.degrees(r)),
+                "fits": bool(c <= 2.0 * cheapest + 1e-9),
+                "chosen": candidate is done,
+            }
+            for c, r, candidate in tried
+        ]
+    return done.rig
+
+
+def _roll(rotations: Array) -> float:
+    """How far stations lean sideways, in radians: root of the sum of squares."""
+    return float(np.sqrt(np.sum(np.arcsin(np.clip(rotations[:, 2, 1], -1, 1)) ** 2)))
+
+
+def _extend(
+    angles: Array,
+    rays: Array,
+    calibrations: tuple[Calibration, ...],
+    rig: Rig,
+    pair: tuple[int, int],
+    inside: NDArray[np.int64],
+    planar: bool,
+    sigma: float,
+    facts: dict[str, object],
+) -> Assembly:
+    """Resect the other stations on located points, then adjust all together."""
+    count = len(calibrations)
+    positions = np.full((count, 3), np.nan)
+    rotations = np.tile(np.eye(3), (count, 1, 1))
+    refined = list(calibrations)
+    for k, index in enumerate(pair):
+        positions[index], rotations[index] = rig.positions[k], rig.rotations[k]
+        refined[index] = rig.calibrations[k]
+    known = sorted(pair)
+    floor = 0.0 if planar else None
+
+    def fixes_of(stations: list[int]) -> Fixes:
+        return locate(
+            angles[:, stations],
+            positions[stations],
+            rotations[stations],
+            tuple(refined[k] for k in stations),
+            floor_z=floor,
+        )
+
+    while len(known) < count:
+        fixes = fixes_of(known)
+        good = np.isfinite(fixes.position[:, 0]) & (fixes.worst < twoview.GATE)
+        shared = {
+            k: np.flatnonzero(good & np.isfinite(rays[:, k, 0]))
+            for k in range(count)
+            if k not in known
+        }
+        index = max(shared, key=lambda k: len(shared[k]))
+        rows = shared[index]
+        points = fixes.position[rows]
+        try:
+            positions[index], rotations[index] = (
+                resect_on_plane(points[:, :2], rays[rows, index])
+                if planar
+                else resect_in_space(points, rays[rows, index])
+            )
+        except DegenerateError:
+            break
+        known = sorted([*known, index])
+
+    fixes = fixes_of(known)
+    good = np.isfinite(fixes.position[:, 0]) & (fixes.freedom > 0) & (fixes.worst < twoview.GATE)
+    if len(known) == 2:
+        # What the two-view consensus refused stays out: two planes can meet by chance.
+        member = np.zeros(len(angles), bool)
+        member[inside] = True
+        good &= member
+    usable = np.flatnonzero(good)
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, BUNDLE_POINTS).astype(int))]
+    final = adjust(
+        angles[chosen][:, known],
+        Rig(
+            positions[known],
+            rotations[known],
+            tuple(calibrations[k] for k in known),
+            fixes.position[chosen],
+        ),
+        sigma=sigma,
+        planar=planar,
+    )
+    facts["bundle_points"] = len(chosen)
+    facts["bundle_iterations"] = final.iterations
+    return Assembly(final, tuple(known), chosen, planar, facts)

@@ -1,0 +1,51 @@
+"""Moments at a standstill, gathered into places.
+
+A robot that stands still repeats itself: its moments inform a scene as one place whose
+angles are averaged, not as many places. That makes a scene both sharper and faster to solve.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+STILL = 6e-4
+"""Rotor angle by which a standing photodiode may seem to move, in radians: eleven LFSR
+steps, five standard deviations of the published scatter; a millimetre at 2 m."""
+
+
+def gather(angles: Array, device: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """Average runs of consecutive moments that saw the same angles.
+
+    Parameters
+    ----------
+    angles : (m, s, 2) ndarray
+        Rotor angles in radians, ordered by device and time; ``nan`` where not seen.
+    device : (m,) int ndarray
+
+    Returns
+    -------
+    places : (k, s, 2) ndarray
+        Mean angles of each run; k <= m.
+    run : (m,) int ndarray
+        The place of each moment.
+    """
+    m = len(angles)
+    if m == 0:
+        return angles, np.zeros(0, np.int64)
+    flat = angles.reshape(m, -1)
+    seen = np.isfinite(flat)
+    step = np.abs(np.diff(flat, axis=0))
+    moved = np.any(np.nan_to_num(step) > STILL, axis=1) | np.any(seen[1:] != seen[:-1], axis=1)
+    run = np.cumsum(np.r_[0, moved | (np.diff(device) != 0)])
+    # A slow drift chains moments that are far apart: such runs are not standstills.
+    first = np.flatnonzero(np.r_[True, np.diff(run) != 0])
+    spread = np.maximum.reduceat(flat, first) - np.minimum.reduceat(flat, first)
+    drifting = np.any(np.nan_to_num(spread) > 2 * STILL, axis=1)
+    run = np.cumsum(np.r_[0, (np.diff(run) != 0) | drifting[run[1:]]])
+    first = np.flatnonzero(np.r_[True, np.diff(run) != 0])
+    size = np.bincount(run)[:, None]
+    places = np.add.reduceat(flat, first) / size
+    return places.reshape(-1, *angles.shape[1:]), run

@@ -1,0 +1,111 @@
+"""A lighthouse scene: stations with pose and calibration, and what fixes its frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.lighthouse.calibration import Calibration
+
+
+@dataclass(frozen=True)
+class Station:
+    """One base station in the scene's frame.
+
+    Attributes
+    ----------
+    channel : int
+        1 to 16.
+    position : (3,) ndarray
+        Of the rotor's centre in the scene's frame, in metres (or units of the
+        scene where :attr:`Scene.scale` is ``"unit"``).
+    rotation : (3, 3) ndarray
+        Station to scene. The station's x looks forward, y left, z up.
+    calibration : Calibration
+        Parameters of its two light planes and where they come from.
+    id : int, optional
+        Serial number, from the factory's OOTX data.
+    covariance : (6, 6) ndarray, optional
+        Of position and rotation (a rotation vector in the scene's frame).
+    """
+
+    channel: int
+    position: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    calibration: Calibration
+    id: int | None = None
+    covariance: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A time during which a device stood on a marker, or the counts seen there.
+
+    Either ``device``, ``start_ns`` and ``end_ns``, or ``counts``: for each channel
+    the LFSR indices of its two sweeps (any order).
+    """
+
+    device: str | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
+    counts: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A place that was measured by hand: it fixes frame and scale.
+
+    ``position`` is (3,) in metres in the scene's frame; z is 0 for floor points.
+    """
+
+    name: str
+    position: NDArray[np.float64]
+    sightings: tuple[Sighting, ...] = ()
+
+
+@dataclass(frozen=True)
+class Distance:
+    """A known distance in metres between two sightings: it fixes the scale only."""
+
+    first: Sighting
+    second: Sighting
+    distance: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Stations and the points that fix their frame.
+
+    Attributes
+    ----------
+    stations : tuple of Station
+        Empty in a scene that has yet to be solved.
+    markers, distances
+        What is known of the place before solving.
+    planar : bool or None
+        True where all devices move on the plane z = ``floor_z``; None if not known.
+    floor_z : float
+        Height of the photodiodes in a planar scene, in metres.
+    scale : str
+        What fixed the scale: ``"markers"``, ``"distance"``, ``"odometry"`` or ``"unit"``
+        (the distance of the first two stations, or the height of the only one, is 1).
+    frame : str
+        Name of the frame of positions.
+    notes : tuple of str
+        Assumptions made when it was solved.
+    """
+
+    stations: tuple[Station, ...] = ()
+    markers: tuple[Marker, ...] = ()
+    distances: tuple[Distance, ...] = ()
+    planar: bool | None = None
+    floor_z: float = 0.0
+    scale: str = "unit"
+    frame: str = "floor"
+    notes: tuple[str, ...] = ()
+
+    def station(self, channel: int) -> Station | None:
+        """The station on ``channel``, or None."""
+        return next((s for s in self.stations if s.channel == channel), None)

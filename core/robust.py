@@ -1,0 +1,81 @@
+"""Estimating in the presence of outliers: random sampling and robust scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def consensus(
+    fit: Callable[[Array, Array], Array],
+    residuals: Callable[[Array, Array, Array], Array],
+    a: Array,
+    b: Array,
+    *,
+    sample: int,
+    gate: float,
+    trials: int = 300,
+    seed: int = 0,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Model with the most correspondences within a gate (RANSAC), refined on them.
+
+    Parameters
+    ----------
+    fit : callable
+        From corresponding points (..., n, d), (..., n, d) to models (..., p, q).
+    residuals : callable
+        From models (..., p, q) and points (n, d), (n, d) to residuals (..., n).
+    a, b : (n, d) ndarray
+        Correspondences.
+    sample : int
+        How many determine a model.
+    gate : float
+        Residual up to which a correspondence agrees, in the unit of ``residuals``.
+    trials : int
+        Random samples; all are fitted and scored in one batch.
+    seed : int
+        Same seed, same answer.
+
+    Returns
+    -------
+    model : (p, q) ndarray
+    inliers : (n,) bool ndarray
+
+    Notes
+    -----
+    Fischler and Bolles 1981, scored by truncated squares (MSAC, Torr and Zisserman 2000),
+    then refitted until the set of inliers is stable.
+    """
+    rng = np.random.default_rng(seed)
+    n = len(a)
+    picks = np.argsort(rng.random((trials, n)) if n < 64 else rng.random((trials, 64)), axis=1)
+    picks = picks[:, :sample]
+    if n >= 64:
+        # Large sets: a sample of a sample keeps the memory small.
+        picks = rng.integers(0, n, (trials, 64))[np.arange(trials)[:, None], picks]
+    scored = np.linspace(0, n - 1, min(n, 600)).astype(int)
+    models = fit(a[picks], b[picks])
+    errors = np.abs(residuals(models, a[scored], b[scored]))
+    cost = np.sum(np.minimum(np.nan_to_num(errors, nan=np.inf) / gate, 1.0) ** 2, axis=-1)
+    model = models[int(np.argmin(cost))]
+    inliers = np.abs(residuals(model, a, b)) < gate
+    for _ in range(10):
+        if np.count_nonzero(inliers) < sample:
+            break
+        model = fit(a[inliers], b[inliers])
+        fresh = np.abs(residuals(model, a, b)) < gate
+        if np.array_equal(fresh, inliers):
+            break
+        inliers = fresh
+    return model, inliers
+
+
+def robust_sigma(residuals: Array) -> float:
+    """Standard deviation estimated from the median absolute value (1.4826 MAD about
+    zero); ``nan`` values are left out, 0.0 where nothing is left."""
+    finite = np.abs(residuals[np.isfinite(residuals)])
+    return float(1.4826 * np.median(finite)) if len(finite) else 0.0

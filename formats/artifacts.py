@@ -1,0 +1,332 @@
+"""Artifacts that people edit: the lighthouse scene, ``scene.toml``.
+
+Its keys are described in docs/formats.md. Lengths are in mm, exactly: a scene that is
+written and read again is the same to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from locatk.core.errors import InputError, MissingDataError
+from locatk.core.lighthouse.calibration import PARAMETERS, Calibration
+from locatk.core.lighthouse.scene import Distance, Marker, Scene, Sighting, Station
+from locatk.formats import toml
+from locatk.formats.output import atomic_write, tool_version
+from locatk.formats.toml import Inline, Shifted, Table
+
+if TYPE_CHECKING:
+    from locatk.formats.session import Session
+
+SCENE_FILE = "scene.toml"
+"""Name of the attachment that holds the scene of a session or a solution."""
+
+SCENE_FORMAT = "locatk-lighthouse-scene"
+SCENE_VERSION = 1
+
+SCALES = ("markers", "distance", "odometry", "unit")
+SOURCES = ("factory", "generic", "estimated", "none")
+
+ANGLES = ("phase", "tilt", "gibphase", "ogeephase")
+"""Calibration parameters that are angles; their keys end in ``_rad``."""
+
+_TIME = re.compile(
+    r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?([Zz]|[+-]\d\d:\d\d)", re.ASCII
+)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_MM = 3
+_METRES = -3
+
+
+def write_scene(path: str | os.PathLike[str], scene: Scene, *, overwrite: bool = False) -> None:
+    """Write a scene as TOML.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError
+        See :func:`locatk.formats.output.atomic_write`.
+    """
+    with atomic_write(path, overwrite=overwrite) as stream:
+        stream.write(dumps_scene(scene).encode())
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read a scene that a person or :func:`write_scene` has written.
+
+    Raises
+    ------
+    MissingDataError
+        There is no such file.
+    ArtifactError
+        It is no valid scene; the error names the key and what was expected.
+    """
+    try:
+        with open(path, "rb") as stream:
+            data = stream.read()
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingDataError("no such file", file=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
+    return loads_scene(data, file=path)
+
+
+def attached_scene(session: Session) -> Scene | None:
+    """The lighthouse scene that is attached to a session, or None.
+
+    Raises
+    ------
+    FormatError, ArtifactError
+        The attachment is damaged, or no valid scene.
+    """
+    data = session.attachment(SCENE_FILE)
+    if data is None:
+        return None
+    return loads_scene(data, file=f"{session.path}:{SCENE_FILE}")
+
+
+def dumps_scene(scene: Scene) -> str:
+    """TOML text of a scene; the same scene gives the same text."""
+    in_units = bool(scene.stations) and scene.scale == "unit"
+    table: dict[str, Any] = {
+        "format": SCENE_FORMAT,
+        "format_version": SCENE_VERSION,
+        "tool_version": tool_version(),
+        "frame": scene.frame,
+        "scale": scene.scale,
+        "planar": scene.planar,
+    }
+    if in_units:
+        table["floor_z_units"] = float(scene.floor_z)
+    else:
+        table["floor_z_mm"] = Shifted(scene.floor_z, _MM)
+    table["notes"] = list(scene.notes) or None
+    table["stations"] = [_station_table(station, in_units) for station in scene.stations]
+    table["markers"] = [
+        {
+            "name": marker.name,
+            "position_mm": Shifted(marker.position, _MM),
+            "sightings": [_sighting_table(sighting) for sighting in marker.sightings] or None,
+        }
+        for marker in scene.markers
+    ]
+    table["distances"] = [
+        {
+            "distance_mm": Shifted(distance.distance, _MM),
+            "first": _sighting_table(distance.first),
+            "second": _sighting_table(distance.second),
+        }
+        for distance in scene.distances
+    ]
+    return toml.dumps({key: value for key, value in table.items() if value != []})
+
+
+def _station_table(station: Station, in_units: bool) -> dict[str, Any]:
+    x, y, z = station.rotation[:, 0].tolist()
+    yaw, pitch = math.degrees(math.atan2(y, x)), math.degrees(math.asin(max(-1.0, min(1.0, z))))
+    position = (
+        {"position_units": np.asarray(station.position)}
+        if in_units
+        else {"position_mm": Shifted(station.position, _MM)}
+    )
+    covariance = "covariance_units_rad" if in_units else "covariance_m_rad"
+    return {
+        "#": f"looks to yaw {yaw:.1f} deg, {abs(pitch):.1f} deg {'up' if pitch > 0 else 'down'}",
+        "channel": int(station.channel),
+        "id": None if station.id is None else f"{station.id:08x}",
+        **position,
+        "rotation": station.rotation,
+        covariance: station.covariance,
+        "calibration": {
+            "source": station.calibration.source,
+            **{
+                name: Inline(
+                    {_calibration_key(p): float(v) for p, v in zip(PARAMETERS, row, strict=True)}
+                )
+                for name, row in zip(("first", "second"), station.calibration.sweeps, strict=True)
+            },
+        },
+    }
+
+
+def _calibration_key(parameter: str) -> str:
+    return f"{parameter}_rad" if parameter in ANGLES else parameter
+
+
+def _sighting_table(sighting: Sighting) -> dict[str, Any]:
+    if sighting.counts:
+        counts = {str(c): [float(n) for n in pair] for c, pair in sighting.counts.items()}
+        return {"counts": Inline(counts)}
+    return {
+        "device": sighting.device,
+        "start": None if sighting.start_ns is None else format_time(sighting.start_ns),
+        "end": None if sighting.end_ns is None else format_time(sighting.end_ns),
+    }
+
+
+def loads_scene(text: str | bytes, *, file: str | os.PathLike[str] | None = None) -> Scene:
+    """Scene of TOML text; ``file`` is named in errors.
+
+    Raises
+    ------
+    ArtifactError
+        A key is missing, unknown or wrong; the error names it and what was expected.
+    """
+    table = toml.loads(text, file if file is not None else "<scene>")
+    if table.text("format") != SCENE_FORMAT:
+        raise table.error("format", f"expected {SCENE_FORMAT!r}")
+    if table.integer("format_version", 1, 10**6) > SCENE_VERSION:
+        raise table.error(
+            "format_version",
+            f"newer than {SCENE_VERSION}, which this locatk knows",
+            "Update locatk",
+        )
+    table.text("tool_version", None)
+    scale = table.text("scale", "unit", SCALES)
+    stations = table.tables("stations")
+    in_units = bool(stations) and scale == "unit"
+    floor_z = (
+        table.number("floor_z_units", 0.0)
+        if in_units
+        else table.number("floor_z_mm", 0.0, shift=_METRES)
+    )
+    scene = Scene(
+        stations=tuple(_station(station, in_units) for station in stations),
+        markers=tuple(_marker(marker) for marker in table.tables("markers")),
+        distances=tuple(_distance(distance) for distance in table.tables("distances")),
+        planar=table.flag("planar", None),
+        floor_z=floor_z,
+        scale=scale,
+        frame=table.text("frame", "floor"),
+        notes=table.texts("notes", ()),
+    )
+    table.end()
+    _refuse_repeated(table, "stations", "channel", [s.channel for s in scene.stations])
+    _refuse_repeated(table, "markers", "name", [m.name for m in scene.markers])
+    return scene
+
+
+def _refuse_repeated(table: Table, key: str, name: str, values: list[Any]) -> None:
+    for number, value in enumerate(values):
+        if value in values[:number]:
+            raise table.error(f"{key}[{number}].{name}", f"{value!r} is there twice")
+
+
+def _station(table: Table, in_units: bool) -> Station:
+    channel = table.integer("channel", 1, 16)
+    text = table.text("id", None)
+    if text is not None and not re.fullmatch("[0-9a-fA-F]{1,16}", text):
+        raise table.error("id", 'expected a hexadecimal number in quotes, as in "4cc60647"')
+    if in_units:
+        position = table.array("position_units", (3,))
+    else:
+        position = table.array("position_mm", (3,), shift=_METRES)
+    rotation = table.array("rotation", (3, 3))
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or (
+        np.linalg.det(rotation) < 0
+    ):
+        raise table.error("rotation", "expected the rows of a rotation matrix")
+    key = "covariance_units_rad" if in_units else "covariance_m_rad"
+    covariance = table.array(key, (6, 6), nan=True) if key in table else None
+    table.raw(key, None)  # known also where it is missing
+    calibration = _calibration(table.table("calibration"))
+    table.end()
+    number = None if text is None else int(text, 16)
+    return Station(channel, position, rotation, calibration, number, covariance)
+
+
+def _calibration(table: Table) -> Calibration:
+    source = table.text("source", choices=SOURCES)
+    sweeps = np.zeros((2, len(PARAMETERS)))
+    for number, name in enumerate(("first", "second")):
+        # Without calibration there is nothing to say: all zero.
+        sweep = table.table(name, None) if source == "none" else table.table(name)
+        if sweep is not None:
+            sweeps[number] = [sweep.number(_calibration_key(p)) for p in PARAMETERS]
+            sweep.end()
+    table.end()
+    return Calibration(sweeps, source)
+
+
+def _marker(table: Table) -> Marker:
+    marker = Marker(
+        name=table.text("name"),
+        position=table.array("position_mm", (3,), shift=_METRES),
+        sightings=tuple(_sighting(sighting) for sighting in table.tables("sightings")),
+    )
+    table.end()
+    return marker
+
+
+def _distance(table: Table) -> Distance:
+    distance = table.number("distance_mm", shift=_METRES)
+    if distance <= 0:
+        raise table.error("distance_mm", "expected a number above 0")
+    first, second = (_sighting(table.table(name)) for name in ("first", "second"))
+    table.end()
+    return Distance(first, second, distance)
+
+
+def _sighting(table: Table) -> Sighting:
+    if "counts" in table:
+        counts = table.table("counts")
+        found = {_channel(counts, key): _pair(counts, key) for key in counts}
+        table.end()
+        return Sighting(counts=found)
+    device = table.text("device")
+    start, end = (_time(table, key) for key in ("start", "end"))
+    if end < start:
+        raise table.error("end", "is before start")
+    table.raw("counts", None)
+    table.end()
+    return Sighting(device, start, end)
+
+
+def _channel(table: Table, key: str) -> int:
+    if not re.fullmatch("[1-9][0-9]?", key) or int(key) > 16:
+        raise table.error(key, "expected a channel from 1 to 16 as key")
+    return int(key)
+
+
+def _pair(table: Table, key: str) -> tuple[float, float]:
+    first, second = table.array(key, (2,)).tolist()
+    if min(first, second) < 0:
+        raise table.error(key, "a count is below 0")
+    return first, second
+
+
+def _time(table: Table, key: str) -> int:
+    value = table.raw(key)
+    # TOML's own date and time without quotes is welcome; it holds microseconds.
+    text = value.isoformat() if isinstance(value, datetime) else value
+    time_ns = parse_time(text) if isinstance(text, str) else None
+    if time_ns is None:
+        raise table.error(key, 'expected a time with its zone, as in "2023-07-27T15:34:22.700963Z"')
+    return time_ns
+
+
+def parse_time(text: str) -> int | None:
+    """Nanoseconds since the epoch of an RFC 3339 time; None where it is none."""
+    found = _TIME.fullmatch(text)
+    if found is None:
+        return None
+    day, clock, fraction, zone = found.groups()
+    try:
+        whole = datetime.fromisoformat(f"{day}T{clock}{zone.upper().replace('Z', '+00:00')}")
+        seconds = (whole - _EPOCH) // timedelta(seconds=1)
+    except (ValueError, OverflowError):
+        return None
+    time_ns = seconds * 1_000_000_000 + int((fraction or "").ljust(9, "0"))
+    return time_ns if abs(time_ns) < 1 << 63 else None
+
+
+def format_time(time_ns: int) -> str:
+    """RFC 3339 text of nanoseconds since the epoch, in UTC, with all nine digits."""
+    seconds, nanos = divmod(int(time_ns), 1_000_000_000)
+    whole = _EPOCH + timedelta(seconds=seconds)
+    return f"{whole:%Y-%m-%dT%H:%M:%S}.{nanos:09d}Z"

@@ -1,0 +1,192 @@
+"""What a session holds, as arrays for a solver: sweeps, truth, odometry, the scene.
+
+Solutions and trajectories have modules of their own; what a caller needs of them is
+offered here too.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from locatk.core.errors import FormatError
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.trajectory import Trajectory
+from locatk.formats import artifacts, viewers
+from locatk.formats.artifacts import attached_scene as read_scene
+from locatk.formats.messages import SWEEPS, batch_edges
+from locatk.formats.session import Session, SessionWriter
+from locatk.formats.solutions import read_solution, read_trajectories, write_solution
+from locatk.formats.tracks import (
+    LARGEST_BATCH,
+    Timed,
+    check_devices,
+    odometry_messages,
+    read_batches,
+    read_odometry,
+    read_truth,
+    track_messages,
+    write_streams,
+)
+
+__all__ = [
+    "read_odometry",
+    "read_scene",
+    "read_solution",
+    "read_sweeps",
+    "read_trajectories",
+    "read_truth",
+    "sweep_messages",
+    "write_session",
+    "write_solution",
+    "write_sweeps",
+]
+
+BATCH_NS = 500_000_000
+"""Longest time that one message of an imported or simulated session covers."""
+
+
+def read_sweeps(session: Session) -> Sweeps:
+    """All lighthouse sweeps of a session, in the order of the file.
+
+    Raises
+    ------
+    FormatError
+        There are none, a message is damaged, or a value is outside its range.
+    """
+    topics = session.topics("/lighthouse/", "locatk.LighthouseSweep")
+    if not topics:
+        raise FormatError(
+            "no lighthouse sweeps (topic /lighthouse/<device>)"
+            if session.facts
+            else "not a session of locatk: no topic /lighthouse/<device>",
+            file=session.path,
+            hint=_contents(session),
+        )
+    batches = read_batches(session, topics, SWEEPS)
+    names = batches.texts["device"]
+    devices = tuple(dict.fromkeys(names))
+    numbers = {name: number for number, name in enumerate(devices)}
+    device = np.array([numbers[name] for name in names], np.int32).repeat(batches.counts)
+    columns = batches.columns
+    sweeps = Sweeps(
+        devices=devices,
+        time_ns=columns["time_ns"],
+        device=device,
+        sensor=columns["sensor"],
+        channel=columns["channel"],
+        polynomial=columns["polynomial"],
+        sweep=columns["sweep"],
+        count=columns["count"],
+    )
+    _check_ranges(sweeps, session.path)
+    return sweeps
+
+
+def _check_ranges(sweeps: Sweeps, path: str | None) -> None:
+    allowed = {
+        "time_ns": (0, np.iinfo(np.int64).max),
+        "sensor": (0, np.iinfo(np.int32).max),
+        "channel": (1, 16),
+        "polynomial": (-1, 31),
+        "sweep": (-1, 1),
+    }
+    for name, (low, high) in allowed.items():
+        values = getattr(sweeps, name)
+        if len(values) and (values.min() < low or values.max() > high):
+            bad = values[(values < low) | (values > high)][0]
+            raise FormatError(
+                f"{name} {bad} of a sweep is not in {low}..{high}", file=path, where="/lighthouse"
+            )
+
+
+def sweep_messages(sweeps: Sweeps, *, batch_ns: int = BATCH_NS) -> Iterator[Timed]:
+    """Batches of ``sweeps`` by device and time, ascending in the time of their first."""
+    _check_ranges(sweeps, None)
+    order = np.lexsort((sweeps.time_ns, sweeps.device))
+    columns = {column.name: getattr(sweeps, column.name)[order] for column in SWEEPS.columns}
+    device = sweeps.device[order]
+    edges = batch_edges(columns["time_ns"], device, batch_ns, LARGEST_BATCH)
+    starts, stops = edges[:-1], edges[1:]
+    for number in np.argsort(columns["time_ns"][starts], kind="stable"):
+        part = slice(starts[number], stops[number])
+        name = sweeps.devices[device[starts[number]]]
+        message = SWEEPS.pack({"device": name}, {key: c[part] for key, c in columns.items()})
+        yield int(columns["time_ns"][part.start]), f"/lighthouse/{name}", message
+
+
+def write_sweeps(writer: SessionWriter, sweeps: Sweeps, *, batch_ns: int = BATCH_NS) -> None:
+    """Write ``sweeps`` on ``/lighthouse/<device>``, batched by device and time.
+
+    ``batch_ns`` is the time that one message covers, in nanoseconds.
+    """
+    for time_ns, topic, message in sweep_messages(sweeps, batch_ns=batch_ns):
+        writer.write(topic, message, time_ns)
+
+
+def write_session(
+    path: str | os.PathLike[str],
+    *,
+    system: str,
+    sweeps: Sweeps,
+    truth: Sequence[Trajectory] = (),
+    odometry: Sequence[Trajectory] = (),
+    scene: Scene | None = None,
+    facts: Mapping[str, object] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a session of sweeps with what is known beside them.
+
+    Parameters
+    ----------
+    path : path
+        The output.
+    system : str
+        ``"lighthouse"``.
+    sweeps : Sweeps
+        The observations, on ``/lighthouse/<device>``.
+    truth : sequence of Trajectory
+        Reference poses: exact on ``/truth_track/<device>``, one message a pose for
+        viewers on ``/truth/<device>``.
+    odometry : sequence of Trajectory
+        Its plane part (x, y, heading) is written, on ``/odometry/<device>``.
+    scene : Scene, optional
+        Attached as ``scene.toml``.
+    facts : mapping, optional
+        Where the data comes from; written as texts to the metadata record ``facts``.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError
+        See :func:`locatk.formats.output.atomic_write`.
+    InputError
+        A time is before 1970, or two trajectories have the same device.
+    """
+    for kind, trajectories in (("truth", truth), ("odometry", odometry)):
+        check_devices(trajectories, kind)
+    streams = [sweep_messages(sweeps)]
+    for trajectory in truth:
+        streams.append(track_messages(f"/truth_track/{trajectory.device}", trajectory))
+        streams.append(viewers.poses(f"/truth/{trajectory.device}", trajectory))
+    for trajectory in odometry:
+        streams.append(odometry_messages(f"/odometry/{trajectory.device}", trajectory))
+    with SessionWriter(path, system=system, overwrite=overwrite) as writer:
+        if facts:
+            writer.metadata("facts", {key: str(value) for key, value in facts.items()})
+        if scene is not None:
+            text = artifacts.dumps_scene(scene)
+            writer.attach(artifacts.SCENE_FILE, text.encode(), "application/toml")
+        write_streams(writer, streams)
+
+
+def _contents(session: Session) -> str:
+    topics = [channel.topic for channel in session.channels]
+    if not topics:
+        return "the file holds no messages at all"
+    more = "" if len(topics) <= 5 else f" and {len(topics) - 5} more"
+    return f"it holds {', '.join(topics[:5])}{more}"

@@ -1,0 +1,225 @@
+"""Solutions on disk: poses for programs and viewers, with all that the solver said."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from locatk.core.errors import FormatError, InputError, LocatkError
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats import artifacts, viewers
+from locatk.formats.artifacts import SCENE_FILE, attached_scene
+from locatk.formats.session import Session, SessionWriter
+from locatk.formats.tracks import (
+    Timed,
+    check_devices,
+    read_poses,
+    read_tracks,
+    read_truth,
+    track_messages,
+    write_streams,
+)
+
+SOLUTION_FILE = "solution.json"
+SOLUTION_VERSION = 1
+
+
+def write_solution(
+    path: str | os.PathLike[str],
+    solution: Solution,
+    *,
+    source: str | os.PathLike[str],
+    overwrite: bool = False,
+) -> None:
+    """Write a solution as MCAP; the topics are those of docs/formats.md.
+
+    Parameters
+    ----------
+    path : path
+        The output.
+    solution : Solution
+        What a solver answered; it may hold no poses at all.
+    source : path
+        The session that was solved; its name is kept.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError
+        See :func:`locatk.formats.output.atomic_write`.
+    """
+    check_devices(solution.trajectories, "solved")
+    scene = solution.artifact if isinstance(solution.artifact, Scene) else None
+    starts = [int(t.time_ns[0]) for t in solution.trajectories if len(t) > 0]
+    start = min(starts, default=0)
+    name = Path(source).name
+    facts = {"method": solution.method, "source": name}
+    with SessionWriter(
+        path, kind="solution", system=solution.system, facts=facts, overwrite=overwrite
+    ) as writer:
+        if scene is not None:
+            writer.attach(SCENE_FILE, artifacts.dumps_scene(scene).encode(), "application/toml")
+        text = json.dumps(plain(_statement(solution, name)), indent=1, allow_nan=False)
+        writer.attach(SOLUTION_FILE, text.encode(), "application/json")
+        streams = [iter(_once(solution, scene, start))]
+        for t in solution.trajectories:
+            streams.append(track_messages(f"/solution/{t.device}", t))
+            streams.append(viewers.poses(f"/pose/{t.device}", t))
+            streams.append(viewers.transforms("/tf", t))
+        write_streams(writer, streams)
+
+
+def _statement(solution: Solution, source: str) -> dict[str, Any]:
+    return {
+        "version": SOLUTION_VERSION,
+        "system": solution.system,
+        "method": solution.method,
+        "source": source,
+        "devices": [
+            {"device": t.device, "frame": t.frame, "poses": len(t)} for t in solution.trajectories
+        ],
+        "rejected": solution.rejected,
+        "notes": solution.notes,
+        "facts": solution.facts,
+        "detections": solution.detections,
+    }
+
+
+def _once(solution: Solution, scene: Scene | None, start: int) -> list[Timed]:
+    """What is said once, at the start: the scene, whole paths, the log."""
+    said: list[Timed] = [
+        (start, "/scene", viewers.scene_update(scene, solution.trajectories, start))
+    ]
+    for t in solution.trajectories:
+        if len(t) > 0:
+            said.append((start, f"/path/{t.device}", viewers.path(t, start)))
+    for note in solution.notes:
+        said.append((start, "/log", viewers.log(note, start)))
+    for reason, count in solution.rejected.items():
+        if count:
+            line = viewers.log(f"rejected {count}: {reason}", start, warning=True)
+            said.append((start, "/log", line))
+    return said
+
+
+def read_solution(path: str | os.PathLike[str]) -> Solution:
+    """The solution that :func:`write_solution` wrote.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        See :meth:`Session.open`; also where the file holds no solution.
+    """
+    session = Session.open(path)
+    data = session.attachment(SOLUTION_FILE)
+    if data is None:
+        raise FormatError(
+            "no solution", file=path, hint="Give a file that `locatk solve` has written"
+        )
+    try:
+        said = json.loads(data)
+        if said["version"] > SOLUTION_VERSION:
+            raise FormatError(
+                f"solution of format {said['version']}, newer than this locatk",
+                file=path,
+                where=SOLUTION_FILE,
+                hint="Update locatk",
+            )
+        return Solution(
+            system=str(said["system"]),
+            method=str(said["method"]),
+            trajectories=_trajectories(session, said["devices"]),
+            rejected={str(key): int(count) for key, count in said["rejected"].items()},
+            detections=list(said["detections"]),
+            artifact=attached_scene(session),
+            notes=tuple(said["notes"]),
+            facts=dict(said["facts"]),
+        )
+    except LocatkError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise FormatError("damaged solution", file=path, where=SOLUTION_FILE) from None
+
+
+def _trajectories(session: Session, devices: list[dict[str, Any]]) -> tuple[Trajectory, ...]:
+    """Trajectories in the solver's order; those without a pose have no messages."""
+    tracks = {track.device: track for track in read_tracks(session, "/solution/")}
+    found = []
+    for entry in devices:
+        device, frame = str(entry["device"]), str(entry["frame"])
+        nothing = np.zeros(0, np.int64)
+        track = tracks.get(device)
+        if track is None:
+            track = Trajectory.from_positions(device, frame, nothing, np.zeros((0, 3)))
+        if len(track) != entry["poses"]:
+            raise FormatError(
+                f"{len(track)} poses of {device} where there were {entry['poses']}",
+                file=session.path,
+                where=f"/solution/{device}",
+            )
+        found.append(track)
+    return tuple(found)
+
+
+def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[Trajectory]:
+    """Trajectories of a solution or a session, one a device, sorted by device.
+
+    Parameters
+    ----------
+    path : path
+        An MCAP file.
+    kind : {"auto", "solution", "truth"}
+        Solved poses (``/solution/``, else ``PoseInFrame`` on ``/pose/``), reference
+        poses (``/truth``), or what there is, in this order.
+
+    Raises
+    ------
+    FormatError
+        There are none of this kind.
+    """
+    if kind not in ("auto", "solution", "truth"):
+        raise ValueError(f"kind is {kind!r}")
+    session = Session.open(path)
+    found: list[Trajectory] = []
+    if kind != "truth":
+        found = read_tracks(session, "/solution/") or read_poses(session, "/pose/")
+    if not found and kind != "solution":
+        found = read_truth(session)
+    if not found:
+        hints = {
+            "auto": "solve it first: `locatk solve`",
+            "solution": "solve it first: `locatk solve`",
+            "truth": "import it with its reference: `locatk import ... --truth`",
+        }
+        what = {"auto": "poses", "solution": "solved poses", "truth": "reference poses"}[kind]
+        raise FormatError(f"no {what}", file=path, hint=hints[kind])
+    return sorted(found, key=lambda trajectory: trajectory.device)
+
+
+def plain(value: Any) -> Any:
+    """``value`` in types that JSON knows: numpy numbers and arrays resolved, nan as null.
+
+    Raises
+    ------
+    InputError
+        It holds something that JSON cannot say.
+    """
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    raise InputError(f"a {type(value).__name__} cannot be written as JSON")

@@ -1,0 +1,244 @@
+"""Foxglove messages: what Foxglove, Lichtblick and Rerun draw without being told how."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
+from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
+from locatk.core.geometry import quaternion_from_matrix
+from locatk.core.lighthouse.scene import Marker, Scene, Station
+from locatk.core.trajectory import Trajectory
+from locatk.formats.messages import timestamp
+from locatk.formats.session import Session
+
+LONGEST_PATH = 5000
+"""Most points of a path that is drawn as one line; longer ones are thinned evenly."""
+
+STATION_COLOR = Color(r=0.15, g=0.35, b=0.75, a=1.0)
+MARKER_COLOR = Color(r=0.85, g=0.25, b=0.2, a=1.0)
+TEXT_COLOR = Color(r=0.5, g=0.5, b=0.5, a=1.0)
+PATH_COLORS = tuple(
+    Color(r=r, g=g, b=b, a=1.0)
+    for r, g, b in (
+        (0.0, 0.45, 0.7),
+        (0.9, 0.6, 0.0),
+        (0.0, 0.6, 0.5),
+        (0.8, 0.4, 0.0),
+        (0.8, 0.6, 0.7),
+        (0.35, 0.7, 0.9),
+    )
+)
+"""Okabe and Ito's colours, told apart by the colour-blind too."""
+
+Timed = tuple[int, str, Message]
+
+
+def poses(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
+    """One ``PoseInFrame`` a pose."""
+    for time_ns, pose in _stamped(trajectory):
+        message = PoseInFrame(timestamp=timestamp(time_ns), frame_id=trajectory.frame, pose=pose)
+        yield time_ns, topic, message
+
+
+def transforms(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
+    """One ``FrameTransform`` a pose: the device's frame in the trajectory's."""
+    for time_ns, pose in _stamped(trajectory):
+        message = FrameTransform(
+            timestamp=timestamp(time_ns),
+            parent_frame_id=trajectory.frame,
+            child_frame_id=trajectory.device,
+            translation=_vector(pose.position.x, pose.position.y, pose.position.z),
+            rotation=pose.orientation,
+        )
+        yield time_ns, topic, message
+
+
+def path(trajectory: Trajectory, time_ns: int) -> PosesInFrame:
+    """The whole path in one message, at most :data:`LONGEST_PATH` poses of it."""
+    keep = _thinned(len(trajectory))
+    return PosesInFrame(
+        timestamp=timestamp(time_ns),
+        frame_id=trajectory.frame,
+        poses=[
+            _pose(p, q)
+            for p, q in zip(
+                trajectory.position[keep].tolist(),
+                trajectory.quaternion[keep].tolist(),
+                strict=True,
+            )
+        ],
+    )
+
+
+def log(message: str, time_ns: int, *, warning: bool = False) -> Log:
+    """A line for the log panel."""
+    level = Log.WARNING if warning else Log.INFO
+    return Log(timestamp=timestamp(time_ns), level=level, message=message, name="locatk")
+
+
+def scene_update(
+    scene: Scene | None, trajectories: Sequence[Trajectory], time_ns: int
+) -> SceneUpdate:
+    """Stations, markers and paths as things to look at.
+
+    Sizes are in the units of the scene, which has 0.1 m stations where its scale is
+    metric.
+    """
+    entities = []
+    if scene is not None:
+        entities += [_station(station, scene, time_ns) for station in scene.stations]
+        entities += [_marker(marker, scene, time_ns) for marker in scene.markers]
+    for number, trajectory in enumerate(trajectories):
+        if len(trajectory) > 0:
+            color = PATH_COLORS[number % len(PATH_COLORS)]
+            entities.append(_line(trajectory, color, time_ns))
+    return SceneUpdate(entities=entities)
+
+
+def trajectory(session: Session, topic: str, device: str) -> Trajectory:
+    """Poses of a ``PoseInFrame`` topic of any tool, in the order of their own times.
+
+    The covariance is unknown. Where a message has no time of its own, its log time
+    is taken.
+    """
+    times: list[int] = []
+    rows: list[tuple[float, ...]] = []
+    frame = ""
+    for log_ns, message in session.decoded(topic, PoseInFrame):
+        stamp, p, q = message.timestamp, message.pose.position, message.pose.orientation
+        own_ns = stamp.seconds * 1_000_000_000 + stamp.nanos
+        times.append(own_ns if message.HasField("timestamp") else log_ns)
+        rows.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+        frame = frame or message.frame_id
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    time_ns = np.array(times, np.int64)
+    order = np.argsort(time_ns, kind="stable")
+    return Trajectory(
+        device,
+        frame,
+        time_ns[order],
+        table[order, :3],
+        table[order, 3:],
+        np.full((len(times), 6, 6), np.nan),
+    )
+
+
+def _stamped(trajectory: Trajectory) -> Iterator[tuple[int, Pose]]:
+    rows = zip(
+        trajectory.time_ns.tolist(),
+        trajectory.position.tolist(),
+        trajectory.quaternion.tolist(),
+        strict=True,
+    )
+    for time_ns, position, quaternion in rows:
+        yield time_ns, _pose(position, quaternion)
+
+
+def _pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose:
+    x, y, z, w = quaternion
+    return Pose(position=_vector(*position), orientation=Quaternion(x=x, y=y, z=z, w=w))
+
+
+def _vector(x: float, y: float, z: float) -> Vector3:
+    return Vector3(x=x, y=y, z=z)
+
+
+def _thinned(n: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, n - 1, min(n, LONGEST_PATH)).round().astype(np.int64))
+
+
+def _station(station: Station, scene: Scene, time_ns: int) -> SceneEntity:
+    position = station.position.tolist()
+    pose = _pose(position, quaternion_from_matrix(station.rotation).tolist())
+    label = f"station {station.channel}"
+    facts = {"channel": str(station.channel), "calibration": station.calibration.source}
+    if station.id is not None:
+        facts["id"] = f"{station.id:08x}"
+        label += f" ({station.id:08x})"
+    return SceneEntity(
+        timestamp=timestamp(time_ns),
+        frame_id=scene.frame,
+        id=f"station/{station.channel}",
+        metadata=_pairs(facts),
+        cubes=[CubePrimitive(pose=pose, size=_vector(0.07, 0.1, 0.1), color=STATION_COLOR)],
+        arrows=[
+            ArrowPrimitive(
+                pose=pose,
+                shaft_length=0.25,
+                shaft_diameter=0.02,
+                head_length=0.08,
+                head_diameter=0.05,
+                color=STATION_COLOR,
+            )
+        ],
+        texts=[_text(label, position, 0.12)],
+    )
+
+
+def _marker(marker: Marker, scene: Scene, time_ns: int) -> SceneEntity:
+    position = marker.position.tolist()
+    pose = _pose(position, (0.0, 0.0, 0.0, 1.0))
+    size = 0.02
+    return SceneEntity(
+        timestamp=timestamp(time_ns),
+        frame_id=scene.frame,
+        id=f"marker/{marker.name}",
+        spheres=[SpherePrimitive(pose=pose, size=_vector(size, size, size), color=MARKER_COLOR)],
+        texts=[_text(marker.name, position, 0.04)],
+    )
+
+
+def _line(trajectory: Trajectory, color: Color, time_ns: int) -> SceneEntity:
+    points = trajectory.position[_thinned(len(trajectory))].tolist()
+    return SceneEntity(
+        timestamp=timestamp(time_ns),
+        frame_id=trajectory.frame,
+        id=f"path/{trajectory.device}",
+        metadata=_pairs({"device": trajectory.device, "poses": str(len(trajectory))}),
+        lines=[
+            LinePrimitive(
+                type=LinePrimitive.LINE_STRIP,
+                pose=_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
+                thickness=2.0,
+                scale_invariant=True,
+                points=[Point3(x=x, y=y, z=z) for x, y, z in points],
+                color=color,
+            )
+        ],
+    )
+
+
+def _text(text: str, position: Sequence[float], above: float) -> TextPrimitive:
+    x, y, z = position
+    return TextPrimitive(
+        pose=_pose((x, y, z + above), (0.0, 0.0, 0.0, 1.0)),
+        billboard=True,
+        font_size=14,
+        scale_invariant=True,
+        color=TEXT_COLOR,
+        text=text,
+    )
+
+
+def _pairs(facts: Mapping[str, str]) -> list[KeyValuePair]:
+    return [KeyValuePair(key=key, value=value) for key, value in facts.items()]

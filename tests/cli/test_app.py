@@ -1,0 +1,283 @@
+"""The command as a whole: help, start-up, errors and exit statuses."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from locatk.cli import app as app_module
+from locatk.cli import console, failures
+from locatk.cli.app import COMMANDS, app
+from locatk.core import errors
+
+Run = Callable[..., Result]
+
+
+def every_command(command: click.Command = app, path: tuple[str, ...] = ()) -> Iterator[tuple]:
+    """(path, command) of each command below the group."""
+    if path:
+        yield path, command
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            child = command.get_command(context, name)
+            assert child is not None
+            yield from every_command(child, (*path, name))
+
+
+@pytest.mark.parametrize("path", [path for path, _ in every_command()], ids=" ".join)
+def test_every_help_has_examples_that_parse(locatk: Run, path: tuple[str, ...]) -> None:
+    result = locatk(*path, "--help")
+    assert result.exit_code == 0
+    assert "Examples:" in result.stdout
+    examples = [line.strip() for line in result.stdout.split("Examples:")[1].splitlines()]
+    examples = [line for line in examples if line.startswith("locatk ")]
+    assert examples
+    assert any(line.startswith("locatk " + " ".join(path)) for line in examples)
+
+
+@pytest.mark.parametrize("path", [path for path, _ in every_command()], ids=" ".join)
+def test_examples_are_valid_usage(path: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each example of each help names commands and options that exist."""
+    monkeypatch.setattr(Path, "exists", lambda self, **_: True)
+    monkeypatch.delenv("LOCATK_DATA", raising=False)
+    text = CliRunner().invoke(app, [*path, "--help"]).stdout
+    for line in text.split("Examples:")[1].splitlines():
+        if not line.strip().startswith("locatk "):
+            continue
+        args = line.split()[1:]
+        context = click.Context(app)
+        command: click.Command = app
+        while isinstance(command, click.Group):
+            found = command.get_command(context, args.pop(0))
+            assert found is not None, line
+            command = found
+        command.make_context("example", args, resilient_parsing=False)
+    console.reset()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_table_agrees_with_commands(name: str) -> None:
+    module, short = COMMANDS[name]
+    assert importlib.import_module(module).command.short_help == short
+
+
+@pytest.mark.parametrize("args", [["--help"], ["--version"], ["solve", "--help"], ["nonsense"]])
+def test_start_up_is_light(args: list[str]) -> None:
+    code = (
+        "import sys\n"
+        "from locatk.cli.app import app\n"
+        f"try: app({args!r}, prog_name='locatk')\n"
+        "except SystemExit: pass\n"
+        "loaded = set(sys.modules)\n"
+        "print(sorted(loaded & {'numpy', 'scipy', 'cv2', 'matplotlib', 'google.protobuf'}))\n"
+        "print(sorted(m for m in loaded if m.startswith('locatk.')))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy, own = done.stdout.splitlines()[-2:]
+    assert heavy == "[]"
+    if args[0] == "--help":
+        commands = {module for module, _ in COMMANDS.values()}
+        assert not commands & set(eval(own))
+
+
+def test_module_runs() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "locatk.cli", "--version"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.startswith("locatk ")
+
+
+def test_completion_needs_no_command_module() -> None:
+    environment = {
+        **os.environ,
+        "_LOCATK_COMPLETE": "bash_complete",
+        "COMP_WORDS": "locatk s",
+        "COMP_CWORD": "1",
+    }
+    code = "import sys\nfrom locatk.cli.app import main\nmain()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment
+    )
+    assert done.stdout.splitlines() == ["plain,simulate", "plain,solve"]
+
+
+def failing(error: BaseException) -> Callable[..., Result]:
+    """`locatk broken`, a command that raises ``error``."""
+
+    @click.command()
+    @click.option("-v", is_flag=True, callback=lambda c, p, v: console.set_verbosity(int(v)))
+    def broken(v: bool) -> None:
+        raise error
+
+    def run(*args: str) -> Result:
+        group = app_module.LazyGroup("locatk")
+        group.get_command = lambda ctx, name: broken  # type: ignore[method-assign]
+        return CliRunner().invoke(group, ["broken", *args], prog_name="locatk")
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (
+            errors.FormatError("not MCAP", file="a.mcap", where=3, hint="Give a session"),
+            1,
+            "Error: not MCAP in a.mcap:3. Hint: Give a session.\n",
+        ),
+        (errors.DegenerateError("one robot\nstood still"), 1, "Error: one robot stood still.\n"),
+        (
+            PermissionError(errno.EACCES, "denied", "/x/y"),
+            1,
+            "Error: Permission denied in /x/y. Hint: Check the permissions of the file and of "
+            "its folder.\n",
+        ),
+        (
+            OSError(errno.ENOSPC, "full"),
+            1,
+            "Error: No space left on device. Hint: Free some space or write to another disk.\n",
+        ),
+        (
+            IsADirectoryError(errno.EISDIR, "dir", "/x"),
+            1,
+            "Error: Is a directory in /x. Hint: Name a file, not a folder.\n",
+        ),
+        (
+            ZeroDivisionError("division by zero"),
+            1,
+            "Error: internal error, ZeroDivisionError: division by zero. Hint: Please report "
+            "it, with the traceback that -v shows.\n",
+        ),
+        (
+            failures.Incomplete("2 sessions are unsolved"),
+            3,
+            "Incomplete: 2 sessions are unsolved.\n",
+        ),
+        (KeyboardInterrupt(), 130, "\nAborted\n"),
+        (
+            click.UsageError("Two are too many."),
+            2,
+            "Error: Two are too many. Hint: `locatk broken --help` shows how to use it.\n",
+        ),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_errors_are_one_line(error: BaseException, status: int, line: str) -> None:
+    result = failing(error)()
+    assert result.exit_code == status
+    assert result.stderr == line
+    assert result.stdout == ""
+
+
+def test_verbose_shows_the_traceback() -> None:
+    result = failing(ZeroDivisionError("oops"))("-v")
+    assert "Traceback" in result.stderr
+    assert result.stderr.splitlines()[-1].startswith("Error: internal error")
+    assert "Traceback" not in failing(ZeroDivisionError("oops"))().stderr
+
+
+def test_wrong_usage_is_one_line(locatk: Run) -> None:
+    for args in (
+        ["nonsense"],
+        ["solve"],
+        ["solve", "--nonsense"],
+        ["import", "xyz", "a", "-o", "b"],
+    ):
+        result = locatk(*args)
+        assert result.exit_code == 2, args
+        assert result.stderr.startswith("Error: ")
+        assert len(result.stderr.splitlines()) == 1
+        assert "--help` shows" in result.stderr
+
+
+def test_no_arguments_show_help(locatk: Run) -> None:
+    result = locatk()
+    assert result.exit_code == 2
+    assert "Commands:" in result.stderr
+
+
+def test_a_closed_pipe_is_quiet() -> None:
+    done = subprocess.run(
+        f"{sys.executable} -m locatk.cli --help | true",
+        shell=True,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_termination_cleans_up(tmp_path: Path) -> None:
+    """SIGTERM ends with 143, and a file in the making is removed."""
+    code = (
+        "import sys, time, click\n"
+        "from locatk.cli import app as m\n"
+        "from locatk.formats.output import atomic_write\n"
+        "@click.command()\n"
+        "def slow():\n"
+        f"    with atomic_write({str(tmp_path / 'x.bin')!r}) as f:\n"
+        "        f.write(b'1'); print('ready', flush=True); time.sleep(60)\n"
+        "m.LazyGroup.get_command = lambda self, ctx, name: slow\n"
+        "sys.argv = ['locatk', 'slow']\n"
+        "m.main()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=20) == 143
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_color_is_honoured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert "\x1b[" in console.colour("x", "red")
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert console.colour("x", "red") == "x"
+
+
+def test_json_is_plain(capsys: pytest.CaptureFixture[str]) -> None:
+    import numpy as np
+
+    value = {
+        "nan": float("nan"),
+        "array": np.array([1.0, np.inf]),
+        "count": np.int64(3),
+        "flag": np.bool_(True),
+        "path": Path("a/b"),
+        "tuple": (1, None, "x"),
+        2: "key",
+    }
+    console.emit_json(value)
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1
+    assert json.loads(out) == {
+        "nan": None,
+        "array": [1.0, None],
+        "count": 3,
+        "flag": True,
+        "path": "a/b",
+        "tuple": [1, None, "x"],
+        "2": "key",
+    }
+
+
+def test_table_aligns() -> None:
+    text = console.table(("name", "n"), [("a", 1), ("long", 100), (None, "-")])
+    assert text == "name    n\na       1\nlong  100\n        -"
+    assert console.table(("a", "b"), []) == "a  b"

@@ -1,0 +1,150 @@
+"""Outputs appear whole or not at all, and never over another unasked."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
+from locatk.formats import output
+from locatk.formats.output import atomic_write, check_output
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(os.listdir(folder))
+
+
+def test_file_appears_only_at_the_end(tmp_path: Path) -> None:
+    target = tmp_path / "out.bin"
+    with atomic_write(target) as stream:
+        stream.write(b"abc")
+        assert not target.exists()
+    assert target.read_bytes() == b"abc"
+    assert names(tmp_path) == ["out.bin"]
+
+
+def test_text_is_utf8_with_line_ends_as_given(tmp_path: Path) -> None:
+    with atomic_write(tmp_path / "out.csv", mode="w") as stream:
+        stream.write("µ\r\nx\n")
+    assert (tmp_path / "out.csv").read_bytes() == b"\xc2\xb5\r\nx\n"
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
+    with atomic_write(tmp_path / "ours"):
+        pass
+    (tmp_path / "usual").write_bytes(b"")
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_nothing_is_left_after_an_exception(
+    tmp_path: Path, error: type[BaseException], overwrite: bool
+) -> None:
+    target = tmp_path / "out.bin"
+    if overwrite:
+        target.write_bytes(b"old")
+
+    def write() -> None:
+        with atomic_write(target, overwrite=overwrite) as stream:
+            stream.write(b"half")
+            raise error
+
+    with pytest.raises(error):
+        write()
+    assert names(tmp_path) == (["out.bin"] if overwrite else [])
+    if overwrite:
+        assert target.read_bytes() == b"old"
+
+
+def test_existing_output_is_refused_before_the_work(tmp_path: Path) -> None:
+    target = tmp_path / "out.bin"
+    target.write_bytes(b"old")
+    with pytest.raises(OutputExistsError) as caught, atomic_write(target):
+        pytest.fail("entered")
+    assert "--overwrite" in (caught.value.hint or "")
+    with pytest.raises(OutputExistsError):
+        check_output(target)
+    check_output(target, overwrite=True)
+    assert target.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_race_cannot_clobber(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
+    """Another process makes the file while we write, with and without hard links."""
+    if not links:
+
+        def no_link(*_: object) -> None:
+            raise PermissionError(1, "Operation not permitted")
+
+        monkeypatch.setattr(output.os, "link", no_link)
+    target = tmp_path / "out.bin"
+
+    def write() -> None:
+        with atomic_write(target) as stream:
+            stream.write(b"ours")
+            target.write_bytes(b"theirs")
+
+    with pytest.raises(OutputExistsError):
+        write()
+    assert target.read_bytes() == b"theirs"
+    assert names(tmp_path) == ["out.bin"]
+
+    with atomic_write(tmp_path / "free") as stream:
+        stream.write(b"ours")
+    assert (tmp_path / "free").read_bytes() == b"ours"
+
+
+def test_overwrite_replaces(tmp_path: Path) -> None:
+    target = tmp_path / "out.bin"
+    target.write_bytes(b"old")
+    link = tmp_path / "link"
+    link.symlink_to(target)
+    with atomic_write(link, overwrite=True) as stream:
+        stream.write(b"new")
+    assert target.read_bytes() == b"new"
+    assert link.is_symlink()
+
+
+def test_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(MissingDataError) as caught, atomic_write(tmp_path / "no" / "out"):
+        pytest.fail("entered")
+    assert caught.value.hint
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_only_regular_files_are_replaced(tmp_path: Path, overwrite: bool) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for target in (tmp_path, tmp_path / "pipe"):
+        with pytest.raises(OutputExistsError), atomic_write(target, overwrite=overwrite):
+            pytest.fail("entered")
+
+
+def test_refusal_of_the_system_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(LocatkError) as caught, atomic_write(tmp_path / ("n" * 300)):
+        pass
+    assert "cannot write" in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def test_full_disk_is_one_line(tmp_path: Path) -> None:
+    def write() -> None:
+        with atomic_write(tmp_path / "out"):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(LocatkError, match="No space left"):
+        write()
+    assert names(tmp_path) == []
+
+
+def test_errors_about_other_files_pass(tmp_path: Path) -> None:
+    def write() -> None:
+        with atomic_write(tmp_path / "out"):
+            open(tmp_path / "other").close()
+
+    with pytest.raises(FileNotFoundError) as caught:
+        write()
+    assert not isinstance(caught.value, LocatkError)
+    assert names(tmp_path) == []
