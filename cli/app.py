@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -116,6 +117,8 @@ def app() -> None:
 
 def main() -> None:
     """Entry point of the `locatk` script."""
+    # With protobuf 6, each schema of foxglove warns that it was generated for protobuf 5.
+    warnings.filterwarnings("ignore", message="Protobuf gencode version", category=UserWarning)
     # As an exception, so that files in the making are removed.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     app(prog_name="locatk")

@@ -14,17 +14,15 @@ BENCHES = {
 }
 """Name of a system to the function that measures its figures."""
 
-DEFAULT_DATA = Path("../shared/data")
+ELSEWHERE = Path("../shared/data")
 
 
 @click.command(short_help="Measure what the project promises, on published data.")
 @click.argument("system", type=click.Choice(list(BENCHES)))
 @options.input_option(
     "--data",
-    envvar="LOCATK_DATA",
-    show_envvar=True,
     metavar="FOLDER",
-    help=f"Folder with the published recordings.  [default: {DEFAULT_DATA}]",
+    help=f"Folder with the published recordings.  [default: $LOCATK_DATA, else {ELSEWHERE}]",
 )
 @options.as_json
 @options.verbosity
@@ -38,8 +36,10 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
       locatk bench lighthouse
       locatk bench lighthouse --data ~/data --json
     """
+    from locatk.formats.data import data_folder
+
     with console.working("Measuring"):
-        figures = options.load(BENCHES[system])(data or DEFAULT_DATA)
+        figures = options.load(BENCHES[system])(data_folder(data) or ELSEWHERE)
     if as_json:
         rows = [{name: getattr(figure, name) for name in FIELDS} for figure in figures]
         console.emit_json({"system": system, "commit": _commit(), "figures": rows})

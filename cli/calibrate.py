@@ -46,7 +46,7 @@ def scene(
       locatk calibrate scene run.mcap -o scene.toml --scene two-3d
       locatk solve later.mcap -o solved.mcap --artifact scene.toml
     """
-    from locatk.cli.solve import entry, show
+    from locatk.cli.solve import entry, notes, text
     from locatk.cli.systems import Request, solve_session
     from locatk.formats import artifacts
 
@@ -54,6 +54,8 @@ def scene(
     with console.working("Solving"):
         solved = solve_session(session, Request(method=method, scene=scene))
     artifacts.write_scene(output, solved.solution.artifact, overwrite=overwrite)
-    show(session, output, solved)
+    console.result(text(session, output, solved))
+    for note in notes(session, solved):
+        console.say(note)
     if as_json:
         console.emit_json({"version": 1, "sessions": [entry(session, output, solved)]})

@@ -154,7 +154,7 @@ def _text(facts: dict[str, Any]) -> str:
     kind = facts.get("kind") or "recording of another tool"
     lines = [f"{facts['file']}: {kind}" + (f", {facts['system']}" if facts.get("system") else "")]
     for label, value in (
-        ("size", f"{facts['bytes'] / 1e6:.3g} MB"),
+        ("size", _size(facts["bytes"])),
         ("made by", facts.get("library")),
         ("start", _when(facts.get("start_ns"))),
         ("duration", _seconds(facts.get("duration_s"))),
@@ -226,4 +226,11 @@ def _seconds(value: float | None) -> str | None:
 
 
 def _rate(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _size(count: int) -> str:
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count} bytes"

@@ -66,9 +66,10 @@ as_json = click.option(
 
 method = click.option(
     "--method",
+    type=click.Choice(("bundle", "paper")),
     default=None,
-    metavar="NAME",
-    help="Algorithm: `paper` is the published one as written; without it, the better one.",
+    help="Algorithm: `paper` is the published one as written, `bundle` the better one.  "
+    "[default: the system's better one]",
 )
 
 artifact = input_option(

@@ -73,6 +73,7 @@ def command(
     request = Request(method=method, scene=scene, artifact=artifact)
     entries: list[dict[str, Any]] = []
     losses: list[str] = []
+    said: list[tuple[str, list[str]]] = []
     with console.progress(sessions, "Solving") as bar:
         for session, target in zip(bar, outputs, strict=True):
             try:
@@ -96,8 +97,12 @@ def command(
             ]
             if not solved.solution.trajectories:
                 losses.append(f"{session}: no pose at all")
-            show(session, target, solved)
+            said.append((text(session, target, solved), notes(session, solved)))
 
+    for results, remarks in said:  # not inside the loop: a progress bar is there
+        console.result(results)
+        for remark in remarks:
+            console.say(remark)
     if as_json:
         console.emit_json({"version": 1, "sessions": entries})
     if losses:
@@ -122,7 +127,7 @@ def plan_outputs(sessions: tuple[Path, ...], output: Path) -> list[Path]:
     return [output / f"{session.stem}.mcap" for session in sessions]
 
 
-def entry(session: Path, output: Path | None, solved: Solved) -> dict[str, Any]:
+def entry(session: Path, output: Path, solved: Solved) -> dict[str, Any]:
     """One session of ``--json`` (ARCHITECTURE 4; docs/commands.md)."""
     solution = solved.solution
     return {
@@ -134,29 +139,32 @@ def entry(session: Path, output: Path | None, solved: Solved) -> dict[str, Any]:
         "rejected": solution.rejected,
         "solve_s": solved.solve_s,
         "detections": solution.detections,
-        "devices": {t.device: len(t) for t in solution.trajectories},
-        "notes": list(solution.notes),
-        "facts": solution.facts,
     }
 
 
-def show(session: Path, output: Path | None, solved: Solved) -> None:
-    """The same for people: a line, a table of devices, and what must be known."""
+def text(session: Path, output: Path, solved: Solved) -> str:
+    """The same for people: a line, a table of devices, and what was rejected."""
     solution = solved.solution
-    where = f" -> {output}" if output else ""
-    console.result(
-        f"{session}{where}: {solution.poses} poses, {solution.system} by {solution.method}, "
-        f"{solved.solve_s:.3g} s"
-    )
+    # A scene that nothing measured has no metres.
+    unit = "1e-3" if getattr(solution.artifact, "scale", None) == "unit" else "mm"
+    header = ("device", "poses", "sigma x", "sigma y", f"sigma z [{unit}]")
     rows = [(t.device, len(t), *_spread(t.sigma)) for t in solution.trajectories]
-    if rows:
-        console.result(
-            console.table(("device", "poses", "sigma x", "sigma y", "sigma z [mm]"), rows)
-        )
-    rejected = ", ".join(f"{count} {reason}" for reason, count in solution.rejected.items())
-    console.result(f"rejected: {rejected or 'nothing'}")
-    for note in solution.notes:
-        console.result(f"note: {note}")
+    rejected = ", ".join(
+        f"{count} {reason.replace('_', ' ')}" for reason, count in solution.rejected.items()
+    )
+    return "\n".join(
+        [
+            f"{session} -> {output}: {solution.poses} poses, {solution.system} by "
+            f"{solution.method}, {solved.solve_s:.3g} s",
+            *([console.table(header, rows)] if rows else []),
+            f"rejected: {rejected or 'nothing'}",
+        ]
+    )
+
+
+def notes(session: Path, solved: Solved) -> list[str]:
+    """What must be known to use the poses; said with ``--json`` too, on stderr."""
+    return [f"{session.name}: {note}" for note in solved.solution.notes]
 
 
 def _spread(sigma: Any) -> list[str]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from locatk.core.errors import InputError, MissingDataError
-from locatk.core.lighthouse.calibration import PARAMETERS, Calibration
+from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, Scene, Sighting, Station
 from locatk.formats import toml
 from locatk.formats.output import atomic_write, tool_version
@@ -142,8 +142,10 @@ def _station_table(station: Station, in_units: bool) -> dict[str, Any]:
         **position,
         "rotation": station.rotation,
         covariance: station.covariance,
+        "floor_map_m": station.floor_map,
         "calibration": {
             "source": station.calibration.source,
+            "model": station.calibration.model,
             **{
                 name: Inline(
                     {_calibration_key(p): float(v) for p, v in zip(PARAMETERS, row, strict=True)}
@@ -233,15 +235,18 @@ def _station(table: Table, in_units: bool) -> Station:
         raise table.error("rotation", "expected the rows of a rotation matrix")
     key = "covariance_units_rad" if in_units else "covariance_m_rad"
     covariance = table.array(key, (6, 6), nan=True) if key in table else None
-    table.raw(key, None)  # known also where it is missing
+    floor_map = table.array("floor_map_m", (3, 3)) if "floor_map_m" in table else None
+    for name in (key, "floor_map_m"):
+        table.raw(name, None)  # known also where it is missing
     calibration = _calibration(table.table("calibration"))
     table.end()
     number = None if text is None else int(text, 16)
-    return Station(channel, position, rotation, calibration, number, covariance)
+    return Station(channel, position, rotation, calibration, number, covariance, floor_map)
 
 
 def _calibration(table: Table) -> Calibration:
     source = table.text("source", choices=SOURCES)
+    model = table.text("model", "libsurvive", choices=MODELS)
     sweeps = np.zeros((2, len(PARAMETERS)))
     for number, name in enumerate(("first", "second")):
         # Without calibration there is nothing to say: all zero.
@@ -250,7 +255,7 @@ def _calibration(table: Table) -> Calibration:
             sweeps[number] = [sweep.number(_calibration_key(p)) for p in PARAMETERS]
             sweep.end()
     table.end()
-    return Calibration(sweeps, source)
+    return Calibration(sweeps, source, model)
 
 
 def _marker(table: Table) -> Marker:

@@ -47,3 +47,10 @@ def test_commands_are_valid_usage(root: Path, monkeypatch: pytest.MonkeyPatch) -
             command = child
         if args:  # a bare name is a mention, not a use
             command.make_context("example", args)
+
+
+def test_python_example_runs(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (root / "README.md").read_text(encoding="utf-8")
+    [code] = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
+    exec(code, {})
+    assert len(capsys.readouterr().out.splitlines()) == 3

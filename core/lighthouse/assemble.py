@@ -95,10 +95,7 @@ def assemble(
         plane (for ``planar=False``), or stations without common sight.
     """
     rays = np.stack(
-        [
-            rays_of(ideal_angles(angles[:, i], c), c.tilts)
-            for i, c in enumerate(calibrations)
-        ],
+        [rays_of(ideal_angles(angles[:, i], c), c.tilts) for i, c in enumerate(calibrations)],
         axis=1,
     )
     seen = np.isfinite(rays[..., 0])
@@ -112,8 +109,9 @@ def assemble(
     planar, agreed = _decide(a, b, flat, on_plane, planar, seed, facts)
     _require_places(a[agreed], b[agreed], 4 if planar else 8)
     if not planar:
-        miss = twoview.homography_residuals(twoview.fit_homography(a[agreed], b[agreed]),
-                                            a[agreed], b[agreed])
+        miss = twoview.homography_residuals(
+            twoview.fit_homography(a[agreed], b[agreed]), a[agreed], b[agreed]
+        )
         if np.sqrt(np.median(miss**2)) < SAME_PLACE / 2:
             raise DegenerateError(
                 "all places lie on one plane, which does not determine a scene in space",
@@ -136,8 +134,10 @@ def assemble(
 
 
 def _best_pair(seen: NDArray[np.bool_]) -> tuple[int, int]:
-    joint = {p: np.count_nonzero(seen[:, p[0]] & seen[:, p[1]])
-             for p in combinations(range(seen.shape[1]), 2)}
+    joint = {
+        p: np.count_nonzero(seen[:, p[0]] & seen[:, p[1]])
+        for p in combinations(range(seen.shape[1]), 2)
+    }
     pair = max(joint, key=lambda p: joint[p])
     if joint[pair] == 0:
         raise DegenerateError(
@@ -150,8 +150,14 @@ def _best_pair(seen: NDArray[np.bool_]) -> tuple[int, int]:
 def _require_places(a: Array, b: Array, number: int) -> None:
     """Refuse views with fewer distinct places than needed, or all on one line."""
     cells = np.unique(np.rint(np.c_[a[:, 1:], b[:, 1:]] / SAME_PLACE), axis=0)
-    spread = np.linalg.svd(np.c_[a[:, 1:], b[:, 1:]] - np.mean(np.c_[a[:, 1:], b[:, 1:]], axis=0),
-                           compute_uv=False) / np.sqrt(max(len(a), 1)) if len(a) else np.zeros(4)
+    spread = (
+        np.linalg.svd(
+            np.c_[a[:, 1:], b[:, 1:]] - np.mean(np.c_[a[:, 1:], b[:, 1:]], axis=0), compute_uv=False
+        )
+        / np.sqrt(max(len(a), 1))
+        if len(a)
+        else np.zeros(4)
+    )
     if len(a) == 0 or spread[0] < 2 * SAME_PLACE:
         raise DegenerateError(
             "the photodiodes stood still: one place does not determine a scene",
@@ -266,9 +272,7 @@ def _choose(
     for rig in starts:
         small = Rig(rig.positions, rig.rotations, rig.calibrations, rig.points[some])
         # All residuals count in full: a soft loss would let a bad start stay bad.
-        done = adjust(
-            angles[some], small, sigma=sigma, planar=planar, soft=1.0, iterations=60
-        )
+        done = adjust(angles[some], small, sigma=sigma, planar=planar, soft=1.0, iterations=60)
         tried.append((done.cost, _roll(done.rig.rotations) if planar else 0.0, done))
         # In space only one arrangement fits; with many places a fit is no accident.
         if not planar and len(some) >= FEW and done.cost < len(some):

@@ -127,9 +127,9 @@ def adjust(
     dims = 0 if fixed_points else (2 if planar else 3)
 
     damping = 1e-3
-    step_at = 0
+    steps = 0
     system = _linearise(observed, seen, rig, sigma, loss_width, prior, dims)
-    for step_at in range(1, iterations + 1):
+    for steps in range(1, iterations + 1):  # noqa: B007
         trial = _step(system, rig, damping, planar, dims)
         trial_system = _linearise(observed, seen, trial, sigma, loss_width, prior, dims)
         if trial_system.cost < system.cost:
@@ -153,7 +153,7 @@ def adjust(
         np.where(seen, system.residuals * sigma, np.nan),
         np.where(seen, system.weights, np.nan),
         np.stack([blocks[i, :, i, :] for i in range(s)]),
-        step_at,
+        steps,
         system.cost,
     )
 
@@ -169,8 +169,12 @@ class _Prior:
     def of(cls, rig: Rig, free: NDArray[np.bool_]) -> _Prior:
         mean = np.stack([_unknowns_of(c) for c in rig.calibrations])
         spread = np.concatenate([PHASE_TILT_SIGMA[:, 1], PHASE_TILT_SIGMA[:, 0]])
-        spread = np.maximum(spread, 1e-7)  # the first phase is zero in every unit
-        information = np.where(free[:, None], 1.0 / spread**2, np.inf)
+        information = np.full(mean.shape, np.inf)
+        # What is the same in every unit (the first phase is zero) is not estimated.
+        loose = free[:, None] & (spread > 0)
+        information[loose] = np.broadcast_to(
+            1.0 / np.where(spread > 0, spread, 1.0) ** 2, mean.shape
+        )[loose]
         return cls(mean, information)
 
 
@@ -214,9 +218,7 @@ def _linearise(
     for i in range(s):
         rotation = rig.rotations[i]
         offset = rig.points - rig.positions[i]
-        predicted, by_local, by_tilt = predict_with_gradient(
-            offset @ rotation, rig.calibrations[i]
-        )
+        predicted, by_local, by_tilt = predict_with_gradient(offset @ rotation, rig.calibrations[i])
         residual = np.where(seen[:, i], predicted - observed[:, i], 0.0) / sigma
         # A point outside the cone of a sweep cannot have been seen by it.
         residual = np.where(np.isfinite(residual), residual, 1e3)
@@ -253,13 +255,9 @@ def _linearise(
             transposed = by_free.transpose(0, 2, 1)
             points += transposed @ by_free
             points_rhs += (transposed @ pulled[..., None])[..., 0]
-            mixed[:, i * n : (i + 1) * n] = (
-                flat.reshape(m, 2, n).transpose(0, 2, 1) @ by_free
-            )
+            mixed[:, i * n : (i + 1) * n] = flat.reshape(m, 2, n).transpose(0, 2, 1) @ by_free
         residuals[:, i], weights[:, i] = residual, weight
-    return _System(
-        stations, stations_rhs, points, points_rhs, mixed, residuals, weights, cost
-    )
+    return _System(stations, stations_rhs, points, points_rhs, mixed, residuals, weights, cost)
 
 
 def _reduce(system: _System, damping: float, dims: int) -> tuple[Array, Array, Array]:
@@ -271,13 +269,13 @@ def _reduce(system: _System, damping: float, dims: int) -> tuple[Array, Array, A
     rhs = system.stations_rhs.ravel().copy()
     full[np.diag_indices(s * n)] *= 1.0 + damping
     if not dims:
-        return full, rhs, np.zeros((0, 0, 0))
+        return full, rhs, np.zeros((0, 0, 0), np.float64)
     blocks = system.points.copy()
     diagonal = np.einsum("mii->mi", blocks)
     diagonal *= 1.0 + damping
     # A point seen by too few planes has no place: leave it where it is.
     diagonal += 1e-12 * diagonal.max() + 1e-300
-    inverses = np.linalg.inv(blocks)
+    inverses = np.linalg.inv(blocks).astype(np.float64, copy=False)
     eliminated = system.mixed @ inverses
     columns = eliminated.transpose(1, 0, 2).reshape(s * n, -1)
     full -= columns @ system.mixed.transpose(1, 0, 2).reshape(s * n, -1).T
@@ -321,9 +319,7 @@ def _step(system: _System, rig: Rig, damping: float, planar: bool, dims: int) ->
     return Rig(
         rig.positions + change[:, 0:3],
         rotation_exp(change[:, 3:6]) @ rig.rotations,
-        tuple(
-            _moved(c, d) for c, d in zip(rig.calibrations, change[:, 6:], strict=True)
-        ),
+        tuple(_moved(c, d) for c, d in zip(rig.calibrations, change[:, 6:], strict=True)),
         points,
     )
 
@@ -335,4 +331,3 @@ def _moved(calibration: Calibration, change: Array) -> Calibration:
     sweeps[:, TILT] += change[0:2]
     sweeps[:, PHASE] += change[2:4]
     return replace(calibration, sweeps=sweeps, source="estimated")
-

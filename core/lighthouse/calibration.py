@@ -24,6 +24,8 @@ them; angles in radians."""
 
 PHASE, TILT, CURVE, GIBMAG, GIBPHASE, OGEEMAG, OGEEPHASE = range(7)
 
+MODELS = ("libsurvive", "crazyflie")
+
 LENS_SERIES = np.array([0.0, 0.0, 0.0076069798, 5.3685255e-06, 0.0028679863, -8.0108022e-06])
 """Coefficients of the lens polynomial, constant term first (libsurvive)."""
 
@@ -38,10 +40,15 @@ class Calibration:
         One row a sweep, columns as in :data:`PARAMETERS`.
     source : str
         ``"factory"``, ``"generic"``, ``"estimated"`` or ``"none"``.
+    model : str
+        One of :data:`MODELS`: libsurvive's full model, or what Crazyflie firmware makes of
+        the same numbers (``lighthouse_calibration.c``), which leaves curve and ogee out and
+        takes the gib wave at the azimuth of the point.
     """
 
     sweeps: Array
     source: str
+    model: str = "libsurvive"
 
     @property
     def tilts(self) -> Array:
@@ -52,12 +59,6 @@ class Calibration:
     def bends(self) -> bool:
         """Whether more than tilt and phase is known."""
         return bool(np.any(self.sweeps[:, [CURVE, GIBMAG, OGEEMAG]]))
-
-    def without_lens(self) -> Calibration:
-        """The subset that Crazyflie firmware uses: neither curve nor ogee."""
-        sweeps = self.sweeps.copy()
-        sweeps[:, [CURVE, OGEEMAG]] = 0.0
-        return Calibration(sweeps, self.source)
 
 
 IDEAL = Calibration(np.zeros((2, 7)), "none")
@@ -126,7 +127,8 @@ class _Sweep:
         tilt = calibration.tilts
         self.parameters, self.slope = p, slope
         self.tan, self.cos, self.sin = np.tan(tilt), np.cos(tilt), np.sin(tilt)
-        self.curved = bool(np.any(p[:, [CURVE, OGEEMAG]]))
+        self.gib_at_azimuth = calibration.model == "crazyflie"
+        self.curved = not self.gib_at_azimuth and bool(np.any(p[:, [CURVE, OGEEMAG]]))
         with np.errstate(invalid="ignore"):
             self.lift = self.tan * slope
             self.lead = np.arcsin(self.lift)
@@ -135,7 +137,7 @@ class _Sweep:
                 self._curve(azimuth)
                 self.bent_lead = np.arcsin(self.bent)
         seen = azimuth - self.bent_lead
-        self.wave = seen + p[:, GIBPHASE]
+        self.wave = (azimuth if self.gib_at_azimuth else seen) + p[:, GIBPHASE]
         self.angles = seen + p[:, GIBMAG] * np.cos(self.wave) - p[:, PHASE]
 
     def _curve(self, azimuth: Array) -> None:
@@ -162,8 +164,10 @@ class _Sweep:
                     -self.tan * d_asin,
                     -self.slope * d_tan * d_asin,
                 )
-        gain = 1.0 - p[:, GIBMAG] * np.sin(self.wave)
-        return parts[0] * gain, parts[1] * gain, parts[2] * gain
+        wobble = p[:, GIBMAG] * np.sin(self.wave)
+        if self.gib_at_azimuth:
+            return parts[0] - wobble, parts[1], parts[2]
+        return parts[0] * (1.0 - wobble), parts[1] * (1.0 - wobble), parts[2] * (1.0 - wobble)
 
     def _curved_gradient(self, d_asin: Array, d_tan: Array) -> tuple[Array, Array, Array]:
         dd_lens = _DD_LENS(self.off)
@@ -193,9 +197,7 @@ class _Sweep:
         return (
             derivative(1.0, zero, zero, 0.0),
             derivative(0.0, self.tan + zero, 1.0 / (flat**3 * self.cos), 0.0),
-            derivative(
-                0.0, self.slope * d_tan, self.elevation_sin * self.sin / self.cos**2, 1.0
-            ),
+            derivative(0.0, self.slope * d_tan, self.elevation_sin * self.sin / self.cos**2, 1.0),
         )
 
 
@@ -210,8 +212,13 @@ def _horner(coefficients: Array) -> Callable[[Array], Array]:
     return evaluate
 
 
-_SERIES = np.polynomial.Polynomial(LENS_SERIES)
-_LENS, _D_LENS, _DD_LENS = (_horner(_SERIES.deriv(k).coef) for k in range(3))
+def _derivative(coefficients: Array) -> Array:
+    return coefficients[1:] * np.arange(1, len(coefficients))
+
+
+_LENS = _horner(LENS_SERIES)
+_D_LENS = _horner(_derivative(LENS_SERIES))
+_DD_LENS = _horner(_derivative(_derivative(LENS_SERIES)))
 
 
 def ideal_angles(angles: Array, calibration: Calibration, iterations: int = 3) -> Array:

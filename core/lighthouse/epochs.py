@@ -217,6 +217,6 @@ def _drop_spikes(epochs: Epochs) -> None:
     _note(epochs.rejected, "spike", dropped)
 
 
-def _note(rejected: dict[str, int], reason: str, number: int) -> None:
+def _note(rejected: dict[str, int], reason: str, number: int | np.signedinteger) -> None:
     if number:
         rejected[reason] = rejected.get(reason, 0) + int(number)

@@ -115,7 +115,10 @@ def scale_of_distances(
         for sighting in (distance.first, distance.second):
             seen = sighted_angles(sighting, epochs, angles)[None]
             fix = locate(
-                seen, rig.positions, rig.rotations, rig.calibrations,
+                seen,
+                rig.positions,
+                rig.rotations,
+                rig.calibrations,
                 floor_z=0.0 if planar else None,
             )
             ends.append(fix.position[0])
@@ -161,10 +164,7 @@ def scale_of_odometry(
         pairs, later = pairs[near], later[near]
         base = track.time_ns[0]
         path = np.stack(
-            [
-                np.interp(when - base, track.time_ns - base, track.position[:, k])
-                for k in range(3)
-            ],
+            [np.interp(when - base, track.time_ns - base, track.position[:, k]) for k in range(3)],
             axis=1,
         )
         covered = np.linalg.norm(path[later] - path[pairs], axis=1)
@@ -185,6 +185,18 @@ def moved(rig: Rig, to: Similarity) -> Rig:
     )
 
 
-def scaled(rig: Rig, scale: float) -> Rig:
-    """The rig in another unit."""
-    return moved(rig, Similarity(scale, np.eye(3), np.zeros(3)))
+def at_first_station(rig: Rig, planar: bool, scale: float) -> Similarity:
+    """Frame of a rig that nothing ties to the world.
+
+    In space the axes are the first station's. On a floor z stays up and the origin lies
+    below the first station, which looks along x.
+    """
+    rotation = rig.rotations[0].T
+    origin = rig.positions[0]
+    if planar:
+        forward = rig.rotations[0][:2, 0] / np.linalg.norm(rig.rotations[0][:2, 0])
+        rotation = np.array(
+            [[forward[0], forward[1], 0.0], [-forward[1], forward[0], 0.0], [0.0, 0.0, 1.0]]
+        )
+        origin = origin * np.array([1.0, 1.0, 0.0])
+    return Similarity(scale, rotation, -scale * rotation @ origin)

@@ -56,8 +56,10 @@ class Fixes:
         full = np.zeros((len(self.position), 3, 3))
         known = np.isfinite(self.position[:, 0])
         full[~known] = np.nan
-        block = self.information[known][:, :dims, :dims]
-        full[np.ix_(known, range(dims), range(dims))] = np.linalg.inv(block) * sigma**2
+        block = np.linalg.inv(self.information[known][:, :dims, :dims]) * sigma**2
+        widened = np.zeros((len(block), 3, 3))
+        widened[:, :dims, :dims] = block
+        full[known] = widened
         return full
 
 

@@ -99,7 +99,9 @@ def two_planar(image: Array) -> PaperScene:
     return PaperScene(locate, _pair(rotation, translation))
 
 
-def _real_one(candidates: list[tuple[Array, Array, Array]], image: Array) -> tuple[Array, Array, Array]:
+def _real_one(
+    candidates: list[tuple[Array, Array, Array]], image: Array
+) -> tuple[Array, Array, Array]:
     """The paper's conditions: the plane lies ahead of the camera and below it (n has a
     fixed sign in its second element once depths are positive)."""
     ray = np.c_[image[:, 0], np.ones(len(image))]

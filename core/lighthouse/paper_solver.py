@@ -91,9 +91,7 @@ def solve_as_paper(job: Job) -> Solution:
         tuple(job.notes),
     )
     trajectories = tuple(
-        Trajectory.from_positions(
-            name, scene.frame, job.epochs.time_ns[mine], position[mine]
-        )
+        Trajectory.from_positions(name, scene.frame, job.epochs.time_ns[mine], position[mine])
         for k, name in enumerate(job.epochs.devices)
         for mine in [np.flatnonzero(good & (job.epochs.device == k))]
     )

@@ -29,6 +29,10 @@ class Station:
         Serial number, from the factory's OOTX data.
     covariance : (6, 6) ndarray, optional
         Of position and rotation (a rotation vector in the scene's frame).
+    floor_map : (3, 3) ndarray, optional
+        Homography from its rays (1, y, z) to floor points (1, x, y) in metres, where it is
+        the only station over a floor with markers
+        (:mod:`locatk.core.lighthouse.floor_map`).
     """
 
     channel: int
@@ -37,6 +41,7 @@ class Station:
     calibration: Calibration
     id: int | None = None
     covariance: NDArray[np.float64] | None = None
+    floor_map: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

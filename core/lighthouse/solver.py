@@ -17,6 +17,7 @@ from locatk.core.lighthouse.bundle import STATION_UNKNOWNS, Rig, adjust
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.epochs import Epochs, group
+from locatk.core.lighthouse.floor_map import fit_floor_map, locate_on_map
 from locatk.core.lighthouse.generic import GENERIC, MODEL_SIGMA
 from locatk.core.lighthouse.locate import Fixes, locate
 from locatk.core.lighthouse.places import gather
@@ -135,7 +136,7 @@ class Job:
         self.rejected = dict(self.epochs.rejected)
         self.angles = angles_of(self.epochs)
 
-    def reject(self, reason: str, number: int) -> None:
+    def reject(self, reason: str, number: int | np.signedinteger) -> None:
         if number:
             self.rejected[reason] = self.rejected.get(reason, 0) + int(number)
 
@@ -215,8 +216,9 @@ class Job:
                 "two arrangements of the stations explain the angles equally well; chosen is "
                 "the one with less roll"
             )
-        return self._framed(assembly.adjustment.rig, assembly.planar,
-                            assembly.adjustment.station_covariance)
+        return self._framed(
+            assembly.adjustment.rig, assembly.planar, assembly.adjustment.station_covariance
+        )
 
     def _solve_one(self) -> Scene:
         """One station on a plane, by resection on its markers."""
@@ -236,7 +238,7 @@ class Job:
                 "or record with two stations",
             )
         floor_z = float(np.mean(known[:, 2]))
-        flat = known - [0.0, 0.0, floor_z]
+        flat = known - np.array([0.0, 0.0, floor_z])
         rays = rays_of(ideal_angles(seen[:, 0], GENERIC), GENERIC.tilts)
         position, rotation = resect_on_plane(flat[:, :2], rays)
         done = adjust(
@@ -245,12 +247,21 @@ class Job:
             sigma=MODEL_SIGMA,
             planar=True,
             fixed_points=True,
+            calibrate=False,
         )
         self.facts["planar"] = True
         self.facts["marker_residual_rad"] = float(np.sqrt(np.nanmean(done.residuals**2)))
         rig = done.rig
-        rig = Rig(rig.positions + [0.0, 0.0, floor_z], rig.rotations, rig.calibrations, rig.points)
-        return self._scene_of(rig, True, floor_z, "markers", done.station_covariance)
+        raised = rig.positions + np.array([0.0, 0.0, floor_z])
+        rig = Rig(raised, rig.rotations, rig.calibrations, rig.points)
+        solved = self._scene_of(rig, True, floor_z, "markers", done.station_covariance)
+        # The map is fitted to rays as GENERIC corrects them, so that it goes with GENERIC.
+        station = replace(
+            solved.stations[0],
+            calibration=GENERIC,
+            floor_map=fit_floor_map(flat[:, :2], rays),
+        )
+        return replace(solved, stations=(station,))
 
     def _framed(self, rig: Rig, planar: bool, covariance: Array) -> Scene:
         """Bring a rig into the frame and scale that markers, distances or odometry give."""
@@ -273,10 +284,12 @@ class Job:
                 f"{np.count_nonzero(usable)} markers were sighted; a frame needs three"
             )
         scale, source = self._scale(rig, planar)
-        return self._scene_of(
-            frames.scaled(rig, scale), planar, 0.0, source,
-            _turned(covariance, scale, np.eye(3)),
+        to = frames.at_first_station(rig, planar, scale)
+        frame = self.scene.frame if planar else f"station-{self.epochs.channels[0]}"
+        scene = self._scene_of(
+            frames.moved(rig, to), planar, 0.0, source, _turned(covariance, scale, to.rotation)
         )
+        return replace(scene, frame=frame)
 
     def _scale(self, rig: Rig, planar: bool) -> tuple[float, str]:
         if self.scene.distances:
@@ -286,13 +299,19 @@ class Job:
             return scale, "distance"
         if self.odometry:
             fixes = locate(
-                self.angles, rig.positions, rig.rotations, rig.calibrations,
+                self.angles,
+                rig.positions,
+                rig.rotations,
+                rig.calibrations,
                 floor_z=0.0 if planar else None,
             )
             good = fixes.worst < GATE
             position = np.where(good[:, None], fixes.position, np.nan)
             found = frames.scale_of_odometry(
-                position, self.epochs.time_ns, self.epochs.device, self.epochs.devices,
+                position,
+                self.epochs.time_ns,
+                self.epochs.device,
+                self.epochs.devices,
                 self.odometry,
             )
             if found is not None:
@@ -367,9 +386,13 @@ def _answer(job: Job, scene: Scene) -> Solution:
         tuple(s.calibration for s in stations),
     )
     floor = scene.floor_z if scene.planar else None
-    fixes = locate(job.angles, *rig, floor_z=floor)
-    fixes = _swap_back(job, fixes, rig, floor)
-    fixes = _without_worst_station(job, fixes, rig, floor)
+    floor_map = stations[0].floor_map if len(stations) == 1 else None
+    if floor_map is not None:
+        fixes = locate_on_map(job.angles, rig[2][0], floor_map, scene.floor_z)
+    else:
+        fixes = locate(job.angles, *rig, floor_z=floor)
+        fixes = _swap_back(job, fixes, rig, floor)
+        fixes = _without_worst_station(job, fixes, rig, floor)
 
     unsolved = ~np.isfinite(fixes.position[:, 0])
     inconsistent = ~unsolved & (fixes.worst > GATE)
@@ -390,7 +413,10 @@ def _answer(job: Job, scene: Scene) -> Solution:
         mine = np.flatnonzero(good & (job.epochs.device == k))
         trajectories.append(
             Trajectory.from_positions(
-                name, scene.frame, job.epochs.time_ns[mine], fixes.position[mine],
+                name,
+                scene.frame,
+                job.epochs.time_ns[mine],
+                fixes.position[mine],
                 covariance[mine],
             )
         )

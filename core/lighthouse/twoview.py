@@ -140,7 +140,9 @@ def split_essential(e: Array) -> list[tuple[Array, Array]]:
     return [(u @ turn @ vt, sign * u[:, 2]) for turn in (w, w.T) for sign in (1.0, -1.0)]
 
 
-def upright_motions(a: Array, b: Array, turns: int = 36, best: int = 3) -> list[tuple[Array, Array]]:
+def upright_motions(
+    a: Array, b: Array, turns: int = 36, best: int = 3
+) -> list[tuple[Array, Array]]:
     """The likeliest motions between two stations that both stand upright and level.
 
     For each turn about the vertical the translation follows linearly, as the direction
@@ -155,9 +157,7 @@ def upright_motions(a: Array, b: Array, turns: int = 36, best: int = 3) -> list[
     across = np.cross(b, a @ np.swapaxes(rotation, -1, -2))
     values, vectors = np.linalg.eigh(np.swapaxes(across, -1, -2) @ across)
     chosen = np.argsort(values[:, 0] / values[:, 1])[:best]
-    return [
-        (rotation[k], sign * vectors[k, :, 0]) for k in chosen for sign in (1.0, -1.0)
-    ]
+    return [(rotation[k], sign * vectors[k, :, 0]) for k in chosen for sign in (1.0, -1.0)]
 
 
 def triangulate(a: Array, b: Array, rotation: Array, translation: Array) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-PROTOC, GRPCIO_TOOLS = "5.29.0", "1.71.0"
+PROTOC, GRPCIO_TOOLS = "6.30.0", "1.72.1"
 """Release of protobuf that the code is made for, and of grpcio-tools that holds it."""
 
 

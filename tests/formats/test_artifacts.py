@@ -48,6 +48,7 @@ def stations(draw: st.DrawFn, channel: int) -> Station:
         Calibration(draw(vectors(14)).reshape(2, 7), draw(st.sampled_from(artifacts.SOURCES))),
         draw(st.none() | st.integers(0, 2**32 - 1)),
         draw(st.none() | covariance),
+        draw(st.none() | vectors(9).map(lambda v: v.reshape(3, 3))),
     )
 
 

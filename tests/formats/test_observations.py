@@ -192,7 +192,16 @@ def test_every_wire_form_of_protobuf_is_read(values: tuple[list[int], ...]) -> N
         count=[0.5] * n,
     ).SerializeToString()
     later = b"\x7a\x03abc" + b"\x80\x01\x05"
-    forms = [plain, unpacked + rest, rest + unpacked, later + plain, plain + later]
+    pieces = b"".join(LighthouseSweep(time_ns=[value]).SerializeToString() for value in times)
+    forms = [
+        plain,
+        pieces + rest,
+        rest + pieces,
+        unpacked + rest,
+        rest + unpacked,
+        later + plain,
+        plain + later,
+    ]
     batches = SWEEPS.unpack(forms)
     assert batches.counts.tolist() == [n] * len(forms)
     assert batches.texts["device"] == ["R"] * len(forms)

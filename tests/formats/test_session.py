@@ -264,6 +264,14 @@ def test_a_flipped_byte_in_a_chunk_names_the_checksum(file: Path, tmp_path: Path
     assert caught.value.hint
 
 
+def test_a_flipped_byte_in_an_attachment(file: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(file.read_bytes().replace(b"x = 1\n", b"x = 3\n"))
+    with pytest.raises(FormatError, match=r"scene\.toml is damaged") as caught:
+        Session.open(path).attachment("scene.toml")
+    one_line(caught.value)
+
+
 def test_garbage_behind_the_magic(tmp_path: Path) -> None:
     path = tmp_path / "bad.mcap"
     rng = random.Random(3)
