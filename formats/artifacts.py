@@ -123,6 +123,10 @@ def dumps_scene(scene: Scene) -> str:
         }
         for distance in scene.distances
     ]
+    table["calibrations"] = [
+        {"channel": int(channel), **_calibration_table(calibration)}
+        for channel, calibration in sorted(scene.calibrations.items())
+    ]
     return toml.dumps({key: value for key, value in table.items() if value != []})
 
 
@@ -143,15 +147,19 @@ def _station_table(station: Station, in_units: bool) -> dict[str, Any]:
         "rotation": station.rotation,
         covariance: station.covariance,
         "floor_map_m": station.floor_map,
-        "calibration": {
-            "source": station.calibration.source,
-            "model": station.calibration.model,
-            **{
-                name: Inline(
-                    {_calibration_key(p): float(v) for p, v in zip(PARAMETERS, row, strict=True)}
-                )
-                for name, row in zip(("first", "second"), station.calibration.sweeps, strict=True)
-            },
+        "calibration": _calibration_table(station.calibration),
+    }
+
+
+def _calibration_table(calibration: Calibration) -> dict[str, Any]:
+    return {
+        "source": calibration.source,
+        "model": calibration.model,
+        **{
+            name: Inline(
+                {_calibration_key(p): float(v) for p, v in zip(PARAMETERS, row, strict=True)}
+            )
+            for name, row in zip(("first", "second"), calibration.sweeps, strict=True)
         },
     }
 
@@ -197,6 +205,9 @@ def loads_scene(text: str | bytes, *, file: str | os.PathLike[str] | None = None
         if in_units
         else table.number("floor_z_mm", 0.0, shift=_METRES)
     )
+    calibrations = table.tables("calibrations")
+    channels = [entry.integer("channel", 1, 16) for entry in calibrations]
+    _refuse_repeated(table, "calibrations", "channel", channels)
     scene = Scene(
         stations=tuple(_station(station, in_units) for station in stations),
         markers=tuple(_marker(marker) for marker in table.tables("markers")),
@@ -206,6 +217,10 @@ def loads_scene(text: str | bytes, *, file: str | os.PathLike[str] | None = None
         scale=scale,
         frame=table.text("frame", "floor"),
         notes=table.texts("notes", ()),
+        calibrations={
+            channel: _calibration(entry)
+            for channel, entry in zip(channels, calibrations, strict=True)
+        },
     )
     table.end()
     _refuse_repeated(table, "stations", "channel", [s.channel for s in scene.stations])

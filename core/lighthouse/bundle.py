@@ -308,8 +308,10 @@ def _hold_gauge(matrix: Array, rig: Rig, planar: bool, dims: int) -> Array:
 
 def _step(system: _System, rig: Rig, damping: float, planar: bool, dims: int) -> Rig:
     reduced, rhs, inverses = _reduce(system, damping, dims)
+    frozen = ~np.any(reduced, axis=1)
     reduced = _hold_gauge(reduced, rig, planar, dims)
     delta = -np.linalg.lstsq(reduced, rhs, rcond=1e-14)[0]
+    delta[frozen] = 0.0
     change = delta.reshape(len(rig.positions), STATION_UNKNOWNS)
     points = rig.points
     if dims:

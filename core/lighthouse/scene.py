@@ -100,6 +100,8 @@ class Scene:
         Name of the frame of positions.
     notes : tuple of str
         Assumptions made when it was solved.
+    calibrations : dict of int to Calibration
+        By channel, of stations that have yet to be solved; used as they are.
     """
 
     stations: tuple[Station, ...] = ()
@@ -110,6 +112,7 @@ class Scene:
     scale: str = "unit"
     frame: str = "floor"
     notes: tuple[str, ...] = ()
+    calibrations: dict[int, Calibration] = field(default_factory=dict)
 
     def station(self, channel: int) -> Station | None:
         """The station on ``channel``, or None."""

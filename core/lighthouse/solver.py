@@ -160,6 +160,10 @@ class Job:
             return "one-planar"
         return {True: "two-planar", False: "two-3d", None: "two-auto"}[self.scene.planar]
 
+    def calibration(self, channel: int) -> Calibration:
+        """What is known of a station's calibration, else the mean of other units."""
+        return self.scene.calibrations.get(channel, GENERIC)
+
     # ---- scenes
 
     def known_scene(self) -> Scene:
@@ -191,9 +195,12 @@ class Job:
             )
         planar = {"two-planar": True, "two-3d": False}.get(self.kind)
         places, _ = gather(self.angles, self.epochs.device)
-        calibrations = (GENERIC,) * len(self.epochs.channels)
         assembly = assemble(
-            places, calibrations, sigma=MODEL_SIGMA, planar=planar, seed=self.options.seed
+            places,
+            tuple(self.calibration(int(c)) for c in self.epochs.channels),
+            sigma=MODEL_SIGMA,
+            planar=planar,
+            seed=self.options.seed,
         )
         if len(assembly.stations) < len(self.epochs.channels):
             left = [
@@ -239,11 +246,12 @@ class Job:
             )
         floor_z = float(np.mean(known[:, 2]))
         flat = known - np.array([0.0, 0.0, floor_z])
-        rays = rays_of(ideal_angles(seen[:, 0], GENERIC), GENERIC.tilts)
+        calibration = self.calibration(int(self.epochs.channels[0]))
+        rays = rays_of(ideal_angles(seen[:, 0], calibration), calibration.tilts)
         position, rotation = resect_on_plane(flat[:, :2], rays)
         done = adjust(
             seen,
-            Rig(position[None], rotation[None], (GENERIC,), flat),
+            Rig(position[None], rotation[None], (calibration,), flat),
             sigma=MODEL_SIGMA,
             planar=True,
             fixed_points=True,
@@ -255,12 +263,7 @@ class Job:
         raised = rig.positions + np.array([0.0, 0.0, floor_z])
         rig = Rig(raised, rig.rotations, rig.calibrations, rig.points)
         solved = self._scene_of(rig, True, floor_z, "markers", done.station_covariance)
-        # The map is fitted to rays as GENERIC corrects them, so that it goes with GENERIC.
-        station = replace(
-            solved.stations[0],
-            calibration=GENERIC,
-            floor_map=fit_floor_map(flat[:, :2], rays),
-        )
+        station = replace(solved.stations[0], floor_map=fit_floor_map(flat[:, :2], rays))
         return replace(solved, stations=(station,))
 
     def _framed(self, rig: Rig, planar: bool, covariance: Array) -> Scene:
@@ -327,10 +330,16 @@ class Job:
         self, rig: Rig, planar: bool, floor_z: float, scale: str, covariance: Array
     ) -> Scene:
         """The artifact: a station each, with the assumptions it stands on."""
-        self.notes.append(
-            "no factory calibration is known: tilt and phase start from the mean of other "
-            "units (generic)"
-        )
+        guessed = [
+            str(channel)
+            for channel, c in zip(self.epochs.channels, rig.calibrations, strict=True)
+            if c.source in ("generic", "estimated")
+        ]
+        if guessed:
+            self.notes.append(
+                f"no factory calibration is known of channel {', '.join(guessed)}: the mean of "
+                "other units is used (generic), refined where the data tell"
+            )
         stations = tuple(
             Station(
                 int(channel),

@@ -1,0 +1,312 @@
+"""A small world of base stations that shares nothing with the solver.
+
+Its light planes are libsurvive's (``survive_reproject_gen2.c``), written again in
+libsurvive's own axes: X right, Y up, the view along -Z. Its stations have factory
+calibrations of real units, so that the solver's generic one is never exactly right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.lighthouse.generic import UNITS
+from locatk.core.lighthouse.scene import Marker, Sighting
+from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+START_NS = 1_690_000_000_000_000_000
+
+ROTATION_TICKS = dict(
+    zip(
+        range(1, 17),
+        (959000, 957000, 953000, 949000, 947000, 943000, 941000, 939000,
+         937000, 929000, 919000, 911000, 907000, 901000, 893000, 887000),
+        strict=True,
+    )
+)  # fmt: skip
+"""Bitcraze's table (crazyflie-firmware, pulse_processor_v2.c), copied, not imported."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One sweep's factory calibration, under libsurvive's names."""
+
+    phase: float = 0.0
+    tilt: float = 0.0
+    curve: float = 0.0
+    gibpha: float = 0.0
+    gibmag: float = 0.0
+    ogeephase: float = 0.0
+    ogeemag: float = 0.0
+
+
+def planes_of(unit: Array) -> tuple[Plane, Plane]:
+    """Both planes of a row of ``generic.UNITS``."""
+    p1, t0, t1, c0, c1, gm0, gm1, gp0, gp1, om0, om1, op0, op1 = map(float, unit)
+    return Plane(0.0, t0, c0, gp0, gm0, op0, om0), Plane(p1, t1, c1, gp1, gm1, op1, om1)
+
+
+def libsurvive_angle(plane: Plane, second: bool, x: Array, y: Array, z: Array) -> Array:
+    """``survive_reproject_axis_gen2``, for arrays; x right, y up, z towards the lamp's back."""
+    z = -z
+    b = np.arctan2(z, x)
+    y_deg = plane.tilt + (-1 if second else 1) * np.pi / 6
+    asin_arg = np.tan(y_deg) * y / np.sqrt(x * x + z * z)
+    sin_part = np.sin(b - np.arcsin(asin_arg) + plane.ogeephase) * plane.ogeemag
+    s = np.arcsin(y / np.sqrt(x * x + y * y + z * z) / np.cos(y_deg))
+    mod = np.full_like(s, -8.0108022e-06)
+    acc = np.zeros_like(s)
+    for f in (0.0028679863, 5.3685255e-06, 0.0076069798, 0.0, 0.0):
+        acc = acc * s + mod
+        mod = mod * s + f
+    bend = sin_part + plane.curve
+    asin_arg_2 = asin_arg + mod * bend / (np.cos(y_deg) - acc * bend * np.sin(y_deg))
+    out = b - np.arcsin(asin_arg_2)
+    return out + np.sin(out + plane.gibpha) * plane.gibmag - plane.phase - np.pi / 2
+
+
+def look(position: Array, target: Array, roll: float = 0.0) -> Array:
+    """Station to world: x looks from ``position`` to ``target``; ``roll`` leans it."""
+    forward = np.asarray(target, float) - position
+    forward = forward / np.linalg.norm(forward)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left)
+    up = np.cross(forward, left)
+    cos, sin = np.cos(roll), np.sin(roll)
+    return np.stack([forward, cos * left + sin * up, cos * up - sin * left], axis=1)
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A base station of the world."""
+
+    channel: int
+    position: Array
+    rotation: Array
+    planes: tuple[Plane, Plane]
+
+    def angles(self, points: Array) -> Array:
+        """Rotor angles (m, 2) at which both planes meet world points (m, 3)."""
+        forward, left, up = ((points - self.position) @ self.rotation).T
+        return np.stack(
+            [libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(self.planes)],
+            axis=-1,
+        )
+
+    def counts(self, angles: Array) -> Array:
+        """Steps of the 6 MHz clock since the rotor's zero: the planes look straight ahead
+        at 120 and 240 degrees of the turn."""
+        degrees = np.degrees(angles) + [120.0, 240.0]
+        return degrees / 360.0 * ROTATION_TICKS[self.channel] / 8
+
+
+PLACES = {
+    1: ((2.6, 1.1, 1.9), 0.03),
+    2: ((-2.3, 1.4, 2.2), -0.04),
+    5: ((0.4, -2.7, 2.0), 0.02),
+    16: ((-0.8, 2.9, 1.7), -0.02),
+}
+"""Channel to position in metres and roll in radians."""
+
+
+def lamps(*channels: int, units: tuple[int, ...] = (5, 7, 2, 9)) -> tuple[Lamp, ...]:
+    """Stations around a room of 4 m, on the given channels."""
+    found = []
+    for k, channel in enumerate(channels):
+        place, roll = PLACES[channel]
+        position = np.array(place)
+        rotation = look(position, np.array([0.1 * k, -0.1, 0.1]), roll)
+        found.append(Lamp(channel, position, rotation, planes_of(UNITS[units[k]])))
+    return tuple(found)
+
+
+def curve(m: int, *, flat: bool, size: float = 0.8) -> Array:
+    """Places (m, 3) along a winding drive, in metres; on z = 0 where ``flat``."""
+    t = np.linspace(0, 6.0, m)
+    z = np.zeros(m) if flat else 0.4 + 0.3 * np.sin(2.3 * t + 0.5)
+    return np.stack([size * np.cos(1.1 * t), size * np.sin(1.7 * t + 0.3), z], axis=1)
+
+
+@dataclass
+class Drive:
+    """Reports of a receiver: one a place, all sweeps of a report under one stamp.
+
+    Change ``counts`` (m, s, 2) to spoil it, ``nan`` to hide; then take :attr:`sweeps`.
+    """
+
+    lamps: tuple[Lamp, ...]
+    points: Array
+    counts: Array
+    time_ns: NDArray[np.int64]
+    devices: tuple[str, ...] = ("robot",)
+    device: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    labelled: bool = True
+
+    def __post_init__(self) -> None:
+        if not len(self.device):
+            self.device = np.zeros(len(self.points), np.int32)
+
+    def column(self, channel: int) -> int:
+        return [lamp.channel for lamp in self.lamps].index(channel)
+
+    def turned(self, rows: NDArray[np.int64], column: int, plane: int, radians: Array) -> None:
+        """Move angles of some rows."""
+        per_turn = ROTATION_TICKS[self.lamps[column].channel] / 8
+        self.counts[rows, column, plane] += np.asarray(radians) / (2 * np.pi) * per_turn
+
+    @property
+    def sweeps(self) -> Sweeps:
+        m, s, _ = self.counts.shape
+        channel = np.array([lamp.channel for lamp in self.lamps], np.int32)
+        seen = np.isfinite(self.counts).ravel()
+        channels = np.broadcast_to(channel[:, None], (m, s, 2)).ravel()[seen]
+        n = len(channels)
+        return Sweeps(
+            devices=self.devices,
+            time_ns=np.repeat(self.time_ns, 2 * s)[seen],
+            device=np.repeat(self.device, 2 * s)[seen],
+            sensor=np.zeros(n, np.int32),
+            channel=channels,
+            polynomial=2 * (channels - 1) if self.labelled else np.full(n, -1, np.int32),
+            sweep=np.full(n, -1, np.int32),
+            count=self.counts.ravel()[seen],
+        )
+
+    @property
+    def truth(self) -> Trajectory:
+        return Trajectory.from_positions(self.devices[0], "floor", self.time_ns, self.points)
+
+
+def drive(
+    world: tuple[Lamp, ...],
+    points: Array,
+    *,
+    noise_rad: float = 1e-4,
+    step_s: float = 0.1,
+    seed: int = 1,
+    start_s: float = 0.0,
+) -> Drive:
+    """What a receiver at ``points`` reports of the world, one report every ``step_s``."""
+    rng = np.random.default_rng(seed)
+    counts = np.stack(
+        [
+            lamp.counts(angles + rng.normal(0, noise_rad, angles.shape))
+            for lamp in world
+            for angles in [lamp.angles(points)]
+        ],
+        axis=1,
+    )
+    stamps = START_NS + np.rint((start_s + step_s * np.arange(len(points))) * 1e9).astype(np.int64)
+    return Drive(world, points, np.rint(counts), stamps)
+
+
+def stream(
+    world: tuple[Lamp, ...],
+    where: Callable[[Array], Array],
+    seconds: float,
+    *,
+    sensors: Array | None = None,
+    seed: int = 1,
+) -> Sweeps:
+    """Every sweep of rotors that turn freely, at the moment at which it crosses.
+
+    ``where`` gives positions (n, 3) at times (n,) in seconds; ``sensors`` (k, 3) are
+    offsets of photodiodes from there.
+    """
+    rng = np.random.default_rng(seed)
+    offsets = np.zeros((1, 3)) if sensors is None else sensors
+    parts = []
+    for lamp in world:
+        turn_s = ROTATION_TICKS[lamp.channel] / 48e6
+        zero = np.arange(rng.uniform(0, turn_s), seconds - turn_s, turn_s)
+        for sensor, offset in enumerate(offsets):
+            for plane in (0, 1):
+                when = zero + 0.4 * turn_s
+                for _ in range(4):  # the receiver moves while the rotor turns
+                    count = lamp.counts(lamp.angles(where(when) + offset))[:, plane]
+                    when = zero + count / 6e6
+                parts.append((when, count, lamp.channel, sensor))
+    when = np.concatenate([p[0] for p in parts])
+    count = np.concatenate([p[1] for p in parts])
+    channel = np.concatenate([np.full(len(p[0]), p[2], np.int32) for p in parts])
+    sensor = np.concatenate([np.full(len(p[0]), p[3], np.int32) for p in parts])
+    order = np.argsort(when)
+    n = len(order)
+    return Sweeps(
+        devices=("robot",),
+        time_ns=START_NS + np.rint(when[order] * 1e9).astype(np.int64),
+        device=np.zeros(n, np.int32),
+        sensor=sensor[order],
+        channel=channel[order],
+        polynomial=2 * (channel[order] - 1),
+        sweep=np.full(n, -1, np.int32),
+        count=np.rint(count[order]),
+    )
+
+
+def take(sweeps: Sweeps, rows: NDArray[np.int64]) -> Sweeps:
+    """Some of the sweeps, in the order of ``rows``."""
+    names = ("time_ns", "device", "sensor", "channel", "polynomial", "sweep", "count")
+    return replace(sweeps, **{name: getattr(sweeps, name)[rows] for name in names})
+
+
+def join(*parts: Sweeps) -> Sweeps:
+    """All sweeps of recordings of the same devices."""
+    names = ("time_ns", "device", "sensor", "channel", "polynomial", "sweep", "count")
+    return replace(
+        parts[0], **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+    )
+
+
+def markers_of(world: tuple[Lamp, ...], places: Array) -> tuple[Marker, ...]:
+    """Markers whose sightings are the counts that the world shows there."""
+    found = []
+    for k, place in enumerate(np.asarray(places, float)):
+        counts = {
+            lamp.channel: tuple(map(float, lamp.counts(lamp.angles(place[None]))[0]))
+            for lamp in world
+        }
+        found.append(Marker(f"m{k}", place, (Sighting(counts=counts),)))  # type: ignore[arg-type]
+    return tuple(found)
+
+
+SQUARE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+
+
+class World:
+    """The functions above, for tests that cannot import a conftest."""
+
+    Plane, Lamp, Drive = Plane, Lamp, Drive
+    start_ns = START_NS
+    square = SQUARE
+    ticks = ROTATION_TICKS
+    planes_of = staticmethod(planes_of)
+    libsurvive_angle = staticmethod(libsurvive_angle)
+    look = staticmethod(look)
+    lamps = staticmethod(lamps)
+    curve = staticmethod(curve)
+    drive = staticmethod(drive)
+    stream = staticmethod(stream)
+    take = staticmethod(take)
+    join = staticmethod(join)
+    markers_of = staticmethod(markers_of)
+
+
+@pytest.fixture(scope="session")
+def world() -> type[World]:
+    """The independent world: lamps, drives, streams."""
+    return World
+
+
+@pytest.fixture(scope="session")
+def recordings(data: Path) -> Path:
+    """Folder of the published Lighthouse recordings."""
+    return data / "lighthouse"
