@@ -67,7 +67,8 @@ def _lighthouse(folder: Path, seed: int, overwrite: bool) -> dict[str, Any]:
     from locatk.cli.systems import Request, solve_session
     from locatk.core import metrics
     from locatk.core.lighthouse.simulate import SimulationOptions, simulate
-    from locatk.formats import observations, plot, solutions
+    from locatk.formats import observations, solutions
+    from locatk.formats.plot import plot_solution
 
     session, solution, picture = (
         folder / f"lighthouse{end}" for end in (".mcap", "-solved.mcap", ".png")
@@ -99,7 +100,7 @@ def _lighthouse(folder: Path, seed: int, overwrite: bool) -> dict[str, Any]:
         return metrics.evaluate_all(pairs).mae
 
     with console.working("Drawing"):
-        plot.plot_solution(picture, solved.solution, truth=simulated.truth, overwrite=overwrite)
+        plot_solution(picture, solved.solution, truth=simulated.truth, overwrite=overwrite)
     return {
         "system": "lighthouse",
         "poses": solved.solution.poses,

@@ -1,4 +1,4 @@
-"""The README: what .ci/run takes from it, and that it promises nothing that is not there."""
+"""README and docs: what .ci/run takes from them, and that they promise what is there."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ import click
 import pytest
 
 from locatk.cli.app import app
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [
+    "README.md",
+    # The page of commands is made from the commands and has a test of its own.
+    *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md")) if p.stem != "commands"),
+]
 
 
 @pytest.mark.parametrize("heading", ["Run it", "Test it"])
@@ -25,7 +32,7 @@ def test_one_line_does_all(root: Path, heading: str) -> None:
     assert done.stdout.startswith("python3 -m venv ")
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+@pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(root: Path, page: str) -> None:
     path = root / page
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text(encoding="utf-8")):
@@ -33,20 +40,37 @@ def test_links_lead_somewhere(root: Path, page: str) -> None:
             assert (path.parent / target).exists(), target
 
 
-def test_commands_are_valid_usage(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def command_of(words: list[str]) -> tuple[click.Command, list[str]]:
+    """The command that ``locatk words...`` calls, and what is left of the words."""
+    command: click.Command = app
+    while isinstance(command, click.Group) and words and not words[0].startswith("-"):
+        child = command.get_command(click.Context(command), words[0])
+        assert child is not None, words
+        command, words = child, words[1:]
+    return command, words
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_command_lines_are_valid_usage(
+    root: Path, page: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (root / page).read_text(encoding="utf-8")
     monkeypatch.setattr(Path, "exists", lambda self, **_: True)
-    text = (root / "README.md").read_text(encoding="utf-8")
-    found = re.findall(r"^locatk .*$|(?<=`)locatk [^`]+(?=`)", text, re.M)
-    assert len(found) > 5
-    for line in found:
-        args = line.split()[1:]
-        command: click.Command = app
-        while isinstance(command, click.Group):
-            child = command.get_command(click.Context(app), args.pop(0))
-            assert child is not None, line
-            command = child
-        if args:  # a bare name is a mention, not a use
-            command.make_context("example", args)
+    for block in re.findall(r"^```(?:sh|console)\n(.*?)^```$", text, re.M | re.S):
+        for line in re.findall(r"^locatk (.*)$", block, re.M):
+            command, words = command_of(line.split("#")[0].split())
+            command.make_context("example", words)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_mentioned_commands_and_options_are_there(root: Path, page: str) -> None:
+    text = (root / page).read_text(encoding="utf-8")
+    for line in re.findall(r"(?<=`)locatk ([^`]+)(?=`)", text):
+        command, words = command_of(line.split())
+        context = click.Context(command, help_option_names=["-h", "--help"])
+        known = {name for option in command.get_params(context) for name in option.opts}
+        known |= {name for option in command.get_params(context) for name in option.secondary_opts}
+        assert {word for word in words if word.startswith("-")} <= known, line
 
 
 def test_python_example_runs(root: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,8 +29,10 @@ its calibration, and cost time."""
 START_POINTS = 300
 """Moments with which candidate rigs are compared."""
 
-FEW = 60
-"""Places below which upright arrangements are tried as well."""
+MANY = 60
+CERTAIN = 1.5e-4
+"""With so many places, and a residual (rms, in radians) at the noise of a standing
+receiver, a start is taken without trying the others."""
 
 SAME_PLACE = 1e-3
 """Rays closer than this (as tangents) saw one place: 2 mm at 2 m."""
@@ -238,8 +240,7 @@ def _spatial_starts(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[R
     # is then the better start.
     for rotation, translation, _ in twoview.split_homography(twoview.fit_homography(a, b)):
         motions.append((rotation, translation / np.linalg.norm(translation)))
-    if len(a) < FEW:
-        motions += twoview.upright_motions(a, b)
+    motions += twoview.upright_motions(a, b)
     rigs = []
     for rotation, translation in motions:
         depth, other = twoview.triangulate(a, b, rotation, translation)
@@ -274,8 +275,9 @@ def _choose(
         # All residuals count in full: a soft loss would let a bad start stay bad.
         done = adjust(angles[some], small, sigma=sigma, planar=planar, soft=1.0, iterations=60)
         tried.append((done.cost, _roll(done.rig.rotations) if planar else 0.0, done))
-        # In space only one arrangement fits; with many places a fit is no accident.
-        if not planar and len(some) >= FEW and done.cost < len(some):
+        # In space only one arrangement fits; with many places a perfect fit is no accident.
+        perfect = np.sqrt(np.nanmean(done.residuals**2)) < CERTAIN
+        if not planar and len(some) >= MANY and perfect:
             break
     cheapest = min(cost for cost, _, _ in tried)
     fitting = [t for t in tried if t[0] <= 2.0 * cheapest + 1e-9]
@@ -341,13 +343,25 @@ def _extend(
         rows = shared[index]
         points = fixes.position[rows]
         try:
-            positions[index], rotations[index] = (
-                resect_on_plane(points[:, :2], rays[rows, index])
+            poses = (
+                [resect_on_plane(points[:, :2], rays[rows, index])]
                 if planar
                 else resect_in_space(points, rays[rows, index])
             )
         except DegenerateError:
             break
+        tries = [
+            adjust(
+                angles[rows][:, [index]],
+                Rig(position[None], rotation[None], (refined[index],), points),
+                sigma=sigma,
+                fixed_points=True,
+            )
+            for position, rotation in poses
+        ]
+        best = min(tries, key=lambda t: t.cost)
+        positions[index], rotations[index] = best.rig.positions[0], best.rig.rotations[0]
+        refined[index] = best.rig.calibrations[0]
         known = sorted([*known, index])
 
     fixes = fixes_of(known)

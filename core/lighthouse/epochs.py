@@ -15,11 +15,15 @@ from numpy.typing import NDArray
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
 from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
 
-WINDOW_NS = 20_000_000
-"""Length of an epoch: about one rotation."""
+PAIR_NS = 10_500_000
+"""The second plane of a rotation follows the first within this time; the first of the next
+rotation comes later than that after the second. (Half a rotation, and a little.)"""
 
-QUIET_NS = 8_000_000
-"""A silence this long ends an epoch early: the report of a device is over."""
+WINDOW_NS = 30_000_000
+"""Longest epoch: a report holds the last pair of each station, up to a rotation apart."""
+
+QUIET_NS = 20_000_000
+"""A longer silence than a rotation ends an epoch: the report of a device is over."""
 
 SPIKE = np.deg2rad(2.0)
 """Demodulation errors move an angle by more than this for one step (paper IV.A)."""
@@ -78,36 +82,31 @@ def group(sweeps: Sweeps) -> Epochs:
     rejected: dict[str, int] = {}
     usable = _usable(sweeps, rejected)
     key, names = _photodiodes(sweeps)
-    order = usable[np.lexsort((sweeps.time_ns[usable], key[usable]))]
-    key, time = key[order], sweeps.time_ns[order]
-    epoch = _cut(key, time)
-
-    channel, count = sweeps.channel[order], sweeps.count[order]
-    # Within an epoch and a station by count: the first plane comes first.
-    inner = np.lexsort((count, channel, epoch))
-    epoch, channel, count, time = epoch[inner], channel[inner], count[inner], time[inner]
-    stated = sweeps.sweep[order][inner]
-    start = np.r_[True, (np.diff(epoch) != 0) | (np.diff(channel) != 0)]
-    pair = np.cumsum(start) - 1
-    size = np.bincount(pair)[pair] if len(pair) else pair
-    rank = np.arange(len(pair)) - np.flatnonzero(start)[pair]
-    plane = np.where(stated == UNKNOWN, np.where(size == 2, rank, UNKNOWN), stated)
+    order = usable[
+        np.lexsort(
+            (sweeps.count[usable], sweeps.time_ns[usable], sweeps.channel[usable], key[usable])
+        )
+    ]
+    key, time, channel = key[order], sweeps.time_ns[order], sweeps.channel[order]
+    count, stated = sweeps.count[order], sweeps.sweep[order]
+    pair, plane = _pair(key, channel, time, stated)
     _note(rejected, "plane_unknown", np.count_nonzero(plane == UNKNOWN))
 
     channels = np.unique(channel)
     column = np.searchsorted(channels, channel)
-    kept = plane != UNKNOWN
+    epoch = _cut(key, time, column, plane, pair)
     slot = (epoch * len(channels) + column) * 2 + plane
+    kept = plane != UNKNOWN
     _, first = np.unique(np.where(kept, slot, -1), return_index=True)
     first = first[kept[first]]
     _note(rejected, "repeated_in_rotation", np.count_nonzero(kept) - len(first))
 
-    m = int(epoch[-1]) + 1 if len(epoch) else 0
+    m = int(epoch.max()) + 1 if len(epoch) else 0
     shape = (m, len(channels), 2)
     counts = np.full(shape, np.nan)
     counts.ravel()[slot[first]] = count[first]
     epoch_key = np.zeros(m, np.int64)
-    epoch_key[epoch] = key[inner]
+    epoch_key[epoch] = key
     base, middle, offset = _middle_times(epoch, time, m)
     if np.any(offset):
         lag = np.full(shape, np.nan)
@@ -148,15 +147,73 @@ def _photodiodes(sweeps: Sweeps) -> tuple[NDArray[np.int64], list[str]]:
     return key, [f"{sweeps.devices[k // sensors]}/{k % sensors}" for k in present]
 
 
-def _cut(key: NDArray[np.int64], time: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Epoch number of each sweep, given sweeps sorted by photodiode and time."""
+def _pair(
+    key: NDArray[np.int64],
+    channel: NDArray[np.int32],
+    time: NDArray[np.int64],
+    stated: NDArray[np.int32],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pair number and plane (0, 1, or -1 where nobody can tell) of each sweep.
+
+    Sweeps are sorted by photodiode, station, time and count, so that a pair is a sweep and
+    the next one.
+    """
+    n = len(time)
+    if n == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    same = (np.diff(key) == 0) & (np.diff(channel) == 0)
+    close = same & (np.diff(time) <= PAIR_NS)
+    told = stated != UNKNOWN
+    in_order = np.where(told[:-1] & told[1:], stated[:-1] < stated[1:], ~(told[:-1] | told[1:]))
+    linked = np.r_[close & in_order, False]
+    # In a chain of links every other one is a pair.
+    head = np.r_[True, ~linked[:-1]]
+    place = np.arange(n) - np.flatnonzero(head)[np.cumsum(head) - 1]
+    starts = linked & (place % 2 == 0)
+    follows = np.r_[False, starts[:-1]]
+    plane = np.where(told, stated, np.where(starts, 0, np.where(follows, 1, UNKNOWN)))
+    # Three sweeps under one stamp: any two could be the pair.
+    crowd = np.r_[False, same[:-1] & same[1:] & (time[2:] == time[:-2]), False] if n > 2 else None
+    if crowd is not None and np.any(crowd):
+        crowd[:-1] |= crowd[1:]
+        crowd[1:] |= crowd[:-1]
+        plane = np.where(crowd & ~told, UNKNOWN, plane)
+    return np.cumsum(~follows) - 1, plane.astype(np.int64)
+
+
+def _cut(
+    key: NDArray[np.int64],
+    time: NDArray[np.int64],
+    column: NDArray[np.int64],
+    plane: NDArray[np.int64],
+    pair: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Epoch number of each sweep; a pair is never cut in two.
+
+    An epoch ends with a silence, when it grows too long, or when a plane comes again.
+    """
     if not len(time):
         return np.zeros(0, np.int64)
-    starts = np.r_[True, (np.diff(time) > QUIET_NS) | (np.diff(key) != 0)]
-    report = np.cumsum(starts) - 1
-    part = (time - time[starts][report]) // WINDOW_NS
-    fresh = starts | np.r_[True, np.diff(part) != 0]
-    return np.cumsum(fresh) - 1
+    first = np.flatnonzero(np.r_[True, np.diff(pair) != 0])
+    base = time.min()
+    since = (time - base).astype(np.float64)
+    middle = np.add.reduceat(since, first) / np.diff(np.r_[first, len(time)])
+    bits = np.where(plane == UNKNOWN, 0, np.left_shift(1, np.maximum(column * 2 + plane, 0)))
+    mask = np.bitwise_or.reduceat(bits, first)
+    order = np.lexsort((middle, key[first]))
+    middle, mask, owner = middle[order], mask[order], key[first][order]
+    fresh = np.r_[True, (np.diff(middle) > QUIET_NS) | (np.diff(owner) != 0)]
+    number = np.empty(len(order), np.int64)
+    epoch, seen, begun = -1, 0, 0.0
+    # Where an epoch ends depends on where it began: this one loop cannot be vectorised.
+    labels = []
+    for new, at, planes in zip(fresh.tolist(), middle.tolist(), mask.tolist(), strict=True):
+        if new or seen & planes or at - begun > WINDOW_NS:
+            epoch, seen, begun = epoch + 1, 0, at
+        seen |= planes
+        labels.append(epoch)
+    number[order] = labels
+    return number[pair]
 
 
 def _middle_times(

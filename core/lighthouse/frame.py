@@ -72,8 +72,9 @@ def sighted_markers(
     return np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows])
 
 
-def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Similarity:
-    """Similarity that brings the rig into the frame of its markers.
+def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Similarity | None:
+    """Similarity that brings the rig into the frame of its markers, or None where fewer
+    than three are seen well enough.
 
     Parameters
     ----------
@@ -88,17 +89,14 @@ def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Simil
     Raises
     ------
     DegenerateError
-        Fewer than three markers were seen well enough, or they lie on a line.
+        The markers lie on a line.
     """
     fixes = locate(
         seen, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0 if planar else None
     )
     good = np.isfinite(fixes.position[:, 0])
     if np.count_nonzero(good) < 3:
-        raise DegenerateError(
-            f"{np.count_nonzero(good)} sighted markers do not fix a frame",
-            hint="give three or more that are not on one line, or leave them out",
-        )
+        return None
     return umeyama(fixes.position[good], known[good])
 
 

@@ -6,18 +6,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.lighthouse.twoview import fit_homography
+from locatk.core.geometry import fit_plane
+from locatk.core.lighthouse.twoview import GATE, fit_homography, homography_residuals
+from locatk.core.robust import consensus
 
 Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
+"""Position (3,) and rotation (3, 3), station to frame."""
 
 
-def resect_on_plane(points: Array, rays: Array) -> tuple[Array, Array]:
+def resect_on_plane(points: Array, rays: Array) -> Pose:
     """Pose of a station from points of the plane z = 0.
 
     Parameters
     ----------
     points : (n, 2) ndarray
-        Known places, n >= 4, no three of four on a line.
+        Known places, n >= 4, not on one line; wrong ones are outvoted where n > 4.
     rays : (n, 3) ndarray
         Directions in which the station saw them.
 
@@ -35,40 +39,81 @@ def resect_on_plane(points: Array, rays: Array) -> tuple[Array, Array]:
 
     Notes
     -----
-    The homography from the plane to the rays has the first two columns of the inverse
-    rotation and the translation as its columns (Zhang 2000, section 2.2).
+    The homography from the plane to the rays has the translation and the first two columns
+    of the inverse rotation as its columns (Zhang 2000, section 2.2).
     """
     _require_spread(points, 4, 2, "markers on the floor, not on one line")
-    h = fit_homography(np.c_[np.ones(len(points)), points], rays)
+    known = np.c_[np.ones(len(points)), points]
+    if len(points) > 4:
+        h, agreed = consensus(
+            fit_homography, homography_residuals, known, rays, sample=4, gate=GATE
+        )
+        known = known[agreed] if np.count_nonzero(agreed) >= 4 else known
+    else:
+        h = fit_homography(known, rays)
     h = h / np.mean(np.linalg.norm(h[:, 1:], axis=0))
-    if np.mean(h[0] @ np.c_[np.ones(len(points)), points].T) < 0:
+    if np.mean(h[0] @ known.T) < 0:
         h = -h
     across = h[:, 1:]
     rotation = _nearest_rotation(np.c_[across, np.cross(across[:, 0], across[:, 1])])
     return -rotation.T @ h[:, 0], rotation.T
 
 
-def resect_in_space(points: Array, rays: Array) -> tuple[Array, Array]:
-    """Pose of a station from points in space, n >= 6 and not on one plane.
+def resect_in_space(points: Array, rays: Array) -> list[Pose]:
+    """Likely poses of a station from points in space.
 
-    Parameters and result as for :func:`resect_on_plane`, with (n, 3) ``points``. Direct
-    linear transform of the projection (Hartley and Zisserman, algorithm 7.1).
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+        Known places, n >= 6; wrong ones are outvoted.
+    rays : (n, 3) ndarray
+
+    Returns
+    -------
+    list of (position, rotation)
+        As :func:`resect_on_plane`: by the direct linear transform (Hartley and Zisserman,
+        algorithm 7.1), which needs points off one plane, and by the plane through the
+        points, which wants them on one. Refining tells which it was.
+
+    Raises
+    ------
+    DegenerateError
+        Too few points, or all on a line.
     """
-    _require_spread(points, 6, 3, "points, not on one plane")
+    _require_spread(points, 6, 2, "places that are not on one line")
     middle, size = points.mean(axis=0), points.std()
     known = np.c_[np.ones(len(points)), (points - middle) / size]
+    p, agreed = consensus(
+        _fit_projection, homography_residuals, known, rays, sample=6, gate=GATE, trials=200
+    )
+    poses = []
+    spin = np.cbrt(np.linalg.det(p[:, 1:]))
+    if spin != 0:
+        p = p / spin
+        rotation = _nearest_rotation(p[:, 1:])
+        scale = np.mean(np.linalg.svd(p[:, 1:])[1])
+        poses.append((middle - size * rotation.T @ p[:, 0] / scale, rotation.T))
+    voters = agreed if np.count_nonzero(agreed) >= 6 else np.ones(len(points), bool)
+    centre, normal = fit_plane(points[voters])
+    across = np.linalg.svd(normal[None])[2]
+    axes = np.stack([across[1], np.cross(normal, across[1]), normal], axis=1)
+    position, turned = resect_on_plane(((points - centre) @ axes)[:, :2], rays)
+    poses.append((centre + axes @ position, axes @ turned))
+    return poses
+
+
+def _fit_projection(known: Array, rays: Array) -> Array:
+    """Projections (..., 3, 4) with rays ~ P known, by direct linear transform."""
     zero = np.zeros_like(known)
     rows = np.concatenate(
         [
-            np.concatenate([-rays[:, 1:2] * known, rays[:, 0:1] * known, zero], axis=1),
-            np.concatenate([-rays[:, 2:3] * known, zero, rays[:, 0:1] * known], axis=1),
-        ]
+            np.concatenate([-rays[..., 1:2] * known, rays[..., 0:1] * known, zero], axis=-1),
+            np.concatenate([-rays[..., 2:3] * known, zero, rays[..., 0:1] * known], axis=-1),
+        ],
+        axis=-2,
     )
-    p = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 4)
-    p = p / np.cbrt(np.linalg.det(p[:, 1:]))
-    rotation = _nearest_rotation(p[:, 1:])
-    scale = np.mean(np.linalg.svd(p[:, 1:])[1])
-    return middle - size * rotation.T @ p[:, 0] / scale, rotation.T
+    null = np.linalg.eigh(np.swapaxes(rows, -1, -2) @ rows)[1][..., 0]
+    return null.reshape(*rows.shape[:-2], 3, 4)
 
 
 def _nearest_rotation(matrix: Array) -> Array:

@@ -42,6 +42,11 @@ GATE = 0.01
 at half a metre a second moves between the sweeps of two stations, and a third of a
 demodulation error."""
 
+GATE_SIGMAS = 12.0
+FINEST_GATE = 1.5e-3
+"""The gate follows the noise of the recording at this many standard deviations, but stays
+above what a generic calibration leaves unmodelled."""
+
 REACH_M = 20.0
 """Base stations are not received farther away, in metres."""
 
@@ -269,12 +274,10 @@ class Job:
     def _framed(self, rig: Rig, planar: bool, covariance: Array) -> Scene:
         """Bring a rig into the frame and scale that markers, distances or odometry give."""
         known, seen = frames.sighted_markers(self.scene.markers, self.epochs, self.angles)
-        usable = np.count_nonzero(np.isfinite(seen).all(axis=2), axis=1) >= (1 if planar else 2)
-        if np.count_nonzero(usable) >= 3:
-            to = frames.place_on_markers(rig, planar, known[usable], seen[usable])
+        to = frames.place_on_markers(rig, planar, known, seen)
+        if to is not None:
             rig = frames.moved(rig, to)
             covariance = _turned(covariance, to.scale, to.rotation)
-            self.facts["markers"] = int(np.count_nonzero(usable))
             floor_z = float(np.mean(known[:, 2])) if planar else 0.0
             if planar and np.mean(rig.positions[:, 2]) < floor_z:
                 self.notes.append(
@@ -284,7 +287,7 @@ class Job:
             return self._scene_of(rig, planar, floor_z, "markers", covariance)
         if self.scene.markers:
             self.notes.append(
-                f"{np.count_nonzero(usable)} markers were sighted; a frame needs three"
+                "fewer than three markers were sighted by enough stations: they fix no frame"
             )
         scale, source = self._scale(rig, planar)
         to = frames.at_first_station(rig, planar, scale)
@@ -401,10 +404,12 @@ def _answer(job: Job, scene: Scene) -> Solution:
     else:
         fixes = locate(job.angles, *rig, floor_z=floor)
         fixes = _swap_back(job, fixes, rig, floor)
-        fixes = _without_worst_station(job, fixes, rig, floor)
+    gate = _gate(fixes)
+    if floor_map is None:
+        fixes = _without_worst_station(job, fixes, rig, floor, gate)
 
     unsolved = ~np.isfinite(fixes.position[:, 0])
-    inconsistent = ~unsolved & (fixes.worst > GATE)
+    inconsistent = ~unsolved & (fixes.worst > gate)
     distance = np.min(
         np.linalg.norm(fixes.position[:, None] - rig[0], axis=2), axis=1, initial=np.inf
     )
@@ -413,6 +418,9 @@ def _answer(job: Job, scene: Scene) -> Solution:
     job.reject("moment_inconsistent", np.count_nonzero(inconsistent))
     job.reject("moment_out_of_reach", np.count_nonzero(far))
     good = ~(unsolved | inconsistent | far)
+    jumps = _jumps(job.epochs, fixes, good)
+    job.reject("moment_jumps", np.count_nonzero(jumps))
+    good &= ~jumps
 
     sigma = _noise(fixes, good)
     job.facts["angle_sigma_rad"] = sigma
@@ -439,6 +447,39 @@ def _answer(job: Job, scene: Scene) -> Solution:
         tuple(dict.fromkeys(job.notes)),
         job.facts,
     )
+
+
+def _gate(fixes: Fixes) -> float:
+    """Angle by which a plane may miss its position, in radians: far out in what the
+    recording itself shows, and never more than :data:`GATE`."""
+    checked = fixes.residual[(fixes.freedom > 0) & (fixes.worst < GATE)]
+    return float(np.clip(GATE_SIGMAS * robust_sigma(checked), FINEST_GATE, GATE))
+
+
+def _jumps(epochs: Epochs, fixes: Fixes, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Moments that nothing checks and that leave the path of their device.
+
+    Compared is each position with the median of the five around it, which a steady motion
+    does not leave (Hampel's filter).
+    """
+    jumps = np.zeros(len(epochs), bool)
+    if np.all(fixes.freedom[good] > 0):
+        return jumps
+    for device in range(len(epochs.devices)):
+        mine = np.flatnonzero(good & (epochs.device == device))
+        if len(mine) < 5:
+            continue
+        path = fixes.position[mine]
+        first = np.clip(np.arange(len(mine)) - 2, 0, len(mine) - 5)
+        window = first[:, None] + np.arange(5)
+        away = np.linalg.norm(path - np.median(path[window], axis=1), axis=1)
+        step = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        usual = max(float(np.percentile(away, 75)), float(np.percentile(step, 75)))
+        # Over a pause in the recording a device may be anywhere.
+        span = epochs.time_ns[mine[first + 4]] - epochs.time_ns[mine[first]]
+        left = (away > 5 * usual) & (span < 2_000_000_000)
+        jumps[mine] = left & (fixes.freedom[mine] <= 0)
+    return jumps
 
 
 def _swap_back(
@@ -474,12 +515,16 @@ def _swap_back(
 
 
 def _without_worst_station(
-    job: Job, fixes: Fixes, rig: tuple[Array, Array, tuple[Calibration, ...]], floor: float | None
+    job: Job,
+    fixes: Fixes,
+    rig: tuple[Array, Array, tuple[Calibration, ...]],
+    floor: float | None,
+    gate: float,
 ) -> Fixes:
     """Where one of three or more stations contradicts the others, go on without it."""
     if len(job.epochs.channels) < 3:
         return fixes
-    wrong = np.flatnonzero((fixes.worst > GATE) & (fixes.freedom > 2))
+    wrong = np.flatnonzero((fixes.worst > gate) & (fixes.freedom > 2))
     best = fixes.worst[wrong].copy()
     repaired = np.zeros(len(wrong), bool)
     for column in range(len(job.epochs.channels)):
@@ -488,7 +533,7 @@ def _without_worst_station(
         fresh = locate(trial, *rig, floor_z=floor)
         better = (
             np.isfinite(fresh.position[:, 0])
-            & (fresh.worst < np.minimum(best, GATE))
+            & (fresh.worst < np.minimum(best, gate))
             & (fresh.freedom > 0)
         )
         best[better] = fresh.worst[better]

@@ -1,0 +1,394 @@
+"""Pictures of solutions: paths seen from above, and how far they are from the truth."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from locatk.core import metrics
+from locatk.core.errors import InputError
+from locatk.core.geometry import Similarity
+from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.metrics import Evaluation
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats.output import atomic_write, check_output
+
+Array = NDArray[np.float64]
+
+SUFFIXES = (".png", ".svg", ".pdf")
+
+SIZE_IN, DPI = (12.0, 6.0), 100
+"""1200 x 600 pixels as PNG."""
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D")
+"""Okabe and Ito's, which the colour-blind can tell apart, without yellow."""
+
+TRUTH_COLOR, SCENE_COLOR = "0.75", "0.2"
+
+IN_LEGEND = 8
+"""Devices that the legend names, at most."""
+
+NEAR = 1.0
+"""A station is drawn in its place up to this far outside the paths, in widths of these;
+beyond, at the margin."""
+
+BREAK_NS = 500_000_000
+"""A path is not drawn across a longer silence."""
+
+
+def plot_solution(
+    path: str | os.PathLike[str],
+    solution: Solution,
+    *,
+    truth: Sequence[Trajectory] = (),
+    evaluation: Evaluation | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Draw a solution: paths from above, and errors (else what the solver expects of them).
+
+    Parameters
+    ----------
+    path : path
+        The output; its suffix is one of :data:`SUFFIXES`. The same arguments give the same
+        bytes.
+    solution : Solution
+    truth : sequence of Trajectory
+        Drawn beneath the paths.
+    evaluation : Evaluation, optional
+        The errors, and the alignment with which the solution is laid over the truth. Without
+        one a solution in metres is compared with ``truth`` as it is, without alignment.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    InputError
+        The suffix is another one.
+    OutputExistsError, MissingDataError
+        See :func:`locatk.formats.output.atomic_write`.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(
+            f"no picture can be written as {Path(path).name!r}",
+            hint=f"End its name with one of {', '.join(SUFFIXES)}",
+        )
+    check_output(path, overwrite=overwrite)
+    undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
+    # Neither the user's matplotlibrc nor a random salt may change the picture.
+    with style.context("default"), mpl.rc_context({"svg.hashsalt": "locatk", "font.size": 9}):
+        figure = draw(solution, truth, evaluation)
+        with atomic_write(path, overwrite=overwrite) as stream:
+            figure.savefig(stream, format=suffix[1:], dpi=DPI, metadata=undated)
+
+
+def draw(
+    solution: Solution, truth: Sequence[Trajectory] = (), evaluation: Evaluation | None = None
+) -> Figure:
+    """The figure of :func:`plot_solution`, not yet written."""
+    scene = solution.artifact if isinstance(solution.artifact, Scene) else Scene()
+    unscaled = scene.scale == "unit"
+    if evaluation is None and not unscaled:
+        evaluation = _compare(solution, truth)
+    if evaluation is not None:
+        paths, scene = _aligned(solution.trajectories, scene, evaluation.alignment)
+        unscaled = unscaled and evaluation.align != "sim3"
+    else:
+        paths = {t.device: t.position for t in solution.trajectories}
+    times = {t.device: t.time_ns for t in solution.trajectories}
+    colors = {name: COLORS[k % len(COLORS)] for k, name in enumerate(paths)}
+
+    figure = Figure(figsize=SIZE_IN, layout="constrained")
+    grid = figure.add_gridspec(1, 2)
+    left, right = figure.add_subfigure(grid[0, 0]), figure.add_subfigure(grid[0, 1])
+    ground = left.subplots()
+    unit = "unit" if unscaled else "m"
+    _draw_map(ground, paths, times, () if unscaled else truth, scene, colors, unit)
+    left.legend(
+        handles=_legend(colors, scene, bool(truth) and not unscaled),
+        loc="outside lower center",
+        ncols=5,
+        frameon=False,
+    )
+    over_time, spread = right.subplots(2, 1, height_ratios=(3, 2))
+    series = _errors(evaluation) if evaluation else _sigmas(solution)
+    what = "error" if evaluation else "solver's sigma"
+    label = f"{what} [{'1/1000 unit' if unscaled else 'mm'}]"
+    _draw_series(over_time, spread, series, colors, label)
+    if evaluation is not None:
+        spread.set_title(
+            f"half below {_mm(evaluation.median)}, 95 % below {_mm(evaluation.p95)}, "
+            f"largest {_mm(evaluation.max)}",
+            loc="left",
+            fontsize=9,
+        )
+    figure.suptitle(_title(solution, evaluation), x=0.01, ha="left", fontsize=10)
+    return figure
+
+
+# ---- what is drawn
+
+
+@dataclass(frozen=True)
+class Series:
+    """One number a pose: times (n,) in ns and values (n,), in thousandths of the unit."""
+
+    time_ns: NDArray[np.int64]
+    value: Array
+
+
+def _compare(solution: Solution, truth: Sequence[Trajectory]) -> Evaluation | None:
+    """The solution against the truth as it is; None where no pose has truth."""
+    true = {t.device: t for t in truth}
+    pairs = [(t, true[t.device]) for t in solution.trajectories if t.device in true and len(t)]
+    try:
+        return metrics.evaluate_all(pairs) if pairs else None
+    except InputError:
+        return None
+
+
+def _aligned(
+    trajectories: Sequence[Trajectory], scene: Scene, to: Similarity
+) -> tuple[dict[str, Array], Scene]:
+    """Paths and scene in the frame of the truth."""
+    stations = tuple(
+        replace(s, position=to.apply(s.position), rotation=to.rotation @ s.rotation)
+        for s in scene.stations
+    )
+    markers = tuple(replace(m, position=to.apply(m.position)) for m in scene.markers)
+    moved = replace(scene, stations=stations, markers=markers)
+    return {t.device: to.apply(t.position) for t in trajectories}, moved
+
+
+def _errors(evaluation: Evaluation) -> dict[str, Series]:
+    """Errors of each device."""
+    series = {}
+    for k, name in enumerate(evaluation.devices):
+        mine = evaluation.device == k
+        series[name] = Series(evaluation.time_ns[mine], 1e3 * evaluation.errors[mine])
+    return series
+
+
+def _sigmas(solution: Solution) -> dict[str, Series]:
+    """Standard deviations of positions; devices whose covariance is unknown are left out."""
+    series = {}
+    for t in solution.trajectories:
+        variance = np.einsum("nii->n", t.covariance[:, :3, :3])
+        known = np.isfinite(variance)
+        if np.any(known):
+            series[t.device] = Series(t.time_ns[known], 1e3 * np.sqrt(variance[known]))
+    return series
+
+
+# ---- the map
+
+
+def _draw_map(
+    axes: Axes,
+    paths: dict[str, Array],
+    times: dict[str, NDArray[np.int64]],
+    truth: Sequence[Trajectory],
+    scene: Scene,
+    colors: dict[str, str],
+    unit: str,
+) -> None:
+    for t in truth:
+        axes.plot(*_broken(t.position, t.time_ns), color=TRUTH_COLOR, lw=2.5, zorder=1)
+    for name, position in paths.items():
+        line = _broken(position, times[name])
+        axes.plot(*line, color=colors[name], lw=0.8, marker=".", ms=2.5, zorder=2)
+    for marker in scene.markers:
+        axes.plot(*marker.position[:2], "s", color=SCENE_COLOR, mfc="none", ms=7, zorder=3)
+
+    solid = [t.position for t in truth] + [m.position[None] for m in scene.markers]
+    middle, half = _view(list(paths.values()), solid)
+    places = np.array([s.position[:2] for s in scene.stations]).reshape(-1, 2)
+    near = np.max(np.abs(places - middle), axis=1, initial=0.0) <= half * (1 + 2 * NEAR)
+    if np.any(near):
+        both = np.vstack([middle - half, middle + half, places[near]])
+        middle = (both.min(axis=0) + both.max(axis=0)) / 2
+        half = float(np.max(both.max(axis=0) - both.min(axis=0))) / 2
+    half *= 1.12 if np.all(near) else 1.45  # room for the labels at the margin
+    for station, inside in zip(scene.stations, near, strict=True):
+        _draw_station(axes, station, bool(inside), middle, half, unit)
+    axes.set_xlim(middle[0] - half, middle[0] + half)
+    axes.set_ylim(middle[1] - half, middle[1] + half)
+    axes.set_aspect("equal")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    axes.set_xlabel(f"x [{unit}]")
+    axes.set_ylabel(f"y [{unit}]")
+    out = sum(
+        int(np.count_nonzero(np.any(np.abs(p[:, :2] - middle) > half, axis=1)))
+        for p in paths.values()
+    )
+    if out:
+        axes.set_title(f"{out} poses lie outside this view", loc="left", fontsize=9)
+
+
+def _broken(position: Array, time_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+    """x and y of a path, with nan where it is silent for long."""
+    gaps = np.flatnonzero(np.diff(time_ns) > BREAK_NS) + 1
+    x, y = np.insert(position[:, :2], gaps, np.nan, axis=0).T
+    return x, y
+
+
+def _view(paths: Sequence[Array], solid: Sequence[Array]) -> tuple[Array, float]:
+    """Middle (2,) and half the width of the square that holds the paths.
+
+    All of what is ``solid``; of the solved poses all but the outermost, which may be wild.
+    """
+    corners = [f(p[:, :2], axis=0) for p in solid if len(p) for f in (np.min, np.max)]
+    solved = np.concatenate([p[:, :2] for p in paths]) if paths else np.zeros((0, 2))
+    if len(solved):
+        corners.extend(np.percentile(solved, (1, 99), axis=0))
+    box = np.array(corners) if corners else np.array([[-1.0, -1.0], [1.0, 1.0]])
+    low, high = box.min(axis=0), box.max(axis=0)
+    return (low + high) / 2, max(float(np.max(high - low)) / 2, 0.05)
+
+
+def _draw_station(
+    axes: Axes, station: Station, inside: bool, middle: Array, half: float, unit: str
+) -> None:
+    """A station with the direction it looks in, or at the margin the way to it."""
+    place, label = station.position[:2], f"ch {station.channel}"
+    if inside:
+        # A flat arrow shrinks as the station looks down.
+        tip = place + station.rotation[:2, 0] * 0.22 * half
+        axes.plot(*place, "o", color=SCENE_COLOR, ms=6, zorder=4)
+        above = tip[1] < place[1]
+        label_at, shift = place, 7 if above else -7
+    else:
+        away = place - middle
+        label += f"\n{float(np.linalg.norm(away)):.3g} {unit}"
+        tip = middle + away * 0.98 * half / np.max(np.abs(away))
+        place = tip - 0.09 * half * away / np.linalg.norm(away)
+        above = tip[1] < middle[1]
+        # Beside the arrow, on the side of the middle of the margin that it runs along.
+        label_at = middle + (tip - middle) * 0.9
+        shift = 10 if above else -10
+    axes.annotate(
+        "",
+        xy=(tip[0], tip[1]),
+        xytext=(place[0], place[1]),
+        arrowprops={"arrowstyle": "-|>", "color": SCENE_COLOR, "shrinkA": 0, "shrinkB": 0},
+    )
+    axes.annotate(
+        label,
+        (label_at[0], label_at[1]),
+        xytext=(0, shift),
+        textcoords="offset points",
+        ha="center",
+        va="bottom" if above else "top",
+        fontsize=8,
+    )
+
+
+def _legend(colors: dict[str, str], scene: Scene, with_truth: bool) -> list[Line2D]:
+    """What the signs of the map mean."""
+
+    def sign(label: str, **look: Any) -> Line2D:
+        return Line2D([], [], **{"color": SCENE_COLOR, "label": label, "ls": "", **look})
+
+    named = list(colors)
+    if len(named) > IN_LEGEND:
+        named = named[: IN_LEGEND - 1]
+    handles = [sign(_short(name), color=colors[name], ls="-", marker=".") for name in named]
+    if len(named) < len(colors):
+        handles.append(sign(f"and {len(colors) - len(named)} more"))
+    if with_truth:
+        handles.append(sign("truth", color=TRUTH_COLOR, ls="-", lw=2.5))
+    if scene.markers:
+        handles.append(sign("marker", marker="s", mfc="none", ms=7))
+    if scene.stations:
+        handles.append(sign("station", marker="o", ms=6))
+    return handles
+
+
+# ---- numbers over time
+
+
+def _draw_series(
+    over_time: Axes,
+    spread: Axes,
+    series: dict[str, Series],
+    colors: dict[str, str],
+    label: str,
+) -> None:
+    """Values over time, and how often they occur; wild ones are drawn at the upper edge."""
+    over_time.set_xlabel("time [s]")
+    over_time.set_ylabel(label)
+    spread.set_xlabel(label)
+    spread.set_ylabel("poses")
+    filled = {name: s for name, s in series.items() if len(s.value)}
+    if not filled:
+        for axes in (over_time, spread):
+            axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center")
+            axes.set_xticks([])
+            axes.set_yticks([])
+        return
+    every = np.concatenate([s.value for s in filled.values()])
+    usual = 1.5 * float(np.percentile(every, 98))
+    top = 1.05 * min(float(every.max()), usual) or 1.0
+    start = min(int(s.time_ns.min()) for s in filled.values())
+    for name, s in filled.items():
+        seconds = (s.time_ns - start) * 1e-9
+        wild = s.value > top
+        over_time.plot(seconds[~wild], s.value[~wild], ".", color=colors[name], ms=3)
+        edge = np.full(np.count_nonzero(wild), 0.98 * top)
+        over_time.plot(seconds[wild], edge, "^", color=colors[name], ms=5)
+    over_time.set_ylim(0, top)
+    over_time.grid(color="0.92")
+    out = int(np.count_nonzero(every > top))
+    if out:
+        beyond = f"{out} of {len(every)} beyond this scale (triangles)"
+        over_time.set_title(beyond, loc="left", fontsize=9)
+    # Many colours on top of each other tell nothing.
+    parts = [s.value for s in filled.values()], [colors[name] for name in filled]
+    if len(filled) > IN_LEGEND:
+        parts = [every], ["0.5"]
+    values = [np.minimum(value, top) for value in parts[0]]
+    spread.hist(values, bins=np.linspace(0, top, 41).tolist(), stacked=True, color=parts[1])
+    spread.set_xlim(0, top)
+    spread.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+
+
+# ---- words
+
+
+def _title(solution: Solution, evaluation: Evaluation | None) -> str:
+    """What this is, how good it is, and what it stands on."""
+    devices = len(solution.trajectories)
+    text = (
+        f"{solution.system}, {solution.method}: {solution.poses} poses of {devices} "
+        f"{'device' if devices == 1 else 'devices'}"
+    )
+    if evaluation is not None:
+        text += f", MAE {_mm(evaluation.mae)}, RMSE {_mm(evaluation.rmse)}"
+        text += f" (alignment: {evaluation.align}, time offset: {evaluation.offset_source})"
+    notes = textwrap.wrap("; ".join(solution.notes), 160, max_lines=2, placeholder=" ...")
+    return "\n".join(textwrap.wrap(text, 160) + notes)
+
+
+def _mm(metres: float) -> str:
+    """A length in mm, to three digits."""
+    digits = np.clip(2 - np.floor(np.log10(max(1e3 * metres, 1e-3))), 0, 3)
+    return f"{1e3 * metres:.{int(digits)}f} mm"
+
+
+def _short(name: str) -> str:
+    return textwrap.shorten(name, 18, placeholder="...") if " " in name else name[:18]

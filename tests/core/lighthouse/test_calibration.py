@@ -1,0 +1,239 @@
+"""The bending of light planes: against libsurvive and Crazyflie, written again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.lighthouse import calibration as cal
+from locatk.core.lighthouse.angles import plane_normals, rays
+from locatk.core.lighthouse.generic import GENERIC, PHASE_TILT_SIGMA, UNITS
+
+Array = NDArray[np.float64]
+
+
+def calibration_of(planes: Any, model: str = "libsurvive") -> cal.Calibration:
+    """Our form of two of libsurvive's planes."""
+    sweeps = [
+        [p.phase, p.tilt, p.curve, p.gibmag, p.gibpha, p.ogeemag, p.ogeephase] for p in planes
+    ]
+    return cal.Calibration(np.array(sweeps), "factory", model)
+
+
+def wide(n: int = 200, seed: int = 0) -> Array:
+    """Points over a field of 110 by 80 degrees."""
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = rng.uniform(-0.96, 0.96, n), rng.uniform(-0.7, 0.7, n)
+    away = rng.uniform(0.5, 6, n)
+    level = away * np.cos(elevation)
+    return np.stack(
+        [level * np.cos(azimuth), level * np.sin(azimuth), away * np.sin(elevation)], axis=1
+    )
+
+
+def crazyflie_angle(point: Array, t: float, sweep: Array) -> float:
+    """``lighthouseCalibrationMeasurementModelLh2``; ``t`` is -30 degrees for the first."""
+    x, y, z = point
+    ax, r = math.atan2(y, x), math.hypot(x, y)
+    base = ax + math.asin(z * math.tan(t - sweep[cal.TILT]) / r)
+    gib = -sweep[cal.GIBMAG] * math.cos(ax + sweep[cal.GIBPHASE])
+    return base - (sweep[cal.PHASE] + gib)
+
+
+@pytest.mark.parametrize("unit", range(len(UNITS)))
+def test_libsurvive_in_its_own_axes(unit: int, world: Any) -> None:
+    planes = world.planes_of(UNITS[unit])
+    points = wide()
+    forward, left, up = points.T
+    theirs = [
+        world.libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(planes)
+    ]
+    ours = cal.predict_angles(points, calibration_of(planes))
+    np.testing.assert_allclose(ours, np.stack(theirs, axis=1), atol=1e-13)
+
+
+def test_ideal_planes_are_those_of_crazyflies_documentation() -> None:
+    # alpha = atan2(y, x) + asin(z tan t / hypot(x, y)), t = -30, +30 degrees.
+    points = wide()
+    x, y, z = points.T
+    for k, t in enumerate((-math.pi / 6, math.pi / 6)):
+        theirs = np.arctan2(y, x) + np.arcsin(z * math.tan(t) / np.hypot(x, y))
+        np.testing.assert_allclose(cal.predict_angles(points, cal.IDEAL)[:, k], theirs, atol=1e-14)
+
+
+def test_ideal_gradient_is_crazyflies_h_vector() -> None:
+    points = wide(50)
+    _, by_point, _ = cal.predict_with_gradient(points, cal.IDEAL)
+    for (x, y, z), rows in zip(points, by_point, strict=True):
+        for k, t in enumerate((-math.pi / 6, math.pi / 6)):
+            r = math.hypot(x, y)
+            q = math.tan(t) / math.sqrt(r**2 - (z * math.tan(t)) ** 2)
+            h = [(-y - x * z * q) / r**2, (x - y * z * q) / r**2, q]
+            np.testing.assert_allclose(rows[k], h, rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize("unit", [0, 4, 9])
+def test_crazyflie_model_is_its_firmwares(unit: int, world: Any) -> None:
+    calibration = calibration_of(world.planes_of(UNITS[unit]), "crazyflie")
+    points = wide(50)
+    nominal = (-np.pi / 6, np.pi / 6)
+    theirs = [
+        [crazyflie_angle(p, t, calibration.sweeps[k]) for k, t in enumerate(nominal)]
+        for p in points
+    ]
+    np.testing.assert_allclose(cal.predict_angles(points, calibration), theirs, atol=1e-14)
+
+
+@pytest.mark.parametrize("model", cal.MODELS)
+@pytest.mark.parametrize("unit", [1, 6, 9])
+def test_gradients_are_those_of_small_steps(unit: int, model: str, world: Any) -> None:
+    calibration = calibration_of(world.planes_of(UNITS[unit]), model)
+    points = wide(60)
+    angles, by_point, by_tilt = cal.predict_with_gradient(points, calibration)
+    np.testing.assert_array_equal(angles, cal.predict_angles(points, calibration))
+    step = 1e-6
+    for axis in range(3):
+        move = step * np.eye(3)[axis]
+        numeric = (
+            cal.predict_angles(points + move, calibration)
+            - cal.predict_angles(points - move, calibration)
+        ) / (2 * step)
+        np.testing.assert_allclose(by_point[..., axis], numeric, atol=2e-8)
+    for sign in (1, -1):
+        moved = calibration.sweeps.copy()
+        moved[:, cal.TILT] += sign * step
+        shifted = cal.predict_angles(points, cal.Calibration(moved, "factory", model))
+        by_tilt = by_tilt - sign * shifted / (2 * step)
+    np.testing.assert_allclose(by_tilt, 0, atol=2e-8)
+
+
+def test_phase_turns_the_angle_back() -> None:
+    sweeps = np.zeros((2, 7))
+    sweeps[1, cal.PHASE] = -0.005
+    points = wide(5)
+    change = cal.predict_angles(points, cal.Calibration(sweeps, "factory")) - cal.predict_angles(
+        points, cal.IDEAL
+    )
+    np.testing.assert_allclose(change, np.tile([0, 0.005], (5, 1)), atol=1e-15)
+
+
+def test_points_above_the_cone_have_no_angle() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        above = cal.predict_angles(np.array([[0.1, 0.0, 2.0], [2.0, 0.0, 0.1]]), GENERIC)
+        gradient = cal.predict_with_gradient(np.array([[0.1, 0.0, 2.0]]), GENERIC)[1]
+    assert np.isnan(above[0]).all()
+    assert np.isfinite(above[1]).all()
+    assert not np.isfinite(gradient).any()
+
+
+@pytest.mark.parametrize("unit", range(len(UNITS)))
+def test_correcting_gives_plain_planes_through_the_point(unit: int, world: Any) -> None:
+    planes = world.planes_of(UNITS[unit])
+    calibration = calibration_of(planes)
+    points = wide()
+    forward, left, up = points.T
+    observed = np.stack(
+        [world.libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(planes)], 1
+    )
+    corrected = cal.ideal_angles(observed, calibration)
+    ray = rays(corrected, calibration.tilts)
+    np.testing.assert_allclose(ray, points / points[:, :1], atol=2e-6)
+    level = np.hypot(points[:, 0], points[:, 1])[:, None]
+    missed = np.einsum("nki,ni->nk", plane_normals(corrected, calibration.tilts), points) / level
+    assert np.max(np.abs(missed)) < 1e-6
+    # Without it, planes miss by milliradians.
+    raw = np.einsum("nki,ni->nk", plane_normals(observed, calibration.tilts), points) / level
+    assert np.max(np.abs(raw)) > 1e-3
+
+
+def test_correcting_three_steps_is_correct_to_a_tenth_of_a_microradian(world: Any) -> None:
+    # What the docstring of ideal_angles promises, within the field of a usual scene.
+    for unit in UNITS:
+        calibration = calibration_of(world.planes_of(unit))
+        points = wide()
+        points = points[np.abs(points[:, 2]) < 0.5 * np.hypot(points[:, 0], points[:, 1])]
+        observed = cal.predict_angles(points, calibration)
+        three = cal.ideal_angles(observed, calibration)
+        many = cal.ideal_angles(observed, calibration, iterations=20)
+        assert np.max(np.abs(three - many)) < 1e-7
+
+
+def test_correcting_as_crazyflie_does_gives_its_ray(world: Any) -> None:
+    # The firmware's fixed point: corrected angles are those of 30-degree planes.
+    calibration = calibration_of(world.planes_of(UNITS[3]), "crazyflie")
+    for point in wide(40):
+        raw = [
+            crazyflie_angle(point, t, calibration.sweeps[k])
+            for k, t in enumerate((-np.pi / 6, np.pi / 6))
+        ]
+        a = list(raw)
+        for _ in range(50):
+            y = math.tan((a[0] + a[1]) / 2)
+            z = math.sin(a[1] - a[0]) / (math.tan(math.pi / 6) * (math.cos(a[1]) + math.cos(a[0])))
+            bent = [
+                crazyflie_angle(np.array([1.0, y, z]), t, calibration.sweeps[k])
+                for k, t in enumerate((-np.pi / 6, np.pi / 6))
+            ]
+            a = [a[k] + raw[k] - bent[k] for k in range(2)]
+        ours = rays(cal.ideal_angles(np.array(raw), calibration), calibration.tilts)
+        np.testing.assert_allclose(ours, [1.0, y, z], atol=3e-6)
+
+
+def test_unseen_angles_stay_unseen() -> None:
+    observed = np.array([[0.1, np.nan], [np.nan, np.nan], [0.1, -0.1]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        corrected = cal.ideal_angles(observed, GENERIC)
+    assert not np.isfinite(corrected[:2]).all(axis=1).any()
+    assert np.isfinite(corrected[2]).all()
+
+
+def test_generic_is_what_other_units_are() -> None:
+    # facts/lighthouse.md 1.6: mean and spread over the units that libsurvive recorded.
+    assert GENERIC.source == "generic"
+    np.testing.assert_allclose(GENERIC.sweeps[:, cal.TILT], [-0.0493, 0.0459], atol=5e-4)
+    np.testing.assert_allclose(GENERIC.sweeps[:, cal.PHASE], [0, -0.0051], atol=5e-4)
+    np.testing.assert_allclose(PHASE_TILT_SIGMA, [[0, 0.0016], [0.0019, 0.0020]], atol=5e-4)
+    # The mean of gib is that of the waves, not of their sizes and phases.
+    azimuth = np.linspace(-1, 1, 9)
+    for k in range(2):
+        waves = UNITS[:, 5 + k, None] * np.cos(azimuth + UNITS[:, 7 + k, None])
+        ours = GENERIC.sweeps[k, cal.GIBMAG] * np.cos(azimuth + GENERIC.sweeps[k, cal.GIBPHASE])
+        np.testing.assert_allclose(ours, waves.mean(axis=0), atol=1e-12)
+
+
+def test_units_are_those_of_libsurvives_file(recordings: Path, world: Any) -> None:
+    text = (recordings / "libsurvive" / "tracker-cal-attempt.rec.gz.json").read_text()
+    found = 0
+    for block in re.findall(r'"lighthouse\d+":(\{[^}]*\})', text):
+        lamp = json.loads(re.sub(r"[\r\n]", "", block))
+        if lamp.get("OOTXSet") != "1":
+            continue
+        names = [f.name for f in dataclasses.fields(world.Plane)]
+        theirs = {name: [float(v) for v in lamp[f"fcal{name}"]] for name in names}
+        unit = min(UNITS, key=lambda u: np.abs(u[1:3] - theirs["tilt"]).sum())
+        for k, plane in enumerate(world.planes_of(unit)):
+            for key, values in theirs.items():
+                assert getattr(plane, key) == pytest.approx(values[k], abs=1e-6), key
+        found += 1
+    assert found >= 2
+
+
+def test_what_a_calibration_says_of_itself(world: Any) -> None:
+    assert not cal.IDEAL.bends
+    assert cal.IDEAL.source == "none"
+    assert GENERIC.bends
+    factory = calibration_of(world.planes_of(UNITS[0]))
+    np.testing.assert_allclose(
+        factory.tilts, [np.pi / 6 + UNITS[0, 1], -np.pi / 6 + UNITS[0, 2]]
+    )

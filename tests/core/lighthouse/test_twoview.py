@@ -1,0 +1,215 @@
+"""Two views, with OpenCV as the judge.
+
+OpenCV's image is x right, y down, z ahead; a station's rays are (1, y left, z up).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.lighthouse import twoview
+
+Array = NDArray[np.float64]
+
+TO_CV = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Station axes to OpenCV's."""
+
+
+class Views:
+    """Two stations over places, as rays without error, and the motion between them."""
+
+    def __init__(self, world: Any, flat: bool, n: int = 60, channels: Any = (1, 2)) -> None:
+        first, second = world.lamps(*channels)
+        self.points = world.curve(n, flat=flat)
+        a, b = ((self.points - s.position) @ s.rotation for s in (first, second))
+        self.depths = a[:, 0], b[:, 0]
+        self.a, self.b = a / a[:, :1], b / b[:, :1]
+        self.rotation = second.rotation.T @ first.rotation
+        self.translation = second.rotation.T @ (first.position - second.position)
+        self.up = first.rotation.T @ [0.0, 0.0, 1.0]
+        self.height = first.position[2]
+
+    @property
+    def image(self) -> tuple[Array, Array]:
+        return (self.a @ TO_CV.T)[:, :2], (self.b @ TO_CV.T)[:, :2]
+
+
+@pytest.fixture(params=[(1, 2), (2, 5), (5, 16)])
+def flat(world: Any, request: pytest.FixtureRequest) -> Views:
+    return Views(world, True, channels=request.param)
+
+
+@pytest.fixture(params=[(1, 2), (2, 5), (5, 16)])
+def space(world: Any, request: pytest.FixtureRequest) -> Views:
+    return Views(world, False, channels=request.param)
+
+
+def unit(h: Array) -> Array:
+    h = h / np.linalg.norm(h)
+    return h * np.sign(h.ravel()[np.argmax(np.abs(h))])
+
+
+def test_homography_is_opencvs(flat: Views) -> None:
+    noisy = flat.b + np.random.default_rng(0).normal(0, 1e-4, flat.b.shape) * [0, 1, 1]
+    ours = TO_CV @ twoview.fit_homography(flat.a, noisy) @ TO_CV.T
+    image_a, _ = flat.image
+    theirs, _ = cv2.findHomography(image_a, (noisy @ TO_CV.T)[:, :2], 0)
+    # OpenCV refines its direct transform: the two agree to the noise of the points.
+    np.testing.assert_allclose(unit(ours), unit(theirs), atol=5e-4)
+    exact = TO_CV @ twoview.fit_homography(flat.a, flat.b) @ TO_CV.T
+    np.testing.assert_allclose(unit(exact), unit(cv2.findHomography(*flat.image, 0)[0]), atol=1e-8)
+
+
+def test_homography_residual_is_a_distance_in_the_image(flat: Views) -> None:
+    h = twoview.fit_homography(flat.a, flat.b)
+    off = flat.b + [0.0, 3e-3, 4e-3]
+    np.testing.assert_allclose(twoview.homography_residuals(h, flat.a, flat.b), 0, atol=1e-9)
+    np.testing.assert_allclose(twoview.homography_residuals(h, flat.a, off), 5e-3, atol=1e-9)
+    np.testing.assert_allclose(
+        twoview.homography_residuals(-2.5 * h, 3 * flat.a, 0.1 * off), 5e-3, atol=1e-9
+    )
+
+
+def test_motions_behind_a_homography_are_opencvs(flat: Views) -> None:
+    h = twoview.fit_homography(flat.a, flat.b)
+    ours = twoview.split_homography(-3.7 * h)  # neither scale nor sign matters
+    _, turns, moves, normals = cv2.decomposeHomographyMat(TO_CV @ h @ TO_CV.T, np.eye(3))
+    assert len(ours) == len(turns) == 4
+    for turn, move, normal in zip(turns, moves, normals, strict=True):
+        back = TO_CV.T @ turn @ TO_CV, TO_CV.T @ move[:, 0], TO_CV.T @ normal[:, 0]
+        # OpenCV's normal has unit length and its translation is that over the height; ours
+        # puts the plane at normal . a = 1. The product is the same.
+        assert any(
+            np.allclose(r, back[0], atol=1e-6)
+            and np.allclose(np.outer(t, n), np.outer(back[1], back[2]), atol=1e-6)
+            for r, t, n in ours
+        )
+
+
+def test_one_motion_behind_a_homography_is_the_true_one(flat: Views) -> None:
+    motions = twoview.split_homography(twoview.fit_homography(flat.a, flat.b))
+    normal = -flat.up / flat.height
+    assert any(
+        np.allclose(r, flat.rotation, atol=1e-7)
+        and np.allclose(t / np.linalg.norm(normal) * np.linalg.norm(n), flat.translation / 1.0,
+                        atol=1e-6)
+        or np.allclose(r, flat.rotation, atol=1e-7)
+        and np.allclose(np.outer(t, n), np.outer(flat.translation, normal), atol=1e-6)
+        for r, t, n in motions
+    )  # fmt: skip
+    for rotation, _, _ in motions:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_every_motion_explains_the_homography(flat: Views) -> None:
+    h = twoview.fit_homography(flat.a, flat.b)
+    for r, t, n in twoview.split_homography(h):
+        again = r + np.outer(t, n)
+        np.testing.assert_allclose(unit(again), unit(h), atol=1e-9)
+
+
+def test_stations_at_one_place_have_no_motion() -> None:
+    turn = cv2.Rodrigues(np.array([0.1, -0.4, 0.2]))[0]
+    assert twoview.split_homography(turn) == []
+
+
+def test_essential_matrix_is_opencvs(space: Views) -> None:
+    e = TO_CV @ twoview.fit_epipolar(space.a, space.b) @ TO_CV.T
+    theirs, _ = cv2.findFundamentalMat(*space.image, cv2.FM_8POINT)
+    np.testing.assert_allclose(unit(e), unit(theirs), atol=1e-6)
+    true = np.cross(np.eye(3), space.translation) @ space.rotation
+    np.testing.assert_allclose(
+        unit(twoview.fit_epipolar(space.a, space.b)), unit(true), atol=1e-8
+    )
+
+
+def test_sampson_distance_is_that_of_opencv(space: Views) -> None:
+    e = twoview.fit_epipolar(space.a, space.b)
+    off = space.b + np.random.default_rng(0).normal(0, 3e-3, space.b.shape) * [0, 1, 1]
+    ours = twoview.epipolar_residuals(e, space.a, off)
+    e_cv = TO_CV @ e @ TO_CV.T
+    theirs = [
+        cv2.sampsonDistance(TO_CV @ a, TO_CV @ b, e_cv)
+        for a, b in zip(space.a, off, strict=True)
+    ]
+    np.testing.assert_allclose(ours**2, theirs, rtol=1e-6)
+
+
+def test_motions_behind_an_essential_matrix_are_opencvs(space: Views) -> None:
+    e = twoview.fit_epipolar(space.a, space.b)
+    ours = twoview.split_essential(e)
+    assert len(ours) == 4
+    turn_1, turn_2, move = cv2.decomposeEssentialMat(TO_CV @ e @ TO_CV.T)
+    for turn in (turn_1, turn_2):
+        for sign in (1, -1):
+            r, t = TO_CV.T @ turn @ TO_CV, sign * TO_CV.T @ move[:, 0]
+            assert any(
+                np.allclose(p, r, atol=1e-6) and np.allclose(q, t, atol=1e-6) for p, q in ours
+            )
+    direction = space.translation / np.linalg.norm(space.translation)
+    assert any(
+        np.allclose(p, space.rotation, atol=1e-6) and np.allclose(q, direction, atol=1e-6)
+        for p, q in ours
+    )
+
+
+def test_only_one_motion_puts_the_points_ahead_as_opencv_says(space: Views) -> None:
+    e = twoview.fit_epipolar(space.a, space.b)
+    ahead = []
+    for r, t in twoview.split_essential(e):
+        depth, other = twoview.triangulate(space.a, space.b, r, t)
+        if np.all(depth > 0) and np.all(other > 0):
+            ahead.append((r, t))
+    _, turn, move, _ = cv2.recoverPose(TO_CV @ e @ TO_CV.T, *space.image, np.eye(3))
+    assert len(ahead) == 1
+    np.testing.assert_allclose(ahead[0][0], TO_CV.T @ turn @ TO_CV, atol=1e-6)
+    np.testing.assert_allclose(ahead[0][1], TO_CV.T @ move[:, 0], atol=1e-6)
+
+
+def test_triangulation_finds_the_depths(space: Views) -> None:
+    depth, other = twoview.triangulate(space.a, space.b, space.rotation, space.translation)
+    np.testing.assert_allclose(depth, space.depths[0], rtol=1e-9)
+    np.testing.assert_allclose(other, space.depths[1], rtol=1e-9)
+
+
+def test_parallel_rays_have_no_depth() -> None:
+    ray = np.array([[1.0, 0.1, 0.2]])
+    depth, _ = twoview.triangulate(ray, ray, np.eye(3), np.array([0.0, 1.0, 0.0]))
+    assert not np.isfinite(depth[0]) or abs(depth[0]) > 1e6
+
+
+@pytest.mark.parametrize("n", [40, 400])
+def test_consensus_finds_who_agrees(world: Any, n: int) -> None:
+    rng = np.random.default_rng(n)
+    wrong = rng.random(n) < 0.25
+    for is_flat, agree in ((True, twoview.agree_on_plane), (False, twoview.agree_in_space)):
+        views = Views(world, is_flat, n)
+        b = views.b + rng.normal(0, 3e-4, views.b.shape) * [0, 1, 1]
+        b[wrong, 1:] += rng.uniform(0.1, 0.4, (np.count_nonzero(wrong), 2)) * rng.choice([-1, 1])
+        _, agreed = agree(views.a, b)
+        assert agreed[~wrong].all()
+        # A ray that slips along its own epipolar line shows nothing.
+        assert np.count_nonzero(agreed[wrong]) <= (0 if is_flat else 0.15 * wrong.sum() + 1)
+
+
+def test_upright_motions_are_near_the_true_one(world: Any) -> None:
+    first, second = world.lamps(1, 2)
+    points = world.curve(9, flat=False)
+    level = [world.look(s.position, s.position + s.rotation[:, 0] * [1, 1, 0]) for s in (first, second)]
+    a, b = ((points - s.position) @ r for s, r in zip((first, second), level, strict=True))
+    rotation = level[1].T @ level[0]
+    direction = level[1].T @ (first.position - second.position)
+    direction /= np.linalg.norm(direction)
+    found = twoview.upright_motions(a / a[:, :1], b / b[:, :1], turns=720)
+    best = min(
+        np.degrees(np.arccos(np.clip((np.trace(r.T @ rotation) - 1) / 2, -1, 1)))
+        + np.degrees(np.arccos(np.clip(t @ direction, -1, 1)))
+        for r, t in found
+    )
+    assert best < 3
