@@ -96,7 +96,7 @@ def _line(word: str, colour: str, what: str, hint: str | None) -> str:
 def _sentences(what: str, hint: str | None) -> str:
     text = _sentence(what)
     if hint:
-        text += " Hint: " + _sentence(hint)
+        text += " Hint: " + _sentence(hint[0].upper() + hint[1:])
     return text
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import textwrap
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -90,7 +91,9 @@ def plot_solution(
     check_output(path, overwrite=overwrite)
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
     # Neither the user's matplotlibrc nor a random salt may change the picture.
-    with style.context("default"), mpl.rc_context({"svg.hashsalt": "locatk", "font.size": 9}):
+    salted = mpl.rc_context({"svg.hashsalt": "locatk", "font.size": 9})
+    with style.context("default"), salted, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing")  # drawn as a box
         figure = draw(solution, truth, evaluation)
         with atomic_write(path, overwrite=overwrite) as stream:
             figure.savefig(stream, format=suffix[1:], dpi=DPI, metadata=undated)
@@ -118,10 +121,12 @@ def draw(
     ground = left.subplots()
     unit = "unit" if unscaled else "m"
     _draw_map(ground, paths, times, () if unscaled else truth, scene, colors, unit)
+    signs = _legend(colors, scene, bool(truth) and not unscaled)
+    widest = max((len(str(sign.get_label())) for sign in signs), default=0)
     left.legend(
-        handles=_legend(colors, scene, bool(truth) and not unscaled),
+        handles=signs,
         loc="outside lower center",
-        ncols=5,
+        ncols=min(5, 600 // (62 + 7 * widest)),  # in pixels: half the picture, a sign, a letter
         frameon=False,
     )
     over_time, spread = right.subplots(2, 1, height_ratios=(3, 2))
@@ -254,6 +259,7 @@ def _view(paths: Sequence[Array], solid: Sequence[Array]) -> tuple[Array, float]
     """
     corners = [f(p[:, :2], axis=0) for p in solid if len(p) for f in (np.min, np.max)]
     solved = np.concatenate([p[:, :2] for p in paths]) if paths else np.zeros((0, 2))
+    solved = solved[np.isfinite(solved).all(axis=1)]
     if len(solved):
         corners.extend(np.percentile(solved, (1, 99), axis=0))
     box = np.array(corners) if corners else np.array([[-1.0, -1.0], [1.0, 1.0]])
@@ -270,30 +276,22 @@ def _draw_station(
         # A flat arrow shrinks as the station looks down.
         tip = place + station.rotation[:2, 0] * 0.22 * half
         axes.plot(*place, "o", color=SCENE_COLOR, ms=6, zorder=4)
-        above = tip[1] < place[1]
-        label_at, shift = place, 7 if above else -7
+        label_at, shift = place, 13 if tip[1] < place[1] else -13
     else:
         away = place - middle
-        label += f"\n{float(np.linalg.norm(away)):.3g} {unit}"
+        label += f"\n{float(np.linalg.norm(away)):.2g} {unit}"
         tip = middle + away * 0.98 * half / np.max(np.abs(away))
         place = tip - 0.09 * half * away / np.linalg.norm(away)
-        above = tip[1] < middle[1]
-        # Beside the arrow, on the side of the middle of the margin that it runs along.
-        label_at = middle + (tip - middle) * 0.9
-        shift = 10 if above else -10
-    axes.annotate(
-        "",
-        xy=(tip[0], tip[1]),
-        xytext=(place[0], place[1]),
-        arrowprops={"arrowstyle": "-|>", "color": SCENE_COLOR, "shrinkA": 0, "shrinkB": 0},
-    )
+        label_at, shift = middle + (tip - middle) * 0.82, 0
+    look = {"arrowstyle": "-|>", "color": SCENE_COLOR, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", xy=(tip[0], tip[1]), xytext=(place[0], place[1]), arrowprops=look)
     axes.annotate(
         label,
         (label_at[0], label_at[1]),
         xytext=(0, shift),
         textcoords="offset points",
         ha="center",
-        va="bottom" if above else "top",
+        va="center",
         fontsize=8,
     )
 
@@ -381,7 +379,7 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
         text += f", MAE {_mm(evaluation.mae)}, RMSE {_mm(evaluation.rmse)}"
         text += f" (alignment: {evaluation.align}, time offset: {evaluation.offset_source})"
     notes = textwrap.wrap("; ".join(solution.notes), 160, max_lines=2, placeholder=" ...")
-    return "\n".join(textwrap.wrap(text, 160) + notes)
+    return _plain("\n".join(textwrap.wrap(text, 160) + notes))
 
 
 def _mm(metres: float) -> str:
@@ -391,4 +389,10 @@ def _mm(metres: float) -> str:
 
 
 def _short(name: str) -> str:
-    return textwrap.shorten(name, 18, placeholder="...") if " " in name else name[:18]
+    # A leading underscore would hide it from the legend.
+    return _plain((name if len(name) <= 18 else f"{name[:7]}...{name[-8:]}").lstrip("_") or "_ ")
+
+
+def _plain(text: str) -> str:
+    """Text in which a dollar is a dollar, not the start of a formula."""
+    return text.replace("$", r"\$")

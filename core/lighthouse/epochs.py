@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.lighthouse.angles import counts_to_angles
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
 from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
 
@@ -277,3 +278,11 @@ def _drop_spikes(epochs: Epochs) -> None:
 def _note(rejected: dict[str, int], reason: str, number: int | np.signedinteger) -> None:
     if number:
         rejected[reason] = rejected.get(reason, 0) + int(number)
+
+
+def angles_of(epochs: Epochs) -> NDArray[np.float64]:
+    """Rotor angles (m, s, 2) of epochs, in radians."""
+    angles = np.empty_like(epochs.counts)
+    for i, channel in enumerate(epochs.channels):
+        angles[:, i] = counts_to_angles(epochs.counts[:, i], int(channel))
+    return angles

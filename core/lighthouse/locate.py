@@ -70,7 +70,7 @@ def locate(
     calibrations: tuple[Calibration, ...],
     *,
     floor_z: float | None = None,
-    passes: int = 3,
+    passes: int = 2,
 ) -> Fixes:
     """Where photodiodes are that saw the given rotor angles.
 
@@ -86,7 +86,7 @@ def locate(
     floor_z : float, optional
         Height of all photodiodes, where they move on a plane.
     passes : int
-        Linear solves; the weights settle after the second.
+        Linear solves: the first has rough weights, the second those of its positions.
 
     Returns
     -------

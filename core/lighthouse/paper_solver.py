@@ -14,6 +14,7 @@ from locatk.core.lighthouse import paper
 from locatk.core.lighthouse.angles import angles_to_counts, paper_image_points
 from locatk.core.lighthouse.calibration import IDEAL
 from locatk.core.lighthouse.epochs import Epochs
+from locatk.core.lighthouse.poses import detections
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -39,8 +40,6 @@ def solve_as_paper(job: Job) -> Solution:
     One station: floor positions through markers. Two: the kind must be known (``--scene``;
     planar where the scene does not say), scale from markers or a distance, else unit.
     """
-    from locatk.core.lighthouse.solver import detections
-
     kind = job.kind
     if kind == "two-auto":
         kind = "two-planar"

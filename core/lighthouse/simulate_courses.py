@@ -32,7 +32,7 @@ class Curve:
     """
 
     ORDERS = np.array([1, -1, 2, -2, 3])
-    HARMONICS = 0.8
+    HARMONICS = 0.6
     NODES = 4096
 
     def __init__(self, rng: np.random.Generator, planar: bool) -> None:

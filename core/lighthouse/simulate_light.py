@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.angles import ROTOR_ZERO, angles_to_counts
 from locatk.core.lighthouse.calibration import predict_angles
+from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.scene import Station
 from locatk.core.lighthouse.simulate_courses import Course
 
@@ -70,6 +71,8 @@ class Light:
         angle = np.where(lit, angle + noise, np.nan)
         turn = (angle - ROTOR_ZERO) / (2 * np.pi)
         count = np.rint(angles_to_counts(angle, self.station.channel))
+        # Only noise beyond all measure leaves the rotation.
+        count[(count < 0) | (count >= period_counts(self.station.channel))] = np.nan
         return start_s[:, None] + turn * self.period_s, count
 
 

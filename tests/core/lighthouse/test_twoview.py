@@ -96,12 +96,9 @@ def test_one_motion_behind_a_homography_is_the_true_one(flat: Views) -> None:
     normal = -flat.up / flat.height
     assert any(
         np.allclose(r, flat.rotation, atol=1e-7)
-        and np.allclose(t / np.linalg.norm(normal) * np.linalg.norm(n), flat.translation / 1.0,
-                        atol=1e-6)
-        or np.allclose(r, flat.rotation, atol=1e-7)
         and np.allclose(np.outer(t, n), np.outer(flat.translation, normal), atol=1e-6)
         for r, t, n in motions
-    )  # fmt: skip
+    )
     for rotation, _, _ in motions:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(rotation) == pytest.approx(1)
@@ -195,13 +192,15 @@ def test_consensus_finds_who_agrees(world: Any, n: int) -> None:
         _, agreed = agree(views.a, b)
         assert agreed[~wrong].all()
         # A ray that slips along its own epipolar line shows nothing.
-        assert np.count_nonzero(agreed[wrong]) <= (0 if is_flat else 0.15 * wrong.sum() + 1)
+        assert np.count_nonzero(agreed[wrong]) <= (0 if is_flat else 0.25 * wrong.sum())
 
 
 def test_upright_motions_are_near_the_true_one(world: Any) -> None:
     first, second = world.lamps(1, 2)
     points = world.curve(9, flat=False)
-    level = [world.look(s.position, s.position + s.rotation[:, 0] * [1, 1, 0]) for s in (first, second)]
+    level = [
+        world.look(s.position, s.position + s.rotation[:, 0] * [1, 1, 0]) for s in (first, second)
+    ]
     a, b = ((points - s.position) @ r for s, r in zip((first, second), level, strict=True))
     rotation = level[1].T @ level[0]
     direction = level[1].T @ (first.position - second.position)

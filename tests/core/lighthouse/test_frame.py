@@ -1,0 +1,199 @@
+"""Scale and frame: markers, distances, odometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.errors import DegenerateError, InputError
+from locatk.core.geometry import Similarity, rotation_exp
+from locatk.core.lighthouse import frame
+from locatk.core.lighthouse.bundle import Rig
+from locatk.core.lighthouse.epochs import group
+from locatk.core.lighthouse.generic import GENERIC
+from locatk.core.lighthouse.scene import Distance, Sighting
+from locatk.core.lighthouse.solver import angles_of
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+SECOND = 1_000_000_000
+
+
+class Recorded:
+    """A receiver that stays 3 s on each marker, and a rig in a unit of its own."""
+
+    def __init__(self, world: Any) -> None:
+        plain = (world.Plane(), world.Plane())
+        self.lamps = tuple(replace(s, planes=plain) for s in world.lamps(1, 2))
+        self.places = world.square
+        self.drive = world.drive(self.lamps, np.repeat(self.places, 30, axis=0))
+        self.epochs = group(self.drive.sweeps)
+        self.angles = angles_of(self.epochs)
+        self.to = Similarity(0.2, rotation_exp(np.array([0.0, 0.0, 0.7])), np.array([3.0, 1, 0]))
+        ideal = replace(GENERIC, sweeps=np.zeros((2, 7)))
+        self.rig = frame.moved(
+            Rig(
+                np.stack([s.position for s in self.lamps]),
+                np.stack([s.rotation for s in self.lamps]),
+                (ideal, ideal),
+                self.places,
+            ),
+            self.to,
+        )
+
+    def stay(self, k: int) -> Sighting:
+        start = int(self.drive.time_ns[30 * k])
+        return Sighting("robot", start, start + int(2.9 * SECOND))
+
+
+@pytest.fixture(scope="module")
+def recorded(world: Any) -> Recorded:
+    return Recorded(world)
+
+
+def test_sighting_by_time_is_the_median_of_its_time(recorded: Recorded) -> None:
+    for k in range(4):
+        seen = frame.sighted_angles(recorded.stay(k), recorded.epochs, recorded.angles)
+        np.testing.assert_allclose(
+            seen, np.median(recorded.angles[30 * k : 30 * k + 30], axis=0), atol=1e-12
+        )
+
+
+def test_sighting_by_counts_takes_either_order(recorded: Recorded) -> None:
+    counts = {1: (80_000.0, 41_000.0), 9: (1.0, 2.0)}
+    seen = frame.sighted_angles(Sighting(counts=counts), recorded.epochs, recorded.angles)
+    same = frame.sighted_angles(
+        Sighting(counts={1: (41_000.0, 80_000.0)}), recorded.epochs, recorded.angles
+    )
+    np.testing.assert_array_equal(seen, same)
+    assert np.isfinite(seen[0]).all()
+    assert np.isnan(seen[1]).all()
+    assert abs(seen[0]).max() < 0.2
+
+
+def test_a_sighting_outside_the_recording_shows_nothing(recorded: Recorded) -> None:
+    early = Sighting("robot", 0, 10)
+    assert np.isnan(frame.sighted_angles(early, recorded.epochs, recorded.angles)).all()
+
+
+def test_an_unknown_device_is_named(recorded: Recorded) -> None:
+    with pytest.raises(InputError, match="'green'") as refused:
+        frame.sighted_angles(Sighting("green", 0, 1), recorded.epochs, recorded.angles)
+    assert "robot" in str(refused.value.hint)
+
+
+def test_markers_bring_the_rig_home(recorded: Recorded, world: Any) -> None:
+    markers = world.markers_of(recorded.lamps, recorded.places)
+    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
+    np.testing.assert_array_equal(known, recorded.places)
+    to = frame.place_on_markers(recorded.rig, True, known, seen)
+    home = frame.moved(recorded.rig, to)
+    for k, lamp in enumerate(recorded.lamps):
+        np.testing.assert_allclose(home.positions[k], lamp.position, atol=1e-5)
+        np.testing.assert_allclose(home.rotations[k], lamp.rotation, atol=1e-5)
+    np.testing.assert_allclose(home.points, recorded.places, atol=1e-5)
+
+
+def test_several_markers_average_the_error_of_one(recorded: Recorded, world: Any) -> None:
+    # facts/lighthouse.md 4.4: a frame from one origin sample is the peers' largest error.
+    places = np.array([[x, y, 0.0] for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)])
+    markers = world.markers_of(recorded.lamps, places)
+    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
+    moved = known.copy()
+    moved[0, 0] += 0.03  # measured badly
+    to = frame.place_on_markers(recorded.rig, True, moved, seen)
+    home = frame.moved(recorded.rig, to)
+    assert np.max(np.abs(home.points - recorded.places)) < 0.012
+
+
+@pytest.mark.parametrize("kind", ["two", "line", "one place"])
+def test_too_few_markers_are_refused(recorded: Recorded, world: Any, kind: str) -> None:
+    places = {
+        "two": world.square[:2],
+        "line": np.linspace([-0.5, -0.2, 0], [0.5, 0.3, 0], 5),
+        "one place": np.zeros((4, 3)),
+    }[kind]
+    markers = world.markers_of(recorded.lamps, places)
+    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
+    with pytest.raises(DegenerateError) as refused:
+        frame.place_on_markers(recorded.rig, True, known, seen)
+    assert refused.value.hint
+
+
+def test_no_sighting_is_no_marker(recorded: Recorded) -> None:
+    known, seen = frame.sighted_markers([], recorded.epochs, recorded.angles)
+    assert known.shape == (0, 3)
+    assert seen.shape == (0, 2, 2)
+
+
+def test_distances_give_the_scale(recorded: Recorded) -> None:
+    def scale(*distances: Distance) -> float:
+        return frame.scale_of_distances(
+            recorded.rig, True, distances, recorded.epochs, recorded.angles
+        )
+
+    edge = Distance(recorded.stay(0), recorded.stay(1), 1.0)
+    diagonal = Distance(recorded.stay(0), recorded.stay(2), np.sqrt(2))
+    assert scale(edge) == pytest.approx(5, rel=2e-3)
+    assert scale(edge, diagonal) == pytest.approx(5, rel=2e-3)
+    # Of two that disagree the longer says more.
+    wrong = replace(edge, distance=1.1)
+    assert 5 < scale(wrong, diagonal) < 5.25
+
+
+def test_distances_nobody_saw_are_refused(recorded: Recorded) -> None:
+    unseen = Distance(recorded.stay(0), Sighting("robot", 0, 1), 1.0)
+    with pytest.raises(DegenerateError) as refused:
+        frame.scale_of_distances(recorded.rig, True, [unseen], recorded.epochs, recorded.angles)
+    assert refused.value.hint
+
+
+def drift(points: Array, seed: int, share: float = 0.05) -> Array:
+    """Odometry of a drive: every step off by some per cent, the heading wanders."""
+    rng = np.random.default_rng(seed)
+    steps = np.diff(points, axis=0) * (1 + share * rng.normal(size=(len(points) - 1, 1)))
+    turn = np.cumsum(rng.normal(0, 0.01, len(steps)))
+    cos, sin = np.cos(turn), np.sin(turn)
+    x = cos * steps[:, 0] - sin * steps[:, 1]
+    y = sin * steps[:, 0] + cos * steps[:, 1]
+    walked = np.cumsum(np.stack([x, y, steps[:, 2]], axis=1), axis=0)
+    return np.concatenate([np.zeros((1, 3)), walked])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_odometry_gives_the_scale_in_spite_of_drift(world: Any, seed: int) -> None:
+    points = world.curve(300, flat=True)
+    when = world.start_ns + np.arange(300) * SECOND // 10
+    track = Trajectory.from_positions("robot", "odom", when + 7_000_000, drift(points, seed))
+    # The heading has wandered far by the end; the metres have not.
+    assert np.linalg.norm(track.position[-1] - (points[-1] - points[0])) > 0.02
+    found = frame.scale_of_odometry(
+        points / 5, when, np.zeros(300, np.int64), ["robot"], [track]
+    )
+    assert found == pytest.approx(5, rel=0.02)
+
+
+def test_odometry_of_another_or_of_no_motion_says_nothing(world: Any) -> None:
+    points = world.curve(100, flat=True)
+    when = world.start_ns + np.arange(100) * SECOND // 10
+    device = np.zeros(100, np.int64)
+    track = Trajectory.from_positions("blue", "odom", when, points)
+    assert frame.scale_of_odometry(points, when, device, ["robot"], [track]) is None
+    still = Trajectory.from_positions("robot", "odom", when, np.zeros((100, 3)))
+    assert frame.scale_of_odometry(points, when, device, ["robot"], [still]) is None
+    short = Trajectory.from_positions("robot", "odom", when[:1], points[:1])
+    assert frame.scale_of_odometry(points, when, device, ["robot"], [short]) is None
+    assert frame.scale_of_odometry(points, when, device, ["robot"], []) is None
+
+
+def test_scaling_is_moving() -> None:
+    rig = Rig(np.ones((2, 3)), np.stack([np.eye(3)] * 2), (GENERIC, GENERIC), np.ones((4, 3)))
+    big = frame.scaled(rig, 3.0)
+    np.testing.assert_array_equal(big.positions, 3 * np.ones((2, 3)))
+    np.testing.assert_array_equal(big.points, 3 * np.ones((4, 3)))
+    np.testing.assert_array_equal(big.rotations, rig.rotations)
