@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+POOL = 256
+"""Correspondences from which samples are drawn, at most: enough to be fair, and it bounds
+the memory."""
+
+
 def consensus(
     fit: Callable[[Array, Array], Array],
     residuals: Callable[[Array, Array, Array], Array],
@@ -52,11 +57,9 @@ def consensus(
     """
     rng = np.random.default_rng(seed)
     n = len(a)
-    picks = np.argsort(rng.random((trials, n)) if n < 64 else rng.random((trials, 64)), axis=1)
-    picks = picks[:, :sample]
-    if n >= 64:
-        # Large sets: a sample of a sample keeps the memory small.
-        picks = rng.integers(0, n, (trials, 64))[np.arange(trials)[:, None], picks]
+    pool = rng.permutation(n)[:POOL]
+    dice = rng.random((trials, len(pool)))
+    picks = pool[np.argpartition(dice, min(sample, len(pool)) - 1, axis=1)[:, :sample]]
     scored = np.linspace(0, n - 1, min(n, 600)).astype(int)
     models = fit(a[picks], b[picks])
     errors = np.abs(residuals(models, a[scored], b[scored]))

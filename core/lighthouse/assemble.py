@@ -18,6 +18,7 @@ from locatk.core.lighthouse.angles import rays as rays_of
 from locatk.core.lighthouse.bundle import Adjustment, Rig, adjust
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.locate import Fixes, locate
+from locatk.core.lighthouse.places import SAME_PLACE, require_places
 from locatk.core.lighthouse.resection import resect_in_space, resect_on_plane
 
 Array = NDArray[np.float64]
@@ -33,9 +34,6 @@ MANY = 60
 CERTAIN = 1.5e-4
 """With so many places, and a residual (rms, in radians) at the noise of a standing
 receiver, a start is taken without trying the others."""
-
-SAME_PLACE = 1e-3
-"""Rays closer than this (as tangents) saw one place: 2 mm at 2 m."""
 
 FLAT = 3e-3
 """Median miss of a homography, as a tangent, up to which a scene counts as planar."""
@@ -104,12 +102,12 @@ def assemble(
     i, j = _best_pair(seen)
     joint = np.flatnonzero(seen[:, i] & seen[:, j])
     a, b = rays[joint, i], rays[joint, j]
-    _require_places(a, b, 4)
+    require_places(a, b, 4)
 
     facts: dict[str, object] = {}
     flat, on_plane = twoview.agree_on_plane(a, b, seed)
     planar, agreed = _decide(a, b, flat, on_plane, planar, seed, facts)
-    _require_places(a[agreed], b[agreed], 4 if planar else 8)
+    require_places(a[agreed], b[agreed], 4 if planar else 8)
     if not planar:
         miss = twoview.homography_residuals(
             twoview.fit_homography(a[agreed], b[agreed]), a[agreed], b[agreed]
@@ -147,34 +145,6 @@ def _best_pair(seen: NDArray[np.bool_]) -> tuple[int, int]:
             hint="put the stations so that their views overlap",
         )
     return pair
-
-
-def _require_places(a: Array, b: Array, number: int) -> None:
-    """Refuse views with fewer distinct places than needed, or all on one line."""
-    cells = np.unique(np.rint(np.c_[a[:, 1:], b[:, 1:]] / SAME_PLACE), axis=0)
-    spread = (
-        np.linalg.svd(
-            np.c_[a[:, 1:], b[:, 1:]] - np.mean(np.c_[a[:, 1:], b[:, 1:]], axis=0), compute_uv=False
-        )
-        / np.sqrt(max(len(a), 1))
-        if len(a)
-        else np.zeros(4)
-    )
-    if len(a) == 0 or spread[0] < 2 * SAME_PLACE:
-        raise DegenerateError(
-            "the photodiodes stood still: one place does not determine a scene",
-            hint="drive around while recording",
-        )
-    if len(cells) < number:
-        raise DegenerateError(
-            f"{len(cells)} places seen by two stations do not determine a scene",
-            hint=f"record at least {number} places, better 20",
-        )
-    if len(spread) < 2 or spread[1] < SAME_PLACE:
-        raise DegenerateError(
-            "all places lie on one line, which does not determine a scene",
-            hint="drive a curve while recording",
-        )
 
 
 def _decide(

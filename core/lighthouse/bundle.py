@@ -143,9 +143,12 @@ def adjust(
             if damping > 1e6:
                 break
     reduced, _, _ = _reduce(system, 0.0, dims)
-    reduced = _hold_gauge(reduced, rig, planar, dims)
     # Held directions and frozen calibrations carry no information of their own.
-    covariance = np.linalg.pinv(reduced, hermitian=True)
+    loose = np.eye(len(reduced))
+    if dims:
+        basis = _gauge(rig, planar)
+        loose -= basis @ basis.T
+    covariance = loose @ np.linalg.pinv(loose @ reduced @ loose, hermitian=True) @ loose
     s = len(rig.positions)
     blocks = covariance.reshape(s, STATION_UNKNOWNS, s, STATION_UNKNOWNS)
     return Adjustment(
@@ -287,6 +290,12 @@ def _hold_gauge(matrix: Array, rig: Rig, planar: bool, dims: int) -> Array:
     """Add a penalty on moving, turning and scaling the whole rig."""
     if not dims:
         return matrix
+    basis = _gauge(rig, planar)
+    return matrix + np.max(np.diag(matrix)) * basis @ basis.T
+
+
+def _gauge(rig: Rig, planar: bool) -> Array:
+    """(s * 10, g) orthonormal directions of the unknowns that no angle depends on."""
     s = len(rig.positions)
     motions = []
     for axis in range(2 if planar else 3):
@@ -302,8 +311,7 @@ def _hold_gauge(matrix: Array, rig: Rig, planar: bool, dims: int) -> Array:
     growth = np.zeros((s, STATION_UNKNOWNS))
     growth[:, 0:3] = rig.positions
     motions.append(growth)
-    basis = np.linalg.qr(np.stack([g.ravel() for g in motions], axis=1))[0]
-    return matrix + np.max(np.diag(matrix)) * basis @ basis.T
+    return np.linalg.qr(np.stack([g.ravel() for g in motions], axis=1))[0]
 
 
 def _step(system: _System, rig: Rig, damping: float, planar: bool, dims: int) -> Rig:

@@ -20,6 +20,11 @@ PAIR_NS = 10_500_000
 """The second plane of a rotation follows the first within this time; the first of the next
 rotation comes later than that after the second. (Half a rotation, and a little.)"""
 
+CLOSEST_TURN = 0.125
+FARTHEST_TURN = 0.55
+"""By how much of a turn the second plane can follow the first: a third, less or more by
+what the elevation of the photodiode makes of two planes that are tilted apart."""
+
 WINDOW_NS = 30_000_000
 """Longest epoch: a report holds the last pair of each station, up to a rotation apart."""
 
@@ -90,7 +95,11 @@ def group(sweeps: Sweeps) -> Epochs:
     ]
     key, time, channel = key[order], sweeps.time_ns[order], sweeps.channel[order]
     count, stated = sweeps.count[order], sweeps.sweep[order]
-    pair, plane = _pair(key, channel, time, stated)
+    fresh = _not_repeated(key, channel, time, count, stated)
+    _note(rejected, "repeated_in_rotation", np.count_nonzero(~fresh))
+    key, time, channel = key[fresh], time[fresh], channel[fresh]
+    count, stated = count[fresh], stated[fresh]
+    pair, plane = _pair(key, channel, time, count, stated)
     _note(rejected, "plane_unknown", np.count_nonzero(plane == UNKNOWN))
 
     channels = np.unique(channel)
@@ -148,10 +157,19 @@ def _photodiodes(sweeps: Sweeps) -> tuple[NDArray[np.int64], list[str]]:
     return key, [f"{sweeps.devices[k // sensors]}/{k % sensors}" for k in present]
 
 
+def _not_repeated(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Which of the sorted sweeps differ in any column from the one before."""
+    changed = np.zeros(max(len(columns[0]) - 1, 0), bool)
+    for column in columns:
+        changed |= column[1:] != column[:-1]
+    return np.r_[True, changed][: len(columns[0])]
+
+
 def _pair(
     key: NDArray[np.int64],
     channel: NDArray[np.int32],
     time: NDArray[np.int64],
+    count: NDArray[np.float64],
     stated: NDArray[np.int32],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pair number and plane (0, 1, or -1 where nobody can tell) of each sweep.
@@ -165,7 +183,11 @@ def _pair(
     same = (np.diff(key) == 0) & (np.diff(channel) == 0)
     close = same & (np.diff(time) <= PAIR_NS)
     told = stated != UNKNOWN
-    in_order = np.where(told[:-1] & told[1:], stated[:-1] < stated[1:], ~(told[:-1] | told[1:]))
+    turn = np.diff(count) / period_counts(channel[1:])
+    apart = (turn > CLOSEST_TURN) & (turn < FARTHEST_TURN)
+    in_order = np.where(
+        told[:-1] & told[1:], stated[:-1] < stated[1:], ~(told[:-1] | told[1:]) & apart
+    )
     linked = np.r_[close & in_order, False]
     # In a chain of links every other one is a pair.
     head = np.r_[True, ~linked[:-1]]

@@ -15,6 +15,7 @@ from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.angles import plane_normals
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.locate import Fixes
+from locatk.core.lighthouse.resection import require_plane_map
 from locatk.core.lighthouse.twoview import GATE, fit_homography, homography_residuals
 from locatk.core.robust import consensus
 
@@ -34,13 +35,14 @@ def fit_floor_map(points: Array, rays: Array) -> Array:
     Raises
     ------
     DegenerateError
-        Fewer than four markers agree.
+        The markers do not determine a homography, or fewer than four of them agree.
 
     Notes
     -----
     DLT through four; through more, a consensus (RANSAC), refined by least squares of the
     angles with a soft loss.
     """
+    require_plane_map(points, rays)
     floor = np.c_[np.ones(len(points)), points]
     if len(points) == 4:
         return _inverse(fit_homography(floor, rays))

@@ -97,7 +97,13 @@ def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Simil
     good = np.isfinite(fixes.position[:, 0])
     if np.count_nonzero(good) < 3:
         return None
-    return umeyama(fixes.position[good], known[good])
+    try:
+        return umeyama(fixes.position[good], known[good])
+    except DegenerateError:
+        raise DegenerateError(
+            "the sighted markers lie on one line and do not fix a frame",
+            hint="add a marker off that line, or leave the markers out",
+        ) from None
 
 
 def scale_of_distances(

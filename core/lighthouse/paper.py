@@ -90,27 +90,40 @@ def two_planar(image: Array) -> PaperScene:
         rotation = (u @ turn @ vt) * np.sign(np.linalg.det(u @ vt))  # Eq. 7
         translation = e * v1 + sign * f * v3  # Eq. 9
         candidates.append((normal, rotation, translation))
-    normal, rotation, translation = _real_one(candidates, image)
+    normal, rotation, place = _real_one(candidates, image, zeta)
 
     def locate(points: Array) -> Array:
-        ray = np.c_[points[:, 0], np.ones(len(points))]
-        return (ray / (zeta * (ray @ normal))[:, None]) @ TO_STATION.T  # Eq. 11
+        return _on_plane(points[:, 0], normal, zeta) @ TO_STATION.T
 
-    return PaperScene(locate, _pair(rotation, translation))
+    second = (TO_STATION @ place, TO_STATION @ rotation.T @ TO_STATION.T)
+    return PaperScene(locate, ((np.zeros(3), np.eye(3)), second))
+
+
+def _on_plane(image: Array, normal: Array, zeta: float) -> Array:
+    """Eq. 11: where rays meet the plane, in the first station's image axes."""
+    ray = np.c_[image, np.ones(len(image))]
+    places: Array = ray / (zeta * (ray @ normal))[:, None]
+    return places
 
 
 def _real_one(
-    candidates: list[tuple[Array, Array, Array]], image: Array
+    candidates: list[tuple[Array, Array, Array]], image: Array, zeta: float
 ) -> tuple[Array, Array, Array]:
-    """The paper's conditions: the plane lies ahead of the camera and below it (n has a
-    fixed sign in its second element once depths are positive)."""
+    """The candidate that the paper's conditions choose.
+
+    The plane lies ahead of both cameras, and below cameras that stand upright: y is up in
+    the image, so that the normal that leads away from a camera points down in both views.
+    """
     ray = np.c_[image[:, 0], np.ones(len(image))]
-    fitting = []
-    for normal, rotation, translation in candidates:
-        sign = np.sign(np.median(ray @ normal))
-        fitting.append((sign * normal, rotation, sign * translation))
-    # y is up: the normal that faces away from an upright camera over a floor points down.
-    return min(fitting, key=lambda c: c[0][1])
+    ranked = []
+    for normal, rotation, place in candidates:
+        sign = 1.0 if np.median(ray @ normal) > 0 else -1.0
+        normal, place = sign * normal, sign * place
+        seen = (_on_plane(image[:, 0], normal, zeta) - place) @ rotation.T
+        behind = np.mean(seen[:, 2] <= 0) > 0.5
+        down = normal[1] + (rotation @ normal)[1]
+        ranked.append((bool(behind), float(down), (normal, rotation, place)))
+    return min(ranked, key=lambda r: r[:2])[2]
 
 
 def two_3d(image: Array) -> PaperScene:

@@ -14,6 +14,7 @@ from locatk.core.lighthouse import paper
 from locatk.core.lighthouse.angles import angles_to_counts, paper_image_points
 from locatk.core.lighthouse.calibration import IDEAL
 from locatk.core.lighthouse.epochs import Epochs
+from locatk.core.lighthouse.places import require_places
 from locatk.core.lighthouse.poses import detections
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.solution import Solution
@@ -62,11 +63,8 @@ def solve_as_paper(job: Job) -> Solution:
         solved = paper.one_planar(known[:, :2], sighted[:, 0])
         to, scale = Similarity.identity(), "markers"
     else:
-        if np.count_nonzero(seen) < 8:
-            raise DegenerateError(
-                f"{np.count_nonzero(seen)} moments seen by both stations do not fix a scene",
-                hint="record at least 8 places, better 20",
-            )
+        first, second = (np.insert(image[seen, k], 0, 1.0, axis=1) for k in (0, 1))
+        require_places(first, second, 4 if kind == "two-planar" else 8)
         solve = paper.two_planar if kind == "two-planar" else paper.two_3d
         solved = solve(image[seen])
         to, scale = _frame(job, solved, known, sighted)

@@ -9,11 +9,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import DegenerateError
+
 Array = NDArray[np.float64]
 
 STILL = 6e-4
 """Rotor angle by which a standing photodiode may seem to move, in radians: eleven LFSR
 steps, five standard deviations of the published scatter; a millimetre at 2 m."""
+
+
+SAME_PLACE = 1e-3
+"""Rays closer than this (as tangents) saw one place: 2 mm at 2 m."""
 
 
 def gather(angles: Array, device: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
@@ -49,3 +55,38 @@ def gather(angles: Array, device: NDArray[np.int64]) -> tuple[Array, NDArray[np.
     size = np.bincount(run)[:, None]
     places = np.add.reduceat(flat, first) / size
     return places.reshape(-1, *angles.shape[1:]), run
+
+
+def require_places(a: Array, b: Array, number: int) -> None:
+    """Refuse what cannot determine two stations.
+
+    Parameters
+    ----------
+    a, b : (n, 3) ndarray
+        Rays (1, y, z) in which two stations saw the same photodiodes.
+    number : int
+        Distinct places that are needed.
+
+    Raises
+    ------
+    DegenerateError
+        The photodiodes stood still, at too few places, or all on one line.
+    """
+    image = np.c_[a[:, 1:], b[:, 1:]]
+    if len(image) == 0 or np.max(np.ptp(image, axis=0)) < 3 * SAME_PLACE:
+        raise DegenerateError(
+            "the photodiodes stood still: one place does not determine a scene",
+            hint="drive around while recording",
+        )
+    places = len(np.unique(np.rint(image / SAME_PLACE), axis=0))
+    if places < number:
+        raise DegenerateError(
+            f"{places} places seen by two stations do not determine a scene",
+            hint=f"record at least {number} places, better 20",
+        )
+    spread = np.linalg.svd(image - image.mean(axis=0), compute_uv=False) / np.sqrt(len(image))
+    if spread[1] < SAME_PLACE:
+        raise DegenerateError(
+            "all places lie on one line, which does not determine a scene",
+            hint="drive a curve while recording",
+        )

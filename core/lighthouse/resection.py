@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
+from locatk.core.geometry import fit_homography as plane_homography
 from locatk.core.geometry import fit_plane
 from locatk.core.lighthouse.twoview import GATE, fit_homography, homography_residuals
 from locatk.core.robust import consensus
@@ -42,7 +43,7 @@ def resect_on_plane(points: Array, rays: Array) -> Pose:
     The homography from the plane to the rays has the translation and the first two columns
     of the inverse rotation as its columns (Zhang 2000, section 2.2).
     """
-    _require_spread(points, 4, 2, "markers on the floor, not on one line")
+    require_plane_map(points, rays)
     known = np.c_[np.ones(len(points)), points]
     if len(points) > 4:
         h, agreed = consensus(
@@ -102,6 +103,21 @@ def resect_in_space(points: Array, rays: Array) -> list[Pose]:
     return poses
 
 
+def require_plane_map(points: Array, rays: Array) -> None:
+    """Refuse floor points (n, 2) and rays (n, 3) that do not determine a homography.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than four, three of four on a line, or all in one place.
+    """
+    hint = "give four or more markers on the floor, no three of four on one line"
+    try:
+        plane_homography(points, rays[:, 1:] / rays[:, :1])
+    except DegenerateError as error:
+        raise DegenerateError(str(error), hint=hint) from None
+
+
 def _fit_projection(known: Array, rays: Array) -> Array:
     """Projections (..., 3, 4) with rays ~ P known, by direct linear transform."""
     zero = np.zeros_like(known)
@@ -128,5 +144,5 @@ def _require_spread(points: Array, number: int, rank: int, what: str) -> None:
             hint=f"give at least {number} {what}",
         )
     sizes = np.linalg.svd(points - points.mean(axis=0))[1]
-    if sizes[rank - 1] < 1e-3 * sizes[0]:
+    if sizes[rank - 1] <= 1e-3 * sizes[0]:
         raise DegenerateError("the known points do not span the space", hint=f"give {what}")

@@ -16,7 +16,7 @@ from locatk.core.lighthouse.bundle import Rig
 from locatk.core.lighthouse.epochs import group
 from locatk.core.lighthouse.generic import GENERIC
 from locatk.core.lighthouse.scene import Distance, Sighting
-from locatk.core.lighthouse.solver import angles_of
+from locatk.core.lighthouse.epochs import angles_of
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -92,6 +92,7 @@ def test_markers_bring_the_rig_home(recorded: Recorded, world: Any) -> None:
     known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
     np.testing.assert_array_equal(known, recorded.places)
     to = frame.place_on_markers(recorded.rig, True, known, seen)
+    assert to is not None
     home = frame.moved(recorded.rig, to)
     for k, lamp in enumerate(recorded.lamps):
         np.testing.assert_allclose(home.positions[k], lamp.position, atol=1e-5)
@@ -107,20 +108,26 @@ def test_several_markers_average_the_error_of_one(recorded: Recorded, world: Any
     moved = known.copy()
     moved[0, 0] += 0.03  # measured badly
     to = frame.place_on_markers(recorded.rig, True, moved, seen)
+    assert to is not None
     home = frame.moved(recorded.rig, to)
     assert np.max(np.abs(home.points - recorded.places)) < 0.012
 
 
-@pytest.mark.parametrize("kind", ["two", "line", "one place"])
-def test_too_few_markers_are_refused(recorded: Recorded, world: Any, kind: str) -> None:
+def test_two_markers_fix_no_frame(recorded: Recorded, world: Any) -> None:
+    markers = world.markers_of(recorded.lamps, world.square[:2])
+    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
+    assert frame.place_on_markers(recorded.rig, True, known, seen) is None
+
+
+@pytest.mark.parametrize("kind", ["line", "one place"])
+def test_markers_on_a_line_are_refused(recorded: Recorded, world: Any, kind: str) -> None:
     places = {
-        "two": world.square[:2],
         "line": np.linspace([-0.5, -0.2, 0], [0.5, 0.3, 0], 5),
         "one place": np.zeros((4, 3)),
     }[kind]
     markers = world.markers_of(recorded.lamps, places)
     known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
-    with pytest.raises(DegenerateError) as refused:
+    with pytest.raises(DegenerateError, match="marker") as refused:
         frame.place_on_markers(recorded.rig, True, known, seen)
     assert refused.value.hint
 
@@ -191,9 +198,22 @@ def test_odometry_of_another_or_of_no_motion_says_nothing(world: Any) -> None:
     assert frame.scale_of_odometry(points, when, device, ["robot"], []) is None
 
 
-def test_scaling_is_moving() -> None:
-    rig = Rig(np.ones((2, 3)), np.stack([np.eye(3)] * 2), (GENERIC, GENERIC), np.ones((4, 3)))
-    big = frame.scaled(rig, 3.0)
-    np.testing.assert_array_equal(big.positions, 3 * np.ones((2, 3)))
-    np.testing.assert_array_equal(big.points, 3 * np.ones((4, 3)))
-    np.testing.assert_array_equal(big.rotations, rig.rotations)
+def test_a_rig_of_its_own_stands_at_its_first_station(recorded: Recorded) -> None:
+    for planar in (True, False):
+        to = frame.at_first_station(recorded.rig, planar, 5.0)
+        home = frame.moved(recorded.rig, to)
+        true = np.stack([s.position for s in recorded.lamps])
+        np.testing.assert_allclose(
+            np.linalg.norm(home.positions[1] - home.positions[0]),
+            np.linalg.norm(true[1] - true[0]),
+            rtol=1e-9,
+        )
+        forward = home.rotations[0][:, 0]
+        if planar:
+            np.testing.assert_allclose(home.positions[0], [0, 0, true[0, 2]], atol=1e-9)
+            np.testing.assert_allclose(home.points[:, 2], 0, atol=1e-9)
+            assert abs(forward[1]) < 1e-9
+            assert forward[0] > 0
+        else:
+            np.testing.assert_allclose(home.positions[0], 0, atol=1e-9)
+            np.testing.assert_allclose(home.rotations[0], np.eye(3), atol=1e-9)
