@@ -35,6 +35,9 @@ CERTAIN = 1.5e-4
 """With so many places, and a residual (rms, in radians) at the noise of a standing
 receiver, a start is taken without trying the others."""
 
+LEAST_BASELINE = 0.02
+"""Distance of two stations, as a share of their distance from the plane of the robots."""
+
 FLAT = 3e-3
 """Median miss of a homography, as a tangent, up to which a scene counts as planar."""
 
@@ -102,7 +105,7 @@ def assemble(
     i, j = _best_pair(seen)
     joint = np.flatnonzero(seen[:, i] & seen[:, j])
     a, b = rays[joint, i], rays[joint, j]
-    require_places(a, b, 4)
+    require_places(a, b, 5 if planar is None else 4 if planar else 8)
 
     facts: dict[str, object] = {}
     flat, on_plane = twoview.agree_on_plane(a, b, seed)
@@ -117,6 +120,7 @@ def assemble(
                 "all places lie on one plane, which does not determine a scene in space",
                 hint="move the photodiode up and down as well, or use --scene two-planar",
             )
+    _require_baseline(a[agreed], b[agreed])
     pair = (calibrations[i], calibrations[j])
     starts = (
         _planar_starts(a[agreed], b[agreed], pair)
@@ -145,6 +149,19 @@ def _best_pair(seen: NDArray[np.bool_]) -> tuple[int, int]:
             hint="put the stations so that their views overlap",
         )
     return pair
+
+
+def _require_baseline(a: Array, b: Array) -> None:
+    """Refuse two stations at one place: their views then differ by a turn alone."""
+    h = twoview.fit_homography(a, b)
+    if np.median(twoview.homography_residuals(h, a, b)) > FLAT:
+        return
+    stretch = np.linalg.svd(h, compute_uv=False)
+    if stretch[0] - stretch[2] < LEAST_BASELINE * stretch[1]:
+        raise DegenerateError(
+            "two stations stand at one place, which does not determine a scene",
+            hint="move them apart, best by as much as they are away from the robots",
+        )
 
 
 def _decide(

@@ -70,7 +70,7 @@ def locate(
     calibrations: tuple[Calibration, ...],
     *,
     floor_z: float | None = None,
-    passes: int = 2,
+    passes: int = 3,
 ) -> Fixes:
     """Where photodiodes are that saw the given rotor angles.
 
@@ -86,7 +86,7 @@ def locate(
     floor_z : float, optional
         Height of all photodiodes, where they move on a plane.
     passes : int
-        Linear solves: the first has rough weights, the second those of its positions.
+        Linear solves: the first has rough weights, the others those of the positions before.
 
     Returns
     -------

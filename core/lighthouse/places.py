@@ -78,15 +78,25 @@ def require_places(a: Array, b: Array, number: int) -> None:
             "the photodiodes stood still: one place does not determine a scene",
             hint="drive around while recording",
         )
-    places = len(np.unique(np.rint(image / SAME_PLACE), axis=0))
+    places = _count_places(image, number)
     if places < number:
         raise DegenerateError(
             f"{places} places seen by two stations do not determine a scene",
             hint=f"record at least {number} places, better 20",
         )
-    spread = np.linalg.svd(image - image.mean(axis=0), compute_uv=False) / np.sqrt(len(image))
-    if spread[1] < SAME_PLACE:
-        raise DegenerateError(
-            "all places lie on one line, which does not determine a scene",
-            hint="drive a curve while recording",
-        )
+    for view in (image[:, :2], image[:, 2:]):
+        spread = np.linalg.svd(view - view.mean(axis=0), compute_uv=False) / np.sqrt(len(view))
+        if spread[1] < max(SAME_PLACE, 0.01 * spread[0]):
+            raise DegenerateError(
+                "all places lie on one line, which does not determine a scene",
+                hint="drive a curve while recording",
+            )
+
+
+def _count_places(image: Array, enough: int) -> int:
+    """How many points (n, 4) differ by more than :data:`SAME_PLACE`, up to ``enough``."""
+    left, found = image, 0
+    while len(left) and found < enough:
+        found += 1
+        left = left[np.max(np.abs(left - left[0]), axis=1) > SAME_PLACE]
+    return found

@@ -113,9 +113,18 @@ def require_plane_map(points: Array, rays: Array) -> None:
     """
     hint = "give four or more markers on the floor, no three of four on one line"
     try:
-        plane_homography(points, rays[:, 1:] / rays[:, :1])
+        h = plane_homography(_unit(points), _unit(rays[:, 1:] / rays[:, :1]))
     except DegenerateError as error:
         raise DegenerateError(str(error), hint=hint) from None
+    sizes = np.linalg.svd(h, compute_uv=False)
+    if sizes[2] < 1e-4 * sizes[0]:
+        raise DegenerateError("too many of the markers lie on one line", hint=hint)
+
+
+def _unit(points: Array) -> Array:
+    """Points (n, 2) about their middle, in units of their spread."""
+    spread = points.std() if len(points) else 0.0
+    return (points - points.mean(axis=0)) / spread if spread > 0 else points
 
 
 def _fit_projection(known: Array, rays: Array) -> Array:

@@ -99,12 +99,19 @@ def solve(
             + (", ".join(f"{n} {r}" for r, n in epochs.rejected.items()) or "nothing"),
         )
     job = Job(epochs, scene, options, odometry)
+    if scene.stations:
+        known = job.known_scene()
+        if options.method == "paper":
+            raise InputError(
+                "the paper's method solves its own scene and takes none with stations",
+                hint="leave --artifact or --method paper out",
+            )
+        return poses.answer(job, known)
     if options.method == "paper":
         from locatk.core.lighthouse.paper_solver import solve_as_paper
 
         return solve_as_paper(job)
-    solved = job.known_scene() if scene.stations else job.solve_scene()
-    return poses.answer(job, solved)
+    return poses.answer(job, job.solve_scene())
 
 
 @dataclass

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.errors import DegenerateError, InputError, LocatkError
+from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import Similarity, rotation_exp, umeyama
+from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.poses import REACH_M
 from locatk.core.lighthouse.scene import Distance, Scene, Sighting
 from locatk.core.lighthouse.solver import SolveOptions, solve
@@ -231,10 +232,41 @@ def test_a_scene_of_other_stations_is_refused(world: Any) -> None:
     lamps = world.lamps(1, 2)
     artifact = strict(world.drive(lamps, world.curve(60, flat=True)).sweeps).artifact
     other = world.drive(world.lamps(5, 16), world.curve(60, flat=True))
-    for method in ("bundle", "paper"):
-        with pytest.raises(LocatkError, match="stations") as refused:
-            strict(other.sweeps, artifact, method=method)
-        assert "5" in str(refused.value.hint)
+    with pytest.raises(DegenerateError, match="stations") as refused:
+        strict(other.sweeps, artifact)
+    assert "5" in str(refused.value.hint)
+
+
+def test_the_papers_method_does_not_pass_over_a_solved_scene_in_silence(world: Any) -> None:
+    lamps = world.lamps(2, 16)
+    drive = world.drive(lamps, world.curve(60, flat=True))
+    artifact = strict(drive.sweeps, marked(world, lamps)).artifact
+    try:
+        solution = strict(drive.sweeps, artifact, method="paper")
+    except InputError:
+        return
+    assert any("scene" in note and "not" in note for note in solution.notes)
+
+
+def test_factory_calibration_of_stations_is_used_as_it_is(world: Any) -> None:
+    lamps = world.lamps(1, 2)
+    names = ("phase", "tilt", "curve", "gibmag", "gibpha", "ogeemag", "ogeephase")
+    calibrations = {
+        lamp.channel: Calibration(
+            np.array([[getattr(plane, name) for name in names] for plane in lamp.planes]),
+            "factory",
+        )
+        for lamp in lamps
+    }
+    for flat in (True, False):
+        drive = world.drive(lamps, world.curve(200, flat=flat))
+        guessed = strict(drive.sweeps, marked(world, lamps))
+        known = strict(drive.sweeps, replace(marked(world, lamps), calibrations=calibrations))
+        for station in known.artifact.stations:
+            assert station.calibration is calibrations[station.channel]
+        assert not any("generic" in note for note in known.notes)
+        assert errors(known, drive).mean() < errors(guessed, drive).mean()
+        assert errors(known, drive).mean() < (5e-4 if flat else 1.5e-3)
 
 
 # ---- order, labels, seeds
