@@ -38,7 +38,7 @@ GATE = 0.01
 at half a metre a second moves between the sweeps of two stations, and a third of a
 demodulation error."""
 
-GATE_SIGMAS = 12.0
+GATE_SIGMAS = 8.0
 FINEST_GATE = 1.5e-3
 """The gate follows the noise of the recording at this many standard deviations, but stays
 above what a generic calibration leaves unmodelled."""
@@ -120,8 +120,8 @@ def answer(job: Job, scene: Scene) -> Solution:
 def _gate(fixes: Fixes) -> float:
     """Angle by which a plane may miss its position, in radians: far out in what the
     recording itself shows, and never more than :data:`GATE`."""
-    checked = fixes.residual[(fixes.freedom > 0) & (fixes.worst < GATE)]
-    return float(np.clip(GATE_SIGMAS * robust_sigma(checked), FINEST_GATE, GATE))
+    noise = _noise(fixes, fixes.worst < GATE)
+    return float(np.clip(GATE_SIGMAS * noise, FINEST_GATE, GATE))
 
 
 def _jumps(epochs: Epochs, fixes: Fixes, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -217,15 +217,17 @@ def _put(fixes: Fixes, rows: NDArray[np.int64], fresh: Fixes, chosen: NDArray[np
 def _noise(fixes: Fixes, good: NDArray[np.bool_]) -> float:
     """Standard deviation of an angle in radians, from what redundancy shows of it.
 
-    Never below the published noise of a standing receiver.
+    The sum of squares of a moment's residuals has a chi-square distribution; its median
+    (Wilson and Hilferty 1931) is compared, so that outliers do not count. Never below the
+    published noise of a standing receiver.
     """
     checked = good & (fixes.freedom > 0)
     if not np.any(checked):
         return COUNT_SIGMA
-    residual = fixes.residual[checked]
-    seen = np.count_nonzero(np.isfinite(residual), axis=(1, 2))
-    inflate = np.sqrt(seen / fixes.freedom[checked])
-    return max(COUNT_SIGMA, robust_sigma(residual * inflate[:, None, None]))
+    freedom = fixes.freedom[checked]
+    squares = np.nansum(fixes.residual[checked] ** 2, axis=(1, 2))
+    median = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    return max(COUNT_SIGMA, float(np.sqrt(np.median(squares / median))))
 
 
 def detections(

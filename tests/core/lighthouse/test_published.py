@@ -185,12 +185,22 @@ def test_floor_by_the_authors_alignment(floor: Any) -> None:
 
 
 def test_floor_swapped_sweeps_are_given_back(floor: Any) -> None:
-    sweeps, _, _ = floor
+    sweeps, truths, _ = floor
     solution = solve(sweeps)
     restored = solution.facts["moments_with_swapped_sweeps_restored"]
     assert 650 < restored < 800
-    lost = sum(n for reason, n in solution.rejected.items() if reason.startswith("moment"))
-    assert lost < 0.02 * 4626
+    # Between experiments robots are carried, off the floor; within them few moments are lost.
+    seen = lost = 0
+    for truth in truths:
+        for true in truth:
+            mine = sweeps.device == sweeps.devices.index(true.device)
+            inside = mine & (sweeps.time_ns >= true.time_ns[0]) & (sweeps.time_ns <= true.time_ns[-1])
+            moments = np.unique(sweeps.time_ns[inside])
+            (track,) = (t for t in solution.trajectories if t.device == true.device)
+            seen += len(moments)
+            lost += np.count_nonzero(~np.isin(moments, track.time_ns))
+    assert seen > 1150
+    assert lost < 0.03 * seen
 
 
 def test_floor_with_its_markers_is_in_metres(floor: Any) -> None:
@@ -202,15 +212,13 @@ def test_floor_with_its_markers_is_in_metres(floor: Any) -> None:
     assert 1e3 * score.mae < 6  # the frame of four markers, no alignment
 
 
-def test_floor_channels_may_be_named_otherwise(floor: Any) -> None:
-    # Which station is called first decides nothing but the order of unlabelled reports.
+def test_floor_does_not_hang_on_order_seed_or_names(floor: Any, world: Any) -> None:
     sweeps, truths, _ = floor
-    score = []
-    for seed in (0, 3):
-        solution = solve(sweeps, None, SolveOptions(seed=seed))
-        every = [pair for truth in truths for pair in pairs_of(solution, truth)]
-        score.append(metrics.evaluate_all(every, align="sim3", offset_s=-0.265).mae)
-    assert score[0] == pytest.approx(score[1], rel=0.02)
+    order = np.random.default_rng(0).permutation(len(sweeps))
+    solution = solve(world.take(sweeps, order), None, SolveOptions(seed=3))
+    every = [pair for truth in truths for pair in pairs_of(solution, truth)]
+    score = metrics.evaluate_all(every, align="sim3", offset_s=-0.265)
+    assert 1e3 * score.mae <= 2.9
 
 
 def test_floor_by_the_papers_method_is_near_that_of_the_authors(floor: Any) -> None:
