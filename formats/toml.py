@@ -37,7 +37,9 @@ def loads(text: str | bytes, file: str | os.PathLike[str]) -> Table:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text
     except UnicodeDecodeError as error:
         where = error.object[: error.start].count(b"\n") + 1
-        raise ArtifactError("not UTF-8 text", file=file, where=where) from None
+        raise ArtifactError(
+            "not UTF-8 text", file=file, where=where, hint="give a TOML artifact, not a recording"
+        ) from None
     try:
         data = tomllib.loads(decoded.removeprefix("\ufeff"), parse_float=_decimal)
     except (ValueError, DecimalException, RecursionError) as error:

@@ -15,7 +15,7 @@ from locatk.core.errors import DegenerateError
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse import paper
 from locatk.core.lighthouse.angles import paper_image_points
-from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene import Distance, Scene, Sighting
 from locatk.core.lighthouse.solver import SolveOptions, solve
 
 Array = NDArray[np.float64]
@@ -134,6 +134,16 @@ def test_a_session_is_solved_as_the_paper_does(world: Any, flat: bool) -> None:
     for lamp, station in zip(lamps, solution.artifact.stations, strict=True):
         assert station.calibration.source == "none"
         np.testing.assert_allclose(station.position, lamp.position, atol=0.02)
+
+
+def test_a_distance_nobody_saw_is_refused(world: Any) -> None:
+    lamps = ideal(world, 2, 16)
+    recording = world.drive(lamps, world.curve(60, flat=True))
+    seen = Sighting("robot", int(recording.time_ns[0]), int(recording.time_ns[3]))
+    scene = Scene(distances=(Distance(seen, Sighting("robot", 0, 1), 1.0),))
+    with pytest.raises(DegenerateError, match="distance") as refused:
+        solve(recording.sweeps, scene, SolveOptions(method="paper", scene="two-planar"))
+    assert refused.value.hint
 
 
 def test_the_paper_must_be_told_of_the_plane(world: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.errors import DegenerateError, InputError
+from locatk.core.errors import DegenerateError, InputError, LocatkError
 from locatk.core.geometry import Similarity, rotation_exp, umeyama
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.poses import REACH_M
@@ -460,18 +460,18 @@ def test_occlusion_costs_poses_not_accuracy(
 
 def test_swapped_sweeps_are_given_back(world: Any) -> None:
     # A report without polynomials that sorts all four counts exchanges a plane of each
-    # station wherever their counts cross (facts 1.2).
+    # station wherever their counts cross (facts 1.2), or both planes.
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(300, flat=True))
     drive.labelled = False
     crossed = drive.counts[:, 0] > drive.counts[:, 1]
+    assert np.count_nonzero(crossed.any(axis=1) & ~crossed.all(axis=1)) > 20
+    assert np.count_nonzero(crossed.all(axis=1)) > 50
     drive.counts = np.sort(drive.counts, axis=1)
     solution = strict(drive.sweeps, marked(world, lamps))
-    swapped = np.count_nonzero(crossed.any(axis=1) & ~crossed.all(axis=1))
-    assert swapped > 20
-    error = errors(solution, drive)
-    assert np.percentile(error, 95) < 4e-3
+    assert np.max(errors(solution, drive)) < 6e-3
     assert any("swapped" in note for note in solution.notes)
+    assert solution.poses > 0.95 * 300
 
 
 @pytest.mark.parametrize("flat", [True, False])
@@ -677,6 +677,52 @@ def test_drives_that_determine_nothing_are_named(
     with pytest.raises(DegenerateError, match=word) as refused:
         strict(drive.sweeps, scene=scene)
     assert refused.value.hint
+
+
+def test_a_few_moments_in_space_that_are_called_flat(world: Any) -> None:
+    drive = world.drive(world.lamps(2, 5, 16), world.curve(12, flat=False))
+    try:
+        solution = strict(drive.sweeps, scene="two-planar")
+    except DegenerateError as refused:
+        assert refused.hint
+    else:
+        assert sum(solution.rejected.values()) > 0
+
+
+@pytest.mark.parametrize("kind", ["any counts", "one jumbled", "equal planes", "drawn twice"])
+@pytest.mark.parametrize("channels", [(1,), (1, 2), (2, 5, 16), (1, 2, 5, 16)])
+def test_garbage_is_refused_or_told_never_a_crash(
+    world: Any, channels: tuple[int, ...], kind: str
+) -> None:
+    lamps = world.lamps(*channels)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        moments = int(rng.choice([6, 12, 20, 60]))
+        drive = world.drive(lamps, world.curve(moments, flat=seed % 2 == 0), noise_rad=1e-3)
+        if kind == "any counts":
+            drive.counts = rng.uniform(0, 110_000, drive.counts.shape)
+        if kind == "one jumbled":
+            drive.counts[rng.random(drive.counts.shape) < 0.3] += rng.uniform(-5000, 5000)
+        if kind == "equal planes":
+            drive.counts[..., 1] = drive.counts[..., 0]
+        sweeps = drive.sweeps
+        if kind == "drawn twice":
+            sweeps = world.take(sweeps, rng.integers(0, len(sweeps), len(sweeps)))
+        known = marked(world, lamps) if seed % 3 == 0 else None
+        for method in ("bundle", "paper"):
+            for scene in ("auto", "two-planar", "two-3d"):
+                try:
+                    solution = strict(sweeps, known, scene=scene, method=method)
+                except LocatkError as refused:
+                    assert refused.hint, str(refused)
+                    continue
+                for station in solution.artifact.stations:
+                    assert np.isfinite(station.position).all()
+                    assert np.linalg.det(station.rotation) == pytest.approx(1)
+                for track in solution.trajectories:
+                    assert np.isfinite(track.position).all()
+                    if method == "bundle":
+                        assert np.isfinite(track.covariance[:, :3, :3]).all()
 
 
 def test_unknown_choices_are_refused() -> None:
