@@ -6,6 +6,7 @@ the others are resected one by one; a bundle adjustment ends it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.lighthouse import twoview
+from locatk.core.lighthouse import candidates, twoview
 from locatk.core.lighthouse.angles import rays as rays_of
 from locatk.core.lighthouse.bundle import Adjustment, Rig, adjust
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
@@ -40,6 +41,9 @@ LEAST_BASELINE = 0.02
 
 FLAT = 3e-3
 """Median miss of a homography, as a tangent, up to which a scene counts as planar."""
+
+
+Misfit = Callable[[Rig, tuple[int, int]], float]
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ def assemble(
     *,
     sigma: float,
     planar: bool | None = None,
+    misfit: Misfit | None = None,
     seed: int = 0,
 ) -> Assembly:
     """Solve for two or more stations.
@@ -88,6 +93,9 @@ def assemble(
         Standard deviation of an angle with what calibration leaves unmodelled, in radians.
     planar : bool, optional
         Whether all photodiodes lie on one plane; decided from the data when None.
+    misfit : callable, optional
+        How badly a rig of two stations, given with their columns, fits what else is known
+        of the place (markers): decides between the two readings of a plane.
     seed : int
         For the random samples: same input and seed, same answer.
 
@@ -123,9 +131,9 @@ def assemble(
     _require_baseline(a[agreed], b[agreed])
     pair = (calibrations[i], calibrations[j])
     starts = (
-        _planar_starts(a[agreed], b[agreed], pair)
+        candidates.on_plane(a[agreed], b[agreed], pair)
         if planar
-        else _spatial_starts(a[agreed], b[agreed], pair)
+        else candidates.in_space(a[agreed], b[agreed], pair)
     )
     if not starts:
         raise DegenerateError(
@@ -133,7 +141,7 @@ def assemble(
             hint="check that the channels of the stations are those of the recording",
         )
     inside = joint[agreed]
-    best = _choose(angles[inside][:, [i, j]], starts, planar, sigma, facts)
+    best = _choose(angles[inside][:, [i, j]], starts, planar, sigma, misfit, (i, j), facts)
     return _extend(angles, rays, calibrations, best, (i, j), inside, planar, sigma, facts)
 
 
@@ -194,66 +202,21 @@ def _decide(
     return False, agreed
 
 
-def _planar_starts(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
-    """Rigs with the plane at z = 0 in which all points lie before both stations."""
-    rigs = []
-    for rotation, translation, normal in twoview.split_homography(twoview.fit_homography(a, b)):
-        depth = a @ normal
-        local = a / depth[:, None]
-        ahead = (depth > 0) & ((local @ rotation.T + translation)[:, 0] > 0)
-        if np.mean(ahead) < 0.9:
-            continue
-        height = 1.0 / np.linalg.norm(normal)
-        up = -normal * height
-        forward = np.eye(3)[0] - up[0] * up
-        forward = forward / np.linalg.norm(forward)
-        level = np.stack([forward, np.cross(up, forward), up])
-        first = np.array([0.0, 0.0, height])
-        second = first - level @ rotation.T @ translation
-        if second[2] <= 0:  # on the other side of the floor
-            continue
-        points = local @ level.T + first
-        points[:, 2] = 0.0
-        rigs.append(
-            Rig(np.stack([first, second]), np.stack([level, level @ rotation.T]), pair, points)
-        )
-    return rigs
-
-
-def _spatial_starts(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
-    """Rigs in the first station's axes in which most points lie before both stations."""
-    motions = twoview.split_essential(twoview.fit_epipolar(a, b))
-    # Few places in a narrow field make the essential matrix loose; the plane through them
-    # is then the better start.
-    for rotation, translation, _ in twoview.split_homography(twoview.fit_homography(a, b)):
-        motions.append((rotation, translation / np.linalg.norm(translation)))
-    motions += twoview.upright_motions(a, b)
-    rigs = []
-    for rotation, translation in motions:
-        depth, other = twoview.triangulate(a, b, rotation, translation)
-        ahead = (depth > 0) & (other > 0) & (depth < 100)
-        if np.mean(ahead) < 0.7:
-            continue
-        depth = np.where(ahead, depth, np.median(depth[ahead]))
-        rigs.append(
-            Rig(
-                np.stack([np.zeros(3), -rotation.T @ translation]),
-                np.stack([np.eye(3), rotation.T]),
-                pair,
-                a * depth[:, None],
-            )
-        )
-    return rigs
-
-
 def _choose(
-    angles: Array, starts: list[Rig], planar: bool, sigma: float, facts: dict[str, object]
+    angles: Array,
+    starts: list[Rig],
+    planar: bool,
+    sigma: float,
+    misfit: Misfit | None,
+    columns: tuple[int, int],
+    facts: dict[str, object],
 ) -> Rig:
-    """The start that explains the angles best; of two that do, the upright one.
+    """The start that explains the angles best; of two that do, the one that fits the markers,
+    else the upright one.
 
     A homography has two valid readings. Noise-free they predict the same angles, so that
-    only the world decides: stations stand or hang upright, with little roll (the paper's
-    conditions on the signs of n and t say as much).
+    only the world decides: what is known of it, or that stations stand or hang upright, with
+    little roll (the paper's conditions on the signs of n and t say as much).
     """
     some = np.unique(np.linspace(0, len(angles) - 1, START_POINTS).astype(int))
     tried = []
@@ -269,6 +232,12 @@ def _choose(
     cheapest = min(cost for cost, _, _ in tried)
     fitting = [t for t in tried if t[0] <= 2.0 * cheapest + 1e-9]
     _, _, done = min(fitting, key=lambda t: (t[1], t[0]))
+    if planar and misfit is not None and len(fitting) > 1:
+        missed = [misfit(t[2].rig, columns) for t in fitting]
+        order = np.argsort(missed)
+        if missed[order[0]] < 0.5 * missed[order[1]]:
+            done = fitting[int(order[0])][2]
+            facts["reading_decided_by"] = "markers"
     if planar:
         facts["candidates"] = [
             {
@@ -359,6 +328,11 @@ def _extend(
         member[inside] = True
         good &= member
     usable = np.flatnonzero(good)
+    if len(usable) < (4 if planar else 8):
+        raise DegenerateError(
+            f"{len(usable)} places agree with one arrangement of the stations",
+            hint="the recording holds little but wrong sweeps; `locatk info` shows its channels",
+        )
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, BUNDLE_POINTS).astype(int))]
     final = adjust(
         angles[chosen][:, known],

@@ -117,7 +117,13 @@ def _frame(
             for s in (distance.first, distance.second)
         ]
         first, second = (solved.locate(image_of(job.epochs, e))[0] for e in ends)
-        ratios.append(distance.distance / float(np.linalg.norm(second - first)))
+        length = float(np.linalg.norm(second - first))
+        if np.isfinite(length) and length > 0:
+            ratios.append(distance.distance / length)
+    if job.scene.distances and not ratios:
+        raise DegenerateError(
+            "no known distance was seen at both its ends", hint="check the times of its sightings"
+        )
     unit = Similarity.identity()
     if ratios:
         return Similarity(float(np.mean(ratios)), unit.rotation, unit.translation), "distance"

@@ -153,15 +153,15 @@ def _jumps(epochs: Epochs, fixes: Fixes, good: NDArray[np.bool_]) -> NDArray[np.
 def _swap_back(job: Job, fixes: Fixes, rig: Stations, floor: float | None) -> Fixes:
     """Give sweeps back to their stations where a report without polynomials mixed them up.
 
-    Reports that sort all counts of two stations exchange a plane of theirs whenever the
-    stations' counts cross. Such a moment contradicts itself as it is, and fits exactly
+    Reports that sort all counts of two stations exchange a plane of theirs, or both,
+    whenever the stations' counts cross. Such a moment contradicts itself as it is, and fits exactly
     with the exchange undone.
     """
     if job.epochs.labelled or len(job.epochs.channels) != 2:
         return fixes
     wrong = np.flatnonzero((fixes.worst > GATE) & (fixes.freedom > 0))
     restored = 0
-    for planes in ((0,), (1,)):
+    for planes in ((0,), (1,), (0, 1)):
         counts = job.epochs.counts[wrong].copy()
         counts[:, :, planes] = counts[:, ::-1, planes]
         trial = angles_of(replace(job.epochs, counts=counts))

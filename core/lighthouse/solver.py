@@ -193,6 +193,7 @@ class Job:
             tuple(self.calibration(int(c)) for c in self.epochs.channels),
             sigma=MODEL_SIGMA,
             planar=planar,
+            misfit=self._marker_misfit if self.scene.markers else None,
             seed=self.options.seed,
         )
         if len(assembly.stations) < len(self.epochs.channels):
@@ -211,7 +212,7 @@ class Job:
                 "the data lie on one plane" if assembly.planar else "the data fill space"
             )
         readings = [c for c in _candidates(assembly.facts) if c["fits"]]
-        if len(readings) > 1:
+        if len(readings) > 1 and "reading_decided_by" not in assembly.facts:
             self.notes.append(
                 "two arrangements of the stations explain the angles equally well; chosen is "
                 "the one with less roll"
@@ -219,6 +220,22 @@ class Job:
         return self._framed(
             assembly.adjustment.rig, assembly.planar, assembly.adjustment.station_covariance
         )
+
+    def _marker_misfit(self, rig: Rig, columns: tuple[int, int]) -> float:
+        """Rms distance in metres of the markers from where two stations on a plane see them;
+        infinite where too few are seen to tell."""
+        known, seen = frames.sighted_markers(self.scene.markers, self.epochs, self.angles)
+        fixes = locate(
+            seen[:, columns], rig.positions, rig.rotations, rig.calibrations, floor_z=0.0
+        )
+        good = np.isfinite(fixes.position[:, 0])
+        if np.count_nonzero(good) < 4:
+            return float("inf")
+        to = frames.place_on_markers(rig, True, known[good], seen[good][:, columns])
+        if to is None:
+            return float("inf")
+        missed = to.apply(fixes.position[good]) - known[good]
+        return float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
 
     def _solve_one(self) -> Scene:
         """One station on a plane, by resection on its markers."""

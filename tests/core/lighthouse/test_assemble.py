@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -178,10 +179,24 @@ def test_what_does_not_determine_a_scene_is_named_and_refused(
 
 def test_four_places_do_not_tell_their_kind(world: Any) -> None:
     # A homography fits any four places exactly: that is no sign of a floor.
-    angles = angles_of(world.lamps(1, 2), world.curve(4, flat=False))
-    try:
-        found = run(angles)
-    except DegenerateError as refused:
-        assert refused.hint
-    else:
-        assert found.facts["planar_decided_by"] != "data"
+    with pytest.raises(DegenerateError) as refused:
+        run(angles_of(world.lamps(1, 2), world.curve(4, flat=False)))
+    assert refused.value.hint
+
+
+def test_of_two_readings_of_a_floor_the_upright_one_is_taken(world: Any) -> None:
+    # Two stations side by side: both readings of the homography see all places ahead.
+    first, second = world.lamps(1, 2)
+    side = np.array([2.5, 0.6, 2.0]), np.array([2.5, 0.9, 2.4])
+    lamps = tuple(
+        replace(lamp, position=place, rotation=world.look(place, np.zeros(3)))
+        for lamp, place in zip((first, second), side, strict=True)
+    )
+    points = world.curve(150, flat=True)
+    found = run(angles_of(lamps, points), planar=True)
+    readings = found.facts["candidates"]
+    assert isinstance(readings, list)
+    assert [r["fits"] for r in readings] == [True, True]
+    (chosen,) = [r for r in readings if r["chosen"]]
+    assert chosen["roll_deg"] < 10 < max(r["roll_deg"] for r in readings)
+    assert off(found, points) < 0.03

@@ -54,9 +54,7 @@ def test_libsurvive_in_its_own_axes(unit: int, world: Any) -> None:
     planes = world.planes_of(UNITS[unit])
     points = wide()
     forward, left, up = points.T
-    theirs = [
-        world.libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(planes)
-    ]
+    theirs = [world.libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(planes)]
     ours = cal.predict_angles(points, calibration_of(planes))
     np.testing.assert_allclose(ours, np.stack(theirs, axis=1), atol=1e-13)
 
@@ -234,6 +232,4 @@ def test_what_a_calibration_says_of_itself(world: Any) -> None:
     assert cal.IDEAL.source == "none"
     assert GENERIC.bends
     factory = calibration_of(world.planes_of(UNITS[0]))
-    np.testing.assert_allclose(
-        factory.tilts, [np.pi / 6 + UNITS[0, 1], -np.pi / 6 + UNITS[0, 2]]
-    )
+    np.testing.assert_allclose(factory.tilts, [np.pi / 6 + UNITS[0, 1], -np.pi / 6 + UNITS[0, 2]])

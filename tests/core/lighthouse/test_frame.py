@@ -13,10 +13,9 @@ from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.lighthouse import frame
 from locatk.core.lighthouse.bundle import Rig
-from locatk.core.lighthouse.epochs import group
+from locatk.core.lighthouse.epochs import angles_of, group
 from locatk.core.lighthouse.generic import GENERIC
 from locatk.core.lighthouse.scene import Distance, Sighting
-from locatk.core.lighthouse.epochs import angles_of
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -179,9 +178,7 @@ def test_odometry_gives_the_scale_in_spite_of_drift(world: Any, seed: int) -> No
     track = Trajectory.from_positions("robot", "odom", when + 7_000_000, drift(points, seed))
     # The heading has wandered far by the end; the metres have not.
     assert np.linalg.norm(track.position[-1] - (points[-1] - points[0])) > 0.02
-    found = frame.scale_of_odometry(
-        points / 5, when, np.zeros(300, np.int64), ["robot"], [track]
-    )
+    found = frame.scale_of_odometry(points / 5, when, np.zeros(300, np.int64), ["robot"], [track])
     assert found == pytest.approx(5, rel=0.02)
 
 

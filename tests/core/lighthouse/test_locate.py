@@ -131,9 +131,7 @@ def test_covariance_is_that_of_noise_draws(world: Any, flat: bool) -> None:
     stated = fixes.covariance(sigma, flat).reshape(8, draws, 3, 3)[:, 0, :dims, :dims]
     for k in range(8):
         found = np.cov(error[k].T)
-        np.testing.assert_allclose(
-            np.sqrt(np.diag(found)), np.sqrt(np.diag(stated[k])), rtol=0.06
-        )
+        np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(stated[k])), rtol=0.06)
     nees = np.einsum("kni,kij,knj->kn", error, np.linalg.inv(stated), error)
     assert nees.mean() == pytest.approx(dims, rel=0.05)
     # Chi square with `dims` degrees: 95 % below 5.99 and 7.81.

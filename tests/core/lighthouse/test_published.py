@@ -194,11 +194,11 @@ def test_floor_swapped_sweeps_are_given_back(floor: Any) -> None:
     for truth in truths:
         for true in truth:
             mine = sweeps.device == sweeps.devices.index(true.device)
-            inside = mine & (sweeps.time_ns >= true.time_ns[0]) & (sweeps.time_ns <= true.time_ns[-1])
-            moments = np.unique(sweeps.time_ns[inside])
+            moments = np.unique(sweeps.time_ns[mine])
+            moments = moments[(moments >= true.time_ns[0]) & (moments <= true.time_ns[-1])]
             (track,) = (t for t in solution.trajectories if t.device == true.device)
             seen += len(moments)
-            lost += np.count_nonzero(~np.isin(moments, track.time_ns))
+            lost += int(np.count_nonzero(~np.isin(moments, track.time_ns)))
     assert seen > 1150
     assert lost < 0.03 * seen
 

@@ -55,9 +55,7 @@ def marked(world: Any, lamps: Any, places: Array | None = None) -> Scene:
 
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("channels", [(1, 2), (1, 2, 5), (1, 2, 5, 16)])
-def test_markers_give_metres_and_frame(
-    world: Any, channels: tuple[int, ...], flat: bool
-) -> None:
+def test_markers_give_metres_and_frame(world: Any, channels: tuple[int, ...], flat: bool) -> None:
     lamps = world.lamps(*channels)
     drive = world.drive(lamps, world.curve(150, flat=flat))
     solution = strict(drive.sweeps, marked(world, lamps))
@@ -81,9 +79,7 @@ def test_one_station_needs_only_its_markers(world: Any) -> None:
     solution = strict(drive.sweeps, marked(world, lamps))
     assert errors(solution, drive).mean() < 1.5e-3
     assert solution.artifact.planar
-    np.testing.assert_allclose(
-        solution.artifact.stations[0].position, lamps[0].position, atol=0.1
-    )
+    np.testing.assert_allclose(solution.artifact.stations[0].position, lamps[0].position, atol=0.1)
 
 
 def test_one_station_says_how_sure_it_is(world: Any) -> None:
@@ -109,6 +105,8 @@ def test_markers_at_a_height_raise_the_floor(world: Any) -> None:
     alone = strict(single.sweeps, marked(world, lamps[:1], world.square + up))
     assert errors(alone, single).mean() < 1.5e-3
     assert alone.trajectories[0].position[0, 2] == pytest.approx(0.15)
+    (station,) = alone.artifact.stations
+    np.testing.assert_allclose(station.position, lamps[0].position, atol=0.1)
 
 
 @pytest.mark.parametrize("flat", [True, False])
@@ -241,11 +239,8 @@ def test_the_papers_method_does_not_pass_over_a_solved_scene_in_silence(world: A
     lamps = world.lamps(2, 16)
     drive = world.drive(lamps, world.curve(60, flat=True))
     artifact = strict(drive.sweeps, marked(world, lamps)).artifact
-    try:
-        solution = strict(drive.sweeps, artifact, method="paper")
-    except InputError:
-        return
-    assert any("scene" in note and "not" in note for note in solution.notes)
+    solution = told(drive.sweeps, artifact, method="paper")
+    assert solution is None or any("scene" in n and "not" in n for n in solution.notes)
 
 
 def test_factory_calibration_of_stations_is_used_as_it_is(world: Any) -> None:
@@ -278,9 +273,7 @@ def test_order_of_sweeps_and_names_of_channels_do_not_matter(world: Any, flat: b
     drive = world.drive(lamps, world.curve(120, flat=flat))
     scene = marked(world, lamps)
     reference = strict(drive.sweeps, scene).trajectories[0]
-    shuffled = world.take(
-        drive.sweeps, np.random.default_rng(0).permutation(len(drive.sweeps))
-    )
+    shuffled = world.take(drive.sweeps, np.random.default_rng(0).permutation(len(drive.sweeps)))
     again = strict(shuffled, scene).trajectories[0]
     np.testing.assert_array_equal(again.position, reference.position)
     np.testing.assert_array_equal(again.time_ns, reference.time_ns)
@@ -441,6 +434,32 @@ def test_two_stations_that_contradict_are_both_left_out(world: Any, flat: bool) 
     assert error.mean() < SPOILED_MEAN[flat]
     assert error.max() < 0.025
     assert sum(n for r, n in solution.rejected.items() if r.startswith("moment")) >= 28
+
+
+def test_reflections_that_nothing_checks_leave_the_path(world: Any) -> None:
+    # One station: only the path itself tells. Two moments in a row are no single spike.
+    lamps = world.lamps(1)
+    drive = world.drive(lamps, world.curve(300, flat=True, size=0.5))
+    for start in (50, 140, 230):
+        rows = np.array([start, start + 1])
+        mirrored = drive.points[rows] * [-1, 1, 1] + [0, 2.0, 0.0]
+        drive.counts[rows, 0] = np.rint(lamps[0].counts(lamps[0].angles(mirrored)))
+    solution = strict(drive.sweeps, marked(world, lamps))
+    assert solution.rejected == {"moment_jumps": 6}
+    assert errors(solution, drive).max() < 5e-3
+
+
+def test_markers_decide_between_two_readings_or_protest(world: Any) -> None:
+    """Two stations side by side, both leaning: roll alone picks the wrong reading."""
+    places = np.array([2.5, 0.6, 2.0]), np.array([2.5, 0.9, 2.4])
+    lamps = tuple(
+        replace(lamp, position=place, rotation=world.look(place, np.zeros(3), 0.5))
+        for lamp, place in zip(world.lamps(1, 2), places, strict=True)
+    )
+    drive = world.drive(lamps, world.curve(150, flat=True))
+    solution = strict(drive.sweeps, marked(world, lamps), scene="two-planar")
+    right = errors(solution, drive).mean() < 0.06
+    assert right or any("markers" in note for note in solution.notes)
 
 
 @pytest.mark.parametrize("flat", [True, False])
@@ -679,14 +698,21 @@ def test_drives_that_determine_nothing_are_named(
     assert refused.value.hint
 
 
+def told(sweeps: Sweeps, known: Scene | None, **options: Any) -> Solution | None:
+    """A solution, or None where the session was refused with a hint."""
+    try:
+        return strict(sweeps, known, **options)
+    except LocatkError as refused:
+        hint = refused.hint
+        message = str(refused)
+    assert hint, message
+    return None
+
+
 def test_a_few_moments_in_space_that_are_called_flat(world: Any) -> None:
     drive = world.drive(world.lamps(2, 5, 16), world.curve(12, flat=False))
-    try:
-        solution = strict(drive.sweeps, scene="two-planar")
-    except DegenerateError as refused:
-        assert refused.hint
-    else:
-        assert sum(solution.rejected.values()) > 0
+    solution = told(drive.sweeps, None, scene="two-planar")
+    assert solution is None or sum(solution.rejected.values()) > 0
 
 
 @pytest.mark.parametrize("kind", ["any counts", "one jumbled", "equal planes", "drawn twice"])
@@ -711,10 +737,8 @@ def test_garbage_is_refused_or_told_never_a_crash(
         known = marked(world, lamps) if seed % 3 == 0 else None
         for method in ("bundle", "paper"):
             for scene in ("auto", "two-planar", "two-3d"):
-                try:
-                    solution = strict(sweeps, known, scene=scene, method=method)
-                except LocatkError as refused:
-                    assert refused.hint, str(refused)
+                solution = told(sweeps, known, scene=scene, method=method)
+                if solution is None:
                     continue
                 for station in solution.artifact.stations:
                     assert np.isfinite(station.position).all()

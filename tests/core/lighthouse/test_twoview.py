@@ -121,9 +121,7 @@ def test_essential_matrix_is_opencvs(space: Views) -> None:
     theirs, _ = cv2.findFundamentalMat(*space.image, cv2.FM_8POINT)
     np.testing.assert_allclose(unit(e), unit(theirs), atol=1e-6)
     true = np.cross(np.eye(3), space.translation) @ space.rotation
-    np.testing.assert_allclose(
-        unit(twoview.fit_epipolar(space.a, space.b)), unit(true), atol=1e-8
-    )
+    np.testing.assert_allclose(unit(twoview.fit_epipolar(space.a, space.b)), unit(true), atol=1e-8)
 
 
 def test_sampson_distance_is_that_of_opencv(space: Views) -> None:
@@ -132,8 +130,7 @@ def test_sampson_distance_is_that_of_opencv(space: Views) -> None:
     ours = twoview.epipolar_residuals(e, space.a, off)
     e_cv = TO_CV @ e @ TO_CV.T
     theirs = [
-        cv2.sampsonDistance(TO_CV @ a, TO_CV @ b, e_cv)
-        for a, b in zip(space.a, off, strict=True)
+        cv2.sampsonDistance(TO_CV @ a, TO_CV @ b, e_cv) for a, b in zip(space.a, off, strict=True)
     ]
     np.testing.assert_allclose(ours**2, theirs, rtol=1e-6)
 
