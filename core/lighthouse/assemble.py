@@ -287,13 +287,14 @@ def _extend(
             floor_z=floor,
         )
 
-    while len(known) < count:
+    apart: set[int] = set()
+    while len(known) + len(apart) < count:
         fixes = fixes_of(known)
         good = np.isfinite(fixes.position[:, 0]) & (fixes.worst < twoview.GATE)
         shared = {
             k: np.flatnonzero(good & np.isfinite(rays[:, k, 0]))
             for k in range(count)
-            if k not in known
+            if k not in known and k not in apart
         }
         index = max(shared, key=lambda k: len(shared[k]))
         rows = shared[index]
@@ -305,7 +306,8 @@ def _extend(
                 else resect_in_space(points, rays[rows, index])
             )
         except DegenerateError:
-            break
+            apart.add(index)
+            continue
         tries = [
             adjust(
                 angles[rows][:, [index]],
@@ -334,6 +336,7 @@ def _extend(
             hint="the recording holds little but wrong sweeps; `locatk info` shows its channels",
         )
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, BUNDLE_POINTS).astype(int))]
+    # From the calibrations that came in: the prior holds whatever an adjustment starts from.
     final = adjust(
         angles[chosen][:, known],
         Rig(

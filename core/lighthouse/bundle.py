@@ -21,7 +21,7 @@ from locatk.core.lighthouse.calibration import (
     Calibration,
     predict_with_gradient,
 )
-from locatk.core.lighthouse.generic import PHASE_TILT_SIGMA
+from locatk.core.lighthouse.generic import GENERIC, PHASE_TILT_SIGMA
 
 Array = NDArray[np.float64]
 
@@ -170,7 +170,8 @@ class _Prior:
 
     @classmethod
     def of(cls, rig: Rig, free: NDArray[np.bool_]) -> _Prior:
-        mean = np.stack([_unknowns_of(c) for c in rig.calibrations])
+        own = np.stack([_unknowns_of(c) for c in rig.calibrations])
+        mean = np.where(free[:, None], _unknowns_of(GENERIC), own)
         spread = np.concatenate([PHASE_TILT_SIGMA[:, 1], PHASE_TILT_SIGMA[:, 0]])
         information = np.full(mean.shape, np.inf)
         # What is the same in every unit (the first phase is zero) is not estimated.

@@ -263,13 +263,17 @@ def _move_to_middle(
     seconds = middle * 1e-9
     for column in np.ndindex(counts.shape[1:]):
         seen = np.flatnonzero(np.isfinite(counts[(slice(None), *column)]))
-        if len(seen) < 3:
+        if len(seen) < 2:
             continue
         value = counts[(seen, *column)]
         when = seconds[seen] + lag[(seen, *column)]
-        before, after = np.r_[0, : len(seen) - 1], np.r_[1 : len(seen), len(seen) - 1]
+        # At the ends of a device's path the one neighbour there is must do.
+        here = np.arange(len(seen))
+        turns = np.diff(key[seen]) != 0
+        before = np.where(np.r_[True, turns], here, here - 1)
+        after = np.where(np.r_[turns, True], here, here + 1)
         span = when[after] - when[before]
-        near = (key[seen[after]] == key[seen[before]]) & (span > 0) & (span < 0.5)
+        near = (span > 0) & (span < 0.5)
         rate = np.where(near, (value[after] - value[before]) / np.where(near, span, 1.0), 0.0)
         counts[(seen, *column)] = value - rate * lag[(seen, *column)]
 

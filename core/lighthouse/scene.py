@@ -28,7 +28,8 @@ class Station:
     id : int, optional
         Serial number, from the factory's OOTX data.
     covariance : (6, 6) ndarray, optional
-        Of position and rotation (a rotation vector in the scene's frame).
+        Of position and rotation (a rotation vector in the scene's frame), as far as the
+        angles tell; errors of markers, scale and frame are not in it.
     floor_map : (3, 3) ndarray, optional
         Homography from its rays (1, y, z) to floor points (1, x, y) in metres, where it is
         the only station over a floor with markers
@@ -95,7 +96,7 @@ class Scene:
         Height of the photodiodes in a planar scene, in metres.
     scale : str
         What fixed the scale: ``"markers"``, ``"distance"``, ``"odometry"`` or ``"unit"``
-        (the distance of the first two stations, or the height of the only one, is 1).
+        (the distance of the first two stations is 1).
     frame : str
         Name of the frame of positions.
     notes : tuple of str

@@ -239,9 +239,15 @@ def _few_places(data: Path) -> list[Figure]:
             + (f"; {refused} refused as degenerate" if refused else "")
         )
         rows.append(
-            Figure(f"3D grid from {n} places: MAE", float(np.mean(errors)), "mm", how,
-                   peer="paper, Fig. 12", peer_value=peer)
-        )  # fmt: skip
+            Figure(
+                f"3D grid from {n} places: MAE",
+                float(np.mean(errors)) if errors else None,
+                "mm",
+                how,
+                peer="paper, Fig. 12",
+                peer_value=peer,
+            )
+        )
     return rows
 
 
@@ -351,7 +357,7 @@ def _speed_on_a_million() -> list[Figure]:
 
 
 def _a_million() -> tuple[Sweeps, Scene]:
-    """Four robots' worth of sweeps under two stations, made by the forward model."""
+    """A robot under two stations that reports each rotation, made by the forward model."""
     from locatk.core.lighthouse.angles import angles_to_counts
     from locatk.core.lighthouse.calibration import predict_angles
     from locatk.core.lighthouse.generic import GENERIC
