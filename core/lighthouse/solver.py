@@ -214,8 +214,8 @@ class Job:
         share = assembly.facts["plane_share"]
         if assembly.planar and isinstance(share, float) and share < 0.95:
             self.notes.append(
-                f"{1.0 - share:.0%} of the places contradict the plane as they were reported (carried "
-                "robots, swapped sweeps, reflections)"
+                f"{1.0 - share:.0%} of the places contradict the plane as they were reported "
+                "(carried robots, swapped sweeps, reflections)"
             )
         readings = [c for c in _candidates(assembly.facts) if c["fits"]]
         if len(readings) > 1 and "reading_decided_by" not in assembly.facts:
