@@ -43,7 +43,8 @@ def command() -> None:
     type=click.FloatRange(min=0),
     default=300.0,
     show_default=True,
-    help="Standard deviation of an angle, in millionths of a degree.",
+    help="Standard deviation of an angle, in millionths of a degree. The default is the paper's "
+    "jitter of the rotor; receivers at a standstill scatter by about 6600.",
 )
 @click.option(
     "--occlusion",
