@@ -96,10 +96,10 @@ def rays(
     sin_first, sin_second = np.sin(first), np.sin(second)
     forward = lean[..., 0] * cos_second - lean[..., 1] * cos_first
     ray = np.empty((*np.shape(first), 3))
-    ray[..., 0] = 1.0
-    ray[..., 1] = (lean[..., 0] * sin_second - lean[..., 1] * sin_first) / forward
-    ray[..., 2] = (cos_first * sin_second - sin_first * cos_second) / forward
-    return ray
+    ray[..., 0] = forward
+    ray[..., 1] = lean[..., 0] * sin_second - lean[..., 1] * sin_first
+    ray[..., 2] = cos_first * sin_second - sin_first * cos_second
+    return ray / forward[..., None]
 
 
 def paper_image_points(
