@@ -2,8 +2,8 @@
 
 The paper's III.A. A homography has eight unknowns, a posed station six: the other two
 take up what calibration leaves of tilt and phase, which pays where a handful of markers is
-all there is. On recordings that are not scored (experiments 0 and 6 of the published set)
-it halves the error of the pose's own prediction.
+all there is. On the published experiment 6, which no figure scores, it takes the mean error
+of the posed station from 5.8 to 3.9 mm.
 """
 
 from __future__ import annotations
