@@ -18,7 +18,7 @@ ELSEWHERE = Path("../shared/data")
 
 
 @click.command(short_help="Measure what the project promises, on published data.")
-@click.argument("system", type=click.Choice(list(BENCHES)))
+@click.argument("system", metavar="SYSTEM", type=click.Choice(list(BENCHES)))
 @options.input_option(
     "--data",
     metavar="FOLDER",

@@ -129,7 +129,8 @@ def adjust(
     damping = 1e-3
     steps = 0
     system = _linearise(observed, seen, rig, sigma, loss_width, prior, dims)
-    for steps in range(1, iterations + 1):  # noqa: B007
+    while steps < iterations:
+        steps += 1
         trial = _step(system, rig, damping, planar, dims)
         trial_system = _linearise(observed, seen, trial, sigma, loss_width, prior, dims)
         if trial_system.cost < system.cost:

@@ -7,7 +7,7 @@ into metres and into the user's frame; a distance or odometry give the metres on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from locatk.core.geometry import Similarity, umeyama
 from locatk.core.lighthouse.angles import counts_to_angles
 from locatk.core.lighthouse.bundle import Rig
 from locatk.core.lighthouse.epochs import Epochs
-from locatk.core.lighthouse.locate import locate
+from locatk.core.lighthouse.locate import Fixes, locate
 from locatk.core.lighthouse.scene import Distance, Marker, Sighting
 from locatk.core.trajectory import Trajectory
 
@@ -72,6 +72,27 @@ def sighted_markers(
     return np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows])
 
 
+def sight(rig: Rig, planar: bool, angles: Array) -> Fixes:
+    """Where a rig sees photodiodes (m, s, 2), in its own unit; on z = 0 where ``planar``."""
+    return locate(
+        angles, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0 if planar else None
+    )
+
+
+def marker_misfit(rig: Rig, planar: bool, known: Array, seen: Array) -> float:
+    """Rms distance in metres of markers from where the rig sees them, after the best
+    similarity; infinite for fewer than four, which fit too easily to tell.
+
+    Parameters as for :func:`place_on_markers`.
+    """
+    position = sight(rig, planar, seen).position
+    good = np.isfinite(position[:, 0])
+    to = place_on_markers(rig, planar, known, seen) if np.count_nonzero(good) >= 4 else None
+    if to is None:
+        return float("inf")
+    return float(np.sqrt(np.mean(np.sum((to.apply(position[good]) - known[good]) ** 2, axis=1))))
+
+
 def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Similarity | None:
     """Similarity that brings the rig into the frame of its markers, or None where fewer
     than three are seen well enough.
@@ -91,9 +112,7 @@ def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Simil
     DegenerateError
         The markers lie on a line.
     """
-    fixes = locate(
-        seen, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0 if planar else None
-    )
+    fixes = sight(rig, planar, seen)
     good = np.isfinite(fixes.position[:, 0])
     if np.count_nonzero(good) < 3:
         return None
@@ -107,36 +126,40 @@ def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Simil
 
 
 def scale_of_distances(
-    rig: Rig, planar: bool, distances: Sequence[Distance], epochs: Epochs, angles: Array
+    where: Callable[[Array], Array],
+    distances: Sequence[Distance],
+    epochs: Epochs,
+    angles: Array,
 ) -> float:
-    """Metres a unit of the rig, from known distances (least squares over all).
+    """Metres a unit of a rig, from known distances (least squares over all).
 
-    Each end is located at every moment of its sighting and averaged.
+    Parameters
+    ----------
+    where : callable
+        Positions (n, 3) in the rig's unit of photodiodes that saw angles (n, s, 2).
+    distances : sequence of Distance
+    epochs, angles : Epochs, (m, s, 2) ndarray
+        The recording in which their ends were sighted.
+
+    Raises
+    ------
+    DegenerateError
+        No distance was seen at both its ends.
     """
-    measured, known = [], []
-    for distance in distances:
-        ends = []
-        for sighting in (distance.first, distance.second):
-            seen = sighted_angles(sighting, epochs, angles)[None]
-            fix = locate(
-                seen,
-                rig.positions,
-                rig.rotations,
-                rig.calibrations,
-                floor_z=0.0 if planar else None,
-            )
-            ends.append(fix.position[0])
-        length = float(np.linalg.norm(ends[1] - ends[0]))
-        if np.isfinite(length) and length > 0:
-            measured.append(length)
-            known.append(distance.distance)
-    if not measured:
+    ends = [
+        where(np.stack([sighted_angles(s, epochs, angles) for s in (d.first, d.second)]))
+        for d in distances
+    ]
+    lengths = np.array([np.linalg.norm(second - first) for first, second in ends])
+    known = np.array([d.distance for d in distances])
+    seen = np.isfinite(lengths) & (lengths > 0)
+    if not np.any(seen):
         raise DegenerateError(
-            "no end of a known distance was seen by enough stations",
+            "no known distance was seen at both its ends by enough stations",
             hint="check the times of its sightings",
         )
-    lengths = np.array(measured)
-    return float(lengths @ np.array(known) / (lengths @ lengths))
+    lengths, known = lengths[seen], known[seen]
+    return float(lengths @ known / (lengths @ lengths))
 
 
 def scale_of_odometry(

@@ -110,22 +110,14 @@ def _frame(
     """Scale, and frame where markers give one."""
     if len(known) >= 3:
         return umeyama(solved.locate(sighted), known), "markers"
-    ratios = []
-    for distance in job.scene.distances:
-        ends = [
-            frames.sighted_angles(s, job.epochs, job.angles)[None]
-            for s in (distance.first, distance.second)
-        ]
-        first, second = (solved.locate(image_of(job.epochs, e))[0] for e in ends)
-        length = float(np.linalg.norm(second - first))
-        if np.isfinite(length) and length > 0:
-            ratios.append(distance.distance / length)
-    if job.scene.distances and not ratios:
-        raise DegenerateError(
-            "no known distance was seen at both its ends", hint="check the times of its sightings"
-        )
     unit = Similarity.identity()
-    if ratios:
-        return Similarity(float(np.mean(ratios)), unit.rotation, unit.translation), "distance"
+    if job.scene.distances:
+        scale = frames.scale_of_distances(
+            lambda seen: solved.locate(image_of(job.epochs, seen)),
+            job.scene.distances,
+            job.epochs,
+            job.angles,
+        )
+        return Similarity(scale, unit.rotation, unit.translation), "distance"
     job.notes.append("unit scale: the distance of the two stations is 1")
     return unit, "unit"

@@ -154,8 +154,8 @@ def _swap_back(job: Job, fixes: Fixes, rig: Stations, floor: float | None) -> Fi
     """Give sweeps back to their stations where a report without polynomials mixed them up.
 
     Reports that sort all counts of two stations exchange a plane of theirs, or both,
-    whenever the stations' counts cross. Such a moment contradicts itself as it is, and fits exactly
-    with the exchange undone.
+    whenever the stations' counts cross. Such a moment contradicts itself as it is, and fits
+    exactly with the exchange undone.
     """
     if job.epochs.labelled or len(job.epochs.channels) != 2:
         return fixes
@@ -168,8 +168,8 @@ def _swap_back(job: Job, fixes: Fixes, rig: Stations, floor: float | None) -> Fi
         fresh = locate(trial, *rig, floor_z=floor)
         right = np.isfinite(fresh.position[:, 0]) & (fresh.worst < GATE / 2)
         rows = wrong[right]
-        job.epochs.counts[rows], job.angles[rows] = counts[right], trial[right]
-        _put(fixes, rows, fresh, right)
+        job.correct(rows, counts[right])
+        fixes = _with(fixes, rows, fresh, right)
         restored += len(rows)
         wrong = wrong[~right]
     if restored:
@@ -204,14 +204,18 @@ def _without_worst_station(
         )
         best[better] = fresh.worst[better]
         repaired |= better
-        _put(fixes, wrong[better], fresh, better)
+        fixes = _with(fixes, wrong[better], fresh, better)
     job.reject("station_contradicts_others", np.count_nonzero(repaired))
     return fixes
 
 
-def _put(fixes: Fixes, rows: NDArray[np.int64], fresh: Fixes, chosen: NDArray[np.bool_]) -> None:
+def _with(fixes: Fixes, rows: NDArray[np.int64], fresh: Fixes, chosen: NDArray[np.bool_]) -> Fixes:
+    """``fixes`` with the chosen ones of ``fresh`` at ``rows``."""
+    changed = {}
     for name in ("position", "information", "residual", "freedom"):
-        getattr(fixes, name)[rows] = getattr(fresh, name)[chosen]
+        changed[name] = getattr(fixes, name).copy()
+        changed[name][rows] = getattr(fresh, name)[chosen]
+    return Fixes(**changed)
 
 
 def _noise(fixes: Fixes, good: NDArray[np.bool_]) -> float:

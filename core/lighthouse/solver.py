@@ -18,7 +18,6 @@ from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.epochs import Epochs, angles_of, group
 from locatk.core.lighthouse.floor_map import fit_floor_map
 from locatk.core.lighthouse.generic import GENERIC, MODEL_SIGMA
-from locatk.core.lighthouse.locate import locate
 from locatk.core.lighthouse.places import gather
 from locatk.core.lighthouse.resection import resect_on_plane
 from locatk.core.lighthouse.scene import Scene, Station
@@ -30,6 +29,10 @@ Array = NDArray[np.float64]
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 METHODS = ("bundle", "paper")
+
+LARGEST_MISFIT_M = 0.02
+"""Rms distance of markers from where the stations see them that calls for a word: ten times
+what hand measurement and a guessed calibration leave."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,13 @@ class Job:
         )
         self.angles = self.angles[:, list(columns)]
 
+    def correct(self, rows: NDArray[np.int64], counts: Array) -> None:
+        """Take other counts (n, s, 2) for some moments."""
+        corrected = self.epochs.counts.copy()
+        corrected[rows] = counts
+        self.epochs = replace(self.epochs, counts=corrected)
+        self.angles = angles_of(self.epochs)
+
     @property
     def kind(self) -> str:
         """Kind of scene, ``two-auto`` where the data must tell whether it is planar."""
@@ -231,17 +241,7 @@ class Job:
         """Rms distance in metres of the markers from where two stations on a plane see them;
         infinite where too few are seen to tell."""
         known, seen = frames.sighted_markers(self.scene.markers, self.epochs, self.angles)
-        fixes = locate(
-            seen[:, columns], rig.positions, rig.rotations, rig.calibrations, floor_z=0.0
-        )
-        good = np.isfinite(fixes.position[:, 0])
-        if np.count_nonzero(good) < 4:
-            return float("inf")
-        to = frames.place_on_markers(rig, True, known[good], seen[good][:, columns])
-        if to is None:
-            return float("inf")
-        missed = to.apply(fixes.position[good]) - known[good]
-        return float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
+        return frames.marker_misfit(rig, True, known, seen[:, columns])
 
     def _solve_one(self) -> Scene:
         """One station on a plane, by resection on its markers."""
@@ -287,6 +287,13 @@ class Job:
         known, seen = frames.sighted_markers(self.scene.markers, self.epochs, self.angles)
         to = frames.place_on_markers(rig, planar, known, seen)
         if to is not None:
+            misfit = frames.marker_misfit(rig, planar, known, seen)
+            self.facts["marker_misfit_m"] = misfit if np.isfinite(misfit) else None
+            if LARGEST_MISFIT_M < misfit < np.inf:
+                self.notes.append(
+                    f"the markers are {1e3 * misfit:.0f} mm (rms) from where the stations see "
+                    "them: a marker is measured wrong, or the scene is"
+                )
             rig = frames.moved(rig, to)
             covariance = _turned(covariance, to.scale, to.rotation)
             floor_z = float(np.mean(known[:, 2])) if planar else 0.0
@@ -311,17 +318,14 @@ class Job:
     def _scale(self, rig: Rig, planar: bool) -> tuple[float, str]:
         if self.scene.distances:
             scale = frames.scale_of_distances(
-                rig, planar, self.scene.distances, self.epochs, self.angles
+                lambda seen: frames.sight(rig, planar, seen).position,
+                self.scene.distances,
+                self.epochs,
+                self.angles,
             )
             return scale, "distance"
         if self.odometry:
-            fixes = locate(
-                self.angles,
-                rig.positions,
-                rig.rotations,
-                rig.calibrations,
-                floor_z=0.0 if planar else None,
-            )
+            fixes = frames.sight(rig, planar, self.angles)
             good = fixes.worst < poses.GATE
             position = np.where(good[:, None], fixes.position, np.nan)
             found = frames.scale_of_odometry(

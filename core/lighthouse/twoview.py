@@ -24,6 +24,8 @@ def fit_homography(a: Array, b: Array) -> Array:
     """Homographies with b ~ H a, by direct linear transform.
 
     ``a`` and ``b`` are (..., n, 3) rays or homogeneous points, n >= 4; returns (..., 3, 3).
+    By normal equations, for samples by the hundred and degenerate ones among them;
+    :func:`locatk.core.geometry.fit_homography` fits one set to rounding, or refuses it.
     The points are conditioned by the centroid and size of each set (Hartley 1997).
     """
     a, from_a = _conditioned(a)

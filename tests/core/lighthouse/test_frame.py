@@ -15,6 +15,7 @@ from locatk.core.lighthouse import frame
 from locatk.core.lighthouse.bundle import Rig
 from locatk.core.lighthouse.epochs import angles_of, group
 from locatk.core.lighthouse.generic import GENERIC
+from locatk.core.lighthouse.locate import locate
 from locatk.core.lighthouse.scene import Distance, Sighting
 from locatk.core.trajectory import Trajectory
 
@@ -137,10 +138,18 @@ def test_no_sighting_is_no_marker(recorded: Recorded) -> None:
     assert seen.shape == (0, 2, 2)
 
 
+def seen_on_floor(recorded: Recorded) -> Any:
+    """Positions on the floor, in the rig's unit, of photodiodes that saw given angles."""
+    rig = recorded.rig
+    return lambda angles: (
+        locate(angles, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0).position
+    )
+
+
 def test_distances_give_the_scale(recorded: Recorded) -> None:
     def scale(*distances: Distance) -> float:
         return frame.scale_of_distances(
-            recorded.rig, True, distances, recorded.epochs, recorded.angles
+            seen_on_floor(recorded), distances, recorded.epochs, recorded.angles
         )
 
     edge = Distance(recorded.stay(0), recorded.stay(1), 1.0)
@@ -155,7 +164,9 @@ def test_distances_give_the_scale(recorded: Recorded) -> None:
 def test_distances_nobody_saw_are_refused(recorded: Recorded) -> None:
     unseen = Distance(recorded.stay(0), Sighting("robot", 0, 1), 1.0)
     with pytest.raises(DegenerateError) as refused:
-        frame.scale_of_distances(recorded.rig, True, [unseen], recorded.epochs, recorded.angles)
+        frame.scale_of_distances(
+            seen_on_floor(recorded), [unseen], recorded.epochs, recorded.angles
+        )
     assert refused.value.hint
 
 

@@ -462,6 +462,19 @@ def test_markers_decide_between_two_readings_or_protest(world: Any) -> None:
     assert right or any("markers" in note for note in solution.notes)
 
 
+def test_markers_that_contradict_the_scene_are_told(world: Any) -> None:
+    lamps = world.lamps(1, 2)
+    drive = world.drive(lamps, world.curve(100, flat=True))
+    right = strict(drive.sweeps, marked(world, lamps))
+    assert right.facts["marker_misfit_m"] < 5e-3
+    assert not any("marker" in note for note in right.notes)
+    scene = marked(world, lamps)
+    first = replace(scene.markers[0], position=scene.markers[0].position + [0.15, 0, 0])
+    wrong = strict(drive.sweeps, replace(scene, markers=(first, *scene.markers[1:])))
+    assert wrong.facts["marker_misfit_m"] > 0.02
+    assert any("markers are" in note for note in wrong.notes)
+
+
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("channels", [(1, 2), (1, 2, 5)])
 def test_occlusion_costs_poses_not_accuracy(
