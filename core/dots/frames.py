@@ -1,0 +1,35 @@
+"""Camera frames as a solver takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frames of one camera, in the order of time.
+
+    Attributes
+    ----------
+    device : str
+        Name of the camera or of the robot that carries it.
+    time_ns : (n,) int64 ndarray
+        Nanoseconds since the epoch, ascending.
+    names : tuple of str
+        Name of each frame: the file it came from, or its number.
+    images : sequence of (height, width) uint8 ndarray
+        Grey values, dots dark. Any sequence: ``images[i]`` may load the frame just then,
+        and raises InputError where that frame cannot be read.
+    """
+
+    device: str
+    time_ns: NDArray[np.int64]
+    names: tuple[str, ...]
+    images: Sequence[NDArray[np.uint8]]
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
