@@ -1,0 +1,155 @@
+"""Dots in grey images: where, to a fraction of a pixel, and how dark.
+
+The image is smoothed once by about the width of a dot; a dot is a local minimum that is
+darker than its surroundings. No threshold is global: how dark a dot must be follows from
+the minima of the same frame relative to the paper around each, so that vignettes, uneven
+light and exposure do not matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+SMOOTHING_PX = 1.1
+"""Sigma of the smoothing; fits dots of 1.5 to 5 px at a pitch of 8 to 16 px."""
+
+REACH = 2
+"""Pixels to each side that smoothing, and the search for minima, look."""
+
+PAPER = 4
+"""The paper's brightness is taken from an image this much smaller, blurred over
+:data:`PAPER_REACH` of its pixels: about two pitches."""
+PAPER_REACH = 7
+
+FAINTEST = 1.5
+"""Least contrast of a dot, in grey levels after smoothing."""
+
+SHARE = 0.45
+"""Least contrast of a dot as share of that of the frame's median dot."""
+
+
+@dataclass(frozen=True)
+class Dots:
+    """Dots of n frames, padded to the m of the fullest.
+
+    Attributes
+    ----------
+    xy : (n, m, 2) float32 ndarray
+        Pixels; 0 where there is no dot.
+    valid : (n, m) bool ndarray
+    """
+
+    xy: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """(n,) dots a frame."""
+        result: NDArray[np.int64] = self.valid.sum(axis=1)
+        return result
+
+
+def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
+    """Dots of each of (n, h, w) grey images; of more than ``most`` the darkest.
+
+    The position is the top of a Gaussian through the minimum and its neighbours.
+    """
+    n, h, w = images.shape
+    smooth = np.empty((n, h, w), np.float32)
+    minima = np.zeros((n, h, w), bool)
+    rows, columns = h // PAPER, w // PAPER
+    paper = np.empty((n, rows, columns), np.float32)
+    kernel = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    core = np.s_[REACH : h - REACH, REACH : w - REACH]
+    size = (2 * REACH + 1, 2 * REACH + 1)
+    for k, image in enumerate(images):
+        cv2.GaussianBlur(image.astype(np.float32), size, SMOOTHING_PX, dst=smooth[k])
+        np.equal(smooth[k][core], cv2.erode(smooth[k], kernel)[core], out=minima[k][core])
+        whole = image[: rows * PAPER, : columns * PAPER]  # other ratios cost ten times as much
+        small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+        cv2.blur(small.astype(np.float32), (PAPER_REACH, PAPER_REACH), dst=paper[k])
+
+    at = np.flatnonzero(minima)
+    line, column = np.divmod(at, w)
+    frame, row = np.divmod(line, h)
+    light = paper[
+        frame, np.minimum(row // PAPER, rows - 1), np.minimum(column // PAPER, columns - 1)
+    ]
+    flat = smooth.reshape(-1)
+    contrast = light - flat[at]
+    keep = contrast > FAINTEST
+    at, frame, row, column = at[keep], frame[keep], row[keep], column[keep]
+    light, contrast = light[keep], contrast[keep]
+
+    relative = contrast / light
+    keep = relative > (SHARE * _typical(relative, frame, n))[frame]
+    at, frame, light, contrast = at[keep], frame[keep], light[keep], contrast[keep]
+    x = column[keep] + _peak(flat, at, 1, light, contrast)
+    y = row[keep] + _peak(flat, at, w, light, contrast)
+    return _padded(frame, x, y, contrast, n, most)
+
+
+def _typical(
+    contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int
+) -> NDArray[np.float32]:
+    """(n,) contrast of the median dot of each frame.
+
+    Which minima are dots and which are noise is decided by Otsu's criterion on their
+    contrasts: the split that most reduces the variance within both parts.
+    """
+    counts = np.bincount(frame, minlength=n)
+    table = np.zeros((n, max(int(counts.max(initial=0)), 1)), np.float32)
+    table[frame, np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame]] = contrast
+    table = -np.sort(-table, axis=1)
+    sums = np.cumsum(table, axis=1)
+    above = np.arange(1, table.shape[1] + 1)
+    below = counts[:, None] - above
+    rest = sums[:, -1:] - sums
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = np.where(below > 0, sums**2 / above + rest**2 / below, -1.0)
+    dots = between.argmax(axis=1)
+    result: NDArray[np.float32] = table[np.arange(n), dots // 2]
+    return result
+
+
+def _peak(
+    flat: NDArray[np.float32],
+    at: NDArray[np.intp],
+    step: int,
+    light: NDArray[np.float32],
+    contrast: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Offset of the top of a Gaussian through three samples, within half a pixel."""
+    floor = 0.05 * contrast
+    before = np.log(np.maximum(light - flat[at - step], floor))
+    after = np.log(np.maximum(light - flat[at + step], floor))
+    bend = 2 * np.log(contrast) - before - after
+    offset = 0.5 * (after - before) / np.maximum(bend, 1e-6)
+    result: NDArray[np.float32] = np.clip(offset, -0.5, 0.5)
+    return result
+
+
+def _padded(
+    frame: NDArray[np.intp],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    contrast: NDArray[np.float32],
+    n: int,
+    most: int,
+) -> Dots:
+    counts = np.bincount(frame, minlength=n)
+    if counts.max(initial=0) > most:
+        order = np.lexsort((-contrast, frame))
+        rank = np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame[order]]
+        kept = np.sort(order[rank < most])
+        return _padded(frame[kept], x[kept], y[kept], contrast[kept], n, most)
+    m = max(int(counts.max(initial=0)), 1)
+    slot = np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame]
+    xy = np.zeros((n, m, 2), np.float32)
+    xy[frame, slot, 0], xy[frame, slot, 1] = x, y
+    valid = np.arange(m) < counts[:, None]
+    return Dots(xy, valid)

@@ -1,0 +1,337 @@
+"""Soft decoding: the place of a window of the pattern from all dots that are seen of it.
+
+Each dot gives the logarithm of how much likelier either of its bits is one than zero (0
+where the dot is missing); each column and row is correlated with all 63 phases of the main
+sequence; the differences of neighbouring phases vote, by how sure both are, for all places
+of the four secondary sequences. Then the pattern at the winning place is compared with
+every dot; where that leaves a doubt, the likeliest few places are, and share the confidence.
+
+The evidence for an axis is the logarithm of how much likelier its dots are at that place
+than if their bits were random. Before the dots are seen, one of ``4 * 63 * RANGE`` places,
+sections and orientations is as likely as the next; by this the evidence is lowered, so
+that random bits pass a confidence of 1 - p with a probability below p, however many places
+were tried.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.dots import sequences
+from locatk.core.dots.codec import MAIN, PERIOD, RANGE, Codec
+
+PLACES = math.log(4 * PERIOD * RANGE)
+"""Logarithm of the number of hypotheses an axis."""
+
+THRESHOLD = 0.999
+"""Least confidence of an accepted answer."""
+
+SURE = 40.0
+"""Log odds from which no other place can come near, wrong bits or not."""
+
+NARROW = 16
+"""Columns up to which a window is worth a second look when it cannot be read."""
+
+LIST = 6
+"""Residues of each secondary sequence that are joined into candidates."""
+
+CANDIDATES = 48
+"""Places that are compared with the whole window."""
+
+SIGNS = 2.0 * MAIN.astype(np.float32) - 1.0
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Answers for n windows; each array's first axis is the window.
+
+    Attributes
+    ----------
+    x, y : (n,) int64 ndarray
+        Grid coordinates of the printed window's upper left corner. The corner itself may
+        lie outside of the range where no dot is seen there; below 0 then.
+    section : (n, 2) int64 ndarray
+    rotation : (n,) int64 ndarray
+        Quarter turns counter-clockwise by which the printed pattern is seen turned.
+    dots : (n,) int64 ndarray
+        Dots seen.
+    corrected : (n,) int64 ndarray
+        Bits that were seen wrong.
+    confidence : (n,) float64 ndarray
+        Probability that the answer is right; accept from :data:`THRESHOLD` on.
+    border : (n,) bool ndarray
+        Whether dots are seen on both sides of the border of a section.
+    """
+
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    section: NDArray[np.int64]
+    rotation: NDArray[np.int64]
+    dots: NDArray[np.int64]
+    corrected: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    border: NDArray[np.bool_]
+
+
+def decode(
+    column_bits: NDArray[np.float32], row_bits: NDArray[np.float32], codec: Codec
+) -> Decoded:
+    """Place, section and orientation of n windows.
+
+    Parameters
+    ----------
+    column_bits, row_bits : (n, rows, columns) float32 ndarray
+        As seen, upright or not: logarithm of the likelihood ratio that the dot lies left
+        or down (column bit 1), and right or down (row bit 1); 0 where no dot is seen.
+        Bits of symbols that are known for sure: plus or minus 4.
+    codec : Codec
+    """
+    x_bits, y_bits = _square(column_bits), _square(row_bits)
+    forwards, backwards = _templates(x_bits.shape[1])
+    down = x_bits.transpose(0, 2, 1)
+    scores = [down @ forwards, down @ backwards, y_bits @ forwards, y_bits @ backwards]
+    sums = [score.max(axis=2).sum(axis=1) for score in scores]
+    # Columns first; each quarter turn reads what was rows as columns.
+    turns = np.stack([sums[0] + sums[2], sums[2] + sums[1], sums[1] + sums[3], sums[3] + sums[0]])
+    rotation = turns.argmax(axis=0)
+    decoded = _at_rotation(x_bits, y_bits, scores, rotation, codec)
+    doubtful = np.flatnonzero(decoded.confidence < THRESHOLD)
+    if len(doubtful) and x_bits.shape[1] <= NARROW:
+        # In small windows a few wrong bits may hide which way is up.
+        turns[rotation, np.arange(len(rotation))] = -np.inf
+        other = _at_rotation(
+            x_bits[doubtful],
+            y_bits[doubtful],
+            [score[doubtful] for score in scores],
+            turns.argmax(axis=0)[doubtful],
+            codec,
+        )
+        better = other.confidence > decoded.confidence[doubtful]
+        for name in Decoded.__dataclass_fields__:
+            getattr(decoded, name)[doubtful[better]] = getattr(other, name)[better]
+    return decoded
+
+
+def _at_rotation(
+    x_bits: NDArray[np.float32],
+    y_bits: NDArray[np.float32],
+    scores: list[NDArray[np.float32]],
+    rotation: NDArray[np.int64],
+    codec: Codec,
+) -> Decoded:
+    columns = _chosen(scores, rotation, (0, 2, 1, 3), (False, True, True, False))
+    rows = _chosen(scores, rotation, (2, 1, 3, 0), (False, False, True, True))
+    printed = _turned(x_bits, y_bits, rotation)
+    seen = (printed[0] != 0) | (printed[1] != 0)
+    x = _solve_axis(columns, printed[0].transpose(0, 2, 1), codec)
+    y = _solve_axis(rows, printed[1], codec)
+    section = np.stack([(x.shift - y.place) % PERIOD, (y.shift - x.place) % PERIOD], axis=1)
+    at_x, x_border = _signed(x.place, seen.any(axis=1))
+    at_y, y_border = _signed(y.place, seen.any(axis=2))
+    return Decoded(
+        x=at_x,
+        y=at_y,
+        section=section,
+        rotation=rotation,
+        dots=seen.sum(axis=(1, 2)),
+        corrected=x.wrong + y.wrong,
+        confidence=x.confidence * y.confidence,
+        border=x_border | y_border,
+    )
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """One axis of n windows: place, shift of the phases, wrong bits and confidence."""
+
+    place: NDArray[np.int64]
+    shift: NDArray[np.int64]
+    wrong: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+
+
+def _solve_axis(scores: NDArray[np.float32], bits: NDArray[np.float32], codec: Codec) -> _Axis:
+    """From (n, length, 63) scores of the phases and (n, length, length) bits along them."""
+    place, shift = _vote(scores, codec)
+    odds, wrong = _compare(place, shift, bits, codec)
+    rivals = np.zeros(len(place))
+    doubtful = np.flatnonzero((odds < SURE) & (wrong > 0))
+    if len(doubtful):
+        found, turned, against = _search(scores[doubtful], codec)
+        place[doubtful], shift[doubtful], rivals[doubtful] = found, turned, against
+        odds[doubtful], wrong[doubtful] = _compare(found, turned, bits[doubtful], codec)
+    with np.errstate(over="ignore"):
+        return _Axis(place, shift, wrong, 1 / (1 + rivals + np.exp(-odds)))
+
+
+def _square(bits: NDArray[np.float32]) -> NDArray[np.float32]:
+    n, rows, columns = bits.shape
+    if rows == columns:
+        return bits
+    length = max(rows, columns)
+    result = np.zeros((n, length, length), np.float32)
+    result[:, :rows, :columns] = bits
+    return result
+
+
+@functools.lru_cache(8)
+def _templates(length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(length, 63) main sequence from each phase; read backwards and inverted likewise."""
+    forwards = SIGNS[np.add.outer(np.arange(length), np.arange(PERIOD)) % PERIOD]
+    return forwards, np.ascontiguousarray(-forwards[::-1])
+
+
+def _chosen(
+    scores: list[NDArray[np.float32]],
+    rotation: NDArray[np.int64],
+    which: tuple[int, ...],
+    turned: tuple[bool, ...],
+) -> NDArray[np.float32]:
+    """(n, length, 63) scores of printed columns (or rows) at each window's orientation."""
+    result = np.empty_like(scores[0])
+    for turn in range(4):
+        of = rotation == turn
+        if of.any():
+            score = scores[which[turn]][of]
+            result[of] = score[:, ::-1] if turned[turn] else score
+    return result
+
+
+def _turned(
+    x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], rotation: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row bits as printed: turned back, dots' directions with them."""
+    x, y = np.empty_like(x_bits), np.empty_like(y_bits)
+    parts = ((x_bits, y_bits, 1), (y_bits, x_bits, -1), (x_bits, y_bits, -1), (y_bits, x_bits, 1))
+    for turn, (column, row, sign) in enumerate(parts):
+        of = rotation == turn
+        if of.any():
+            # The column bit changes its sign on the second half turn, the row bit between.
+            x[of] = np.rot90(column[of], -turn, (1, 2)) * (-1 if turn in (2, 3) else 1)
+            y[of] = np.rot90(row[of], -turn, (1, 2)) * (-1 if turn in (1, 2) else 1)
+    return x, y
+
+
+def _vote(
+    scores: NDArray[np.float32], codec: Codec
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Place (n,) and shift of the phases (n,) by the likeliest phase of each column."""
+    n, length, _ = scores.shape
+    phase = scores.argmax(axis=2)
+    top = np.take_along_axis(scores, phase[..., None], axis=2)[..., 0]
+    rivals = scores.copy()
+    np.put_along_axis(rivals, phase[..., None], -np.inf, axis=2)
+    margin = top - rivals.max(axis=2)
+
+    difference = (phase[:, 1:] - phase[:, :-1]) % PERIOD
+    weight = np.minimum(margin[:, 1:], margin[:, :-1])
+    residues = np.empty((n, 4), np.int64)
+    for k, (digits, votes) in enumerate(zip(_digits(), _ballots(codec, length - 1), strict=True)):
+        ballot = digits[difference] * weight[..., None]
+        residues[:, k] = (ballot.reshape(n, -1) @ votes).argmax(axis=1)
+    place = codec.place(residues)
+    shifts = (phase - codec.phases(place[:, None] + np.arange(length))) % PERIOD
+    ballots = np.bincount(
+        (shifts + PERIOD * np.arange(n)[:, None]).ravel(), margin.ravel(), PERIOD * n
+    )
+    return place, ballots.reshape(n, PERIOD).argmax(axis=1)
+
+
+def _search(
+    scores: NDArray[np.float32], codec: Codec
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Likeliest place (n,) and shift (n,), and how likely the rest is relative to it (n,).
+
+    All phases of a column stay in play: the differences of two columns have the circular
+    correlation of both posteriors, and each digit its marginal. The best few residues of
+    each secondary sequence, joined, are compared with all columns at all shifts.
+    """
+    n, length, _ = scores.shape
+    posterior = np.exp(0.5 * (scores - scores.max(axis=2, keepdims=True)).astype(np.float64))
+    posterior /= posterior.sum(axis=2, keepdims=True)
+    spectrum = np.fft.rfft(posterior, axis=2)
+    difference = np.fft.irfft(spectrum[:, 1:] * spectrum[:, :-1].conj(), PERIOD, axis=2)
+    totals, residues = np.zeros((n, 1)), np.zeros((n, 1, 0), np.int64)
+    for digits, votes in zip(_digits(), _ballots(codec, length - 1), strict=True):
+        marginal = np.log(np.maximum(difference, 0) @ digits + 1e-4)
+        votes_of = marginal.reshape(n, -1) @ votes
+        best = np.argsort(-votes_of, axis=1)[:, :LIST]
+        sums = totals[:, :, None] + np.take_along_axis(votes_of, best, axis=1)[:, None]
+        kept = np.argsort(-sums.reshape(n, -1), axis=1)[:, :CANDIDATES]
+        totals = np.take_along_axis(sums.reshape(n, -1), kept, axis=1)
+        old, new = np.divmod(kept, best.shape[1])
+        residues = np.concatenate(
+            [
+                np.take_along_axis(residues, old[..., None], axis=1),
+                np.take_along_axis(best, new, axis=1)[..., None],
+            ],
+            axis=2,
+        )
+    places = codec.place(residues)
+    steps = np.arange(length)
+    phases = codec.phases(places[..., None] + steps)
+    # One shift at a time: (n, candidates, length) scores are picked for each of 63.
+    row = np.arange(n)[:, None, None]
+    joint = np.stack(
+        [scores[row, steps, (phases + k) % PERIOD].sum(axis=2) for k in range(PERIOD)], axis=2
+    ).astype(np.float64)
+    joint = 0.5 * joint.reshape(n, -1)
+    winner = joint.argmax(axis=1)
+    rivals = np.exp(joint - joint.max(axis=1, keepdims=True)).sum(axis=1) - 1
+    which, shift = np.divmod(winner, PERIOD)
+    return places[np.arange(n), which], shift, rivals
+
+
+def _compare(
+    place: NDArray[np.int64], shift: NDArray[np.int64], bits: NDArray[np.float32], codec: Codec
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Log odds (n,) that ``bits`` are those at ``place``, and how many of them are wrong."""
+    n, length, _ = bits.shape
+    steps = np.arange(length)
+    phase = codec.phases(place[:, None] + steps) + shift[:, None]
+    window, column, row = np.nonzero(bits)
+    agreement = bits[window, column, row] * SIGNS[(phase[window, column] + row) % PERIOD]
+    gain = math.log(2) - np.log1p(np.exp(-agreement))
+    odds = np.bincount(window, gain, n) - PLACES
+    wrong = np.bincount(window[agreement < 0], minlength=n)
+    return odds, wrong
+
+
+@functools.cache
+def _digits() -> tuple[NDArray[np.float32], ...]:
+    """Four (63, base) tables: one at the digit of a difference; none for impossible ones."""
+    tables = []
+    for weight, base in zip(sequences.WEIGHTS, sequences.BASES, strict=True):
+        table = np.zeros((PERIOD, base), np.float32)
+        for difference in range(sequences.SMALLEST_SHIFT, PERIOD - 4):
+            digit = (difference - sequences.SMALLEST_SHIFT) // weight % base
+            table[difference, digit] = 1
+        tables.append(table)
+    return tuple(tables)
+
+
+@functools.lru_cache(16)
+def _ballots(codec: Codec, length: int) -> tuple[NDArray[np.float32], ...]:
+    """Four (length * base, period) tables: which digits a place expects at each step."""
+    tables = []
+    for digits, base in zip(codec.digits, sequences.BASES, strict=True):
+        ahead = digits[np.add.outer(np.arange(length), np.arange(len(digits))) % len(digits)]
+        table = ahead[:, None, :] == np.arange(base)[:, None]
+        tables.append(table.reshape(length * base, -1).astype(np.float32))
+    return tuple(tables)
+
+
+def _signed(
+    place: NDArray[np.int64], seen: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """``place`` of an unseen corner beyond the border as a negative; whether dots straddle."""
+    length = seen.shape[1]
+    first = seen.argmax(axis=1)
+    last = length - 1 - seen[:, ::-1].argmax(axis=1)
+    wraps = place + first >= RANGE
+    return np.where(wraps, place - RANGE, place), ~wraps & (place + last >= RANGE)

@@ -1,0 +1,112 @@
+"""Places of the pattern as metres on paper and floor, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from locatk.core.dots.sheet import MM_PER_INCH, OFFSET, Manifest, Sheet
+
+PAGE = Sheet("A4-1", (1000, 2000), (394, 565), (3, 5), (210.0, 297.0), (5.08, 4.0))
+MANIFEST = Manifest((PAGE,), pitch_mm=0.5)
+
+
+def test_origin_is_the_papers_lower_left_corner_and_y_points_up() -> None:
+    found = MANIFEST.to_metres(0, [[1000, 2000], [1100, 2000], [1000, 2010.5], [989.84, 2586]])
+    expected = [[0.00508, 0.293], [0.05508, 0.293], [0.00508, 0.28775], [0.0, 0.0]]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert MANIFEST.to_metres(0, (1000, 2000)).shape == (2,)
+    assert MANIFEST.to_metres(0, np.zeros((4, 3, 2))).shape == (4, 3, 2)
+
+
+def test_measured_scale_stretches_the_whole_paper() -> None:
+    printed = replace(MANIFEST, scale=(1.002, 0.999))
+    np.testing.assert_allclose(
+        printed.to_metres(0, [1100, 2010]), [0.05508 * 1.002, 0.288 * 0.999], atol=1e-12
+    )
+
+
+def test_tiles_lie_on_the_floor() -> None:
+    tile = replace(PAGE, position_mm=(1000.0, -200.0))
+    plain = Manifest((tile,), pitch_mm=0.5)
+    np.testing.assert_allclose(plain.to_metres(0, [1000, 2000]), [1.00508, 0.093], atol=1e-12)
+    # Turned a quarter counter-clockwise: the paper's x points to the floor's y.
+    turned = Manifest((replace(tile, heading_deg=90.0),), pitch_mm=0.5)
+    np.testing.assert_allclose(
+        turned.to_metres(0, [[1000, 2000], [1100, 2000]]),
+        [[0.707, -0.19492], [0.707, -0.14492]],
+        atol=1e-12,
+    )
+    # The scale is the paper's, and goes before the turn; the tile's place is not scaled.
+    both = replace(turned, scale=(1.01, 1.0))
+    np.testing.assert_allclose(
+        both.to_metres(0, [1000, 2000]), [0.707, -0.2 + 0.00508 * 1.01], atol=1e-12
+    )
+
+
+def test_frames_poses_are_given_in() -> None:
+    tiles = Manifest((PAGE, replace(PAGE, id="A4-2", position_mm=(0.0, 0.0))))
+    assert tiles.frame(0) == "A4-1"
+    assert tiles.frame(1) == "floor"
+
+
+@given(
+    st.floats(-180, 180),
+    st.tuples(st.floats(0.9, 1.1), st.floats(0.9, 1.1)),
+    st.tuples(st.floats(900, 1500), st.floats(1900, 2700)),
+    st.booleans(),
+)
+def test_jacobian_is_the_derivative(
+    heading: float, scale: tuple[float, float], at: tuple[float, float], tiled: bool
+) -> None:
+    sheet = replace(PAGE, position_mm=(40.0, 30.0), heading_deg=heading) if tiled else PAGE
+    manifest = Manifest((sheet,), scale=scale)
+    here = manifest.to_metres(0, at)
+    derivative = np.stack(
+        [(manifest.to_metres(0, np.add(at, step)) - here) / 8 for step in ((8, 0), (0, 8))], axis=1
+    )
+    np.testing.assert_allclose(manifest.jacobian(0), derivative, atol=1e-12)
+    # A pitch stays a pitch, and the page's y down becomes y up.
+    lengths = np.linalg.norm(manifest.jacobian(0), axis=0)
+    np.testing.assert_allclose(lengths, np.multiply(scale, 0.508e-3), rtol=1e-9)
+    assert np.linalg.det(manifest.jacobian(0)) < 0
+
+
+def test_find_tells_sheets_and_sections_apart() -> None:
+    other = replace(PAGE, id="A4-2", origin=(1394, 2000))
+    elsewhere = replace(PAGE, id="A4-3", section=(4, 5))
+    manifest = Manifest((PAGE, other, elsewhere))
+    grid = [[1000, 2000], [1393, 2564], [1394, 2000], [1200, 2100], [1200, 2100], [1200, 2100]]
+    section = [[3, 5], [3, 5], [3, 5], [4, 5], [4, -1], [-1, -1]]
+    assert manifest.find(grid, section).tolist() == [0, 0, 1, 2, 2, 0]
+    outside = [
+        [999.9, 2100],
+        [1788, 2100],
+        [1200, 1999],
+        [1200, 2564.1],
+        [1200, 2100],
+        [1500, 2100],
+    ]
+    wrong = [[3, 5], [3, 5], [3, 5], [3, 5], [9, 5], [4, 5]]
+    assert manifest.find(outside, wrong).tolist() == [-1] * 6
+    assert manifest.find(np.zeros((0, 2)), np.zeros((0, 2), int)).tolist() == []
+
+
+def test_find_with_slack_takes_the_rim() -> None:
+    sections = [[3, 5]] * 4
+    grid = [[995.1, 1995.1], [1398, 2569], [994.9, 2100], [1200, 2569.1]]
+    assert MANIFEST.find(grid, sections).tolist() == [-1] * 4
+    assert MANIFEST.find(grid, sections, slack=5.0).tolist() == [0, 0, -1, -1]
+
+
+def test_defaults_are_the_papers_print() -> None:
+    # 0.508 mm are six printer dots at 300 dpi; a dot is one wide and one from its place.
+    plain = Manifest((PAGE,))
+    for length, printer_dots in ((plain.pitch_mm, 6), (plain.dot_mm, 1), (plain.offset_mm, 1)):
+        assert length / MM_PER_INCH * 300 == pytest.approx(printer_dots)
+    assert plain.offset_mm == pytest.approx(plain.pitch_mm * OFFSET)
+    assert plain.scale == (1.0, 1.0)
