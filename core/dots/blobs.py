@@ -93,9 +93,7 @@ def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
     return _padded(frame, x, y, contrast, n, most)
 
 
-def _typical(
-    contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int
-) -> NDArray[np.float32]:
+def _typical(contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int) -> NDArray[np.float32]:
     """(n,) contrast of the median dot of each frame.
 
     Which minima are dots and which are noise is decided by Otsu's criterion on their

@@ -207,8 +207,8 @@ def _turned(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Column and row bits as printed: turned back, dots' directions with them."""
     x, y = np.empty_like(x_bits), np.empty_like(y_bits)
-    parts = ((x_bits, y_bits, 1), (y_bits, x_bits, -1), (x_bits, y_bits, -1), (y_bits, x_bits, 1))
-    for turn, (column, row, sign) in enumerate(parts):
+    for turn in range(4):
+        column, row = (y_bits, x_bits) if turn % 2 else (x_bits, y_bits)
         of = rotation == turn
         if of.any():
             # The column bit changes its sign on the second half turn, the row bit between.
@@ -217,9 +217,7 @@ def _turned(
     return x, y
 
 
-def _vote(
-    scores: NDArray[np.float32], codec: Codec
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _vote(scores: NDArray[np.float32], codec: Codec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Place (n,) and shift of the phases (n,) by the likeliest phase of each column."""
     n, length, _ = scores.shape
     phase = scores.argmax(axis=2)
@@ -297,8 +295,8 @@ def _compare(
     window, column, row = np.nonzero(bits)
     agreement = bits[window, column, row] * SIGNS[(phase[window, column] + row) % PERIOD]
     gain = math.log(2) - np.log1p(np.exp(-agreement))
-    odds = np.bincount(window, gain, n) - PLACES
-    wrong = np.bincount(window[agreement < 0], minlength=n)
+    odds = np.bincount(window, gain.astype(np.float64), n) - PLACES
+    wrong = np.bincount(window[agreement < 0], minlength=n).astype(np.int64)
     return odds, wrong
 
 

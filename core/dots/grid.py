@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots.blobs import Dots
 from locatk.core.dots.sheet import OFFSET
 
 SEEDS = 40
@@ -83,9 +82,7 @@ class Lattices:
     lens: bool
 
 
-def fit_lattices(
-    points: NDArray[np.float32], valid: NDArray[np.bool_], *, lens: bool
-) -> Lattices:
+def fit_lattices(points: NDArray[np.float32], valid: NDArray[np.bool_], *, lens: bool) -> Lattices:
     """Lattices of the dots of n frames.
 
     Parameters
@@ -96,7 +93,6 @@ def fit_lattices(
     lens : bool
         Fit the bend of an unknown lens too.
     """
-    n = len(points)
     parameters, found = _seed(points, valid)
     for ring in RINGS:
         uv, z = _project(parameters, points)
@@ -163,7 +159,9 @@ def _seed(
     square[~(there[:, :, None] & there[:, None])] = np.inf
 
     # A dot has four neighbours at a pitch, more or less: take the median of the third.
-    third = np.partition(square, min(2, square.shape[2] - 1), axis=2)[:, :, min(2, square.shape[2] - 1)]
+    third = np.partition(square, min(2, square.shape[2] - 1), axis=2)[
+        :, :, min(2, square.shape[2] - 1)
+    ]
     third = np.where(there, third, np.nan)
     found = there.sum(axis=1) >= FEWEST
     third[~found] = 1.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import DISPLACEMENT, MAIN, PERIOD, RANGE, Codec
 from locatk.core.dots.decode import THRESHOLD, decode
 from locatk.core.dots.grid import Lattices
+from locatk.core.dots.located import Located, nothing
 from locatk.core.dots.sheet import OFFSET
 
 BATCH = 16
@@ -44,48 +45,11 @@ OFTEN = 0.018
 SHARPEST = 0.03
 """Least standard deviation of a dot that is believed, in pitches."""
 
-ACCEPTED, FEW_DOTS, NO_GRID, NO_CODE, DOUBTFUL, BORDER = range(6)
-REASONS = {
-    FEW_DOTS: "too_few_dots",
-    NO_GRID: "no_grid",
-    NO_CODE: "no_code",
-    DOUBTFUL: "low_confidence",
-    BORDER: "section_border",
-}
-"""Why a frame has no place."""
-
-
-@dataclass(frozen=True)
-class Located:
-    """Places of n frames; without meaning where ``outcome`` is not :data:`ACCEPTED`.
-
-    Attributes
-    ----------
-    grid : (n, 2) float64 ndarray
-        Grid coordinates of the camera's centre.
-    section : (n, 2) int64 ndarray
-    heading : (n,) float64 ndarray
-        From the sheet's x axis to the image's right, counter-clockwise, in rad.
-    covariance : (n, 3, 3) float64 ndarray
-        Of x, y (pitches, y down) and heading (rad).
-    dots, corrected : (n,) int64 ndarray
-        Dots of the grid, and bits among theirs that were seen wrong.
-    confidence : (n,) float64 ndarray
-    outcome : (n,) int64 ndarray
-        :data:`ACCEPTED`, or a key of :data:`REASONS`.
-    """
-
-    grid: NDArray[np.float64]
-    section: NDArray[np.int64]
-    heading: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    dots: NDArray[np.int64]
-    corrected: NDArray[np.int64]
-    confidence: NDArray[np.float64]
-    outcome: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.outcome)
+FEW_DOTS = "too_few_dots"
+NO_GRID = "no_grid"
+NO_CODE = "no_code"
+DOUBTFUL = "low_confidence"
+BORDER = "section_border"
 
 
 @dataclass(frozen=True)
@@ -119,15 +83,15 @@ def locate(
     is estimated in each frame.
     """
     n, height, width = images.shape
-    result = _nothing(n)
+    result = nothing(n, FEW_DOTS)
     if min(height, width) < SMALLEST:
         return result
     for start in range(0, n, BATCH):
         left = np.arange(start, min(start + BATCH, n))
         for level in _levels(height, width):
             part, _ = _locate(images[left], codec, camera, level, threshold)
-            _keep(result, left, part)
-            left = left[result.outcome[left] != ACCEPTED]
+            result.keep(left, part)
+            left = left[~result.accepted[left]]
             if not len(left):
                 break
     return result
@@ -141,7 +105,7 @@ def sightings(
     for image in images:
         for level in _levels(height, width):
             part, match = _locate(image[None], codec, camera, level, THRESHOLD)
-            if part.outcome[0] == ACCEPTED:
+            if part.accepted[0]:
                 dots = match.use[0]
                 centre, scale = _normal_frame(height, width, camera)
                 seen = match.lattices.points[0, dots] * scale
@@ -209,12 +173,12 @@ def _locate(
     match = _match(lattices, half, decoded.x, decoded.y, decoded.section, decoded.rotation, codec)
     covariance = _refine(lattices, match)
 
-    outcome = np.full(n, ACCEPTED)
-    outcome[decoded.confidence < threshold] = DOUBTFUL
-    outcome[decoded.confidence < 0.5] = NO_CODE
-    outcome[(outcome != ACCEPTED) & decoded.border] = BORDER
-    outcome[~lattices.found] = NO_GRID
-    outcome[dots.counts < grid.FEWEST] = FEW_DOTS
+    rejected = np.full(n, "", object)
+    rejected[decoded.confidence < threshold] = DOUBTFUL
+    rejected[decoded.confidence < 0.5] = NO_CODE
+    rejected[(rejected != "") & decoded.border] = BORDER
+    rejected[~lattices.found] = NO_GRID
+    rejected[dots.counts < grid.FEWEST] = FEW_DOTS
     centre_uv = lattices.parameters[:, [grid.C_U, grid.C_V]]
     turn = _turns()[decoded.rotation]
     at = np.einsum("nij,nj->ni", turn, centre_uv + half) + _corner(half)[decoded.rotation]
@@ -228,7 +192,7 @@ def _locate(
         dots=decoded.dots,
         corrected=decoded.corrected,
         confidence=np.where(lattices.found, decoded.confidence, 0.0),
-        outcome=outcome,
+        rejected=rejected,
     )
     return located, match
 
@@ -240,9 +204,7 @@ def _half(lattices: Lattices) -> int:
     return min(reach, WIDEST // 2)
 
 
-def _bits(
-    lattices: Lattices, half: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _bits(lattices: Lattices, half: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Column and row bits (n, 2 half, 2 half) as the decoder takes them.
 
     A bit is one where the dot lies beyond the diagonal through its place (papers/dots.txt
@@ -250,10 +212,12 @@ def _bits(
     claim a place, the one closer to where symbols stand is taken.
     """
     length = 2 * half
-    n, m = lattices.valid.shape
+    n = len(lattices.found)
     rest = lattices.uv - lattices.place
     index = lattices.place.astype(np.int64) + half
-    inside = lattices.valid & lattices.found[:, None] & ((index >= 0) & (index < length)).all(axis=2)
+    inside = (
+        lattices.valid & lattices.found[:, None] & ((index >= 0) & (index < length)).all(axis=2)
+    )
     frame, dot = np.nonzero(inside)
     index, rest = index[frame, dot], rest[frame, dot]
     cell = (frame * length + index[:, 1]) * length + index[:, 0]
@@ -341,23 +305,3 @@ def _pose_covariance(
     jacobian[:, 2, grid.A_V.start] = -u / square
     result: NDArray[np.float64] = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
     return result
-
-
-def _nothing(n: int) -> Located:
-    return Located(
-        grid=np.full((n, 2), np.nan),
-        section=np.full((n, 2), -1, np.int64),
-        heading=np.full(n, np.nan),
-        covariance=np.full((n, 3, 3), np.nan),
-        dots=np.zeros(n, np.int64),
-        corrected=np.zeros(n, np.int64),
-        confidence=np.zeros(n),
-        outcome=np.full(n, FEW_DOTS),
-    )
-
-
-def _keep(result: Located, at: NDArray[np.int64], part: Located) -> None:
-    """Put ``part`` where nothing was found yet, or where it came further."""
-    better = (part.outcome == ACCEPTED) | (part.confidence >= result.confidence[at])
-    for field in fields(Located):
-        getattr(result, field.name)[at[better]] = getattr(part, field.name)[better]

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec, codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.locate import ACCEPTED, REASONS, Located, locate
+from locatk.core.dots.locate import FEW_DOTS, locate
+from locatk.core.dots.located import Located, nothing
+from locatk.core.dots.paper import locate_paper
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
@@ -76,19 +78,19 @@ def solve(
     trajectories: list[Trajectory] = []
     astray: list[NDArray[np.float64]] = []
     for camera_frames in frames:
-        answer = _locate_all(camera_frames, code, options)
-        sheet = np.full(len(camera_frames), -1, np.intp)
-        accepted = answer.reasons == ""
+        located = _locate_all(camera_frames, code, options)
+        accepted = np.flatnonzero(located.accepted)
+        sheet = np.full(len(located), -1, np.intp)
         sheet[accepted] = manifest.find(
-            answer.located.grid[accepted], answer.located.section[accepted], slack=RIM
+            located.grid[accepted], located.section[accepted], slack=RIM
         )
-        off = accepted & (sheet < 0)
-        answer.reasons[off] = OFF_SHEET
-        astray.extend(answer.located.grid[off][:1])
-        on_sheet, pose = _poses(answer.located, sheet, manifest)
-        outcomes += _outcomes(camera_frames, answer)
-        detections += _detections(camera_frames, answer, manifest, sheet, on_sheet, pose)
-        trajectories += _trajectories(camera_frames.device, camera_frames, manifest, sheet, pose)
+        off = accepted[sheet[accepted] < 0]
+        located.rejected[off] = OFF_SHEET
+        astray += list(located.grid[off[:1]])
+        poses = _poses(located, sheet, manifest)
+        outcomes += _outcomes(camera_frames, located)
+        detections += _detections(camera_frames, located, sheet, poses, manifest)
+        trajectories += _trajectories(camera_frames, sheet, poses, manifest)
     rejected = Counter(frame["rejected"] for frame in outcomes if frame["rejected"])
     return Solution(
         system="dots",
@@ -102,42 +104,158 @@ def solve(
     )
 
 
-@dataclass
-class _Answer:
-    """What was found in the frames of one camera; a reason is ``""`` where it is a place."""
-
-    located: Located
-    reasons: NDArray[np.object_]
-
-
-def _locate_all(frames: Frames, code: Codec, options: SolveOptions) -> _Answer:
-    from locatk.core.dots.locate import _keep, _nothing
-
-    located = _nothing(len(frames))
-    reasons = np.full(len(frames), "", object)
-    find = _paper if options.method == "paper" else locate
-    for indices, images in _batches(frames, reasons, options.camera):
-        part = find(images, code, options.camera)
-        _keep(located, indices, part)
-        reasons[indices] = [REASONS.get(int(k), "") for k in part.outcome]
-    return _Answer(located, reasons)
+def _locate_all(frames: Frames, code: Codec, options: SolveOptions) -> Located:
+    located = nothing(len(frames), FEW_DOTS)
+    find = _locate_paper if options.method == "paper" else locate
+    for indices, images in _batches(frames, located.rejected, options.camera):
+        located.keep(indices, find(images, code, options.camera))
+    return located
 
 
 def _batches(
-    frames: Frames, reasons: NDArray[np.object_], camera: Camera | None
+    frames: Frames, rejected: NDArray[np.object_], camera: Camera | None
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """Frames of one size at a time, with their indices; what is wrong goes to ``reasons``."""
+    """Frames of one size at a time, with their indices; what is wrong goes to ``rejected``."""
     for start in range(0, len(frames), LOADED):
-        by_size: dict[tuple[int, int], list[tuple[int, NDArray[np.uint8]]]] = {}
+        by_size: dict[tuple[int, ...], list[tuple[int, NDArray[np.uint8]]]] = {}
         for index in range(start, min(start + LOADED, len(frames))):
             try:
                 image = frames.images[index]
             except InputError:
-                reasons[index] = UNREADABLE
+                rejected[index] = UNREADABLE
                 continue
             if camera is not None and image.shape != camera.size[::-1]:
-                reasons[index] = OTHER_SIZE
+                rejected[index] = OTHER_SIZE
                 continue
-            by_size.setdefault((image.shape[0], image.shape[1]), []).append((index, image))
+            by_size.setdefault(image.shape, []).append((index, image))
         for found in by_size.values():
             yield np.array([index for index, _ in found]), np.stack([image for _, image in found])
+
+
+def _locate_paper(images: NDArray[np.uint8], code: Codec, camera: Camera | None = None) -> Located:
+    """The published algorithm's answers; for lack of better its quality is the confidence."""
+    located = nothing(len(images), FEW_DOTS)
+    for k, image in enumerate(images):
+        pose = locate_paper(image, code, camera)
+        located.grid[k] = pose.x, pose.y
+        located.section[k] = pose.section
+        located.heading[k] = pose.heading_rad
+        located.dots[k] = pose.dots
+        located.corrected[k] = pose.corrected_bits
+        located.confidence[k] = pose.quality
+        located.rejected[k] = pose.rejected or ""
+    return located
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Of all frames, without meaning where there is no sheet: (n, 2) m, (n,) rad, (n, 3, 3)."""
+
+    position: NDArray[np.float64]
+    heading: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+def _poses(located: Located, sheet: NDArray[np.intp], manifest: Manifest) -> _Poses:
+    n = len(located)
+    poses = _Poses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
+    for number in np.unique(sheet[sheet >= 0]):
+        on = sheet == number
+        jacobian = manifest.jacobian(int(number))
+        poses.position[on] = manifest.to_metres(int(number), located.grid[on])
+        right = np.column_stack([np.cos(located.heading[on]), -np.sin(located.heading[on])])
+        x, y = (right @ jacobian.T).T
+        poses.heading[on] = np.arctan2(y, x)
+        full = np.eye(3)
+        full[:2, :2] = jacobian
+        poses.covariance[on] = full @ located.covariance[on] @ full.T
+    return poses
+
+
+def _outcomes(frames: Frames, located: Located) -> list[dict[str, Any]]:
+    return [
+        {
+            "time_s": frames.time_ns[k] * 1e-9,
+            "frame": frames.names[k],
+            "dots": int(located.dots[k]),
+            "corrected_bits": int(located.corrected[k]),
+            "confidence": float(located.confidence[k]),
+            "rejected": located.rejected[k] or None,
+        }
+        for k in range(len(frames))
+    ]
+
+
+def _detections(
+    frames: Frames,
+    located: Located,
+    sheet: NDArray[np.intp],
+    poses: _Poses,
+    manifest: Manifest,
+) -> list[dict[str, Any]]:
+    return [
+        {
+            "time_s": frames.time_ns[k] * 1e-9,
+            "frame": frames.names[k],
+            "x_m": float(poses.position[k, 0]),
+            "y_m": float(poses.position[k, 1]),
+            "heading_rad": float(poses.heading[k]),
+            "confidence": float(located.confidence[k]),
+            "corrected_bits": int(located.corrected[k]),
+            "dots": int(located.dots[k]),
+            "grid_x": float(located.grid[k, 0]),
+            "grid_y": float(located.grid[k, 1]),
+            "sheet": manifest.sheets[sheet[k]].id,
+        }
+        for k in np.flatnonzero(sheet >= 0)
+    ]
+
+
+def _trajectories(
+    frames: Frames, sheet: NDArray[np.intp], poses: _Poses, manifest: Manifest
+) -> Iterator[Trajectory]:
+    """One a frame of reference; the device's name bears it where there are several."""
+    names = np.array([manifest.frame(k) for k in range(len(manifest.sheets))], object)
+    seen = list(dict.fromkeys(names[sheet[sheet >= 0]]))
+    for name in seen or [names[0]]:
+        on = np.flatnonzero((sheet >= 0) & (names[sheet] == name))
+        covariance = np.full((len(on), 6, 6), np.nan)
+        plane = np.array([0, 1, 5])
+        covariance[:, plane[:, None], plane] = poses.covariance[on]
+        yield Trajectory(
+            device=frames.device if len(seen) < 2 else f"{frames.device}-{name}",
+            frame=str(name),
+            time_ns=frames.time_ns[on],
+            position=np.column_stack([poses.position[on], np.zeros(len(on))]),
+            quaternion=quaternion_from_heading(poses.heading[on]),
+            covariance=covariance,
+        )
+
+
+def _notes(
+    options: SolveOptions,
+    manifest: Manifest,
+    rejected: Counter[str],
+    astray: list[NDArray[np.float64]],
+) -> tuple[str, ...]:
+    notes = []
+    if options.method == "paper":
+        notes.append("the published method knows no uncertainty: its confidence is a quality")
+    if options.camera is None:
+        notes.append(
+            "no camera model: poses are of the middle of the frame, its lens estimated anew in each"
+            if options.method != "paper"
+            else "no camera model: poses are of the middle of the frame, its lens taken as flat"
+        )
+    if rejected[OFF_SHEET]:
+        x, y = astray[0]
+        notes.append(
+            f"{rejected[OFF_SHEET]} frames show the pattern off all sheets of the manifest, the "
+            f"first at {x:.1f}, {y:.1f}: is it the manifest of another sheet?"
+        )
+    if rejected["no_code"] > max(3, sum(rejected.values()) // 2):
+        notes.append(
+            f"{rejected['no_code']} frames show dots on a grid, but no place of the codec "
+            f"{manifest.codec!r}: was the sheet printed with another?"
+        )
+    return tuple(notes)
