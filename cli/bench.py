@@ -11,6 +11,7 @@ from locatk.cli import console, options
 
 BENCHES = {
     "lighthouse": "locatk.formats.bench.lighthouse:figures",
+    "dots": "locatk.formats.bench.dots:figures",
 }
 """Name of a system to the function that measures its figures."""
 
@@ -34,6 +35,7 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
     \b
     Examples:
       locatk bench lighthouse
+      locatk bench dots
       locatk bench lighthouse --data ~/data --json
     """
     from locatk.formats.data import data_folder

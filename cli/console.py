@@ -11,14 +11,15 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import click
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass
@@ -124,7 +125,11 @@ def _numeric(cell: str) -> bool:
     return cell in ("", "-") or cell.lstrip("<>=~+- ")[:1].isdigit()
 
 
-def progress(items: Sequence[T], label: str) -> AbstractContextManager[Iterable[T]]:
+class _Counted(Sized, Iterable[T_co], Protocol[T_co]):
+    """What can be walked and says how long it is, like a list."""
+
+
+def progress(items: _Counted[T], label: str) -> AbstractContextManager[Iterable[T]]:
     """``with progress(items, "Solving") as bar: for item in bar`` shows a bar.
 
     On stderr, only on a terminal, and neither with ``-q`` nor with ``--json``, nor for

@@ -2,34 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from locatk.cli import console, options
 
+if TYPE_CHECKING:
+    from locatk.core.trajectory import Trajectory
+
+SYSTEMS = ("lighthouse", "dots")
+
 
 @click.command(short_help="Simulate, solve and evaluate, to see that all works.")
-@options.output("Folder for session, solution and plot. [default: a new one]", required=False)
+@click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
+@options.output("Folder for sessions, solutions and plots. [default: a new one]", required=False)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @options.overwrite
 @options.as_json
 @options.verbosity
-def command(output: Path | None, seed: int, overwrite: bool, as_json: bool) -> None:
-    """Simulate a session of each system, solve it, and compare it with the truth.
+def command(
+    systems: tuple[str, ...], output: Path | None, seed: int, overwrite: bool, as_json: bool
+) -> None:
+    """Simulate a session of each SYSTEM, solve it, and compare it with the truth.
 
-    Here: two robots driving under two Lighthouse stations whose places are unknown.
-    Writes the session, the solution and a plot.
+    Two robots drive under two Lighthouse stations whose places are unknown; a camera
+    drives over a printed A4 sheet of dots, of which some are missing and some are dust.
+    Writes the session, the solution and a plot of each, and the sheet to print.
 
     \b
     Examples:
       locatk demo
-      locatk demo -o demo
+      locatk demo dots -o demo
       locatk demo --seed 7 --json
     """
     folder = _folder(output)
-    rows = [_lighthouse(folder, seed, overwrite)]
+    chosen = [name for name in SYSTEMS if name in systems or not systems]
+    makers = {"lighthouse": _lighthouse, "dots": _dots}
+    for name in chosen:
+        for path in _files(folder, name):
+            options.guard_output(path, overwrite=overwrite)
+    rows = [_whole_way(folder, name, makers[name], seed, overwrite) for name in chosen]
     if as_json:
         console.emit_json({"version": 1, "systems": rows})
         return
@@ -40,15 +55,15 @@ def command(output: Path | None, seed: int, overwrite: bool, as_json: bool) -> N
                 (
                     row["system"],
                     row["poses"],
-                    f"{1e3 * row['mae_m']:.2f}",
-                    f"{1e3 * row['paper_mae_m']:.2f}",
+                    f"{1e3 * row['mae_m']:.2g}",
+                    "-" if row["paper_mae_m"] is None else f"{1e3 * row['paper_mae_m']:.2g}",
                     f"{row['solve_s']:.2f}",
                 )
                 for row in rows
             ],
         )
     )
-    console.say("error: mean distance from the truth, in the frame of the simulated markers")
+    console.say("error: mean distance from the truth, in the frame of the markers or the sheet")
     for row in rows:
         for file in row["files"]:
             console.say(f"Wrote {file}")
@@ -63,49 +78,99 @@ def _folder(output: Path | None) -> Path:
     return output
 
 
-def _lighthouse(folder: Path, seed: int, overwrite: bool) -> dict[str, Any]:
+def _files(folder: Path, system: str) -> list[Path]:
+    """Session, solution and plot; of dots the sheet as well."""
+    endings = [".mcap", "-solved.mcap", ".png", *(["-sheet.pdf"] if system == "dots" else [])]
+    return [folder / f"{system}{end}" for end in endings]
+
+
+def _whole_way(
+    folder: Path,
+    system: str,
+    make: Callable[[list[Path], int, bool], tuple[Trajectory, ...]],
+    seed: int,
+    overwrite: bool,
+) -> dict[str, Any]:
     from locatk.cli.systems import Request, solve_session
     from locatk.core import metrics
-    from locatk.core.lighthouse.simulate import SimulationOptions, simulate
-    from locatk.formats import observations, solutions
+    from locatk.formats import solutions
     from locatk.formats.plot import plot_solution
 
-    session, solution, picture = (
-        folder / f"lighthouse{end}" for end in (".mcap", "-solved.mcap", ".png")
-    )
-    for path in (session, solution, picture):
-        options.guard_output(path, overwrite=overwrite)
-
+    files = _files(folder, system)
+    session, solution, picture = files[:3]
     with console.working("Simulating"):
-        simulated = simulate(
-            SimulationOptions(robots=2, stations=2, planar=True, duration_s=60.0, seed=seed)
-        )
-        observations.write_session(
-            session,
-            system="lighthouse",
-            sweeps=simulated.sweeps,
-            scene=simulated.scene,
-            truth=simulated.truth,
-            overwrite=overwrite,
-        )
+        truths = make(files, seed, overwrite)
     with console.working("Solving"):
         solved = solve_session(session, Request())
         paper = solve_session(session, Request(method="paper"))
         solutions.write_solution(solution, solved.solution, source=session, overwrite=overwrite)
 
-    truth = {trajectory.device: trajectory for trajectory in simulated.truth}
+    truth = {trajectory.device: trajectory for trajectory in truths}
 
-    def error(of: Any) -> float:
-        pairs = [(mine, truth[mine.device]) for mine in of.solution.trajectories]
-        return metrics.evaluate_all(pairs).mae
+    def error(of: Any) -> float | None:
+        found = [mine for mine in of.solution.trajectories if len(mine)]
+        if not found:
+            return None
+        return metrics.evaluate_all([(mine, truth[mine.device]) for mine in found]).mae
 
     with console.working("Drawing"):
-        plot_solution(picture, solved.solution, truth=simulated.truth, overwrite=overwrite)
+        plot_solution(picture, solved.solution, truth=truths, overwrite=overwrite)
     return {
-        "system": "lighthouse",
+        "system": system,
         "poses": solved.solution.poses,
         "mae_m": error(solved),
         "paper_mae_m": error(paper),
         "solve_s": solved.solve_s,
-        "files": [str(session), str(solution), str(picture)],
+        "files": [str(path) for path in files],
     }
+
+
+def _lighthouse(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    from locatk.core.lighthouse.simulate import SimulationOptions, simulate
+    from locatk.formats import observations
+
+    simulated = simulate(
+        SimulationOptions(robots=2, stations=2, planar=True, duration_s=60.0, seed=seed)
+    )
+    observations.write_session(
+        files[0],
+        system="lighthouse",
+        sweeps=simulated.sweeps,
+        scene=simulated.scene,
+        truth=simulated.truth,
+        overwrite=overwrite,
+    )
+    return simulated.truth
+
+
+def _dots(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    from math import radians
+
+    from locatk.core.dots import simulate
+    from locatk.formats import frames
+    from locatk.formats.output import atomic_write
+    from locatk.formats.pdf import pattern
+
+    wanted = simulate.SimulationOptions(
+        frames=400,
+        speed_mps=0.25,
+        tilt_rad=radians(3),
+        missing=0.02,
+        dust=0.01,
+        jitter_m=10e-6,
+        noise=6.0,
+        vignette=0.3,
+        seed=seed,
+    )
+    simulated = simulate.simulate(None, wanted)
+    frames.write_session(
+        files[0],
+        [simulated.frames],
+        simulated.manifest,
+        camera=simulated.camera,
+        truth=(simulated.truth,),
+        overwrite=overwrite,
+    )
+    with atomic_write(files[3], overwrite=overwrite) as stream:
+        stream.write(pattern.render(simulated.manifest))
+    return (simulated.truth,)

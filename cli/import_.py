@@ -2,33 +2,69 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
+
+MOST_WARNINGS = 10
+"""So many are said on stderr; ``--json`` and the log of a camera session hold them all."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A foreign format: who reads it, and the options that mean something to it."""
+
+    reader: str
+    system: str
+    options: tuple[str, ...]
+
 
 FORMATS = {
-    "dotbot-lh2": "locatk.formats.importers.dotbot:read_dotbot",
+    "dotbot-lh2": Format(
+        "locatk.formats.importers.dotbot:read_dotbot", "lighthouse", ("truth", "calibration")
+    ),
+    "images": Format(
+        "locatk.formats.importers.images:ImageFiles", "dots", ("sheet", "camera", "rate")
+    ),
+    "video": Format("locatk.formats.importers.video:Video", "dots", ("sheet", "camera")),
 }
-"""Name of a foreign format to the function that reads it."""
+"""Name of a foreign format to what is known of it."""
 
 
 @click.command("import", short_help="Turn recordings of other tools into a session.")
 @click.argument("format_name", metavar="FORMAT", type=click.Choice(list(FORMATS)))
-@options.input_argument("paths", many=True)
+@click.argument("paths", type=options.PATH, nargs=-1, required=True)
 @options.output("Session to write (.mcap).")
 @options.input_option(
     "--truth",
     many=True,
     metavar="PATH",
-    help="Reference to store beside the data: pixel tracks from Blender. Repeatable. Grid "
-    "columns in the data itself are taken unasked.",
+    help="dotbot-lh2: reference to store beside the data: pixel tracks from Blender. "
+    "Repeatable. Grid columns in the data itself are taken unasked.",
 )
 @options.input_option(
     "--calibration",
     metavar="PATH",
-    help="Camera or marker calibration (calibration.json), where it is not beside the truth.",
+    help="dotbot-lh2: camera or marker calibration (calibration.json), where it is not beside "
+    "the truth.",
+)
+@options.input_option(
+    "--sheet",
+    metavar="MANIFEST",
+    help="images, video: manifest of the sheet in the frames (sheet.toml).",
+)
+@options.input_option(
+    "--camera", metavar="FILE", help="images, video: the camera that took them (camera.toml)."
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(min=1e-3, max=1e6),
+    metavar="HZ",
+    help="images: frames a second. [default: 30]",
 )
 @options.overwrite
 @options.as_json
@@ -39,23 +75,78 @@ def command(
     output: Path,
     truth: tuple[Path, ...],
     calibration: Path | None,
+    sheet: Path | None,
+    camera: Path | None,
+    rate: float | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Read PATHS, recorded by another tool in FORMAT, into one session.
 
-    FORMAT is `dotbot-lh2`: LFSR counts of Lighthouse V2 as published by DotBots (CSV).
+    \b
+    FORMAT is one of
+      dotbot-lh2  LFSR counts of Lighthouse V2 as published by DotBots (CSV)
+      images      camera frames of a dot sheet: files, folders or patterns, in
+                  the order of the file names (frame2 before frame10)
+      video       the same from one video file, whose times are kept
+
+    Files that are no image, or are damaged, are left out and named; the exit status is 3
+    then, and the rest is written all the same.
 
     \b
     Examples:
       locatk import dotbot-lh2 data_all.csv -o grid.mcap
       locatk import dotbot-lh2 1_lh2.csv --truth 1_blender.csv -o run.mcap
       locatk import dotbot-lh2 data.csv --truth 1_blender.csv --truth 2_blender.csv -o two.mcap
+      locatk import images frames/ --sheet sheet.toml --rate 46.6 -o run.mcap
+      locatk import images 'run/*.png' --sheet sheet.toml --camera camera.toml -o run.mcap
+      locatk import video run.mp4 --sheet sheet.toml -o run.mcap
     """
+    chosen = FORMATS[format_name]
+    given = {
+        "truth": truth,
+        "calibration": calibration,
+        "sheet": sheet,
+        "camera": camera,
+        "rate": rate,
+    }
+    for name, value in given.items():
+        if value not in (None, ()) and name not in chosen.options:
+            raise click.UsageError(f"--{name} means nothing to the format {format_name}.")
+    if format_name == "video" and len(paths) > 1:
+        raise click.UsageError("The format video takes one PATH.")
+    if format_name != "images":  # whose patterns are not there by that name
+        options.must_exist(paths)
+    aside = [*truth, *(path for path in (calibration, sheet, camera) if path is not None)]
+    options.guard_output(output, overwrite=overwrite, inputs=[*paths, *aside])
+    read = options.load(chosen.reader)
+    if chosen.system == "dots":
+        answer, lost = _frames(format_name, read, paths, output, sheet, camera, rate, overwrite)
+    else:
+        answer, lost = _sweeps(read, paths, output, truth, calibration, overwrite), None
+    for warning in answer["warnings"][:MOST_WARNINGS]:
+        console.warn(warning)
+    if len(answer["warnings"]) > MOST_WARNINGS:
+        console.warn(f"... and {len(answer['warnings']) - MOST_WARNINGS} more")
+    if as_json:
+        console.emit_json({"version": 1, "output": output, "format": format_name, **answer})
+    else:
+        console.result(f"Wrote {output}")
+    if lost is not None:
+        raise failures.Incomplete(lost)
+
+
+def _sweeps(
+    read: Any,
+    paths: tuple[Path, ...],
+    output: Path,
+    truth: tuple[Path, ...],
+    calibration: Path | None,
+    overwrite: bool,
+) -> dict[str, Any]:
+    """Import sweeps; returns what ``--json`` says of them."""
     from locatk.formats import observations
 
-    options.guard_output(output, overwrite=overwrite, inputs=[*paths, *truth])
-    read = options.load(FORMATS[format_name])
     with console.working("Reading"):
         # A recording named as its own reference means its own columns, which are read anyway.
         references = [path for path in truth if not any(path.samefile(other) for other in paths)]
@@ -69,27 +160,61 @@ def command(
             facts=imported.facts,
             overwrite=overwrite,
         )
-    for warning in imported.warnings:
-        console.warn(warning)
-
     sweeps = imported.sweeps
     truth_poses = sum(len(trajectory) for trajectory in imported.truth)
-    if as_json:
-        console.emit_json(
-            {
-                "version": 1,
-                "output": output,
-                "format": format_name,
-                "sweeps": len(sweeps),
-                "devices": list(sweeps.devices),
-                "truth_poses": truth_poses,
-                "warnings": imported.warnings,
-            }
-        )
+    console.say(
+        f"{len(sweeps)} sweeps of {len(sweeps.devices)} device(s) "
+        f"({', '.join(sweeps.devices)}), {truth_poses} truth poses"
+    )
+    return {
+        "sweeps": len(sweeps),
+        "devices": list(sweeps.devices),
+        "truth_poses": truth_poses,
+        "warnings": imported.warnings,
+    }
+
+
+def _frames(
+    format_name: str,
+    read: Any,
+    paths: tuple[Path, ...],
+    output: Path,
+    sheet: Path | None,
+    camera: Path | None,
+    rate: float | None,
+    overwrite: bool,
+) -> tuple[dict[str, Any], str | None]:
+    """Import camera frames; returns what ``--json`` says of them, and what was lost."""
+    from locatk.formats import frames, sheets
+    from locatk.formats.importers.images import DEVICE, find_images
+
+    manifest = None if sheet is None else sheets.read_manifest(sheet)
+    lens = None if camera is None else sheets.read_camera(camera)
+    more = {} if rate is None else {"rate_hz": rate}
+    if format_name == "images":
+        found = find_images(paths)
+        options.guard_output(output, overwrite=overwrite, inputs=found)
+        source = read(found, camera=lens, **more)
     else:
-        devices = ", ".join(sweeps.devices)
-        console.say(
-            f"{len(sweeps)} sweeps of {len(sweeps.devices)} device(s) ({devices}), "
-            f"{truth_poses} truth poses"
+        source = read(paths[0], camera=lens)
+    with console.progress(source, "Importing") as bar:
+        counts = frames.write_shots(
+            output,
+            {DEVICE: bar},
+            manifest=manifest,
+            camera=lens,
+            facts=source.facts,
+            warnings=source.warnings,
+            overwrite=overwrite,
         )
-        console.result(f"Wrote {output}")
+    count = counts[DEVICE]
+    console.say(f"{count} frames of {DEVICE}")
+    if manifest is None:
+        console.say("No --sheet: `locatk solve` will need its manifest as --artifact")
+    answer = {
+        "frames": count,
+        "devices": [DEVICE],
+        "left_out": source.left_out,
+        "warnings": source.warnings,
+    }
+    return answer, source.lost

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 @options.as_json
 @options.verbosity
 def command(file: Path, as_json: bool) -> None:
-    """Say what is in FILE: a session, a solution (.mcap, of any tool) or a scene (.toml).
+    """Say what is in FILE: a session or a solution (.mcap, of any tool), or an artifact
+    (.toml): a lighthouse scene, a manifest of dot sheets, a camera.
 
     A damaged or cut recording is described as far as it can be read; the exit status
     is 3 then.
@@ -31,6 +33,7 @@ def command(file: Path, as_json: bool) -> None:
       locatk info run.mcap
       locatk info run.mcap --json
       locatk info scene.toml
+      locatk info sheet.toml
     """
     facts = _artifact(file) if file.suffix.lower() == ".toml" else _recording(file)
     facts = {"version": 1, "file": str(file), "bytes": file.stat().st_size, **facts}
@@ -43,8 +46,17 @@ def command(file: Path, as_json: bool) -> None:
 
 
 def _artifact(file: Path) -> dict[str, Any]:
-    from locatk.formats import artifacts
+    from locatk.formats import artifacts, describe, sheets, toml
 
+    table = toml.read(file)
+    known = (artifacts.SCENE_FORMAT, sheets.MANIFEST_FORMAT, sheets.CAMERA_FORMAT)
+    name = table.text("format", choices=known)
+    if name == sheets.MANIFEST_FORMAT:
+        manifest = describe.manifest(sheets.read_manifest(file))
+        return {"kind": "manifest", "system": "dots", **manifest}
+    if name == sheets.CAMERA_FORMAT:
+        camera = describe.camera(sheets.read_camera(file))
+        return {"kind": "camera", "system": "dots", "camera": camera}
     scene = artifacts.read_scene(file)
     return {"kind": "scene", "system": "lighthouse", **_scene(scene)}
 
@@ -73,6 +85,10 @@ def _recording(file: Path) -> dict[str, Any]:
     }
     if facts.get("system") == "lighthouse":
         described |= _lighthouse(session)
+    elif facts.get("system") == "dots":
+        from locatk.formats import describe
+
+        described |= describe.dots(session)
     return described
 
 
@@ -162,6 +178,9 @@ def _text(facts: dict[str, Any]) -> str:
         ("sweeps", facts.get("sweeps")),
         ("markers", facts.get("markers")),
         ("scale", facts.get("scale")),
+        ("frames", facts.get("frames")),
+        ("print", _print(facts)),
+        ("camera", _camera(facts.get("camera"))),
         ("damage", facts.get("damage")),
     ):
         if value not in (None, ""):
@@ -197,6 +216,26 @@ def _text(facts: dict[str, Any]) -> str:
         ],
     )
     section(
+        ("camera", "frames", "px"),
+        [(c["device"], c["frames"], _by(c["size_px"])) for c in facts.get("cameras", ())],
+    )
+    section(
+        ("sheet", "origin", "dots", "section", "paper [mm]", "pattern [mm]", "frame", "place"),
+        [
+            (
+                s["id"],
+                ",".join(map(str, s["origin"])),
+                _by(s["size"]),
+                ",".join(map(str, s["section"])),
+                _by(s["page_mm"]),
+                _by(s["pattern_mm"]),
+                s["frame"],
+                "-" if s["position_mm"] is None else _place(s),
+            )
+            for s in facts.get("sheets", ())
+        ],
+    )
+    section(
         ("attachment", "type", "bytes"),
         [(a["name"], a["media_type"], a["bytes"]) for a in facts.get("attachments", ())],
     )
@@ -210,6 +249,37 @@ def _text(facts: dict[str, Any]) -> str:
         ],
     )
     return "\n".join(lines)
+
+
+def _print(facts: dict[str, Any]) -> str | None:
+    if "pitch_mm" not in facts:
+        return None
+    scale = [facts["scale_x"], facts["scale_y"]]
+    measured = "" if scale == [1, 1] else f", scale {scale[0]:.6g} x {scale[1]:.6g}"
+    return (
+        f"{facts['codec']}, pitch {facts['pitch_mm']:.6g} mm, dots {facts['dot_mm']:.3g} mm, "
+        f"{facts['dpi']} dpi{measured}"
+    )
+
+
+def _camera(camera: dict[str, Any] | None) -> str | None:
+    if camera is None:
+        return None
+    x, y = camera["centre_px"]
+    return (
+        f"{_by(camera['size_px'])} px, focal length {camera['focal_px']:.6g} px, centre "
+        f"{x:.6g},{y:.6g}, radial {camera['radial']:.4g} ({camera['distortion_px']:.2g} px "
+        "in the corners)"
+    )
+
+
+def _place(sheet: dict[str, Any]) -> str:
+    x, y = sheet["position_mm"]
+    return f"{x:.6g},{y:.6g} mm, {sheet['heading_deg']:.4g} deg"
+
+
+def _by(pair: Sequence[float] | None) -> str:
+    return "-" if pair is None else f"{pair[0]:.6g} x {pair[1]:.6g}"
 
 
 def _when(time_ns: int | None) -> str | None:

@@ -19,13 +19,22 @@ PATH = click.Path(path_type=Path)
 
 def _existing(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
     """Callback: every path given must be there."""
-    paths = value if isinstance(value, tuple) else (value,)
+    must_exist(value if isinstance(value, tuple) else (value,))
+    return value
+
+
+def must_exist(paths: Sequence[Path | None]) -> None:
+    """Refuse paths that are not there.
+
+    Raises
+    ------
+    MissingDataError
+    """
     for path in paths:
         if path is not None and not path.exists():
             raise MissingDataError(
                 "No such file or folder", file=path, hint="Check the spelling of the path"
             )
-    return value
 
 
 def input_argument(name: str, *, many: bool = False) -> Callable[[F], F]:
@@ -66,10 +75,10 @@ as_json = click.option(
 
 method = click.option(
     "--method",
-    type=click.Choice(("bundle", "paper")),
+    type=click.Choice(("bundle", "lattice", "paper")),
     default=None,
-    help="Algorithm: `paper` is the published one as written, `bundle` the better one.  "
-    "[default: the system's better one]",
+    help="Algorithm: `paper` is the published one as written; the better one is `bundle` of "
+    "lighthouse, `lattice` of dots.  [default: the system's better one]",
 )
 
 artifact = input_option(

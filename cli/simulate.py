@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, options, simulate_dots
 
 
 @click.group(short_help="Make a session with known truth, without hardware.")
@@ -16,7 +16,11 @@ def command() -> None:
     \b
     Examples:
       locatk simulate lighthouse -o run.mcap
+      locatk simulate dots -o run.mcap
     """
+
+
+command.add_command(simulate_dots.command, "dots")
 
 
 @command.command(short_help="Robots driving under Lighthouse stations.")

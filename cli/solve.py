@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,11 +31,16 @@ scene_option = click.option(
 @options.method
 @scene_option
 @options.artifact
+@options.input_option(
+    "--camera",
+    metavar="FILE",
+    help="Dots: the camera (.toml) to use instead of the session's.",
+)
 @click.option(
     "--save-scene",
     type=options.PATH,
     metavar="FILE",
-    help="Write the solved scene as an artifact (.toml) too, for --artifact.",
+    help="Lighthouse: write the solved scene as an artifact (.toml) too, for --artifact.",
 )
 @options.overwrite
 @options.as_json
@@ -45,6 +51,7 @@ def command(
     method: str | None,
     scene: str | None,
     artifact: Path | None,
+    camera: Path | None,
     save_scene: Path | None,
     overwrite: bool,
     as_json: bool,
@@ -60,21 +67,28 @@ def command(
       locatk solve run.mcap -o solved.mcap --method paper --json
       locatk solve first.mcap -o solved.mcap --save-scene scene.toml
       locatk solve day/*.mcap -o solved/ --artifact scene.toml
+      locatk solve frames.mcap -o solved.mcap --camera camera.toml
     """
-    from locatk.cli.systems import Request, solve_session
+    from locatk.cli.systems import Request, solve_session, system_of
     from locatk.formats import artifacts, solutions
 
     outputs = plan_outputs(sessions, output)
     if save_scene is not None and len(sessions) > 1:
         raise click.UsageError("--save-scene needs exactly one session.")
-    for path in [*outputs, *([save_scene] if save_scene else [])]:
-        options.guard_output(path, overwrite=overwrite, inputs=sessions)
+    if save_scene is not None and system_of(sessions[0]) == "dots":
+        raise click.UsageError("--save-scene is for lighthouse: dots solve no scene.")
+    aside = [path for path in (artifact, camera) if path is not None]
+    for path in outputs:
+        options.guard_output(path, overwrite=overwrite, inputs=[*sessions, *aside])
+    if save_scene is not None:
+        options.guard_output(save_scene, overwrite=overwrite, inputs=sessions)
 
-    request = Request(method=method, scene=scene, artifact=artifact)
+    request = Request(method=method, scene=scene, artifact=artifact, camera=camera)
     entries: list[dict[str, Any]] = []
     losses: list[str] = []
     said: list[tuple[str, list[str]]] = []
-    with console.progress(sessions, "Solving") as bar:
+    wait = console.working("Solving") if len(sessions) == 1 else contextlib.nullcontext()
+    with wait, console.progress(sessions, "Solving") as bar:
         for session, target in zip(bar, outputs, strict=True):
             try:
                 solved = solve_session(session, request)
@@ -172,4 +186,5 @@ def _spread(sigma: Any) -> list[str]:
     import numpy as np
 
     known = [column[np.isfinite(column)] for column in sigma[:, :3].T]
-    return [f"{1e3 * np.median(column):.2f}" if len(column) else "-" for column in known]
+    # Of lighthouse these are millimetres, of dots a thousandth of that.
+    return [f"{1e3 * np.median(column):#.3g}" if len(column) else "-" for column in known]

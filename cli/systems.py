@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from locatk.core.errors import FormatError, LocatkError
+from locatk.core.errors import FormatError, InputError, LocatkError
 
 if TYPE_CHECKING:
     from locatk.core.solution import Solution
@@ -26,6 +26,7 @@ class Request:
     method: str | None = None
     scene: str | None = None
     artifact: Path | None = None
+    camera: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ def lighthouse(session: Session, request: Request) -> Solved:
     from locatk.core.lighthouse.scene import Scene
     from locatk.formats import artifacts, observations
 
+    _check(request, "lighthouse", methods=("bundle", "paper"), refused=("camera",))
     sweeps = observations.read_sweeps(session)
     if request.artifact is not None:
         scene = artifacts.read_scene(request.artifact)
@@ -57,7 +59,36 @@ def lighthouse(session: Session, request: Request) -> Solved:
     return Solved(solution, time.perf_counter() - start)
 
 
-SYSTEMS: dict[str, Solver] = {"lighthouse": lighthouse}
+def dots(session: Session, request: Request) -> Solved:
+    """Solve a session of camera frames of a dot sheet."""
+    from locatk.core import dots as system
+    from locatk.formats import observations, sheets
+
+    _check(request, "dots", methods=("lattice", "paper"), refused=("scene",))
+    if request.artifact is not None:
+        manifest = sheets.read_manifest(request.artifact)
+    else:
+        attached = observations.read_manifest(session)
+        if attached is None:
+            raise InputError(
+                "no manifest of the sheet",
+                file=session.path,
+                hint="Import the frames with --sheet, or give the manifest as --artifact",
+            )
+        manifest = attached
+    camera = (
+        observations.read_camera(session)
+        if request.camera is None
+        else sheets.read_camera(request.camera)
+    )
+    frames = observations.read_frames(session)
+    options = _given(system.SolveOptions, {"method": request.method, "camera": camera})
+    start = time.perf_counter()
+    solution = system.solve(frames, manifest, options)
+    return Solved(solution, time.perf_counter() - start)
+
+
+SYSTEMS: dict[str, Solver] = {"lighthouse": lighthouse, "dots": dots}
 
 
 def solve_session(path: Path, request: Request) -> Solved:
@@ -104,6 +135,27 @@ def _solver(session: Session) -> Solver:
     )
 
 
-def _given(options: Callable[..., Any], values: dict[str, str | None]) -> Any:
+def system_of(path: Path) -> str:
+    """Name of the system whose session is at ``path``, "" where it does not say."""
+    from locatk.formats.session import Session
+
+    return Session.open(path).facts.get("system", "")
+
+
+def _check(
+    request: Request, system: str, *, methods: tuple[str, ...], refused: tuple[str, ...]
+) -> None:
+    """Refuse what was asked of a solver that means nothing to it."""
+    if request.method is not None and request.method not in methods:
+        raise InputError(
+            f"no method {request.method!r} for {system}",
+            hint=f"Use --method {' or '.join(methods)}",
+        )
+    for name in refused:
+        if getattr(request, name) is not None:
+            raise InputError(f"--{name} means nothing to {system}", hint=f"Leave out --{name}")
+
+
+def _given(options: Callable[..., Any], values: dict[str, Any]) -> Any:
     """``options`` from the values that the user gave, its own defaults for the rest."""
     return options(**{name: value for name, value in values.items() if value is not None})

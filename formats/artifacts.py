@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from locatk.core.errors import InputError, MissingDataError
 from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, Scene, Sighting, Station
 from locatk.formats import toml
@@ -66,14 +65,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     ArtifactError
         It is no valid scene; the error names the key and what was expected.
     """
-    try:
-        with open(path, "rb") as stream:
-            data = stream.read()
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingDataError("no such file", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
-    return loads_scene(data, file=path)
+    return _parse(toml.read(path))
 
 
 def attached_scene(session: Session) -> Scene | None:
@@ -187,16 +179,11 @@ def loads_scene(text: str | bytes, *, file: str | os.PathLike[str] | None = None
     ArtifactError
         A key is missing, unknown or wrong; the error names it and what was expected.
     """
-    table = toml.loads(text, file if file is not None else "<scene>")
-    if table.text("format") != SCENE_FORMAT:
-        raise table.error("format", f"expected {SCENE_FORMAT!r}")
-    if table.integer("format_version", 1, 10**6) > SCENE_VERSION:
-        raise table.error(
-            "format_version",
-            f"newer than {SCENE_VERSION}, which this locatk knows",
-            "Update locatk",
-        )
-    table.text("tool_version", None)
+    return _parse(toml.loads(text, file if file is not None else "<scene>"))
+
+
+def _parse(table: Table) -> Scene:
+    toml.check_format(table, SCENE_FORMAT, SCENE_VERSION)
     scale = table.text("scale", "unit", SCALES)
     stations = table.tables("stations")
     in_units = bool(stations) and scale == "unit"

@@ -51,13 +51,15 @@ class NotMcapError(DamageError):
 class Segment:
     """A part of the file that holds messages: one chunk, or a run of records outside.
 
-    ``channels`` are the ids of the channels inside, None where not known.
+    ``channels`` are the ids of the channels inside, None where not known; ``indexes``
+    says at which byte of the file the index of a channel's messages is, where there is one.
     """
 
     offset: int
     length: int
     is_chunk: bool
     channels: frozenset[int] | None = None
+    indexes: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass
@@ -130,8 +132,9 @@ def _index_of_summary(stream: IO[bytes], summary: bytes, offset: int) -> Index |
             statistics = parse(records.Statistics.read, content, start)
         elif opcode == Opcode.CHUNK_INDEX:
             chunk = parse(records.ChunkIndex.read, content, start)
+            at = tuple(chunk.message_index_offsets.items())
             channels = frozenset(chunk.message_index_offsets) or None
-            segment = Segment(chunk.chunk_start_offset, chunk.chunk_length, True, channels)
+            segment = Segment(chunk.chunk_start_offset, chunk.chunk_length, True, channels, at)
             index.segments.append(segment)
         elif opcode == Opcode.ATTACHMENT_INDEX:
             index.attachments.append(parse(records.AttachmentIndex.read, content, start))
@@ -262,13 +265,7 @@ def read_messages(
     DamageError
         The segment is not what the index says, or its checksum is wrong.
     """
-    if segment.is_chunk:
-        content = record_at(stream, segment.offset, Opcode.CHUNK)
-        if len(content) + _FRAME.size != segment.length:
-            raise DamageError("a chunk is damaged", segment.offset)
-        data: bytes | memoryview = decompress(content, segment.offset)
-    else:
-        data = _read(stream, segment.offset, segment.length)
+    data = unpacked(stream, segment)
     # One chunk may hold tens of thousands of messages: no call a record in this loop.
     position, end = 0, len(data)
     unpack_frame, unpack_message = _FRAME.unpack_from, _MESSAGE.unpack_from
@@ -287,6 +284,22 @@ def read_messages(
                     yield channel, time_ns, bytes(data[start + 22 : position])
         except struct.error:
             raise DamageError("a record is damaged", segment.offset) from None
+
+
+def unpacked(stream: IO[bytes], segment: Segment) -> bytes | memoryview:
+    """Records of one segment, one after the other.
+
+    Raises
+    ------
+    DamageError
+        The segment is not what the index says, or its checksum is wrong.
+    """
+    if not segment.is_chunk:
+        return _read(stream, segment.offset, segment.length)
+    content = record_at(stream, segment.offset, Opcode.CHUNK)
+    if len(content) + _FRAME.size != segment.length:
+        raise DamageError("a chunk is damaged", segment.offset)
+    return decompress(content, segment.offset)
 
 
 def decompress(content: bytes, offset: int) -> bytes | memoryview:

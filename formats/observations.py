@@ -1,4 +1,4 @@
-"""What a session holds, as arrays for a solver: sweeps, truth, odometry, the scene.
+"""What a session holds, as arrays for a solver: sweeps, frames, truth, odometry, artifacts.
 
 Solutions and trajectories have modules of their own; what a caller needs of them is
 offered here too.
@@ -15,10 +15,13 @@ from locatk.core.errors import FormatError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.trajectory import Trajectory
-from locatk.formats import artifacts, viewers
+from locatk.formats import artifacts
 from locatk.formats.artifacts import attached_scene as read_scene
+from locatk.formats.frames import read_frames
 from locatk.formats.messages import SWEEPS, batch_edges
 from locatk.formats.session import Session, SessionWriter
+from locatk.formats.sheets import attached_camera as read_camera
+from locatk.formats.sheets import attached_manifest as read_manifest
 from locatk.formats.solutions import read_solution, read_trajectories, write_solution
 from locatk.formats.tracks import (
     LARGEST_BATCH,
@@ -28,11 +31,14 @@ from locatk.formats.tracks import (
     read_batches,
     read_odometry,
     read_truth,
-    track_messages,
+    truth_messages,
     write_streams,
 )
 
 __all__ = [
+    "read_camera",
+    "read_frames",
+    "read_manifest",
     "read_odometry",
     "read_scene",
     "read_solution",
@@ -169,10 +175,7 @@ def write_session(
     """
     for kind, trajectories in (("truth", truth), ("odometry", odometry)):
         check_devices(trajectories, kind)
-    streams = [sweep_messages(sweeps)]
-    for trajectory in truth:
-        streams.append(track_messages(f"/truth_track/{trajectory.device}", trajectory))
-        streams.append(viewers.poses(f"/truth/{trajectory.device}", trajectory))
+    streams = [sweep_messages(sweeps), *truth_messages(truth)]
     for trajectory in odometry:
         streams.append(odometry_messages(f"/odometry/{trajectory.device}", trajectory))
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:

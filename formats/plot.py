@@ -104,7 +104,7 @@ def draw(
 ) -> Figure:
     """The figure of :func:`plot_solution`, not yet written."""
     scene = solution.artifact if isinstance(solution.artifact, Scene) else Scene()
-    unscaled = scene.scale == "unit"
+    unscaled = solution.system == "lighthouse" and scene.scale == "unit"
     if evaluation is None and not unscaled:
         evaluation = _compare(solution, truth)
     if evaluation is not None:
@@ -189,11 +189,11 @@ def _errors(evaluation: Evaluation) -> dict[str, Series]:
 
 
 def _sigmas(solution: Solution) -> dict[str, Series]:
-    """Standard deviations of positions; devices whose covariance is unknown are left out."""
+    """Standard deviations of positions, of the axes that are known; devices without are left out."""
     series = {}
     for t in solution.trajectories:
-        variance = np.einsum("nii->n", t.covariance[:, :3, :3])
-        known = np.isfinite(variance)
+        variances = np.einsum("nii->ni", t.covariance[:, :3, :3])
+        known, variance = np.isfinite(variances).any(axis=1), np.nansum(variances, axis=1)
         if np.any(known):
             series[t.device] = Series(t.time_ns[known], 1e3 * np.sqrt(variance[known]))
     return series
@@ -384,7 +384,7 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
 
 def _mm(metres: float) -> str:
     """A length in mm, to three digits."""
-    digits = np.clip(2 - np.floor(np.log10(max(1e3 * metres, 1e-3))), 0, 3)
+    digits = np.clip(2 - np.floor(np.log10(max(1e3 * metres, 1e-5))), 0, 5)
     return f"{1e3 * metres:.{int(digits)}f} mm"
 
 

@@ -69,11 +69,13 @@ class Session:
         Log times of the first and the last message; None without messages.
     damage : str or None
         What is wrong with the file, where it was opened in spite of it.
+    index : Index
+        Where the records are, for :mod:`locatk.formats.mcap_places`.
     """
 
     def __init__(self, path: str | os.PathLike[str], index: Index) -> None:
         self.path = os.fspath(path)
-        self._index = index
+        self.index = index
         self.profile = index.header.profile
         self.library = index.header.library
         self.start_ns = index.start_ns
@@ -108,7 +110,7 @@ class Session:
         FormatError
             It is empty, not MCAP, cut short or damaged.
         """
-        with _reading(path) as stream:
+        with reading(path) as stream:
             try:
                 return cls(path, mcap_records.read_index(stream))
             except NotMcapError:
@@ -145,13 +147,13 @@ class Session:
         names = None if topics is None else frozenset(topics)
         wanted = {
             entry.id: entry.topic
-            for entry in self._index.channels.values()
+            for entry in self.index.channels.values()
             if names is None or entry.topic in names
         }
-        expected = sum(self._index.counts[channel] for channel in wanted)
+        expected = sum(self.index.counts[channel] for channel in wanted)
         seen = 0
-        with _reading(self.path) as stream:
-            for segment in self._index.segments:
+        with reading(self.path) as stream:
+            for segment in self.index.segments:
                 if segment.channels is not None and segment.channels.isdisjoint(wanted):
                     continue
                 for channel, time_ns, data in mcap_records.read_messages(stream, segment, wanted):
@@ -188,18 +190,18 @@ class Session:
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records by name; of equal names the later one wins, key by key."""
-        return {name: dict(record) for name, record in self._index.metadata.items()}
+        return {name: dict(record) for name, record in self.index.metadata.items()}
 
     @property
     def facts(self) -> dict[str, str]:
         """The record ``locatk``: kind, system, versions; empty for another tool's file."""
-        return dict(self._index.metadata.get(RECORD, {}))
+        return dict(self.index.metadata.get(RECORD, {}))
 
     def attachments(self) -> tuple[AttachmentInfo, ...]:
         """What is attached, without reading it."""
         return tuple(
             AttachmentInfo(entry.name, entry.media_type, entry.data_size, entry.log_time)
-            for entry in self._index.attachments
+            for entry in self.index.attachments
         )
 
     def attachment(self, name: str) -> bytes | None:
@@ -210,11 +212,11 @@ class Session:
         FormatError
             It is damaged.
         """
-        entries = [entry for entry in self._index.attachments if entry.name == name]
+        entries = [entry for entry in self.index.attachments if entry.name == name]
         if not entries:
             return None
         offset = entries[-1].offset
-        with _reading(self.path) as stream:
+        with reading(self.path) as stream:
             content = mcap_records.record_at(stream, offset, Opcode.ATTACHMENT)
             crc = int.from_bytes(content[-4:], "little")
             if crc and zlib.crc32(content[:-4]) != crc:
@@ -223,8 +225,8 @@ class Session:
 
 
 @contextmanager
-def _reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
-    """The open file; whatever is wrong with it becomes an error of one line."""
+def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+    """The open MCAP file; whatever is wrong with it becomes an error of one line."""
     try:
         with open(path, "rb") as stream:
             yield stream

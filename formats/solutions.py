@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import artifacts, viewers
+from locatk.formats import artifacts, sheets, viewers
 from locatk.formats.artifacts import SCENE_FILE, attached_scene
 from locatk.formats.session import Session, SessionWriter
+from locatk.formats.sheets import SHEET_FILE, attached_manifest
 from locatk.formats.tracks import (
     Timed,
     check_devices,
@@ -29,6 +31,11 @@ from locatk.formats.tracks import (
 
 SOLUTION_FILE = "solution.json"
 SOLUTION_VERSION = 1
+
+# Tuples, not unions, which isinstance takes twice as long for: there are a million values.
+_PLAIN, _LISTS, _ARRAYS = (str, int), (list, tuple), (np.ndarray, np.generic)
+
+_ENCODER = json.JSONEncoder(allow_nan=False)
 
 
 def write_solution(
@@ -57,7 +64,7 @@ def write_solution(
         See :func:`locatk.formats.output.atomic_write`.
     """
     check_devices(solution.trajectories, "solved")
-    scene = solution.artifact if isinstance(solution.artifact, Scene) else None
+    artifact = solution.artifact
     starts = [int(t.time_ns[0]) for t in solution.trajectories if len(t) > 0]
     start = min(starts, default=0)
     name = Path(source).name
@@ -65,11 +72,13 @@ def write_solution(
     with SessionWriter(
         path, kind="solution", system=solution.system, facts=facts, overwrite=overwrite
     ) as writer:
-        if scene is not None:
-            writer.attach(SCENE_FILE, artifacts.dumps_scene(scene).encode(), "application/toml")
-        text = json.dumps(plain(_statement(solution, name)), indent=1, allow_nan=False)
+        if isinstance(artifact, Scene):
+            writer.attach(SCENE_FILE, artifacts.dumps_scene(artifact).encode(), "application/toml")
+        elif isinstance(artifact, Manifest):
+            writer.attach(SHEET_FILE, sheets.dumps_manifest(artifact).encode(), "application/toml")
+        text = _json(plain(_statement(solution, name)))
         writer.attach(SOLUTION_FILE, text.encode(), "application/json")
-        streams = [iter(_once(solution, scene, start))]
+        streams = [iter(_once(solution, start))]
         for t in solution.trajectories:
             streams.append(track_messages(f"/solution/{t.device}", t))
             streams.append(viewers.poses(f"/pose/{t.device}", t))
@@ -93,10 +102,24 @@ def _statement(solution: Solution, source: str) -> dict[str, Any]:
     }
 
 
-def _once(solution: Solution, scene: Scene | None, start: int) -> list[Timed]:
-    """What is said once, at the start: the scene, whole paths, the log."""
+def _json(value: Any, depth: int = 0) -> str:
+    """JSON text with a line for each key of the upper levels and for each entry of a list of
+    objects: there may be 100,000 of them, which an indented text makes three times slower."""
+    space, below = "\n" + " " * depth, "\n" + " " * (depth + 1)
+    if isinstance(value, dict) and value and depth < 2:
+        pairs = (f"{json.dumps(key)}: {_json(item, depth + 1)}" for key, item in value.items())
+        return "{" + below + ("," + below).join(pairs) + space + "}"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        items = (_ENCODER.encode(item) for item in value)
+        return "[" + below + ("," + below).join(items) + space + "]"
+    return _ENCODER.encode(value)
+
+
+def _once(solution: Solution, start: int) -> list[Timed]:
+    """What is said once, at the start: the artifact, whole paths, the log."""
+    artifact = solution.artifact if isinstance(solution.artifact, Scene | Manifest) else None
     said: list[Timed] = [
-        (start, "/scene", viewers.scene_update(scene, solution.trajectories, start))
+        (start, "/scene", viewers.scene_update(artifact, solution.trajectories, start))
     ]
     for t in solution.trajectories:
         if len(t) > 0:
@@ -139,7 +162,7 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
             trajectories=_trajectories(session, said["devices"]),
             rejected={str(key): int(count) for key, count in said["rejected"].items()},
             detections=list(said["detections"]),
-            artifact=attached_scene(session),
+            artifact=attached_scene(session) or attached_manifest(session),
             notes=tuple(said["notes"]),
             facts=dict(said["facts"]),
         )
@@ -212,14 +235,14 @@ def plain(value: Any) -> Any:
     InputError
         It holds something that JSON cannot say.
     """
+    if value is None or isinstance(value, _PLAIN):
+        return value
+    if isinstance(value, float):  # numpy's float64 too
+        return float(value) if math.isfinite(value) else None
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, _LISTS):
         return [plain(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, _ARRAYS):
         return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | bool | int):
-        return value
     raise InputError(f"a {type(value).__name__} cannot be written as JSON")

@@ -19,10 +19,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import ArtifactError
+from locatk.core.errors import ArtifactError, InputError, MissingDataError
 
 _REQUIRED: Any = object()
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def read(path: str | os.PathLike[str]) -> Table:
+    """Parse the file at ``path``.
+
+    Raises
+    ------
+    MissingDataError
+        There is no such file.
+    InputError
+        It cannot be read.
+    ArtifactError
+        It is not TOML; see :func:`loads`.
+    """
+    try:
+        with open(path, "rb") as stream:
+            data = stream.read()
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingDataError("no such file", file=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
+    return loads(data, path)
+
+
+def check_format(table: Table, name: str, version: int) -> None:
+    """Refuse an artifact that is not of the format ``name``, or newer than ``version``.
+
+    Reads the three keys with which every artifact begins: ``format``,
+    ``format_version`` and ``tool_version``.
+    """
+    if table.text("format") != name:
+        raise table.error("format", f"expected {name!r}")
+    if table.integer("format_version", 1, 10**6) > version:
+        raise table.error(
+            "format_version", f"newer than {version}, which this locatk knows", "Update locatk"
+        )
+    table.text("tool_version", None)
 
 
 def loads(text: str | bytes, file: str | os.PathLike[str]) -> Table:

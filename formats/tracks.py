@@ -64,10 +64,24 @@ def _batched(
         yield int(part["time_ns"][0]), topic, layout.pack(texts, part)
 
 
-def write_streams(writer: SessionWriter, streams: Iterable[Iterator[Timed]]) -> None:
-    """Write messages of several ascending streams in the order of their times."""
+def truth_messages(truth: Iterable[Trajectory]) -> list[Iterator[Timed]]:
+    """Streams of reference poses: exact ones, and one message a pose for viewers."""
+    streams = []
+    for trajectory in truth:
+        streams.append(track_messages(f"/truth_track/{trajectory.device}", trajectory))
+        streams.append(viewers.poses(f"/truth/{trajectory.device}", trajectory))
+    return streams
+
+
+def write_streams(writer: SessionWriter, streams: Iterable[Iterator[Timed]]) -> int:
+    """Write messages of several ascending streams in the order of their times.
+
+    Returns the time of the last one, 0 where there is none.
+    """
+    time_ns = 0
     for time_ns, topic, message in heapq.merge(*streams, key=lambda item: item[0]):
         writer.write(topic, message, time_ns)
+    return time_ns
 
 
 def check_devices(trajectories: Sequence[Trajectory], kind: str) -> None:

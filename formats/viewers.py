@@ -25,6 +25,7 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
+from locatk.core.dots.sheet import Manifest
 from locatk.core.geometry import quaternion_from_matrix
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.trajectory import Trajectory
@@ -36,6 +37,8 @@ LONGEST_PATH = 5000
 
 STATION_COLOR = Color(r=0.15, g=0.35, b=0.75, a=1.0)
 MARKER_COLOR = Color(r=0.85, g=0.25, b=0.2, a=1.0)
+PAPER_COLOR = Color(r=0.35, g=0.35, b=0.35, a=1.0)
+PATTERN_COLOR = Color(r=0.6, g=0.6, b=0.6, a=1.0)
 TEXT_COLOR = Color(r=0.5, g=0.5, b=0.5, a=1.0)
 PATH_COLORS = tuple(
     Color(r=r, g=g, b=b, a=1.0)
@@ -97,17 +100,20 @@ def log(message: str, time_ns: int, *, warning: bool = False) -> Log:
 
 
 def scene_update(
-    scene: Scene | None, trajectories: Sequence[Trajectory], time_ns: int
+    artifact: Scene | Manifest | None, trajectories: Sequence[Trajectory], time_ns: int
 ) -> SceneUpdate:
-    """Stations, markers and paths as things to look at.
+    """Stations and markers, or sheets of paper, and paths as things to look at.
 
     Sizes are in the units of the scene, which has 0.1 m stations where its scale is
-    metric.
+    metric; sheets are in metres.
     """
     entities = []
-    if scene is not None:
-        entities += [_station(station, scene, time_ns) for station in scene.stations]
-        entities += [_marker(marker, scene, time_ns) for marker in scene.markers]
+    if isinstance(artifact, Scene):
+        entities += [_station(station, artifact, time_ns) for station in artifact.stations]
+        entities += [_marker(marker, artifact, time_ns) for marker in artifact.markers]
+    elif isinstance(artifact, Manifest):
+        sheets = range(len(artifact.sheets))
+        entities += [_sheet(artifact, number, time_ns) for number in sheets]
     for number, trajectory in enumerate(trajectories):
         if len(trajectory) > 0:
             color = PATH_COLORS[number % len(PATH_COLORS)]
@@ -205,6 +211,38 @@ def _marker(marker: Marker, scene: Scene, time_ns: int) -> SceneEntity:
         id=f"marker/{marker.name}",
         spheres=[SpherePrimitive(pose=pose, size=_vector(size, size, size), color=MARKER_COLOR)],
         texts=[_text(marker.name, position, 0.04)],
+    )
+
+
+def _sheet(manifest: Manifest, number: int, time_ns: int) -> SceneEntity:
+    """Rims of the paper and of the pattern on it."""
+    sheet = manifest.sheets[number]
+    origin, first = np.array(sheet.origin, float), np.array(sheet.first_mm)
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    paper = origin + (unit * sheet.page_mm - first) / manifest.pitch_mm
+    pattern = origin + unit * (np.array(sheet.size) - 1)
+    corners = manifest.to_metres(number, paper)
+    return SceneEntity(
+        timestamp=timestamp(time_ns),
+        frame_id=manifest.frame(number),
+        id=f"sheet/{sheet.id}",
+        metadata=_pairs({"id": sheet.id, "codec": manifest.codec}),
+        lines=[
+            _loop(corners, PAPER_COLOR, 2.0),
+            _loop(manifest.to_metres(number, pattern), PATTERN_COLOR, 1.0),
+        ],
+        texts=[_text(sheet.id, (*corners[0].tolist(), 0.0), 0.0)],
+    )
+
+
+def _loop(corners: NDArray[np.float64], color: Color, thickness: float) -> LinePrimitive:
+    return LinePrimitive(
+        type=LinePrimitive.LINE_LOOP,
+        pose=_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
+        thickness=thickness,
+        scale_invariant=True,
+        points=[Point3(x=x, y=y, z=0.0) for x, y in corners.tolist()],
+        color=color,
     )
 
 

@@ -8,11 +8,14 @@ light and exposure do not matter.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from locatk.core.kernels import kernels
 
 SMOOTHING_PX = 1.1
 """Sigma of the smoothing; fits dots of 1.5 to 5 px at a pitch of 8 to 16 px."""
@@ -58,6 +61,32 @@ def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
 
     The position is the top of a Gaussian through the minimum and its neighbours.
     """
+    if kernels is None:
+        return find_dots_numpy(images, most)
+    n, h, w = images.shape
+    xy = np.empty((n, most, 2), np.float32)
+    counts = np.empty(n, np.int64)
+    kernels.find_dots(
+        np.ascontiguousarray(images),
+        *(n, h, w),
+        _taps(),
+        *(PAPER, PAPER_REACH, FAINTEST, SHARE, most),
+        xy,
+        counts,
+    )
+    xy = xy[:, : max(int(counts.max(initial=0)), 1)]
+    valid = np.arange(xy.shape[1]) < counts[:, None]
+    return Dots(np.where(valid[..., None], xy, np.float32(0)), valid)
+
+
+@functools.cache
+def _taps() -> NDArray[np.float32]:
+    taps: NDArray[np.float32] = cv2.getGaussianKernel(2 * REACH + 1, SMOOTHING_PX)[: REACH + 1, 0]
+    return taps.astype(np.float32)
+
+
+def find_dots_numpy(images: NDArray[np.uint8], most: int = 4096) -> Dots:
+    """:func:`find_dots` without the compiled kernel."""
     n, h, w = images.shape
     smooth = np.empty((n, h, w), np.float32)
     minima = np.zeros((n, h, w), bool)

@@ -152,8 +152,6 @@ def codec(name: str) -> Codec:
         There is none.
     """
     if name not in sequences.FOURTH:
-        raise InputError(
-            f"no codec {name!r}", hint=f"Known codecs: {', '.join(sequences.FOURTH)}"
-        )
+        raise InputError(f"no codec {name!r}", hint=f"Known codecs: {', '.join(sequences.FOURTH)}")
     texts = (sequences.FIRST, sequences.SECOND, sequences.THIRD, sequences.FOURTH[name])
     return Codec(name, tuple(np.array(list(text), np.uint8) for text in texts))

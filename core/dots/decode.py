@@ -18,12 +18,15 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots import sequences
 from locatk.core.dots.codec import MAIN, PERIOD, RANGE, Codec
+from locatk.core.errors import InputError
+from locatk.core.kernels import kernels
 
 PLACES = math.log(4 * PERIOD * RANGE)
 """Logarithm of the number of hypotheses an axis."""
@@ -33,6 +36,9 @@ THRESHOLD = 0.999
 
 SURE = 40.0
 """Log odds from which no other place can come near, wrong bits or not."""
+
+LONGEST = 64
+"""Most columns and rows of a window."""
 
 NARROW = 16
 """Columns up to which a window is worth a second look when it cannot be read."""
@@ -90,87 +96,156 @@ def decode(
         or down (column bit 1), and right or down (row bit 1); 0 where no dot is seen.
         Bits of symbols that are known for sure: plus or minus 4.
     codec : Codec
+
+    Raises
+    ------
+    InputError
+        A window has more than :data:`LONGEST` columns or rows.
     """
     x_bits, y_bits = _square(column_bits), _square(row_bits)
-    forwards, backwards = _templates(x_bits.shape[1])
-    down = x_bits.transpose(0, 2, 1)
-    scores = [down @ forwards, down @ backwards, y_bits @ forwards, y_bits @ backwards]
-    sums = [score.max(axis=2).sum(axis=1) for score in scores]
-    # Columns first; each quarter turn reads what was rows as columns.
-    turns = np.stack([sums[0] + sums[2], sums[2] + sums[1], sums[1] + sums[3], sums[3] + sums[0]])
-    rotation = turns.argmax(axis=0)
-    decoded = _at_rotation(x_bits, y_bits, scores, rotation, codec)
-    doubtful = np.flatnonzero(decoded.confidence < THRESHOLD)
+    reading = _read(x_bits, y_bits, codec)
+    confidence = _settle(reading, x_bits, y_bits, codec)
+    doubtful = np.flatnonzero(confidence < THRESHOLD)
     if len(doubtful) and x_bits.shape[1] <= NARROW:
         # In small windows a few wrong bits may hide which way is up.
-        turns[rotation, np.arange(len(rotation))] = -np.inf
-        other = _at_rotation(
-            x_bits[doubtful],
-            y_bits[doubtful],
-            [score[doubtful] for score in scores],
-            turns.argmax(axis=0)[doubtful],
-            codec,
-        )
-        better = other.confidence > decoded.confidence[doubtful]
-        for name in Decoded.__dataclass_fields__:
-            getattr(decoded, name)[doubtful[better]] = getattr(other, name)[better]
-    return decoded
+        windows = x_bits[doubtful], y_bits[doubtful]
+        second = np.argsort(-_turns(*windows), axis=0)[1]
+        other = _read_turned(*windows, second, codec)
+        other_confidence = _settle(other, *windows, codec)
+        better = other_confidence > confidence[doubtful]
+        for mine, its in zip(reading, other, strict=True):
+            mine[doubtful[better]] = its[better]
+        confidence[doubtful[better]] = other_confidence[better]
+    return _decoded(reading, confidence, np.count_nonzero(x_bits, axis=(1, 2)))
 
 
-def _at_rotation(
-    x_bits: NDArray[np.float32],
-    y_bits: NDArray[np.float32],
-    scores: list[NDArray[np.float32]],
-    rotation: NDArray[np.int64],
-    codec: Codec,
-) -> Decoded:
-    columns = _chosen(scores, rotation, (0, 2, 1, 3), (False, True, True, False))
-    rows = _chosen(scores, rotation, (2, 1, 3, 0), (False, False, True, True))
-    printed = _turned(x_bits, y_bits, rotation)
-    seen = (printed[0] != 0) | (printed[1] != 0)
-    x = _solve_axis(columns, printed[0].transpose(0, 2, 1), codec)
-    y = _solve_axis(rows, printed[1], codec)
-    section = np.stack([(x.shift - y.place) % PERIOD, (y.shift - x.place) % PERIOD], axis=1)
-    at_x, x_border = _signed(x.place, seen.any(axis=1))
-    at_y, y_border = _signed(y.place, seen.any(axis=2))
-    return Decoded(
-        x=at_x,
-        y=at_y,
-        section=section,
-        rotation=rotation,
-        dots=seen.sum(axis=(1, 2)),
-        corrected=x.wrong + y.wrong,
-        confidence=x.confidence * y.confidence,
-        border=x_border | y_border,
-    )
+class Reading(NamedTuple):
+    """A reading of n windows, x before y in each last axis of two.
 
+    Attributes
+    ----------
+    rotation : (n,) int64 ndarray
+    place, shift : (n, 2) int64 ndarray
+        Of the printed corner, modulo :data:`RANGE`; of the phases, modulo 63.
+    wrong : (n, 2) int64 ndarray
+        Bits that differ from the pattern there.
+    first, last : (n, 2) int64 ndarray
+        Printed columns and rows in which dots are seen.
+    odds : (n, 2) float64 ndarray
+        Logarithm of the odds for the place against random bits.
+    """
 
-@dataclass(frozen=True)
-class _Axis:
-    """One axis of n windows: place, shift of the phases, wrong bits and confidence."""
-
+    rotation: NDArray[np.int64]
     place: NDArray[np.int64]
     shift: NDArray[np.int64]
     wrong: NDArray[np.int64]
-    confidence: NDArray[np.float64]
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    odds: NDArray[np.float64]
 
 
-def _solve_axis(scores: NDArray[np.float32], bits: NDArray[np.float32], codec: Codec) -> _Axis:
-    """From (n, length, 63) scores of the phases and (n, length, length) bits along them."""
-    place, shift = _vote(scores, codec)
-    odds, wrong = _compare(place, shift, bits, codec)
-    rivals = np.zeros(len(place))
-    doubtful = np.flatnonzero((odds < SURE) & (wrong > 0))
-    if len(doubtful):
-        found, turned, against = _search(scores[doubtful], codec)
-        place[doubtful], shift[doubtful], rivals[doubtful] = found, turned, against
-        odds[doubtful], wrong[doubtful] = _compare(found, turned, bits[doubtful], codec)
+def _read(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec) -> Reading:
+    """First reading of (n, length, length) windows: the likeliest phases vote."""
+    if kernels is None:
+        return read_numpy(x_bits, y_bits, codec)
+    n, length, _ = x_bits.shape
+    whole, odds = np.empty((n, 11), np.int64), np.empty((n, 2))
+    kernels.read_windows(
+        np.ascontiguousarray(x_bits),
+        np.ascontiguousarray(y_bits),
+        *(n, length),
+        *kernel_tables(codec),
+        *(RANGE, sequences.SMALLEST_SHIFT, PLACES),
+        *(whole, odds),
+    )
+    columns = whole[:, 1:].reshape(n, 2, 5)
+    return Reading(whole[:, 0], *(columns[..., k] for k in range(5)), odds)
+
+
+def read_numpy(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec) -> Reading:
+    """First reading without the compiled kernel."""
+    return _read_turned(x_bits, y_bits, _turns(x_bits, y_bits).argmax(axis=0), codec)
+
+
+def _turns(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(4, n) how well the main sequence fits at each rotation.
+
+    Seen after a quarter turn what was rows reads as columns, forwards or, for one of both,
+    backwards and inverted; no string of seven is in the sequence in both ways.
+    """
+    forwards, backwards = _templates(x_bits.shape[1])
+    fits = [
+        (bits @ template).max(axis=2).sum(axis=1)
+        for bits in (x_bits.transpose(0, 2, 1), y_bits)
+        for template in (forwards, backwards)
+    ]
+    return np.stack([fits[a] + fits[b] for a, b in ((0, 2), (2, 1), (1, 3), (3, 0))])
+
+
+def _read_turned(
+    x_bits: NDArray[np.float32],
+    y_bits: NDArray[np.float32],
+    rotation: NDArray[np.int64],
+    codec: Codec,
+) -> Reading:
+    """Reading at known rotations."""
+    printed = _turned(x_bits, y_bits, rotation)
+    answers = []
+    for bits in (printed[0].transpose(0, 2, 1), printed[1]):
+        place, shift = _vote(_scores(bits), codec)
+        odds, wrong = _compare(place, shift, bits, codec)
+        seen = (bits != 0).any(axis=2)
+        first = np.where(seen.any(axis=1), seen.argmax(axis=1), seen.shape[1])
+        last = np.where(seen.any(axis=1), seen.shape[1] - 1 - seen[:, ::-1].argmax(axis=1), -1)
+        answers.append((place, shift, wrong, first, last, odds))
+    place, shift, wrong, first, last, odds = (
+        np.stack(pair, axis=1) for pair in zip(*answers, strict=True)
+    )
+    return Reading(rotation, place, shift, wrong, first, last, odds)
+
+
+def _settle(
+    reading: Reading, x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec
+) -> NDArray[np.float64]:
+    """Confidence (n,) of a reading; in doubt a search finds a better one, put in its place."""
+    rivals = np.zeros_like(reading.odds)
+    for axis in range(2):
+        doubtful = np.flatnonzero((reading.odds[:, axis] < SURE) & (reading.wrong[:, axis] > 0))
+        if not len(doubtful):
+            continue
+        printed = _turned(x_bits[doubtful], y_bits[doubtful], reading.rotation[doubtful])
+        bits = printed[1] if axis else printed[0].transpose(0, 2, 1)
+        place, shift, rivals[doubtful, axis] = _search(_scores(bits), codec)
+        reading.place[doubtful, axis], reading.shift[doubtful, axis] = place, shift
+        odds, wrong = _compare(place, shift, bits, codec)
+        reading.odds[doubtful, axis], reading.wrong[doubtful, axis] = odds, wrong
     with np.errstate(over="ignore"):
-        return _Axis(place, shift, wrong, 1 / (1 + rivals + np.exp(-odds)))
+        result: NDArray[np.float64] = (1 / (1 + rivals + np.exp(-reading.odds))).prod(axis=1)
+    return result
+
+
+def _decoded(reading: Reading, confidence: NDArray[np.float64], dots: NDArray[np.int64]) -> Decoded:
+    place = reading.place
+    # A corner that no dot holds may lie before the first place.
+    wraps = place + reading.first >= RANGE
+    straddles: NDArray[np.bool_] = ~wraps & (reading.last >= 0) & (place + reading.last >= RANGE)
+    at = np.where(wraps, place - RANGE, place)
+    return Decoded(
+        x=at[:, 0],
+        y=at[:, 1],
+        section=(reading.shift - place[:, ::-1]) % PERIOD,
+        rotation=reading.rotation,
+        dots=dots,
+        corrected=reading.wrong.sum(axis=1),
+        confidence=confidence,
+        border=straddles[:, 0] | straddles[:, 1],
+    )
 
 
 def _square(bits: NDArray[np.float32]) -> NDArray[np.float32]:
     n, rows, columns = bits.shape
+    if max(rows, columns) > LONGEST:
+        raise InputError(f"a window of {columns} x {rows} places, more than {LONGEST}")
     if rows == columns:
         return bits
     length = max(rows, columns)
@@ -186,19 +261,9 @@ def _templates(length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return forwards, np.ascontiguousarray(-forwards[::-1])
 
 
-def _chosen(
-    scores: list[NDArray[np.float32]],
-    rotation: NDArray[np.int64],
-    which: tuple[int, ...],
-    turned: tuple[bool, ...],
-) -> NDArray[np.float32]:
-    """(n, length, 63) scores of printed columns (or rows) at each window's orientation."""
-    result = np.empty_like(scores[0])
-    for turn in range(4):
-        of = rotation == turn
-        if of.any():
-            score = scores[which[turn]][of]
-            result[of] = score[:, ::-1] if turned[turn] else score
+def _scores(bits: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n, length, 63) fit of each line to the main sequence from each phase on."""
+    result: NDArray[np.float32] = bits @ _templates(bits.shape[2])[0]
     return result
 
 
@@ -324,12 +389,24 @@ def _ballots(codec: Codec, length: int) -> tuple[NDArray[np.float32], ...]:
     return tuple(tables)
 
 
-def _signed(
-    place: NDArray[np.int64], seen: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """``place`` of an unseen corner beyond the border as a negative; whether dots straddle."""
-    length = seen.shape[1]
-    first = seen.argmax(axis=1)
-    last = length - 1 - seen[:, ::-1].argmax(axis=1)
-    wraps = place + first >= RANGE
-    return np.where(wraps, place - RANGE, place), ~wraps & (place + last >= RANGE)
+@functools.lru_cache(16)
+def kernel_tables(codec: Codec) -> tuple[NDArray[np.generic], ...]:
+    """What the compiled kernel needs to know of a codec; see `Code` in core/_kernels.c."""
+    widest = 2 * max(len(digits) for digits in codec.digits)
+    masks = np.zeros((4, max(sequences.BASES), widest), np.float32)
+    digit = np.full((4, PERIOD), -1, np.int8)
+    for k, (digits, table) in enumerate(zip(codec.digits, _digits(), strict=True)):
+        ahead = digits[np.arange(widest) % len(digits)]
+        masks[k] = ahead == np.arange(len(masks[k]))[:, None]
+        possible, value = np.nonzero(table)
+        digit[k, possible] = value
+    prefixes = [np.concatenate([[0], np.cumsum(d, dtype=np.int64)]) for d in codec.digits]
+    return (
+        np.array([len(digits) for digits in codec.digits], np.int64),
+        np.array(sequences.WEIGHTS, np.int64),
+        np.concatenate(prefixes),
+        codec.place(np.eye(4, dtype=np.int64)),
+        SIGNS[np.arange(LONGEST + PERIOD) % PERIOD],
+        digit,
+        masks,
+    )

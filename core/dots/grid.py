@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.sheet import OFFSET
+from locatk.core.kernels import kernels
 
 SEEDS = 40
 """Dots in the middle of the frame from which the lattice is seeded."""
@@ -27,6 +28,15 @@ GATE = 0.36
 
 LOOSE = 0.12
 """Standard deviation of a dot about its place: most of it is the code's displacement."""
+
+NEIGHBOURS = (0.36, 1.32)
+"""Square distances of neighbours, in square pitches; diagonal ones begin at 1.39."""
+
+BENT_FROM = 4.0
+"""Radius in pitches from which the bend of a lens is fitted."""
+
+FIRM = 0.03
+"""Standard deviation of a dot about where its symbol stands, before it was measured."""
 
 TIGHT = 0.12
 """Largest distance of a dot from where its symbol stands, in pitches."""
@@ -93,6 +103,28 @@ def fit_lattices(points: NDArray[np.float32], valid: NDArray[np.bool_], *, lens:
     lens : bool
         Fit the bend of an unknown lens too.
     """
+    if kernels is None:
+        return fit_lattices_numpy(points, valid, lens=lens)
+    n, m = valid.shape
+    parameters, sigma = np.zeros((n, 9)), np.zeros(n)
+    uv, place = np.zeros((n, m, 2), np.float32), np.zeros((n, m, 2), np.float32)
+    found = np.zeros(n, np.bool_)
+    kernels.fit_lattices(
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(valid),
+        *(n, m, lens),
+        np.array(RINGS),
+        weights(True),
+        *(SEEDS, FEWEST, *NEIGHBOURS, GATE, LOOSE, TIGHT, FIRM, BENT_FROM, OFFSET),
+        *(parameters, uv, place, sigma, found),
+    )
+    return Lattices(parameters, points, valid, uv, place, sigma, found, lens)
+
+
+def fit_lattices_numpy(
+    points: NDArray[np.float32], valid: NDArray[np.bool_], *, lens: bool
+) -> Lattices:
+    """:func:`fit_lattices` without the compiled kernel."""
     parameters, found = _seed(points, valid)
     for ring in RINGS:
         uv, z = _project(parameters, points)
@@ -101,13 +133,13 @@ def fit_lattices(points: NDArray[np.float32], valid: NDArray[np.bool_], *, lens:
         use = valid & (np.abs(rest) < GATE).all(axis=2)
         if np.isfinite(ring):
             use &= (place * place).sum(axis=2) < ring * ring
-        _step(parameters, z, uv, -rest, use, LOOSE, lens=lens and ring > 4)
+        _step(parameters, z, uv, -rest, use, LOOSE, lens=lens and ring > BENT_FROM)
     for _ in range(2):
         uv, z = _project(parameters, points)
         place = np.rint(uv)
         miss = uv - place - displacement(uv - place)
         use = valid & (np.abs(miss) < TIGHT).all(axis=2)
-        _step(parameters, z, uv, -miss, use, 0.03, lens=lens)
+        _step(parameters, z, uv, -miss, use, FIRM, lens=lens)
     uv, _ = _project(parameters, points)
     shift = np.rint(parameters[:, [C_U, C_V]])
     parameters[:, :3] -= shift[:, :1] * _unit(parameters)
@@ -168,7 +200,8 @@ def _seed(
     pitch_square = np.nanmedian(third, axis=1)[:, None, None]
 
     # Neighbours lie in four directions, which the fourth power turns into one.
-    near = (square > 0.36 * pitch_square) & (square < 1.32 * pitch_square)
+    low, high = NEIGHBOURS
+    near = (square > low * pitch_square) & (square < high * pitch_square)
     inverse = near / np.where(near, square, 1)
     real = (dx * dx - dy * dy) * inverse
     imaginary = 2 * dx * dy * inverse
@@ -287,6 +320,15 @@ def normal_equations(
     return normal, right
 
 
+def weights(lens: bool) -> NDArray[np.float64]:
+    """(9,) inverse variance of each parameter; a known lens bends nothing."""
+    weight = np.zeros(9)
+    weight[6:] = PRIOR[6:] ** -2.0
+    if not lens:
+        weight[LENS] = 1e12
+    return weight
+
+
 def add_prior(
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
@@ -296,10 +338,6 @@ def add_prior(
     lens: bool,
 ) -> None:
     """Add what is known of perspective and lens to normal equations in units of ``sigma``."""
-    weight = np.zeros(9)
-    weight[6:] = PRIOR[6:] ** -2.0
-    if not lens:
-        weight[LENS] = 1e12
-    weights = weight * np.square(np.asarray(sigma, float))[..., None]
-    np.einsum("nii->ni", normal)[:] += weights + 1e-9
-    right -= weights * parameters
+    weight = weights(lens) * np.square(np.asarray(sigma, float))[..., None]
+    np.einsum("nii->ni", normal)[:] += weight + 1e-9
+    right -= weight * parameters

@@ -7,7 +7,7 @@ between: each place is asked at which of its four spots there is most ink.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,10 +17,10 @@ from locatk.core.dots.printer_fields import FieldScore, score_field
 from locatk.core.dots.sheet import MM_PER_INCH, Manifest
 from locatk.core.dots.testsheet import (
     CORNERS,
-    TestSheet,
+    PrinterSheet,
     dictionary,
+    printer_sheet,
     sheet_of_marker,
-    test_sheet,
 )
 from locatk.core.errors import DegenerateError, InputError
 
@@ -56,7 +56,7 @@ class PrinterReport:
 
     Attributes
     ----------
-    sheet : TestSheet
+    sheet : PrinterSheet
     fields : tuple of FieldScore
         In the order of the sheet's fields.
     recommended : FieldScore or None
@@ -67,16 +67,17 @@ class PrinterReport:
     bend_mm : float
         Rms by which markers and fields lie off a straight, evenly stretched sheet: uneven
         feed of the printer (or of the scanner), or a paper that is not flat.
-    flat : bool
-        Whether the picture can be a scan: no perspective, no bend.
+    doubt : str or None
+        Why :attr:`scale` cannot be true: the picture is a photo, or its resolution is not
+        what is said.
     """
 
-    sheet: TestSheet
+    sheet: PrinterSheet
     fields: tuple[FieldScore, ...]
     recommended: FieldScore | None
     scale: tuple[float, float] | None
     bend_mm: float
-    flat: bool
+    doubt: str | None
 
 
 def calibrate(
@@ -84,7 +85,6 @@ def calibrate(
     scan_dpi: tuple[float, float] | None = None,
     *,
     pitch_mm: float | None = None,
-    done: Callable[[], object] = lambda: None,
 ) -> PrinterReport:
     """Score each field of a test sheet and measure the printer's scale.
 
@@ -96,8 +96,6 @@ def calibrate(
         Pixels of the image an inch, where a scanner has made it.
     pitch_mm : float, optional
         Recommend a field of this pitch only.
-    done : callable
-        Called after each field.
 
     Raises
     ------
@@ -109,53 +107,27 @@ def calibrate(
     sheet, corners, found = find_sheet(image)
     to_image = _homography(corners, found)
     black = _black(image, sheet, to_image)
-    fields = []
-    for field in sheet.fields:
-        fields.append(score_field(image, to_image, sheet, field, black))
-        done()
-    if not any(field.read for field in fields):
+    fields = [score_field(image, to_image, sheet, field, black) for field in sheet.fields]
+    read = [field for field in fields if field.read]
+    if not read:
         raise DegenerateError(
             f"none of the {len(fields)} fields of the test sheet can be read",
             hint="Scan the whole sheet sharply, with 600 dpi or more",
         )
-    read = [field for field in fields if field.read]
     places = np.vstack([corners, [field.centre_mm for field in read]])
     seen = np.vstack([found, [field.centre_px for field in read]])
-    scale, bend_mm = _stretch(places, seen, scan_dpi or (MM_PER_INCH, MM_PER_INCH))
-    unit = 1.0 if scan_dpi else float(np.mean(scale))
-    return PrinterReport(
-        sheet,
-        tuple(fields),
-        recommend(fields, pitch_mm),
-        scale if scan_dpi else None,
-        bend_mm / unit,
-        bend_mm / unit < FLAT_MM,
-    )
+    scale, bend_mm = _stretch(places, seen, scan_dpi)
+    doubt = None
+    if scan_dpi and bend_mm > FLAT_MM:
+        doubt = f"the sheet is {bend_mm:.1f} mm out of shape, so the picture is no scan"
+    elif scan_dpi and max(abs(s - 1) for s in scale) > PLAUSIBLE:
+        doubt = "at {:.6g} x {:.6g} dpi".format(*scan_dpi)
+        doubt += " the sheet would be {:.3f} x {:.3f} times its size".format(*scale)
+    chosen = recommend(fields, pitch_mm)
+    return PrinterReport(sheet, tuple(fields), chosen, scale if scan_dpi else None, bend_mm, doubt)
 
 
-def check_scale(report: PrinterReport) -> None:
-    """Refuse a scale that no printer has: the resolution of the picture is not what is said.
-
-    Raises
-    ------
-    InputError
-    """
-    if report.scale is None:
-        return
-    if not report.flat:
-        raise InputError(
-            f"the sheet is {report.bend_mm:.1f} mm out of shape, so it is a photo, not a scan",
-            hint="Measure the two rulers and give --measured-x and --measured-y",
-        )
-    if max(abs(s - 1) for s in report.scale) > PLAUSIBLE:
-        raise InputError(
-            "the sheet would be {:.3f} and {:.3f} times its size".format(*report.scale),
-            hint="Give the scanner's true resolution with --scan-dpi, or --measured-x and "
-            "--measured-y; print at 100 %",
-        )
-
-
-def recommend(fields: list[FieldScore], pitch_mm: float | None = None) -> FieldScore | None:
+def recommend(fields: Sequence[FieldScore], pitch_mm: float | None = None) -> FieldScore | None:
     """The field to print with.
 
     Of the fields with the fewest wrong or missing symbols (within :data:`TIED`), those whose
@@ -189,12 +161,12 @@ def recommend(fields: list[FieldScore], pitch_mm: float | None = None) -> FieldS
     return min(candidates, key=lambda f: (round(abs(f.pitch_mm - USUAL_MM), 6), -f.margin))
 
 
-def find_sheet(image: NDArray[np.uint8]) -> tuple[TestSheet, Floats, Floats]:
+def find_sheet(image: NDArray[np.uint8]) -> tuple[PrinterSheet, Floats, Floats]:
     """The test sheet in a picture.
 
     Returns
     -------
-    sheet : TestSheet
+    sheet : PrinterSheet
     corners : (n, 2) ndarray
         Corners of the markers that were found, in mm from the page's upper left corner to
         the right and down.
@@ -234,7 +206,7 @@ def find_sheet(image: NDArray[np.uint8]) -> tuple[TestSheet, Floats, Floats]:
         )
     known = sheet_of_marker(min(by_number))
     assert known is not None
-    sheet = test_sheet(*known)
+    sheet = printer_sheet(*known)
     marks = [corner for corner in sheet.corners if corner.number in by_number]
     corners = np.vstack([corner.points for corner in marks])
     corners = sheet.mm(1) * corners
@@ -265,7 +237,7 @@ def _homography(places: Floats, found: Floats) -> Floats:
     return result
 
 
-def _black(image: NDArray[np.uint8], sheet: TestSheet, to_image: Floats) -> float:
+def _black(image: NDArray[np.uint8], sheet: PrinterSheet, to_image: Floats) -> float:
     """Grey value of full black: the median of the markers' black modules."""
     import cv2
 
@@ -282,16 +254,16 @@ def _black(image: NDArray[np.uint8], sheet: TestSheet, to_image: Floats) -> floa
 
 
 def _stretch(
-    places: Floats, seen: Floats, dpi: tuple[float, float]
+    places: Floats, seen: Floats, dpi: tuple[float, float] | None
 ) -> tuple[tuple[float, float], float]:
     """Scale along the paper's x and y, and the rms of what no stretching explains, in mm.
 
     An affine map: the paper may lie askew on the scanner, and feed and scan need not be at
-    right angles.
+    right angles. Without dpi the scale is in px a mm; the rms is in true mm all the same.
     """
-    scanned = seen * (MM_PER_INCH / np.array(dpi))
+    scanned = seen * (1.0 if dpi is None else MM_PER_INCH / np.array(dpi))
     design = np.c_[places, np.ones(len(places))]
     matrix, *_ = np.linalg.lstsq(design, scanned, rcond=None)
     off = scanned - design @ matrix
     x, y = np.linalg.norm(matrix[:2], axis=1)
-    return (float(x), float(y)), float(np.sqrt((off**2).sum(axis=1).mean()))
+    return (float(x), float(y)), float(np.sqrt((off**2).sum(axis=1).mean()) * 2 / (x + y))

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from locatk.core.dots.codec import DISPLACEMENT
-from locatk.core.dots.testsheet import Field, TestSheet
+from locatk.core.dots.testsheet import Field, PrinterSheet
 
 Floats = NDArray[np.float64]
 
 FINEST, COARSEST = 32.0, 8.0
 """Pixels a pitch in the cut-out, at most and at least."""
 
-TOO_COARSE = 5.0
+TOO_COARSE = 4.8
 """Pixels a pitch of the picture, below which it says nothing of the printer."""
 
 RIM = 2.0
@@ -45,6 +45,9 @@ WINDOW = 0.2
 
 REACH = 1 / 3
 """Reach within which all of a dot's ink is, and none of another's."""
+
+MOST = 1200
+"""Dots that are measured one by one."""
 
 WORST = 0.01
 """Quantile of the places at which the margin is taken."""
@@ -107,7 +110,7 @@ class FieldScore:
 
 
 def score_field(
-    image: NDArray[np.uint8], to_image: Floats, sheet: TestSheet, field: Field, black: float
+    image: NDArray[np.uint8], to_image: Floats, sheet: PrinterSheet, field: Field, black: float
 ) -> FieldScore:
     """Score one field.
 
@@ -116,7 +119,7 @@ def score_field(
     image : (height, width) uint8 ndarray
     to_image : (3, 3) ndarray
         From mm on the page (from its upper left corner to the right and down) to px.
-    sheet : TestSheet
+    sheet : PrinterSheet
     field : Field
     black : float
         Grey value of full black in the image.
@@ -220,7 +223,7 @@ class _Cut:
 
     @classmethod
     def of(
-        cls, image: NDArray[np.uint8], to_image: Floats, sheet: TestSheet, field: Field
+        cls, image: NDArray[np.uint8], to_image: Floats, sheet: PrinterSheet, field: Field
     ) -> _Cut:
         import cv2
 
@@ -382,7 +385,7 @@ class _Lattice:
         (n, 2) ndarray
             How far each of them then lies from its spot, in pitches.
         """
-        places, spot = self._places[right.ravel()], self._spots[symbols[right]]
+        places, spot = self._some(symbols, right)
         off = np.zeros((len(places), 2))
         around = _around(WINDOW, 11)
         for _ in range(3):
@@ -395,15 +398,22 @@ class _Lattice:
         self._map = self._map + shift @ self._map[:2]
         return off - places @ shift
 
+    def _some(self, symbols: NDArray[np.intp], right: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """Places and spots of right dots, evenly over the field where there are many."""
+        every = np.flatnonzero(right.ravel())
+        some = every[:: -(-len(every) // MOST)]
+        return self._places[some], self._spots[symbols.ravel()[some]]
+
     def gain(
         self, ink: Floats, symbols: NDArray[np.intp], right: NDArray[np.bool_], dot: float
     ) -> float:
         """Ink of the right dots over that of a square of ``dot`` pitches; the median."""
-        at = self._places[right.ravel()] @ self._map + self._spots[symbols[right]] @ self._map[:2]
+        places, spot = self._some(symbols, right)
+        at = places @ self._map + spot @ self._map[:2]
         around = _around(REACH, 19)
         amount = _sample(ink, at[:, None] + around @ self._map[:2]).mean(axis=1)
-        places = self._places @ self._map + np.array([0.5, 0.5]) @ self._map[:2]
-        bare = float(np.median(_sample(ink, places)))
+        between = places @ self._map + np.array([0.5, 0.5]) @ self._map[:2]
+        bare = float(np.median(_sample(ink, between)))
         return float(np.median(amount - bare)) * (2 * REACH) ** 2 / dot**2
 
 

@@ -125,7 +125,7 @@ def _axes(rng: np.random.Generator, size: tuple[int, int]) -> tuple[Image, Image
 def _checkerboard(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
     u, v = _axes(rng, size)
     field = rng.uniform(3, 40)
-    dark = (np.floor(u / field) + np.floor(v / field)) % 2
+    dark = (np.floor(u / field) + np.floor(v / field)).astype(np.int32) & 1
     return _finished(dark.astype(np.float32), rng, size)
 
 
@@ -140,9 +140,9 @@ def _lines(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]
 
 def _halftone(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
     u, v = _axes(rng, size)
-    pitch = rng.choice([PITCH_PX, rng.uniform(4, 25)])
-    away = np.hypot((u / pitch) % 1 - 0.5, (v / pitch) % 1 - 0.5)
-    return _finished((away < rng.uniform(0.08, 0.4)).astype(np.float32), rng, size)
+    pitch, radius = float(rng.choice([PITCH_PX, rng.uniform(4, 25)])), rng.uniform(0.08, 0.4)
+    u, v = (a / pitch - np.rint(a / pitch) for a in (u, v))
+    return _finished((u * u + v * v < radius**2).astype(np.float32), rng, size)
 
 
 def _texture(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -115,8 +115,8 @@ class Corner:
 
 
 @dataclass(frozen=True)
-class TestSheet:
-    """A test sheet; see :func:`test_sheet`.
+class PrinterSheet:
+    """A test sheet; see :func:`printer_sheet`.
 
     Attributes
     ----------
@@ -130,8 +130,6 @@ class TestSheet:
     corners : tuple of Corner
         Upper left, upper right, lower right, lower left.
     """
-
-    __test__ = False  # for pytest: this is no test
 
     paper: str
     dpi: int
@@ -156,7 +154,7 @@ def dictionary():  # type: ignore[no-untyped-def]  # OpenCV has no types
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
 
 
-def test_sheet(paper: str, dpi: int, codec_name: str = "anoto") -> TestSheet:
+def printer_sheet(paper: str, dpi: int, codec_name: str = "anoto") -> PrinterSheet:
     """The test sheet for a paper, a printer and a codec; always the same.
 
     Raises
@@ -204,7 +202,7 @@ def test_sheet(paper: str, dpi: int, codec_name: str = "anoto") -> TestSheet:
             layout = Layout(raster, page, (start[0], start[1]), (count, count))
             origin = (ORIGIN + column * STEP, ORIGIN + row * STEP)
             fields.append(Field(f"{chr(ord('A') + column)}{row + 1}", layout, origin))
-    return TestSheet(paper, dpi, codec_name, page, tuple(fields), corners)
+    return PrinterSheet(paper, dpi, codec_name, page, tuple(fields), corners)
 
 
 def sheet_of_marker(number: int) -> tuple[str, int, str] | None:

@@ -1,0 +1,23 @@
+"""``locatk print``: artifacts on paper, at true size."""
+
+from __future__ import annotations
+
+import click
+
+from locatk.cli.print_pattern import pattern
+from locatk.cli.print_testsheet import testsheet
+
+
+@click.group(short_help="Draw sheets at true size.")
+def command() -> None:
+    """Draw sheets at true size.
+
+    \b
+    Examples:
+      locatk print pattern -o sheet.pdf
+      locatk print testsheet -o test.pdf
+    """
+
+
+command.add_command(pattern)
+command.add_command(testsheet)

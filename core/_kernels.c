@@ -1,0 +1,1089 @@
+/* The two hot loops of core/dots, frame by frame: dots of an image, and the lattice of dots.
+ *
+ * Each has a twin in numpy that says what it does and why (core/dots/blobs.py, grid.py) and
+ * that is used where this module was not built; tests/core/dots/test_kernels.py holds the two
+ * against each other. Constants come in as arguments, so that they stand in one place.
+ * Only the stable ABI of Python 3.11 is used, and buffers instead of numpy's own interface.
+ */
+#define PY_SSIZE_T_CLEAN
+#ifndef Py_LIMITED_API
+#define Py_LIMITED_API 0x030B0000
+#endif
+#include <Python.h>
+#include <float.h>
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* ---- Sorting ---------------------------------------------------------------------------- */
+
+/* Shell sort, ascending; for the few hundred numbers of a frame. */
+static void sort_floats(float *values, int count)
+{
+    static const int gaps[] = {301, 132, 57, 23, 10, 4, 1};
+    for (int g = 0; g < 7; g++) {
+        const int gap = gaps[g];
+        for (int i = gap; i < count; i++) {
+            const float value = values[i];
+            int j = i;
+            for (; j >= gap && values[j - gap] > value; j -= gap)
+                values[j] = values[j - gap];
+            values[j] = value;
+        }
+    }
+}
+
+static float nth_smallest(float *values, int count, int rank)
+{
+    int low = 0, high = count - 1;
+    while (low < high) {
+        const float pivot = values[(low + high) / 2];
+        int i = low, j = high;
+        while (i <= j) {
+            while (values[i] < pivot) i++;
+            while (values[j] > pivot) j--;
+            if (i <= j) {
+                const float swap = values[i];
+                values[i++] = values[j];
+                values[j--] = swap;
+            }
+        }
+        if (rank <= j) high = j;
+        else if (rank >= i) low = i;
+        else break;
+    }
+    return values[rank];
+}
+
+/* ---- Dots of an image ------------------------------------------------------------------- */
+
+/* Index beyond the rim, mirrored at the outermost pixel. */
+static inline int mirrored(int i, int count)
+{
+    if (count == 1) return 0;
+    while (i < 0 || i >= count) i = i < 0 ? -i : 2 * (count - 1) - i;
+    return i;
+}
+
+static inline float smaller(float a, float b) { return a < b ? a : b; }
+
+/* Smoothed image by five taps each way (two outer, two inner, the middle). */
+static void smooth_image(const uint8_t *restrict image, int h, int w, const float *taps,
+                         float *restrict line, float *restrict smooth)
+{
+    const float outer = taps[0], inner = taps[1], middle = taps[2];
+    for (int y = 0; y < h; y++) {
+        const uint8_t *a = image + (size_t)mirrored(y - 2, h) * w;
+        const uint8_t *b = image + (size_t)mirrored(y - 1, h) * w;
+        const uint8_t *c = image + (size_t)y * w;
+        const uint8_t *d = image + (size_t)mirrored(y + 1, h) * w;
+        const uint8_t *e = image + (size_t)mirrored(y + 2, h) * w;
+        float *restrict in = line + 2;
+        for (int x = 0; x < w; x++)
+            in[x] = outer * (float)(a[x] + e[x]) + inner * (float)(b[x] + d[x])
+                    + middle * (float)c[x];
+        for (int k = 1; k <= 2; k++) {
+            in[-k] = in[mirrored(-k, w)];
+            in[w - 1 + k] = in[mirrored(w - 1 + k, w)];
+        }
+        float *restrict out = smooth + (size_t)y * w;
+        for (int x = 0; x < w; x++)
+            out[x] = outer * (in[x - 2] + in[x + 2]) + inner * (in[x - 1] + in[x + 1])
+                     + middle * in[x];
+    }
+}
+
+/* Moving sums over `reach` values of a line with a stride, mirrored at its ends. */
+static void moving_sum(const float *line, int count, int stride, int reach, float *out)
+{
+    const int half = reach / 2;
+    float sum = 0;
+    for (int k = -half; k <= half; k++) sum += line[mirrored(k, count) * stride];
+    for (int k = 0; k < count; k++) {
+        out[k * stride] = sum;
+        sum += line[mirrored(k + half + 1, count) * stride]
+               - line[mirrored(k - half, count) * stride];
+    }
+}
+
+/* Brightness of the paper: means of blocks, averaged over a square of blocks. */
+static void paper_image(const uint8_t *image, int w, int rows, int columns, int block, int reach,
+                        int *restrict sums, float *means, float *across, float *paper)
+{
+    for (int r = 0; r < rows; r++) {
+        memset(sums, 0, (size_t)w * sizeof(int));
+        for (int y = 0; y < block; y++) {
+            const uint8_t *restrict row = image + (size_t)(r * block + y) * w;
+            for (int x = 0; x < w; x++) sums[x] += row[x];
+        }
+        for (int c = 0; c < columns; c++) {
+            int sum = 0;
+            for (int x = 0; x < block; x++) sum += sums[c * block + x];
+            /* Whole grey levels, as an 8-bit image has them. */
+            means[r * columns + c] = (float)((2 * sum + block * block) / (2 * block * block));
+        }
+    }
+    for (int r = 0; r < rows; r++)
+        moving_sum(means + r * columns, columns, 1, reach, across + r * columns);
+    for (int c = 0; c < columns; c++) moving_sum(across + c, rows, columns, reach, paper + c);
+    const float share = 1.0f / (float)(reach * reach);
+    for (int k = 0; k < rows * columns; k++) paper[k] *= share;
+}
+
+/* Contrast of the median dot: of those above the split that Otsu's criterion makes. */
+static float typical(float *contrasts, int count)
+{
+    if (count == 0) return 0;
+    sort_floats(contrasts, count);
+    float total = 0, sum = 0, best = -1;
+    int dots = 0;
+    for (int k = 0; k < count; k++) total += contrasts[k];
+    for (int above = 1; above < count; above++) {
+        sum += contrasts[count - above];
+        const float rest = total - sum;
+        const float between = sum * sum / (float)above + rest * rest / (float)(count - above);
+        if (between > best) {
+            best = between;
+            dots = above - 1;
+        }
+    }
+    return contrasts[count - 1 - dots / 2];
+}
+
+static float peak(const float *at, int step, float light, float contrast, float top)
+{
+    const float least = 0.05f * contrast;
+    const float before = light - at[-step], after = light - at[step];
+    const float a = logf(before > least ? before : least);
+    const float b = logf(after > least ? after : least);
+    float bend = 2 * top - a - b;
+    bend = bend > 1e-6f ? bend : 1e-6f;
+    const float offset = 0.5f * (b - a) / bend;
+    return offset < -0.5f ? -0.5f : offset > 0.5f ? 0.5f : offset;
+}
+
+typedef struct {
+    float x, y, contrast;
+} Dot;
+
+static int darker_first(const void *a, const void *b)
+{
+    const float x = ((const Dot *)a)->contrast, y = ((const Dot *)b)->contrast;
+    return (x < y) - (x > y);
+}
+
+static PyObject *find_dots(PyObject *self, PyObject *args)
+{
+    Py_buffer images, taps, xy, counts;
+    int n, h, w, block, reach, most;
+    float faintest, share;
+    if (!PyArg_ParseTuple(args, "y*iiiy*iiffiw*w*", &images, &n, &h, &w, &taps, &block, &reach,
+                          &faintest, &share, &most, &xy, &counts))
+        return NULL;
+    const int rows = h / block, columns = w / block;
+    const size_t area = (size_t)h * w, blocks = (size_t)rows * columns;
+    float *store = malloc((5 * area + (size_t)w + 4 + 3 * blocks) * sizeof(float));
+    Dot *dots = malloc(area * sizeof(Dot));
+    int *sums = malloc((size_t)w * sizeof(int));
+    if (!store || !dots || !sums) {
+        free(store);
+        free(dots);
+        free(sums);
+        PyBuffer_Release(&images);
+        PyBuffer_Release(&taps);
+        PyBuffer_Release(&xy);
+        PyBuffer_Release(&counts);
+        return PyErr_NoMemory();
+    }
+    float *smooth = store, *across = smooth + area, *least = across + area;
+    float *line = least + area, *means = line + w + 4, *blurred = means + blocks;
+    float *paper = blurred + blocks, *contrasts = paper + blocks, *lights = contrasts + area;
+    int64_t *found = counts.buf;
+
+    Py_BEGIN_ALLOW_THREADS
+    for (int frame = 0; frame < n; frame++) {
+        const uint8_t *image = (const uint8_t *)images.buf + frame * area;
+        smooth_image(image, h, w, taps.buf, line, smooth);
+        paper_image(image, w, rows, columns, block, reach, sums, means, blurred,
+                    paper);
+        for (int y = 0; y < h; y++) {
+            const float *restrict s = smooth + (size_t)y * w;
+            float *restrict m = across + (size_t)y * w;
+            for (int x = 2; x < w - 2; x++)
+                m[x] = smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])),
+                               s[x]);
+        }
+        int minima = 0;
+        for (int y = 2; y < h - 2; y++) {
+            const float *a = across + (size_t)(y - 2) * w, *b = a + w, *c = b + w, *d = c + w,
+                        *e = d + w, *s = smooth + (size_t)y * w;
+            for (int x = 2; x < w - 2; x++)
+                least[x] = smaller(smaller(smaller(a[x], b[x]), smaller(d[x], e[x])), c[x]);
+            const int row = y / block < rows ? y / block : rows - 1;
+            for (int x = 2; x < w - 2; x++) {
+                if (s[x] != least[x]) continue;
+                const int column = x / block < columns ? x / block : columns - 1;
+                const float light = paper[row * columns + column];
+                const float contrast = light - s[x];
+                if (!(contrast > faintest)) continue;
+                lights[minima] = light;
+                contrasts[minima] = contrast / light;
+                dots[minima].x = (float)x;
+                dots[minima].y = (float)y;
+                dots[minima].contrast = contrast;
+                minima++;
+            }
+        }
+        memcpy(across, contrasts, (size_t)minima * sizeof(float));
+        const float bar = share * typical(across, minima);
+        int kept = 0;
+        for (int k = 0; k < minima; k++) {
+            if (!(contrasts[k] > bar)) continue;
+            dots[kept] = dots[k];
+            lights[kept++] = lights[k];
+        }
+        for (int k = 0; k < kept; k++) {
+            const float *at = smooth + (size_t)dots[k].y * w + (size_t)dots[k].x;
+            const float top = logf(dots[k].contrast);
+            dots[k].x += peak(at, 1, lights[k], dots[k].contrast, top);
+            dots[k].y += peak(at, w, lights[k], dots[k].contrast, top);
+        }
+        if (kept > most) {
+            qsort(dots, (size_t)kept, sizeof(Dot), darker_first);
+            kept = most;
+        }
+        float *out = (float *)xy.buf + (size_t)frame * most * 2;
+        for (int k = 0; k < kept; k++) {
+            out[2 * k] = dots[k].x;
+            out[2 * k + 1] = dots[k].y;
+        }
+        found[frame] = kept;
+    }
+    Py_END_ALLOW_THREADS
+
+    free(store);
+    free(dots);
+    free(sums);
+    PyBuffer_Release(&images);
+    PyBuffer_Release(&taps);
+    PyBuffer_Release(&xy);
+    PyBuffer_Release(&counts);
+    Py_RETURN_NONE;
+}
+
+/* ---- The lattice of dots ---------------------------------------------------------------- */
+
+enum { A_U = 0, C_U = 2, A_V = 3, C_V = 5, PERSPECTIVE = 6, LENS = 8, PARAMETERS = 9 };
+
+typedef struct {
+    int seeds, fewest, rings;
+    const double *ring, *prior; /* radii; inverse squares of the parameters' deviations */
+    double nearest, farthest, gate, loose, tight, firm, bent_from, offset;
+} Rules;
+
+typedef struct {
+    float x, y, u, v, bend, over; /* p, (u, v), |p|^2 / (1 + lens |p|^2), 1 / (1 + g q) */
+    float q[2];
+} Projected;
+
+static void project(const double *parameters, const float *points, int count, Projected *out)
+{
+    float t[PARAMETERS];
+    for (int k = 0; k < PARAMETERS; k++) t[k] = (float)parameters[k];
+    for (int i = 0; i < count; i++) {
+        const float x = points[2 * i], y = points[2 * i + 1], square = x * x + y * y;
+        const float bend = 1 / (1 + t[LENS] * square), qx = x * bend, qy = y * bend;
+        const float over = 1 / (1 + t[PERSPECTIVE] * qx + t[PERSPECTIVE + 1] * qy);
+        out[i].u = (t[A_U] * qx + t[A_U + 1] * qy + t[C_U]) * over;
+        out[i].v = (t[A_V] * qx + t[A_V + 1] * qy + t[C_V]) * over;
+        out[i].bend = square * bend;
+        out[i].over = over;
+        out[i].q[0] = qx;
+        out[i].q[1] = qy;
+    }
+}
+
+/* Solves a x = b in place by Gauss with pivots, for `sides` columns b[k][side]. */
+static int solve(double a[PARAMETERS][PARAMETERS], double *b, int sides)
+{
+    for (int k = 0; k < PARAMETERS; k++) {
+        int pivot = k;
+        for (int i = k + 1; i < PARAMETERS; i++)
+            if (fabs(a[i][k]) > fabs(a[pivot][k])) pivot = i;
+        if (!(fabs(a[pivot][k]) > 0)) return 0;
+        if (pivot != k) {
+            for (int j = k; j < PARAMETERS; j++) {
+                const double swap = a[k][j];
+                a[k][j] = a[pivot][j];
+                a[pivot][j] = swap;
+            }
+            for (int j = 0; j < sides; j++) {
+                const double swap = b[k * sides + j];
+                b[k * sides + j] = b[pivot * sides + j];
+                b[pivot * sides + j] = swap;
+            }
+        }
+        for (int i = k + 1; i < PARAMETERS; i++) {
+            const double factor = a[i][k] / a[k][k];
+            for (int j = k; j < PARAMETERS; j++) a[i][j] -= factor * a[k][j];
+            for (int j = 0; j < sides; j++) b[i * sides + j] -= factor * b[k * sides + j];
+        }
+    }
+    for (int k = PARAMETERS - 1; k >= 0; k--)
+        for (int side = 0; side < sides; side++) {
+            for (int j = k + 1; j < PARAMETERS; j++)
+                b[k * sides + side] -= a[k][j] * b[j * sides + side];
+            b[k * sides + side] /= a[k][k];
+        }
+    return 1;
+}
+
+/* Normal equations of dots that should move by `wanted`, nan where not in use, and priors. */
+static void equations(const double *parameters, const Projected *dots, const float *wanted,
+                      int count, double sigma, int lens, const double *prior,
+                      double normal[PARAMETERS][PARAMETERS], double *right)
+{
+    memset(right, 0, PARAMETERS * sizeof(double));
+    double shared[6] = {0}, cross[2][9] = {{0}}, corner[6] = {0};
+    const float g0 = (float)parameters[PERSPECTIVE], g1 = (float)parameters[PERSPECTIVE + 1];
+    for (int i = 0; i < count; i++) {
+        const float *want = wanted + 2 * i;
+        if (isnan(want[0])) continue;
+        const Projected *d = dots + i;
+        const float over = d->over, b0 = d->q[0] * over, b1 = d->q[1] * over;
+        const float value[2] = {d->u, d->v};
+        shared[0] += b0 * b0;
+        shared[1] += b0 * b1;
+        shared[2] += b0 * over;
+        shared[3] += b1 * b1;
+        shared[4] += b1 * over;
+        shared[5] += over * over;
+        for (int axis = 0; axis < 2; axis++) {
+            const float w = want[axis], c0 = -value[axis] * b0, c1 = -value[axis] * b1;
+            float c2 = 0;
+            if (lens) {
+                const double *a = parameters + 3 * axis;
+                const float slope = (float)a[0] * d->q[0] + (float)a[1] * d->q[1]
+                                    - value[axis] * (g0 * d->q[0] + g1 * d->q[1]);
+                c2 = -slope * d->bend * over;
+            }
+            double *x = cross[axis];
+            x[0] += b0 * c0;
+            x[1] += b0 * c1;
+            x[2] += b0 * c2;
+            x[3] += b1 * c0;
+            x[4] += b1 * c1;
+            x[5] += b1 * c2;
+            x[6] += over * c0;
+            x[7] += over * c1;
+            x[8] += over * c2;
+            corner[0] += c0 * c0;
+            corner[1] += c0 * c1;
+            corner[2] += c0 * c2;
+            corner[3] += c1 * c1;
+            corner[4] += c1 * c2;
+            corner[5] += c2 * c2;
+            right[3 * axis] += b0 * w;
+            right[3 * axis + 1] += b1 * w;
+            right[3 * axis + 2] += over * w;
+            right[6] += c0 * w;
+            right[7] += c1 * w;
+            right[8] += c2 * w;
+        }
+    }
+    static const int packed[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+    memset(normal, 0, PARAMETERS * sizeof(*normal));
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            normal[i][j] = normal[3 + i][3 + j] = shared[packed[i][j]];
+            normal[6 + i][6 + j] = corner[packed[i][j]];
+            normal[i][6 + j] = normal[6 + j][i] = cross[0][3 * i + j];
+            normal[3 + i][6 + j] = normal[6 + j][3 + i] = cross[1][3 * i + j];
+        }
+    for (int k = 0; k < PARAMETERS; k++) {
+        const double weight = (k == LENS && !lens ? 1e12 : prior[k]) * sigma * sigma;
+        normal[k][k] += weight + 1e-9;
+        right[k] -= weight * parameters[k];
+    }
+}
+
+static int step(double *parameters, const Projected *dots, const float *wanted, int count,
+                double sigma, int lens, const double *prior)
+{
+    double normal[PARAMETERS][PARAMETERS], right[PARAMETERS];
+    equations(parameters, dots, wanted, count, sigma, lens, prior, normal, right);
+    if (!solve(normal, right, 1)) return 0;
+    for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
+    return 1;
+}
+
+/* Where, about its place, the symbol stands that is nearest. */
+static inline void nearest_symbol(const float *rest, float offset, float *symbol)
+{
+    const int along_x = fabsf(rest[0]) > fabsf(rest[1]);
+    symbol[0] = along_x ? copysignf(offset, rest[0]) : 0;
+    symbol[1] = along_x ? 0 : copysignf(offset, rest[1]);
+}
+
+typedef struct {
+    float square, x, y;
+} Seed;
+
+/* Pitch, direction and shift in the middle; false where there are too few dots. */
+static int seed(const float *points, const uint8_t *valid, int m, const Rules *rules,
+                float *squares, Seed *middle, double *parameters)
+{
+    int there = 0, count = 0;
+    for (int i = 0; i < m; i++)
+        if (valid[i]) {
+            const float x = points[2 * i], y = points[2 * i + 1];
+            squares[there++] = x * x + y * y;
+        }
+    if (there < rules->fewest) return 0;
+    const int wanted = there < rules->seeds ? there : rules->seeds;
+    const float bar = nth_smallest(squares, there, wanted - 1);
+    for (int i = 0; i < m && count < wanted; i++) {
+        const float x = points[2 * i], y = points[2 * i + 1];
+        if (!valid[i] || x * x + y * y > bar) continue;
+        middle[count].x = x;
+        middle[count++].y = y;
+    }
+    for (int i = 0; i < count; i++) {
+        float three[3] = {FLT_MAX, FLT_MAX, FLT_MAX};
+        for (int j = 0; j < count; j++) {
+            if (j == i) continue;
+            const float dx = middle[i].x - middle[j].x, dy = middle[i].y - middle[j].y;
+            const float square = dx * dx + dy * dy;
+            if (square < three[2]) {
+                if (square < three[1]) {
+                    three[2] = three[1];
+                    if (square < three[0]) {
+                        three[1] = three[0];
+                        three[0] = square;
+                    } else
+                        three[1] = square;
+                } else
+                    three[2] = square;
+            }
+        }
+        squares[i] = three[2];
+    }
+    sort_floats(squares, count);
+    const float pitch_square = 0.5f * (squares[(count - 1) / 2] + squares[count / 2]);
+    const float low = (float)rules->nearest * pitch_square;
+    const float high = (float)rules->farthest * pitch_square;
+    double sine = 0, cosine = 0;
+    for (int i = 0; i < count; i++)
+        for (int j = 0; j < i; j++) {
+            const float dx = middle[i].x - middle[j].x, dy = middle[i].y - middle[j].y;
+            const float square = dx * dx + dy * dy;
+            if (!(square > low && square < high)) continue;
+            const float re = (dx * dx - dy * dy) / square, im = 2 * dx * dy / square;
+            sine += 2 * re * im;
+            cosine += re * re - im * im;
+        }
+    const double angle = 0.25 * atan2(sine, cosine), c = cos(angle), s = sin(angle);
+    double total = 0;
+    int pairs = 0;
+    for (int i = 0; i < count; i++)
+        for (int j = 0; j < i; j++) {
+            const float dx = middle[i].x - middle[j].x, dy = middle[i].y - middle[j].y;
+            const float square = dx * dx + dy * dy;
+            if (!(square > low && square < high)) continue;
+            const float a = fabsf((float)c * dx + (float)s * dy);
+            const float b = fabsf((float)c * dy - (float)s * dx);
+            total += a > b ? a : b;
+            pairs++;
+        }
+    if (!pairs) return 0;
+    const double pitch = total / pairs;
+    memset(parameters, 0, PARAMETERS * sizeof(double));
+    parameters[A_U] = parameters[A_V + 1] = c / pitch;
+    parameters[A_U + 1] = s / pitch;
+    parameters[A_V] = -s / pitch;
+    const double turn = 2 * 3.14159265358979323846;
+    for (int axis = 0; axis < 2; axis++) {
+        const double *a = parameters + 3 * axis;
+        double re = 0, im = 0;
+        for (int i = 0; i < count; i++) {
+            const double phase = turn * (a[0] * middle[i].x + a[1] * middle[i].y);
+            re += cos(phase);
+            im += sin(phase);
+        }
+        parameters[C_U + 3 * axis] = -atan2(im, re) / turn;
+    }
+    return 1;
+}
+
+static int fit(const float *points, const uint8_t *valid, int m, int lens, const Rules *rules,
+               Projected *dots, float *wanted, Seed *middle, double *parameters, float *uv,
+               float *place, double *sigma)
+{
+    const float gate = (float)rules->gate, tight = (float)rules->tight;
+    const float offset = (float)rules->offset;
+    if (!seed(points, valid, m, rules, wanted, middle, parameters)) return 0;
+    for (int r = 0; r < rules->rings; r++) {
+        const float ring = (float)(rules->ring[r] * rules->ring[r]);
+        project(parameters, points, m, dots);
+        for (int i = 0; i < m; i++) {
+            const float u = rintf(dots[i].u), v = rintf(dots[i].v);
+            const float du = dots[i].u - u, dv = dots[i].v - v;
+            const int use = valid[i] && fabsf(du) < gate && fabsf(dv) < gate
+                            && u * u + v * v < ring;
+            wanted[2 * i] = use ? -du : NAN;
+            wanted[2 * i + 1] = -dv;
+        }
+        if (!step(parameters, dots, wanted, m, rules->loose, lens && rules->ring[r] > rules->bent_from,
+                  rules->prior))
+            return 0;
+    }
+    for (int last = 0; last < 3; last++) {
+        project(parameters, points, m, dots);
+        double shift[2] = {0, 0};
+        if (last == 2) { /* the place in the middle becomes the origin */
+            for (int axis = 0; axis < 2; axis++) {
+                double *a = parameters + 3 * axis;
+                shift[axis] = rint(a[2]);
+                a[0] -= shift[axis] * parameters[PERSPECTIVE];
+                a[1] -= shift[axis] * parameters[PERSPECTIVE + 1];
+                a[2] -= shift[axis];
+            }
+        }
+        int count = 0;
+        double squares = 0;
+        for (int i = 0; i < m; i++) {
+            uv[2 * i] = dots[i].u - (float)shift[0];
+            uv[2 * i + 1] = dots[i].v - (float)shift[1];
+            place[2 * i] = rintf(uv[2 * i]);
+            place[2 * i + 1] = rintf(uv[2 * i + 1]);
+            const float rest[2] = {uv[2 * i] - place[2 * i], uv[2 * i + 1] - place[2 * i + 1]};
+            float symbol[2];
+            nearest_symbol(rest, offset, symbol);
+            const float du = rest[0] - symbol[0], dv = rest[1] - symbol[1];
+            const int use = valid[i] && fabsf(du) < tight && fabsf(dv) < tight;
+            wanted[2 * i] = use ? -du : NAN;
+            wanted[2 * i + 1] = -dv;
+            if (use) {
+                count++;
+                squares += (double)(du * du + dv * dv);
+            }
+        }
+        if (last == 2) {
+            *sigma = sqrt(squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1));
+            for (int k = 0; k < PARAMETERS; k++)
+                if (!isfinite(parameters[k])) return 0;
+            return count >= rules->fewest;
+        }
+        if (!step(parameters, dots, wanted, m, rules->firm, lens, rules->prior)) return 0;
+    }
+    return 0;
+}
+
+static PyObject *fit_lattices(PyObject *self, PyObject *args)
+{
+    Py_buffer points, valid, ring, prior, parameters, uv, place, sigma, found;
+    int n, m, lens;
+    Rules rules;
+    if (!PyArg_ParseTuple(args, "y*y*iipy*y*iiddddddddw*w*w*w*w*", &points, &valid, &n, &m, &lens,
+                          &ring, &prior, &rules.seeds, &rules.fewest, &rules.nearest,
+                          &rules.farthest, &rules.gate, &rules.loose, &rules.tight, &rules.firm,
+                          &rules.bent_from, &rules.offset, &parameters, &uv, &place, &sigma,
+                          &found))
+        return NULL;
+    rules.rings = (int)(ring.len / (Py_ssize_t)sizeof(double));
+    rules.ring = ring.buf;
+    rules.prior = prior.buf;
+    Projected *dots = malloc((size_t)m * sizeof(Projected));
+    float *wanted = malloc((size_t)m * 2 * sizeof(float));
+    Seed *middle = malloc((size_t)rules.seeds * sizeof(Seed));
+    const int stored = dots && wanted && middle;
+    if (stored) {
+        Py_BEGIN_ALLOW_THREADS
+        for (int k = 0; k < n; k++) {
+            const size_t at = (size_t)k * m;
+            ((uint8_t *)found.buf)[k] = (uint8_t)fit(
+                (const float *)points.buf + 2 * at, (const uint8_t *)valid.buf + at, m, lens,
+                &rules, dots, wanted, middle, (double *)parameters.buf + (size_t)k * PARAMETERS,
+                (float *)uv.buf + 2 * at, (float *)place.buf + 2 * at, (double *)sigma.buf + k);
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(dots);
+    free(wanted);
+    free(middle);
+    PyBuffer_Release(&points);
+    PyBuffer_Release(&valid);
+    PyBuffer_Release(&ring);
+    PyBuffer_Release(&prior);
+    PyBuffer_Release(&parameters);
+    PyBuffer_Release(&uv);
+    PyBuffer_Release(&place);
+    PyBuffer_Release(&sigma);
+    PyBuffer_Release(&found);
+    if (!stored) return PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
+/* Soft bits of a frame's dots on the square of places about the middle. */
+static void bits_of(const float *uv, const float *place, const uint8_t *valid, int m, int half,
+                    float sigma, float offset, float often, float *misses, float *x_bits,
+                    float *y_bits)
+{
+    const int length = 2 * half;
+    const float spread = -0.25f / (sigma * sigma);
+    for (int k = 0; k < length * length; k++) {
+        misses[k] = FLT_MAX;
+        x_bits[k] = y_bits[k] = 0;
+    }
+    for (int i = 0; i < m; i++) {
+        if (!valid[i]) continue;
+        const int column = (int)place[2 * i] + half, row = (int)place[2 * i + 1] + half;
+        if (column < 0 || column >= length || row < 0 || row >= length) continue;
+        const float rest[2] = {uv[2 * i] - place[2 * i], uv[2 * i + 1] - place[2 * i + 1]};
+        float symbol[2];
+        nearest_symbol(rest, offset, symbol);
+        const float a = fabsf(rest[0] - symbol[0]), b = fabsf(rest[1] - symbol[1]);
+        const float miss = a > b ? a : b;
+        const int cell = row * length + column;
+        if (miss >= misses[cell]) continue;
+        misses[cell] = miss;
+        for (int axis = 0; axis < 2; axis++) {
+            const float along = axis ? rest[1] + rest[0] : rest[1] - rest[0];
+            const float one = expf(spread * (along - offset) * (along - offset)) + often;
+            const float zero = expf(spread * (along + offset) * (along + offset)) + often;
+            (axis ? y_bits : x_bits)[cell] = logf(one / zero);
+        }
+    }
+}
+
+static PyObject *soft_bits(PyObject *self, PyObject *args)
+{
+    Py_buffer uv, place, valid, found, sigma, x_bits, y_bits;
+    int n, m, half;
+    float offset, often;
+    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iiiffw*w*", &uv, &place, &valid, &found, &sigma, &n,
+                          &m, &half, &offset, &often, &x_bits, &y_bits))
+        return NULL;
+    const size_t size = 4 * (size_t)half * half;
+    float *misses = malloc(size * sizeof(float));
+    if (misses) {
+        Py_BEGIN_ALLOW_THREADS
+        for (int k = 0; k < n; k++) {
+            const size_t at = (size_t)k * m;
+            bits_of((const float *)uv.buf + 2 * at, (const float *)place.buf + 2 * at,
+                    (const uint8_t *)valid.buf + at, ((const uint8_t *)found.buf)[k] ? m : 0,
+                    half, (float)((const double *)sigma.buf)[k], offset, often, misses,
+                    (float *)x_bits.buf + k * size, (float *)y_bits.buf + k * size);
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(misses);
+    PyBuffer_Release(&uv);
+    PyBuffer_Release(&place);
+    PyBuffer_Release(&valid);
+    PyBuffer_Release(&found);
+    PyBuffer_Release(&sigma);
+    PyBuffer_Release(&x_bits);
+    PyBuffer_Release(&y_bits);
+    if (!misses) return PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
+/* ---- A first reading of windows ---------------------------------------------------------- */
+
+enum { PERIOD = 63, SEQUENCES = 4, BASE = 3 };
+
+typedef struct {
+    const int64_t *lengths, *weights, *prefixes, *crt; /* prefixes one after the other */
+    const float *signs;  /* the main sequence as -1 and 1, from 0 to its period and beyond */
+    const int8_t *digit; /* (4, 63) digit of each difference, -1 where there is none */
+    const float *masks;  /* (4, 3, widest) whether a place has a digit, repeated beyond the end */
+    int64_t range, smallest, widest;
+    double places;
+} Code;
+
+typedef struct {
+    int64_t place, shift, wrong, first, last;
+    double odds;
+} Axis;
+
+static inline int64_t remainder_of(int64_t a, int64_t b)
+{
+    const int64_t r = a % b;
+    return r < 0 ? r + b : r;
+}
+
+/* Index of the main sequence at the start of a column or row; Codec.phases. */
+static int64_t phase_at(const Code *code, int64_t place)
+{
+    int64_t total = code->smallest * place;
+    const int64_t *prefix = code->prefixes;
+    for (int k = 0; k < SEQUENCES; k++) {
+        const int64_t length = code->lengths[k];
+        total += code->weights[k] * (place / length * prefix[length] + prefix[place % length]);
+        prefix += length + 1;
+    }
+    return remainder_of(total, PERIOD);
+}
+
+/* Likeliest place and shift of one axis by the likeliest phase of each line. */
+static void vote(const Code *code, const float *const *scores, int lines, float *votes, int *phase,
+                 float *margin, Axis *axis)
+{
+    for (int i = 0; i < lines; i++) {
+        const float *s = scores[i];
+        float top = s[0], next = -FLT_MAX;
+        int best = 0;
+        for (int k = 1; k < PERIOD; k++) {
+            if (s[k] > top) {
+                next = top;
+                top = s[k];
+                best = k;
+            } else if (s[k] > next)
+                next = s[k];
+        }
+        phase[i] = best;
+        margin[i] = top - next;
+    }
+    int64_t place = 0;
+    for (int k = 0; k < SEQUENCES; k++) {
+        const int length = (int)code->lengths[k];
+        memset(votes, 0, (size_t)length * sizeof(float));
+        for (int i = 0; i + 1 < lines; i++) {
+            const float weight = smaller(margin[i], margin[i + 1]);
+            const int difference = (phase[i + 1] - phase[i] + PERIOD) % PERIOD;
+            const int digit = code->digit[k * PERIOD + difference];
+            if (digit < 0 || weight <= 0) continue;
+            const float *restrict mask = code->masks + (k * BASE + digit) * code->widest + i % length;
+            for (int q = 0; q < length; q++) votes[q] += weight * mask[q];
+        }
+        int best = 0;
+        for (int q = 1; q < length; q++)
+            if (votes[q] > votes[best]) best = q;
+        place = (place + code->crt[k] * best) % code->range;
+    }
+    axis->place = place;
+    float ballots[PERIOD] = {0};
+    for (int i = 0; i < lines; i++) {
+        const int64_t ahead = phase_at(code, (place + i) % code->range);
+        ballots[remainder_of(phase[i] - ahead, PERIOD)] += margin[i];
+    }
+    int best = 0;
+    for (int k = 1; k < PERIOD; k++)
+        if (ballots[k] > ballots[best]) best = k;
+    axis->shift = best;
+}
+
+/* Evidence for the place: line i of the axis, dot j along it, at bits[start + i*a + j*b]. */
+static void compare(const Code *code, const float *bits, float sign, int start, int across,
+                    int along, int length, Axis *axis)
+{
+    double odds = 0;
+    axis->wrong = 0;
+    axis->first = length;
+    axis->last = -1;
+    for (int i = 0; i < length; i++) {
+        const float *line = bits + start + i * across;
+        const int64_t phase =
+            remainder_of(phase_at(code, (axis->place + i) % code->range) + axis->shift, PERIOD);
+        int seen = 0;
+        for (int j = 0; j < length; j++) {
+            const float bit = line[j * along];
+            if (bit == 0) continue;
+            seen = 1;
+            const float agreement = sign * bit * code->signs[phase + j];
+            axis->wrong += agreement < 0;
+            odds -= logf(0.5f + 0.5f * expf(-agreement));
+        }
+        if (seen) {
+            if (i < axis->first) axis->first = i;
+            axis->last = i;
+        }
+    }
+    axis->odds = odds - code->places;
+}
+
+static void read_window(const Code *code, const float *x_bits, const float *y_bits, int length,
+                        float *scores, const float **lines, float *votes, int *phase,
+                        float *margin, int64_t *rotation, Axis *x, Axis *y)
+{
+    const size_t size = (size_t)length * PERIOD;
+    float *table[4] = {scores, scores + size, scores + 2 * size, scores + 3 * size};
+    memset(scores, 0, 4 * size * sizeof(float));
+    for (int row = 0; row < length; row++)
+        for (int column = 0; column < length; column++) {
+            const float a = x_bits[row * length + column], b = y_bits[row * length + column];
+            if (a != 0) {
+                float *restrict up = table[0] + column * PERIOD;
+                float *restrict down = table[1] + column * PERIOD;
+                const float *restrict f = code->signs + row;
+                const float *restrict g = code->signs + length - 1 - row;
+                for (int k = 0; k < PERIOD; k++) up[k] += a * f[k];
+                for (int k = 0; k < PERIOD; k++) down[k] -= a * g[k];
+            }
+            if (b != 0) {
+                float *restrict up = table[2] + row * PERIOD;
+                float *restrict down = table[3] + row * PERIOD;
+                const float *restrict f = code->signs + column;
+                const float *restrict g = code->signs + length - 1 - column;
+                for (int k = 0; k < PERIOD; k++) up[k] += b * f[k];
+                for (int k = 0; k < PERIOD; k++) down[k] -= b * g[k];
+            }
+        }
+    float sums[4] = {0};
+    for (int t = 0; t < 4; t++)
+        for (int i = 0; i < length; i++) {
+            const float *s = table[t] + i * PERIOD;
+            float top = s[0];
+            for (int k = 1; k < PERIOD; k++) top = top > s[k] ? top : s[k];
+            sums[t] += top;
+        }
+    /* Scores of columns and rows at each rotation, and whether they count backwards. */
+    static const int column_table[4] = {0, 2, 1, 3}, row_table[4] = {2, 1, 3, 0};
+    static const int column_turned[4] = {0, 1, 1, 0}, row_turned[4] = {0, 0, 1, 1};
+    int best = 0;
+    for (int r = 1; r < 4; r++)
+        if (sums[column_table[r]] + sums[row_table[r]]
+            > sums[column_table[best]] + sums[row_table[best]])
+            best = r;
+    *rotation = best;
+    const int last = length - 1, width = length;
+    for (int i = 0; i < length; i++)
+        lines[i] = table[column_table[best]] + (column_turned[best] ? last - i : i) * PERIOD;
+    vote(code, lines, length, votes, phase, margin, x);
+    for (int i = 0; i < length; i++)
+        lines[i] = table[row_table[best]] + (row_turned[best] ? last - i : i) * PERIOD;
+    vote(code, lines, length, votes, phase, margin, y);
+    /* Steps in the seen window for a step in x and in y of the printed one. */
+    static const int sign_x[4] = {1, 1, -1, -1}, sign_y[4] = {1, -1, -1, 1};
+    const int start[4] = {0, last * width, last * width + last, last};
+    const int step_x[4] = {1, -width, -1, width}, step_y[4] = {width, 1, -width, -1};
+    const float *columns = best % 2 ? y_bits : x_bits, *rows = best % 2 ? x_bits : y_bits;
+    compare(code, columns, (float)sign_x[best], start[best], step_x[best], step_y[best], length, x);
+    compare(code, rows, (float)sign_y[best], start[best], step_y[best], step_x[best], length, y);
+}
+
+static PyObject *read_windows(PyObject *self, PyObject *args)
+{
+    Py_buffer x_bits, y_bits, lengths, weights, prefixes, crt, signs, digit, masks, whole, odds;
+    int n, length;
+    long long range, smallest;
+    Code code;
+    if (!PyArg_ParseTuple(args, "y*y*iiy*y*y*y*y*y*y*LLdw*w*", &x_bits, &y_bits, &n, &length,
+                          &lengths, &weights, &prefixes, &crt, &signs, &digit, &masks, &range,
+                          &smallest, &code.places, &whole, &odds))
+        return NULL;
+    code.lengths = lengths.buf;
+    code.weights = weights.buf;
+    code.prefixes = prefixes.buf;
+    code.crt = crt.buf;
+    code.signs = signs.buf;
+    code.digit = digit.buf;
+    code.masks = masks.buf;
+    code.widest = masks.len / (Py_ssize_t)(SEQUENCES * BASE * sizeof(float));
+    code.range = range;
+    code.smallest = smallest;
+    const size_t size = (size_t)length * length;
+    float *scores = malloc((4 * (size_t)length * PERIOD + (size_t)length + 512) * sizeof(float));
+    const float **lines = malloc((size_t)length * sizeof(float *));
+    int *phase = malloc((size_t)length * sizeof(int));
+    const int stored = scores && lines && phase;
+    if (stored) {
+        float *margin = scores + 4 * (size_t)length * PERIOD, *votes = margin + length;
+        int64_t *out = whole.buf;
+        double *evidence = odds.buf;
+        Py_BEGIN_ALLOW_THREADS
+        for (int k = 0; k < n; k++, out += 11, evidence += 2) {
+            Axis axes[2];
+            read_window(&code, (const float *)x_bits.buf + k * size,
+                        (const float *)y_bits.buf + k * size, length, scores, lines, votes, phase,
+                        margin, out, axes, axes + 1);
+            for (int axis = 0; axis < 2; axis++) {
+                const Axis *a = axes + axis;
+                const int64_t row[5] = {a->place, a->shift, a->wrong, a->first, a->last};
+                memcpy(out + 1 + 5 * axis, row, sizeof(row));
+                evidence[axis] = a->odds;
+            }
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(scores);
+    free((void *)lines);
+    free(phase);
+    PyBuffer_Release(&x_bits);
+    PyBuffer_Release(&y_bits);
+    PyBuffer_Release(&lengths);
+    PyBuffer_Release(&weights);
+    PyBuffer_Release(&prefixes);
+    PyBuffer_Release(&crt);
+    PyBuffer_Release(&signs);
+    PyBuffer_Release(&digit);
+    PyBuffer_Release(&masks);
+    PyBuffer_Release(&whole);
+    PyBuffer_Release(&odds);
+    if (!stored) return PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
+/* ---- From a place to a pose --------------------------------------------------------------- */
+
+/* Fits the lattice once more, to the dots that say what they should, and reads the pose off. */
+static int pose_of(const Code *code, const float *points, const uint8_t *valid, const float *uv,
+                   const float *place, int m, int half, int lens, const double *prior,
+                   const int64_t *window, double offset, double tight, double finest,
+                   Projected *dots, float *wanted, int64_t *phases, double *parameters,
+                   double *pose, double *covariance)
+{
+    static const int turns[4][2][2] = {
+        {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
+    static const int corners[4][2] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
+    const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
+    const int(*turn)[2] = turns[window[4]], *corner = corners[window[4]], length = 2 * half;
+    int64_t *columns = phases, *rows = phases + length;
+    for (int k = 0; k < length; k++) {
+        const int64_t at_x = remainder_of(x + k, code->range);
+        const int64_t at_y = remainder_of(y + k, code->range);
+        columns[k] = remainder_of(phase_at(code, at_x) + section[0] + y, PERIOD);
+        rows[k] = remainder_of(phase_at(code, at_y) + section[1] + x, PERIOD);
+    }
+    int count = 0;
+    double squares = 0;
+    for (int i = 0; i < m; i++) {
+        wanted[2 * i] = NAN;
+        if (!valid[i]) continue;
+        const int a = (int)place[2 * i] + half, b = (int)place[2 * i + 1] + half;
+        const int column = turn[0][0] * a + turn[0][1] * b + corner[0] * (length - 1);
+        const int row = turn[1][0] * a + turn[1][1] * b + corner[1] * (length - 1);
+        if (column < 0 || column >= length || row < 0 || row >= length) continue;
+        const int column_bit = code->signs[columns[column] + row] > 0;
+        const int row_bit = code->signs[rows[row] + column] > 0;
+        /* Up 00, left 10, right 01, down 11 (column bit, row bit). */
+        const int dx = row_bit - column_bit, dy = row_bit + column_bit - 1;
+        const float du = uv[2 * i] - place[2 * i]
+                         - (float)offset * (float)(turn[0][0] * dx + turn[1][0] * dy);
+        const float dv = uv[2 * i + 1] - place[2 * i + 1]
+                         - (float)offset * (float)(turn[0][1] * dx + turn[1][1] * dy);
+        if (!(fabsf(du) < (float)tight && fabsf(dv) < (float)tight)) continue;
+        wanted[2 * i] = -du;
+        wanted[2 * i + 1] = -dv;
+        count++;
+        squares += (double)(du * du + dv * dv);
+    }
+    double variance = squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1);
+    if (variance < finest * finest) variance = finest * finest;
+    project(parameters, points, m, dots);
+    double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], right[PARAMETERS];
+    equations(parameters, dots, wanted, m, sqrt(variance), lens, prior, normal, right);
+    memcpy(copy, normal, sizeof(normal));
+    if (!solve(copy, right, 1)) return 0;
+    for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
+
+    const double *t = parameters;
+    const double centre[2] = {t[C_U] + half, t[C_V] + half};
+    const double u = t[A_U] - t[C_U] * t[PERSPECTIVE], v = t[A_V] - t[C_V] * t[PERSPECTIVE];
+    double right_of[2];
+    for (int axis = 0; axis < 2; axis++) {
+        pose[axis] = turn[axis][0] * centre[0] + turn[axis][1] * centre[1]
+                     + corner[axis] * (length - 1) + (double)(axis ? y : x);
+        right_of[axis] = turn[axis][0] * u + turn[axis][1] * v;
+    }
+    pose[2] = atan2(-right_of[1], right_of[0]);
+    double jacobian[3][PARAMETERS] = {{0}}, solved[PARAMETERS * 3];
+    for (int axis = 0; axis < 2; axis++) {
+        jacobian[axis][C_U] = turn[axis][0];
+        jacobian[axis][C_V] = turn[axis][1];
+    }
+    jacobian[2][A_U] = v / (u * u + v * v);
+    jacobian[2][A_V] = -u / (u * u + v * v);
+    for (int k = 0; k < PARAMETERS; k++)
+        for (int side = 0; side < 3; side++) solved[3 * k + side] = jacobian[side][k];
+    if (!solve(normal, solved, 3)) return 0;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            double sum = 0;
+            for (int k = 0; k < PARAMETERS; k++) sum += jacobian[i][k] * solved[3 * k + j];
+            covariance[3 * i + j] = sum * variance;
+        }
+    return 1;
+}
+
+static PyObject *poses(PyObject *self, PyObject *args)
+{
+    Py_buffer points, valid, uv, place, prior, windows, parameters, pose, covariance;
+    Py_buffer lengths, weights, prefixes, crt, signs, digit, masks;
+    int n, m, half, lens;
+    long long range, smallest;
+    double offset, tight, finest;
+    Code code;
+    if (!PyArg_ParseTuple(args, "y*y*y*y*iiipy*y*y*y*y*y*y*y*y*LLdddw*w*w*", &points, &valid, &uv,
+                          &place, &n, &m, &half, &lens, &prior, &windows, &lengths, &weights,
+                          &prefixes, &crt, &signs, &digit, &masks, &range, &smallest, &offset,
+                          &tight, &finest, &parameters, &pose, &covariance))
+        return NULL;
+    code.lengths = lengths.buf;
+    code.weights = weights.buf;
+    code.prefixes = prefixes.buf;
+    code.signs = signs.buf;
+    code.range = range;
+    code.smallest = smallest;
+    Projected *dots = malloc((size_t)m * sizeof(Projected));
+    float *wanted = malloc((size_t)m * 2 * sizeof(float));
+    int64_t *phases = malloc(4 * (size_t)half * sizeof(int64_t));
+    const int stored = dots && wanted && phases;
+    if (stored) {
+        Py_BEGIN_ALLOW_THREADS
+        for (int k = 0; k < n; k++) {
+            const size_t at = (size_t)k * m;
+            double *out = (double *)pose.buf + 3 * k, *spread = (double *)covariance.buf + 9 * k;
+            if (!pose_of(&code, (const float *)points.buf + 2 * at,
+                         (const uint8_t *)valid.buf + at, (const float *)uv.buf + 2 * at,
+                         (const float *)place.buf + 2 * at, m, half, lens, prior.buf,
+                         (const int64_t *)windows.buf + 5 * k, offset, tight, finest, dots,
+                         wanted, phases, (double *)parameters.buf + (size_t)k * PARAMETERS, out,
+                         spread)) {
+                for (int i = 0; i < 3; i++) out[i] = NAN;
+                for (int i = 0; i < 9; i++) spread[i] = NAN;
+            }
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(dots);
+    free(wanted);
+    free(phases);
+    PyBuffer_Release(&points);
+    PyBuffer_Release(&valid);
+    PyBuffer_Release(&uv);
+    PyBuffer_Release(&place);
+    PyBuffer_Release(&prior);
+    PyBuffer_Release(&windows);
+    PyBuffer_Release(&lengths);
+    PyBuffer_Release(&weights);
+    PyBuffer_Release(&prefixes);
+    PyBuffer_Release(&crt);
+    PyBuffer_Release(&signs);
+    PyBuffer_Release(&digit);
+    PyBuffer_Release(&masks);
+    PyBuffer_Release(&parameters);
+    PyBuffer_Release(&pose);
+    PyBuffer_Release(&covariance);
+    if (!stored) return PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
+static PyMethodDef methods[] = {
+    {"find_dots", find_dots, METH_VARARGS, "Twin of locatk.core.dots.blobs.find_dots_numpy."},
+    {"fit_lattices", fit_lattices, METH_VARARGS,
+     "Twin of locatk.core.dots.grid.fit_lattices_numpy."},
+    {"read_windows", read_windows, METH_VARARGS, "Twin of locatk.core.dots.decode.read_numpy."},
+    {"soft_bits", soft_bits, METH_VARARGS, "Twin of locatk.core.dots.locate.soft_bits_numpy."},
+    {"poses", poses, METH_VARARGS, "Twin of locatk.core.dots.locate.poses_numpy."},
+    {NULL, NULL, 0, NULL},
+};
+
+static struct PyModuleDef module = {
+    PyModuleDef_HEAD_INIT, "_kernels", "Hot loops of locatk.core.", -1, methods,
+    NULL, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__kernels(void) { return PyModule_Create(&module); }

@@ -1,0 +1,143 @@
+"""`locatk simulate dots` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.core.dots import simulate
+from locatk.core.dots.camera import Camera
+from locatk.formats import sheets
+from locatk.formats.frames import read_frames
+from locatk.formats.session import Session
+from locatk.formats.tracks import read_truth
+
+
+def test_a_session_holds_frames_sheet_camera_and_truth(locatk, tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    result = locatk("simulate", "dots", "-o", out, "--frames", 5, "--seed", 3, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout) == {
+        "version": 1,
+        "output": str(out),
+        "frames": 5,
+        "device": "camera",
+        "frame": "simulated",
+        "codec": "anoto",
+        "calibrated": True,
+        "truth_poses": 5,
+    }
+    session = Session.open(out)
+    assert session.facts["system"] == "dots"
+    (frames,) = read_frames(session)
+    wanted = simulate.simulate(None, simulate.SimulationOptions(frames=5, seed=3))
+    assert np.array_equal(list(frames.images), list(wanted.frames.images))
+    assert frames.names == wanted.frames.names
+    assert np.array_equal(frames.time_ns, wanted.frames.time_ns)
+    assert sheets.attached_manifest(session) == wanted.manifest
+    assert sheets.attached_camera(session) == wanted.camera
+    (truth,) = read_truth(session)
+    assert truth.frame == "simulated"
+    assert truth.position == pytest.approx(wanted.truth.position)
+    assert truth.quaternion == pytest.approx(wanted.truth.quaternion)
+
+
+def test_each_option_reaches_the_frames(locatk, tmp_path: Path) -> None:
+    printed, lens = tmp_path / "sheet.toml", tmp_path / "camera.toml"
+    one = simulate.sheet("libdots")
+    two = replace(one.sheets[0], id="second", origin=(7_000, 9_000))
+    manifest = replace(one, sheets=(*one.sheets, two))
+    camera = Camera((160, 100), 300.0, (80.0, 50.0), -0.2)
+    sheets.write_manifest(printed, manifest)
+    sheets.write_camera(lens, camera)
+    out = tmp_path / "run.mcap"
+    given = (
+        *("--sheet", printed, "--id", "second", "--camera", lens, "--duration", "0.2"),
+        *("--rate", 20, "--path", "random", "--speed", 0.3, "--motion", 2, "--dot", 0.25),
+        *("--missing", 0.1, "--dust", 0.05, "--jitter", 8, "--printer-scale", "1.002,0.999"),
+        *("--scale-known", "--blur", 0.9, "--noise", 4, "--contrast", 0.5, "--vignette", 0.2),
+        *("--gradient", 0.1, "--tilt", 5, "--askew", "2,-3", "--uncalibrated", "--seed", 8),
+    )
+    result = locatk("simulate", "dots", "-o", out, *given)
+    assert result.exit_code == 0, result.stderr
+    assert "4 frames of camera over second, 4 truth poses" in result.stdout
+    options = simulate.SimulationOptions(
+        frames=4,
+        rate_hz=20.0,
+        path="random",
+        speed_mps=0.3,
+        motion_px=2.0,
+        camera=camera,
+        pitch_rad=math.radians(2),
+        roll_rad=math.radians(-3),
+        tilt_rad=math.radians(5),
+        dot=0.25,
+        missing=0.1,
+        dust=0.05,
+        jitter_m=8e-6,
+        printer_scale=(1.002, 0.999),
+        blur_px=0.9,
+        noise=4.0,
+        contrast=0.5,
+        vignette=0.2,
+        gradient=0.1,
+        sheet=1,
+        seed=8,
+    )
+    session = Session.open(out)
+    (frames,) = read_frames(session)
+    wanted = simulate.simulate(manifest, options)
+    assert np.array_equal(list(frames.images), list(wanted.frames.images))
+    assert sheets.attached_manifest(session) == replace(manifest, scale=(1.002, 0.999))
+    assert sheets.attached_camera(session) is None
+
+
+def test_a_scale_that_nobody_measured_stays_out_of_the_manifest(locatk, tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    options = ("--frames", 1, "--printer-scale", "1.002,0.999")
+    assert locatk("simulate", "dots", "-o", out, *options).exit_code == 0
+    manifest = sheets.attached_manifest(Session.open(out))
+    assert manifest is not None
+    assert manifest.scale == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "said"),
+    [
+        (("--frames", 3, "--duration", 2), 2, "not both"),
+        (("--scale-known",), 2, "--printer-scale"),
+        (("--printer-scale", "1.002"), 2, "two numbers"),
+        (("--id", "other"), 2, "simulated"),
+        (("--missing", 1.5), 2, "--missing"),
+        (("--codec", "qr"), 2, "libdots"),
+        (("--dot", 0.9), 1, "dot 0.9"),
+        (("--tilt", 60), 1, "tilt_rad"),
+        (("--rate", 10000), 1, "exposure_s"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    locatk, tmp_path: Path, options: tuple[object, ...], status: int, said: str
+) -> None:
+    result = locatk("simulate", "dots", "-o", tmp_path / "run.mcap", *options)
+    assert result.exit_code == status
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_overwritten_unasked(locatk, tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    out.write_text("mine")
+    assert locatk("simulate", "dots", "-o", out, "--frames", 1).exit_code == 1
+    assert out.read_text() == "mine"
+    assert locatk("simulate", "dots", "-o", out, "--frames", 1, "--overwrite").exit_code == 0
+    sheet = tmp_path / "sheet.toml"
+    sheets.write_manifest(sheet, simulate.sheet())
+    result = locatk("simulate", "dots", "-o", sheet, "--sheet", sheet, "--overwrite")
+    assert result.exit_code == 1
+    assert sheets.read_manifest(sheet) == simulate.sheet()
