@@ -1,6 +1,6 @@
 /* The two hot loops of core/dots, frame by frame: dots of an image, and the lattice of dots.
  *
- * Each has a twin in numpy that says what it does and why (core/dots/blobs.py, grid.py) and
+ * Each has a twin in numpy that says what it does and why (core/dots/blobs.py and others) and
  * that is used where this module was not built; tests/core/dots/test_kernels.py holds the two
  * against each other. Constants come in as arguments, so that they stand in one place.
  * Only the stable ABI of Python 3.11 is used, and buffers instead of numpy's own interface.
@@ -1075,9 +1075,9 @@ static PyMethodDef methods[] = {
     {"find_dots", find_dots, METH_VARARGS, "Twin of locatk.core.dots.blobs.find_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,
      "Twin of locatk.core.dots.grid.fit_lattices_numpy."},
-    {"read_windows", read_windows, METH_VARARGS, "Twin of locatk.core.dots.decode.read_numpy."},
-    {"soft_bits", soft_bits, METH_VARARGS, "Twin of locatk.core.dots.locate.soft_bits_numpy."},
-    {"poses", poses, METH_VARARGS, "Twin of locatk.core.dots.locate.poses_numpy."},
+    {"read_windows", read_windows, METH_VARARGS, "Twin of locatk.core.dots.reading.read_numpy."},
+    {"soft_bits", soft_bits, METH_VARARGS, "Twin of locatk.core.dots.softbits.soft_bits_numpy."},
+    {"poses", poses, METH_VARARGS, "Twin of locatk.core.dots.pose.poses_numpy."},
     {NULL, NULL, 0, NULL},
 };
 

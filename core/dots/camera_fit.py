@@ -142,7 +142,7 @@ class Fit:
 
 def fit_flat(views: Views) -> Fit:
     """Homographies without any lens, for comparison."""
-    return _fit(views, Homographies(), np.zeros(5), _seeds(views), [])
+    return _fit(views, Homographies(), np.zeros(5), homographies(views), [])
 
 
 def fit_homographies(views: Views, *, hold_centre: bool = False) -> Fit:
@@ -156,7 +156,7 @@ def fit_homographies(views: Views, *, hold_centre: bool = False) -> Fit:
         Leave the centre in the middle of the frame.
     """
     free = [RADIAL] if hold_centre else [0, 1, RADIAL]
-    return _fit(views, Homographies(), np.zeros(5), _seeds(views), free)
+    return _fit(views, Homographies(), np.zeros(5), homographies(views), free)
 
 
 def fit_poses(views: Views, start: Fit, usual_focal: float, *, hold_centre: bool = False) -> Fit:
@@ -186,7 +186,8 @@ def fit_poses(views: Views, start: Fit, usual_focal: float, *, hold_centre: bool
     return _fit(views, Poses(), shared, own, free, usual)
 
 
-def _seeds(views: Views) -> Array:
+def homographies(views: Views) -> Array:
+    """(n, 8) of frames by linear least squares, in half diagonals of the frame; no lens."""
     frame, plane = _scaled(views)
     return seeds(frame, plane, views.valid)
 

@@ -25,7 +25,7 @@ from locatk.core.dots.located import Located, nothing
 from locatk.core.dots.pose import match, poses
 from locatk.core.dots.softbits import half_width, soft_bits
 
-BATCH = 16
+BATCH = 32
 """Frames that are worked on at once; their data fits the cache."""
 
 SMALLEST = 48

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from locatk.core.dots import grid
 from locatk.core.dots.codec import DISPLACEMENT, MAIN, PERIOD, RANGE, Codec
-from locatk.core.dots.decode import Decoded, kernel_tables
+from locatk.core.dots.decode import Decoded
 from locatk.core.dots.grid import Lattices
+from locatk.core.dots.reading import kernel_tables
 from locatk.core.dots.sequences import SMALLEST_SHIFT
 from locatk.core.dots.sheet import OFFSET
 from locatk.core.kernels import kernels

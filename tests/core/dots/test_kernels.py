@@ -1,0 +1,185 @@
+"""The compiled loops and their twins in numpy: the same answers, on frames and on codes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core import kernels
+from locatk.core.dots import blobs, decode, grid, locate, pose, reading, softbits
+from locatk.core.dots.codec import RANGE, codec
+from locatk.core.dots.exact import turn
+
+needs_kernels = pytest.mark.skipif(
+    kernels.kernels is None, reason="the compiled kernels were not built (no C compiler)"
+)
+
+ANOTO = codec("anoto")
+
+
+def drawn(seed: int, n: int = 6) -> NDArray[np.uint8]:
+    """Frames of random dots near a turned and tilted grid, uneven light, noise and dust."""
+    rng = np.random.default_rng(seed)
+    height, width = 120, 188
+    y, x = np.mgrid[:height, :width]
+    frames = []
+    for _ in range(n):
+        angle, pitch = rng.uniform(0, np.pi / 2), rng.uniform(9, 13)
+        light = 190 + 30 * np.sin(x / 90 + rng.uniform(0, 6)) - 0.2 * y
+        image = light.copy()
+        places = np.stack(np.meshgrid(np.arange(-14, 15), np.arange(-14, 15)), -1).reshape(-1, 2)
+        symbols = ANOTO.symbols((int(rng.integers(RANGE - 29)), 7), (29, 29)).reshape(-1)
+        offsets = np.array([[0, -1], [-1, 0], [1, 0], [0, 1]])[symbols] / 6
+        turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        dots = (places + offsets + rng.uniform(-0.5, 0.5, 2)) @ turned.T * pitch
+        dots = dots / (1 + dots @ rng.uniform(-3e-4, 3e-4, 2))[:, None] + [93.5, 59.5]
+        dust = rng.uniform([0, 0], [width, height], (4, 2))
+        for at in np.concatenate([dots[rng.random(len(dots)) > 0.05], dust]):
+            if -5 < at[0] < width + 5 and -5 < at[1] < height + 5:
+                square = (x - at[0]) ** 2 + (y - at[1]) ** 2
+                image -= 0.6 * light * np.exp(-square / (2 * 1.3**2))
+        frames.append(np.clip(image + rng.normal(0, 3, image.shape), 0, 255))
+    return np.array(frames).astype(np.uint8)
+
+
+def as_points(dots: blobs.Dots) -> NDArray[np.float32]:
+    return ((dots.xy - [93.5, 59.5]) / np.hypot(188, 120) * 2).astype(np.float32)
+
+
+@needs_kernels
+@pytest.mark.parametrize("seed", [1, 2])
+def test_dots_are_the_same(seed: int) -> None:
+    images = drawn(seed)
+    mine, twin = blobs.find_dots(images), blobs.find_dots_numpy(images)
+    assert np.array_equal(mine.valid, twin.valid)
+    assert mine.counts.min() > 100
+    np.testing.assert_allclose(mine.xy, twin.xy, atol=2e-3)
+
+
+@needs_kernels
+def test_the_darkest_dots_are_kept() -> None:
+    images = drawn(3)
+    for found in (blobs.find_dots(images, 50), blobs.find_dots_numpy(images, 50)):
+        assert found.counts.tolist() == [50] * len(images)
+    few = blobs.find_dots(images, 50).xy, blobs.find_dots_numpy(images, 50).xy
+    order = [np.lexsort(np.round(xy, 1).transpose(2, 0, 1), axis=1) for xy in few]
+    rows = np.arange(len(images))[:, None]
+    same = np.abs(few[0][rows, order[0]] - few[1][rows, order[1]]).max(axis=2) < 0.2
+    assert same.mean() > 0.95
+
+
+@needs_kernels
+@pytest.mark.parametrize("shape", [(1, 5, 5), (2, 9, 40), (1, 48, 7), (1, 61, 200)])
+def test_dots_of_odd_sizes(shape: tuple[int, int, int]) -> None:
+    images = np.random.default_rng(4).integers(0, 256, shape).astype(np.uint8)
+    mine, twin = blobs.find_dots(images), blobs.find_dots_numpy(images)
+    assert np.array_equal(mine.counts, twin.counts)
+    np.testing.assert_allclose(mine.xy, twin.xy, atol=5e-3)
+
+
+@needs_kernels
+@pytest.mark.parametrize("lens", [True, False])
+def test_lattices_are_the_same(lens: bool) -> None:
+    dots = blobs.find_dots_numpy(drawn(5))
+    points = as_points(dots)
+    mine = grid.fit_lattices(points, dots.valid, lens=lens)
+    twin = grid.fit_lattices_numpy(points, dots.valid, lens=lens)
+    assert mine.found.all()
+    assert np.array_equal(mine.found, twin.found)
+    np.testing.assert_allclose(mine.parameters, twin.parameters, atol=1e-4)
+    np.testing.assert_allclose(mine.sigma, twin.sigma, rtol=1e-3)
+    np.testing.assert_allclose(mine.uv[dots.valid], twin.uv[dots.valid], atol=1e-3)
+    assert np.array_equal(mine.place[dots.valid], twin.place[dots.valid])
+
+
+@needs_kernels
+def test_too_few_dots_have_no_lattice_in_either() -> None:
+    points = np.random.default_rng(6).normal(size=(2, 15, 2)).astype(np.float32)
+    valid = np.ones((2, 15), bool)
+    assert not grid.fit_lattices(points, valid, lens=False).found.any()
+    assert not grid.fit_lattices_numpy(points, valid, lens=False).found.any()
+
+
+@needs_kernels
+def test_soft_bits_are_the_same() -> None:
+    dots = blobs.find_dots_numpy(drawn(7))
+    lattices = grid.fit_lattices_numpy(as_points(dots), dots.valid, lens=True)
+    half = softbits.half_width(lattices)
+    mine = softbits.soft_bits(lattices, half)
+    scatter = np.clip(1.5 * lattices.sigma, softbits.SHARPEST, 2 * softbits.SHARPEST)
+    twin = softbits.soft_bits_numpy(lattices, half, scatter)
+    assert np.count_nonzero(mine[0]) > 600
+    for a, b in zip(mine, twin, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+@needs_kernels
+@pytest.mark.parametrize("name", ["anoto", "libdots", "microdots"])
+@pytest.mark.parametrize(
+    ("side", "missing", "wrong"), [(8, 0, 0), (11, 0.1, 0.03), (24, 0.6, 0.05)]
+)
+def test_readings_are_the_same(name: str, side: int, missing: float, wrong: float) -> None:
+    rng = np.random.default_rng(side)
+    code = codec(name)
+    windows = []
+    for _ in range(60):
+        x, y = (int(v) for v in rng.integers(0, RANGE - side, 2))
+        u, v = (int(v) for v in rng.integers(0, 63, 2))
+        windows.append(turn(code.symbols((x, y), (side, side), (u, v)), int(rng.integers(4))))
+    symbols = np.array(windows)
+    bits = []
+    for bit in (1, 2):
+        sure = rng.uniform(0.5, 4, symbols.shape).astype(np.float32)
+        table = np.where(symbols & bit, sure, -sure)
+        table[rng.random(table.shape) < wrong] *= -1
+        bits.append(table)
+    gone = rng.random(symbols.shape) < missing
+    for table in bits:
+        table[gone] = 0
+    mine, twin = reading.read(*bits, code), reading.read_numpy(*bits, code)
+    for field in ("rotation", "place", "shift", "wrong", "first", "last"):
+        same = getattr(mine, field) == getattr(twin, field)
+        assert same.mean() > 0.99, field  # the sums are rounded differently; ties may fall apart
+    agree = (mine.place == twin.place).all(axis=1)
+    np.testing.assert_allclose(mine.odds[agree], twin.odds[agree], atol=1e-3)
+
+
+@needs_kernels
+def test_poses_are_the_same() -> None:
+    dots = blobs.find_dots_numpy(drawn(8))
+    lattices = grid.fit_lattices_numpy(as_points(dots), dots.valid, lens=True)
+    half = softbits.half_width(lattices)
+    decoded = decode.decode(*softbits.soft_bits(lattices, half), ANOTO)
+    assert (decoded.confidence > 0.999).all()
+    mine = pose.poses(lattices, half, decoded, ANOTO)
+    twin = pose.poses_numpy(lattices, half, decoded, ANOTO)
+    np.testing.assert_allclose(mine.grid, twin.grid, atol=1e-5)
+    np.testing.assert_allclose(mine.heading, twin.heading, atol=1e-6)
+    np.testing.assert_allclose(mine.covariance, twin.covariance, rtol=1e-2, atol=1e-12)
+
+
+def test_frames_without_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = drawn(9)
+    mine = locate.locate(images, ANOTO)
+    for module in (blobs, grid, softbits, reading, pose):
+        monkeypatch.setattr(module, "kernels", None)
+    twin = locate.locate(images, ANOTO)
+    assert mine.accepted.all()
+    assert twin.accepted.all()
+    assert np.array_equal(mine.section, twin.section)
+    np.testing.assert_allclose(mine.grid, twin.grid, atol=1e-3)
+    np.testing.assert_allclose(mine.heading, twin.heading, atol=1e-4)
+
+
+def test_the_kernels_can_be_left_out() -> None:
+    code = "from locatk.core import kernels; print(kernels.kernels)"
+    environment = {**os.environ, "LOCATK_NUMPY": "1"}
+    answer = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert answer.stdout.strip() == "None"
