@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 from locatk.cli import console, options
+from locatk.cli.calibrate_camera import camera
+from locatk.cli.calibrate_printer import printer
 from locatk.cli.solve import scene_option
 
 
@@ -17,7 +19,13 @@ def command() -> None:
     \b
     Examples:
       locatk calibrate scene run.mcap -o scene.toml
+      locatk calibrate camera run.mcap -o camera.toml
+      locatk calibrate printer scan.png -o printer.toml
     """
+
+
+command.add_command(camera)
+command.add_command(printer)
 
 
 @command.command(short_help="Solve where the Lighthouse stations are.")

@@ -152,7 +152,8 @@ def _dots(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ..
     from locatk.formats.pdf import pattern
 
     wanted = simulate.SimulationOptions(
-        frames=400,
+        frames=200,
+        rate_hz=25.0,
         speed_mps=0.25,
         tilt_rad=radians(3),
         missing=0.02,

@@ -134,7 +134,7 @@ def text(facts: dict[str, Any]) -> str:
             (
                 name,
                 row["n"],
-                *(f"{1e3 * row[f'{s}_m']:.3f}" if row["n"] else "-" for s in STATISTICS),
+                *(_millimetres(row[f"{s}_m"]) if row["n"] else "-" for s in STATISTICS),
             )
             for name, row in rows
         ],
@@ -149,3 +149,9 @@ def text(facts: dict[str, Any]) -> str:
             f"not scored: {left_out or 'nothing'}",
         ]
     )
+
+
+def _millimetres(metres: float) -> str:
+    """Three decimals; three digits below a tenth of a millimetre."""
+    value = 1e3 * metres
+    return f"{value:.3f}" if value >= 0.1 or value == 0 else f"{value:.3g}"

@@ -161,7 +161,7 @@ def text(session: Path, output: Path, solved: Solved) -> str:
     solution = solved.solution
     # A scene that nothing measured has no metres.
     unit = "1e-3" if getattr(solution.artifact, "scale", None) == "unit" else "mm"
-    header = ("device", "poses", "sigma x", "sigma y", f"sigma z [{unit}]")
+    header = ("device", "poses", "sigma x", "sigma y", f"sigma z [{unit}]", "heading [deg]")
     rows = [(t.device, len(t), *_spread(t.sigma)) for t in solution.trajectories]
     rejected = ", ".join(
         f"{count} {reason.replace('_', ' ')}" for reason, count in solution.rejected.items()
@@ -182,9 +182,10 @@ def notes(session: Path, solved: Solved) -> list[str]:
 
 
 def _spread(sigma: Any) -> list[str]:
-    """Median standard deviation of x, y and z in mm, `-` where it is not known."""
+    """Median standard deviations: x, y, z in mm and heading in degrees, `-` where unknown."""
     import numpy as np
 
-    known = [column[np.isfinite(column)] for column in sigma[:, :3].T]
+    in_units = sigma[:, [0, 1, 2, 5]] * [1e3, 1e3, 1e3, 180 / np.pi]
+    known = [column[np.isfinite(column)] for column in in_units.T]
     # Of lighthouse these are millimetres, of dots a thousandth of that.
-    return [f"{1e3 * np.median(column):#.3g}" if len(column) else "-" for column in known]
+    return [f"{np.median(column):#.3g}" if len(column) else "-" for column in known]

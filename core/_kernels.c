@@ -16,6 +16,14 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* Loops over arrays are compiled for wide registers too, and the processor's own version is
+ * taken at run time, where compiler and C library can do that. */
+#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
+#define HOT __attribute__((target_clones("avx2", "default")))
+#else
+#define HOT
+#endif
+
 /* ---- Sorting ---------------------------------------------------------------------------- */
 
 /* Shell sort, ascending; for the few hundred numbers of a frame. */
@@ -69,7 +77,7 @@ static inline int mirrored(int i, int count)
 static inline float smaller(float a, float b) { return a < b ? a : b; }
 
 /* Smoothed image by five taps each way (two outer, two inner, the middle). */
-static void smooth_image(const uint8_t *restrict image, int h, int w, const float *taps,
+HOT static void smooth_image(const uint8_t *restrict image, int h, int w, const float *taps,
                          float *restrict line, float *restrict smooth)
 {
     const float outer = taps[0], inner = taps[1], middle = taps[2];
@@ -91,6 +99,26 @@ static void smooth_image(const uint8_t *restrict image, int h, int w, const floa
         for (int x = 0; x < w; x++)
             out[x] = outer * (in[x - 2] + in[x + 2]) + inner * (in[x - 1] + in[x + 1])
                      + middle * in[x];
+    }
+}
+
+/* Marks (1) where a pixel is the least of the 5 x 5 about it; the rim of two is not looked at. */
+HOT static void mark_minima(const float *restrict smooth, int h, int w, float *restrict across,
+                            uint8_t *restrict marks)
+{
+    for (int y = 0; y < h; y++) {
+        const float *restrict s = smooth + (size_t)y * w;
+        float *restrict m = across + (size_t)y * w;
+        for (int x = 2; x < w - 2; x++)
+            m[x] = smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])), s[x]);
+    }
+    for (int y = 2; y < h - 2; y++) {
+        const float *restrict a = across + (size_t)(y - 2) * w, *restrict b = a + w;
+        const float *restrict c = b + w, *restrict d = c + w, *restrict e = d + w;
+        const float *restrict s = smooth + (size_t)y * w;
+        uint8_t *restrict mark = marks + (size_t)y * w;
+        for (int x = 2; x < w - 2; x++)
+            mark[x] = s[x] == smaller(smaller(smaller(a[x], b[x]), smaller(d[x], e[x])), c[x]);
     }
 }
 
@@ -183,10 +211,12 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
         return NULL;
     const int rows = h / block, columns = w / block;
     const size_t area = (size_t)h * w, blocks = (size_t)rows * columns;
-    float *store = malloc((5 * area + (size_t)w + 4 + 3 * blocks) * sizeof(float));
+    float *store = malloc((4 * area + (size_t)w + 4 + 3 * blocks) * sizeof(float));
     Dot *dots = malloc(area * sizeof(Dot));
     int *sums = malloc((size_t)w * sizeof(int));
-    if (!store || !dots || !sums) {
+    uint8_t *marks = malloc(area);
+    if (!store || !dots || !sums || !marks) {
+        free(marks);
         free(store);
         free(dots);
         free(sums);
@@ -196,8 +226,8 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
         PyBuffer_Release(&counts);
         return PyErr_NoMemory();
     }
-    float *smooth = store, *across = smooth + area, *least = across + area;
-    float *line = least + area, *means = line + w + 4, *blurred = means + blocks;
+    float *smooth = store, *across = smooth + area;
+    float *line = across + area, *means = line + w + 4, *blurred = means + blocks;
     float *paper = blurred + blocks, *contrasts = paper + blocks, *lights = contrasts + area;
     int64_t *found = counts.buf;
 
@@ -207,22 +237,14 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
         smooth_image(image, h, w, taps.buf, line, smooth);
         paper_image(image, w, rows, columns, block, reach, sums, means, blurred,
                     paper);
-        for (int y = 0; y < h; y++) {
-            const float *restrict s = smooth + (size_t)y * w;
-            float *restrict m = across + (size_t)y * w;
-            for (int x = 2; x < w - 2; x++)
-                m[x] = smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])),
-                               s[x]);
-        }
+        mark_minima(smooth, h, w, across, marks);
         int minima = 0;
         for (int y = 2; y < h - 2; y++) {
-            const float *a = across + (size_t)(y - 2) * w, *b = a + w, *c = b + w, *d = c + w,
-                        *e = d + w, *s = smooth + (size_t)y * w;
-            for (int x = 2; x < w - 2; x++)
-                least[x] = smaller(smaller(smaller(a[x], b[x]), smaller(d[x], e[x])), c[x]);
+            const float *s = smooth + (size_t)y * w;
+            const uint8_t *mark = marks + (size_t)y * w, *end = mark + w - 2;
             const int row = y / block < rows ? y / block : rows - 1;
-            for (int x = 2; x < w - 2; x++) {
-                if (s[x] != least[x]) continue;
+            for (const uint8_t *at = mark + 2; (at = memchr(at, 1, (size_t)(end - at))); at++) {
+                const int x = (int)(at - mark);
                 const int column = x / block < columns ? x / block : columns - 1;
                 const float light = paper[row * columns + column];
                 const float contrast = light - s[x];
@@ -265,6 +287,7 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     free(store);
     free(dots);
     free(sums);
+    free(marks);
     PyBuffer_Release(&images);
     PyBuffer_Release(&taps);
     PyBuffer_Release(&xy);
@@ -728,7 +751,7 @@ static int64_t phase_at(const Code *code, int64_t place)
 }
 
 /* Likeliest place and shift of one axis by the likeliest phase of each line. */
-static void vote(const Code *code, const float *const *scores, int lines, float *votes, int *phase,
+HOT static void vote(const Code *code, const float *const *scores, int lines, float *votes, int *phase,
                  float *margin, Axis *axis)
 {
     for (int i = 0; i < lines; i++) {
@@ -804,7 +827,7 @@ static void compare(const Code *code, const float *bits, float sign, int start, 
     axis->odds = odds - code->places;
 }
 
-static void read_window(const Code *code, const float *x_bits, const float *y_bits, int length,
+HOT static void read_window(const Code *code, const float *x_bits, const float *y_bits, int length,
                         float *scores, const float **lines, float *votes, int *phase,
                         float *margin, int64_t *rotation, Axis *x, Axis *y)
 {

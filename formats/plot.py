@@ -189,7 +189,7 @@ def _errors(evaluation: Evaluation) -> dict[str, Series]:
 
 
 def _sigmas(solution: Solution) -> dict[str, Series]:
-    """Standard deviations of positions, of the axes that are known; devices without are left out."""
+    """Standard deviations of positions, over the axes that are known; else left out."""
     series = {}
     for t in solution.trajectories:
         variances = np.einsum("nii->ni", t.covariance[:, :3, :3])

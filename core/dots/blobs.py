@@ -61,9 +61,11 @@ def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
 
     The position is the top of a Gaussian through the minimum and its neighbours.
     """
+    n, h, w = images.shape
+    if min(h, w) <= 2 * REACH:
+        return Dots(np.zeros((n, 1, 2), np.float32), np.zeros((n, 1), bool))
     if kernels is None:
         return find_dots_numpy(images, most)
-    n, h, w = images.shape
     xy = np.empty((n, most, 2), np.float32)
     counts = np.empty(n, np.int64)
     kernels.find_dots(

@@ -8,35 +8,30 @@ focal length only those that are tilted.
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
+from locatk.core.dots.camera_fit import Fit, Views, fit_flat, fit_homographies, fit_poses
+from locatk.core.dots.camera_views import (
+    MOST_FRAMES,
+    MOST_SEEN,
+    NO_PATTERN,
+    SeenFrame,
+    common_size,
+    look,
+    seen_of,
+    spread,
+    views_of,
+)
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.sheet import Manifest
-from locatk.core.errors import InputError
-
-Array = NDArray[np.float64]
-
-NO_PATTERN = "no_pattern"
-
-FEWEST_FRAMES = 5
-"""With fewer, nothing tells a bad frame from a good one."""
-
-MOST_FRAMES = 200
-"""Frames that are fitted; more would tell nothing new."""
-
-MOST_LOCATED = 2 * MOST_FRAMES
-"""Frames with a place from which those are chosen."""
-
-MOST_SEEN = 1000
-"""Frames that are looked at, where many of them show no pattern."""
-
-MOST_DOTS = 250
-"""Of a frame; the paper's camera sees 180."""
+from locatk.core.dots.solver import OTHER_SIZE
+from locatk.core.errors import DegenerateError, InputError
 
 USUAL_FOCAL = 1.56
 """Focal length in diagonals of a frame where nothing is known: that of the paper's camera,
@@ -129,6 +124,16 @@ class CameraReport:
     skipped: dict[str, int]
     notes: tuple[str, ...]
 
+    @property
+    def sigma_radial(self) -> float:
+        """Of the camera's k, for its focal length."""
+        return self.sigma_radial_px * self.camera.focal_px**2
+
+    @property
+    def distortion(self) -> float:
+        """Share by which the lens draws in what belongs half a diagonal from its centre."""
+        return -self.camera.radial_px * (math.hypot(*self.camera.size) / 2) ** 2
+
 
 def calibrate(
     frames: Frames, manifest: Manifest, options: CalibrateOptions | None = None
@@ -150,142 +155,28 @@ def calibrate(
     code = codec(manifest.codec)
     # Any beginning of this order is spread over all frames (the golden ratio's multiples).
     order = np.argsort(np.arange(len(frames)) * (math.sqrt(5) - 1) / 2 % 1).tolist()
-    looked = _look(frames, manifest, code, order[:MOST_SEEN], (None, options.camera))
-    size = _common_size(looked, len(frames))
-    chosen = _spread(size, _seen_of(looked, looked, size), len(frames))
+    looked = look(frames, manifest, code, order[:MOST_SEEN], (None, options.camera))
+    size = common_size(looked, len(frames))
+    chosen = spread(size, seen_of(looked, looked, size), len(frames))
 
     # With the lens known, more dots and frames are told: so look at them once more.
-    lens = _camera(size, fit_homographies(_views(size, chosen)), _usual_focal(size))
+    lens = _camera(size, fit_homographies(views_of(size, chosen)), _usual_focal(size))
     again = [seen.index for seen in chosen]
     blank = [index for index, outcome in looked.items() if outcome == NO_PATTERN]
     again += blank[: max(MOST_FRAMES - len(again), 0)]
     looked |= {
         index: outcome
-        for index, outcome in _look(frames, manifest, code, again, (lens,)).items()
-        if isinstance(outcome, _Seen)
+        for index, outcome in look(frames, manifest, code, again, (lens,)).items()
+        if isinstance(outcome, SeenFrame)
     }
     skipped = Counter(outcome for outcome in looked.values() if isinstance(outcome, str))
-    skipped[OTHER_SIZE] = sum(isinstance(o, _Seen) and o.size != size for o in looked.values())
+    skipped[OTHER_SIZE] = sum(isinstance(o, SeenFrame) and o.size != size for o in looked.values())
     return _report(
-        _views(size, _seen_of(looked, again, size)),
+        views_of(size, seen_of(looked, again, size)),
         options,
         len(looked),
         {reason: count for reason, count in sorted(skipped.items()) if count},
     )
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """Dots of a frame: (m, 2) in px, and (m, 2) in metres on the sheet, x right, y down."""
-
-    index: int
-    size: tuple[int, int]
-    pixels: Array
-    plane: Array
-
-
-def _look(
-    frames: Frames,
-    manifest: Manifest,
-    code: Codec,
-    order: Iterable[int],
-    cameras: Sequence[Camera | None],
-) -> dict[int, _Seen | str]:
-    """What frames show, or why they show nothing, by index; until there are enough."""
-    looked: dict[int, _Seen | str] = {}
-    located = 0
-    for index in order:
-        try:
-            image = frames.images[index]
-        except InputError:
-            looked[index] = UNREADABLE
-            continue
-        looked[index] = _dots_of(index, image, manifest, code, cameras)
-        located += isinstance(looked[index], _Seen)
-        if located == MOST_LOCATED:
-            break
-    return looked
-
-
-def _dots_of(
-    index: int,
-    image: NDArray[np.uint8],
-    manifest: Manifest,
-    code: Codec,
-    cameras: Sequence[Camera | None],
-) -> _Seen | str:
-    height, width = image.shape
-    for camera in dict.fromkeys(cameras):
-        if camera is not None and camera.size != (width, height):
-            continue
-        for sighting in sightings(image[None], code, camera):
-            middle = sighting.origin + sighting.grid.mean(axis=0)
-            number = int(manifest.find(middle[None], [[-1, -1]], slack=RIM)[0])
-            if number < 0:
-                return OFF_SHEET
-            place = np.rint(sighting.grid)
-            shift = (sighting.grid - place) * (manifest.offset_mm / manifest.pitch_mm / OFFSET)
-            # Lengths alone: how a tile is turned on its floor means nothing to a camera.
-            pitch = np.linalg.norm(manifest.jacobian(number), axis=0)
-            plane = (place + shift) * pitch
-            some = np.random.default_rng(index).permutation(len(plane))[:MOST_DOTS]
-            return _Seen(index, (width, height), sighting.pixels[some], plane[some])
-    return NO_PATTERN
-
-
-def _seen_of(
-    looked: dict[int, _Seen | str], indices: Iterable[int], size: tuple[int, int]
-) -> list[_Seen]:
-    """Located frames of ``size`` among ``indices``."""
-    outcomes = (looked[index] for index in indices)
-    return [one for one in outcomes if isinstance(one, _Seen) and one.size == size]
-
-
-def _common_size(looked: dict[int, _Seen | str], total: int) -> tuple[int, int]:
-    """Size of most located frames, of which there must be enough."""
-    sizes = Counter(one.size for one in looked.values() if isinstance(one, _Seen))
-    size, count = sizes.most_common(1)[0] if sizes else ((0, 0), 0)
-    if count >= FEWEST_FRAMES:
-        return size
-    reasons = Counter(one for one in looked.values() if isinstance(one, str))
-    off = reasons[OFF_SHEET] > count
-    seen = f"{len(looked)} of {total}" if len(looked) < total else f"{total}"
-    raise DegenerateError(
-        f"{count or 'none'} of {seen} frames show the pattern, where {FEWEST_FRAMES} are needed"
-        if not off
-        else f"{reasons[OFF_SHEET]} of {seen} frames show the pattern off all sheets of the manifest",
-        hint="Is it the manifest of another sheet?"
-        if off
-        else "Take frames at several places of the sheet, in focus, turned in several directions",
-    )
-
-
-def _spread(size: tuple[int, int], found: list[_Seen], total: int) -> list[_Seen]:
-    """At most :data:`MOST_FRAMES`, as different as can be in heading, tilt and time."""
-    if len(found) <= MOST_FRAMES:
-        return found
-    own = homographies(_views(size, found))
-    heading = np.arctan2(own[:, 3], own[:, 0])
-    tilt = own[:, 6:] / np.maximum(np.std(own[:, 6:]), 1e-12)
-    when = np.array([seen.index for seen in found]) / total
-    features = np.column_stack([np.cos(heading), np.sin(heading), tilt.clip(-3, 3), 2 * when])
-    chosen = [0]
-    nearest = np.full(len(found), np.inf)
-    while len(chosen) < MOST_FRAMES:
-        away = np.linalg.norm(features - features[chosen[-1]], axis=1)
-        nearest = np.minimum(nearest, away)
-        chosen.append(int(np.argmax(nearest)))
-    return [found[k] for k in sorted(chosen)]
-
-
-def _views(size: tuple[int, int], found: Sequence[_Seen]) -> Views:
-    most = max(len(seen.pixels) for seen in found)
-    pixels, plane = np.zeros((2, len(found), most, 2))
-    valid = np.zeros((len(found), most), bool)
-    for k, seen in enumerate(found):
-        count = len(seen.pixels)
-        pixels[k, :count], plane[k, :count], valid[k, :count] = seen.pixels, seen.plane, True
-    return Views(size, pixels, plane, valid)
 
 
 def _usual_focal(size: tuple[int, int]) -> float:
@@ -349,5 +240,47 @@ def _report(
         used=len(views),
         dots=int(best.used.sum()),
         skipped=skipped,
-        notes=tuple(_notes(best, poses, bend, camera, source, held, tilted, fits)),
+        notes=tuple(_notes(best, poses, bend, camera, source, held=held, tilted=tilted, fits=fits)),
     )
+
+
+def _notes(
+    best: Fit,
+    poses: Fit,
+    bend: Fit,
+    camera: Camera,
+    source: str,
+    *,
+    held: bool,
+    tilted: bool,
+    fits: bool,
+) -> Iterator[str]:
+    focal = camera.focal_px
+    kept = {"usual": f"a usual one, {focal:.0f} px, stands in", "given": "the given one is kept"}
+    if not fits:
+        yield (
+            "the frames are not what a pinhole sees of a flat sheet: dots miss their places by "
+            f"{poses.rms:.2g} px, and by {bend.rms:.2g} px where each frame may be any homography; "
+            "the shutter may be a rolling one, the sheet not flat, or pixels not square"
+        )
+    if source in ("usual", "camera"):
+        yield (
+            f"the frames do not tell the focal length{'' if tilted else ': they are not tilted'}; "
+            f"{kept.get(source, f'the earlier one, {focal:.1f} px, is kept')}. Poses on the sheet "
+            "do not depend on it"
+        )
+    if source == "given" and tilted and fits:
+        sigma = poses.sigma[3]
+        if abs(poses.focal - focal) > max(3 * sigma, 0.01 * focal):
+            yield f"the frames tell a focal length of {poses.focal:.1f} px (sigma {sigma:.2g})"
+    if held:
+        yield (
+            "the frames do not tell the centre, for want of bend and tilt: it is taken to be the "
+            "middle of the frame"
+        )
+    if abs(best.aspect) > max(3 * best.sigma[4], NOTED_ASPECT):
+        more = "longer" if best.aspect > 0 else "shorter"
+        yield (
+            f"the sheet is {100 * abs(best.aspect):.2f} % {more} along x, compared to y, than its "
+            "manifest says: its scales should be measured"
+        )

@@ -161,7 +161,8 @@ def score(located: Located, grid: Array, heading: Array) -> Score:
 def condition_figures() -> list[Figure]:
     """A share that is right, an error and a share that is wrong for each condition."""
     manifest = page("A0")
-    rows, right, wrong = [], 0, 0
+    rows: list[Figure] = []
+    right = wrong = 0
     for number, condition in enumerate(CONDITIONS):
         images, grid, heading = render(condition, FRAMES, SEED + 100 + number, manifest)
         found = score(locate(images, codec(manifest.codec), condition.camera), grid, heading)

@@ -29,6 +29,9 @@ WINDOWS = 20_000
 SPOILT = 4000
 """Windows with wrong bits, or of nothing but wrong bits, behind each rate."""
 
+RASTER_WINDOWS = 1000
+"""Windows that are read from each paper's raster."""
+
 FIRMNESS = 4.0
 """Log-likelihood ratio of a bit that was read off a symbol: 1.8 % of such bits are wrong."""
 
@@ -224,13 +227,12 @@ def is_right(answer: Decoded, truth: NDArray[np.int64]) -> NDArray[np.bool_]:
 # ---- print
 
 
-def print_figures(papers: tuple[str, ...] = tuple(PRINTS)) -> list[Figure]:
+def print_figures() -> list[Figure]:
     """Time, size and memory of PDFs, and whether their raster can be read."""
     from locatk.formats.pdf import pattern
 
-    rows = []
-    for paper in papers:
-        seconds_target, size_target, peer_s, peer_kb = PRINTS[paper]
+    rows: list[Figure] = []
+    for paper, (seconds_target, size_target, peer_s, peer_kb) in PRINTS.items():
         sheet = page(paper)
         pdf = pattern.render(sheet)
         seconds = cpu_seconds(lambda sheet=sheet: pattern.render(sheet), 3)  # type: ignore[misc]
@@ -243,9 +245,8 @@ def print_figures(papers: tuple[str, ...] = tuple(PRINTS)) -> list[Figure]:
                    peer=peer, peer_value=peer_kb),
             *_raster(paper, sheet, pdf),
         ]  # fmt: skip
-    if "A0" in papers:
-        how = "most of a process of its own; {0:.0f} MB of it before it prints"
-        rows.append(measured("A0 printed: memory", "MB", "dots_print.memory()", 1.0, how, 300.0))
+    how = "most of a process of its own; {0:.0f} MB of it before it prints"
+    rows.append(measured("A0 printed: memory", "MB", "dots_print.memory()", 1.0, how, 300.0))
     return rows
 
 
@@ -265,9 +266,6 @@ def _most_memory_mb() -> float:
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024 / 1e6
     raise OSError("no VmHWM in /proc/self/status")
-
-
-RASTER_WINDOWS = 1000
 
 
 def _raster(paper: str, sheet: Manifest, pdf: bytes) -> list[Figure]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pikepdf
-from pikepdf import Name, Operator, Stream
+from pikepdf import Name, Operator, PdfInlineImage, Stream
 
 from locatk.formats.pdf import colours
 from locatk.formats.pdf.colours import Space
@@ -41,6 +41,7 @@ def rewrite(
     stream: Stream,
     look_up: Callable[[Name], Any],
     base: Callable[[pikepdf.Object], Space | None],
+    inline: Callable[[PdfInlineImage], Name],
     left: Counter[str],
     *,
     starts: bool,
@@ -55,6 +56,8 @@ def rewrite(
         None where it cannot be converted.
     base : callable
         From the colours of a pattern space to their Space, or None.
+    inline : callable
+        From an image in the content to the name of one in the resources that replaces it.
     left : Counter of str
         Counts what stays as it is.
     starts : bool
@@ -90,7 +93,7 @@ def rewrite(
         elif operator in SETS:
             instruction = _converted(instruction, current[operator.isupper()], paint, left)
         elif operator == "INLINE IMAGE" and not instruction.iimage.image_mask:
-            left["images inside of patterns and glyphs"] += 1
+            instruction = ([inline(instruction.iimage)], Operator("Do"))
         out.append(instruction)
     return pikepdf.unparse_content_stream(out)
 

@@ -191,8 +191,6 @@ def _lay(
     if any(abs(a - b) > TOLERANCE_MM for a, b in zip(frame.size_mm, its.size_mm, strict=True)):
         sizes = (*its.size_mm, *frame.size_mm)
         raise InputError("a stamp of {:.2f} x {:.2f} mm on {:.2f} x {:.2f} mm".format(*sizes))
-    if stripper is not None:
-        page.externalize_inline_images(min_size=0)
     below = _as_form(pdf, page.obj)
     if stripper is not None:
         below = stripper.form(below, starts=True)

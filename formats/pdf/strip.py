@@ -15,14 +15,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import pikepdf
-from pikepdf import Array, Dictionary, Name, Pdf, Stream
+from pikepdf import Array, Dictionary, Name, Pdf, PdfInlineImage, Stream
 
 from locatk.formats.pdf import colours, pictures
 from locatk.formats.pdf.colours import Space
 from locatk.formats.pdf.operators import rewrite
 from locatk.formats.pdf.pictures import Left
 
-BROKEN = (pikepdf.PdfError, ValueError, TypeError, KeyError, IndexError, AttributeError)
+BROKEN = (
+    pikepdf.PdfError,
+    pikepdf.DataDecodingError,
+    pikepdf.models.PdfParsingError,
+    *(ValueError, TypeError, KeyError, IndexError, AttributeError),
+)
 """What reading a damaged object raises."""
 
 BLACK = b"1 1 1 0 k 1 1 1 0 K\n"
@@ -75,9 +80,8 @@ class Stripper:
 
         def fill(made: Stream) -> None:
             own = stream.get("/Resources")
-            scope = outer if own is None else self._scope(own)
-            if scope is not None:
-                made.Resources = scope.made
+            scope = outer if own is None and outer else self._scope(own or Dictionary())
+            made.Resources = scope.made
             if "/Group" in stream and "/CS" in stream.Group:
                 # Blending in RGB turns all into RGB, and the printer that into black.
                 made.Group = copy.copy(stream.Group)
@@ -93,9 +97,8 @@ class Stripper:
         key = (role, found.objgen)
         if found.is_indirect and key in self._made:
             return self._made[key]
-        made = copy.copy(found)
+        made = self._pdf.make_indirect(copy.copy(found))
         if found.is_indirect:
-            made = self._pdf.make_indirect(made)
             self._made[key] = made  # before it is filled: it may hold itself
         fill(made)
         return made
@@ -121,17 +124,19 @@ class Stripper:
     def _scope(self, found: pikepdf.Object) -> Scope:
         def fill(made: pikepdf.Object) -> None:
             scope = Scope(found, made)
-            for key, convert in (
-                ("/Shading", self._shading),
-                ("/Pattern", self._pattern),
-                ("/XObject", self._xobject),
-                ("/Font", self._font),
-            ):
-                if key in found:
-                    held = found[key].items()
-                    # What is neither is nothing that can be drawn.
-                    items = {k: v for k, v in held if isinstance(v, Dictionary | Stream)}
-                    made[key] = Dictionary({k: convert(v, scope) for k, v in items.items()})
+            jobs = {
+                "/Shading": self._shading,
+                "/Pattern": self._pattern,
+                "/XObject": self._xobject,
+                "/Font": self._font,
+            }
+            # All of them first, as content may add to what is not converted yet.
+            for key in jobs:
+                made[key] = copy.copy(found.get(key, Dictionary()))
+            for key, convert in jobs.items():
+                for name, item in found.get(key, Dictionary()).items():
+                    if isinstance(item, Dictionary | Stream):
+                        made[key][name] = convert(item, scope)
             spaces = found.get("/ColorSpace")
             if spaces is not None:
                 kept = {name: self._kept_space(item, spaces) for name, item in spaces.items()}
@@ -185,8 +190,8 @@ class Stripper:
             "glyph", glyph, lambda made: made.write(self._content(glyph, scope, False))
         )
 
-    def _content(self, stream: Stream, scope: Scope | None, starts: bool) -> bytes:
-        spaces = None if scope is None else scope.was.get("/ColorSpace")
+    def _content(self, stream: Stream, scope: Scope, starts: bool) -> bytes:
+        spaces = scope.was.get("/ColorSpace")
 
         def look_up(name: pikepdf.Object) -> Space | pikepdf.Object | None:
             """A space, the array of a pattern's, or None for what cannot be converted."""
@@ -198,8 +203,31 @@ class Stripper:
             return self._space(name, spaces)
 
         return rewrite(
-            stream, look_up, lambda found: self._space(found, spaces), self.left, starts=starts
+            stream,
+            look_up,
+            lambda found: self._space(found, spaces),
+            lambda image: self._name_inline(image, scope),
+            self.left,
+            starts=starts,
         )
+
+    def _name_inline(self, image: PdfInlineImage, scope: Scope) -> Name:
+        """The name of an image that stood in the content itself, and is none any more."""
+        stream = self._pdf.make_stream(b"")
+        for key, value in image.obj.items():
+            stream[key] = value
+        _, _, data = image.unparse().partition(b"\nID\n")
+        filters: Any = image.obj.get("/Filter")
+        parameters: Any = image.obj.get("/DecodeParms")
+        data = data.removesuffix(b"EI")
+        stream.write(data, filter=filters, decode_parms=parameters, type_check=False)
+        held = scope.made.XObject
+        number = len(held)
+        while (name := f"/Inline{number}") in held:
+            number += 1
+        stream.Subtype = Name.Image
+        held[name] = self._xobject(stream, scope)
+        return Name(name)
 
     def _space(self, found: pikepdf.Object, spaces: pikepdf.Object | None) -> Space | None:
         try:

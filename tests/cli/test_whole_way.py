@@ -58,14 +58,25 @@ def test_demo(locatk, tmp_path: Path) -> None:
     folder = tmp_path / "demo"
     result = locatk("demo", "-o", folder, "--json")
     assert result.exit_code == 0, result.stderr
-    [row] = json.loads(result.stdout)["systems"]
-    assert row["system"] == "lighthouse"
-    assert row["poses"] > 100
-    assert row["mae_m"] < 0.005
-    assert row["mae_m"] < row["paper_mae_m"]
-    assert sorted(row["files"]) == sorted(str(path) for path in folder.iterdir())
-    assert (folder / "lighthouse.png").read_bytes().startswith(b"\x89PNG")
+    rows = {row["system"]: row for row in json.loads(result.stdout)["systems"]}
+    assert set(rows) == {"lighthouse", "dots"}
+    for system, mae_m in (("lighthouse", 0.005), ("dots", 5e-6)):
+        row = rows[system]
+        assert row["poses"] > 100
+        assert row["mae_m"] < mae_m
+        assert row["mae_m"] < row["paper_mae_m"]
+        assert (folder / f"{system}.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "dots-sheet.pdf").read_bytes().startswith(b"%PDF")
+    files = [path for row in rows.values() for path in row["files"]]
+    assert sorted(files) == sorted(str(path) for path in folder.iterdir())
     assert locatk("demo", "-o", folder).exit_code == 1  # nothing is replaced unasked
+
+
+def test_demo_of_one_system(locatk, tmp_path: Path) -> None:
+    result = locatk("demo", "dots", "-o", tmp_path / "demo")
+    assert result.exit_code == 0, result.stderr
+    assert "lighthouse" not in result.stdout
+    assert locatk("demo", "magnets").exit_code == 2
 
 
 def test_published_grid_is_solved(locatk, data: Path, tmp_path: Path) -> None:

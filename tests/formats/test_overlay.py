@@ -136,12 +136,12 @@ def streams_below(holder: Any, seen: set[Any]) -> Iterator[Any]:
     if resources is None:
         return
     for kind in ("/XObject", "/Pattern", "/Shading", "/Font"):
-        for item in resources.get(kind, Dictionary()).values():
+        for _, item in resources.get(kind, Dictionary()).items():
             if item.objgen not in seen or item.objgen == (0, 0):
                 seen.add(item.objgen)
                 yield item
                 yield from streams_below(item, seen)
-                yield from item.get("/CharProcs", Dictionary()).values()
+                yield from (glyph for _, glyph in item.get("/CharProcs", Dictionary()).items())
 
 
 def names_of_inks(space: Any) -> str:
@@ -227,7 +227,12 @@ def test_everything_that_has_a_colour_is_converted(tmp_path: Path) -> None:
     )
     make.add(
         "Pattern",
-        Own=make.stream(b"0 0 4 4 re f 0.5 g 4 4 4 4 re f", PaintType=1, **tile),
+        Own=make.stream(
+            b"0 0 4 4 re f 0.5 g 4 4 4 4 re f q 4 0 0 4 4 0 cm "
+            b"BI /W 1 /H 1 /CS /G /BPC 8 /F /AHx ID 40> EI Q",
+            PaintType=1,
+            **tile,
+        ),
         Stencil=make.stream(b"0 0 4 4 re f", PaintType=2, **tile),
         Ramp=Dictionary(PatternType=2, Shading=shading, Matrix=Array([1, 0, 0, 1, 200, 0])),
     )
@@ -392,8 +397,8 @@ def test_the_stamp_is_untouched(tmp_path: Path) -> None:
         with pikepdf.open(io.BytesIO(made.data)) as pdf:
             assert pdf.Root.ViewerPreferences.PrintScaling == "/None"
             dots = pdf.pages[0].obj.Resources.XObject.Dots
-            states = dots.Resources.ExtGState.values()
-            assert any(bool(state.get("/op")) for state in states)
+            states = dots.Resources.ExtGState.items()
+            assert any(bool(state.get("/op")) for _, state in states)
             with pikepdf.open(io.BytesIO(mark)) as alone:
                 assert dots.read_bytes() == alone.pages[0].Contents.read_bytes()
 
@@ -411,7 +416,7 @@ def test_the_same_input_gives_the_same_small_file(tmp_path: Path) -> None:
     with pikepdf.open(io.BytesIO(made.data)) as pdf:
         fonts = {page.obj.Resources.XObject.Dots.Resources.Font.F1.objgen for page in pdf.pages}
         badges = {
-            next(iter(page.obj.Resources.XObject.Below.Resources.XObject.values())).objgen
+            next(iter(page.obj.Resources.XObject.Below.Resources.XObject.items()))[1].objgen
             for page in pdf.pages
         }
     assert len(fonts) == len(badges) == 1

@@ -82,6 +82,11 @@ def test_dots_of_odd_sizes(shape: tuple[int, int, int]) -> None:
     np.testing.assert_allclose(mine.xy, twin.xy, atol=5e-3)
 
 
+@pytest.mark.parametrize("shape", [(2, 3, 50), (1, 4, 4), (3, 60, 1), (0, 60, 60)])
+def test_images_too_small_for_a_dot_have_none(shape: tuple[int, int, int]) -> None:
+    assert blobs.find_dots(np.zeros(shape, np.uint8)).counts.tolist() == [0] * shape[0]
+
+
 @needs_kernels
 @pytest.mark.parametrize("lens", [True, False])
 def test_lattices_are_the_same(lens: bool) -> None:

@@ -187,6 +187,10 @@ def test_pictures_without_a_readable_sheet_are_refused(coarse: Ink) -> None:
     for image in (noise, np.full((900, 700), 255, np.uint8)):
         with pytest.raises(DegenerateError, match="markers"):
             calibrate(image)
+    bare = scan(coarse, 300)
+    bare[480:-480, 480:] = 240  # only the markers are left
+    with pytest.raises(DegenerateError, match="none of the 11 fields"):
+        calibrate(bare)
     small = cv2.resize(scan(coarse, 300), None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
     with pytest.raises(InputError, match="two test sheets"):
         calibrate(np.hstack([small, small]))
