@@ -106,8 +106,20 @@ def scaled(manifest: Manifest, scale: tuple[float, float]) -> Manifest:
 
     The test sheet is upright. A printer feeds a paper of the other orientation through in
     the same direction, so that the two scales change places; where a manifest holds both,
-    that of its first sheet counts.
+    that of its first sheet counts. Tiles lie at their registration marks, which the same
+    printer has made, so that their places on the floor grow with the scale.
     """
     width, height = manifest.sheets[0].page_mm
     x, y = (round(value, DIGITS) for value in scale)
-    return replace(manifest, scale=(y, x) if width > height else (x, y))
+    new = (y, x) if width > height else (x, y)
+    growth = [after / before for after, before in zip(new, manifest.scale, strict=True)]
+    sheets = tuple(
+        sheet
+        if sheet.position_mm is None
+        else replace(
+            sheet,
+            position_mm=(sheet.position_mm[0] * growth[0], sheet.position_mm[1] * growth[1]),
+        )
+        for sheet in manifest.sheets
+    )
+    return replace(manifest, scale=new, sheets=sheets)

@@ -12,8 +12,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.camera_fit import Fit, Views, fit_flat, fit_homographies, fit_poses
 from locatk.core.dots.camera_views import (
@@ -25,6 +23,7 @@ from locatk.core.dots.camera_views import (
     look,
     seen_of,
     spread,
+    spread_order,
     views_of,
 )
 from locatk.core.dots.codec import codec
@@ -153,9 +152,8 @@ def calibrate(
     if options.focal_px is not None and not 0 < options.focal_px < math.inf:
         raise InputError(f"a focal length of {options.focal_px:g} px", hint="Give one above 0")
     code = codec(manifest.codec)
-    # Any beginning of this order is spread over all frames (the golden ratio's multiples).
-    order = np.argsort(np.arange(len(frames)) * (math.sqrt(5) - 1) / 2 % 1).tolist()
-    looked = look(frames, manifest, code, order[:MOST_SEEN], (None, options.camera))
+    order = spread_order(len(frames))[:MOST_SEEN]
+    looked = look(frames, manifest, code, order, (None, options.camera))
     size = common_size(looked, len(frames))
     chosen = spread(size, seen_of(looked, looked, size), len(frames))
 

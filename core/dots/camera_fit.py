@@ -196,10 +196,10 @@ def _scaled(views: Views) -> tuple[Array, Array]:
     """Pixels in half diagonals from the middle; the plane from the middle of each frame's
     dots in units about as large as a frame; 0 where there is no dot."""
     there = views.valid[..., None]
-    count = there.sum(axis=1, keepdims=True)
-    plane = (views.plane - (views.plane * there).sum(axis=1, keepdims=True) / count) * there
-    unit = math.sqrt((plane * plane).sum() / count.sum())
-    return (views.pixels - views.middle) / views.half_diagonal * there, plane / unit
+    frame = np.where(there, (views.pixels - views.middle) / views.half_diagonal, 0)
+    plane, count = np.where(there, views.plane, 0), there.sum(axis=1, keepdims=True)
+    plane = (plane - plane.sum(axis=1, keepdims=True) / count) * there
+    return frame, plane / math.sqrt((plane * plane).sum() / count.sum())
 
 
 @dataclass(frozen=True)

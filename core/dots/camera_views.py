@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -58,6 +59,14 @@ class SeenFrame:
     size: tuple[int, int]
     pixels: Array
     plane: Array
+
+
+def spread_order(count: int) -> list[int]:
+    """All of 0 .. count - 1, so that any beginning of it is spread evenly over them.
+
+    By the fractional parts of the multiples of the golden ratio.
+    """
+    return np.argsort(np.arange(count) * ((math.sqrt(5) - 1) / 2) % 1).tolist()
 
 
 def look(

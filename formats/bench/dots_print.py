@@ -26,7 +26,7 @@ SEED = 20_000
 ORIGIN = (RANGE // 2, RANGE // 4)
 WINDOW = 8
 WINDOWS = 20_000
-SPOILT = 4000
+SPOILT = 2000
 """Windows with wrong bits, or of nothing but wrong bits, behind each rate."""
 
 RASTER_WINDOWS = 1000

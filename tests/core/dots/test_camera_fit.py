@@ -1,0 +1,213 @@
+"""Fits of a camera to dots that OpenCV has projected: nothing is rendered or decoded here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.dots import camera_models as models
+from locatk.core.dots.camera_fit import Fit, Views, fit_flat, fit_homographies, fit_poses
+from locatk.core.geometry import rotation_exp
+
+Array = NDArray[np.float64]
+SIZE = (188, 120)
+HALF = math.hypot(*SIZE) / 2
+FOCAL, CENTRE, K = 350.0, np.array([96.0, 57.5]), -3.5e-6
+PITCH = 0.508
+
+
+def bent(offset: Array, k: float) -> Array:
+    """Where a lens shows what belongs at ``offset``: u = r / (1 + k r^2), by a table."""
+    r = np.linspace(0, 3 * HALF if k <= 0 else min(3 * HALF, 0.98 / math.sqrt(k)), 200_000)
+    ideal = r / (1 + k * r * r)
+    fits = int(np.argmax(np.diff(ideal) <= 0)) or len(r)
+    length = np.linalg.norm(offset, axis=1, keepdims=True)
+    return offset * np.interp(length, ideal[:fits], r[:fits], right=np.nan) / length
+
+
+def views(
+    frames: int = 25,
+    *,
+    tilt_deg: float = 10.0,
+    tilts_deg: Sequence[float] = (),
+    k: float = K,
+    noise: float = 0.03,
+    wrong: float = 0.0,
+    aspect: float = 0.0,
+    bow_mm: float = 0.0,
+    seed: int = 0,
+) -> Views:
+    """Frames in all directions, at 0.046 mm a pixel; tilted evenly, or as told."""
+    rng = np.random.default_rng(seed)
+    intrinsic = np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]])
+    steps = np.arange(-16, 17) * PITCH
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    found = []
+    for tilt in np.radians(tilts_deg or rng.uniform(0, tilt_deg, frames)):
+        towards, turn = rng.uniform(-4, 4, 2)
+        lean, _ = cv2.Rodrigues(tilt * np.array([math.cos(towards), math.sin(towards), 0.0]))
+        spin, _ = cv2.Rodrigues(np.array([0.0, 0.0, turn]))
+        vector, _ = cv2.Rodrigues(lean @ spin)
+        place = grid + rng.uniform(-0.3, 0.3, 2)
+        real = np.c_[place * [1 + aspect / 2, 1 - aspect / 2], np.zeros(len(place))]
+        real[:, 2] = bow_mm * rng.normal() * (real[:, 0] / 4) ** 2
+        shift = np.array([*rng.uniform(-0.2, 0.2, 2), FOCAL * 0.046])
+        flat, _ = cv2.projectPoints(real, vector, shift, intrinsic, None)
+        seen = CENTRE + bent(flat[:, 0] - CENTRE, k)
+        inside = ((seen > 1) & (seen < np.array(SIZE) - 2)).all(axis=1)
+        seen = seen[inside] + rng.normal(0, noise, (int(inside.sum()), 2))
+        astray = rng.random(len(seen)) < wrong
+        seen[astray] += rng.uniform(-1.3, 1.3, (int(astray.sum()), 2))
+        found.append((seen, place[inside]))
+    most = max(len(seen) for seen, _ in found)
+    result = Views(
+        SIZE,
+        np.full((frames, most, 2), np.nan),
+        np.full((frames, most, 2), np.nan),
+        np.zeros((frames, most), bool),
+    )
+    for n, (seen, place) in enumerate(found):
+        result.pixels[n, : len(seen)], result.plane[n, : len(seen)] = seen, place
+        result.valid[n, : len(seen)] = True
+    return result
+
+
+def errors(fit: Fit) -> Array:
+    """Of centre, k, focal length and aspect in standard deviations."""
+    found = np.array([*fit.centre, fit.radial, fit.focal, fit.aspect])
+    return (found - [*CENTRE, K, FOCAL, 0.0]) / fit.sigma
+
+
+@pytest.mark.parametrize("name", ["homographies", "poses"])
+def test_derivatives_are_those_of_the_model(name: str) -> None:
+    rng = np.random.default_rng(1)
+    plane = rng.uniform(-1, 1, (3, 7, 2))
+    shared = np.array([0.02, -0.03, -0.1, 0.7, 0.01])
+    model: models.Model
+    if name == "homographies":
+        model, own = models.Homographies(), rng.normal(0, 0.1, (3, 8)) + [1, 0, 0, 0, 1, 0, 0, 0]
+    else:
+        turns = rotation_exp(rng.normal(0, 0.3, (3, 3))).reshape(3, 9)
+        model, own = models.Poses(), np.c_[turns, rng.normal(0, 0.1, (3, 2)), [1.1, 0.9, 1.0]]
+    _, by_own, by_shared = models.seen(model, shared, own, plane)
+    small = 1e-6
+    for k in range(by_own.shape[3]):
+        step = np.zeros((3, by_own.shape[3]))
+        step[:, k] = small
+        after, before = (
+            models.seen(model, shared, model.moved(own, s), plane)[0] for s in (step, -step)
+        )
+        assert by_own[..., k] == pytest.approx((after - before) / (2 * small), abs=1e-8)
+    for k in range(5):
+        change = np.zeros(5)
+        change[k] = small
+        after, before = (models.seen(model, shared + c, own, plane)[0] for c in (change, -change))
+        assert by_shared[..., k] == pytest.approx((after - before) / (2 * small), abs=1e-8)
+
+
+@pytest.mark.parametrize("k", [-1.5e-5, -3.5e-6, 5e-6])
+def test_without_noise_the_camera_comes_back_exactly(k: float) -> None:
+    seen = views(8, k=k, noise=0.0)
+    bend = fit_homographies(seen)
+    poses = fit_poses(seen, bend, 250.0)
+    for fit in (bend, poses):
+        assert fit.centre == pytest.approx(CENTRE, abs=1e-4)
+        assert fit.radial == pytest.approx(k, rel=1e-5)
+        assert fit.rms < 1e-4
+    assert poses.focal == pytest.approx(FOCAL, rel=1e-5)
+    assert fit_flat(seen).rms > 0.3
+
+
+def test_sigmas_are_what_repetitions_scatter_by() -> None:
+    found = []
+    for seed in range(16):
+        seen = views(12, seed=seed)
+        bend = fit_homographies(seen)
+        assert np.isnan(bend.sigma[3:]).all()
+        found.append([*errors(bend)[:3], *errors(fit_poses(seen, bend, 300.0))])
+    # 16 draws of a variance scatter by a third; 2.2 of them allowed for eight numbers.
+    assert np.sqrt(np.mean(np.square(found), axis=0)) == pytest.approx(1.0, abs=0.65)
+
+
+def test_frames_that_contradict_each_other_are_believed_less() -> None:
+    """Paper that is bowed in each frame anew moves all dots of a frame together."""
+    flat, bowed = (fit_homographies(views(20, bow_mm=bow, seed=3)) for bow in (0.0, 0.02))
+    assert bowed.rms < 1.4 * flat.rms
+    assert bowed.sigma[2] > 2.5 * flat.sigma[2]
+    assert abs(errors(bowed)[:3]).max() < 4
+
+
+def test_wrong_dots_are_given_up() -> None:
+    clean, spoilt = views(seed=5), views(wrong=0.1, seed=5)
+    bend = fit_homographies(spoilt)
+    poses = fit_poses(spoilt, bend, 300.0)
+    assert abs(errors(poses)).max() < 4
+    assert poses.sigma[0] < 1.5 * fit_poses(clean, fit_homographies(clean), 300.0).sigma[0]
+    given_up = np.mean(~poses.used[spoilt.valid])
+    assert 0.05 < given_up < 0.12
+
+
+def test_a_bad_frame_counts_little() -> None:
+    """Motion makes the dots of some frames scatter ten times as much."""
+    seen = views(20, seed=7)
+    rng = np.random.default_rng(0)
+    seen.pixels[::4] += rng.normal(0, 0.3, seen.pixels[::4].shape)
+    without = Views(
+        SIZE, *(a[np.arange(20) % 4 > 0] for a in (seen.pixels, seen.plane, seen.valid))
+    )
+    with_bad, good = fit_homographies(seen), fit_homographies(without)
+    assert with_bad.sigma[:3] == pytest.approx(good.sigma[:3], rel=0.15)
+    assert abs(with_bad.centre - good.centre).max() < good.sigma[:2].max()
+
+
+def test_how_well_the_focal_length_is_known_depends_on_the_tilt() -> None:
+    sigmas = []
+    for tilt_deg in (10.0, 3.0, 0.0):
+        seen = views(25, tilt_deg=tilt_deg, seed=2)
+        poses = fit_poses(seen, fit_homographies(seen), 300.0)
+        sigmas.append(poses.sigma[3] / poses.focal)
+        # The lens is known all the same.
+        assert poses.centre == pytest.approx(CENTRE, abs=0.3)
+        assert poses.radial == pytest.approx(K, rel=0.01)
+    assert sigmas[0] < 0.005 < sigmas[1] < 0.05
+    assert sigmas[2] > 0.5
+
+
+def test_a_sheet_that_is_stretched_does_not_move_the_focal_length() -> None:
+    seen = views(25, aspect=0.004, tilt_deg=5.0)
+    poses = fit_poses(seen, fit_homographies(seen), 300.0)
+    assert abs(poses.focal - FOCAL) < 4 * poses.sigma[3] < 0.05 * FOCAL
+    assert poses.aspect == pytest.approx(0.004, abs=1e-4)
+
+
+def test_a_lens_without_bend_has_a_centre_where_frames_are_tilted() -> None:
+    seen = views(25, k=0.0)
+    bend = fit_homographies(seen)
+    poses = fit_poses(seen, bend, 300.0)
+    assert bend.sigma[:2].min() > 5  # px: nothing but the middle of the frame is assumed
+    assert poses.centre == pytest.approx(CENTRE, abs=0.3)
+    assert poses.sigma[:2].max() < 0.2
+    assert poses.focal == pytest.approx(FOCAL, rel=0.01)
+
+
+def test_a_centre_that_is_held_stays() -> None:
+    seen = views(10)
+    bend = fit_homographies(seen, hold_centre=True)
+    poses = fit_poses(seen, bend, 300.0, hold_centre=True)
+    for fit in (bend, poses):
+        assert fit.centre.tolist() == [93.5, 59.5]
+        assert np.isnan(fit.sigma[:2]).all()
+
+
+def test_tilts_are_those_of_the_frames() -> None:
+    tilts_deg = (9.0, 2.0, 6.0, 0.5, 4.0, 8.0)
+    seen = views(6, tilts_deg=tilts_deg)
+    bend = fit_homographies(seen)
+    assert np.isnan(bend.tilt).all()
+    poses = fit_poses(seen, bend, 300.0)
+    assert np.degrees(poses.tilt) == pytest.approx(tilts_deg, abs=0.15)
