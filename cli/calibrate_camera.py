@@ -84,8 +84,8 @@ def camera(
         console.emit_json(_entry(session, output, frames.device, report))
     if report.focal_from == "usual":
         raise failures.Incomplete(
-            "The focal length is not known: add frames that are tilted by 5 degrees or more, "
-            "or give --focal-px"
+            "The focal length is not known: give it with --focal-px, or add frames that are "
+            "tilted by 5 degrees or more"
         )
 
 

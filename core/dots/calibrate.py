@@ -254,7 +254,6 @@ def _notes(
     fits: bool,
 ) -> Iterator[str]:
     focal = camera.focal_px
-    kept = {"usual": f"a usual one, {focal:.0f} px, stands in", "given": "the given one is kept"}
     if not fits:
         yield (
             "the frames are not what a pinhole sees of a flat sheet: dots miss their places by "
@@ -262,10 +261,11 @@ def _notes(
             "the shutter may be a rolling one, the sheet not flat, or pixels not square"
         )
     if source in ("usual", "camera"):
+        why = "" if tilted else ": they are not tilted enough"
+        instead = "a usual one stands in" if source == "usual" else "the earlier one is kept"
         yield (
-            f"the frames do not tell the focal length{'' if tilted else ': they are not tilted'}; "
-            f"{kept.get(source, f'the earlier one, {focal:.1f} px, is kept')}. Poses on the sheet "
-            "do not depend on it"
+            f"the frames do not tell the focal length{why}; {instead}, {focal:.1f} px. Poses on "
+            "the sheet do not depend on it"
         )
     if source == "given" and tilted and fits:
         sigma = poses.sigma[3]

@@ -149,14 +149,14 @@ def common_size(looked: dict[int, SeenFrame | str], total: int) -> tuple[int, in
         return size
     reasons = Counter(one for one in looked.values() if isinstance(one, str))
     of = f"of {len(looked)} frames" + (f" (of {total})" if len(looked) < total else "")
-    if reasons[OFF_SHEET] > count:
+    if reasons[OFF_SHEET] >= FEWEST_FRAMES:
         raise DegenerateError(
             f"{reasons[OFF_SHEET]} {of} show the pattern off all sheets of the manifest",
             hint="Is it the manifest of another sheet?",
         )
     raise DegenerateError(
         f"{count or 'none'} {of} show the pattern, where {FEWEST_FRAMES} are needed",
-        hint="Take sharp frames of the sheet, at several places and turned in several directions",
+        hint="Take sharp frames at several places of the sheet that the manifest describes",
     )
 
 

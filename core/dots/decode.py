@@ -22,15 +22,14 @@ from locatk.core.dots.reading import (
     LONGEST,
     PLACES,
     Reading,
-    ballot_tables,
     compare,
-    digit_tables,
     read,
     read_turned,
     scores,
     turned,
     turns,
 )
+from locatk.core.dots.search import search
 from locatk.core.errors import InputError
 
 THRESHOLD = 0.999
@@ -44,12 +43,6 @@ NARROW = 16
 
 PLAIN = 8
 """Columns and rows from which a window without a wrong bit has one place only."""
-
-LIST = 6
-"""Residues of each secondary sequence that are joined into candidates."""
-
-CANDIDATES = 48
-"""Places that are compared with the whole window."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +162,9 @@ def _settle(
             continue
         printed = turned(x_bits[doubtful], y_bits[doubtful], reading.rotation[doubtful])
         bits = printed[1] if axis else printed[0].transpose(0, 2, 1)
-        place, shift, rivals[doubtful, axis] = _search(scores(bits), codec)
+        place, shift, rivals[doubtful, axis] = search(
+            scores(bits), codec, narrow=x_bits.shape[1] <= NARROW
+        )
         reading.place[doubtful, axis], reading.shift[doubtful, axis] = place, shift
         odds, wrong = compare(place, shift, bits, codec)
         reading.odds[doubtful, axis], reading.wrong[doubtful, axis] = odds, wrong
@@ -204,48 +199,3 @@ def _square(bits: NDArray[np.float32]) -> NDArray[np.float32]:
     result = np.zeros((n, length, length), np.float32)
     result[:, :rows, :columns] = bits
     return result
-
-
-def _search(
-    scores: NDArray[np.float32], codec: Codec
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Likeliest place (n,) and shift (n,), and how likely the rest is relative to it (n,).
-
-    All phases of a column stay in play: the differences of two columns have the circular
-    correlation of both posteriors, and each digit its marginal. The best few residues of
-    each secondary sequence, joined, are compared with all columns at all shifts.
-    """
-    n, length, _ = scores.shape
-    posterior = np.exp(0.5 * (scores - scores.max(axis=2, keepdims=True)).astype(np.float64))
-    posterior /= posterior.sum(axis=2, keepdims=True)
-    spectrum = np.fft.rfft(posterior, axis=2)
-    difference = np.fft.irfft(spectrum[:, 1:] * spectrum[:, :-1].conj(), PERIOD, axis=2)
-    totals, residues = np.zeros((n, 1)), np.zeros((n, 1, 0), np.int64)
-    for digits, votes in zip(digit_tables(), ballot_tables(codec, length - 1), strict=True):
-        marginal = np.log(np.maximum(difference, 0) @ digits + 1e-4)
-        votes_of = marginal.reshape(n, -1) @ votes
-        best = np.argsort(-votes_of, axis=1)[:, :LIST]
-        sums = totals[:, :, None] + np.take_along_axis(votes_of, best, axis=1)[:, None]
-        kept = np.argsort(-sums.reshape(n, -1), axis=1)[:, :CANDIDATES]
-        totals = np.take_along_axis(sums.reshape(n, -1), kept, axis=1)
-        old, new = np.divmod(kept, best.shape[1])
-        residues = np.concatenate(
-            [
-                np.take_along_axis(residues, old[..., None], axis=1),
-                np.take_along_axis(best, new, axis=1)[..., None],
-            ],
-            axis=2,
-        )
-    places = codec.place(residues)
-    steps = np.arange(length)
-    phases = codec.phases(places[..., None] + steps)
-    # One shift at a time: (n, candidates, length) scores are picked for each of 63.
-    row = np.arange(n)[:, None, None]
-    joint = np.stack(
-        [scores[row, steps, (phases + k) % PERIOD].sum(axis=2) for k in range(PERIOD)], axis=2
-    ).astype(np.float64)
-    joint = 0.5 * joint.reshape(n, -1)
-    winner = joint.argmax(axis=1)
-    rivals = np.exp(joint - joint.max(axis=1, keepdims=True)).sum(axis=1) - 1
-    which, shift = np.divmod(winner, PERIOD)
-    return places[np.arange(n), which], shift, rivals

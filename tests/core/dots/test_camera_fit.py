@@ -152,17 +152,17 @@ def test_wrong_dots_are_given_up() -> None:
     assert 0.05 < given_up < 0.12
 
 
-def test_a_bad_frame_counts_little() -> None:
-    """Motion makes the dots of some frames scatter ten times as much."""
-    seen = views(20, seed=7)
-    rng = np.random.default_rng(0)
-    seen.pixels[::4] += rng.normal(0, 0.3, seen.pixels[::4].shape)
-    without = Views(
-        SIZE, *(a[np.arange(20) % 4 > 0] for a in (seen.pixels, seen.plane, seen.valid))
-    )
-    with_bad, good = fit_homographies(seen), fit_homographies(without)
-    assert with_bad.sigma[:3] == pytest.approx(good.sigma[:3], rel=0.15)
-    assert abs(with_bad.centre - good.centre).max() < good.sigma[:2].max()
+def test_bad_frames_count_little() -> None:
+    """Motion makes the dots of some frames scatter four times as much."""
+    seen = views(30, seed=7)
+    bad = np.arange(30) % 5 < 2
+    seen.pixels[bad] += np.random.default_rng(0).normal(0, 0.12, seen.pixels[bad].shape)
+    good = Views(SIZE, *(a[~bad] for a in (seen.pixels, seen.plane, seen.valid)))
+    with_bad, without = fit_homographies(seen), fit_homographies(good)
+    assert (with_bad.sigma[:3] < 1.15 * without.sigma[:3]).all()
+    # Not because their dots were taken for wrong ones.
+    assert np.mean(with_bad.used[seen.valid & bad[:, None]]) > 0.98
+    assert abs(with_bad.centre - without.centre).max() < without.sigma[:2].max()
 
 
 def test_how_well_the_focal_length_is_known_depends_on_the_tilt() -> None:
