@@ -14,7 +14,7 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.camera_fit import Views, homographies
 from locatk.core.dots.codec import Codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.locate import sightings
+from locatk.core.dots.locate import locate, sightings
 from locatk.core.dots.sheet import OFFSET, Manifest
 from locatk.core.dots.solver import OFF_SHEET, RIM, UNREADABLE
 from locatk.core.errors import DegenerateError, InputError
@@ -34,6 +34,9 @@ MOST_LOCATED = 2 * MOST_FRAMES
 
 MOST_SEEN = 1000
 """Frames that are looked at, where many of them show no pattern."""
+
+BLOCK = 40
+"""Frames that are in memory at once."""
 
 MOST_DOTS = 250
 """Of a frame; the paper's camera sees 180."""
@@ -87,18 +90,32 @@ def look(
         With which of them to look, until one helps; None knows of no lens.
     """
     looked: dict[int, SeenFrame | str] = {}
-    located = 0
-    for index in order:
-        try:
-            image = frames.images[index]
-        except InputError:
-            looked[index] = UNREADABLE
-            continue
-        looked[index] = _dots_of(index, image, manifest, code, cameras)
-        located += isinstance(looked[index], SeenFrame)
-        if located == MOST_LOCATED:
+    order = list(order)
+    for start in range(0, len(order), BLOCK):
+        images: dict[int, NDArray[np.uint8]] = {}
+        for index in order[start : start + BLOCK]:
+            looked[index] = NO_PATTERN
+            try:
+                images[index] = frames.images[index]
+            except InputError:
+                looked[index] = UNREADABLE
+        for camera in dict.fromkeys(cameras):
+            for index in _located(images, code, camera):
+                looked[index] = _dots_of(index, images.pop(index), manifest, code, camera)
+        if sum(isinstance(one, SeenFrame) for one in looked.values()) >= MOST_LOCATED:
             break
     return looked
+
+
+def _located(images: dict[int, NDArray[np.uint8]], code: Codec, camera: Camera | None) -> list[int]:
+    """Which frames have a place. In a batch, those that have none cost least."""
+    found: list[int] = []
+    for shape in {image.shape for image in images.values()}:
+        if camera is None or camera.size == shape[::-1]:
+            same = [index for index, image in images.items() if image.shape == shape]
+            located = locate(np.stack([images[index] for index in same]), code, camera)
+            found += [same[k] for k in np.flatnonzero(located.accepted)]
+    return sorted(found)
 
 
 def _dots_of(
@@ -106,24 +123,21 @@ def _dots_of(
     image: NDArray[np.uint8],
     manifest: Manifest,
     code: Codec,
-    cameras: Sequence[Camera | None],
+    camera: Camera | None,
 ) -> SeenFrame | str:
     height, width = image.shape
-    for camera in dict.fromkeys(cameras):
-        if camera is not None and camera.size != (width, height):
-            continue
-        for sighting in sightings(image[None], code, camera):
-            middle = sighting.origin + sighting.grid.mean(axis=0)
-            number = int(manifest.find(middle[None], [[-1, -1]], slack=RIM)[0])
-            if number < 0:
-                return OFF_SHEET
-            place = np.rint(sighting.grid)
-            shift = (sighting.grid - place) * (manifest.offset_mm / manifest.pitch_mm / OFFSET)
-            # Lengths alone: how a tile is turned on its floor means nothing to a camera.
-            pitch = np.linalg.norm(manifest.jacobian(number), axis=0)
-            plane = (place + shift) * pitch
-            some = np.random.default_rng(index).permutation(len(plane))[:MOST_DOTS]
-            return SeenFrame(index, (width, height), sighting.pixels[some], plane[some])
+    for sighting in sightings(image[None], code, camera):
+        middle = sighting.origin + sighting.grid.mean(axis=0)
+        number = int(manifest.find(middle[None], [[-1, -1]], slack=RIM)[0])
+        if number < 0:
+            return OFF_SHEET
+        place = np.rint(sighting.grid)
+        shift = (sighting.grid - place) * (manifest.offset_mm / manifest.pitch_mm / OFFSET)
+        # Lengths alone: how a tile is turned on its floor means nothing to a camera.
+        pitch = np.linalg.norm(manifest.jacobian(number), axis=0)
+        plane = (place + shift) * pitch
+        some = np.random.default_rng(index).permutation(len(plane))[:MOST_DOTS]
+        return SeenFrame(index, (width, height), sighting.pixels[some], plane[some])
     return NO_PATTERN
 
 

@@ -379,6 +379,7 @@ def test_of_long_sessions_some_frames_are_taken(
     for module in (camera_views, calibration):
         monkeypatch.setattr(module, "MOST_FRAMES", 8)
     monkeypatch.setattr(camera_views, "MOST_LOCATED", 16)
+    monkeypatch.setattr(camera_views, "BLOCK", 8)
     taken: list[int] = []
 
     class Counted(Some):
