@@ -159,24 +159,29 @@ static void paper_image(const uint8_t *image, int w, int rows, int columns, int 
     for (int k = 0; k < rows * columns; k++) paper[k] *= share;
 }
 
-/* Contrast of the median dot: of those above the split that Otsu's criterion makes. */
-static float typical(float *contrasts, int count)
+/* Contrast of the median dot: of those above the split that Otsu's criterion makes, once the
+ * few that are darker than any dot were set aside as dirt. */
+static float median_dot(float *contrasts, int count, int fewest, int splits)
 {
     if (count == 0) return 0;
     sort_floats(contrasts, count);
-    float total = 0, sum = 0, best = -1;
-    int dots = 0;
-    for (int k = 0; k < count; k++) total += contrasts[k];
-    for (int above = 1; above < count; above++) {
-        sum += contrasts[count - above];
-        const float rest = total - sum;
-        const float between = sum * sum / (float)above + rest * rest / (float)(count - above);
-        if (between > best) {
-            best = between;
-            dots = above - 1;
+    for (int split = 0; split < splits && count > 1; split++) {
+        float total = 0, sum = 0, best = -1;
+        int dots = 0;
+        for (int k = 0; k < count; k++) total += contrasts[k];
+        for (int above = 1; above < count; above++) {
+            sum += contrasts[count - above];
+            const float rest = total - sum;
+            const float between = sum * sum / (float)above + rest * rest / (float)(count - above);
+            if (between > best) {
+                best = between;
+                dots = above;
+            }
         }
+        if (dots >= fewest) return contrasts[count - 1 - (dots - 1) / 2];
+        count -= dots;
     }
-    return contrasts[count - 1 - dots / 2];
+    return contrasts[count - 1 - (count - 1) / 2];
 }
 
 static float peak(const float *at, int step, float light, float contrast, float top)
@@ -204,10 +209,10 @@ static int darker_first(const void *a, const void *b)
 static PyObject *find_dots(PyObject *self, PyObject *args)
 {
     Py_buffer images, taps, xy, counts;
-    int n, h, w, block, reach, most;
+    int n, h, w, block, reach, fewest, splits, most;
     float faintest, share;
-    if (!PyArg_ParseTuple(args, "y*iiiy*iiffiw*w*", &images, &n, &h, &w, &taps, &block, &reach,
-                          &faintest, &share, &most, &xy, &counts))
+    if (!PyArg_ParseTuple(args, "y*iiiy*iiffiiiw*w*", &images, &n, &h, &w, &taps, &block, &reach,
+                          &faintest, &share, &fewest, &splits, &most, &xy, &counts))
         return NULL;
     const int rows = h / block, columns = w / block;
     const size_t area = (size_t)h * w, blocks = (size_t)rows * columns;
@@ -258,7 +263,7 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
             }
         }
         memcpy(across, contrasts, (size_t)minima * sizeof(float));
-        const float bar = share * typical(across, minima);
+        const float bar = share * median_dot(across, minima, fewest, splits);
         int kept = 0;
         for (int k = 0; k < minima; k++) {
             if (!(contrasts[k] > bar)) continue;
@@ -723,12 +728,12 @@ typedef struct {
     const int8_t *digit; /* (4, 63) digit of each difference, -1 where there is none */
     const float *masks;  /* (4, 3, widest) whether a place has a digit, repeated beyond the end */
     int64_t range, smallest, widest;
-    double places;
+    double places, phases; /* logarithms of how many there are */
 } Code;
 
 typedef struct {
     int64_t place, shift, wrong, first, last;
-    double odds;
+    double odds, order;
 } Axis;
 
 static inline int64_t remainder_of(int64_t a, int64_t b)
@@ -796,6 +801,15 @@ HOT static void vote(const Code *code, const float *const *scores, int lines, fl
     for (int k = 1; k < PERIOD; k++)
         if (ballots[k] > ballots[best]) best = k;
     axis->shift = best;
+    /* Against lines of the main sequence in any order: what it costs to have this one. */
+    axis->order = -code->places;
+    for (int i = 0; i < lines; i++) {
+        const float top = scores[i][phase[i]];
+        if (top <= 0) continue;
+        const int64_t ahead = phase_at(code, (place + i) % code->range);
+        const float here = scores[i][remainder_of(ahead + best, PERIOD)];
+        axis->order += code->phases - 0.5 * (double)(top - here);
+    }
 }
 
 /* Evidence for the place: line i of the axis, dot j along it, at bits[start + i*a + j*b]. */
@@ -907,6 +921,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
     code.widest = masks.len / (Py_ssize_t)(SEQUENCES * BASE * sizeof(float));
     code.range = range;
     code.smallest = smallest;
+    code.phases = log(PERIOD);
     const size_t size = (size_t)length * length;
     float *scores = malloc((4 * (size_t)length * PERIOD + (size_t)length + 512) * sizeof(float));
     const float **lines = malloc((size_t)length * sizeof(float *));
@@ -917,7 +932,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
         int64_t *out = whole.buf;
         double *evidence = odds.buf;
         Py_BEGIN_ALLOW_THREADS
-        for (int k = 0; k < n; k++, out += 11, evidence += 2) {
+        for (int k = 0; k < n; k++, out += 11, evidence += 4) {
             Axis axes[2];
             read_window(&code, (const float *)x_bits.buf + k * size,
                         (const float *)y_bits.buf + k * size, length, scores, lines, votes, phase,
@@ -927,6 +942,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
                 const int64_t row[5] = {a->place, a->shift, a->wrong, a->first, a->last};
                 memcpy(out + 1 + 5 * axis, row, sizeof(row));
                 evidence[axis] = a->odds;
+                evidence[2 + axis] = a->order;
             }
         }
         Py_END_ALLOW_THREADS

@@ -9,6 +9,7 @@ light and exposure do not matter.
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -30,6 +31,12 @@ PAPER_REACH = 7
 
 FAINTEST = 1.5
 """Least contrast of a dot, in grey levels after smoothing."""
+
+FEWEST_DOTS = 40
+"""Minima that are dirt if they stand out and are fewer than these."""
+
+SPLITS = 3
+"""How often dirt is set aside."""
 
 SHARE = 0.45
 """Least contrast of a dot as share of that of the frame's median dot."""
@@ -72,7 +79,7 @@ def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
         np.ascontiguousarray(images),
         *(n, h, w),
         _taps(),
-        *(PAPER, PAPER_REACH, FAINTEST, SHARE, most),
+        *(PAPER, PAPER_REACH, FAINTEST, SHARE, FEWEST_DOTS, SPLITS, most),
         xy,
         counts,
     )
@@ -125,24 +132,32 @@ def find_dots_numpy(images: NDArray[np.uint8], most: int = 4096) -> Dots:
 
 
 def _typical(contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int) -> NDArray[np.float32]:
-    """(n,) contrast of the median dot of each frame.
+    """(n,) contrast of the median dot of each frame."""
+    order = np.lexsort((-contrast, frame))
+    edges = np.searchsorted(frame[order], np.arange(n + 1))
+    parts = [contrast[order[a:b]] for a, b in itertools.pairwise(edges)]
+    return np.array([_median_dot(part) for part in parts], np.float32)
 
-    Which minima are dots and which are noise is decided by Otsu's criterion on their
-    contrasts: the split that most reduces the variance within both parts.
+
+def _median_dot(contrast: NDArray[np.float32]) -> float:
+    """Contrast of the median dot among minima, given darkest first.
+
+    Which are dots and which are noise is decided by Otsu's criterion: the split that most
+    reduces the variance within both parts. A first part of few is dirt on the paper, darker
+    than any dot; then the rest is split again.
     """
-    counts = np.bincount(frame, minlength=n)
-    table = np.zeros((n, max(int(counts.max(initial=0)), 1)), np.float32)
-    table[frame, np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame]] = contrast
-    table = -np.sort(-table, axis=1)
-    sums = np.cumsum(table, axis=1)
-    above = np.arange(1, table.shape[1] + 1)
-    below = counts[:, None] - above
-    rest = sums[:, -1:] - sums
-    with np.errstate(divide="ignore", invalid="ignore"):
-        between = np.where(below > 0, sums**2 / above + rest**2 / below, -1.0)
-    dots = between.argmax(axis=1)
-    result: NDArray[np.float32] = table[np.arange(n), dots // 2]
-    return result
+    for _ in range(SPLITS):
+        if len(contrast) < 2:
+            break
+        sums = np.cumsum(contrast)
+        above = np.arange(1, len(contrast))
+        rest = sums[-1] - sums[:-1]
+        between = sums[:-1] ** 2 / above + rest**2 / (len(contrast) - above)
+        dots = int(between.argmax()) + 1
+        if dots >= FEWEST_DOTS:
+            return float(contrast[(dots - 1) // 2])
+        contrast = contrast[dots:]
+    return float(contrast[(len(contrast) - 1) // 2]) if len(contrast) else 0.0
 
 
 def _peak(

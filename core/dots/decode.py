@@ -4,8 +4,9 @@ The evidence for an axis is the logarithm of how much likelier its dots are at a
 if their bits were random. Before the dots are seen, one of ``4 * 63 * RANGE`` places,
 sections and orientations is as likely as the next; by this the evidence is lowered, so
 that random bits pass a confidence of 1 - p with a probability below p, however many places
-were tried. Where wrong bits leave a doubt, the likeliest few places are compared with the
-whole window, and share the confidence.
+were tried. A sheet of another codec is no random bits: columns of the main sequence in any
+order are a hypothesis too. Where wrong bits leave a doubt, the likeliest few places are
+compared with the whole window, and share the confidence.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from locatk.core.dots.reading import (
     PLACES,
     Reading,
     compare,
+    in_order,
     read,
     read_turned,
     scores,
@@ -34,6 +36,12 @@ from locatk.core.errors import InputError
 
 THRESHOLD = 0.999
 """Least confidence of an accepted answer."""
+
+STRANGE = 0.01
+"""How much likelier than a sheet of another codec it is to see one of this."""
+
+UNLISTED = 3.0
+"""How much more the rivals of a place weigh than those that were found."""
 
 SURE = 40.0
 """Log odds from which no other place can come near, wrong bits or not."""
@@ -162,14 +170,15 @@ def _settle(
             continue
         printed = turned(x_bits[doubtful], y_bits[doubtful], reading.rotation[doubtful])
         bits = printed[1] if axis else printed[0].transpose(0, 2, 1)
-        place, shift, rivals[doubtful, axis] = search(
-            scores(bits), codec, narrow=x_bits.shape[1] <= NARROW
-        )
+        fits, narrow = scores(bits), x_bits.shape[1] <= NARROW
+        place, shift, rivals[doubtful, axis] = search(fits, codec, narrow=narrow)
         reading.place[doubtful, axis], reading.shift[doubtful, axis] = place, shift
         odds, wrong = compare(place, shift, bits, codec)
         reading.odds[doubtful, axis], reading.wrong[doubtful, axis] = odds, wrong
+        reading.order[doubtful, axis] = in_order(place, shift, fits, codec)
     with np.errstate(over="ignore"):
-        result: NDArray[np.float64] = (1 / (1 + rivals + np.exp(-reading.odds))).prod(axis=1)
+        others = UNLISTED * rivals + np.exp(-reading.odds) + STRANGE * np.exp(-reading.order)
+    result: NDArray[np.float64] = (1 / (1 + others)).prod(axis=1)
     return result
 
 

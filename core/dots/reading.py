@@ -43,6 +43,9 @@ class Reading(NamedTuple):
         Printed columns and rows in which dots are seen.
     odds : (n, 2) float64 ndarray
         Logarithm of the odds for the place against random bits.
+    order : (n, 2) float64 ndarray
+        The same against columns (or rows) of the main sequence in any order, as a sheet of
+        another codec has them.
     """
 
     rotation: NDArray[np.int64]
@@ -52,6 +55,7 @@ class Reading(NamedTuple):
     first: NDArray[np.int64]
     last: NDArray[np.int64]
     odds: NDArray[np.float64]
+    order: NDArray[np.float64]
 
 
 def read(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec) -> Reading:
@@ -59,7 +63,7 @@ def read(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec)
     if kernels is None:
         return read_numpy(x_bits, y_bits, codec)
     n, length, _ = x_bits.shape
-    whole, odds = np.empty((n, 11), np.int64), np.empty((n, 2))
+    whole, odds = np.empty((n, 11), np.int64), np.empty((n, 4))
     kernels.read_windows(
         np.ascontiguousarray(x_bits),
         np.ascontiguousarray(y_bits),
@@ -69,7 +73,7 @@ def read(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec)
         *(whole, odds),
     )
     place, shift, wrong, first, last = np.moveaxis(whole[:, 1:].reshape(n, 2, 5), 2, 0)
-    return Reading(whole[:, 0], place, shift, wrong, first, last, odds)
+    return Reading(whole[:, 0], place, shift, wrong, first, last, odds[:, :2], odds[:, 2:])
 
 
 def read_numpy(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec) -> Reading:
@@ -102,16 +106,18 @@ def read_turned(
     printed = turned(x_bits, y_bits, rotation)
     answers = []
     for bits in (printed[0].transpose(0, 2, 1), printed[1]):
-        place, shift = vote(scores(bits), codec)
+        fits = scores(bits)
+        place, shift = vote(fits, codec)
         odds, wrong = compare(place, shift, bits, codec)
+        order = in_order(place, shift, fits, codec)
         seen = (bits != 0).any(axis=2)
         first = np.where(seen.any(axis=1), seen.argmax(axis=1), seen.shape[1])
         last = np.where(seen.any(axis=1), seen.shape[1] - 1 - seen[:, ::-1].argmax(axis=1), -1)
-        answers.append((place, shift, wrong, first, last, odds))
-    place, shift, wrong, first, last, odds = (
+        answers.append((place, shift, wrong, first, last, odds, order))
+    place, shift, wrong, first, last, odds, order = (
         np.stack(pair, axis=1) for pair in zip(*answers, strict=True)
     )
-    return Reading(rotation, place, shift, wrong, first, last, odds)
+    return Reading(rotation, place, shift, wrong, first, last, odds, order)
 
 
 @functools.lru_cache(8)
@@ -180,6 +186,26 @@ def compare(
     odds = np.asarray(np.bincount(window, gain, n) - PLACES, np.float64)
     wrong = np.bincount(window[agreement < 0], minlength=n).astype(np.int64)
     return odds, wrong
+
+
+def in_order(
+    place: NDArray[np.int64],
+    shift: NDArray[np.int64],
+    fits: NDArray[np.float32],
+    codec: Codec,
+) -> NDArray[np.float64]:
+    """Log odds (n,) of the lines at ``place`` against lines of the main sequence in any order.
+
+    A line that is free takes its best phase, one of 63; one of the code has no choice, once
+    the place is chosen. ``fits`` are :func:`scores`.
+    """
+    length = fits.shape[1]
+    phase = (codec.phases(place[:, None] + np.arange(length)) + shift[:, None]) % PERIOD
+    here = np.take_along_axis(fits, phase[..., None], axis=2)[..., 0].astype(np.float64)
+    top = fits.max(axis=2)
+    gain = np.where(top > 0, math.log(PERIOD) - 0.5 * (top - here), 0.0)
+    result: NDArray[np.float64] = gain.sum(axis=1) - PLACES
+    return result
 
 
 @functools.cache
