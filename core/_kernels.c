@@ -24,6 +24,14 @@
 #define HOT
 #endif
 
+/* Releases the buffers of a call; None, or MemoryError where there was none to work in. */
+static PyObject *done(Py_buffer *buffers, int count, int stored)
+{
+    for (int k = 0; k < count; k++) PyBuffer_Release(buffers + k);
+    if (!stored) return PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
 /* ---- Sorting ---------------------------------------------------------------------------- */
 
 /* Shell sort, ascending; for the few hundred numbers of a frame. */
@@ -35,8 +43,7 @@ static void sort_floats(float *values, int count)
         for (int i = gap; i < count; i++) {
             const float value = values[i];
             int j = i;
-            for (; j >= gap && values[j - gap] > value; j -= gap)
-                values[j] = values[j - gap];
+            for (; j >= gap && values[j - gap] > value; j -= gap) values[j] = values[j - gap];
             values[j] = value;
         }
     }
@@ -57,9 +64,12 @@ static float nth_smallest(float *values, int count, int rank)
                 values[j--] = swap;
             }
         }
-        if (rank <= j) high = j;
-        else if (rank >= i) low = i;
-        else break;
+        if (rank <= j)
+            high = j;
+        else if (rank >= i)
+            low = i;
+        else
+            break;
     }
     return values[rank];
 }
@@ -78,7 +88,7 @@ static inline float smaller(float a, float b) { return a < b ? a : b; }
 
 /* Smoothed image by five taps each way (two outer, two inner, the middle). */
 HOT static void smooth_image(const uint8_t *restrict image, int h, int w, const float *taps,
-                         float *restrict line, float *restrict smooth)
+                             float *restrict line, float *restrict smooth)
 {
     const float outer = taps[0], inner = taps[1], middle = taps[2];
     for (int y = 0; y < h; y++) {
@@ -89,16 +99,16 @@ HOT static void smooth_image(const uint8_t *restrict image, int h, int w, const 
         const uint8_t *e = image + (size_t)mirrored(y + 2, h) * w;
         float *restrict in = line + 2;
         for (int x = 0; x < w; x++)
-            in[x] = outer * (float)(a[x] + e[x]) + inner * (float)(b[x] + d[x])
-                    + middle * (float)c[x];
+            in[x] =
+                outer * (float)(a[x] + e[x]) + inner * (float)(b[x] + d[x]) + middle * (float)c[x];
         for (int k = 1; k <= 2; k++) {
             in[-k] = in[mirrored(-k, w)];
             in[w - 1 + k] = in[mirrored(w - 1 + k, w)];
         }
         float *restrict out = smooth + (size_t)y * w;
         for (int x = 0; x < w; x++)
-            out[x] = outer * (in[x - 2] + in[x + 2]) + inner * (in[x - 1] + in[x + 1])
-                     + middle * in[x];
+            out[x] =
+                outer * (in[x - 2] + in[x + 2]) + inner * (in[x - 1] + in[x + 1]) + middle * in[x];
     }
 }
 
@@ -110,7 +120,8 @@ HOT static void mark_minima(const float *restrict smooth, int h, int w, float *r
         const float *restrict s = smooth + (size_t)y * w;
         float *restrict m = across + (size_t)y * w;
         for (int x = 2; x < w - 2; x++)
-            m[x] = smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])), s[x]);
+            m[x] =
+                smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])), s[x]);
     }
     for (int y = 2; y < h - 2; y++) {
         const float *restrict a = across + (size_t)(y - 2) * w, *restrict b = a + w;
@@ -206,98 +217,101 @@ static int darker_first(const void *a, const void *b)
     return (x < y) - (x > y);
 }
 
+typedef struct {
+    int h, w, block, reach, fewest, splits, most, rows, columns;
+    float faintest, share;
+    const float *taps;
+    float *smooth, *across, *line, *means, *blurred, *paper, *contrasts, *lights;
+    int *sums;
+    uint8_t *marks;
+    Dot *dots;
+} Finder;
+
+/* Dots of an image to `xy`; how many there are. */
+static int dots_of(const Finder *f, const uint8_t *image, float *xy)
+{
+    const int h = f->h, w = f->w;
+    Dot *dots = f->dots;
+    smooth_image(image, h, w, f->taps, f->line, f->smooth);
+    paper_image(image, w, f->rows, f->columns, f->block, f->reach, f->sums, f->means, f->blurred,
+                f->paper);
+    mark_minima(f->smooth, h, w, f->across, f->marks);
+    int minima = 0;
+    for (int y = 2; y < h - 2; y++) {
+        const uint8_t *mark = f->marks + (size_t)y * w, *end = mark + w - 2;
+        const int row = y / f->block < f->rows ? y / f->block : f->rows - 1;
+        for (const uint8_t *at = mark + 2; (at = memchr(at, 1, (size_t)(end - at))); at++) {
+            const int x = (int)(at - mark);
+            const int column = x / f->block < f->columns ? x / f->block : f->columns - 1;
+            const float light = f->paper[row * f->columns + column];
+            const float contrast = light - f->smooth[(size_t)y * w + x];
+            if (!(contrast > f->faintest)) continue;
+            f->lights[minima] = light;
+            f->contrasts[minima] = contrast / light;
+            dots[minima].x = (float)x;
+            dots[minima].y = (float)y;
+            dots[minima++].contrast = contrast;
+        }
+    }
+    memcpy(f->across, f->contrasts, (size_t)minima * sizeof(float));
+    const float bar = f->share * median_dot(f->across, minima, f->fewest, f->splits);
+    int kept = 0;
+    for (int k = 0; k < minima; k++) {
+        if (!(f->contrasts[k] > bar)) continue;
+        const float light = f->lights[k], contrast = dots[k].contrast, top = logf(contrast);
+        const float *at = f->smooth + (size_t)dots[k].y * w + (size_t)dots[k].x;
+        dots[kept].x = dots[k].x + peak(at, 1, light, contrast, top);
+        dots[kept].y = dots[k].y + peak(at, w, light, contrast, top);
+        dots[kept++].contrast = contrast;
+    }
+    if (kept > f->most) {
+        qsort(dots, (size_t)kept, sizeof(Dot), darker_first);
+        kept = f->most;
+    }
+    for (int k = 0; k < kept; k++) {
+        xy[2 * k] = dots[k].x;
+        xy[2 * k + 1] = dots[k].y;
+    }
+    return kept;
+}
+
 static PyObject *find_dots(PyObject *self, PyObject *args)
 {
-    Py_buffer images, taps, xy, counts;
-    int n, h, w, block, reach, fewest, splits, most;
-    float faintest, share;
-    if (!PyArg_ParseTuple(args, "y*iiiy*iiffiiiw*w*", &images, &n, &h, &w, &taps, &block, &reach,
-                          &faintest, &share, &fewest, &splits, &most, &xy, &counts))
+    enum { IMAGES, TAPS, XY, COUNTS, BUFFERS };
+    Py_buffer b[BUFFERS];
+    int n;
+    Finder f;
+    if (!PyArg_ParseTuple(args, "y*iiiy*iiffiiiw*w*", &b[IMAGES], &n, &f.h, &f.w, &b[TAPS],
+                          &f.block, &f.reach, &f.faintest, &f.share, &f.fewest, &f.splits, &f.most,
+                          &b[XY], &b[COUNTS]))
         return NULL;
-    const int rows = h / block, columns = w / block;
-    const size_t area = (size_t)h * w, blocks = (size_t)rows * columns;
-    float *store = malloc((4 * area + (size_t)w + 4 + 3 * blocks) * sizeof(float));
-    Dot *dots = malloc(area * sizeof(Dot));
-    int *sums = malloc((size_t)w * sizeof(int));
-    uint8_t *marks = malloc(area);
-    if (!store || !dots || !sums || !marks) {
-        free(marks);
-        free(store);
-        free(dots);
-        free(sums);
-        PyBuffer_Release(&images);
-        PyBuffer_Release(&taps);
-        PyBuffer_Release(&xy);
-        PyBuffer_Release(&counts);
-        return PyErr_NoMemory();
+    f.rows = f.h / f.block;
+    f.columns = f.w / f.block;
+    f.taps = b[TAPS].buf;
+    const size_t area = (size_t)f.h * f.w, blocks = (size_t)f.rows * f.columns;
+    f.smooth = malloc((4 * area + (size_t)f.w + 4 + 3 * blocks) * sizeof(float));
+    f.dots = malloc(area * sizeof(Dot));
+    f.sums = malloc((size_t)f.w * sizeof(int));
+    f.marks = malloc(area);
+    const int stored = f.smooth && f.dots && f.sums && f.marks;
+    if (stored) {
+        f.across = f.smooth + area;
+        f.contrasts = f.across + area;
+        f.lights = f.contrasts + area;
+        f.line = f.lights + area;
+        f.means = f.line + f.w + 4;
+        f.blurred = f.means + blocks;
+        f.paper = f.blurred + blocks;
+        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)((int64_t *)b[COUNTS].buf)[k] =
+            dots_of(&f, (const uint8_t *)b[IMAGES].buf + k * area,
+                    (float *)b[XY].buf + 2 * (size_t)k * f.most);
+        Py_END_ALLOW_THREADS
     }
-    float *smooth = store, *across = smooth + area;
-    float *line = across + area, *means = line + w + 4, *blurred = means + blocks;
-    float *paper = blurred + blocks, *contrasts = paper + blocks, *lights = contrasts + area;
-    int64_t *found = counts.buf;
-
-    Py_BEGIN_ALLOW_THREADS
-    for (int frame = 0; frame < n; frame++) {
-        const uint8_t *image = (const uint8_t *)images.buf + frame * area;
-        smooth_image(image, h, w, taps.buf, line, smooth);
-        paper_image(image, w, rows, columns, block, reach, sums, means, blurred,
-                    paper);
-        mark_minima(smooth, h, w, across, marks);
-        int minima = 0;
-        for (int y = 2; y < h - 2; y++) {
-            const float *s = smooth + (size_t)y * w;
-            const uint8_t *mark = marks + (size_t)y * w, *end = mark + w - 2;
-            const int row = y / block < rows ? y / block : rows - 1;
-            for (const uint8_t *at = mark + 2; (at = memchr(at, 1, (size_t)(end - at))); at++) {
-                const int x = (int)(at - mark);
-                const int column = x / block < columns ? x / block : columns - 1;
-                const float light = paper[row * columns + column];
-                const float contrast = light - s[x];
-                if (!(contrast > faintest)) continue;
-                lights[minima] = light;
-                contrasts[minima] = contrast / light;
-                dots[minima].x = (float)x;
-                dots[minima].y = (float)y;
-                dots[minima].contrast = contrast;
-                minima++;
-            }
-        }
-        memcpy(across, contrasts, (size_t)minima * sizeof(float));
-        const float bar = share * median_dot(across, minima, fewest, splits);
-        int kept = 0;
-        for (int k = 0; k < minima; k++) {
-            if (!(contrasts[k] > bar)) continue;
-            dots[kept] = dots[k];
-            lights[kept++] = lights[k];
-        }
-        for (int k = 0; k < kept; k++) {
-            const float *at = smooth + (size_t)dots[k].y * w + (size_t)dots[k].x;
-            const float top = logf(dots[k].contrast);
-            dots[k].x += peak(at, 1, lights[k], dots[k].contrast, top);
-            dots[k].y += peak(at, w, lights[k], dots[k].contrast, top);
-        }
-        if (kept > most) {
-            qsort(dots, (size_t)kept, sizeof(Dot), darker_first);
-            kept = most;
-        }
-        float *out = (float *)xy.buf + (size_t)frame * most * 2;
-        for (int k = 0; k < kept; k++) {
-            out[2 * k] = dots[k].x;
-            out[2 * k + 1] = dots[k].y;
-        }
-        found[frame] = kept;
-    }
-    Py_END_ALLOW_THREADS
-
-    free(store);
-    free(dots);
-    free(sums);
-    free(marks);
-    PyBuffer_Release(&images);
-    PyBuffer_Release(&taps);
-    PyBuffer_Release(&xy);
-    PyBuffer_Release(&counts);
-    Py_RETURN_NONE;
+    free(f.smooth);
+    free(f.dots);
+    free(f.sums);
+    free(f.marks);
+    return done(b, BUFFERS, stored);
 }
 
 /* ---- The lattice of dots ---------------------------------------------------------------- */
@@ -557,13 +571,13 @@ static int fit(const float *points, const uint8_t *valid, int m, int lens, const
         for (int i = 0; i < m; i++) {
             const float u = rintf(dots[i].u), v = rintf(dots[i].v);
             const float du = dots[i].u - u, dv = dots[i].v - v;
-            const int use = valid[i] && fabsf(du) < gate && fabsf(dv) < gate
-                            && u * u + v * v < ring;
+            const int use =
+                valid[i] && fabsf(du) < gate && fabsf(dv) < gate && u * u + v * v < ring;
             wanted[2 * i] = use ? -du : NAN;
             wanted[2 * i + 1] = -dv;
         }
-        if (!step(parameters, dots, wanted, m, rules->loose, lens && rules->ring[r] > rules->bent_from,
-                  rules->prior))
+        if (!step(parameters, dots, wanted, m, rules->loose,
+                  lens && rules->ring[r] > rules->bent_from, rules->prior))
             return 0;
     }
     for (int last = 0; last < 3; last++) {
@@ -610,47 +624,39 @@ static int fit(const float *points, const uint8_t *valid, int m, int lens, const
 
 static PyObject *fit_lattices(PyObject *self, PyObject *args)
 {
-    Py_buffer points, valid, ring, prior, parameters, uv, place, sigma, found;
+    enum { POINTS, VALID, RING, PRIOR, FITTED, UV, PLACE, SIGMA, FOUND, BUFFERS };
+    Py_buffer b[BUFFERS];
     int n, m, lens;
     Rules rules;
-    if (!PyArg_ParseTuple(args, "y*y*iipy*y*iiddddddddw*w*w*w*w*", &points, &valid, &n, &m, &lens,
-                          &ring, &prior, &rules.seeds, &rules.fewest, &rules.nearest,
+    if (!PyArg_ParseTuple(args, "y*y*iipy*y*iiddddddddw*w*w*w*w*", &b[POINTS], &b[VALID], &n, &m,
+                          &lens, &b[RING], &b[PRIOR], &rules.seeds, &rules.fewest, &rules.nearest,
                           &rules.farthest, &rules.gate, &rules.loose, &rules.tight, &rules.firm,
-                          &rules.bent_from, &rules.offset, &parameters, &uv, &place, &sigma,
-                          &found))
+                          &rules.bent_from, &rules.offset, &b[FITTED], &b[UV], &b[PLACE],
+                          &b[SIGMA], &b[FOUND]))
         return NULL;
-    rules.rings = (int)(ring.len / (Py_ssize_t)sizeof(double));
-    rules.ring = ring.buf;
-    rules.prior = prior.buf;
+    rules.rings = (int)(b[RING].len / (Py_ssize_t)sizeof(double));
+    rules.ring = b[RING].buf;
+    rules.prior = b[PRIOR].buf;
     Projected *dots = malloc((size_t)m * sizeof(Projected));
     float *wanted = malloc((size_t)m * 2 * sizeof(float));
     Seed *middle = malloc((size_t)rules.seeds * sizeof(Seed));
     const int stored = dots && wanted && middle;
     if (stored) {
-        Py_BEGIN_ALLOW_THREADS
-        for (int k = 0; k < n; k++) {
+        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
+        {
             const size_t at = (size_t)k * m;
-            ((uint8_t *)found.buf)[k] = (uint8_t)fit(
-                (const float *)points.buf + 2 * at, (const uint8_t *)valid.buf + at, m, lens,
-                &rules, dots, wanted, middle, (double *)parameters.buf + (size_t)k * PARAMETERS,
-                (float *)uv.buf + 2 * at, (float *)place.buf + 2 * at, (double *)sigma.buf + k);
+            ((uint8_t *)b[FOUND].buf)[k] = (uint8_t)fit(
+                (const float *)b[POINTS].buf + 2 * at, (const uint8_t *)b[VALID].buf + at, m, lens,
+                &rules, dots, wanted, middle, (double *)b[FITTED].buf + (size_t)k * PARAMETERS,
+                (float *)b[UV].buf + 2 * at, (float *)b[PLACE].buf + 2 * at,
+                (double *)b[SIGMA].buf + k);
         }
         Py_END_ALLOW_THREADS
     }
     free(dots);
     free(wanted);
     free(middle);
-    PyBuffer_Release(&points);
-    PyBuffer_Release(&valid);
-    PyBuffer_Release(&ring);
-    PyBuffer_Release(&prior);
-    PyBuffer_Release(&parameters);
-    PyBuffer_Release(&uv);
-    PyBuffer_Release(&place);
-    PyBuffer_Release(&sigma);
-    PyBuffer_Release(&found);
-    if (!stored) return PyErr_NoMemory();
-    Py_RETURN_NONE;
+    return done(b, BUFFERS, stored);
 }
 
 /* Soft bits of a frame's dots on the square of places about the middle. */
@@ -687,35 +693,28 @@ static void bits_of(const float *uv, const float *place, const uint8_t *valid, i
 
 static PyObject *soft_bits(PyObject *self, PyObject *args)
 {
-    Py_buffer uv, place, valid, found, sigma, x_bits, y_bits;
+    enum { UV, PLACE, VALID, FOUND, SIGMA, X_BITS, Y_BITS, BUFFERS };
+    Py_buffer b[BUFFERS];
     int n, m, half;
     float offset, often;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iiiffw*w*", &uv, &place, &valid, &found, &sigma, &n,
-                          &m, &half, &offset, &often, &x_bits, &y_bits))
+    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iiiffw*w*", &b[UV], &b[PLACE], &b[VALID], &b[FOUND],
+                          &b[SIGMA], &n, &m, &half, &offset, &often, &b[X_BITS], &b[Y_BITS]))
         return NULL;
     const size_t size = 4 * (size_t)half * half;
     float *misses = malloc(size * sizeof(float));
     if (misses) {
-        Py_BEGIN_ALLOW_THREADS
-        for (int k = 0; k < n; k++) {
+        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
+        {
             const size_t at = (size_t)k * m;
-            bits_of((const float *)uv.buf + 2 * at, (const float *)place.buf + 2 * at,
-                    (const uint8_t *)valid.buf + at, ((const uint8_t *)found.buf)[k] ? m : 0,
-                    half, (float)((const double *)sigma.buf)[k], offset, often, misses,
-                    (float *)x_bits.buf + k * size, (float *)y_bits.buf + k * size);
+            bits_of((const float *)b[UV].buf + 2 * at, (const float *)b[PLACE].buf + 2 * at,
+                    (const uint8_t *)b[VALID].buf + at, ((const uint8_t *)b[FOUND].buf)[k] ? m : 0,
+                    half, (float)((const double *)b[SIGMA].buf)[k], offset, often, misses,
+                    (float *)b[X_BITS].buf + k * size, (float *)b[Y_BITS].buf + k * size);
         }
         Py_END_ALLOW_THREADS
     }
     free(misses);
-    PyBuffer_Release(&uv);
-    PyBuffer_Release(&place);
-    PyBuffer_Release(&valid);
-    PyBuffer_Release(&found);
-    PyBuffer_Release(&sigma);
-    PyBuffer_Release(&x_bits);
-    PyBuffer_Release(&y_bits);
-    if (!misses) return PyErr_NoMemory();
-    Py_RETURN_NONE;
+    return done(b, BUFFERS, misses != NULL);
 }
 
 /* ---- A first reading of windows ---------------------------------------------------------- */
@@ -756,8 +755,8 @@ static int64_t phase_at(const Code *code, int64_t place)
 }
 
 /* Likeliest place and shift of one axis by the likeliest phase of each line. */
-HOT static void vote(const Code *code, const float *const *scores, int lines, float *votes, int *phase,
-                 float *margin, Axis *axis)
+HOT static void vote(const Code *code, const float *const *scores, int lines, float *votes,
+                     int *phase, float *margin, Axis *axis)
 {
     for (int i = 0; i < lines; i++) {
         const float *s = scores[i];
@@ -783,7 +782,8 @@ HOT static void vote(const Code *code, const float *const *scores, int lines, fl
             const int difference = (phase[i + 1] - phase[i] + PERIOD) % PERIOD;
             const int digit = code->digit[k * PERIOD + difference];
             if (digit < 0 || weight <= 0) continue;
-            const float *restrict mask = code->masks + (k * BASE + digit) * code->widest + i % length;
+            const float *restrict mask =
+                code->masks + (k * BASE + digit) * code->widest + i % length;
             for (int q = 0; q < length; q++) votes[q] += weight * mask[q];
         }
         int best = 0;
@@ -842,8 +842,8 @@ static void compare(const Code *code, const float *bits, float sign, int start, 
 }
 
 HOT static void read_window(const Code *code, const float *x_bits, const float *y_bits, int length,
-                        float *scores, const float **lines, float *votes, int *phase,
-                        float *margin, int64_t *rotation, Axis *x, Axis *y)
+                            float *scores, const float **lines, float *votes, int *phase,
+                            float *margin, int64_t *rotation, Axis *x, Axis *y)
 {
     const size_t size = (size_t)length * PERIOD;
     float *table[4] = {scores, scores + size, scores + 2 * size, scores + 3 * size};
@@ -897,28 +897,43 @@ HOT static void read_window(const Code *code, const float *x_bits, const float *
     const int start[4] = {0, last * width, last * width + last, last};
     const int step_x[4] = {1, -width, -1, width}, step_y[4] = {width, 1, -width, -1};
     const float *columns = best % 2 ? y_bits : x_bits, *rows = best % 2 ? x_bits : y_bits;
-    compare(code, columns, (float)sign_x[best], start[best], step_x[best], step_y[best], length, x);
+    compare(code, columns, (float)sign_x[best], start[best], step_x[best], step_y[best], length,
+            x);
     compare(code, rows, (float)sign_y[best], start[best], step_y[best], step_x[best], length, y);
 }
 
 static PyObject *read_windows(PyObject *self, PyObject *args)
 {
-    Py_buffer x_bits, y_bits, lengths, weights, prefixes, crt, signs, digit, masks, whole, odds;
+    enum {
+        X_BITS,
+        Y_BITS,
+        LENGTHS,
+        WEIGHTS,
+        PREFIXES,
+        CRT,
+        SIGNS,
+        DIGIT,
+        MASKS,
+        WHOLE,
+        ODDS,
+        BUFFERS
+    };
+    Py_buffer b[BUFFERS];
     int n, length;
     long long range, smallest;
     Code code;
-    if (!PyArg_ParseTuple(args, "y*y*iiy*y*y*y*y*y*y*LLdw*w*", &x_bits, &y_bits, &n, &length,
-                          &lengths, &weights, &prefixes, &crt, &signs, &digit, &masks, &range,
-                          &smallest, &code.places, &whole, &odds))
+    if (!PyArg_ParseTuple(args, "y*y*iiy*y*y*y*y*y*y*LLdw*w*", &b[X_BITS], &b[Y_BITS], &n, &length,
+                          &b[LENGTHS], &b[WEIGHTS], &b[PREFIXES], &b[CRT], &b[SIGNS], &b[DIGIT],
+                          &b[MASKS], &range, &smallest, &code.places, &b[WHOLE], &b[ODDS]))
         return NULL;
-    code.lengths = lengths.buf;
-    code.weights = weights.buf;
-    code.prefixes = prefixes.buf;
-    code.crt = crt.buf;
-    code.signs = signs.buf;
-    code.digit = digit.buf;
-    code.masks = masks.buf;
-    code.widest = masks.len / (Py_ssize_t)(SEQUENCES * BASE * sizeof(float));
+    code.lengths = b[LENGTHS].buf;
+    code.weights = b[WEIGHTS].buf;
+    code.prefixes = b[PREFIXES].buf;
+    code.crt = b[CRT].buf;
+    code.signs = b[SIGNS].buf;
+    code.digit = b[DIGIT].buf;
+    code.masks = b[MASKS].buf;
+    code.widest = b[MASKS].len / (Py_ssize_t)(SEQUENCES * BASE * sizeof(float));
     code.range = range;
     code.smallest = smallest;
     code.phases = log(PERIOD);
@@ -929,14 +944,14 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
     const int stored = scores && lines && phase;
     if (stored) {
         float *margin = scores + 4 * (size_t)length * PERIOD, *votes = margin + length;
-        int64_t *out = whole.buf;
-        double *evidence = odds.buf;
-        Py_BEGIN_ALLOW_THREADS
-        for (int k = 0; k < n; k++, out += 11, evidence += 4) {
+        int64_t *out = b[WHOLE].buf;
+        double *evidence = b[ODDS].buf;
+        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++, out += 11, evidence += 4)
+        {
             Axis axes[2];
-            read_window(&code, (const float *)x_bits.buf + k * size,
-                        (const float *)y_bits.buf + k * size, length, scores, lines, votes, phase,
-                        margin, out, axes, axes + 1);
+            read_window(&code, (const float *)b[X_BITS].buf + k * size,
+                        (const float *)b[Y_BITS].buf + k * size, length, scores, lines, votes,
+                        phase, margin, out, axes, axes + 1);
             for (int axis = 0; axis < 2; axis++) {
                 const Axis *a = axes + axis;
                 const int64_t row[5] = {a->place, a->shift, a->wrong, a->first, a->last};
@@ -950,19 +965,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
     free(scores);
     free((void *)lines);
     free(phase);
-    PyBuffer_Release(&x_bits);
-    PyBuffer_Release(&y_bits);
-    PyBuffer_Release(&lengths);
-    PyBuffer_Release(&weights);
-    PyBuffer_Release(&prefixes);
-    PyBuffer_Release(&crt);
-    PyBuffer_Release(&signs);
-    PyBuffer_Release(&digit);
-    PyBuffer_Release(&masks);
-    PyBuffer_Release(&whole);
-    PyBuffer_Release(&odds);
-    if (!stored) return PyErr_NoMemory();
-    Py_RETURN_NONE;
+    return done(b, BUFFERS, stored);
 }
 
 /* ---- From a place to a pose --------------------------------------------------------------- */
@@ -978,7 +981,7 @@ static int pose_of(const Code *code, const float *points, const uint8_t *valid, 
         {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
     static const int corners[4][2] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
     const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
-    const int(*turn)[2] = turns[window[4]], *corner = corners[window[4]], length = 2 * half;
+    const int (*turn)[2] = turns[window[4]], *corner = corners[window[4]], length = 2 * half;
     int64_t *columns = phases, *rows = phases + length;
     for (int k = 0; k < length; k++) {
         const int64_t at_x = remainder_of(x + k, code->range);
@@ -999,8 +1002,8 @@ static int pose_of(const Code *code, const float *points, const uint8_t *valid, 
         const int row_bit = code->signs[rows[row] + column] > 0;
         /* Up 00, left 10, right 01, down 11 (column bit, row bit). */
         const int dx = row_bit - column_bit, dy = row_bit + column_bit - 1;
-        const float du = uv[2 * i] - place[2 * i]
-                         - (float)offset * (float)(turn[0][0] * dx + turn[1][0] * dy);
+        const float du =
+            uv[2 * i] - place[2 * i] - (float)offset * (float)(turn[0][0] * dx + turn[1][0] * dy);
         const float dv = uv[2 * i + 1] - place[2 * i + 1]
                          - (float)offset * (float)(turn[0][1] * dx + turn[1][1] * dy);
         if (!(fabsf(du) < (float)tight && fabsf(dv) < (float)tight)) continue;
@@ -1049,21 +1052,40 @@ static int pose_of(const Code *code, const float *points, const uint8_t *valid, 
 
 static PyObject *poses(PyObject *self, PyObject *args)
 {
-    Py_buffer points, valid, uv, place, prior, windows, parameters, pose, covariance;
-    Py_buffer lengths, weights, prefixes, crt, signs, digit, masks;
+    enum {
+        POINTS,
+        VALID,
+        UV,
+        PLACE,
+        PRIOR,
+        WINDOWS,
+        FITTED,
+        POSE,
+        COVARIANCE,
+        LENGTHS,
+        WEIGHTS,
+        PREFIXES,
+        CRT,
+        SIGNS,
+        DIGIT,
+        MASKS,
+        BUFFERS
+    };
+    Py_buffer b[BUFFERS];
     int n, m, half, lens;
     long long range, smallest;
     double offset, tight, finest;
     Code code;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*iiipy*y*y*y*y*y*y*y*y*LLdddw*w*w*", &points, &valid, &uv,
-                          &place, &n, &m, &half, &lens, &prior, &windows, &lengths, &weights,
-                          &prefixes, &crt, &signs, &digit, &masks, &range, &smallest, &offset,
-                          &tight, &finest, &parameters, &pose, &covariance))
+    if (!PyArg_ParseTuple(args, "y*y*y*y*iiipy*y*y*y*y*y*y*y*y*LLdddw*w*w*", &b[POINTS], &b[VALID],
+                          &b[UV], &b[PLACE], &n, &m, &half, &lens, &b[PRIOR], &b[WINDOWS],
+                          &b[LENGTHS], &b[WEIGHTS], &b[PREFIXES], &b[CRT], &b[SIGNS], &b[DIGIT],
+                          &b[MASKS], &range, &smallest, &offset, &tight, &finest, &b[FITTED],
+                          &b[POSE], &b[COVARIANCE]))
         return NULL;
-    code.lengths = lengths.buf;
-    code.weights = weights.buf;
-    code.prefixes = prefixes.buf;
-    code.signs = signs.buf;
+    code.lengths = b[LENGTHS].buf;
+    code.weights = b[WEIGHTS].buf;
+    code.prefixes = b[PREFIXES].buf;
+    code.signs = b[SIGNS].buf;
     code.range = range;
     code.smallest = smallest;
     Projected *dots = malloc((size_t)m * sizeof(Projected));
@@ -1071,15 +1093,16 @@ static PyObject *poses(PyObject *self, PyObject *args)
     int64_t *phases = malloc(4 * (size_t)half * sizeof(int64_t));
     const int stored = dots && wanted && phases;
     if (stored) {
-        Py_BEGIN_ALLOW_THREADS
-        for (int k = 0; k < n; k++) {
+        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
+        {
             const size_t at = (size_t)k * m;
-            double *out = (double *)pose.buf + 3 * k, *spread = (double *)covariance.buf + 9 * k;
-            if (!pose_of(&code, (const float *)points.buf + 2 * at,
-                         (const uint8_t *)valid.buf + at, (const float *)uv.buf + 2 * at,
-                         (const float *)place.buf + 2 * at, m, half, lens, prior.buf,
-                         (const int64_t *)windows.buf + 5 * k, offset, tight, finest, dots,
-                         wanted, phases, (double *)parameters.buf + (size_t)k * PARAMETERS, out,
+            double *out = (double *)b[POSE].buf + 3 * k,
+                   *spread = (double *)b[COVARIANCE].buf + 9 * k;
+            if (!pose_of(&code, (const float *)b[POINTS].buf + 2 * at,
+                         (const uint8_t *)b[VALID].buf + at, (const float *)b[UV].buf + 2 * at,
+                         (const float *)b[PLACE].buf + 2 * at, m, half, lens, b[PRIOR].buf,
+                         (const int64_t *)b[WINDOWS].buf + 5 * k, offset, tight, finest, dots,
+                         wanted, phases, (double *)b[FITTED].buf + (size_t)k * PARAMETERS, out,
                          spread)) {
                 for (int i = 0; i < 3; i++) out[i] = NAN;
                 for (int i = 0; i < 9; i++) spread[i] = NAN;
@@ -1090,24 +1113,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     free(dots);
     free(wanted);
     free(phases);
-    PyBuffer_Release(&points);
-    PyBuffer_Release(&valid);
-    PyBuffer_Release(&uv);
-    PyBuffer_Release(&place);
-    PyBuffer_Release(&prior);
-    PyBuffer_Release(&windows);
-    PyBuffer_Release(&lengths);
-    PyBuffer_Release(&weights);
-    PyBuffer_Release(&prefixes);
-    PyBuffer_Release(&crt);
-    PyBuffer_Release(&signs);
-    PyBuffer_Release(&digit);
-    PyBuffer_Release(&masks);
-    PyBuffer_Release(&parameters);
-    PyBuffer_Release(&pose);
-    PyBuffer_Release(&covariance);
-    if (!stored) return PyErr_NoMemory();
-    Py_RETURN_NONE;
+    return done(b, BUFFERS, stored);
 }
 
 static PyMethodDef methods[] = {
@@ -1121,8 +1127,15 @@ static PyMethodDef methods[] = {
 };
 
 static struct PyModuleDef module = {
-    PyModuleDef_HEAD_INIT, "_kernels", "Hot loops of locatk.core.", -1, methods,
-    NULL, NULL, NULL, NULL,
+    PyModuleDef_HEAD_INIT,
+    "_kernels",
+    "Hot loops of locatk.core.",
+    -1,
+    methods,
+    NULL,
+    NULL,
+    NULL,
+    NULL,
 };
 
 PyMODINIT_FUNC PyInit__kernels(void) { return PyModule_Create(&module); }
