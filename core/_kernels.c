@@ -112,7 +112,8 @@ HOT static void smooth_image(const uint8_t *restrict image, int h, int w, const 
     }
 }
 
-/* Marks (1) where a pixel is the least of the 5 x 5 about it; the rim of two is not looked at. */
+/* Marks (1) where a pixel is the least of the 5 x 5 about it, and of equal ones the first; the
+ * rim of two is not looked at. */
 HOT static void mark_minima(const float *restrict smooth, int h, int w, float *restrict across,
                             uint8_t *restrict marks)
 {
@@ -120,16 +121,19 @@ HOT static void mark_minima(const float *restrict smooth, int h, int w, float *r
         const float *restrict s = smooth + (size_t)y * w;
         float *restrict m = across + (size_t)y * w;
         for (int x = 2; x < w - 2; x++)
-            m[x] =
-                smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])), s[x]);
+            m[x] = smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])),
+                           s[x]);
     }
     for (int y = 2; y < h - 2; y++) {
         const float *restrict a = across + (size_t)(y - 2) * w, *restrict b = a + w;
-        const float *restrict c = b + w, *restrict d = c + w, *restrict e = d + w;
+        const float *restrict d = a + 3 * w, *restrict e = a + 4 * w;
         const float *restrict s = smooth + (size_t)y * w;
         uint8_t *restrict mark = marks + (size_t)y * w;
-        for (int x = 2; x < w - 2; x++)
-            mark[x] = s[x] == smaller(smaller(smaller(a[x], b[x]), smaller(d[x], e[x])), c[x]);
+        for (int x = 2; x < w - 2; x++) {
+            const float before = smaller(smaller(a[x], b[x]), smaller(s[x - 2], s[x - 1]));
+            const float after = smaller(smaller(d[x], e[x]), smaller(s[x + 1], s[x + 2]));
+            mark[x] = (s[x] < before) & (s[x] <= after);
+        }
     }
 }
 
@@ -565,20 +569,21 @@ static int fit(const float *points, const uint8_t *valid, int m, int lens, const
     const float gate = (float)rules->gate, tight = (float)rules->tight;
     const float offset = (float)rules->offset;
     if (!seed(points, valid, m, rules, wanted, middle, parameters)) return 0;
-    for (int r = 0; r < rules->rings; r++) {
+    for (int r = 0, beyond = 1; r < rules->rings && beyond; r++) {
         const float ring = (float)(rules->ring[r] * rules->ring[r]);
         project(parameters, points, m, dots);
+        beyond = 0;
         for (int i = 0; i < m; i++) {
             const float u = rintf(dots[i].u), v = rintf(dots[i].v);
             const float du = dots[i].u - u, dv = dots[i].v - v;
-            const int use =
-                valid[i] && fabsf(du) < gate && fabsf(dv) < gate && u * u + v * v < ring;
+            const int near = u * u + v * v < ring;
+            const int use = valid[i] && near && fabsf(du) < gate && fabsf(dv) < gate;
+            beyond |= valid[i] && !near;
             wanted[2 * i] = use ? -du : NAN;
             wanted[2 * i + 1] = -dv;
         }
-        if (!step(parameters, dots, wanted, m, rules->loose,
-                  lens && rules->ring[r] > rules->bent_from, rules->prior))
-            return 0;
+        const int bent = lens && rules->ring[r] > rules->bent_from;
+        if (!step(parameters, dots, wanted, m, rules->loose, bent, rules->prior)) return 0;
     }
     for (int last = 0; last < 3; last++) {
         project(parameters, points, m, dots);
@@ -727,12 +732,13 @@ typedef struct {
     const int8_t *digit; /* (4, 63) digit of each difference, -1 where there is none */
     const float *masks;  /* (4, 3, widest) whether a place has a digit, repeated beyond the end */
     int64_t range, smallest, widest;
-    double places, phases; /* logarithms of how many there are */
+    double places;           /* logarithm of how many there are */
+    double free[PERIOD + 1]; /* what a line says of which so many phases are likely */
 } Code;
 
 typedef struct {
     int64_t place, shift, wrong, first, last;
-    double odds, order;
+    double odds, order, lead;
 } Axis;
 
 static inline int64_t remainder_of(int64_t a, int64_t b)
@@ -774,6 +780,7 @@ HOT static void vote(const Code *code, const float *const *scores, int lines, fl
         margin[i] = top - next;
     }
     int64_t place = 0;
+    axis->lead = DBL_MAX;
     for (int k = 0; k < SEQUENCES; k++) {
         const int length = (int)code->lengths[k];
         memset(votes, 0, (size_t)length * sizeof(float));
@@ -787,8 +794,15 @@ HOT static void vote(const Code *code, const float *const *scores, int lines, fl
             for (int q = 0; q < length; q++) votes[q] += weight * mask[q];
         }
         int best = 0;
-        for (int q = 1; q < length; q++)
-            if (votes[q] > votes[best]) best = q;
+        float second = -1;
+        for (int q = 1; q < length; q++) {
+            if (votes[q] > votes[best]) {
+                second = votes[best];
+                best = q;
+            } else if (votes[q] > second)
+                second = votes[q];
+        }
+        if (votes[best] - second < axis->lead) axis->lead = votes[best] - second;
         place = (place + code->crt[k] * best) % code->range;
     }
     axis->place = place;
@@ -801,14 +815,16 @@ HOT static void vote(const Code *code, const float *const *scores, int lines, fl
     for (int k = 1; k < PERIOD; k++)
         if (ballots[k] > ballots[best]) best = k;
     axis->shift = best;
-    /* Against lines of the main sequence in any order: what it costs to have this one. */
+    /* Against lines of the main sequence in any order, each at one of its likely phases. */
     axis->order = -code->places;
     for (int i = 0; i < lines; i++) {
         const float top = scores[i][phase[i]];
         if (top <= 0) continue;
+        int likely = 0;
+        for (int k = 0; k < PERIOD; k++) likely += scores[i][k] > top - 2;
         const int64_t ahead = phase_at(code, (place + i) % code->range);
         const float here = scores[i][remainder_of(ahead + best, PERIOD)];
-        axis->order += code->phases - 0.5 * (double)(top - here);
+        axis->order += code->free[likely] - 0.5 * (double)(top - here);
     }
 }
 
@@ -936,7 +952,8 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
     code.widest = b[MASKS].len / (Py_ssize_t)(SEQUENCES * BASE * sizeof(float));
     code.range = range;
     code.smallest = smallest;
-    code.phases = log(PERIOD);
+    code.free[0] = 0;
+    for (int k = 1; k <= PERIOD; k++) code.free[k] = log((double)PERIOD / k);
     const size_t size = (size_t)length * length;
     float *scores = malloc((4 * (size_t)length * PERIOD + (size_t)length + 512) * sizeof(float));
     const float **lines = malloc((size_t)length * sizeof(float *));
@@ -946,7 +963,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
         float *margin = scores + 4 * (size_t)length * PERIOD, *votes = margin + length;
         int64_t *out = b[WHOLE].buf;
         double *evidence = b[ODDS].buf;
-        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++, out += 11, evidence += 4)
+        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++, out += 11, evidence += 6)
         {
             Axis axes[2];
             read_window(&code, (const float *)b[X_BITS].buf + k * size,
@@ -958,6 +975,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
                 memcpy(out + 1 + 5 * axis, row, sizeof(row));
                 evidence[axis] = a->odds;
                 evidence[2 + axis] = a->order;
+                evidence[4 + axis] = a->lead;
             }
         }
         Py_END_ALLOW_THREADS

@@ -101,12 +101,17 @@ def find_dots_numpy(images: NDArray[np.uint8], most: int = 4096) -> Dots:
     minima = np.zeros((n, h, w), bool)
     rows, columns = h // PAPER, w // PAPER
     paper = np.empty((n, rows, columns), np.float32)
-    kernel = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    # Of equal minima the first counts: pixels before it have to be brighter.
+    before = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    before.ravel()[before.size // 2 :] = 0
+    after = np.ascontiguousarray(before[::-1, ::-1])
     core = np.s_[REACH : h - REACH, REACH : w - REACH]
     size = (2 * REACH + 1, 2 * REACH + 1)
     for k, image in enumerate(images):
         cv2.GaussianBlur(image.astype(np.float32), size, SMOOTHING_PX, dst=smooth[k])
-        np.equal(smooth[k][core], cv2.erode(smooth[k], kernel)[core], out=minima[k][core])
+        least = smooth[k] < cv2.erode(smooth[k], before)
+        least &= smooth[k] <= cv2.erode(smooth[k], after)
+        minima[k][core] = least[core]
         whole = image[: rows * PAPER, : columns * PAPER]  # other ratios cost ten times as much
         small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
         cv2.blur(small.astype(np.float32), (PAPER_REACH, PAPER_REACH), dst=paper[k])

@@ -46,6 +46,12 @@ UNLISTED = 3.0
 SURE = 40.0
 """Log odds from which no other place can come near, wrong bits or not."""
 
+MANY = 0.08
+"""Share of wrong bits from which another place may be as near, whatever the odds."""
+
+AHEAD = 10.0
+"""Votes by which a place leads that no other can share; the margin of a line or less."""
+
 NARROW = 16
 """Columns up to which a window is worth a second look when it cannot be read."""
 
@@ -72,7 +78,8 @@ class Decoded:
     confidence : (n,) float64 ndarray
         Probability that the answer is right; accept from :data:`THRESHOLD` on.
     border : (n,) bool ndarray
-        Whether dots are seen on both sides of the border of a section.
+        Whether dots are seen on both sides of the border of a section; such a window has no
+        confidence.
     """
 
     x: NDArray[np.int64]
@@ -156,7 +163,9 @@ def _decode_soft(
         for mine, its in zip(reading, other, strict=True):
             mine[doubtful[better]] = its[better]
         confidence[doubtful[better]] = other_confidence[better]
-    return _decoded(reading, confidence, np.count_nonzero(x_bits, axis=(1, 2)))
+    _, rows, columns = column_bits.shape
+    length = x_bits.shape[1]
+    return _decoded(reading, confidence, x_bits, (length - rows, length - columns))
 
 
 def _settle(
@@ -165,15 +174,18 @@ def _settle(
     """Confidence (n,) of a reading; in doubt a search finds a better one, put in its place."""
     rivals = np.zeros_like(reading.odds)
     for axis in range(2):
-        doubtful = np.flatnonzero((reading.odds[:, axis] < SURE) & (reading.wrong[:, axis] > 0))
+        odds, wrong = reading.odds[:, axis], reading.wrong[:, axis]
+        bits = np.count_nonzero(y_bits if axis else x_bits, axis=(1, 2))
+        weak = (wrong > 0) & ((odds < SURE) | (wrong > MANY * bits))
+        doubtful = np.flatnonzero((reading.lead[:, axis] < AHEAD) | weak)
         if not len(doubtful):
             continue
         printed = turned(x_bits[doubtful], y_bits[doubtful], reading.rotation[doubtful])
-        bits = printed[1] if axis else printed[0].transpose(0, 2, 1)
-        fits, narrow = scores(bits), x_bits.shape[1] <= NARROW
+        lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
+        fits, narrow = scores(lines), x_bits.shape[1] <= NARROW
         place, shift, rivals[doubtful, axis] = search(fits, codec, narrow=narrow)
         reading.place[doubtful, axis], reading.shift[doubtful, axis] = place, shift
-        odds, wrong = compare(place, shift, bits, codec)
+        odds, wrong = compare(place, shift, lines, codec)
         reading.odds[doubtful, axis], reading.wrong[doubtful, axis] = odds, wrong
         reading.order[doubtful, axis] = in_order(place, shift, fits, codec)
     with np.errstate(over="ignore"):
@@ -182,21 +194,31 @@ def _settle(
     return result
 
 
-def _decoded(reading: Reading, confidence: NDArray[np.float64], dots: NDArray[np.int64]) -> Decoded:
+def _decoded(
+    reading: Reading,
+    confidence: NDArray[np.float64],
+    bits: NDArray[np.float32],
+    unused: tuple[int, int],
+) -> Decoded:
+    """``bits`` are those of the square window; the last ``unused`` rows, columns are filling."""
     place = reading.place
     # A corner that no dot holds may lie before the first place.
     wraps = place + reading.first >= RANGE
     straddles: NDArray[np.bool_] = ~wraps & (reading.last >= 0) & (place + reading.last >= RANGE)
     at = np.where(wraps, place - RANGE, place)
+    # Which printed sides the filling lies before, seen below and to the right, by rotation.
+    rows, columns = unused
+    before = np.array([[0, 0], [rows, 0], [columns, rows], [0, columns]])[reading.rotation]
+    border = straddles[:, 0] | straddles[:, 1]
     return Decoded(
-        x=at[:, 0],
-        y=at[:, 1],
-        section=(reading.shift - place[:, ::-1]) % PERIOD,
+        x=at[:, 0] + before[:, 0],
+        y=at[:, 1] + before[:, 1],
+        section=(reading.shift - at[:, ::-1]) % PERIOD,
         rotation=reading.rotation,
-        dots=dots,
+        dots=np.count_nonzero(bits, axis=(1, 2)),
         corrected=reading.wrong.sum(axis=1),
-        confidence=confidence,
-        border=straddles[:, 0] | straddles[:, 1],
+        confidence=np.where(border, 0.0, confidence),
+        border=border,
     )
 
 

@@ -20,8 +20,8 @@ from locatk.core.kernels import kernels
 SEEDS = 40
 """Dots in the middle of the frame from which the lattice is seeded."""
 
-RINGS = (3.2, 6.0, 9.0, np.inf)
-"""Radii in pitches up to which dots are used while the lattice grows."""
+RINGS = (3.2, 6.0, 9.0, 14.0, 20.0, 28.0, 40.0, np.inf)
+"""Radii in pitches up to which dots are used while the lattice grows; as many as it takes."""
 
 GATE = 0.36
 """Largest distance of a dot from its place, per axis and in pitches; dots lie at 1/6."""

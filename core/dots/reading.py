@@ -46,6 +46,8 @@ class Reading(NamedTuple):
     order : (n, 2) float64 ndarray
         The same against columns (or rows) of the main sequence in any order, as a sheet of
         another codec has them.
+    lead : (n, 2) float64 ndarray
+        Least votes, over the four sequences, by which the best residue is ahead.
     """
 
     rotation: NDArray[np.int64]
@@ -56,6 +58,7 @@ class Reading(NamedTuple):
     last: NDArray[np.int64]
     odds: NDArray[np.float64]
     order: NDArray[np.float64]
+    lead: NDArray[np.float64]
 
 
 def read(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec) -> Reading:
@@ -63,7 +66,7 @@ def read(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec)
     if kernels is None:
         return read_numpy(x_bits, y_bits, codec)
     n, length, _ = x_bits.shape
-    whole, odds = np.empty((n, 11), np.int64), np.empty((n, 4))
+    whole, odds = np.empty((n, 11), np.int64), np.empty((n, 6))
     kernels.read_windows(
         np.ascontiguousarray(x_bits),
         np.ascontiguousarray(y_bits),
@@ -73,7 +76,8 @@ def read(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec)
         *(whole, odds),
     )
     place, shift, wrong, first, last = np.moveaxis(whole[:, 1:].reshape(n, 2, 5), 2, 0)
-    return Reading(whole[:, 0], place, shift, wrong, first, last, odds[:, :2], odds[:, 2:])
+    evidence = np.moveaxis(odds.reshape(n, 3, 2), 1, 0)
+    return Reading(whole[:, 0], place, shift, wrong, first, last, *evidence)
 
 
 def read_numpy(x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec) -> Reading:
@@ -107,17 +111,17 @@ def read_turned(
     answers = []
     for bits in (printed[0].transpose(0, 2, 1), printed[1]):
         fits = scores(bits)
-        place, shift = vote(fits, codec)
+        place, shift, lead = vote(fits, codec)
         odds, wrong = compare(place, shift, bits, codec)
         order = in_order(place, shift, fits, codec)
         seen = (bits != 0).any(axis=2)
         first = np.where(seen.any(axis=1), seen.argmax(axis=1), seen.shape[1])
         last = np.where(seen.any(axis=1), seen.shape[1] - 1 - seen[:, ::-1].argmax(axis=1), -1)
-        answers.append((place, shift, wrong, first, last, odds, order))
-    place, shift, wrong, first, last, odds, order = (
+        answers.append((place, shift, wrong, first, last, odds, order, lead))
+    place, shift, wrong, first, last, odds, order, lead = (
         np.stack(pair, axis=1) for pair in zip(*answers, strict=True)
     )
-    return Reading(rotation, place, shift, wrong, first, last, odds, order)
+    return Reading(rotation, place, shift, wrong, first, last, odds, order, lead)
 
 
 @functools.lru_cache(8)
@@ -148,29 +152,35 @@ def turned(
     return x, y
 
 
-def vote(scores: NDArray[np.float32], codec: Codec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Place (n,) and shift of the phases (n,) by the likeliest phase of each column."""
+def vote(
+    scores: NDArray[np.float32], codec: Codec
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Place, shift of the phases and lead (n,) by the likeliest phase of each column."""
     n, length, _ = scores.shape
     phase = scores.argmax(axis=2)
-    top = np.take_along_axis(scores, phase[..., None], axis=2)[..., 0]
-    rivals = scores.copy()
-    np.put_along_axis(rivals, phase[..., None], -np.inf, axis=2)
-    margin = top - rivals.max(axis=2)
+    best_two = np.partition(scores, PERIOD - 2, axis=2)[..., -2:]
+    margin = best_two[..., 1] - best_two[..., 0]
 
     difference = (phase[:, 1:] - phase[:, :-1]) % PERIOD
     weight = np.minimum(margin[:, 1:], margin[:, :-1])
-    residues = np.empty((n, 4), np.int64)
-    for k, (digits, votes) in enumerate(
-        zip(digit_tables(), ballot_tables(codec, length - 1), strict=True)
-    ):
-        ballot = digits[difference] * weight[..., None]
-        residues[:, k] = (ballot.reshape(n, -1) @ votes).argmax(axis=1)
+    residues, lead = np.empty((n, 4), np.int64), np.full(n, np.inf)
+    tables = zip(digit_tables(), ballot_tables(codec, length - 1), strict=True)
+    for k, (digits, places) in enumerate(tables):
+        votes = (digits[difference] * weight[..., None]).reshape(n, -1) @ places
+        residues[:, k] = votes.argmax(axis=1)
+        best_two = np.partition(votes, votes.shape[1] - 2, axis=1)[:, -2:]
+        lead = np.minimum(lead, best_two[:, 1] - best_two[:, 0])
     place = codec.place(residues)
-    shifts = (phase - codec.phases(place[:, None] + np.arange(length))) % PERIOD
+    shifts = (phase - phases_ahead(place, length, codec)) % PERIOD
     ballots = np.bincount(
         (shifts + PERIOD * np.arange(n)[:, None]).ravel(), margin.ravel(), PERIOD * n
     )
-    return place, ballots.reshape(n, PERIOD).argmax(axis=1)
+    return place, ballots.reshape(n, PERIOD).argmax(axis=1), lead
+
+
+def phases_ahead(place: NDArray[np.int64], length: int, codec: Codec) -> NDArray[np.int64]:
+    """(..., length) phases of the lines from ``place`` on, around the range's end."""
+    return codec.phases((place[..., None] + np.arange(length)) % RANGE)
 
 
 def compare(
@@ -178,8 +188,7 @@ def compare(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Log odds (n,) that ``bits`` are those at ``place``, and how many of them are wrong."""
     n, length, _ = bits.shape
-    steps = np.arange(length)
-    phase = codec.phases(place[:, None] + steps) + shift[:, None]
+    phase = phases_ahead(place, length, codec) + shift[:, None]
     window, column, row = np.nonzero(bits)
     agreement = bits[window, column, row] * SIGNS[(phase[window, column] + row) % PERIOD]
     gain = math.log(2) - np.log1p(np.exp(-agreement))
@@ -196,14 +205,15 @@ def in_order(
 ) -> NDArray[np.float64]:
     """Log odds (n,) of the lines at ``place`` against lines of the main sequence in any order.
 
-    A line that is free takes its best phase, one of 63; one of the code has no choice, once
-    the place is chosen. ``fits`` are :func:`scores`.
+    A line that is free takes one of its likely phases (those within a factor e of the best),
+    of 63; one of the code has no choice, once the place is chosen. So a line of few dots,
+    which fits many phases, says little. ``fits`` are :func:`scores`.
     """
-    length = fits.shape[1]
-    phase = (codec.phases(place[:, None] + np.arange(length)) + shift[:, None]) % PERIOD
+    phase = (phases_ahead(place, fits.shape[1], codec) + shift[:, None]) % PERIOD
     here = np.take_along_axis(fits, phase[..., None], axis=2)[..., 0].astype(np.float64)
     top = fits.max(axis=2)
-    gain = np.where(top > 0, math.log(PERIOD) - 0.5 * (top - here), 0.0)
+    likely = (fits > top[..., None] - 2).sum(axis=2)
+    gain = np.where(top > 0, np.log(PERIOD / likely) - 0.5 * (top - here), 0.0)
     result: NDArray[np.float64] = gain.sum(axis=1) - PLACES
     return result
 

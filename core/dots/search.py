@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.codec import PERIOD, Codec
-from locatk.core.dots.reading import ballot_tables, digit_tables
+from locatk.core.dots.reading import ballot_tables, digit_tables, phases_ahead
 
 LIST = 6
 """Residues of each secondary sequence that are joined into candidates."""
@@ -46,8 +46,8 @@ def search(
         places = np.concatenate([places, _by_misread_columns(scores, codec)], axis=1)
     places = np.sort(places, axis=1)
     again = places[:, 1:] == places[:, :-1]
+    phases = phases_ahead(places, length, codec)
     steps = np.arange(length)
-    phases = codec.phases(places[..., None] + steps)
     # One shift at a time: (n, candidates, length) scores are picked for each of 63.
     row = np.arange(n)[:, None, None]
     joint = np.stack(

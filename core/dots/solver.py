@@ -24,8 +24,8 @@ from locatk.core.trajectory import Trajectory
 
 METHODS = ("lattice", "paper")
 
-LOADED = 256
-"""Frames that are in memory at once."""
+LOADED = 6_000_000
+"""Pixels of frames of one size that are in memory at once."""
 
 RIM = 12.0
 """Pitches by which the middle of a frame may lie outside of the printed area whose dots
@@ -116,20 +116,25 @@ def _batches(
     frames: Frames, rejected: NDArray[np.object_], camera: Camera | None
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
     """Frames of one size at a time, with their indices; what is wrong goes to ``rejected``."""
-    for start in range(0, len(frames), LOADED):
-        by_size: dict[tuple[int, ...], list[tuple[int, NDArray[np.uint8]]]] = {}
-        for index in range(start, min(start + LOADED, len(frames))):
-            try:
-                image = frames.images[index]
-            except InputError:
-                rejected[index] = UNREADABLE
-                continue
-            if camera is not None and image.shape != camera.size[::-1]:
-                rejected[index] = OTHER_SIZE
-                continue
-            by_size.setdefault(image.shape, []).append((index, image))
-        for found in by_size.values():
-            yield np.array([index for index, _ in found]), np.stack([image for _, image in found])
+    held: dict[tuple[int, ...], list[int]] = {}
+    images: dict[int, NDArray[np.uint8]] = {}
+    for index in range(len(frames)):
+        try:
+            image = frames.images[index]
+        except InputError:
+            rejected[index] = UNREADABLE
+            continue
+        if camera is not None and image.shape != camera.size[::-1]:
+            rejected[index] = OTHER_SIZE
+            continue
+        images[index] = image
+        same = held.setdefault(image.shape, [])
+        same.append(index)
+        if len(same) * image.size >= LOADED:
+            yield np.array(same), np.stack([images.pop(k) for k in same])
+            same.clear()
+    for same in filter(None, held.values()):
+        yield np.array(same), np.stack([images.pop(k) for k in same])
 
 
 def _locate_paper(images: NDArray[np.uint8], code: Codec, camera: Camera | None = None) -> Located:
@@ -255,7 +260,7 @@ def _notes(
         )
     if rejected["no_code"] > max(3, sum(rejected.values()) // 2):
         notes.append(
-            f"{rejected['no_code']} frames show dots on a grid, but no place of the codec "
-            f"{manifest.codec!r}: was the sheet printed with another?"
+            f"{rejected['no_code']} frames show no place of the codec {manifest.codec!r}: no "
+            "pattern in sight, or a sheet printed with another codec"
         )
     return tuple(notes)
