@@ -199,10 +199,25 @@ static float median_dot(float *contrasts, int count, int fewest, int splits)
     return contrasts[count - 1 - (count - 1) / 2];
 }
 
-static float peak(const float *at, int step, float light, float contrast, float top)
+/* Slope of a plane through the paper's brightness, in grey levels a pixel along one axis. */
+static float slope_of(const float *paper, int count, int step, int across, int across_step,
+                      int block)
+{
+    double sum = 0, squares = 0;
+    for (int k = 0; k < count; k++) {
+        const double from_middle = k - (count - 1) / 2.0;
+        double line = 0;
+        for (int j = 0; j < across; j++) line += paper[k * step + j * across_step];
+        sum += line / across * from_middle;
+        squares += from_middle * from_middle;
+    }
+    return (float)(sum / (squares > 1 ? squares : 1) / block);
+}
+
+static float peak(const float *at, int step, float light, float slope, float contrast, float top)
 {
     const float least = 0.05f * contrast;
-    const float before = light - at[-step], after = light - at[step];
+    const float before = light - slope - at[-step], after = light + slope - at[step];
     const float a = logf(before > least ? before : least);
     const float b = logf(after > least ? after : least);
     float bend = 2 * top - a - b;
@@ -212,13 +227,13 @@ static float peak(const float *at, int step, float light, float contrast, float 
 }
 
 typedef struct {
-    float x, y, contrast;
+    float x, y, contrast, off; /* off: square distance from the middle */
 } Dot;
 
-static int darker_first(const void *a, const void *b)
+static int middle_first(const void *a, const void *b)
 {
-    const float x = ((const Dot *)a)->contrast, y = ((const Dot *)b)->contrast;
-    return (x < y) - (x > y);
+    const float x = ((const Dot *)a)->off, y = ((const Dot *)b)->off;
+    return (x > y) - (x < y);
 }
 
 typedef struct {
@@ -259,17 +274,23 @@ static int dots_of(const Finder *f, const uint8_t *image, float *xy)
     }
     memcpy(f->across, f->contrasts, (size_t)minima * sizeof(float));
     const float bar = f->share * median_dot(f->across, minima, f->fewest, f->splits);
+    const int rows = f->rows, columns = f->columns;
+    const float slope_x = slope_of(f->paper, columns, 1, rows, columns, f->block);
+    const float slope_y = slope_of(f->paper, rows, columns, columns, 1, f->block);
     int kept = 0;
     for (int k = 0; k < minima; k++) {
         if (!(f->contrasts[k] > bar)) continue;
         const float light = f->lights[k], contrast = dots[k].contrast, top = logf(contrast);
         const float *at = f->smooth + (size_t)dots[k].y * w + (size_t)dots[k].x;
-        dots[kept].x = dots[k].x + peak(at, 1, light, contrast, top);
-        dots[kept].y = dots[k].y + peak(at, w, light, contrast, top);
-        dots[kept++].contrast = contrast;
+        const float x = dots[k].x + peak(at, 1, light, slope_x, contrast, top);
+        const float y = dots[k].y + peak(at, w, light, slope_y, contrast, top);
+        const float dx = x - 0.5f * (float)(w - 1), dy = y - 0.5f * (float)(h - 1);
+        dots[kept].x = x;
+        dots[kept].y = y;
+        dots[kept++].off = dx * dx + dy * dy;
     }
     if (kept > f->most) {
-        qsort(dots, (size_t)kept, sizeof(Dot), darker_first);
+        qsort(dots, (size_t)kept, sizeof(Dot), middle_first);
         kept = f->most;
     }
     for (int k = 0; k < kept; k++) {

@@ -64,7 +64,7 @@ class Dots:
 
 
 def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
-    """Dots of each of (n, h, w) grey images; of more than ``most`` the darkest.
+    """Dots of each of (n, h, w) grey images; of more than ``most`` those in the middle.
 
     The position is the top of a Gaussian through the minimum and its neighbours.
     """
@@ -131,9 +131,23 @@ def find_dots_numpy(images: NDArray[np.uint8], most: int = 4096) -> Dots:
     relative = contrast / light
     keep = relative > (SHARE * _typical(relative, frame, n))[frame]
     at, frame, light, contrast = at[keep], frame[keep], light[keep], contrast[keep]
-    x = column[keep] + _peak(flat, at, 1, light, contrast)
-    y = row[keep] + _peak(flat, at, w, light, contrast)
-    return _padded(frame, x, y, contrast, n, most)
+    slope_y, slope_x = _slopes(paper)
+    x = column[keep] + _peak(flat, at, 1, light, contrast, slope_x[frame])
+    y = row[keep] + _peak(flat, at, w, light, contrast, slope_y[frame])
+    return _padded(frame, x, y, (w - 1) / 2, (h - 1) / 2, n, most)
+
+
+def _slopes(paper: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(n,) grey levels a pixel by which the paper brightens downwards and to the right.
+
+    Of a plane through the whole frame: light from a side would move the tops of all dots.
+    """
+    slopes = []
+    for axis in (1, 2):
+        steps = np.arange(paper.shape[axis]) - (paper.shape[axis] - 1) / 2
+        profile = paper.mean(axis=3 - axis) @ steps
+        slopes.append((profile / max(float(steps @ steps), 1.0) / PAPER).astype(np.float32))
+    return slopes[0], slopes[1]
 
 
 def _typical(contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int) -> NDArray[np.float32]:
@@ -171,11 +185,12 @@ def _peak(
     step: int,
     light: NDArray[np.float32],
     contrast: NDArray[np.float32],
+    slope: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     """Offset of the top of a Gaussian through three samples, within half a pixel."""
     floor = 0.05 * contrast
-    before = np.log(np.maximum(light - flat[at - step], floor))
-    after = np.log(np.maximum(light - flat[at + step], floor))
+    before = np.log(np.maximum(light - slope - flat[at - step], floor))
+    after = np.log(np.maximum(light + slope - flat[at + step], floor))
     bend = 2 * np.log(contrast) - before - after
     offset = 0.5 * (after - before) / np.maximum(bend, 1e-6)
     result: NDArray[np.float32] = np.clip(offset, -0.5, 0.5)
@@ -186,16 +201,17 @@ def _padded(
     frame: NDArray[np.intp],
     x: NDArray[np.float32],
     y: NDArray[np.float32],
-    contrast: NDArray[np.float32],
+    middle_x: float,
+    middle_y: float,
     n: int,
     most: int,
 ) -> Dots:
     counts = np.bincount(frame, minlength=n)
     if counts.max(initial=0) > most:
-        order = np.lexsort((-contrast, frame))
+        order = np.lexsort(((x - middle_x) ** 2 + (y - middle_y) ** 2, frame))
         rank = np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame[order]]
         kept = np.sort(order[rank < most])
-        return _padded(frame[kept], x[kept], y[kept], contrast[kept], n, most)
+        return _padded(frame[kept], x[kept], y[kept], middle_x, middle_y, n, most)
     m = max(int(counts.max(initial=0)), 1)
     slot = np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame]
     xy = np.zeros((n, m, 2), np.float32)

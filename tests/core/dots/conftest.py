@@ -108,7 +108,10 @@ class Shot:
             shifts = [np.array([[1, 0, math.cos(way) * s], [0, 1, math.sin(way) * s]])
                       for s in steps]  # fmt: skip
             small = np.mean(
-                [cv2.warpAffine(small, s, self.size, borderMode=cv2.BORDER_REFLECT) for s in shifts],
+                [
+                    cv2.warpAffine(small, s, self.size, borderMode=cv2.BORDER_REFLECT)
+                    for s in shifts
+                ],
                 axis=0,
             )
         gx, gy = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
@@ -186,4 +189,3 @@ def shoot() -> Callable[..., Image]:
 def shot() -> Callable[..., Shot]:
     """The class :class:`Shot`."""
     return Shot
-

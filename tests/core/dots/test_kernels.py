@@ -62,7 +62,7 @@ def test_dots_are_the_same(seed: int) -> None:
 
 
 @needs_kernels
-def test_the_darkest_dots_are_kept() -> None:
+def test_dots_in_the_middle_are_kept() -> None:
     images = drawn(3)
     for found in (blobs.find_dots(images, 50), blobs.find_dots_numpy(images, 50)):
         assert found.counts.tolist() == [50] * len(images)
