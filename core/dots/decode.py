@@ -37,6 +37,9 @@ from locatk.core.errors import InputError
 THRESHOLD = 0.999
 """Least confidence of an accepted answer."""
 
+ENOUGH = math.log(THRESHOLD / (1 - THRESHOLD))
+"""Log odds of :data:`THRESHOLD`."""
+
 STRANGE = 0.01
 """How much likelier than a sheet of another codec it is to see one of this."""
 
@@ -175,14 +178,21 @@ def _settle(
     rivals = np.zeros_like(reading.odds)
     for axis in range(2):
         odds, wrong = reading.odds[:, axis], reading.wrong[:, axis]
-        bits = np.count_nonzero(y_bits if axis else x_bits, axis=(1, 2))
-        weak = (wrong > 0) & ((odds < SURE) | (wrong > MANY * bits))
-        doubtful = np.flatnonzero((reading.lead[:, axis] < AHEAD) | weak)
+        doubt = (wrong > 0) & (odds < SURE) | (reading.lead[:, axis] < AHEAD)
+        if wrong.any():
+            doubt |= wrong > MANY * np.count_nonzero(x_bits, axis=(1, 2))
+        doubtful = np.flatnonzero(doubt)
         if not len(doubtful):
             continue
         printed = turned(x_bits[doubtful], y_bits[doubtful], reading.rotation[doubtful])
         lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
         fits, narrow = scores(lines), x_bits.shape[1] <= NARROW
+        # Evidence if every line were at its best phase: where that is not enough, no place is.
+        bound = 0.5 * fits.max(axis=2).sum(axis=1) - np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
+        hope = bound > PLACES + ENOUGH
+        if not hope.any():
+            continue
+        doubtful, lines, fits = doubtful[hope], lines[hope], fits[hope]
         place, shift, rivals[doubtful, axis] = search(fits, codec, narrow=narrow)
         reading.place[doubtful, axis], reading.shift[doubtful, axis] = place, shift
         odds, wrong = compare(place, shift, lines, codec)

@@ -166,7 +166,7 @@ def vote(
     residues, lead = np.empty((n, 4), np.int64), np.full(n, np.inf)
     tables = zip(digit_tables(), ballot_tables(codec, length - 1), strict=True)
     for k, (digits, places) in enumerate(tables):
-        votes = (digits[difference] * weight[..., None]).reshape(n, -1) @ places
+        votes = (digits[difference] * weight[..., None]).reshape(n, len(places)) @ places
         residues[:, k] = votes.argmax(axis=1)
         best_two = np.partition(votes, votes.shape[1] - 2, axis=1)[:, -2:]
         lead = np.minimum(lead, best_two[:, 1] - best_two[:, 0])
