@@ -211,25 +211,25 @@ def test_nothing_to_decode() -> None:
 @pytest.mark.parametrize(("side", "share"), [(10, 0.1), (12, 0.3), (16, 0.5)])
 def test_missing_dots(side: int, share: float) -> None:
     rng = np.random.default_rng(6)
-    windows = Windows("anoto", rng, 1000, side, side).turned(1)
+    windows = Windows("anoto", rng, 400, side, side).turned(1)
     gone = rng.random(windows.symbols.shape) < share
     found = decode(*hidden(soft(windows.symbols), gone), codec("anoto"))
     took, right = accepted(found), windows.right(found)
-    assert (took & right).sum() >= 990
-    assert (took & ~right).sum() <= 1
+    assert (took & right).sum() >= 394
+    assert (took & ~right).sum() == 0
     np.testing.assert_array_equal(found.dots, (~gone).sum(axis=(1, 2)))
 
 
-@pytest.mark.parametrize(("wrong", "least", "most"), [(1, 850, 0), (2, 650, 3), (3, 400, 5)])
+@pytest.mark.parametrize(("wrong", "least", "most"), [(1, 280, 0), (2, 200, 1), (3, 100, 1)])
 def test_a_few_wrong_bits_of_8_by_8(wrong: int, least: int, most: int) -> None:
     # py-microdots reads 44 % right and 43 % wrong at one wrong bit, 19 and 55 % at two. Strings
     # of eight differ by two bits: not every wrong one can be told from a right one.
     rng = np.random.default_rng(wrong)
-    windows = Windows("anoto", rng, 1000, 8, 8)
-    bits = np.stack(soft(windows.symbols), axis=1).reshape(1000, -1)
-    at = rng.permuted(np.tile(np.arange(128), (1000, 1)), axis=1)[:, :wrong]
+    windows = Windows("anoto", rng, 400, 8, 8)
+    bits = np.stack(soft(windows.symbols), axis=1).reshape(400, -1)
+    at = rng.permuted(np.tile(np.arange(128), (400, 1)), axis=1)[:, :wrong]
     np.put_along_axis(bits, at, -np.take_along_axis(bits, at, 1), 1)
-    bits = bits.reshape(1000, 2, 8, 8)
+    bits = bits.reshape(400, 2, 8, 8)
     found = decode(bits[:, 0].copy(), bits[:, 1].copy(), codec("anoto"))
     took, right = accepted(found), windows.right(found)
     assert (took & right).sum() >= least
@@ -271,10 +271,10 @@ def test_confidence_is_kept() -> None:
     took = wrong = 0
     for name in CODECS:
         for side, share in [(8, 0.005), (9, 0.01), (10, 0.03), (12, 0.05), (16, 0.1)]:
-            windows = Windows(name, rng, 200, side, side)
+            windows = Windows(name, rng, 120, side, side)
             right, bad, _ = fate(windows, flip(soft(windows.symbols), share, rng), codec(name))
             took, wrong = took + right + bad, wrong + bad
-    assert took > 2500
+    assert took > 1200
     assert wrong <= took / 1000
 
 
@@ -297,13 +297,13 @@ def test_windows_that_are_half_hidden(side: int) -> None:
     took = wrong = 0
     across, down = np.meshgrid(np.arange(side), np.arange(side))
     for share in (0.4, 0.5, 0.6):
-        windows = Windows("anoto", rng, 200, side, side)
-        angle = rng.uniform(0, 2 * np.pi, (200, 1, 1))
+        windows = Windows("anoto", rng, 120, side, side)
+        angle = rng.uniform(0, 2 * np.pi, (120, 1, 1))
         along = np.cos(angle) * across + np.sin(angle) * down
         gone = along < np.quantile(along, share, axis=(1, 2), keepdims=True)
         right, bad, _ = fate(windows, hidden(soft(windows.symbols), gone), codec("anoto"))
         took, wrong = took + right, wrong + bad
-    assert took > 200
+    assert took > 25
     assert wrong == 0
 
 
@@ -348,16 +348,16 @@ def test_noise_is_refused(size: tuple[int, int], n: int) -> None:
         assert not accepted(decode(bits[0], bits[1], codec("anoto"))).any()
 
 
-@pytest.mark.parametrize(("side", "least"), [(8, 0), (20, 60)])
-def test_half_of_it_noise(side: int, least: int) -> None:
+@pytest.mark.parametrize("side", [8, 20])
+def test_half_of_it_noise(side: int) -> None:
     rng = np.random.default_rng(14)
-    for share in (0.25, 0.5, 0.75):
-        windows = Windows("anoto", rng, 80, side, side)
-        spoilt = round(side * share)
-        windows.symbols[:, :, :spoilt] = rng.integers(0, 4, (80, side, spoilt))
+    for spoilt in (1, side // 4, side // 2, 3 * side // 4):
+        windows = Windows("anoto", rng, 60, side, side)
+        windows.symbols[:, :, :spoilt] = rng.integers(0, 4, (60, side, spoilt))
         right, wrong, _ = fate(windows, soft(windows.symbols), codec("anoto"))
         assert wrong == 0
-        assert right >= (least if share < 0.5 else 0)
+        if (side, spoilt) == (20, 1):
+            assert right == 60
 
 
 @pytest.mark.parametrize("side", [8, 20])
@@ -380,7 +380,7 @@ def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
         assert not accepted(found).any(), what
 
 
-@pytest.mark.parametrize(("side", "beyond"), [(8, 1), (12, 2), (12, 10), (16, 4), (20, 10)])
+@pytest.mark.parametrize(("side", "beyond"), [(8, 1), (12, 2), (16, 4), (16, 14), (20, 10)])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: int) -> None:
     rng = np.random.default_rng(16)
