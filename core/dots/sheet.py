@@ -86,7 +86,7 @@ class Manifest:
         return sheet.id if sheet.position_mm is None else "floor"
 
     def find(self, grid: ArrayLike, section: ArrayLike, *, slack: float = 0.0) -> NDArray[np.intp]:
-        """Number of the sheet that holds each place, -1 where none does.
+        """Number of the sheet that holds each place, else the nearest; -1 where none is near.
 
         Parameters
         ----------
@@ -99,12 +99,14 @@ class Manifest:
         """
         at, sections = np.asarray(grid, float), np.asarray(section)
         found = np.full(len(at), -1, np.intp)
+        nearest = np.full(len(at), np.inf)
         for number, sheet in enumerate(self.sheets):
-            low = np.array(sheet.origin) - slack
-            high = np.array(sheet.origin) + np.array(sheet.size) - 1 + slack
-            inside = ((at >= low) & (at <= high)).all(axis=1)
+            low = np.array(sheet.origin)
+            high = low + np.array(sheet.size) - 1
+            outside = np.maximum(np.maximum(low - at, at - high), 0).max(axis=1, initial=0)
             fits = ((sections == np.array(sheet.section)) | (sections == -1)).all(axis=1)
-            found[(found < 0) & inside & fits] = number
+            better = fits & (outside <= slack) & (outside < nearest)
+            found[better], nearest[better] = number, outside[better]
         return found
 
     def to_metres(self, number: int, grid: ArrayLike) -> NDArray[np.float64]:

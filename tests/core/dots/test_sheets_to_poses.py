@@ -85,6 +85,21 @@ def test_a_camera_that_sees_two_sheets_has_a_trajectory_on_each(shoot: Shoot) ->
     assert frames == {"A4-0001": ("robot-A4-0001", 2), "A4-0002": ("robot-A4-0002", 1)}
 
 
+def test_where_sheets_adjoin_each_holds_its_own() -> None:
+    first, second = (Sheet(f"s{x}", (x, 0), (100, 100), (0, 0), (60, 60), (5, 5)) for x in (0, 100))
+    manifest = Manifest((first, second))
+    places = [
+        [99.0, 50.0],
+        [100.0, 50.0],
+        [105.0, 50.0],
+        [-8.0, 50.0],
+        [208.0, 50.0],
+        [230.0, 50.0],
+    ]
+    found = manifest.find(places, np.zeros((6, 2), int), slack=12.0)
+    assert found.tolist() == [0, 1, 1, 0, 1, -1]
+
+
 def test_what_cannot_be_used_is_counted_and_the_rest_is_solved(shoot: Shoot) -> None:
     class Damaged(list[Image]):
         def __getitem__(self, index):  # type: ignore[no-untyped-def]
