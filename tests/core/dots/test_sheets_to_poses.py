@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots.camera import Camera
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.solver import SolveOptions, solve
@@ -100,44 +99,6 @@ def test_where_sheets_adjoin_each_holds_its_own() -> None:
     assert found.tolist() == [0, 1, 1, 0, 1, -1]
 
 
-def test_what_cannot_be_used_is_counted_and_the_rest_is_solved(shoot: Shoot) -> None:
-    class Damaged(list[Image]):
-        def __getitem__(self, index):  # type: ignore[no-untyped-def]
-            if index == 1:
-                raise InputError("cut short")
-            return super().__getitem__(index)
-
-    good = shoot(at=(1100.0, 2200.0))
-    images = Damaged(
-        [
-            good,
-            good,
-            shoot(at=(1100.0, 9_000_000.0)),
-            np.full_like(good, 200),
-            good[:100],
-            shoot(at=(1100.0, 2200.0), section=(3, 0)),
-            shoot(at=(1100.0, 2200.0), codec="microdots"),
-            good,
-        ]
-    )
-    camera = Camera((188, 120), 348.7, (93.5, 59.5))
-    solution = solve([seen(images)], Manifest((A4,)), SolveOptions(camera=camera))
-    assert len(solution.trajectories[0]) == 2
-    outcomes = [frame["rejected"] for frame in solution.facts["frames"]]
-    assert outcomes[:6] == [
-        None,
-        "unreadable_frame",
-        "off_sheet",
-        "too_few_dots",
-        "not_of_the_cameras_size",
-        "off_sheet",
-    ]
-    assert outcomes[6] in {"no_code", "low_confidence"}
-    assert outcomes[7] is None
-    assert sum(solution.rejected.values()) == 6
-    assert any("another sheet" in note for note in solution.notes)
-
-
 def test_sizes_may_differ_without_a_camera(shoot: Shoot) -> None:
     small = shoot(at=(1100.0, 2200.0))
     large = shoot(at=(1120.0, 2200.0), size=(320, 240), pitch=20.0)
@@ -152,15 +113,6 @@ def test_nothing_to_solve() -> None:
     assert solution.poses == 0
     assert solution.trajectories[0].frame == "A4-0001"
     assert solve([], Manifest((A4,))).trajectories == ()
-
-
-@pytest.mark.parametrize("method", ["lattice", "paper"])
-def test_both_methods_agree(shoot: Shoot, method: str) -> None:
-    images = [shoot(at=(1100.0 + k, 2200.0), heading=0.03 + k / 50) for k in range(3)]
-    solution = solve([seen(images)], Manifest((A4,)), SolveOptions(method))
-    assert solution.method == method
-    x = solution.trajectories[0].position[:, 0]
-    np.testing.assert_allclose(x, (10 + (100 + np.arange(3)) * 0.508) * 1e-3, atol=6e-5)
 
 
 def test_unknown_methods_and_codecs_are_refused() -> None:
