@@ -36,6 +36,7 @@ NATURAL = 120
 paper's frames, at half size in those of twice their size, and so on."""
 
 LEVELS = 4
+"""Sizes that are tried at most, each half of the one before."""
 
 FEW_DOTS = "too_few_dots"
 NO_GRID = "no_grid"
