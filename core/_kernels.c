@@ -121,8 +121,8 @@ HOT static void mark_minima(const float *restrict smooth, int h, int w, float *r
         const float *restrict s = smooth + (size_t)y * w;
         float *restrict m = across + (size_t)y * w;
         for (int x = 2; x < w - 2; x++)
-            m[x] = smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])),
-                           s[x]);
+            m[x] =
+                smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])), s[x]);
     }
     for (int y = 2; y < h - 2; y++) {
         const float *restrict a = across + (size_t)(y - 2) * w, *restrict b = a + w;
@@ -349,25 +349,93 @@ typedef struct {
     double nearest, farthest, gate, loose, tight, firm, bent_from, offset;
 } Rules;
 
-typedef struct {
-    float x, y, u, v, bend, over; /* p, (u, v), |p|^2 / (1 + lens |p|^2), 1 / (1 + g q) */
-    float q[2];
-} Projected;
+enum { LANES = 8 };
 
-static void project(const double *parameters, const float *points, int count, Projected *out)
+/* Dots of a frame, an array a quantity, filled up to whole groups of LANES. */
+typedef struct {
+    int count;
+    float *x, *y, *valid;              /* p; 1 where there is such a dot */
+    float *u, *v, *bend, *over, *q[2]; /* |p|^2 / (1 + lens |p|^2), 1 / (1 + g q), q */
+    float *use, *miss[2];              /* 1 where it counts; by how much it misses */
+} Dots;
+
+static int new_dots(Dots *d, int m)
+{
+    d->count = (m + LANES - 1) / LANES * LANES;
+    float **arrays[] = {&d->x,    &d->y,    &d->valid, &d->u,   &d->v,       &d->bend,
+                        &d->over, &d->q[0], &d->q[1],  &d->use, &d->miss[0], &d->miss[1]};
+    const int number = (int)(sizeof(arrays) / sizeof(*arrays));
+    float *store = calloc((size_t)number * (size_t)d->count, sizeof(float));
+    for (int k = 0; store && k < number; k++) *arrays[k] = store + (size_t)k * d->count;
+    return store != NULL;
+}
+
+static void load_dots(const Dots *d, const float *points, const uint8_t *valid, int m)
+{
+    for (int i = 0; i < m; i++) {
+        d->x[i] = points[2 * i];
+        d->y[i] = points[2 * i + 1];
+        d->valid[i] = valid[i] ? 1.0f : 0.0f;
+    }
+}
+
+HOT static void project(const double *parameters, const Dots *d)
 {
     float t[PARAMETERS];
     for (int k = 0; k < PARAMETERS; k++) t[k] = (float)parameters[k];
-    for (int i = 0; i < count; i++) {
-        const float x = points[2 * i], y = points[2 * i + 1], square = x * x + y * y;
+    const float *restrict px = d->x, *restrict py = d->y;
+    float *restrict us = d->u, *restrict vs = d->v, *restrict bends = d->bend;
+    float *restrict overs = d->over, *restrict q0 = d->q[0], *restrict q1 = d->q[1];
+    for (int i = 0; i < d->count; i++) {
+        const float x = px[i], y = py[i], square = x * x + y * y;
         const float bend = 1 / (1 + t[LENS] * square), qx = x * bend, qy = y * bend;
         const float over = 1 / (1 + t[PERSPECTIVE] * qx + t[PERSPECTIVE + 1] * qy);
-        out[i].u = (t[A_U] * qx + t[A_U + 1] * qy + t[C_U]) * over;
-        out[i].v = (t[A_V] * qx + t[A_V + 1] * qy + t[C_V]) * over;
-        out[i].bend = square * bend;
-        out[i].over = over;
-        out[i].q[0] = qx;
-        out[i].q[1] = qy;
+        us[i] = (t[A_U] * qx + t[A_U + 1] * qy + t[C_U]) * over;
+        vs[i] = (t[A_V] * qx + t[A_V + 1] * qy + t[C_V]) * over;
+        bends[i] = square * bend;
+        overs[i] = over;
+        q0[i] = qx;
+        q1[i] = qy;
+    }
+}
+
+/* Dots near their places within a ring count; whether there are dots beyond it. */
+HOT static int aim_at_places(const Dots *d, float ring, float gate)
+{
+    const float *restrict us = d->u, *restrict vs = d->v, *restrict valid = d->valid;
+    float *restrict use = d->use, *restrict du = d->miss[0], *restrict dv = d->miss[1];
+    int beyond = 0;
+    for (int i = 0; i < d->count; i++) {
+        const float u = rintf(us[i]), v = rintf(vs[i]);
+        const int there = valid[i] > 0, near = u * u + v * v < ring;
+        du[i] = us[i] - u;
+        dv[i] = vs[i] - v;
+        beyond |= there & !near;
+        use[i] = there & near & (fabsf(du[i]) < gate) & (fabsf(dv[i]) < gate) ? 1.0f : 0.0f;
+    }
+    return beyond;
+}
+
+/* Where, about its place, the symbol stands that is nearest. */
+static inline void nearest_symbol(const float *rest, float offset, float *symbol)
+{
+    const int along_x = fabsf(rest[0]) > fabsf(rest[1]);
+    symbol[0] = along_x ? copysignf(offset, rest[0]) : 0;
+    symbol[1] = along_x ? 0 : copysignf(offset, rest[1]);
+}
+
+/* Dots near where a symbol stands count. */
+HOT static void aim_at_symbols(const Dots *d, float offset, float tight)
+{
+    const float *restrict us = d->u, *restrict vs = d->v, *restrict valid = d->valid;
+    float *restrict use = d->use, *restrict du = d->miss[0], *restrict dv = d->miss[1];
+    for (int i = 0; i < d->count; i++) {
+        const float rest[2] = {us[i] - rintf(us[i]), vs[i] - rintf(vs[i])};
+        float symbol[2];
+        nearest_symbol(rest, offset, symbol);
+        du[i] = rest[0] - symbol[0];
+        dv[i] = rest[1] - symbol[1];
+        use[i] = (valid[i] > 0) & (fabsf(du[i]) < tight) & (fabsf(dv[i]) < tight) ? 1.0f : 0.0f;
     }
 }
 
@@ -406,58 +474,75 @@ static int solve(double a[PARAMETERS][PARAMETERS], double *b, int sides)
     return 1;
 }
 
-/* Normal equations of dots that should move by `wanted`, nan where not in use, and priors. */
-static void equations(const double *parameters, const Projected *dots, const float *wanted,
-                      int count, double sigma, int lens, const double *prior,
-                      double normal[PARAMETERS][PARAMETERS], double *right)
+static double total(const float *lanes)
 {
-    memset(right, 0, PARAMETERS * sizeof(double));
-    double shared[6] = {0}, cross[2][9] = {{0}}, corner[6] = {0};
+    double sum = 0;
+    for (int l = 0; l < LANES; l++) sum += lanes[l];
+    return sum;
+}
+
+/* Normal equations by which the dots in use are moved onto what they miss, and priors. Sums
+ * run in LANES side by side, since a compiler may not reorder a single one. */
+HOT static void equations(const double *parameters, const Dots *d, double sigma, int lens,
+                          const double *prior, double normal[PARAMETERS][PARAMETERS],
+                          double *right)
+{
+    float s_shared[6][LANES] = {{0}}, s_cross[2][9][LANES] = {{{0}}}, s_corner[6][LANES] = {{0}};
+    float s_right[PARAMETERS][LANES] = {{0}};
     const float g0 = (float)parameters[PERSPECTIVE], g1 = (float)parameters[PERSPECTIVE + 1];
-    for (int i = 0; i < count; i++) {
-        const float *want = wanted + 2 * i;
-        if (isnan(want[0])) continue;
-        const Projected *d = dots + i;
-        const float over = d->over, b0 = d->q[0] * over, b1 = d->q[1] * over;
-        const float value[2] = {d->u, d->v};
-        shared[0] += b0 * b0;
-        shared[1] += b0 * b1;
-        shared[2] += b0 * over;
-        shared[3] += b1 * b1;
-        shared[4] += b1 * over;
-        shared[5] += over * over;
-        for (int axis = 0; axis < 2; axis++) {
-            const float w = want[axis], c0 = -value[axis] * b0, c1 = -value[axis] * b1;
-            float c2 = 0;
-            if (lens) {
-                const double *a = parameters + 3 * axis;
-                const float slope = (float)a[0] * d->q[0] + (float)a[1] * d->q[1]
-                                    - value[axis] * (g0 * d->q[0] + g1 * d->q[1]);
-                c2 = -slope * d->bend * over;
-            }
-            double *x = cross[axis];
-            x[0] += b0 * c0;
-            x[1] += b0 * c1;
-            x[2] += b0 * c2;
-            x[3] += b1 * c0;
-            x[4] += b1 * c1;
-            x[5] += b1 * c2;
-            x[6] += over * c0;
-            x[7] += over * c1;
-            x[8] += over * c2;
-            corner[0] += c0 * c0;
-            corner[1] += c0 * c1;
-            corner[2] += c0 * c2;
-            corner[3] += c1 * c1;
-            corner[4] += c1 * c2;
-            corner[5] += c2 * c2;
-            right[3 * axis] += b0 * w;
-            right[3 * axis + 1] += b1 * w;
-            right[3 * axis + 2] += over * w;
-            right[6] += c0 * w;
-            right[7] += c1 * w;
-            right[8] += c2 * w;
+    for (int i = 0; i < d->count; i += LANES) {
+        float o[LANES], b[2][LANES];
+        for (int l = 0; l < LANES; l++) {
+            o[l] = d->over[i + l] * d->use[i + l];
+            b[0][l] = d->q[0][i + l] * o[l];
+            b[1][l] = d->q[1][i + l] * o[l];
         }
+        for (int l = 0; l < LANES; l++) s_shared[0][l] += b[0][l] * b[0][l];
+        for (int l = 0; l < LANES; l++) s_shared[1][l] += b[0][l] * b[1][l];
+        for (int l = 0; l < LANES; l++) s_shared[2][l] += b[0][l] * o[l];
+        for (int l = 0; l < LANES; l++) s_shared[3][l] += b[1][l] * b[1][l];
+        for (int l = 0; l < LANES; l++) s_shared[4][l] += b[1][l] * o[l];
+        for (int l = 0; l < LANES; l++) s_shared[5][l] += o[l] * o[l];
+        for (int axis = 0; axis < 2; axis++) {
+            const float *value = (axis ? d->v : d->u) + i, *miss = d->miss[axis] + i;
+            const float *q0 = d->q[0] + i, *q1 = d->q[1] + i, *bend = d->bend + i;
+            const float a0 = (float)parameters[3 * axis], a1 = (float)parameters[3 * axis + 1];
+            float c[3][LANES], w[LANES];
+            for (int l = 0; l < LANES; l++) {
+                c[0][l] = -value[l] * b[0][l];
+                c[1][l] = -value[l] * b[1][l];
+                const float slope = a0 * q0[l] + a1 * q1[l] - value[l] * (g0 * q0[l] + g1 * q1[l]);
+                c[2][l] = lens ? -slope * bend[l] * o[l] : 0;
+                w[l] = -miss[l] * d->use[i + l];
+            }
+            for (int k = 0; k < 3; k++) {
+                const float *column = c[k];
+                float (*x)[LANES] = s_cross[axis];
+                for (int l = 0; l < LANES; l++) x[k][l] += b[0][l] * column[l];
+                for (int l = 0; l < LANES; l++) x[3 + k][l] += b[1][l] * column[l];
+                for (int l = 0; l < LANES; l++) x[6 + k][l] += o[l] * column[l];
+                for (int l = 0; l < LANES; l++) s_right[6 + k][l] += column[l] * w[l];
+            }
+            for (int l = 0; l < LANES; l++) s_corner[0][l] += c[0][l] * c[0][l];
+            for (int l = 0; l < LANES; l++) s_corner[1][l] += c[0][l] * c[1][l];
+            for (int l = 0; l < LANES; l++) s_corner[2][l] += c[0][l] * c[2][l];
+            for (int l = 0; l < LANES; l++) s_corner[3][l] += c[1][l] * c[1][l];
+            for (int l = 0; l < LANES; l++) s_corner[4][l] += c[1][l] * c[2][l];
+            for (int l = 0; l < LANES; l++) s_corner[5][l] += c[2][l] * c[2][l];
+            for (int l = 0; l < LANES; l++) s_right[3 * axis][l] += b[0][l] * w[l];
+            for (int l = 0; l < LANES; l++) s_right[3 * axis + 1][l] += b[1][l] * w[l];
+            for (int l = 0; l < LANES; l++) s_right[3 * axis + 2][l] += o[l] * w[l];
+        }
+    }
+    double shared[6], cross[2][9], corner[6];
+    for (int k = 0; k < 6; k++) {
+        shared[k] = total(s_shared[k]);
+        corner[k] = total(s_corner[k]);
+    }
+    for (int k = 0; k < 9; k++) {
+        cross[0][k] = total(s_cross[0][k]);
+        cross[1][k] = total(s_cross[1][k]);
+        right[k] = total(s_right[k]);
     }
     static const int packed[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
     memset(normal, 0, PARAMETERS * sizeof(*normal));
@@ -475,96 +560,84 @@ static void equations(const double *parameters, const Projected *dots, const flo
     }
 }
 
-static int step(double *parameters, const Projected *dots, const float *wanted, int count,
-                double sigma, int lens, const double *prior)
+/* One Gauss-Newton step; false where it cannot be made. */
+static int step(double *parameters, const Dots *d, double sigma, int lens, const double *prior)
 {
     double normal[PARAMETERS][PARAMETERS], right[PARAMETERS];
-    equations(parameters, dots, wanted, count, sigma, lens, prior, normal, right);
+    equations(parameters, d, sigma, lens, prior, normal, right);
     if (!solve(normal, right, 1)) return 0;
     for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
     return 1;
 }
 
-/* Where, about its place, the symbol stands that is nearest. */
-static inline void nearest_symbol(const float *rest, float offset, float *symbol)
+/* Square distance of each point to its third nearest; no branch, since none could be foretold. */
+HOT static void third_nearest(const float *restrict x, const float *restrict y, int count,
+                              float *restrict first, float *restrict second, float *restrict third)
 {
-    const int along_x = fabsf(rest[0]) > fabsf(rest[1]);
-    symbol[0] = along_x ? copysignf(offset, rest[0]) : 0;
-    symbol[1] = along_x ? 0 : copysignf(offset, rest[1]);
+    for (int i = 0; i < count; i++) first[i] = second[i] = third[i] = FLT_MAX;
+    for (int j = 0; j < count; j++)
+        for (int i = 0; i < count; i++) {
+            const float dx = x[i] - x[j], dy = y[i] - y[j];
+            const float square = i == j ? FLT_MAX : dx * dx + dy * dy;
+            const float a = first[i], b = second[i], c = third[i];
+            third[i] = smaller(c, b > square ? b : square);
+            second[i] = smaller(b, a > square ? a : square);
+            first[i] = smaller(a, square);
+        }
 }
 
-typedef struct {
-    float square, x, y;
-} Seed;
-
-/* Pitch, direction and shift in the middle; false where there are too few dots. */
+/* Pitch, direction and shift in the middle; false where there are too few dots. `scratch` is
+ * for a float a dot, seven a seed, and two a pair of seeds. */
 static int seed(const float *points, const uint8_t *valid, int m, const Rules *rules,
-                float *squares, Seed *middle, double *parameters)
+                float *scratch, double *parameters)
 {
+    float *squares = scratch, *x = squares + m + 1, *y = x + rules->seeds,
+          *work = y + rules->seeds;
+    float *dxs = work + 5 * rules->seeds, *dys = dxs + rules->seeds * (rules->seeds + 1) / 2;
     int there = 0, count = 0;
-    for (int i = 0; i < m; i++)
-        if (valid[i]) {
-            const float x = points[2 * i], y = points[2 * i + 1];
-            squares[there++] = x * x + y * y;
-        }
+    for (int i = 0; i < m; i++) {
+        const float px = points[2 * i], py = points[2 * i + 1];
+        squares[there] = px * px + py * py;
+        there += valid[i] != 0;
+    }
     if (there < rules->fewest) return 0;
     const int wanted = there < rules->seeds ? there : rules->seeds;
     const float bar = nth_smallest(squares, there, wanted - 1);
     for (int i = 0; i < m && count < wanted; i++) {
-        const float x = points[2 * i], y = points[2 * i + 1];
-        if (!valid[i] || x * x + y * y > bar) continue;
-        middle[count].x = x;
-        middle[count++].y = y;
+        const float px = points[2 * i], py = points[2 * i + 1];
+        if (!valid[i] || px * px + py * py > bar) continue;
+        x[count] = px;
+        y[count++] = py;
     }
-    for (int i = 0; i < count; i++) {
-        float three[3] = {FLT_MAX, FLT_MAX, FLT_MAX};
-        for (int j = 0; j < count; j++) {
-            if (j == i) continue;
-            const float dx = middle[i].x - middle[j].x, dy = middle[i].y - middle[j].y;
-            const float square = dx * dx + dy * dy;
-            if (square < three[2]) {
-                if (square < three[1]) {
-                    three[2] = three[1];
-                    if (square < three[0]) {
-                        three[1] = three[0];
-                        three[0] = square;
-                    } else
-                        three[1] = square;
-                } else
-                    three[2] = square;
-            }
-        }
-        squares[i] = three[2];
-    }
-    sort_floats(squares, count);
-    const float pitch_square = 0.5f * (squares[(count - 1) / 2] + squares[count / 2]);
+    float *third = work + 2 * rules->seeds;
+    third_nearest(x, y, count, work, work + rules->seeds, third);
+    sort_floats(third, count);
+    const float pitch_square = 0.5f * (third[(count - 1) / 2] + third[count / 2]);
     const float low = (float)rules->nearest * pitch_square;
     const float high = (float)rules->farthest * pitch_square;
-    double sine = 0, cosine = 0;
-    for (int i = 0; i < count; i++)
-        for (int j = 0; j < i; j++) {
-            const float dx = middle[i].x - middle[j].x, dy = middle[i].y - middle[j].y;
-            const float square = dx * dx + dy * dy;
-            if (!(square > low && square < high)) continue;
-            const float re = (dx * dx - dy * dy) / square, im = 2 * dx * dy / square;
-            sine += 2 * re * im;
-            cosine += re * re - im * im;
-        }
-    const double angle = 0.25 * atan2(sine, cosine), c = cos(angle), s = sin(angle);
-    double total = 0;
     int pairs = 0;
     for (int i = 0; i < count; i++)
         for (int j = 0; j < i; j++) {
-            const float dx = middle[i].x - middle[j].x, dy = middle[i].y - middle[j].y;
-            const float square = dx * dx + dy * dy;
-            if (!(square > low && square < high)) continue;
-            const float a = fabsf((float)c * dx + (float)s * dy);
-            const float b = fabsf((float)c * dy - (float)s * dx);
-            total += a > b ? a : b;
-            pairs++;
+            const float dx = x[i] - x[j], dy = y[i] - y[j], square = dx * dx + dy * dy;
+            dxs[pairs] = dx;
+            dys[pairs] = dy;
+            pairs += (square > low) & (square < high);
         }
     if (!pairs) return 0;
-    const double pitch = total / pairs;
+    double sine = 0, cosine = 0, sum = 0;
+    for (int k = 0; k < pairs; k++) {
+        const float dx = dxs[k], dy = dys[k], square = dx * dx + dy * dy;
+        const float re = (dx * dx - dy * dy) / square, im = 2 * dx * dy / square;
+        sine += 2 * re * im;
+        cosine += re * re - im * im;
+    }
+    const double angle = 0.25 * atan2(sine, cosine), c = cos(angle), s = sin(angle);
+    for (int k = 0; k < pairs; k++) {
+        const float a = fabsf((float)c * dxs[k] + (float)s * dys[k]);
+        const float b = fabsf((float)c * dys[k] - (float)s * dxs[k]);
+        sum += a > b ? a : b;
+    }
+    const double pitch = sum / pairs;
     memset(parameters, 0, PARAMETERS * sizeof(double));
     parameters[A_U] = parameters[A_V + 1] = c / pitch;
     parameters[A_U + 1] = s / pitch;
@@ -574,7 +647,7 @@ static int seed(const float *points, const uint8_t *valid, int m, const Rules *r
         const double *a = parameters + 3 * axis;
         double re = 0, im = 0;
         for (int i = 0; i < count; i++) {
-            const double phase = turn * (a[0] * middle[i].x + a[1] * middle[i].y);
+            const double phase = turn * (a[0] * x[i] + a[1] * y[i]);
             re += cos(phase);
             im += sin(phase);
         }
@@ -583,69 +656,51 @@ static int seed(const float *points, const uint8_t *valid, int m, const Rules *r
     return 1;
 }
 
-static int fit(const float *points, const uint8_t *valid, int m, int lens, const Rules *rules,
-               Projected *dots, float *wanted, Seed *middle, double *parameters, float *uv,
-               float *place, double *sigma)
+/* Lattice of the dots; false where there is none. */
+static int fit(const Dots *d, const float *points, const uint8_t *valid, int m, int lens,
+               const Rules *rules, float *scratch, double *parameters, float *uv, float *place,
+               double *sigma)
 {
-    const float gate = (float)rules->gate, tight = (float)rules->tight;
-    const float offset = (float)rules->offset;
-    if (!seed(points, valid, m, rules, wanted, middle, parameters)) return 0;
+    if (!seed(points, valid, m, rules, scratch, parameters)) return 0;
     for (int r = 0, beyond = 1; r < rules->rings && beyond; r++) {
-        const float ring = (float)(rules->ring[r] * rules->ring[r]);
-        project(parameters, points, m, dots);
-        beyond = 0;
-        for (int i = 0; i < m; i++) {
-            const float u = rintf(dots[i].u), v = rintf(dots[i].v);
-            const float du = dots[i].u - u, dv = dots[i].v - v;
-            const int near = u * u + v * v < ring;
-            const int use = valid[i] && near && fabsf(du) < gate && fabsf(dv) < gate;
-            beyond |= valid[i] && !near;
-            wanted[2 * i] = use ? -du : NAN;
-            wanted[2 * i + 1] = -dv;
-        }
+        project(parameters, d);
+        const double ring = rules->ring[r] * rules->ring[r];
+        beyond = aim_at_places(d, (float)ring, (float)rules->gate);
         const int bent = lens && rules->ring[r] > rules->bent_from;
-        if (!step(parameters, dots, wanted, m, rules->loose, bent, rules->prior)) return 0;
+        if (!step(parameters, d, rules->loose, bent, rules->prior)) return 0;
     }
-    for (int last = 0; last < 3; last++) {
-        project(parameters, points, m, dots);
-        double shift[2] = {0, 0};
-        if (last == 2) { /* the place in the middle becomes the origin */
-            for (int axis = 0; axis < 2; axis++) {
-                double *a = parameters + 3 * axis;
-                shift[axis] = rint(a[2]);
-                a[0] -= shift[axis] * parameters[PERSPECTIVE];
-                a[1] -= shift[axis] * parameters[PERSPECTIVE + 1];
-                a[2] -= shift[axis];
-            }
-        }
-        int count = 0;
-        double squares = 0;
-        for (int i = 0; i < m; i++) {
-            uv[2 * i] = dots[i].u - (float)shift[0];
-            uv[2 * i + 1] = dots[i].v - (float)shift[1];
-            place[2 * i] = rintf(uv[2 * i]);
-            place[2 * i + 1] = rintf(uv[2 * i + 1]);
-            const float rest[2] = {uv[2 * i] - place[2 * i], uv[2 * i + 1] - place[2 * i + 1]};
-            float symbol[2];
-            nearest_symbol(rest, offset, symbol);
-            const float du = rest[0] - symbol[0], dv = rest[1] - symbol[1];
-            const int use = valid[i] && fabsf(du) < tight && fabsf(dv) < tight;
-            wanted[2 * i] = use ? -du : NAN;
-            wanted[2 * i + 1] = -dv;
-            if (use) {
-                count++;
-                squares += (double)(du * du + dv * dv);
-            }
-        }
-        if (last == 2) {
-            *sigma = sqrt(squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1));
-            for (int k = 0; k < PARAMETERS; k++)
-                if (!isfinite(parameters[k])) return 0;
-            return count >= rules->fewest;
-        }
-        if (!step(parameters, dots, wanted, m, rules->firm, lens, rules->prior)) return 0;
+    for (int again = 0; again < 2; again++) {
+        project(parameters, d);
+        aim_at_symbols(d, (float)rules->offset, (float)rules->tight);
+        if (!step(parameters, d, rules->firm, lens, rules->prior)) return 0;
     }
-    return 0;
+    project(parameters, d);
+    aim_at_symbols(d, (float)rules->offset, (float)rules->tight);
+    /* The place in the middle becomes the origin. */
+    double shift[2];
+    for (int axis = 0; axis < 2; axis++) {
+        double *a = parameters + 3 * axis;
+        shift[axis] = rint(a[2]);
+        a[0] -= shift[axis] * parameters[PERSPECTIVE];
+        a[1] -= shift[axis] * parameters[PERSPECTIVE + 1];
+        a[2] -= shift[axis];
+    }
+    int count = 0;
+    double squares = 0;
+    for (int i = 0; i < m; i++) {
+        uv[2 * i] = d->u[i] - (float)shift[0];
+        uv[2 * i + 1] = d->v[i] - (float)shift[1];
+        place[2 * i] = rintf(uv[2 * i]);
+        place[2 * i + 1] = rintf(uv[2 * i + 1]);
+        if (d->use[i] > 0) {
+            count++;
+            squares += (double)(d->miss[0][i] * d->miss[0][i] + d->miss[1][i] * d->miss[1][i]);
+        }
+    }
+    *sigma = sqrt(squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1));
+    for (int k = 0; k < PARAMETERS; k++)
+        if (!isfinite(parameters[k])) return 0;
+    return count >= rules->fewest;
 }
 
 static PyObject *fit_lattices(PyObject *self, PyObject *args)
@@ -663,25 +718,27 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
     rules.rings = (int)(b[RING].len / (Py_ssize_t)sizeof(double));
     rules.ring = b[RING].buf;
     rules.prior = b[PRIOR].buf;
-    Projected *dots = malloc((size_t)m * sizeof(Projected));
-    float *wanted = malloc((size_t)m * 2 * sizeof(float));
-    Seed *middle = malloc((size_t)rules.seeds * sizeof(Seed));
-    const int stored = dots && wanted && middle;
+    Dots d;
+    const int made = new_dots(&d, m);
+    const size_t seeds = (size_t)rules.seeds;
+    float *scratch = malloc(((size_t)m + 1 + 7 * seeds + seeds * (seeds + 1)) * sizeof(float));
+    const int stored = made && scratch;
     if (stored) {
         Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
         {
             const size_t at = (size_t)k * m;
+            const float *points = (const float *)b[POINTS].buf + 2 * at;
+            const uint8_t *valid = (const uint8_t *)b[VALID].buf + at;
+            load_dots(&d, points, valid, m);
             ((uint8_t *)b[FOUND].buf)[k] = (uint8_t)fit(
-                (const float *)b[POINTS].buf + 2 * at, (const uint8_t *)b[VALID].buf + at, m, lens,
-                &rules, dots, wanted, middle, (double *)b[FITTED].buf + (size_t)k * PARAMETERS,
-                (float *)b[UV].buf + 2 * at, (float *)b[PLACE].buf + 2 * at,
-                (double *)b[SIGMA].buf + k);
+                &d, points, valid, m, lens, &rules, scratch,
+                (double *)b[FITTED].buf + (size_t)k * PARAMETERS, (float *)b[UV].buf + 2 * at,
+                (float *)b[PLACE].buf + 2 * at, (double *)b[SIGMA].buf + k);
         }
         Py_END_ALLOW_THREADS
     }
-    free(dots);
-    free(wanted);
-    free(middle);
+    if (made) free(d.x);
+    free(scratch);
     return done(b, BUFFERS, stored);
 }
 
@@ -1010,11 +1067,10 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
 /* ---- From a place to a pose --------------------------------------------------------------- */
 
 /* Fits the lattice once more, to the dots that say what they should, and reads the pose off. */
-static int pose_of(const Code *code, const float *points, const uint8_t *valid, const float *uv,
-                   const float *place, int m, int half, int lens, const double *prior,
-                   const int64_t *window, double offset, double tight, double finest,
-                   Projected *dots, float *wanted, int64_t *phases, double *parameters,
-                   double *pose, double *covariance)
+static int pose_of(const Code *code, const uint8_t *valid, const float *uv, const float *place,
+                   int m, int half, int lens, const double *prior, const int64_t *window,
+                   double offset, double tight, double finest, const Dots *d, int64_t *phases,
+                   double *parameters, double *pose, double *covariance)
 {
     static const int turns[4][2][2] = {
         {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
@@ -1031,7 +1087,7 @@ static int pose_of(const Code *code, const float *points, const uint8_t *valid, 
     int count = 0;
     double squares = 0;
     for (int i = 0; i < m; i++) {
-        wanted[2 * i] = NAN;
+        d->use[i] = 0;
         if (!valid[i]) continue;
         const int a = (int)place[2 * i] + half, b = (int)place[2 * i + 1] + half;
         const int column = turn[0][0] * a + turn[0][1] * b + corner[0] * (length - 1);
@@ -1046,16 +1102,17 @@ static int pose_of(const Code *code, const float *points, const uint8_t *valid, 
         const float dv = uv[2 * i + 1] - place[2 * i + 1]
                          - (float)offset * (float)(turn[0][1] * dx + turn[1][1] * dy);
         if (!(fabsf(du) < (float)tight && fabsf(dv) < (float)tight)) continue;
-        wanted[2 * i] = -du;
-        wanted[2 * i + 1] = -dv;
+        d->use[i] = 1;
+        d->miss[0][i] = du;
+        d->miss[1][i] = dv;
         count++;
         squares += (double)(du * du + dv * dv);
     }
     double variance = squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1);
     if (variance < finest * finest) variance = finest * finest;
-    project(parameters, points, m, dots);
+    project(parameters, d);
     double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], right[PARAMETERS];
-    equations(parameters, dots, wanted, m, sqrt(variance), lens, prior, normal, right);
+    equations(parameters, d, sqrt(variance), lens, prior, normal, right);
     memcpy(copy, normal, sizeof(normal));
     if (!solve(copy, right, 1)) return 0;
     for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
@@ -1127,30 +1184,29 @@ static PyObject *poses(PyObject *self, PyObject *args)
     code.signs = b[SIGNS].buf;
     code.range = range;
     code.smallest = smallest;
-    Projected *dots = malloc((size_t)m * sizeof(Projected));
-    float *wanted = malloc((size_t)m * 2 * sizeof(float));
+    Dots d;
+    const int made = new_dots(&d, m);
     int64_t *phases = malloc(4 * (size_t)half * sizeof(int64_t));
-    const int stored = dots && wanted && phases;
+    const int stored = made && phases;
     if (stored) {
         Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
         {
             const size_t at = (size_t)k * m;
-            double *out = (double *)b[POSE].buf + 3 * k,
-                   *spread = (double *)b[COVARIANCE].buf + 9 * k;
-            if (!pose_of(&code, (const float *)b[POINTS].buf + 2 * at,
-                         (const uint8_t *)b[VALID].buf + at, (const float *)b[UV].buf + 2 * at,
+            const uint8_t *valid = (const uint8_t *)b[VALID].buf + at;
+            double *out = (double *)b[POSE].buf + 3 * k;
+            double *spread = (double *)b[COVARIANCE].buf + 9 * k;
+            load_dots(&d, (const float *)b[POINTS].buf + 2 * at, valid, m);
+            if (!pose_of(&code, valid, (const float *)b[UV].buf + 2 * at,
                          (const float *)b[PLACE].buf + 2 * at, m, half, lens, b[PRIOR].buf,
-                         (const int64_t *)b[WINDOWS].buf + 5 * k, offset, tight, finest, dots,
-                         wanted, phases, (double *)b[FITTED].buf + (size_t)k * PARAMETERS, out,
-                         spread)) {
+                         (const int64_t *)b[WINDOWS].buf + 5 * k, offset, tight, finest, &d,
+                         phases, (double *)b[FITTED].buf + (size_t)k * PARAMETERS, out, spread)) {
                 for (int i = 0; i < 3; i++) out[i] = NAN;
                 for (int i = 0; i < 9; i++) spread[i] = NAN;
             }
         }
         Py_END_ALLOW_THREADS
     }
-    free(dots);
-    free(wanted);
+    if (made) free(d.x);
     free(phases);
     return done(b, BUFFERS, stored);
 }
