@@ -169,9 +169,10 @@ def test_a_few_things_much_darker_than_dots_hide_none() -> None:
     at = places(rng)
     image = draw(at, 3.0, rng, ink=150.0)
     for x, y in rng.uniform(20, 100, (8, 2)):
-        cv2.circle(image, (int(x), int(y)), 2, 5, -1)
-    _, lost, _ = errors(at, image)
-    assert lost <= 20  # those under and beside the dirt
+        cv2.circle(image, (int(x), int(y)), 2, 0, -1)
+    _, lost, extra = errors(at, image)
+    assert lost <= 8  # those under the dirt
+    assert extra <= 10  # the dirt
 
 
 def test_no_dots_where_there_are_none() -> None:

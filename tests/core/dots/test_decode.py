@@ -380,7 +380,9 @@ def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
         assert not accepted(found).any(), what
 
 
-@pytest.mark.parametrize(("side", "beyond"), [(8, 1), (12, 2), (16, 4), (16, 14), (20, 10)])
+@pytest.mark.parametrize(
+    ("side", "beyond"), [(8, 1), (12, 2), (16, 4), (16, 14), (20, 10), (20, 2)]
+)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: int) -> None:
     rng = np.random.default_rng(16)
@@ -394,6 +396,6 @@ def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: i
     if axis == 1:  # upright again, after the quarter turn that makes rows of columns
         symbols = QUARTER[QUARTER[QUARTER[np.rot90(symbols, 3, (1, 2))]]]
     found = decode(*soft(symbols), codec("anoto"))
-    sure = found.confidence >= THRESHOLD
-    assert not accepted(found).any()
-    assert not sure.any() or found.border[sure].all()
+    assert not (found.confidence >= THRESHOLD).any()
+    if side == 20 and beyond == 2:  # most of it is of one section, so that its place is known
+        assert found.border.all()

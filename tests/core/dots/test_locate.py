@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import PERIOD, RANGE, codec
+from locatk.core.dots.grid import Lattices
 from locatk.core.dots.locate import locate, sightings
 from locatk.core.dots.located import Located
+from locatk.core.dots.softbits import soft_bits
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -275,6 +277,21 @@ def test_frames_that_are_half_covered(
     assert least == 0 or outcome.rms < 0.02
 
 
+def test_what_is_not_sure_is_rejected_and_says_so(shot: Shots) -> None:
+    shots = shots_of(shot, 40, 21)
+    rng = np.random.default_rng(21)
+    images = np.stack([bare(one.take(), rng, 0.62) for one in shots])
+    found = locate(images, codec("anoto"))
+    np.testing.assert_array_equal(found.accepted, found.confidence >= 0.999)
+    doubtful = (found.confidence >= 0.5) & ~found.accepted
+    assert doubtful.any()
+    assert set(found.rejected[doubtful]) == {"low_confidence"}
+    assert "low_confidence" not in found.rejected[~doubtful]
+    lenient = locate(images, codec("anoto"), threshold=0.9)
+    assert lenient.accepted.sum() > found.accepted.sum()
+    np.testing.assert_array_equal(lenient.accepted, lenient.confidence >= 0.9)
+
+
 def test_a_strip_of_few_rows_is_not_told(shot: Shots) -> None:
     # Rows tell y by the shifts between them; five rows have four, which many places share.
     shots = shots_of(shot, 24, 10)
@@ -457,6 +474,29 @@ def test_frames_of_any_shape(size: tuple[int, int]) -> None:
 
 def test_no_frames() -> None:
     assert len(locate(np.zeros((0, 120, 188), np.uint8), codec("anoto"))) == 0
+
+
+# --- what the dots say
+
+
+def test_of_two_dots_at_a_place_the_likelier_one_speaks() -> None:
+    # At place (1, 0): a dot just where "right" stands, and dust on the other side of it.
+    for order in ([0, 1], [1, 0]):
+        rest = np.array([[1 / 6, 0.01], [-0.25, 0.1]], np.float32)[order]
+        lattices = Lattices(
+            parameters=np.zeros((1, 9)),
+            points=np.zeros((1, 2, 2), np.float32),
+            valid=np.ones((1, 2), bool),
+            uv=np.array([[[1, 0], [1, 0]]], np.float32) + rest,
+            place=np.array([[[1, 0], [1, 0]]], np.float32),
+            sigma=np.array([0.02]),
+            found=np.ones(1, bool),
+            lens=True,
+        )
+        column, row = soft_bits(lattices, 4)
+        assert np.count_nonzero(column) == np.count_nonzero(row) == 1
+        assert column[0, 4, 5] < -3  # right: column bit 0, row bit 1
+        assert row[0, 4, 5] > 3
 
 
 # --- for calibration
