@@ -98,7 +98,7 @@ class Pair(click.ParamType):
 @click.option("--vignette", type=SHARE, default=0.0, help="By how much corners are darker.")
 @click.option("--gradient", type=SHARE, default=0.0, help="By how much one side is darker.")
 @click.option(
-    "--tilt", "tilt_deg", type=FROM_0, default=0.0, metavar="DEG",
+    "--tilt", "tilt_deg", type=click.FloatRange(0, 45), default=0.0, metavar="DEG",
     help="Each frame is tilted by up to this, in any direction.",
 )  # fmt: skip
 @click.option(

@@ -1,4 +1,5 @@
-/* The two hot loops of core/dots, frame by frame: dots of an image, and the lattice of dots.
+/* The hot loops of core/dots, frame by frame: dots of an image, their lattice, what they say,
+ * where that is in the pattern, and the pose.
  *
  * Each has a twin in numpy that says what it does and why (core/dots/blobs.py and others) and
  * that is used where this module was not built; tests/core/dots/test_kernels.py holds the two

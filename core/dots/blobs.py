@@ -76,7 +76,7 @@ def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
     xy = np.empty((n, most, 2), np.float32)
     counts = np.empty(n, np.int64)
     kernels.find_dots(
-        np.ascontiguousarray(images),
+        np.ascontiguousarray(images, np.uint8),
         *(n, h, w),
         _taps(),
         *(PAPER, PAPER_REACH, FAINTEST, SHARE, FEWEST_DOTS, SPLITS, most),

@@ -69,7 +69,7 @@ class Lattices:
     points : (n, m, 2) float32 ndarray
         p of the dots.
     valid : (n, m) bool ndarray
-        Whether there is such a dot, and it lies at a place of the lattice.
+        Whether there is such a dot.
     uv : (n, m, 2) float32 ndarray
         Lattice coordinates of the dots, with fractions.
     place : (n, m, 2) float32 ndarray
@@ -110,8 +110,8 @@ def fit_lattices(points: NDArray[np.float32], valid: NDArray[np.bool_], *, lens:
     uv, place = np.zeros((n, m, 2), np.float32), np.zeros((n, m, 2), np.float32)
     found = np.zeros(n, np.bool_)
     kernels.fit_lattices(
-        np.ascontiguousarray(points),
-        np.ascontiguousarray(valid),
+        np.ascontiguousarray(points, np.float32),
+        np.ascontiguousarray(valid, np.bool_),
         *(n, m, lens),
         np.array(RINGS),
         weights(True),

@@ -24,6 +24,7 @@ from locatk.core.dots.grid import Lattices
 from locatk.core.dots.located import Located, nothing
 from locatk.core.dots.pose import match, poses
 from locatk.core.dots.softbits import half_width, soft_bits
+from locatk.core.errors import InputError
 
 BATCH = 32
 """Frames that are worked on at once; their data fits the cache."""
@@ -74,7 +75,14 @@ def locate(
 
     Without a ``camera`` the centre of the frame is the camera's, and the bend of its lens
     is estimated in each frame.
+
+    Raises
+    ------
+    InputError
+        The frames are not of 8 bits a pixel.
     """
+    if images.dtype != np.uint8:
+        raise InputError(f"frames of {images.dtype}, not of 8 bits a pixel")
     n, height, width = images.shape
     result = nothing(n, FEW_DOTS)
     if min(height, width) < SMALLEST:

@@ -116,7 +116,7 @@ def test_a_scale_that_nobody_measured_stays_out_of_the_manifest(locatk, tmp_path
         (("--missing", 1.5), 2, "--missing"),
         (("--codec", "qr"), 2, "libdots"),
         (("--dot", 0.9), 1, "dot 0.9"),
-        (("--tilt", 60), 1, "tilt_rad"),
+        (("--tilt", 60), 2, "--tilt"),
         (("--rate", 10000), 1, "exposure_s"),
     ],
 )

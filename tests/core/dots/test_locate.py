@@ -23,6 +23,7 @@ from locatk.core.dots.grid import Lattices
 from locatk.core.dots.locate import locate, sightings
 from locatk.core.dots.located import Located
 from locatk.core.dots.softbits import soft_bits
+from locatk.core.errors import InputError
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -519,3 +520,9 @@ def test_sightings_are_dots_and_where_they_stand(shot: Shots, known: bool) -> No
     # A dot stands a sixth of a pitch beside its place, in one of four directions.
     aside = np.sort(np.abs(seen.grid - np.rint(seen.grid)), axis=1)
     np.testing.assert_allclose(aside, [[0, 1 / 6]] * len(aside), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_frames_of_other_depths_are_refused(kind: type) -> None:
+    with pytest.raises(InputError, match="8 bits"):
+        locate(np.zeros((1, 120, 188), kind), codec("anoto"))
