@@ -936,6 +936,15 @@ static void compare(const Code *code, const float *bits, float sign, int start, 
     axis->odds = odds - code->places;
 }
 
+/* Adds a bit, the step-th of a line, to the line's scores at all phases, read both ways. */
+static inline void correlate(float bit, const float *signs, int step, int length,
+                             float *restrict forwards, float *restrict backwards)
+{
+    const float *restrict f = signs + step, *restrict g = signs + length - 1 - step;
+    for (int k = 0; k < PERIOD; k++) forwards[k] += bit * f[k];
+    for (int k = 0; k < PERIOD; k++) backwards[k] -= bit * g[k];
+}
+
 HOT static void read_window(const Code *code, const float *x_bits, const float *y_bits, int length,
                             float *scores, const float **lines, float *votes, int *phase,
                             float *margin, int64_t *rotation, Axis *x, Axis *y)
@@ -946,22 +955,10 @@ HOT static void read_window(const Code *code, const float *x_bits, const float *
     for (int row = 0; row < length; row++)
         for (int column = 0; column < length; column++) {
             const float a = x_bits[row * length + column], b = y_bits[row * length + column];
-            if (a != 0) {
-                float *restrict up = table[0] + column * PERIOD;
-                float *restrict down = table[1] + column * PERIOD;
-                const float *restrict f = code->signs + row;
-                const float *restrict g = code->signs + length - 1 - row;
-                for (int k = 0; k < PERIOD; k++) up[k] += a * f[k];
-                for (int k = 0; k < PERIOD; k++) down[k] -= a * g[k];
-            }
-            if (b != 0) {
-                float *restrict up = table[2] + row * PERIOD;
-                float *restrict down = table[3] + row * PERIOD;
-                const float *restrict f = code->signs + column;
-                const float *restrict g = code->signs + length - 1 - column;
-                for (int k = 0; k < PERIOD; k++) up[k] += b * f[k];
-                for (int k = 0; k < PERIOD; k++) down[k] -= b * g[k];
-            }
+            const int down = row * PERIOD, right = column * PERIOD;
+            if (a != 0) correlate(a, code->signs, row, length, table[0] + right, table[1] + right);
+            if (b != 0)
+                correlate(b, code->signs, column, length, table[2] + down, table[3] + down);
         }
     float sums[4] = {0};
     for (int t = 0; t < 4; t++)

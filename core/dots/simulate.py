@@ -26,6 +26,7 @@ from locatk.core.dots.simulate_optics import Exposer, Optics, Stand
 from locatk.core.dots.simulate_paper import Paper
 from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
+from locatk.core.simulation import check_options
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -167,32 +168,36 @@ class SimulationOptions:
         # Beyond the rim as well, from where light is blurred into the frame.
         rim_px = 0.75 * float(np.linalg.norm(self.camera.size))
         bend = 1 + min(self.camera.radial_px, 0.0) * rim_px**2
-        for name, fits, wanted in (
-            ("frames", self.frames >= 1, "at least 1"),
-            ("rate_hz", 0 < self.rate_hz < np.inf, "a number above 0"),
-            ("path", self.path in PATHS, "one of " + ", ".join(PATHS)),
-            ("speed_mps", 0 <= self.speed_mps < np.inf, "0 or more"),
-            ("exposure_s", 0 <= self.exposure_s * self.rate_hz < 1, "less than a frame's time"),
-            ("motion_px", self.motion_px is None or 0 <= self.motion_px <= 100, "0 to 100"),
-            ("camera", bend > 0.2, "a camera whose lens does not fold the frame"),
-            ("metres_per_px", 0 < self.metres_per_px < np.inf, "a number above 0"),
-            ("tilt_rad", tilt <= LARGEST_TILT, f"at most {LARGEST_TILT:.4g} with pitch and roll"),
-            ("dot", 0 < self.dot <= LARGEST_DOT, "a share of the pitch of at most 2/3"),
-            ("missing", 0 <= self.missing <= 1, "0 to 1"),
-            ("dust", 0 <= self.dust <= 1, "0 to 1"),
-            ("jitter_m", 0 <= self.jitter_m < 1e-3, "0 to below 0.001"),
-            ("printer_scale", all(0.5 < s < 2 for s in scale), "two numbers about 1"),
-            ("blur_px", 0 <= self.blur_px <= 20, "0 to 20"),
-            ("noise", 0 <= self.noise < np.inf, "0 or more"),
-            ("paper_level", 0 < self.paper_level <= 255, "up to 255"),
-            ("contrast", 0 <= self.contrast <= 1, "0 to 1"),
-            ("vignette", 0 <= self.vignette <= 1, "0 to 1"),
-            ("gradient", 0 <= self.gradient <= 1, "0 to 1"),
-            ("seed", self.seed >= 0, "0 or more"),
-        ):
-            if not fits:
-                value = getattr(self, name)
-                raise InputError(f"a simulation with {name} {value!r}", hint=f"give {wanted}")
+        check_options(
+            self,
+            (
+                ("frames", self.frames >= 1, "at least 1"),
+                ("rate_hz", 0 < self.rate_hz < np.inf, "a number above 0"),
+                ("path", self.path in PATHS, "one of " + ", ".join(PATHS)),
+                ("speed_mps", 0 <= self.speed_mps < np.inf, "0 or more"),
+                ("exposure_s", 0 <= self.exposure_s * self.rate_hz < 1, "less than a frame's time"),
+                ("motion_px", self.motion_px is None or 0 <= self.motion_px <= 100, "0 to 100"),
+                ("camera", bend > 0.2, "a camera whose lens does not fold the frame"),
+                ("metres_per_px", 0 < self.metres_per_px < np.inf, "a number above 0"),
+                (
+                    "tilt_rad",
+                    tilt <= LARGEST_TILT,
+                    f"at most {LARGEST_TILT:.4g} with pitch and roll",
+                ),
+                ("dot", 0 < self.dot <= LARGEST_DOT, "a share of the pitch of at most 2/3"),
+                ("missing", 0 <= self.missing <= 1, "0 to 1"),
+                ("dust", 0 <= self.dust <= 1, "0 to 1"),
+                ("jitter_m", 0 <= self.jitter_m < 1e-3, "0 to below 0.001"),
+                ("printer_scale", all(0.5 < s < 2 for s in scale), "two numbers about 1"),
+                ("blur_px", 0 <= self.blur_px <= 20, "0 to 20"),
+                ("noise", 0 <= self.noise < np.inf, "0 or more"),
+                ("paper_level", 0 < self.paper_level <= 255, "up to 255"),
+                ("contrast", 0 <= self.contrast <= 1, "0 to 1"),
+                ("vignette", 0 <= self.vignette <= 1, "0 to 1"),
+                ("gradient", 0 <= self.gradient <= 1, "0 to 1"),
+                ("seed", self.seed >= 0, "0 or more"),
+            ),
+        )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading, rotation_exp
 from locatk.core.lighthouse.calibration import IDEAL, Calibration
 from locatk.core.lighthouse.channels import TICK_HZ, period_ticks
@@ -24,6 +23,7 @@ from locatk.core.lighthouse.simulate_courses import Course
 from locatk.core.lighthouse.simulate_faults import spoil
 from locatk.core.lighthouse.simulate_light import Light, Link, Pairs, receive
 from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
+from locatk.core.simulation import check_options
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -102,20 +102,24 @@ class SimulationOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, fits, wanted in (
-            ("robots", self.robots >= 1, "at least 1"),
-            ("stations", 1 <= self.stations <= 16, "1 to 16"),
-            ("duration_s", 0 < self.duration_s < np.inf, "a number above 0"),
-            ("report_hz", 0 < self.report_hz < np.inf, "a number above 0"),
-            ("noise_rad", 0 <= self.noise_rad < np.inf, "0 or more"),
-            ("occlusion", 0 <= self.occlusion < 1, "0 to below 1"),
-            ("outliers", 0 <= self.outliers < 1, "0 to below 1"),
-            ("calibration", self.calibration in CALIBRATIONS, "one of " + ", ".join(CALIBRATIONS)),
-            ("seed", self.seed >= 0, "0 or more"),
-        ):
-            if not fits:
-                value = getattr(self, name)
-                raise InputError(f"a simulation with {name} {value!r}", hint=f"give {wanted}")
+        check_options(
+            self,
+            (
+                ("robots", self.robots >= 1, "at least 1"),
+                ("stations", 1 <= self.stations <= 16, "1 to 16"),
+                ("duration_s", 0 < self.duration_s < np.inf, "a number above 0"),
+                ("report_hz", 0 < self.report_hz < np.inf, "a number above 0"),
+                ("noise_rad", 0 <= self.noise_rad < np.inf, "0 or more"),
+                ("occlusion", 0 <= self.occlusion < 1, "0 to below 1"),
+                ("outliers", 0 <= self.outliers < 1, "0 to below 1"),
+                (
+                    "calibration",
+                    self.calibration in CALIBRATIONS,
+                    "one of " + ", ".join(CALIBRATIONS),
+                ),
+                ("seed", self.seed >= 0, "0 or more"),
+            ),
+        )
 
 
 @dataclass(frozen=True)
