@@ -1,0 +1,61 @@
+"""What one pass over a tag has shown, before and after it is read as a tag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Magnets that were found in one pass of the array over them.
+
+    All places are in the array's frame at ``time_ns``; over a pass the array is taken to
+    move along its own x.
+
+    Attributes
+    ----------
+    time_ns : int
+        Of the sample to which the frame belongs, near the middle of the pass.
+    first, stop : int
+        The pass: samples ``first`` to ``stop - 1``.
+    path_m : (stop - first,) ndarray
+        How far the array has moved along its x since ``time_ns``, sample by sample.
+    place_m : (M, 2) ndarray
+        Of the magnets.
+    angle_rad : (M,) ndarray
+        Direction of the moments, counter-clockwise from x.
+    moment_am2 : (M,) ndarray
+        Their size.
+    covariance : (3 M, 3 M) ndarray
+        Of x, y, angle of the first magnet, of the second, ... in m and rad; ``nan`` where
+        the method knows none.
+    height_m : float
+        From the magnets to the sensors, as found; ``nan`` where it was not asked.
+    residual_sigma : float
+        Rms of what the model leaves, in standard deviations of the noise; ``nan`` where
+        the method has no model of the samples.
+    others : int
+        Further sources that are no magnets of a tag (debris).
+    notes : tuple of str
+    """
+
+    time_ns: int
+    first: int
+    stop: int
+    path_m: Array
+    place_m: Array
+    angle_rad: Array
+    moment_am2: Array
+    covariance: Array
+    height_m: float = np.nan
+    residual_sigma: float = np.nan
+    others: int = 0
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.place_m)
