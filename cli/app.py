@@ -18,6 +18,7 @@ import click
 from locatk.cli import console, failures
 
 COMMANDS = {
+    "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),
     "print": ("locatk.cli.print_", "Draw sheets at true size."),
     "import": ("locatk.cli.import_", "Turn recordings of other tools into a session."),
     "simulate": ("locatk.cli.simulate", "Make a session with known truth, without hardware."),

@@ -9,6 +9,7 @@ import click
 from locatk.cli import console, options
 from locatk.cli.calibrate_camera import camera
 from locatk.cli.calibrate_printer import printer
+from locatk.cli.calibrate_tag import tag
 from locatk.cli.solve import scene_option
 
 
@@ -21,11 +22,13 @@ def command() -> None:
       locatk calibrate scene run.mcap -o scene.toml
       locatk calibrate camera run.mcap -o camera.toml
       locatk calibrate printer scan.png -o printer.toml
+      locatk calibrate tag pass*.mcap -o tag.toml
     """
 
 
 command.add_command(camera)
 command.add_command(printer)
+command.add_command(tag)
 
 
 @command.command(short_help="Solve where the Lighthouse stations are.")

@@ -31,6 +31,9 @@ FORMATS = {
         "locatk.formats.importers.images:ImageFiles", "dots", ("sheet", "camera", "rate")
     ),
     "video": Format("locatk.formats.importers.video:Video", "dots", ("sheet", "camera")),
+    "polaris-csv": Format(
+        "locatk.formats.importers.polaris_csv:read_polaris", "polaris", ("rate", "spacing", "tag")
+    ),
 }
 """Name of a foreign format to what is known of it."""
 
@@ -64,7 +67,19 @@ FORMATS = {
     "--rate",
     type=click.FloatRange(min=1e-3, max=1e6),
     metavar="HZ",
-    help="images: frames a second. [default: 30]",
+    help="images: frames a second. [default: 30]  polaris-csv: samples a second, which its "
+    "stamps do not tell; required (published runs: 40).",
+)
+@click.option(
+    "--spacing",
+    type=click.FloatRange(min=0, min_open=True, max=1000),
+    metavar="MM",
+    help="polaris-csv: between neighbouring sensors; required (published runs: 20).",
+)
+@options.input_option(
+    "--tag",
+    metavar="FILE",
+    help="polaris-csv: the tags that were passed (tag.toml). [default: the published design]",
 )
 @options.overwrite
 @options.as_json
@@ -78,6 +93,8 @@ def command(
     sheet: Path | None,
     camera: Path | None,
     rate: float | None,
+    spacing: float | None,
+    tag: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -89,9 +106,13 @@ def command(
       images      camera frames of a dot sheet: files, folders or patterns, in
                   the order of the file names (frame2 before frame10)
       video       the same from one video file, whose times are kept
+      polaris-csv samples of a bar of magnetometers over magnetic tags, as
+                  published with Polaris: one row a sample, a column
+                  "Sensor 1" (the rightmost) and so on, with cells "(x, y, z)"
+                  in microtesla; row over --rate is the time
 
-    Files that are no image, or are damaged, are left out and named; the exit status is 3
-    then, and the rest is written all the same.
+    Files that are no image or are damaged, and samples that are no number or saturated, are
+    left out and named; the exit status is 3 then, and the rest is written all the same.
 
     \b
     Examples:
@@ -101,6 +122,7 @@ def command(
       locatk import images frames/ --sheet sheet.toml --rate 46.6 -o run.mcap
       locatk import images 'run/*.png' --sheet sheet.toml --camera camera.toml -o run.mcap
       locatk import video run.mp4 --sheet sheet.toml -o run.mcap
+      locatk import polaris-csv RawData_1.csv --rate 40 --spacing 20 -o run.mcap
     """
     chosen = FORMATS[format_name]
     given = {
@@ -109,19 +131,23 @@ def command(
         "sheet": sheet,
         "camera": camera,
         "rate": rate,
+        "spacing": spacing,
+        "tag": tag,
     }
     for name, value in given.items():
         if value not in (None, ()) and name not in chosen.options:
             raise click.UsageError(f"--{name} means nothing to the format {format_name}.")
-    if format_name == "video" and len(paths) > 1:
-        raise click.UsageError("The format video takes one PATH.")
+    if format_name in ("video", "polaris-csv") and len(paths) > 1:
+        raise click.UsageError(f"The format {format_name} takes one PATH.")
     if format_name != "images":  # whose patterns are not there by that name
         options.must_exist(paths)
-    aside = [*truth, *(path for path in (calibration, sheet, camera) if path is not None)]
+    aside = [*truth, *(path for path in (calibration, sheet, camera, tag) if path is not None)]
     options.guard_output(output, overwrite=overwrite, inputs=[*paths, *aside])
     read = options.load(chosen.reader)
     if chosen.system == "dots":
         answer, lost = _frames(format_name, read, paths, output, sheet, camera, rate, overwrite)
+    elif chosen.system == "polaris":
+        answer, lost = _samples(read, paths[0], output, rate, spacing, tag, overwrite)
     else:
         answer, lost = _sweeps(read, paths, output, truth, calibration, overwrite), None
     for warning in answer["warnings"][:MOST_WARNINGS]:
@@ -218,3 +244,44 @@ def _frames(
         "warnings": source.warnings,
     }
     return answer, source.lost
+
+
+def _samples(
+    read: Any,
+    path: Path,
+    output: Path,
+    rate: float | None,
+    spacing: float | None,
+    tag: Path | None,
+    overwrite: bool,
+) -> tuple[dict[str, Any], str | None]:
+    """Import samples of an array; returns what ``--json`` says of them, and what was lost."""
+    from locatk.formats import arrays, tags
+    from locatk.formats.importers.polaris_csv import PUBLISHED_TAGS
+
+    if rate is None or spacing is None:
+        name = "--rate" if rate is None else "--spacing"
+        raise click.UsageError(f"The format polaris-csv needs {name}.")
+    known = PUBLISHED_TAGS if tag is None else tags.read_tags(tag)
+    with console.working("Reading"):
+        imported = read(path, rate_hz=rate, spacing_m=spacing / 1000)
+        arrays.write_session(
+            output,
+            [imported.samples],
+            tags=known,
+            facts=imported.facts,
+            warnings=imported.warnings,
+            overwrite=overwrite,
+        )
+    samples = imported.samples
+    console.say(f"{len(samples)} samples of {len(samples.array)} sensors")
+    if tag is None:
+        console.say("No --tag: the session holds the design of the published tags")
+    answer = {
+        "samples": len(samples),
+        "sensors": len(samples.array),
+        "devices": [samples.device],
+        "left_out": imported.left_out,
+        "warnings": imported.warnings,
+    }
+    return answer, imported.lost

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 @options.verbosity
 def command(file: Path, as_json: bool) -> None:
     """Say what is in FILE: a session or a solution (.mcap, of any tool), or an artifact
-    (.toml): a lighthouse scene, a manifest of dot sheets, a camera.
+    (.toml): a lighthouse scene, a manifest of dot sheets, a camera, tags, a sensor array.
 
     A damaged or cut recording is described as far as it can be read; the exit status
     is 3 then.
@@ -34,6 +35,7 @@ def command(file: Path, as_json: bool) -> None:
       locatk info run.mcap --json
       locatk info scene.toml
       locatk info sheet.toml
+      locatk info tag.toml
     """
     facts = _artifact(file) if file.suffix.lower() == ".toml" else _recording(file)
     facts = {"version": 1, "file": str(file), "bytes": file.stat().st_size, **facts}
@@ -46,19 +48,36 @@ def command(file: Path, as_json: bool) -> None:
 
 
 def _artifact(file: Path) -> dict[str, Any]:
-    from locatk.formats import artifacts, describe, sheets, toml
+    from locatk.formats import artifacts, describe, sheets, tags, toml
 
-    table = toml.read(file)
-    known = (artifacts.SCENE_FORMAT, sheets.MANIFEST_FORMAT, sheets.CAMERA_FORMAT)
-    name = table.text("format", choices=known)
-    if name == sheets.MANIFEST_FORMAT:
-        manifest = describe.manifest(sheets.read_manifest(file))
-        return {"kind": "manifest", "system": "dots", **manifest}
-    if name == sheets.CAMERA_FORMAT:
-        camera = describe.camera(sheets.read_camera(file))
-        return {"kind": "camera", "system": "dots", "camera": camera}
-    scene = artifacts.read_scene(file)
-    return {"kind": "scene", "system": "lighthouse", **_scene(scene)}
+    kinds: dict[str, Callable[[], dict[str, Any]]] = {
+        artifacts.SCENE_FORMAT: lambda: {
+            "kind": "scene",
+            "system": "lighthouse",
+            **_scene(artifacts.read_scene(file)),
+        },
+        sheets.MANIFEST_FORMAT: lambda: {
+            "kind": "manifest",
+            "system": "dots",
+            **describe.manifest(sheets.read_manifest(file)),
+        },
+        sheets.CAMERA_FORMAT: lambda: {
+            "kind": "camera",
+            "system": "dots",
+            "camera": describe.camera(sheets.read_camera(file)),
+        },
+        tags.TAG_FORMAT: lambda: {
+            "kind": "tag",
+            "system": "polaris",
+            **describe.tags(tags.read_tags(file)),
+        },
+        tags.ARRAY_FORMAT: lambda: {
+            "kind": "array",
+            "system": "polaris",
+            "arrays": [describe.array(tags.read_array(file))],
+        },
+    }
+    return kinds[toml.read(file).text("format", choices=tuple(kinds))]()
 
 
 def _recording(file: Path) -> dict[str, Any]:
@@ -89,6 +108,10 @@ def _recording(file: Path) -> dict[str, Any]:
         from locatk.formats import describe
 
         described |= describe.dots(session)
+    elif facts.get("system") == "polaris":
+        from locatk.formats import describe
+
+        described |= describe.polaris(session)
     return described
 
 
@@ -163,6 +186,9 @@ def _scene(scene: Scene, sweeps: dict[int, int] | None = None) -> dict[str, Any]
     }
 
 
+MOST_TAGS = 20
+"""So many tags of a family are listed for people; ``--json`` holds them all."""
+
 SHOWN_ABOVE = {("locatk", key) for key in ("format_version", "tool_version", "kind", "system")}
 
 
@@ -181,6 +207,9 @@ def _text(facts: dict[str, Any]) -> str:
         ("frames", facts.get("frames")),
         ("print", _print(facts)),
         ("camera", _camera(facts.get("camera"))),
+        ("samples", facts.get("samples")),
+        ("tag", _design(facts)),
+        ("magnet", _magnet(facts.get("magnet"))),
         ("damage", facts.get("damage")),
     ):
         if value not in (None, ""):
@@ -236,6 +265,39 @@ def _text(facts: dict[str, Any]) -> str:
         ],
     )
     section(
+        ("array", "sensors", "Hz", "left out", "width [mm]", "noise [uT]", "range [uT]", "sensor"),
+        [
+            (
+                a.get("device", "-"),
+                a["sensors"],
+                _rate(a.get("rate_hz")),
+                a.get("left_out", "-"),
+                f"{max(p[1] for p in a['position_mm']) - min(p[1] for p in a['position_mm']):.6g}",
+                _axes(a["noise_ut"]),
+                _axes(a["range_ut"]),
+                a["sensor"] or "-",
+            )
+            for a in facts.get("arrays", ())
+        ],
+    )
+    tags = facts.get("tags", [])
+    section(
+        ("tag", "cell:orientation", "as built (passes)", "place"),
+        [
+            (
+                t["id"],
+                " ".join(
+                    f"{c},{r}:{s}" for (c, r), s in zip(t["cells"], t["symbols"], strict=True)
+                ),
+                "-" if t["passes"] is None else t["passes"],
+                "-" if t["position_mm"] is None else _place(t),
+            )
+            for t in tags[:MOST_TAGS]
+        ],
+    )
+    if len(tags) > MOST_TAGS:
+        lines.append(f"... and {len(tags) - MOST_TAGS} more: see --json")
+    section(
         ("attachment", "type", "bytes"),
         [(a["name"], a["media_type"], a["bytes"]) for a in facts.get("attachments", ())],
     )
@@ -273,9 +335,36 @@ def _camera(camera: dict[str, Any] | None) -> str | None:
     )
 
 
-def _place(sheet: dict[str, Any]) -> str:
-    x, y = sheet["position_mm"]
-    return f"{x:.6g},{y:.6g} mm, {sheet['heading_deg']:.4g} deg"
+def _design(facts: dict[str, Any]) -> str | None:
+    if "orientations" not in facts:
+        return None
+    family = "" if facts["family"] is None else f", a family of {facts['family']}"
+    apart = "" if facts["min_distance"] == 1 else f", {facts['min_distance']} steps apart"
+    return (
+        f"{facts['codec']}, {facts['magnets']} magnets of {facts['orientations']} orientations on "
+        f"{facts['order']} x {facts['order']} cells {facts['spacing_mm']:.6g} mm apart, "
+        f"{facts['clearance_mm']:.6g} mm below the sensors, {facts['capacity']} ids{family}{apart}"
+    )
+
+
+def _magnet(magnet: dict[str, Any] | None) -> str | None:
+    if magnet is None:
+        return None
+    grade = f"{magnet['grade']}, " if magnet["grade"] else ""
+    return (
+        f"{magnet['diameter_mm']:.6g} x {magnet['height_mm']:.6g} mm, {grade}"
+        f"{magnet['remanence_t']:.4g} T, {1e3 * magnet['moment_am2']:.4g} mA m2"
+    )
+
+
+def _axes(values: Sequence[float]) -> str:
+    """Numbers by axis, `-` where unknown."""
+    return " ".join(f"{value:.4g}" if math.isfinite(value) else "-" for value in values)
+
+
+def _place(found: dict[str, Any]) -> str:
+    x, y = found["position_mm"]
+    return f"{x:.6g},{y:.6g} mm, {found['heading_deg']:.4g} deg"
 
 
 def _by(pair: Sequence[float] | None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from locatk.cli.print_pattern import pattern
+from locatk.cli.print_tag import tag
 from locatk.cli.print_testsheet import testsheet
 
 
@@ -15,9 +16,11 @@ def command() -> None:
     \b
     Examples:
       locatk print pattern -o sheet.pdf
+      locatk print tag tag.toml --id 262143 -o tag.pdf
       locatk print testsheet -o test.pdf
     """
 
 
 command.add_command(pattern)
+command.add_command(tag)
 command.add_command(testsheet)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from locatk.cli import console, options, simulate_dots
+from locatk.cli import console, options, simulate_dots, simulate_polaris
 
 
 @click.group(short_help="Make a session with known truth, without hardware.")
@@ -17,10 +17,12 @@ def command() -> None:
     Examples:
       locatk simulate lighthouse -o run.mcap
       locatk simulate dots -o run.mcap
+      locatk simulate polaris -o run.mcap --id 262143
     """
 
 
 command.add_command(simulate_dots.command, "dots")
+command.add_command(simulate_polaris.command, "polaris")
 
 
 @command.command(short_help="Robots driving under Lighthouse stations.")

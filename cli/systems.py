@@ -27,6 +27,7 @@ class Request:
     scene: str | None = None
     artifact: Path | None = None
     camera: Path | None = None
+    speed: float | None = None
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def lighthouse(session: Session, request: Request) -> Solved:
     from locatk.core.lighthouse.scene import Scene
     from locatk.formats import artifacts, observations
 
-    _check(request, "lighthouse", methods=("bundle", "paper"), refused=("camera",))
+    _check(request, "lighthouse", methods=("bundle", "paper"), refused=("camera", "speed"))
     sweeps = observations.read_sweeps(session)
     if request.artifact is not None:
         scene = artifacts.read_scene(request.artifact)
@@ -64,7 +65,7 @@ def dots(session: Session, request: Request) -> Solved:
     from locatk.core import dots as system
     from locatk.formats import observations, sheets
 
-    _check(request, "dots", methods=("lattice", "paper"), refused=("scene",))
+    _check(request, "dots", methods=("lattice", "paper"), refused=("scene", "speed"))
     if request.artifact is not None:
         manifest = sheets.read_manifest(request.artifact)
     else:
@@ -88,7 +89,23 @@ def dots(session: Session, request: Request) -> Solved:
     return Solved(solution, time.perf_counter() - start)
 
 
-SYSTEMS: dict[str, Solver] = {"lighthouse": lighthouse, "dots": dots}
+def polaris(session: Session, request: Request) -> Solved:
+    """Solve a session of a magnetometer array over tags."""
+    from locatk.core import polaris as system
+    from locatk.formats import observations, tags
+
+    _check(request, "polaris", methods=("joint", "paper"), refused=("scene", "camera"))
+    given = request.artifact
+    known = observations.read_tags(session) if given is None else tags.read_tags(given)
+    samples = observations.read_samples(session)
+    odometry = observations.read_odometry(session)
+    options = _given(system.SolveOptions, {"method": request.method, "speed_mps": request.speed})
+    start = time.perf_counter()
+    solution = system.solve(samples, known, options, odometry=odometry)
+    return Solved(solution, time.perf_counter() - start)
+
+
+SYSTEMS: dict[str, Solver] = {"lighthouse": lighthouse, "dots": dots, "polaris": polaris}
 
 
 def solve_session(path: Path, request: Request) -> Solved:

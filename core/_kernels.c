@@ -1209,6 +1209,68 @@ static PyObject *poses(PyObject *self, PyObject *args)
     return done(b, BUFFERS, stored);
 }
 
+/* ---- Derivative dynamic time warping ---------------------------------------------------- */
+
+/* Templates that are compared at a time, one a lane: the cells of one template wait for each
+ * other, those of its neighbours do not. */
+enum { DDTW_LANES = 32 };
+
+/* Costs of the cheapest paths through the matrices of one query (n, 3) and DDTW_LANES templates
+ * (length, 3, DDTW_LANES). `column` (n, DDTW_LANES) holds the matrices' last column. */
+HOT static void ddtw_lanes(const float *restrict query, int n, const float *restrict slopes,
+                           int length, float *restrict column, float *restrict cost)
+{
+    for (int i = 0; i < n * DDTW_LANES; i++) column[i] = INFINITY;
+    for (int j = 0; j < length; j++) {
+        const float *restrict x = slopes + (size_t)j * 3 * DDTW_LANES;
+        const float *restrict y = x + DDTW_LANES, *restrict z = y + DDTW_LANES;
+        float above[DDTW_LANES], corner[DDTW_LANES];
+        for (int k = 0; k < DDTW_LANES; k++) {
+            above[k] = INFINITY;
+            corner[k] = j ? INFINITY : 0;
+        }
+        for (int i = 0; i < n; i++) {
+            const float a = query[3 * i], b = query[3 * i + 1], c = query[3 * i + 2];
+            float *restrict at = column + (size_t)i * DDTW_LANES;
+            for (int k = 0; k < DDTW_LANES; k++) {
+                const float dx = a - x[k], dy = b - y[k], dz = c - z[k];
+                const float before = smaller(at[k], corner[k]);
+                corner[k] = at[k];
+                above[k] = smaller(before, above[k]) + sqrtf(dx * dx + dy * dy + dz * dz);
+                at[k] = above[k];
+            }
+        }
+        memcpy(cost, above, sizeof(above));
+    }
+}
+
+static PyObject *ddtw(PyObject *self, PyObject *args)
+{
+    enum { QUERY, SLOPES, COST, BUFFERS };
+    Py_buffer b[BUFFERS];
+    int n, length, count;
+    if (!PyArg_ParseTuple(args, "y*y*iiiw*", &b[QUERY], &b[SLOPES], &n, &length, &count, &b[COST]))
+        return NULL;
+    const size_t block = (size_t)length * 3 * DDTW_LANES;
+    float *slopes = calloc(block + (size_t)n * DDTW_LANES, sizeof(float));
+    if (slopes) {
+        Py_BEGIN_ALLOW_THREADS for (int first = 0; first < count; first += DDTW_LANES)
+        {
+            const size_t lanes = (size_t)(count - first < DDTW_LANES ? count - first : DDTW_LANES);
+            float cost[DDTW_LANES];
+            for (int row = 0; row < 3 * length; row++)
+                memcpy(slopes + (size_t)row * DDTW_LANES,
+                       (const float *)b[SLOPES].buf + (size_t)row * count + first,
+                       lanes * sizeof(float));
+            ddtw_lanes(b[QUERY].buf, n, slopes, length, slopes + block, cost);
+            memcpy((float *)b[COST].buf + first, cost, lanes * sizeof(float));
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(slopes);
+    return done(b, BUFFERS, slopes != NULL);
+}
+
 static PyMethodDef methods[] = {
     {"find_dots", find_dots, METH_VARARGS, "Twin of locatk.core.dots.blobs.find_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,
@@ -1216,6 +1278,7 @@ static PyMethodDef methods[] = {
     {"read_windows", read_windows, METH_VARARGS, "Twin of locatk.core.dots.reading.read_numpy."},
     {"soft_bits", soft_bits, METH_VARARGS, "Twin of locatk.core.dots.softbits.soft_bits_numpy."},
     {"poses", poses, METH_VARARGS, "Twin of locatk.core.dots.pose.poses_numpy."},
+    {"ddtw", ddtw, METH_VARARGS, "Twin of locatk.core.polaris.ddtw.distances_numpy."},
     {NULL, NULL, 0, NULL},
 };
 

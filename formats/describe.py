@@ -1,4 +1,4 @@
-"""What `locatk info` says of the dots: sheets, cameras and frames, as plain values."""
+"""What `locatk info` says of dots and polaris: artifacts and recordings, as plain values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ import numpy as np
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError, LocatkError
-from locatk.formats import frames, sheets
+from locatk.core.polaris import codec
+from locatk.core.polaris.array import Samples, SensorArray
+from locatk.core.polaris.tag import Tags
+from locatk.formats import arrays, frames, sheets
+from locatk.formats import tags as tag_files
 from locatk.formats.session import Session
 
 
@@ -88,3 +92,88 @@ def _size(images: Any) -> list[int] | None:
     except InputError:
         return None
     return [width, height]
+
+
+def tags(found: Tags) -> dict[str, Any]:
+    """The design of tags, and what is known of each."""
+    magnet = found.magnet
+    numbers = set(found.ids or ()) | set(found.built) | set(found.site)
+    return {
+        "codec": found.codec,
+        "order": found.order,
+        "magnets": found.magnets,
+        "orientations": found.orientations,
+        "spacing_mm": 1e3 * found.spacing_m,
+        "clearance_mm": 1e3 * found.clearance_m,
+        "magnet": {
+            "diameter_mm": 1e3 * magnet.diameter_m,
+            "height_mm": 1e3 * magnet.height_m,
+            "remanence_t": magnet.remanence_t,
+            "grade": magnet.grade,
+            "moment_am2": magnet.moment,
+        },
+        "capacity": codec.capacity(found),
+        "family": None if found.ids is None else len(found.ids),
+        "min_distance": found.min_distance,
+        "tags": [_tag(found, number) for number in sorted(numbers)],
+        "notes": list(found.notes),
+    }
+
+
+def _tag(found: Tags, number: int) -> dict[str, Any]:
+    layout = codec.layout_of(found, number)
+    built, place = found.built.get(number), found.site.get(number)
+    return {
+        "id": number,
+        "cells": layout.cells,
+        "symbols": layout.symbols,
+        "passes": None if built is None else built.passes,
+        "offset_mm": None if built is None else 1e3 * built.offset_m,
+        "angle_deg": None if built is None else np.degrees(built.angle_rad),
+        "position_mm": None if place is None else [1e3 * place.x_m, 1e3 * place.y_m],
+        "heading_deg": None if place is None else float(np.degrees(place.heading_rad)),
+    }
+
+
+def array(found: SensorArray) -> dict[str, Any]:
+    """Where the sensors of an array sit, and how they measure; None where unknown."""
+    return {
+        "sensor": found.sensor,
+        "sensors": len(found),
+        "position_mm": 1e3 * found.position_m,
+        "noise_ut": 1e6 * found.noise_t,
+        "delay_ms": 1e3 * found.delay_s,
+        "quantum_ut": 1e6 * np.where(found.quantum_t > 0, found.quantum_t, np.nan),
+        "range_ut": 1e6 * found.range_t,
+    }
+
+
+def polaris(session: Session) -> dict[str, Any]:
+    """Samples, arrays and tags of a session; what is damaged is left out and said.
+
+    A solution has tags and no samples.
+    """
+    described: dict[str, Any] = {}
+    try:
+        known = tag_files.attached_tags(session)
+        if known is not None:
+            described |= tags(known)
+        if session.topics(arrays.TOPIC, arrays.SCHEMA):
+            found = arrays.read_samples(session)
+            described["arrays"] = [_samples(each) for each in found]
+            described["devices"] = [each.device for each in found]
+            described["samples"] = sum(map(len, found))
+    except LocatkError as error:
+        described["damage"] = session.damage or error.message
+    return described
+
+
+def _samples(found: Samples) -> dict[str, Any]:
+    span = float(found.time_ns[-1] - found.time_ns[0]) * 1e-9
+    return {
+        "device": found.device,
+        "samples": len(found),
+        "rate_hz": (len(found) - 1) / span if span > 0 else None,
+        "left_out": int(np.count_nonzero(np.isnan(found.field_t))),
+        **array(found.array),
+    }

@@ -16,6 +16,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 from locatk.formats.proto.lighthouse_pb2 import LighthouseSweep
+from locatk.formats.proto.magnetics_pb2 import MagnetometerArray
 from locatk.formats.proto.poses_pb2 import Odometry, PoseTrack
 
 
@@ -57,13 +58,14 @@ class Batches:
 class Layout:
     """A message that is a batch: its string fields and its parallel repeated fields.
 
-    The first column must be the times.
+    The first column must be the times. Fields that are not named are passed over.
     """
 
     message: type[Message]
     texts: tuple[str, ...]
     columns: tuple[Column, ...]
     _tags: dict[int, int] = field(init=False, repr=False, compare=False)
+    _numbers: frozenset[int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         # Tag byte on the wire (field number, length-delimited) to place below.
@@ -73,16 +75,18 @@ class Layout:
         if max(tags) > 127:
             raise ValueError("field numbers above 15 have longer tags")
         object.__setattr__(self, "_tags", tags)
+        object.__setattr__(self, "_numbers", frozenset(tag >> 3 for tag in tags))
 
-    def pack(self, texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> Message:
-        """One message of ``columns``, each (n,) or (n, width); see :class:`Column`."""
+    def pack(self, once: Mapping[str, str | int], columns: Mapping[str, NDArray[Any]]) -> Message:
+        """One message of what is said ``once`` and of ``columns``, each (n,) or (n, width);
+        see :class:`Column`."""
         values = {
             column.name: np.asarray(columns[column.name], column.dtype).ravel().tolist()
             for column in self.columns
             if column.name in columns
         }
         first = int(columns[self.columns[0].name][0])
-        return self.message(timestamp=timestamp(first), **texts, **values)
+        return self.message(timestamp=timestamp(first), **once, **values)
 
     def unpack(self, payloads: Iterable[bytes]) -> Batches:
         """Arrays of all messages whose payloads are given.
@@ -152,7 +156,7 @@ class Layout:
         return values if position == end else None
 
     def _canonical(self, payload: bytes) -> bytes:
-        """The same message as locatk would have written it.
+        """The same message with the fields of this layout alone, as locatk would write it.
 
         Protobuf allows unpacked and split fields, and those of later versions.
         """
@@ -161,6 +165,9 @@ class Layout:
         except DecodeError:
             raise BatchError(f"a message is no valid {self.message.DESCRIPTOR.name}") from None
         message.DiscardUnknownFields()
+        for descriptor, _ in message.ListFields():
+            if descriptor.number not in self._numbers:
+                message.ClearField(descriptor.name)
         return message.SerializeToString()
 
 
@@ -200,6 +207,15 @@ ODOMETRY = Layout(
         Column("heading_rad", "<f8"),
     ),
 )
+
+
+def magnetometers(sensors: int) -> Layout:
+    """Layout of the samples of an array of so many sensors, which the message tells."""
+    return Layout(
+        MagnetometerArray,
+        ("device", "frame_id"),
+        (Column("time_ns", "<i8"), Column("b_tesla", "<f4", 3 * sensors)),
+    )
 
 
 def timestamp(time_ns: int) -> Timestamp:

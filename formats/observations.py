@@ -1,4 +1,4 @@
-"""What a session holds, as arrays for a solver: sweeps, frames, truth, odometry, artifacts.
+"""What a session holds, for a solver: sweeps, samples, frames, truth, odometry, artifacts.
 
 Solutions and trajectories have modules of their own; what a caller needs of them is
 offered here too.
@@ -16,6 +16,7 @@ from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats import artifacts
+from locatk.formats.arrays import read_samples
 from locatk.formats.artifacts import attached_scene as read_scene
 from locatk.formats.frames import read_frames
 from locatk.formats.messages import SWEEPS, batch_edges
@@ -23,6 +24,7 @@ from locatk.formats.session import Session, SessionWriter
 from locatk.formats.sheets import attached_camera as read_camera
 from locatk.formats.sheets import attached_manifest as read_manifest
 from locatk.formats.solutions import read_solution, read_trajectories, write_solution
+from locatk.formats.tags import attached_tags as read_tags
 from locatk.formats.tracks import (
     LARGEST_BATCH,
     Timed,
@@ -40,9 +42,11 @@ __all__ = [
     "read_frames",
     "read_manifest",
     "read_odometry",
+    "read_samples",
     "read_scene",
     "read_solution",
     "read_sweeps",
+    "read_tags",
     "read_trajectories",
     "read_truth",
     "sweep_messages",

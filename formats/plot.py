@@ -8,25 +8,24 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from locatk.core import metrics
 from locatk.core.errors import InputError
 from locatk.core.geometry import Similarity
-from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene import Scene
 from locatk.core.metrics import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.output import atomic_write, check_output
+from locatk.formats.plot_map import IN_LEGEND, draw_map, legend, plain, tags_of
 
 Array = NDArray[np.float64]
 
@@ -37,18 +36,6 @@ SIZE_IN, DPI = (12.0, 6.0), 100
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D")
 """Okabe and Ito's, which the colour-blind can tell apart, without yellow."""
-
-TRUTH_COLOR, SCENE_COLOR = "0.75", "0.2"
-
-IN_LEGEND = 8
-"""Devices that the legend names, at most."""
-
-NEAR = 1.0
-"""A station is drawn in its place up to this far outside the paths, in widths of these;
-beyond, at the margin."""
-
-BREAK_NS = 500_000_000
-"""A path is not drawn across a longer silence."""
 
 
 def plot_solution(
@@ -107,8 +94,10 @@ def draw(
     unscaled = solution.system == "lighthouse" and scene.scale == "unit"
     if evaluation is None and not unscaled:
         evaluation = _compare(solution, truth)
+    tags = tags_of(solution)
     if evaluation is not None:
         paths, scene = _aligned(solution.trajectories, scene, evaluation.alignment)
+        tags = tuple(tag.moved(evaluation.alignment) for tag in tags)
         unscaled = unscaled and evaluation.align != "sim3"
     else:
         paths = {t.device: t.position for t in solution.trajectories}
@@ -120,8 +109,8 @@ def draw(
     left, right = figure.add_subfigure(grid[0, 0]), figure.add_subfigure(grid[0, 1])
     ground = left.subplots()
     unit = "unit" if unscaled else "m"
-    _draw_map(ground, paths, times, () if unscaled else truth, scene, colors, unit)
-    signs = _legend(colors, scene, bool(truth) and not unscaled)
+    draw_map(ground, paths, times, () if unscaled else truth, scene, tags, colors, unit)
+    signs = legend(colors, scene, tags, bool(truth) and not unscaled)
     widest = max((len(str(sign.get_label())) for sign in signs), default=0)
     left.legend(
         handles=signs,
@@ -199,124 +188,6 @@ def _sigmas(solution: Solution) -> dict[str, Series]:
     return series
 
 
-# ---- the map
-
-
-def _draw_map(
-    axes: Axes,
-    paths: dict[str, Array],
-    times: dict[str, NDArray[np.int64]],
-    truth: Sequence[Trajectory],
-    scene: Scene,
-    colors: dict[str, str],
-    unit: str,
-) -> None:
-    for t in truth:
-        axes.plot(*_broken(t.position, t.time_ns), color=TRUTH_COLOR, lw=2.5, zorder=1)
-    for name, position in paths.items():
-        line = _broken(position, times[name])
-        axes.plot(*line, color=colors[name], lw=0.8, marker=".", ms=2.5, zorder=2)
-    for marker in scene.markers:
-        axes.plot(*marker.position[:2], "s", color=SCENE_COLOR, mfc="none", ms=7, zorder=3)
-
-    solid = [t.position for t in truth] + [m.position[None] for m in scene.markers]
-    middle, half = _view(list(paths.values()), solid)
-    places = np.array([s.position[:2] for s in scene.stations]).reshape(-1, 2)
-    near = np.max(np.abs(places - middle), axis=1, initial=0.0) <= half * (1 + 2 * NEAR)
-    if np.any(near):
-        both = np.vstack([middle - half, middle + half, places[near]])
-        middle = (both.min(axis=0) + both.max(axis=0)) / 2
-        half = float(np.max(both.max(axis=0) - both.min(axis=0))) / 2
-    half *= 1.12 if np.all(near) else 1.45  # room for the labels at the margin
-    for station, inside in zip(scene.stations, near, strict=True):
-        _draw_station(axes, station, bool(inside), middle, half, unit)
-    axes.set_xlim(middle[0] - half, middle[0] + half)
-    axes.set_ylim(middle[1] - half, middle[1] + half)
-    axes.set_aspect("equal")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
-    axes.set_xlabel(f"x [{unit}]")
-    axes.set_ylabel(f"y [{unit}]")
-    out = sum(
-        int(np.count_nonzero(np.any(np.abs(p[:, :2] - middle) > half, axis=1)))
-        for p in paths.values()
-    )
-    if out:
-        axes.set_title(f"{out} poses lie outside this view", loc="left", fontsize=9)
-
-
-def _broken(position: Array, time_ns: NDArray[np.int64]) -> tuple[Array, Array]:
-    """x and y of a path, with nan where it is silent for long."""
-    gaps = np.flatnonzero(np.diff(time_ns) > BREAK_NS) + 1
-    x, y = np.insert(position[:, :2], gaps, np.nan, axis=0).T
-    return x, y
-
-
-def _view(paths: Sequence[Array], solid: Sequence[Array]) -> tuple[Array, float]:
-    """Middle (2,) and half the width of the square that holds the paths.
-
-    All of what is ``solid``; of the solved poses all but the outermost, which may be wild.
-    """
-    corners = [f(p[:, :2], axis=0) for p in solid if len(p) for f in (np.min, np.max)]
-    solved = np.concatenate([p[:, :2] for p in paths]) if paths else np.zeros((0, 2))
-    solved = solved[np.isfinite(solved).all(axis=1)]
-    if len(solved):
-        corners.extend(np.percentile(solved, (1, 99), axis=0))
-    box = np.array(corners) if corners else np.array([[-1.0, -1.0], [1.0, 1.0]])
-    low, high = box.min(axis=0), box.max(axis=0)
-    return (low + high) / 2, max(float(np.max(high - low)) / 2, 0.05)
-
-
-def _draw_station(
-    axes: Axes, station: Station, inside: bool, middle: Array, half: float, unit: str
-) -> None:
-    """A station with the direction it looks in, or at the margin the way to it."""
-    place, label = station.position[:2], f"ch {station.channel}"
-    if inside:
-        # A flat arrow shrinks as the station looks down.
-        tip = place + station.rotation[:2, 0] * 0.22 * half
-        axes.plot(*place, "o", color=SCENE_COLOR, ms=6, zorder=4)
-        label_at, shift = place, 13 if tip[1] < place[1] else -13
-    else:
-        away = place - middle
-        label += f"\n{float(np.linalg.norm(away)):.2g} {unit}"
-        tip = middle + away * 0.98 * half / np.max(np.abs(away))
-        place = tip - 0.09 * half * away / np.linalg.norm(away)
-        label_at, shift = middle + (tip - middle) * 0.82, 0
-    look = {"arrowstyle": "-|>", "color": SCENE_COLOR, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", xy=(tip[0], tip[1]), xytext=(place[0], place[1]), arrowprops=look)
-    axes.annotate(
-        label,
-        (label_at[0], label_at[1]),
-        xytext=(0, shift),
-        textcoords="offset points",
-        ha="center",
-        va="center",
-        fontsize=8,
-    )
-
-
-def _legend(colors: dict[str, str], scene: Scene, with_truth: bool) -> list[Line2D]:
-    """What the signs of the map mean."""
-
-    def sign(label: str, **look: Any) -> Line2D:
-        return Line2D([], [], **{"color": SCENE_COLOR, "label": label, "ls": "", **look})
-
-    named = list(colors)
-    if len(named) > IN_LEGEND:
-        named = named[: IN_LEGEND - 1]
-    handles = [sign(_short(name), color=colors[name], ls="-", marker=".") for name in named]
-    if len(named) < len(colors):
-        handles.append(sign(f"and {len(colors) - len(named)} more"))
-    if with_truth:
-        handles.append(sign("truth", color=TRUTH_COLOR, ls="-", lw=2.5))
-    if scene.markers:
-        handles.append(sign("marker", marker="s", mfc="none", ms=7))
-    if scene.stations:
-        handles.append(sign("station", marker="o", ms=6))
-    return handles
-
-
 # ---- numbers over time
 
 
@@ -379,20 +250,10 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
         text += f", MAE {_mm(evaluation.mae)}, RMSE {_mm(evaluation.rmse)}"
         text += f" (alignment: {evaluation.align}, time offset: {evaluation.offset_source})"
     notes = textwrap.wrap("; ".join(solution.notes), 160, max_lines=2, placeholder=" ...")
-    return _plain("\n".join(textwrap.wrap(text, 160) + notes))
+    return plain("\n".join(textwrap.wrap(text, 160) + notes))
 
 
 def _mm(metres: float) -> str:
     """A length in mm, to three digits."""
     digits = np.clip(2 - np.floor(np.log10(max(1e3 * metres, 1e-5))), 0, 5)
     return f"{1e3 * metres:.{int(digits)}f} mm"
-
-
-def _short(name: str) -> str:
-    # A leading underscore would hide it from the legend.
-    return _plain((name if len(name) <= 18 else f"{name[:7]}...{name[-8:]}").lstrip("_") or "_ ")
-
-
-def _plain(text: str) -> str:
-    """Text in which a dollar is a dollar, not the start of a formula."""
-    return text.replace("$", r"\$")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,11 @@ import numpy as np
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import artifacts, sheets, viewers
-from locatk.formats.artifacts import SCENE_FILE, attached_scene
+from locatk.formats import artifacts, sheets, tags, viewers
 from locatk.formats.session import Session, SessionWriter
-from locatk.formats.sheets import SHEET_FILE, attached_manifest
 from locatk.formats.tracks import (
     Timed,
     check_devices,
@@ -31,6 +31,13 @@ from locatk.formats.tracks import (
 
 SOLUTION_FILE = "solution.json"
 SOLUTION_VERSION = 1
+
+ARTIFACTS: tuple[tuple[type, str, Callable[[Any], str]], ...] = (
+    (Scene, artifacts.SCENE_FILE, artifacts.dumps_scene),
+    (Manifest, sheets.SHEET_FILE, sheets.dumps_manifest),
+    (Tags, tags.TAG_FILE, tags.dumps_tags),
+)
+"""What a solution may stand on, and as what it is attached."""
 
 # Tuples, not unions, which isinstance takes twice as long for: there are a million values.
 _PLAIN, _LISTS, _ARRAYS = (str, int), (list, tuple), (np.ndarray, np.generic)
@@ -72,10 +79,9 @@ def write_solution(
     with SessionWriter(
         path, kind="solution", system=solution.system, facts=facts, overwrite=overwrite
     ) as writer:
-        if isinstance(artifact, Scene):
-            writer.attach(SCENE_FILE, artifacts.dumps_scene(artifact).encode(), "application/toml")
-        elif isinstance(artifact, Manifest):
-            writer.attach(SHEET_FILE, sheets.dumps_manifest(artifact).encode(), "application/toml")
+        for kind, file, dumps in ARTIFACTS:
+            if isinstance(artifact, kind):
+                writer.attach(file, dumps(artifact).encode(), "application/toml")
         text = _json(plain(_statement(solution, name)))
         writer.attach(SOLUTION_FILE, text.encode(), "application/json")
         streams = [iter(_once(solution, start))]
@@ -117,10 +123,8 @@ def _json(value: Any, depth: int = 0) -> str:
 
 def _once(solution: Solution, start: int) -> list[Timed]:
     """What is said once, at the start: the artifact, whole paths, the log."""
-    artifact = solution.artifact if isinstance(solution.artifact, Scene | Manifest) else None
-    said: list[Timed] = [
-        (start, "/scene", viewers.scene_update(artifact, solution.trajectories, start))
-    ]
+    scene = viewers.scene_update(solution.artifact, solution.trajectories, start)
+    said: list[Timed] = [(start, "/scene", scene)]
     for t in solution.trajectories:
         if len(t) > 0:
             said.append((start, f"/path/{t.device}", viewers.path(t, start)))
@@ -162,7 +166,9 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
             trajectories=_trajectories(session, said["devices"]),
             rejected={str(key): int(count) for key, count in said["rejected"].items()},
             detections=list(said["detections"]),
-            artifact=attached_scene(session) or attached_manifest(session),
+            artifact=artifacts.attached_scene(session)
+            or sheets.attached_manifest(session)
+            or tags.attached_tags(session),
             notes=tuple(said["notes"]),
             facts=dict(said["facts"]),
         )

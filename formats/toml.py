@@ -1,7 +1,8 @@
 """Reading TOML strictly and writing it deterministically, for all artifacts.
 
 Numbers are read as decimals, so that a length in mm becomes one in metres by moving
-the point: ``0.1`` m is written as ``100.0`` mm and comes back as the same float.
+the point: ``0.1`` m is written as ``100.0`` mm and comes back as the same float, and so do
+radians that are written in degrees.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, DecimalException
+from decimal import Context, Decimal, DecimalException
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,9 @@ from locatk.core.errors import ArtifactError, InputError, MissingDataError
 
 _REQUIRED: Any = object()
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+_EXACT = Context(prec=50)
+_DEGREE = _EXACT.divide(Decimal("3.14159265358979323846264338327950288419716939937511"), 180)
 
 
 def read(path: str | os.PathLike[str]) -> Table:
@@ -183,6 +187,16 @@ class Table:
         numbers = [self._float(key, item, shift, nan) for item in flat]
         return np.array(numbers, np.float64).reshape(shape)
 
+    def angle(self, key: str, default: Any = _REQUIRED) -> Any:
+        """A finite number of degrees as a float in radians."""
+        value = self._get(key, default)
+        return value if value is default else self._radians(key, value)
+
+    def angles(self, key: str, count: int) -> NDArray[np.float64]:
+        """A list of ``count`` numbers of degrees, in radians."""
+        flat = self._flat(key, self._get(key, _REQUIRED), (count,))
+        return np.array([self._radians(key, item) for item in flat])
+
     def raw(self, key: str, default: Any = _REQUIRED) -> Any:
         """The value as it is, for the caller to check."""
         return self._get(key, default)
@@ -228,6 +242,10 @@ class Table:
             raise self.error(key, "expected a finite number")
         return number
 
+    def _radians(self, key: str, value: Any) -> float:
+        self._float(key, value, 0, False)
+        return _radians(Decimal(value))
+
     def _flat(self, key: str, value: Any, shape: tuple[int, ...]) -> Iterator[Any]:
         if not shape:
             yield value
@@ -266,6 +284,13 @@ class Shifted:
 
     value: float | NDArray[np.float64]
     shift: int
+
+
+@dataclass(frozen=True)
+class Degrees:
+    """Angles in radians to be written in degrees, exactly."""
+
+    value: float | NDArray[np.float64]
 
 
 def dumps(table: Mapping[str, Any]) -> str:
@@ -307,12 +332,19 @@ def _value(value: Any) -> str:
         inside = ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items.items())
         return f"{{ {inside} }}"
     if isinstance(value, Shifted):
-        return _shifted(np.asarray(value.value).tolist(), value.shift)
+        numbers = np.asarray(value.value)
+        if numbers.ndim == 2:
+            return _rows(_shifted(row, value.shift) for row in numbers.tolist())
+        return _shifted(numbers.tolist(), value.shift)
+    if isinstance(value, Degrees):
+        if isinstance(value.value, np.ndarray):
+            return "[" + ", ".join(_plain(_degrees(x)) for x in value.value.tolist()) + "]"
+        return _plain(_degrees(value.value))
     if isinstance(value, np.ndarray):
         return _value(value.tolist())
     if isinstance(value, list | tuple):
         if value and isinstance(value[0], list | tuple):  # a matrix: one row a line
-            return "[\n" + "".join(f"  {_value(item)},\n" for item in value) + "]"
+            return _rows(map(_value, value))
         return "[" + ", ".join(_value(item) for item in value) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -326,13 +358,31 @@ def _value(value: Any) -> str:
 def _shifted(value: Any, shift: int) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(_shifted(item, shift) for item in value) + "]"
-    if not math.isfinite(value):
-        return repr(float(value))  # nan, inf, -inf: the same words in TOML
-    number = Decimal(repr(float(value))).scaleb(shift)
+    if not math.isfinite(value):  # nan, inf, -inf: the same words in TOML
+        return repr(float(value))
+    return _plain(Decimal(repr(float(value))).scaleb(shift))
+
+
+def _plain(number: Decimal) -> str:
     if not -12 < number.adjusted() < 17:
-        return f"{number:E}" if number else "0.0"
+        return f"{number:E}" if number else "-0.0" if number.is_signed() else "0.0"
     text = f"{number:f}"
     return text if "." in text else f"{text}.0"
+
+
+def _rows(texts: Iterable[str]) -> str:
+    return "[\n" + "".join(f"  {text},\n" for text in texts) + "]"
+
+
+def _radians(degrees: Decimal) -> float:
+    return float(_EXACT.multiply(degrees, _DEGREE))
+
+
+def _degrees(radians: float) -> Decimal:
+    """The shortest number of degrees that :func:`_radians` takes to ``radians``."""
+    exact = _EXACT.divide(Decimal(radians), _DEGREE)
+    shorter = (Context(prec=n).create_decimal(exact) for n in range(1, _EXACT.prec))
+    return next((short for short in shorter if _radians(short) == radians), exact)
 
 
 def _string(text: str) -> str:

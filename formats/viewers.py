@@ -8,6 +8,7 @@ import numpy as np
 from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
@@ -26,8 +27,10 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from locatk.core.dots.sheet import Manifest
-from locatk.core.geometry import quaternion_from_matrix
+from locatk.core.geometry import quaternion_from_heading, quaternion_from_matrix
 from locatk.core.lighthouse.scene import Marker, Scene, Station
+from locatk.core.polaris import codec
+from locatk.core.polaris.tag import Placed, Tags, built_magnets, places, vertices
 from locatk.core.trajectory import Trajectory
 from locatk.formats.messages import timestamp
 from locatk.formats.session import Session
@@ -39,6 +42,7 @@ STATION_COLOR = Color(r=0.15, g=0.35, b=0.75, a=1.0)
 MARKER_COLOR = Color(r=0.85, g=0.25, b=0.2, a=1.0)
 PAPER_COLOR = Color(r=0.35, g=0.35, b=0.35, a=1.0)
 PATTERN_COLOR = Color(r=0.6, g=0.6, b=0.6, a=1.0)
+MAGNET_COLOR = Color(r=0.75, g=0.15, b=0.15, a=1.0)
 TEXT_COLOR = Color(r=0.5, g=0.5, b=0.5, a=1.0)
 PATH_COLORS = tuple(
     Color(r=r, g=g, b=b, a=1.0)
@@ -99,13 +103,11 @@ def log(message: str, time_ns: int, *, warning: bool = False) -> Log:
     return Log(timestamp=timestamp(time_ns), level=level, message=message, name="locatk")
 
 
-def scene_update(
-    artifact: Scene | Manifest | None, trajectories: Sequence[Trajectory], time_ns: int
-) -> SceneUpdate:
-    """Stations and markers, or sheets of paper, and paths as things to look at.
+def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: int) -> SceneUpdate:
+    """Stations and markers, sheets of paper, or tags, and paths as things to look at.
 
     Sizes are in the units of the scene, which has 0.1 m stations where its scale is
-    metric; sheets are in metres.
+    metric; sheets and tags are in metres. An artifact of another kind is not drawn.
     """
     entities = []
     if isinstance(artifact, Scene):
@@ -114,11 +116,26 @@ def scene_update(
     elif isinstance(artifact, Manifest):
         sheets = range(len(artifact.sheets))
         entities += [_sheet(artifact, number, time_ns) for number in sheets]
+    elif isinstance(artifact, Tags):
+        found = tags_in_frames(artifact, trajectories)
+        entities += [_tag(artifact, *where, time_ns) for where in found]
     for number, trajectory in enumerate(trajectories):
         if len(trajectory) > 0:
             color = PATH_COLORS[number % len(PATH_COLORS)]
             entities.append(_line(trajectory, color, time_ns))
     return SceneUpdate(entities=entities)
+
+
+def tags_in_frames(tags: Tags, trajectories: Sequence[Trajectory]) -> list[tuple[int, str, Placed]]:
+    """Ids of the tags whose place is known, the frame of that place, and the place.
+
+    Those of the site; where there is none, the tags in whose frames there are poses.
+    """
+    if tags.site:
+        return [(number, "site", placed) for number, placed in sorted(tags.site.items())]
+    frames = sorted({t.frame for t in trajectories})
+    numbers = [(frame.removeprefix("tag-"), frame) for frame in frames if frame[:4] == "tag-"]
+    return [(int(n), frame, Placed(0.0, 0.0, 0.0)) for n, frame in numbers if n.isdecimal()]
 
 
 def trajectory(session: Session, topic: str, device: str) -> Trajectory:
@@ -232,6 +249,46 @@ def _sheet(manifest: Manifest, number: int, time_ns: int) -> SceneEntity:
             _loop(manifest.to_metres(number, pattern), PATTERN_COLOR, 1.0),
         ],
         texts=[_text(sheet.id, (*corners[0].tolist(), 0.0), 0.0)],
+    )
+
+
+def _tag(tags: Tags, tag_id: int, frame: str, placed: Placed, time_ns: int) -> SceneEntity:
+    """The magnets, each with an arrow in its direction, in the rim of the grid."""
+    place, angle = built_magnets(tags, tag_id, codec.layout_of(tags, tag_id))
+    c, s = np.cos(placed.heading_rad), np.sin(placed.heading_rad)
+    turn, origin = np.array([[c, -s], [s, c]]), np.array([placed.x_m, placed.y_m])
+    corners = places(tags, vertices(tags.order)) @ turn.T + origin
+    headings = quaternion_from_heading(angle + placed.heading_rad).tolist()
+    magnet, length = tags.magnet, tags.spacing_m / 3
+    poses = [
+        _pose((x, y, 0.0), quaternion)
+        for (x, y), quaternion in zip((place @ turn.T + origin).tolist(), headings, strict=True)
+    ]
+    size = _vector(magnet.diameter_m, magnet.diameter_m, magnet.height_m)
+    return SceneEntity(
+        timestamp=timestamp(time_ns),
+        frame_id=frame,
+        id=f"tag/{tag_id}",
+        metadata=_pairs({"id": str(tag_id), "codec": tags.codec}),
+        cylinders=[
+            CylinderPrimitive(
+                pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=MAGNET_COLOR
+            )
+            for pose in poses
+        ],
+        arrows=[
+            ArrowPrimitive(
+                pose=pose,
+                shaft_length=0.7 * length,
+                shaft_diameter=0.08 * length,
+                head_length=0.3 * length,
+                head_diameter=0.2 * length,
+                color=MAGNET_COLOR,
+            )
+            for pose in poses
+        ],
+        lines=[_loop(corners, PATTERN_COLOR, 1.0)],
+        texts=[_text(f"tag {tag_id}", (*corners[0].tolist(), 0.0), 0.0)],
     )
 
 

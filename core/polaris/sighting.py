@@ -15,7 +15,7 @@ class Sighting:
     """Magnets that were found in one pass of the array over them.
 
     All places are in the array's frame at ``time_ns``; over a pass the array is taken to
-    move along its own x.
+    move straight, without turning.
 
     Attributes
     ----------
@@ -34,7 +34,13 @@ class Sighting:
     covariance : (3 M, 3 M) ndarray
         Of x, y, angle of the first magnet, of the second, ... in m and rad; ``nan`` where
         the method knows none.
-    height_m : float
+    path_sigma_m : (stop - first,) ndarray
+        Standard deviation of ``path_m``; ``nan`` where the method knows none.
+    crab_rad : float
+        Direction of the way, counter-clockwise from the array's x.
+    free_path : bool
+        Whether ``path_m`` was found from the field alone, without a known speed.
+    height_m, height_sigma_m : float
         From the magnets to the sensors, as found; ``nan`` where it was not asked.
     residual_sigma : float
         Rms of what the model leaves, in standard deviations of the noise; ``nan`` where
@@ -52,7 +58,11 @@ class Sighting:
     angle_rad: Array
     moment_am2: Array
     covariance: Array
+    path_sigma_m: Array
+    crab_rad: float = 0.0
+    free_path: bool = False
     height_m: float = np.nan
+    height_sigma_m: float = np.nan
     residual_sigma: float = np.nan
     others: int = 0
     notes: tuple[str, ...] = field(default=())

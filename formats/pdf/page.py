@@ -8,7 +8,7 @@ here.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import IO
 
@@ -17,6 +17,7 @@ from reportlab.lib.colors import CMYKColor
 from reportlab.lib.units import mm
 from reportlab.pdfgen.canvas import Canvas
 
+from locatk.core import drawing
 from locatk.core.dots.layout import Layout
 from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
@@ -36,7 +37,6 @@ NEEDED_MM = CLEARANCE_MM + STRIP_MM + 1.0
 
 RULER_MM = 100
 
-_LINE_MM = 0.15
 _CORNER_MM = 6.0
 _MARK_MM = 4.0
 _FONT, _BOLD = "Helvetica", "Helvetica-Bold"
@@ -74,24 +74,29 @@ def open_document(stream: IO[bytes], title: str) -> Canvas:
     return canvas
 
 
-def start_page(canvas: Canvas, size_mm: tuple[float, float]) -> None:
+def start_page(
+    canvas: Canvas,
+    size_mm: tuple[float, float],
+    *,
+    hint: str = "Cut the floor over several papers with --tiles, or use --format png",
+) -> None:
     """Begin a page of this size; `canvas.showPage()` ends it.
 
     Raises
     ------
     InputError
-        No viewer need show a page as long as that.
+        No viewer need show a page as long as that; ``hint`` says what to do.
     """
     if max(size_mm) > LARGEST_MM:
         raise InputError(
             f"a PDF page of {size_mm[0]:g} x {size_mm[1]:g} mm is longer than "
             f"{LARGEST_MM:g} mm, which is the most",
-            hint="Cut the floor over several papers with --tiles, or use --format png",
+            hint=hint,
         )
     canvas.setPageSize(tuple(_points(side) for side in size_mm))
     canvas.setFillColor(BLACK)
     canvas.setStrokeColor(BLACK)
-    canvas.setLineWidth(_LINE_MM * mm)
+    canvas.setLineWidth(drawing.LINE_MM * mm)
 
 
 def _points(side_mm: float) -> float:
@@ -112,31 +117,46 @@ def _points(side_mm: float) -> float:
 def ruler(
     canvas: Canvas, start: tuple[float, float], length: int = RULER_MM, *, upright: bool = False
 ) -> None:
-    """A ruler with a tick each mm, a longer one each 5 mm and a number each 10 mm.
-
-    It runs from ``start`` to the right with its ticks below, or up with its ticks at the
-    left; it is about 4 mm deep.
-    """
-    canvas.saveState()
-    canvas.translate(start[0] * mm, start[1] * mm)
-    if upright:
-        canvas.rotate(90)
-    # Turned by 90 degrees, "below" is at the right: there the ticks grow the other way.
-    out = 1 if upright else -1
-    lines = [(0.0, 0.0, float(length), 0.0)]
-    lines += [(at, 0.0, at, out * _tick(at)) for at in range(length + 1)]
-    _lines(canvas, lines)
-    canvas.setFont(_FONT, _SMALL)
-    baseline = 2.6 if upright else -2.6 - 0.72 * _SMALL / mm
-    for at in range(0, length + 1, 10):
-        canvas.drawCentredString(at * mm, baseline * mm, str(at))
-    after = canvas.stringWidth(str(length), _FONT, _SMALL) / 2
-    canvas.drawString(length * mm + after + 1, baseline * mm, "mm")
-    canvas.restoreState()
+    """Draw :func:`locatk.core.drawing.ruler`."""
+    draw(canvas, drawing.ruler(start, length, upright=upright))
 
 
-def _tick(at: int) -> float:
-    return 2.2 if at % 10 == 0 else 1.5 if at % 5 == 0 else 0.9
+def draw(canvas: Canvas, marks: Iterable[drawing.Mark]) -> None:
+    """Draw marks on the page that was begun."""
+    for mark in marks:
+        canvas.saveState()
+        if isinstance(mark, drawing.Words):
+            _write(canvas, mark)
+        else:
+            canvas.setLineWidth(mark.width_mm * mm)
+            _stroke(canvas, mark)
+        canvas.restoreState()
+
+
+def _write(canvas: Canvas, words: drawing.Words) -> None:
+    canvas.translate(words.at[0] * mm, words.at[1] * mm)
+    canvas.rotate(words.turn_deg)
+    font = _BOLD if words.bold else _FONT
+    canvas.setFont(font, words.points)
+    share = {"start": 0.0, "middle": 0.5, "end": 1.0}[words.anchor]
+    width = canvas.stringWidth(words.text, font, words.points)
+    canvas.drawString(-share * width, 0, words.text)
+
+
+def _stroke(canvas: Canvas, mark: drawing.Line | drawing.Circle | drawing.Polygon) -> None:
+    if isinstance(mark, drawing.Circle):
+        canvas.circle(*(value * mm for value in (*mark.centre, mark.radius_mm)))
+    elif isinstance(mark, drawing.Line):
+        if mark.dash_mm is not None:
+            canvas.setDash([mark.dash_mm * mm])
+        _lines(canvas, [(*mark.start, *mark.end)])
+    else:
+        path = canvas.beginPath()
+        path.moveTo(*(value * mm for value in mark.corners[0]))
+        for corner in mark.corners[1:]:
+            path.lineTo(*(value * mm for value in corner))
+        path.close()
+        canvas.drawPath(path, stroke=int(not mark.filled), fill=int(mark.filled))
 
 
 def _lines(canvas: Canvas, lines: Sequence[tuple[float, float, float, float]]) -> None:

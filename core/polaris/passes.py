@@ -1,0 +1,98 @@
+"""Where in a recording the array passed over magnets, and how noisy its samples are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.polaris.array import Samples
+
+Array = NDArray[np.float64]
+
+LAGS = (1, 2, 4, 8, 16)
+"""Samples over which a change of the field is looked for: for fast robots and slow ones."""
+
+ACTIVE = 8.0
+"""A sample is active where the bar's field changes by so much more than noise does, in
+standard deviations of the sum of squares over the bar."""
+
+LEAST_NOISE_T = 2e-8
+"""What a sensor without noise and without a known quantum is taken to have."""
+
+_QUANTILE, _NORMAL = 0.3, 0.38532
+"""A quantile of the absolute value of a normal distribution: low, so that passes over
+magnets may fill most of a recording."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Samples ``first`` to ``stop - 1``, in which magnets were near."""
+
+    first: int
+    stop: int
+
+
+def noise(samples: Samples) -> Array:
+    """Standard deviation (N, 3) of the noise of each sensor and axis, in tesla.
+
+    From second differences, most of which a smooth field hardly changes; as stated by the
+    array where there are too few samples.
+    """
+    stated = np.broadcast_to(samples.array.noise_t, (len(samples.array), 3))
+    least = np.maximum(samples.array.quantum_t / 4, LEAST_NOISE_T)
+    bend = np.abs(np.diff(samples.field_t, n=2, axis=0))
+    if len(bend) < 20:
+        found = np.array(stated)
+    else:
+        filled = np.where(np.isfinite(bend), bend, np.inf)
+        usable = np.isfinite(bend).sum(axis=0)
+        rank = np.maximum((_QUANTILE * usable).astype(int), 0)
+        ordered = np.sort(filled, axis=0)
+        found = np.take_along_axis(ordered, rank[None], axis=0)[0] / _NORMAL / np.sqrt(6)
+        found = np.where(usable >= 20, found, stated)
+    return np.maximum(np.where(np.isfinite(found), found, LEAST_NOISE_T), least)
+
+
+def activity(samples: Samples, noise_t: Array) -> Array:
+    """How much the field along the bar changes around each sample (n,), in standard
+    deviations of what noise makes of it.
+
+    A field that all sensors share (the Earth's, while the robot turns) does not count.
+    """
+    n = len(samples)
+    scaled = samples.field_t / noise_t
+    with np.errstate(all="ignore"):
+        scaled = scaled - np.nan_to_num(np.nanmean(scaled, axis=1, keepdims=True))
+    scaled = np.nan_to_num(scaled)
+    freedom = max(3 * (len(samples.array) - 1), 1)
+    best = np.zeros(n)
+    for lag in LAGS:
+        if lag >= n:
+            break
+        change = ((scaled[lag:] - scaled[:-lag]) ** 2).sum(axis=(1, 2)) / 2
+        z = (change - freedom) / np.sqrt(2 * freedom)
+        start = lag // 2
+        best[start : start + n - lag] = np.maximum(best[start : start + n - lag], z)
+    return best
+
+
+def find(samples: Samples, noise_t: Array) -> list[Pass]:
+    """Passes of a recording, in order of time; none where nothing has changed."""
+    active = activity(samples, noise_t) > ACTIVE
+    # A single sample is a spike; what is active is so for some samples.
+    sure = active & (np.convolve(active, np.ones(5), "same") >= 3)
+    at = np.flatnonzero(sure)
+    if len(at) == 0:
+        return []
+    found: list[Pass] = []
+    for group in np.split(at, np.flatnonzero(np.diff(at) > max(LAGS)) + 1):
+        first, stop = int(group[0]), int(group[-1]) + 1
+        pad = max(10, (stop - first) // 6)
+        first, stop = max(0, first - pad), min(len(samples), stop + pad)
+        if found and first <= found[-1].stop:
+            found[-1] = Pass(found[-1].first, stop)
+        else:
+            found.append(Pass(first, stop))
+    return found

@@ -1,0 +1,190 @@
+"""From samples of magnetometer bars to tags that were read and poses of the bar."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import InputError
+from locatk.core.polaris import joint, passes
+from locatk.core.polaris.array import Samples
+from locatk.core.polaris.identify import Seen, identify
+from locatk.core.polaris.route import along, corrections, joined, tag_poses
+from locatk.core.polaris.sighting import Sighting
+from locatk.core.polaris.tag import Tags
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+METHODS = ("joint", "paper")
+
+FEWEST_SAMPLES = 20
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """How to solve.
+
+    Attributes
+    ----------
+    method : str
+        ``"joint"``, the default, or ``"paper"``: the published algorithm.
+    speed_mps : float or None
+        Speed of the array over the floor where it is known and constant; ``paper`` needs
+        it. None leaves the way to odometry, else to the field itself.
+    """
+
+    method: str = "joint"
+    speed_mps: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"no method {self.method!r} for polaris", hint="Use joint or paper")
+        if self.speed_mps is not None and not 0 < self.speed_mps < 100:
+            raise InputError(
+                f"a speed of {self.speed_mps!r} m/s cannot be", hint="Give it in metres a second"
+            )
+
+
+def solve(
+    samples: Sequence[Samples],
+    tags: Tags | None = None,
+    options: SolveOptions | None = None,
+    *,
+    odometry: Sequence[Trajectory] = (),
+) -> Solution:
+    """Find the tags that arrays have passed over, read them, and place the arrays by them.
+
+    Parameters
+    ----------
+    samples : sequence of Samples
+        One a device.
+    tags : Tags or None
+        The design of the tags, and where they lie. Without it magnets are found, but no
+        ids.
+    options : SolveOptions, optional
+    odometry : sequence of Trajectory
+        By device; it measures the way, and joins the poses between two tags.
+
+    Returns
+    -------
+    Solution
+        Its detections are what was seen in each pass, read or not (docs/formats.md).
+
+    Raises
+    ------
+    InputError
+        A recording is empty or too short, or the method needs a speed.
+    """
+    options = options or SolveOptions()
+    trajectories, detections, notes = [], [], []
+    rejected: Counter[str] = Counter()
+    turns: list[dict[str, Any]] = []
+    for recording in samples:
+        _check(recording)
+        driven = next((t for t in odometry if t.device == recording.device), None)
+        seen = _seen(recording, tags, options, driven)
+        for item in seen:
+            detections.append(item.detection(recording.device, recording.time_ns))
+            if item.refused:
+                rejected[item.refused] += 1
+        read = [item for item in seen if item.tag_id is not None]
+        poses, said = tag_poses(recording, read, tags)
+        notes += said
+        if poses and driven is not None:
+            poses = joined(poses, driven)
+        trajectories += poses
+        turns += corrections(recording, read, tags)
+        lost = np.isnan(recording.field_t).any(axis=2).mean()
+        if lost > 0:
+            notes.append(f"{recording.device}: {100 * lost:.2g} % of the sensors' samples missing")
+    return Solution(
+        system="polaris",
+        method=options.method,
+        trajectories=tuple(trajectories),
+        rejected=dict(rejected),
+        detections=detections,
+        artifact=tags,
+        notes=tuple(notes),
+        facts={"heading_corrections": turns},
+    )
+
+
+def _check(recording: Samples) -> None:
+    if len(recording) < FEWEST_SAMPLES:
+        raise InputError(
+            f"{len(recording)} samples of {recording.device}, where a tag needs "
+            f"{FEWEST_SAMPLES} and more",
+            hint="Record from before the tag to after it",
+        )
+    if not np.isfinite(recording.field_t).any():
+        raise InputError(
+            f"no sensor of {recording.device} gave a sample", hint="Check wiring and range"
+        )
+
+
+def _seen(
+    recording: Samples, tags: Tags | None, options: SolveOptions, driven: Trajectory | None
+) -> list[Seen]:
+    """What each pass over magnets has shown, in order of time."""
+    if options.method == "paper":
+        if tags is None:
+            raise InputError(
+                "the published algorithm needs the tag",
+                hint="Give it as --artifact, or import with --tag",
+            )
+        sightings = paper.sightings(recording, tags, options.speed_mps)
+        return [seen for sighting in sightings for seen in identify(sighting, recording, tags)]
+    path = None
+    if options.speed_mps is not None:
+        path = (recording.time_ns - recording.time_ns[0]) * 1e-9 * options.speed_mps
+    elif driven is not None:
+        path = along(driven, recording.time_ns)
+    noise = passes.noise(recording)
+    found: list[tuple[Sighting, list[Seen]]] = []
+    for part in passes.find(recording, noise):
+        fresh = _solved(recording, part, noise, tags, path)
+        if fresh is None:
+            continue
+        if found and tags is not None and _may_be_one(found[-1], fresh, tags):
+            both = passes.Pass(found[-1][0].first, fresh[0].stop)
+            whole = _solved(recording, both, noise, tags, path)
+            if whole is not None and any(seen.tag_id is not None for seen in whole[1]):
+                found[-1] = whole
+                continue
+        found.append(fresh)
+    return [seen for _, group in found for seen in group]
+
+
+def _solved(
+    recording: Samples,
+    part: passes.Pass,
+    noise: Array,
+    tags: Tags | None,
+    path: Array | None,
+) -> tuple[Sighting, list[Seen]] | None:
+    """One pass as a sighting and what it is read as; None where there is no magnet."""
+    task = joint.prepare(recording, part, noise, tags, path)
+    fitted = joint.solve_pass(task)
+    if fitted is None:
+        return None
+    sighting = joint.sighting(recording, task, fitted)
+    return sighting, identify(sighting, recording, tags)
+
+
+def _may_be_one(
+    before: tuple[Sighting, list[Seen]], after: tuple[Sighting, list[Seen]], tags: Tags
+) -> bool:
+    """Whether two passes may be the ends of one tag: neither is read, and they are near."""
+    if any(seen.tag_id is not None for seen in (*before[1], *after[1])):
+        return False
+    first, second = before[0], after[0]
+    gap = max(second.first - first.stop, 0)
+    step = np.ptp(first.path_m) / max(len(first.path_m) - 1, 1)
+    return bool(gap * step < 1.5 * tags.order * tags.spacing_m)

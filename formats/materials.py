@@ -1,0 +1,29 @@
+"""Bills of materials as CSV, for a spreadsheet."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+
+from locatk.core.polaris.materials import Item
+from locatk.formats.output import atomic_write
+
+COLUMNS = ("part", "count", "detail", "price_usd", "source")
+
+
+def write_bill(path: str | os.PathLike[str], items: Sequence[Item], *, overwrite: bool) -> None:
+    """Write items as CSV, one a line under :data:`COLUMNS`; a price that is not known stays
+    empty.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError
+        See :func:`locatk.formats.output.atomic_write`.
+    """
+    with atomic_write(path, overwrite=overwrite, mode="w") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for item in items:
+            price = "" if item.price_usd is None else f"{item.price_usd:g}"
+            table.writerow((item.part, item.count, item.detail, price, item.source))
