@@ -13,7 +13,10 @@ from locatk.cli import console, options
 if TYPE_CHECKING:
     from locatk.core.trajectory import Trajectory
 
-SYSTEMS = ("lighthouse", "dots")
+SYSTEMS = ("lighthouse", "dots", "polaris")
+
+SPEED_MPS = 0.1
+"""Of the robot over the tags; the published algorithm has to be told."""
 
 
 @click.command(short_help="Simulate, solve and evaluate, to see that all works.")
@@ -29,8 +32,9 @@ def command(
     """Simulate a session of each SYSTEM, solve it, and compare it with the truth.
 
     Two robots drive under two Lighthouse stations whose places are unknown; a camera
-    drives over a printed A4 sheet of dots, of which some are missing and some are dust.
-    Writes the session, the solution and a plot of each, and the sheet to print.
+    drives over a printed A4 sheet of dots, of which some are missing and some are dust; a
+    bar of magnetometers drives over three tags of magnets that were laid by hand, iron bits
+    among them. Writes the session, the solution and a plot of each, and what to print.
 
     \b
     Examples:
@@ -40,7 +44,7 @@ def command(
     """
     folder = _folder(output)
     chosen = [name for name in SYSTEMS if name in systems or not systems]
-    makers = {"lighthouse": _lighthouse, "dots": _dots}
+    makers = {"lighthouse": _lighthouse, "dots": _dots, "polaris": _polaris}
     for name in chosen:
         for path in _files(folder, name):
             options.guard_output(path, overwrite=overwrite)
@@ -63,7 +67,9 @@ def command(
             ],
         )
     )
-    console.say("error: mean distance from the truth, in the frame of the markers or the sheet")
+    console.say(
+        "error: mean distance from the truth, in the frame of the markers, the sheet or the site"
+    )
     for row in rows:
         for file in row["files"]:
             console.say(f"Wrote {file}")
@@ -79,9 +85,9 @@ def _folder(output: Path | None) -> Path:
 
 
 def _files(folder: Path, system: str) -> list[Path]:
-    """Session, solution and plot; of dots the sheet as well."""
-    endings = [".mcap", "-solved.mcap", ".png", *(["-sheet.pdf"] if system == "dots" else [])]
-    return [folder / f"{system}{end}" for end in endings]
+    """Session, solution and plot, and what is to be printed."""
+    printed = {"dots": ["-sheet.pdf"], "polaris": ["-tags.pdf"]}.get(system, [])
+    return [folder / f"{system}{end}" for end in (".mcap", "-solved.mcap", ".png", *printed)]
 
 
 def _whole_way(
@@ -102,7 +108,8 @@ def _whole_way(
         truths = make(files, seed, overwrite)
     with console.working("Solving"):
         solved = solve_session(session, Request())
-        paper = solve_session(session, Request(method="paper"))
+        speed = SPEED_MPS if system == "polaris" else None
+        paper = solve_session(session, Request(method="paper", speed=speed))
         solutions.write_solution(solution, solved.solution, source=session, overwrite=overwrite)
 
     truth = {trajectory.device: trajectory for trajectory in truths}
@@ -174,4 +181,49 @@ def _dots(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ..
     )
     with atomic_write(files[3], overwrite=overwrite) as stream:
         stream.write(pattern.render(simulated.manifest))
+    return (simulated.truth,)
+
+
+def _polaris(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    from math import radians
+
+    from locatk.core.polaris import cards, simulate
+    from locatk.core.polaris.codec import layout_of
+    from locatk.core.polaris.tag import Placed, Tags
+    from locatk.formats import arrays
+    from locatk.formats.output import atomic_write
+    from locatk.formats.pdf import tag
+
+    ids = (262_143, 77, 123_456)
+    tags = Tags(
+        codec="polaris-released",
+        site={
+            number: Placed(0.5 * k, 0.02 * k, radians(turn))
+            for k, (number, turn) in enumerate(zip(ids, (0.0, 90.0, 200.0), strict=True))
+        },
+    )
+    simulated = simulate.simulate(
+        tags,
+        simulate.SimulationOptions(
+            route=ids,
+            speed_mps=SPEED_MPS,
+            build_angle_rad=radians(3),
+            build_place_m=0.2e-3,
+            build_strength=0.03,
+            debris=3,
+            odometry=True,
+            seed=seed,
+        ),
+    )
+    arrays.write_session(
+        files[0],
+        [simulated.samples],
+        tags=tags,
+        truth=(simulated.truth,),
+        odometry=() if simulated.odometry is None else (simulated.odometry,),
+        overwrite=overwrite,
+    )
+    drawn = cards.draw(tags, [(number, layout_of(tags, number)) for number in ids], (210.0, 297.0))
+    with atomic_write(files[3], overwrite=overwrite) as stream:
+        stream.write(tag.render(drawn.pages, "locatk demo"))
     return (simulated.truth,)

@@ -119,7 +119,8 @@ def design(
             tags = replace(tags, ids=families.generate(tags, count, min_distance))
         tags = replace(tags, notes=(f"family of rule {families.VERSION}, count {count}",))
     families.check(tags)
-    planned = plan(tags, use_of(**use), count=len(tags.ids or (0,)))
+    with console.working("Planning"):
+        planned = plan(tags, use_of(**use), count=len(tags.ids or (0,)))
     write_tags(output, tags, overwrite=overwrite)
     if bom is not None:
         write_bill(bom, planned.materials, overwrite=overwrite)
@@ -150,7 +151,8 @@ def check(tag: Path, as_json: bool, **use: Any) -> None:
     from locatk.formats.tags import read_tags
 
     tags = read_tags(tag)
-    planned = plan(tags, use_of(**use), count=len(tags.ids or (0,)))
+    with console.working("Planning"):
+        planned = plan(tags, use_of(**use), count=len(tags.ids or (0,)))
     warnings = list(planned.warnings)
     found: int | None = None
     if tags.ids is not None and len(tags.ids) > 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,8 @@ if TYPE_CHECKING:
     from locatk.core.polaris.planning import Plan
     from locatk.core.polaris.tag import Tags
 
-MOST_IDS = 8
+WIDTH = 60
+"""Letters for the ids of a family."""
 
 
 def text(plan: Plan) -> str:
@@ -65,9 +67,8 @@ def members(tags: Tags) -> str:
     """Which ids there are, in a few words."""
     if tags.ids is None:
         return "any id may occur"
-    named = ", ".join(str(number) for number in tags.ids[:MOST_IDS])
-    more = ", ..." if len(tags.ids) > MOST_IDS else ""
-    return f"{len(tags.ids)} {'id' if len(tags.ids) == 1 else 'ids'}: {named}{more}"
+    count = "1 id: " if len(tags.ids) == 1 else f"{len(tags.ids)} ids: "
+    return count + textwrap.shorten(", ".join(map(str, tags.ids)), WIDTH, placeholder=" ...")
 
 
 def _head(plan: Plan) -> str:
@@ -168,11 +169,11 @@ def _accuracy(name: str, bound: Bound, pose: bool) -> tuple[str, ...]:
 
 
 def _short(number: int) -> str:
-    return str(number) if number < 10**12 else f"{number:.3e}"
+    return str(number) if number < 10**15 else f"about 10^{math.log10(number):.0f}"
 
 
 def _percent(part: float) -> str:
-    return f"{part * 100:.2g} %"
+    return f"{part:.0%}".replace("%", " %") if part > 0.1 else f"{part * 100:.2g} %"
 
 
 def _mm(metres: float) -> str:

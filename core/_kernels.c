@@ -1,8 +1,9 @@
 /* The hot loops of core/dots, frame by frame: dots of an image, their lattice, what they say,
- * where that is in the pattern, and the pose.
+ * where that is in the pattern, and the pose; and of core/polaris: the alignment of samples with
+ * templates.
  *
- * Each has a twin in numpy that says what it does and why (core/dots/blobs.py and others) and
- * that is used where this module was not built; tests/core/dots/test_kernels.py holds the two
+ * Each has a twin in numpy that says what it does and why (core/dots/blobs.py and others,
+ * core/polaris/ddtw.py) and that is used where this module was not built; tests hold the two
  * against each other. Constants come in as arguments, so that they stand in one place.
  * Only the stable ABI of Python 3.11 is used, and buffers instead of numpy's own interface.
  */
@@ -1257,7 +1258,7 @@ static PyObject *ddtw(PyObject *self, PyObject *args)
         Py_BEGIN_ALLOW_THREADS for (int first = 0; first < count; first += DDTW_LANES)
         {
             const size_t lanes = (size_t)(count - first < DDTW_LANES ? count - first : DDTW_LANES);
-            float cost[DDTW_LANES];
+            float cost[DDTW_LANES] = {0};
             for (int row = 0; row < 3 * length; row++)
                 memcpy(slopes + (size_t)row * DDTW_LANES,
                        (const float *)b[SLOPES].buf + (size_t)row * count + first,

@@ -106,3 +106,12 @@ def poses(
     covariance: Buffer,
     /,
 ) -> None: ...
+def ddtw(
+    query: Buffer,
+    slopes: Buffer,
+    n: int,
+    length: int,
+    count: int,
+    cost: Buffer,
+    /,
+) -> None: ...

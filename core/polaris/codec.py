@@ -6,6 +6,7 @@ for errors it corrects, ``polaris-released`` is the table of the published recor
 
 from __future__ import annotations
 
+from itertools import pairwise
 from types import ModuleType
 
 from locatk.core.errors import InputError
@@ -100,7 +101,7 @@ def _check_layout(tags: Tags, layout: Layout) -> None:
             f"{len(cells)} cells and {len(symbols)} orientations for {tags.magnets} magnets"
         )
     keys = [mosk.row_first(cell) for cell in cells]
-    if any(one >= other for one, other in zip(keys, keys[1:], strict=False)):
+    if any(one >= other for one, other in pairwise(keys)):
         raise InputError("the cells of a layout stand row by row from v1, columns ascending")
     if not all(0 <= index < tags.order for cell in cells for index in cell):
         raise InputError(f"a cell lies outside the grid of order {tags.order}")

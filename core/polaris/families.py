@@ -3,9 +3,9 @@
 Distance of two tags: the steps between their orientations, round the circle (Lee), in the
 cells both occupy, plus P // 2 for each magnet that one has in a cell where the other has
 none. Orientations are misread by a step, seldom by more, so that steps count and not
-symbols. A magnet in another cell counts as the largest turn: it is the smallest weight with
-which the triangle inequality holds (else, over a tag with the magnet elsewhere, two opposite
-orientations would be closer than they are), and a whole spacing is less easily misread.
+symbols. A magnet in another cell, a whole spacing away, is misread less than any turn, and
+counts as the largest of them: so the distance stays a metric, and a magnet that was not seen
+takes P // 2 from it at most, whichever way the two tags differ there.
 
 A family's members never change: :func:`generate` is deterministic, ``VERSION`` names its
 rule, and a longer family begins with the shorter one.
@@ -30,7 +30,7 @@ leaves this one's families as they are."""
 EMPTY = -1
 """In tables: no magnet in the cell."""
 
-MOST_VISITS = 1 << 18
+MOST_VISITS = 1 << 19
 """Ids that :func:`generate` tries before it gives up."""
 
 BATCH = 1024
@@ -162,37 +162,33 @@ def generate(tags: Tags, count: int, min_distance: int) -> tuple[int, ...]:
         raise InputError(f"a family of {count} tags", hint="Use at least 1")
     if min_distance < 1:
         raise InputError(f"a minimum distance of {min_distance}", hint="Use at least 1")
+    hint = "Use a smaller count or minimum distance, or more magnets or orientations"
+    if count > capacity:
+        raise InputError(f"no {count} tags: the codec has {capacity} ids", hint=hint)
     stride = _stride(capacity)
     visits = min(capacity, MOST_VISITS)
+    members = np.empty((count, tags.order**2), np.int16)
     chosen: list[int] = []
-    if count <= capacity:
-        members = np.empty((count, tags.order**2), np.int16)
-        for start in range(0, visits, BATCH):
-            batch = range(start, min(start + BATCH, visits))
-            ids = tuple(visit * stride % capacity for visit in batch)
-            rows = table(tags, ids)
-            fits = np.ones(len(rows), bool)
-            if chosen:
-                known = members[: len(chosen)]
-                fits = (_distances(tags, rows, known) >= min_distance).all(axis=1)
-            ids = tuple(tag_id for tag_id, fit in zip(ids, fits, strict=True) if fit)
-            rows = rows[fits]
-            among = _distances(tags, rows, rows) >= min_distance
-            taken: list[int] = []
-            for k, tag_id in enumerate(ids):
-                if among[k, taken].all():
-                    taken.append(k)
-                    members[len(chosen)] = rows[k]
-                    chosen.append(tag_id)
-                    if len(chosen) == count:
-                        return tuple(chosen)
+    for start in range(0, visits, BATCH):
+        batch = range(start, min(start + BATCH, visits))
+        ids = tuple(visit * stride % capacity for visit in batch)
+        rows = table(tags, ids)
+        far = _distances(tags, rows, members[: len(chosen)]) >= min_distance
+        fits = np.flatnonzero(far.all(axis=1))
+        among = _distances(tags, rows[fits], rows[fits]) >= min_distance
+        taken: list[int] = []
+        for k, row in enumerate(fits):
+            if among[k, taken].all():
+                taken.append(k)
+                members[len(chosen)] = rows[row]
+                chosen.append(ids[row])
+                if len(chosen) == count:
+                    return tuple(chosen)
     tried = "all" if visits == capacity else f"the first {visits} of"
-    found = f", {len(chosen)} found among {tried} {capacity} ids" if count <= capacity else ""
     raise InputError(
-        f"no {count} tags with distance {min_distance}{found}"
-        if found
-        else f"no {count} tags: the codec has {capacity} ids",
-        hint="Use a smaller count or minimum distance, or more magnets or orientations",
+        f"no {count} tags with distance {min_distance}: {len(chosen)} found among {tried} "
+        f"{capacity} ids",
+        hint=hint,
     )
 
 

@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.dipoles import thickness
-from locatk.core.polaris.fit import Fitted, Priors, State, Window, fit
+from locatk.core.polaris.fit import Fitted, fit
 from locatk.core.polaris.passes import Pass
+from locatk.core.polaris.problem import Priors, State, Window
 from locatk.core.polaris.scan import Atom, Scanner
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Tags
 
 Array = NDArray[np.float64]
 
-SPEEDS_M = np.geomspace(0.1e-3, 10e-3, 14)
+SPEEDS_M = np.geomspace(0.1e-3, 10e-3, 12)
 """Steps of a sample period that are tried."""
 
 HEIGHTS_M = (0.005, 0.0075, 0.011, 0.016)
@@ -36,6 +37,9 @@ MOST_SAMPLES = 420
 
 WHITE = 1.6
 """Rms of a residual, in standard deviations of the noise, that needs no other start."""
+
+DEBRIS = 1.3
+"""Rms of a residual above which weak sources are looked for as well."""
 
 WEAK = 0.4
 """A magnet has at least this share of the median moment."""
@@ -63,6 +67,8 @@ class Task:
         Number in the recording of the window's first sample.
     group : int
         Samples that one of the window is the mean of.
+    apart_m : float
+        Least distance of two magnets.
     """
 
     window: Window
@@ -70,6 +76,7 @@ class Task:
     priors: tuple[Priors, ...]
     first: int
     group: int
+    apart_m: float
 
 
 def prepare(
@@ -116,7 +123,8 @@ def prepare(
         )
         for height in heights
     )
-    return Task(window, _level(field / noise_t), priors, part.first, group)
+    apart = SAME_M * heights[0] if tags is None else 0.5 * tags.spacing_m
+    return Task(window, _level(field / noise_t), priors, part.first, group, apart)
 
 
 def _averaged(values: Array, group: int) -> Array:
@@ -210,19 +218,29 @@ def _grow(task: Task, start: _Start) -> Fitted:
     path = start.state.path_m
     atoms, _ = scanner.atoms(path, task.scaled, MOST_MAGNETS, LEAST_ENERGY)
     state = _state(_distinct(atoms, start.state.height_m), path, start.state.speed_m, priors)
-    fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, robust=False)
+    fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
     for _ in range(4):
         state = fitted.state
         scanner = Scanner(window.sensors_m, window.noise_t, state.height_m)
         residual = np.nan_to_num(fitted.residual).reshape(len(window.frames), -1)
         new, _ = scanner.atoms(state.path_m, residual, 4, max(LEAST_ENERGY, 12 * fitted.sigma**2))
-        new = [atom for atom in new if _far(atom.place_m, state, SAME_M * state.height_m)]
+        # What is weak is looked at where it is needed only.
+        least = 0.0 if fitted.sigma > DEBRIS else 0.5 * WEAK * np.median(_sizes(state))
+        new = [
+            atom
+            for atom in new
+            if np.hypot(*atom.moment_am2) > least
+            and _far(atom.place_m, state, SAME_M * state.height_m)
+        ]
         if not new:
             break
         state = _with(state, new)
-        fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, robust=False)
-    state = _without_ghosts(fitted.state)
-    return fit(window, state, priors)
+        fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
+    while True:
+        state = _without_ghosts(fitted.state, task.apart_m)
+        fitted = fit(window, state, priors)
+        if len(_without_ghosts(fitted.state, task.apart_m).place_m) == len(state.place_m):
+            return fitted
 
 
 def _distinct(atoms: list[Atom], height: float) -> list[Atom]:
@@ -236,6 +254,10 @@ def _distinct(atoms: list[Atom], height: float) -> list[Atom]:
     return kept
 
 
+def _sizes(state: State) -> Array:
+    return np.hypot(state.moment_am2[:, 0], state.moment_am2[:, 1])
+
+
 def _far(place: Array, state: State, limit: float) -> bool:
     return bool(np.all(np.linalg.norm(state.place_m - place, axis=1) > limit))
 
@@ -246,21 +268,27 @@ def _with(state: State, atoms: list[Atom]) -> State:
     return replace(state, place_m=places, moment_am2=moments)
 
 
-def _without_ghosts(state: State) -> State:
-    """Without sources that are no hundredth of a magnet, or nearly at another's place."""
-    size = np.hypot(*state.moment_am2[:, :2].T)
+def _without_ghosts(state: State, apart_m: float) -> State:
+    """Without sources that are no hundredth of a magnet, or that share one with another.
+
+    Two magnets of a tag are never nearer than ``apart_m``; a weak source may be, but not at
+    a magnet's own place.
+    """
+    size = _sizes(state)
     order = np.argsort(-size)
     kept: list[int] = []
     for k in order:
         apart = np.linalg.norm(state.place_m[kept] - state.place_m[k], axis=1)
-        if size[k] > 0.03 * size[order[0]] and np.all(apart > SAME_M * state.height_m):
+        weak = size[k] < WEAK * size[order[0]]
+        least = SAME_M * state.height_m if weak else apart_m
+        if size[k] > 0.03 * size[order[0]] and np.all(apart > least):
             kept.append(int(k))
     return replace(state, place_m=state.place_m[kept], moment_am2=state.moment_am2[kept])
 
 
 def magnets(fitted: Fitted) -> NDArray[np.intp]:
     """Which of the sources are magnets of a tag: the others are weaker by far."""
-    size = np.hypot(*fitted.state.moment_am2[:, :2].T)
+    size = _sizes(fitted.state)
     strong = size[size > WEAK * size.max()]
     return np.flatnonzero(size > WEAK * np.median(strong))
 

@@ -72,10 +72,10 @@ class Reading:
 
 
 class _Seen(NamedTuple):
-    """Magnets with an orientation: cells, their index in a table, steps and sigma (m,)."""
+    """Magnets with an orientation: cells, their columns of a table, steps and sigma (m,)."""
 
     cells: tuple[Cell, ...]
-    index: NDArray[np.intp]
+    column: NDArray[np.intp]
     steps: Array
     sigma: Array
     nearest: tuple[int, ...]
@@ -195,7 +195,7 @@ def _read_any(tags: Tags, seen: _Seen) -> Reading:
     owners = list(range(len(ids)))
     if tags.built:
         built = tuple(tags.built)
-        rows = _built(tags, built)[:, seen.index]
+        rows = _built(tags, built)[:, seen.column]
         here = np.flatnonzero(np.isfinite(rows).all(axis=1))
         expected.append(rows[here])
         known = {tag_id: k for k, tag_id in enumerate(ids)}
@@ -217,7 +217,7 @@ def _read_member(tags: Tags, seen: _Seen, ids: tuple[int, ...]) -> Reading:
     rows = _members(tags, ids)
     if not len(rows):
         return _refusal(tags, seen, "not_in_family")
-    seen_rows = rows[:, seen.index]
+    seen_rows = rows[:, seen.column]
     expected = np.where(seen_rows == families.EMPTY, np.nan, seen_rows)
     owner = np.arange(len(ids))
     electable = np.ones(len(ids), bool)
@@ -225,7 +225,7 @@ def _read_member(tags: Tags, seen: _Seen, ids: tuple[int, ...]) -> Reading:
     built = tuple(tag_id for tag_id in tags.built if tag_id in number)
     if built:
         which = np.array([number[tag_id] for tag_id in built])
-        expected = np.concatenate([expected, _built(tags, built)[:, seen.index]])
+        expected = np.concatenate([expected, _built(tags, built)[:, seen.column]])
         electable[which] = False
         owner = np.concatenate([owner, which])
         electable = np.concatenate([electable, np.ones(len(built), bool)])
@@ -265,7 +265,7 @@ def _read_redundant(tags: Tags, seen: _Seen) -> Reading:
     if decoded is not None:
         expected[redundancy.message(tags, decoded)] = np.array(decoded, float)[where]
     if tags.built:
-        built, rows = tuple(tags.built), _built(tags, tuple(tags.built))[:, seen.index]
+        built, rows = tuple(tags.built), _built(tags, tuple(tags.built))[:, seen.column]
         misread = (np.abs(_deviation(tags, rows, seen)) > 0.5).sum(axis=1)
         for k in np.flatnonzero(2 * misread + missing <= redundancy.BUDGET):
             expected[built[k]] = rows[k]
@@ -318,9 +318,9 @@ def _nearest(tags: Tags, found: _Candidates, seen: _Seen) -> tuple[int, float, b
 
 def _deviation(tags: Tags, expected: Array, seen: _Seen) -> Array:
     """Steps from what is expected to what was seen, the short way round; nan stays."""
-    half = tags.orientations / 2
-    result: Array = (seen.steps - expected + half) % tags.orientations - half
-    return result
+    away: Array = seen.steps - expected
+    away -= tags.orientations * np.rint(away / tags.orientations)
+    return away
 
 
 def _capped(tags: Tags, expected: Array, seen: _Seen) -> Array:

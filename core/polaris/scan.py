@@ -57,22 +57,19 @@ class Scanner:
         margin = BESIDE * height_m
         count = int(np.ceil((left - right + 2 * margin) / (ACROSS * height_m))) + 1
         self.across_m = np.linspace(right - margin, left + margin, count)
+        shape = (len(along), len(sensors_m), 3, count)
         offsets = Offsets.of(
-            np.broadcast_to(
-                along[None, :, None, None] + sensors_m[:, None, 0],
-                (3, len(along), len(sensors_m), 1),
-            ),
-            sensors_m[None, :, None, 1] - self.across_m,
+            np.broadcast_to((along[:, None] + sensors_m[:, 0])[:, :, None, None], shape),
+            (sensors_m[:, 1:2] - self.across_m)[None, :, None],
             height_m,
         )
-        units = offsets.unit_fields()[:, :2] / noise_t.T[:, None, None, :, None]
-        # (axis, moment, rows, N, places) to (rows, N, axis) x (places, moment)
-        columns = units.transpose(2, 3, 0, 4, 1)
+        columns = offsets.unit_fields()[..., :2] / noise_t[:, :, None, None]
         self.half, self.channels = half, 3 * len(sensors_m)
-        self.templates = columns.reshape(-1, 2 * count).astype(np.float32)
-        pairs = self.templates.reshape(-1, count, 2).astype(float)
-        self.gram = np.einsum("rpi,rpj->pij", pairs, pairs)
-        self.inverse = np.linalg.inv(self.gram)
+        pairs = np.ascontiguousarray(columns.reshape(-1, count, 2).transpose(1, 0, 2))
+        # Orthogonal for each place, so that energies are sums of squares.
+        self.triangle = np.linalg.cholesky(pairs.transpose(0, 2, 1) @ pairs)
+        pairs = pairs @ np.linalg.inv(self.triangle).transpose(0, 2, 1)
+        self.templates = np.hstack([pairs[:, :, 0].T, pairs[:, :, 1].T]).astype(np.float32)
 
     def rows(self, path_m: Array, scaled: Array) -> tuple[Array, NDArray[np.float32]]:
         """The pass, resampled: places (R,) along the track and samples (R, 3 N).
@@ -93,16 +90,15 @@ class Scanner:
             np.float32
         )
 
-    def correlate(self, rows: NDArray[np.float32]) -> tuple[Array, Array]:
-        """Energies (R, places) and moments (R, places, 2) of one magnet over each row."""
+    def correlate(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Products (R, 2, places) of the templates with the samples around each row; their
+        squares are what a magnet there would explain."""
         padded = np.pad(rows, ((self.half, self.half), (0, 0)))
         size = (2 * self.half + 1) * self.channels
         windows = np.lib.stride_tricks.as_strided(
             padded, (len(rows), size), (padded.strides[0], padded.strides[1])
         )
-        products = (windows @ self.templates).reshape(len(rows), -1, 2).astype(float)
-        moments = np.einsum("pij,rpj->rpi", self.inverse, products)
-        return np.einsum("rpi,rpi->rp", products, moments), moments
+        return (windows @ self.templates).reshape(len(rows), 2, -1)
 
     def atoms(
         self, path_m: Array, scaled: Array, most: int, least_energy: float, share: float = 0.02
@@ -119,18 +115,19 @@ class Scanner:
         floor = least_energy
         left = rows.copy()
         while len(found) < most:
-            energies, moments = self.correlate(left)
+            products = self.correlate(left)
+            energies = products[:, 0] ** 2 + products[:, 1] ** 2
             row, place = np.unravel_index(int(np.argmax(energies)), energies.shape)
             energy = float(energies[row, place])
             if energy < floor:
                 break
             floor = max(floor, share * energy)
-            moment = moments[row, place]
+            product = products[row, :, place]
+            moment = np.linalg.solve(self.triangle[place].T, product)
             found.append(Atom(np.array([places[row], self.across_m[place]]), moment, energy))
-            shape = (2 * self.half + 1, self.channels)
-            pair = self.templates[:, 2 * place : 2 * place + 2] @ moment.astype(np.float32)
+            pair = self.templates[:, [place, place + len(self.across_m)]] @ product
             low, high = max(row - self.half, 0), min(row + self.half + 1, len(left))
             start = low - row + self.half
-            left[low:high] -= pair.reshape(shape)[start : start + high - low]
+            left[low:high] -= pair.reshape(-1, self.channels)[start : start + high - low]
         after = float((left.astype(float) ** 2).sum())
         return found, after / max(before, 1e-30)

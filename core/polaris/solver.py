@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.polaris import joint, passes
+from locatk.core.polaris import joint, paper, passes
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.identify import Seen, identify
 from locatk.core.polaris.route import along, corrections, joined, tag_poses

@@ -1,5 +1,5 @@
-"""Templates: the field that one sensor sees as it passes a magnet, for a grid of lateral
-offsets and orientations (Polaris section 6.2.2, Fig. 13)."""
+"""Templates: what one sensor sees as it passes a magnet, for a grid of lateral offsets and
+orientations (Polaris section 6.2.2, Fig. 13)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from locatk.core.polaris.tag import Magnet, Tags
 
 Array = NDArray[np.float64]
 
-LATERAL_STEPS = 4
-"""Steps of the lateral grid over a spacing: "a resolution of d/4 is sufficient" (6.2.2)."""
+OFFSETS = 5
+"""Lateral offsets of the grid (8.3.1)."""
 
-ORIENTATION_STEPS = 36
+ORIENTATIONS = 36
 """Orientations of the grid: 10 degrees are enough for eight symbols (6.2.2)."""
 
 POINTS = 80
@@ -27,7 +27,7 @@ POINTS = 80
 
 @dataclass(frozen=True)
 class Templates:
-    """A template set; N is the number of lateral offsets times that of orientations.
+    """A template set of N passes of T samples.
 
     Attributes
     ----------
@@ -45,21 +45,23 @@ class Templates:
 
 
 def template_set(
-    tags: Tags, orientations: int = ORIENTATION_STEPS, points: int = POINTS, window=1.0
+    tags: Tags, orientations: int = ORIENTATIONS, points: int = POINTS, offsets: int = OFFSETS
 ) -> Templates:
-    """The paper's template set for a tag: (d/res_d + 1) * orientations templates.
+    """The paper's template set for a tag: ``offsets * orientations`` templates.
 
-    They reach half a spacing to either side and half a spacing before and behind the
-    magnet, as the window does to which they are compared. Eq. 2 counts 360 degrees beside
-    0; here the circle has one of them.
+    They reach a spacing before and behind the magnet, as the 80 points of 8.3.1 do at 1 mm
+    a sample. The offsets span a quarter of a spacing to either side, as those of the
+    released set do: sensors are half a spacing apart (6.2.3), so that the nearest passes
+    within a quarter. (The text of 6.2.2 has half a spacing, in the same number of steps:
+    with it, a moment across the track is taken for its opposite.) Eq. 2 counts 360 degrees
+    beside 0; here the circle has one of them.
     """
-    half = tags.spacing_m / 2
     return templates(
         tags.magnet,
         tags.clearance_m,
-        along_m=np.linspace(-half*window, half*window, points),
-        lateral_m=np.linspace(-half/2, half/2, LATERAL_STEPS + 1),
-        angle_rad=np.arange(orientations) * (math.tau / orientations),
+        along_m=np.linspace(-1, 1, points) * tags.spacing_m,
+        lateral_m=np.linspace(-1, 1, offsets) * tags.spacing_m / 4,
+        angle_rad=np.linspace(0.0, math.tau, orientations, endpoint=False),
     )
 
 
@@ -95,8 +97,8 @@ def templates(
 
     Notes
     -----
-    The disc is round, so turning its moment is a linear combination of two fields: those
-    of a moment along and across the track.
+    The disc is round, so turning its moment combines two fields linearly: those of a moment
+    along and of one across the track.
     """
     lateral, along = np.meshgrid(lateral_m, along_m, indexing="ij")
     sensor = np.stack([along, lateral, np.full_like(along, clearance_m)], axis=-1)
@@ -105,11 +107,10 @@ def templates(
     else:
         basis = _cylinder_fields(magnet, sensor)
     turn = np.column_stack([np.cos(angle_rad), np.sin(angle_rad)])
-    field = turn @ basis.reshape(2, -1)
     return Templates(
         lateral_m=np.tile(lateral_m, len(angle_rad)),
         angle_rad=np.repeat(angle_rad, len(lateral_m)),
-        field_t=field.reshape(-1, len(along_m), 3),
+        field_t=(turn @ basis.reshape(2, -1)).reshape(-1, len(along_m), 3),
     )
 
 

@@ -1,0 +1,192 @@
+"""Families keep their distance, and never change."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from locatk.core.errors import InputError
+from locatk.core.polaris import codec, families
+from locatk.core.polaris.tag import Tags
+
+LARGE = Tags(order=5, magnets=13, orientations=20)
+DESIGNS = [
+    Tags(),
+    Tags(magnets=4, orientations=16),
+    Tags(order=4, magnets=8, orientations=7),
+    Tags(order=2, magnets=3, orientations=2),
+    LARGE,
+    Tags(magnets=8, codec="redundant"),
+    Tags(codec="polaris-released"),
+]
+
+
+def slow_distance(tags: Tags, one: int, other: int) -> int:
+    """The definition, magnet by magnet."""
+    layouts = [codec.layout_of(tags, tag_id) for tag_id in (one, other)]
+    first, second = (dict(zip(a.cells, a.symbols, strict=True)) for a in layouts)
+    total = 0
+    for cell, symbol in first.items():
+        if cell in second:
+            turn = (symbol - second[cell]) % tags.orientations
+            total += min(turn, tags.orientations - turn)
+        else:
+            total += tags.orientations // 2
+    return total
+
+
+@st.composite
+def designs_and_ids(draw, count: int) -> tuple[Tags, list[int]]:
+    tags = draw(st.sampled_from(DESIGNS))
+    some = st.integers(0, codec.capacity(tags) - 1)
+    return tags, [draw(some) for _ in range(count)]
+
+
+@given(designs_and_ids(3))
+def test_distance_is_the_documented_metric(case) -> None:
+    tags, (a, b, c) = case
+    ab, bc, ac = (families.distance(tags, *pair) for pair in ((a, b), (b, c), (a, c)))
+    assert ab == slow_distance(tags, a, b)
+    assert ab == families.distance(tags, b, a)
+    assert (ab == 0) == (a == b)
+    assert ac <= ab + bc
+    assert ab <= tags.magnets * (tags.orientations // 2)
+
+
+def test_placements_count() -> None:
+    """Ids 0 and 8^5 differ in one magnet's cell alone."""
+    tags = Tags()
+    assert codec.layout_of(tags, 0).symbols == codec.layout_of(tags, 8**5).symbols
+    assert families.distance(tags, 0, 8**5) == 4
+
+
+@given(st.sampled_from(DESIGNS), st.data())
+@settings(max_examples=40, deadline=None)
+def test_members_keep_the_distance(tags: Tags, data) -> None:
+    distance = data.draw(st.integers(1, 4))
+    count = data.draw(st.integers(1, 25 if tags.magnets > 3 else 2))
+    if tags.order == 2:
+        distance = min(distance, 3)
+    ids = families.generate(tags, count, distance)
+    assert len(set(ids)) == len(ids) == count
+    pairs = [(a, b) for k, a in enumerate(ids) for b in ids[:k]]
+    smallest = min((slow_distance(tags, a, b) for a, b in pairs), default=None)
+    if smallest is not None:
+        assert smallest >= distance
+        assert families.smallest_distance(tags, ids) == smallest
+    families.check(replace(tags, ids=ids, min_distance=distance))
+
+
+def test_a_longer_family_begins_with_the_shorter() -> None:
+    tags = Tags()
+    long = families.generate(tags, 2000, 4)
+    assert families.generate(tags, 700, 4) == long[:700]
+    assert families.smallest_distance(tags, long) == 4
+
+
+def test_the_batch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    tags = Tags(magnets=4)
+    usual = families.generate(tags, 300, 4)
+    closest = families.closest(tags, usual)
+    monkeypatch.setattr(families, "BATCH", 7)
+    assert families.generate(tags, 300, 4) == usual
+    assert families.closest(tags, usual) == closest
+
+
+@pytest.mark.parametrize(
+    ("tags", "count", "distance", "first", "digest"),
+    [
+        (Tags(), 500, 3, (0, 202517, 77354, 279871), "14025e3a91eb278f"),
+        (
+            Tags(order=4, magnets=8, orientations=16),
+            300,
+            6,
+            (0, 2102313129443, 803012160454, 2905325289897),
+            "56536f8b04ecfa37",
+        ),
+        (
+            Tags(magnets=8, codec="redundant"),
+            100,
+            6,
+            (0, 2531, 966, 3497),
+            "8654f8adf07437f6",
+        ),
+        (
+            LARGE,
+            50,
+            10,
+            (0, 17857779824714376092003, 6821064929428752184006, 24678844754143128276009),
+            "09713b05d53db58d",
+        ),
+        (
+            Tags(codec="polaris-released"),
+            100,
+            4,
+            (0, 162013, 61882, 223895),
+            "7e1fc9a372a9ebab",
+        ),
+    ],
+)
+def test_version_1_never_changes(tags, count, distance, first, digest) -> None:
+    """Tags of these families lie on floors: another rule is another version, beside it."""
+    assert families.VERSION == 1
+    ids = families.generate(tags, count, distance)
+    assert ids[:4] == first
+    assert hashlib.sha256(" ".join(map(str, ids)).encode()).hexdigest()[:16] == digest
+
+
+def test_all_ids_are_a_family_of_distance_one() -> None:
+    tags = Tags(order=2, magnets=3, orientations=8)
+    assert sorted(families.generate(tags, 512, 1)) == list(range(512))
+
+
+def test_what_the_codec_does_not_hold_is_refused() -> None:
+    tags = Tags(order=2, magnets=3, orientations=4)
+    with pytest.raises(InputError, match="the codec has 64 ids"):
+        families.generate(tags, 65, 1)
+    with pytest.raises(InputError, match=r"\d+ found among all 64 ids") as caught:
+        families.generate(tags, 64, 3)
+    found = int(str(caught.value).split(": ")[1].split()[0])
+    # As many as it says are there indeed.
+    assert len(families.generate(tags, found, 3)) == found
+    with pytest.raises(InputError):
+        families.generate(tags, found + 1, 3)
+
+
+def test_the_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(families, "MOST_VISITS", 3000)
+    with pytest.raises(InputError, match="found among the first 3000 of 327680 ids"):
+        families.generate(Tags(), 1000, 8)
+
+
+@pytest.mark.parametrize(("count", "distance"), [(0, 1), (-3, 1), (5, 0)])
+def test_families_that_are_none_are_not_made(count: int, distance: int) -> None:
+    with pytest.raises(InputError):
+        families.generate(Tags(), count, distance)
+
+
+def test_the_two_closest_are_named() -> None:
+    tags = Tags()
+    ids = (0, 202517, 77354, 1, 279871)
+    assert families.closest(tags, ids) == (1, (0, 1))
+    assert families.smallest_distance(tags, (5,)) == 20
+
+
+@pytest.mark.parametrize(
+    ("ids", "distance", "said"),
+    [
+        ((), 1, "without ids"),
+        ((7, 9, 7), 1, "id 7 stands twice"),
+        ((0, 202517, 1), 3, "ids 0 and 1 have distance 1, not 3"),
+        ((0, 327680), 1, "is not in 0"),
+        (None, 3, "without ids"),
+        ((0, 202517), 0, "minimum distance of 0"),
+    ],
+)
+def test_a_list_that_is_no_family_is_refused(ids, distance: int, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        families.check(Tags(ids=ids, min_distance=distance))
