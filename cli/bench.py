@@ -12,6 +12,7 @@ from locatk.cli import console, options
 BENCHES = {
     "lighthouse": "locatk.formats.bench.lighthouse:figures",
     "dots": "locatk.formats.bench.dots:figures",
+    "polaris": "locatk.formats.bench.polaris:figures",
 }
 """Name of a system to the function that measures its figures."""
 

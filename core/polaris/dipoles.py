@@ -37,15 +37,15 @@ class Offsets:
 
     Attributes
     ----------
-    x : (n, N, 3, M) ndarray
+    x : (N, 3, n, M) ndarray
         Along the track, for each axis of the field.
-    y : (n or 1, N, 1, M) ndarray
+    y : (N, 1, n or 1, M) ndarray
         Across it.
     z : float
         Upward.
-    inverse : (n, N, 3, M) ndarray
+    inverse : (N, 3, n, M) ndarray
         One over the square of the distance.
-    scale : (n, N, 3, M) ndarray
+    scale : (N, 3, n, M) ndarray
         ``mu0 / 4 pi`` over its fifth power.
     """
 
@@ -57,20 +57,20 @@ class Offsets:
 
     @classmethod
     def of(cls, x: Array, y: Array, z: float) -> Offsets:
-        """``x`` (n, N, 3, M), ``y`` (n or 1, N, 1, M) and ``z``."""
+        """``x`` (N, 3, n, M), ``y`` (N, 1, n or 1, M) and ``z``."""
         inverse = 1.0 / (x * x + (y * y + z * z))
         return cls(x, y, z, inverse, MU0_4PI * inverse * inverse * np.sqrt(inverse))
 
     def own(self) -> Array:
-        """The offset's component (n, N, 3, M) along each axis of the field."""
+        """The offset's component (N, 3, n, M) along each axis of the field."""
         own = np.empty_like(self.x)
-        own[:, :, 0] = self.x[:, :, 0]
-        own[:, :, 1] = self.y[:, :, 0]
-        own[:, :, 2] = self.z
+        own[:, 0] = self.x[:, 0]
+        own[:, 1] = self.y[:, 0]
+        own[:, 2] = self.z
         return own
 
     def unit_fields(self, thickness: float = 0.0) -> Array:
-        """Fields (n, N, 3, M, 3) of unit moments: axis of the field, ..., of the moment.
+        """Fields (N, 3, n, M, 3) of unit moments, whose axis comes last.
 
         Second derivatives of 1/r; with ``thickness`` (m^2) the fourth ones along z too.
         """
@@ -90,16 +90,16 @@ class Offsets:
         if thickness:
             upward = 30.0 * thickness * self.z * self.inverse * self.scale
             fields[..., 2] -= upward * own
-            fields[:, :, 2, :, 0] -= upward[:, :, 2] * self.x[:, :, 2]
-            fields[:, :, 2, :, 1] -= upward[:, :, 2] * self.y[:, :, 0]
-            fields[:, :, 2, :, 2] -= upward[:, :, 2] * self.z
-            fields[:, :, 2, :, 2] += 6.0 * thickness * self.scale[:, :, 2]
+            fields[:, 2, ..., 0] -= upward[:, 2] * self.x[:, 2]
+            fields[:, 2, ..., 1] -= upward[:, 2] * self.y[:, 0]
+            fields[:, 2, ..., 2] -= upward[:, 2] * self.z
+            fields[:, 2, ..., 2] += 6.0 * thickness * self.scale[:, 2]
         for axis in range(3):
-            fields[:, :, axis, :, axis] += diagonal[:, :, axis]
+            fields[:, axis, ..., axis] += diagonal[:, axis]
         return fields
 
     def gradients(self, moments: Array) -> tuple[Array, Array, Array]:
-        """Derivatives, each (n, N, 3, M), of the magnets' fields along x, y and z.
+        """Derivatives, each (N, 3, n, M), of the magnets' fields along x, y and z.
 
         ``moments`` is (M, 3) in A m^2. Of point dipoles: the thickness changes a step of
         the fit by a hundredth, and nothing where it ends.
@@ -108,11 +108,11 @@ class Offsets:
         own = self.own()
         scale = 3.0 * self.scale
         dot = self.x * mx + (self.y * my + self.z * mz)
-        parallel = np.array([mx, my, mz]) - 5.0 * own * dot * self.inverse
+        parallel = moments.T[:, None] - 5.0 * own * dot * self.inverse
         found = []
         for axis, (component, moment) in enumerate(((self.x, mx), (self.y, my), (self.z, mz))):
             gradient = component * parallel + own * moment
-            gradient[:, :, axis] += dot[:, :, axis]
+            gradient[:, axis] += dot[:, axis]
             gradient *= scale
             found.append(gradient)
         return found[0], found[1], found[2]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solveh_banded
+from scipy.linalg import solveh_banded
 
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.problem import (
@@ -17,6 +17,7 @@ from locatk.core.polaris.problem import (
     State,
     Trial,
     Window,
+    solve_scaled,
 )
 
 Array = NDArray[np.float64]
@@ -80,27 +81,40 @@ def fit(
     DegenerateError
         The samples do not determine it.
     """
-    weight = np.isfinite(window.field_t) / window.noise_t**2
+    weight = np.isfinite(window.field_t) * window.counts[:, None, None] / window.noise_t**2
     try:
-        problem = Problem(window, priors, weight, start)
-        trial, converged = _descend(problem, problem.project(start), iterations, tolerance)
-        if not final:
-            return _fitted(problem, trial, converged, None)
-        if _outliers(_residual(problem, trial)):
-            for _ in range(3):
-                problem = _reweighted(problem, trial, weight, start)
-                trial, converged = _descend(problem, problem.project(trial.state), 5, tolerance)
-        for _ in NUISANCES:
-            seen = _seen(problem, trial)
-            if not seen:
-                break
-            problem.free |= {seen}
-            trial, converged = _descend(problem, problem.project(trial.state), 10, tolerance)
-        problem.free = frozenset(NUISANCES)
-        normal = problem.normal(trial)
-        return _fitted(problem, trial, converged, normal)
-    except np.linalg.LinAlgError:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            return _fit(window, start, priors, weight, iterations, tolerance, final)
+    except (np.linalg.LinAlgError, FloatingPointError):
         raise DegenerateError("the samples do not determine the magnets") from None
+
+
+def _fit(
+    window: Window,
+    start: State,
+    priors: Priors,
+    weight: Array,
+    iterations: int,
+    tolerance: float,
+    final: bool,
+) -> Fitted:
+    problem = Problem(window, priors, weight, start)
+    trial, converged = _descend(problem, problem.project(start), iterations, tolerance)
+    if not final:
+        return _fitted(problem, trial, converged, None)
+    if _outliers(_residual(problem, trial)):
+        for _ in range(3):
+            problem = _reweighted(problem, trial, weight, start)
+            trial, converged = _descend(problem, problem.project(trial.state), 5, tolerance)
+    for _ in NUISANCES:
+        seen = _seen(problem, trial)
+        if not seen:
+            break
+        problem.free |= {seen}
+        trial, converged = _descend(problem, problem.project(trial.state), 10, tolerance)
+    problem.free = frozenset(NUISANCES)
+    normal = problem.normal(trial)
+    return _fitted(problem, trial, converged, normal)
 
 
 def _descend(
@@ -125,8 +139,8 @@ def _descend(
 
 def _residual(problem: Problem, trial: Trial) -> Array:
     """(n, N, 3) residual in standard deviations, ``nan`` where there is no sample."""
-    residual = trial.residual.reshape(problem.root.shape)
-    return np.where(problem.root > 0, residual, np.nan)
+    shown = np.where(problem.root > 0, trial.residual, np.nan)
+    return shown.T.reshape(problem.window.field_t.shape)
 
 
 def _outliers(residual: Array) -> bool:
@@ -137,9 +151,9 @@ def _outliers(residual: Array) -> bool:
 
 def _reweighted(problem: Problem, trial: Trial, weight: Array, start: State) -> Problem:
     """The same with samples weighted by Student's t of their own residual."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = trial.residual.reshape(weight.shape) / problem.root * np.sqrt(weight)
-    z = np.nan_to_num(z)
+    used = problem.root.T.reshape(weight.shape)
+    z = np.nan_to_num(_residual(problem, trial))
+    z *= np.sqrt(weight) / np.where(used > 0, used, 1.0)
     scale = max(1.0, float(np.median(np.abs(z[weight > 0])) * 1.4826))
     share = (ROBUST_FREEDOM + 1) / (ROBUST_FREEDOM + (z / scale) ** 2)
     return Problem(problem.window, problem.priors, weight * share, start)
@@ -158,7 +172,7 @@ def _seen(problem: Problem, trial: Trial) -> str:
             continue
         problem.free = closed | {name}
         normal = problem.normal(trial)
-        gain = float(normal.side @ np.linalg.solve(normal.gram, normal.side))
+        gain = float(normal.side @ solve_scaled(normal.gram, normal.side))
         gains[name] = gain - (m if name == "tilt" else 1)
     problem.free = closed
     best = max(gains, key=gains.__getitem__, default="")
@@ -169,7 +183,7 @@ def _fitted(problem: Problem, trial: Trial, converged: bool, normal: Normal | No
     window, state = problem.window, trial.state
     residual = _residual(problem, trial)
     count = int(np.isfinite(residual).sum())
-    unknowns = 5 * len(state.place_m) + problem.background.shape[1]
+    unknowns = 5 * len(state.place_m) + problem.background_gram[..., 0].size
     if window.path_m is None:
         unknowns += len(window.frames)
     sigma = float(np.sqrt(np.nansum(residual**2) / max(count - unknowns, 1)))
@@ -185,10 +199,7 @@ def _fitted(problem: Problem, trial: Trial, converged: bool, normal: Normal | No
 def _covariances(normal: Normal, state: State) -> tuple[Array, Array, float]:
     """Covariance (3 M, 3 M) of places and angles; standard deviations of path and height."""
     m = len(state.place_m)
-    scale = 1 / np.sqrt(np.diag(normal.gram))
-    scaled = normal.gram * scale[:, None] * scale
-    factor = cho_factor(scaled + 1e-13 * np.eye(len(scaled)))
-    full = scale[:, None] * cho_solve(factor, np.diag(scale))
+    full = solve_scaled(normal.gram, np.eye(len(normal.gram)))
     # From x, y and moment to x, y and angle.
     jacobian = np.zeros((3 * m, len(full)))
     square = (state.moment_am2[:, :2] ** 2).sum(axis=1)

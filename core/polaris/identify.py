@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 MISFIT_M = 0.1
 """Largest rms distance of the magnets from their cells, in spacings."""
 
-RESIDUAL = 8.0
+RESIDUAL = 4.0
 """Largest rms residual of a tag that is read, in standard deviations of the noise."""
 
 
@@ -145,7 +145,9 @@ def _best(sighting: Sighting, recording: Samples, tags: Tags, used: frozenset[in
             reason = _incomplete(sighting, recording, tags, match)
         return Seen(sighting, match, reading, reason)
     match, reading = read_as[0]
-    if len({reading.tag_id for _, reading in read_as}) > 1:
+    shared = set(match.magnets)
+    rivals = {other.tag_id for rival, other in read_as if shared & set(rival.magnets)}
+    if len(rivals) > 1:
         return Seen(sighting, match, reading, "ambiguous")
     assert reading.tag_id is not None
     layout = codec.layout_of(tags, reading.tag_id)

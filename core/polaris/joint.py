@@ -15,31 +15,37 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.dipoles import thickness
 from locatk.core.polaris.fit import Fitted, fit
-from locatk.core.polaris.passes import Pass
-from locatk.core.polaris.problem import Priors, State, Window
-from locatk.core.polaris.scan import Atom, Scanner
+from locatk.core.polaris.problem import Priors, State, Window, trends
+from locatk.core.polaris.scan import BESIDE, Atom, Scanner
 from locatk.core.polaris.sighting import Sighting
-from locatk.core.polaris.tag import Tags
+from locatk.core.polaris.task import Task, clocks
 
 Array = NDArray[np.float64]
 
-SPEEDS_M = np.geomspace(0.1e-3, 10e-3, 12)
+SPEEDS_M = np.geomspace(0.02e-3, 10e-3, 16)
 """Steps of a sample period that are tried."""
 
-HEIGHTS_M = (0.005, 0.0075, 0.011, 0.016)
-"""Tried where no tag tells the clearance."""
+BAD = 3.0
+"""Rms of a residual that has nothing to do with the samples."""
 
-MOST_MAGNETS = 30
-MOST_SAMPLES = 420
-"""A longer pass is averaged down: its samples are closer than the field needs."""
+MOST_STARTS = 3
+
+LONGEST_M = 2.0
+"""A pass is never longer than this."""
 
 WHITE = 1.6
 """Rms of a residual, in standard deviations of the noise, that needs no other start."""
 
 DEBRIS = 1.3
 """Rms of a residual above which weak sources are looked for as well."""
+
+TRENDS = 5
+"""Terms of a background that drifts more than a slope."""
+
+UNEVEN = 6.0
+"""Mean square of a residual's slow or shared part, in units of the noise, that is not left
+to chance."""
 
 WEAK = 0.4
 """A magnet has at least this share of the median moment."""
@@ -53,110 +59,17 @@ reaches 45 among the some thousand places of a pass."""
 
 
 @dataclass(frozen=True)
-class Task:
-    """A pass, ready to be fitted.
-
-    Attributes
-    ----------
-    window : Window
-    scaled : (n, 3 N) ndarray
-        Samples in units of their noise, on a straight background through the ends.
-    priors : tuple of Priors
-        One for each height to try.
-    first : int
-        Number in the recording of the window's first sample.
-    group : int
-        Samples that one of the window is the mean of.
-    apart_m : float
-        Least distance of two magnets.
-    """
-
-    window: Window
-    scaled: Array
-    priors: tuple[Priors, ...]
-    first: int
-    group: int
-    apart_m: float
-
-
-def prepare(
-    samples: Samples,
-    part: Pass,
-    noise_t: Array,
-    tags: Tags | None,
-    path_m: Array | None = None,
-) -> Task:
-    """The samples of a pass as the fit takes them.
-
-    ``path_m`` (n,) is how far the array had moved at each sample of the recording, where
-    that is known.
-    """
-    at = slice(part.first, part.stop)
-    group = max(1, -(-(part.stop - part.first) // MOST_SAMPLES))
-    period_ns = float(np.median(np.diff(samples.time_ns)))
-    frames = (samples.time_ns[at] - samples.time_ns[part.first]) / period_ns
-    field = _averaged(samples.field_t[at], group)
-    frames = _averaged(frames, group) / group
-    noise_t = noise_t / np.sqrt(group)
-    path = None if path_m is None else _averaged(path_m[at], group)
-
-    delay = samples.array.delay_s
-    middle, half = (delay.max() + delay.min()) / 2, np.ptp(delay) / 2
-    order = (delay - middle) / half if half > 0 else np.zeros(3)
-    skew = half * 1e9 / period_ns / group
-    magnet = None if tags is None else tags.magnet
-    window = Window(
-        field_t=field,
-        sensors_m=samples.array.position_m,
-        noise_t=noise_t,
-        frames=frames,
-        order=order,
-        path_m=path,
-        thickness_m2=thickness(magnet),
-    )
-    heights = HEIGHTS_M if tags is None else (tags.clearance_m,)
-    priors = tuple(
-        Priors(
-            height_m=(height, 0.3 * height),
-            skew=(skew, 0.3),
-            moment_am2=1.5e-3 if magnet is None else magnet.moment,
-        )
-        for height in heights
-    )
-    apart = SAME_M * heights[0] if tags is None else 0.5 * tags.spacing_m
-    return Task(window, _level(field / noise_t), priors, part.first, group, apart)
-
-
-def _averaged(values: Array, group: int) -> Array:
-    if group == 1:
-        return values
-    count = len(values) // group
-    shape = (count, group, *values.shape[1:])
-    with np.errstate(all="ignore"):
-        return np.asarray(np.nanmean(values[: count * group].reshape(shape), axis=1))
-
-
-def _level(scaled: Array) -> Array:
-    """Samples (n, 3 N) without the straight line through the means of both ends; 0 where
-    there is none."""
-    n = len(scaled)
-    flat = scaled.reshape(n, -1)
-    ends = max(3, min(10, n // 8))
-    with np.errstate(all="ignore"):
-        left, right = np.nanmedian(flat[:ends], axis=0), np.nanmedian(flat[-ends:], axis=0)
-    share = np.linspace(0, 1, n)[:, None]
-    return np.nan_to_num(flat - (1 - share) * np.nan_to_num(left) - share * np.nan_to_num(right))
-
-
-@dataclass(frozen=True)
 class _Start:
     priors: Priors
     state: State
     left: float
 
 
-def starts(task: Task) -> list[_Start]:
-    """Speeds and heights to begin with, the one that explains the samples best first."""
+def starts(task: Task, sign: float = 1.0) -> list[_Start]:
+    """Speeds and heights to begin with.
+
+    ``sign`` is 1 for an array that drives forward, -1 for one that drives backward.
+    """
     found = []
     window = task.window
     for priors in task.priors:
@@ -167,15 +80,14 @@ def starts(task: Task) -> list[_Start]:
         else:
             span = window.frames[-1] - window.frames[0]
             paths = [
-                (speed * (window.frames - window.frames.mean()), speed)
+                (sign * speed * (window.frames - window.frames.mean()), sign * speed)
                 for speed in SPEEDS_M
-                if 2 * height < speed * span
+                if 2 * height < speed * span < LONGEST_M
             ]
         for path, speed in paths:
             atoms, left = scanner.atoms(path, task.scaled, 3, LEAST_ENERGY)
             if atoms:
                 found.append(_Start(priors, _state(atoms, path, speed, priors), left))
-    found.sort(key=lambda start: start.left)
     return found
 
 
@@ -197,16 +109,26 @@ def _state(atoms: list[Atom], path: Array, speed: float, priors: Priors) -> Stat
 
 
 def solve_pass(task: Task) -> Fitted | None:
-    """The best fit of a pass; None where there is no magnet in it."""
+    """The best fit of a pass; None where there is no magnet in it.
+
+    Of all speeds, heights and clocks those come first that explain the samples best. The
+    first that leaves a white residual is taken; an array that drives backward is thought
+    of where none does.
+    """
     best: Fitted | None = None
-    for start in starts(task)[:3]:
-        try:
-            fitted = _grow(task, start)
-        except DegenerateError:
-            continue
-        if best is None or fitted.sigma < best.sigma:
-            best = fitted
-        if best.sigma < WHITE:
+    for sign in (1.0, -1.0):
+        tried = [(clocked, start) for clocked in clocks(task) for start in starts(clocked, sign)]
+        tried.sort(key=lambda pair: pair[1].left)
+        for clocked, start in tried[:MOST_STARTS]:
+            try:
+                fitted = _grow(clocked, start)
+            except DegenerateError:
+                continue
+            if best is None or fitted.sigma < best.sigma:
+                best = fitted
+            if best.sigma < WHITE:
+                return best
+        if task.window.path_m is not None or (best is not None and best.sigma < BAD):
             break
     return best
 
@@ -216,14 +138,17 @@ def _grow(task: Task, start: _Start) -> Fitted:
     window, priors = task.window, start.priors
     scanner = Scanner(window.sensors_m, window.noise_t, start.state.height_m)
     path = start.state.path_m
-    atoms, _ = scanner.atoms(path, task.scaled, MOST_MAGNETS, LEAST_ENERGY)
+    atoms, _ = scanner.atoms(path, task.scaled, task.most, LEAST_ENERGY)
     state = _state(_distinct(atoms, start.state.height_m), path, start.state.speed_m, priors)
     fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
     for _ in range(4):
         state = fitted.state
         scanner = Scanner(window.sensors_m, window.noise_t, state.height_m)
-        residual = np.nan_to_num(fitted.residual).reshape(len(window.frames), -1)
-        new, _ = scanner.atoms(state.path_m, residual, 4, max(LEAST_ENERGY, 12 * fitted.sigma**2))
+        residual = np.nan_to_num(fitted.residual / np.sqrt(window.counts)[:, None, None])
+        residual = residual.reshape(len(window.frames), -1)
+        room = task.most - len(state.place_m)
+        least_energy = max(LEAST_ENERGY, 12 * fitted.sigma**2)
+        new, _ = scanner.atoms(state.path_m, residual, min(4, room), least_energy)
         # What is weak is looked at where it is needed only.
         least = 0.0 if fitted.sigma > DEBRIS else 0.5 * WEAK * np.median(_sizes(state))
         new = [
@@ -237,10 +162,28 @@ def _grow(task: Task, start: _Start) -> Fitted:
         state = _with(state, new)
         fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
     while True:
-        state = _without_ghosts(fitted.state, task.apart_m)
+        state = _without_ghosts(fitted.state, task)
         fitted = fit(window, state, priors)
-        if len(_without_ghosts(fitted.state, task.apart_m).place_m) == len(state.place_m):
+        better = _with_background(window, fitted)
+        if better is not window:
+            window = better
+            fitted = fit(window, fitted.state, priors)
+        if len(_without_ghosts(fitted.state, task).place_m) == len(state.place_m):
             return fitted
+
+
+def _with_background(window: Window, fitted: Fitted) -> Window:
+    """The window with a background that drifts more, where the residual shows one.
+
+    In units of the noise, a white residual has squares of 1 along each course in time.
+    """
+    residual = np.nan_to_num(fitted.residual)
+    n = len(residual)
+    course = np.linalg.qr(trends(window.frames, TRENDS))[0][:, window.trends :]
+    slow = (course.T @ residual.reshape(n, -1)) ** 2
+    if window.trends < TRENDS and slow.mean() > UNEVEN:
+        window = replace(window, trends=TRENDS)
+    return window
 
 
 def _distinct(atoms: list[Atom], height: float) -> list[Atom]:
@@ -268,21 +211,30 @@ def _with(state: State, atoms: list[Atom]) -> State:
     return replace(state, place_m=places, moment_am2=moments)
 
 
-def _without_ghosts(state: State, apart_m: float) -> State:
-    """Without sources that are no hundredth of a magnet, or that share one with another.
+def _without_ghosts(state: State, task: Task) -> State:
+    """Without sources that are none: beside what the bar has passed over, no hundredth of
+    a magnet, or sharing a magnet with another.
 
-    Two magnets of a tag are never nearer than ``apart_m``; a weak source may be, but not at
-    a magnet's own place.
+    Two magnets of a tag are never nearer than ``task.apart_m``; a weak source may be, but
+    not at a magnet's own place.
     """
-    size = _sizes(state)
-    order = np.argsort(-size)
+    sensors = task.window.sensors_m
+    reach = (BESIDE + 0.5) * state.height_m
+    inside = state.place_m[:, 0] > state.path_m.min() + sensors[:, 0].min() - reach
+    inside &= state.place_m[:, 0] < state.path_m.max() + sensors[:, 0].max() + reach
+    inside &= state.place_m[:, 1] > sensors[:, 1].min() - reach
+    inside &= state.place_m[:, 1] < sensors[:, 1].max() + reach
+    size = np.where(inside, _sizes(state), 0.0)
     kept: list[int] = []
+    order = np.argsort(-size)
     for k in order:
         apart = np.linalg.norm(state.place_m[kept] - state.place_m[k], axis=1)
         weak = size[k] < WEAK * size[order[0]]
-        least = SAME_M * state.height_m if weak else apart_m
+        least = SAME_M * state.height_m if weak else task.apart_m
         if size[k] > 0.03 * size[order[0]] and np.all(apart > least):
             kept.append(int(k))
+    if not kept:
+        raise DegenerateError("no magnet is left under the bar")
     return replace(state, place_m=state.place_m[kept], moment_am2=state.moment_am2[kept])
 
 
@@ -299,24 +251,28 @@ def sighting(samples: Samples, task: Task, fitted: Fitted) -> Sighting:
     chosen = magnets(fitted)
     place = state.place_m[chosen]
     middle = place.mean(axis=0)
-    at = int(np.argmin(np.abs(state.path_m - middle[0])))
+    number = np.arange(task.samples)
+    path = np.interp(number, task.times, state.path_m)
+    if task.path_m is not None and task.window.path_m is not None:
+        path = task.path_m + (state.path_m[0] - task.window.path_m[0])
+    at = int(np.argmin(np.abs(path - middle[0])))
     index = 3 * chosen[:, None] + np.arange(3)
     covariance = fitted.covariance[np.ix_(index.ravel(), index.ravel())]
     # What the model does not know shows in the residual.
     covariance = covariance * max(1.0, fitted.sigma) ** 2
-    here = state.path_m[at] * np.array([1.0, np.tan(state.crab_rad)])
-    moved = state.path_m - state.path_m[at]
+    here = path[at] * np.array([1.0, np.tan(state.crab_rad)])
+    spread = np.interp(number, task.times, fitted.path_sigma_m) * max(1.0, fitted.sigma)
     moment = state.moment_am2[chosen]
     return Sighting(
-        time_ns=int(samples.time_ns[task.first + at * task.group + task.group // 2]),
+        time_ns=int(samples.time_ns[task.first + at]),
         first=task.first,
-        stop=task.first + len(moved) * task.group,
-        path_m=np.repeat(moved, task.group),
+        stop=task.first + task.samples,
+        path_m=path - path[at],
         place_m=place - here,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),
         covariance=covariance,
-        path_sigma_m=np.repeat(fitted.path_sigma_m * max(1.0, fitted.sigma), task.group),
+        path_sigma_m=spread,
         crab_rad=state.crab_rad,
         free_path=task.window.path_m is None,
         height_m=state.height_m,

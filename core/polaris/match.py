@@ -27,6 +27,9 @@ LENGTH = 0.15
 BUILD_M = 4e-4
 """Standard deviation of a magnet's place that is set by hand."""
 
+MEASURED_M = 1e-4
+"""The same of a tag whose magnets were measured as built."""
+
 SCALE = 0.03
 """Standard deviation of a way's scale that was found from the field alone: on the published
 recordings it is 2.5 % short, in each of them (docs/polaris.md)."""
@@ -148,13 +151,14 @@ def _fitted(
 ) -> Match:
     """The grid by least squares: heading, place, and the scale along the track."""
     target = places(tags, cells) if nominal is None else nominal
+    build = BUILD_M if nominal is None else MEASURED_M
     points = sighting.place_m[list(magnets)]
     m = len(points)
     index = (3 * np.array(magnets)[:, None] + np.arange(2)).ravel()
     covariance = sighting.covariance[np.ix_(index, index)]
     if not np.all(np.isfinite(covariance)):
         covariance = np.eye(2 * m) * 1e-6
-    weight = np.linalg.inv(covariance + BUILD_M**2 * np.eye(2 * m))
+    weight = np.linalg.inv(covariance + build**2 * np.eye(2 * m))
     prior = np.zeros(4)
     prior[3] = (1 / SCALE**2) if sighting.free_path else 1e12
     a, b = points - points.mean(axis=0), target - target.mean(axis=0)
@@ -175,13 +179,15 @@ def _fitted(
         moved = np.linalg.solve(gram, side)
         shift, heading, scale = shift + moved[:2], heading + moved[2], scale + moved[3]
     misfit = float(np.sqrt((residual**2).sum() / m))
+    # A way that was no straight line shows in the grid, not in the samples.
+    excess = max(1.0, float(residual @ weight @ residual) / max(2 * m - 3, 1))
     return Match(
         magnets,
         cells,
         float(shift[0]),
         float(shift[1]),
         float(np.remainder(heading + np.pi, 2 * np.pi) - np.pi),
-        np.linalg.inv(gram)[:3, :3],
+        np.linalg.inv(gram)[:3, :3] * excess,
         float(scale),
         misfit,
     )

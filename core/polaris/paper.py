@@ -44,9 +44,6 @@ LEAST_SMOOTHING = 0.5
 CLEAR = 6.0
 """Beyond so many clearances a magnet's field is below a hundredth of its peak: ground."""
 
-SAME = 0.6
-"""Peaks nearer to each other than this are one magnet's, in spacings."""
-
 FEWEST_POINTS = 5
 """Samples a spacing that a window has to have."""
 
@@ -126,11 +123,12 @@ class _Pipeline:
         self.slopes = ddtw.prepare(self.templates.field_t)
 
     def magnets(self, signal: Signals, path: Array) -> list[_Magnet]:
-        peaks = self.one_a_magnet(find_peaks(signal, self.tags.spacing_m / 2 / self.step_m))
-        pairs = self.pairs(signal, peaks)
-        found = [
-            self.located(signal, path, peak, pair) for peak, pair in zip(peaks, pairs, strict=True)
-        ]
+        peaks = find_peaks(signal, self.tags.spacing_m / 2 / self.step_m)
+        found = []
+        for peak in peaks:
+            pair = self.pair(signal, peak, peaks)
+            if pair is not None:
+                found.append(self.located(signal, path, peak, pair))
         fields = [self.field(magnet, path) for magnet in found]
         everything = np.sum(fields, axis=0)
         near = self.tags.clearance_m / 2 / self.step_m
@@ -140,19 +138,6 @@ class _Pipeline:
             peak = peak_near(alone, magnet.peak, near)
             again.append(self.located(alone, path, peak, magnet.pair))
         return self.apart(again)
-
-    def one_a_magnet(self, peaks: Sequence[Peak]) -> list[Peak]:
-        """The strongest of those that neighbouring sensors see of one magnet."""
-        kept: list[Peak] = []
-        for peak in peaks:
-            x, y = peak.at * self.step_m, self.position_m[peak.sensor, 1]
-            distances = [
-                math.hypot(x - other.at * self.step_m, y - self.position_m[other.sensor, 1])
-                for other in kept
-            ]
-            if min(distances, default=math.inf) > SAME * self.tags.spacing_m:
-                kept.append(peak)
-        return kept
 
     def apart(self, magnets: Sequence[_Magnet]) -> list[_Magnet]:
         """The strongest of those that lie closer to each other than magnets can."""
@@ -166,32 +151,35 @@ class _Pipeline:
                 kept.append(magnet)
         return kept
 
-    def pairs(self, signal: Signals, peaks: Sequence[Peak]) -> list[tuple[int, int]]:
-        """The two adjacent sensors by which each magnet is located.
+    def pair(self, signal: Signals, peak: Peak, peaks: Sequence[Peak]) -> tuple[int, int] | None:
+        """The two adjacent sensors by which the magnet of a peak is located, that of the peak
+        first; None where the peak is another's of the same magnet.
 
-        The second is the stronger neighbour, but of magnets that are passed together none
-        shares a sensor with another: of all ways the one in which the second sensors
-        measure the most (6.2.3, Fig. 14b). Where no way is left, the stronger neighbour.
+        Magnets that are passed together have pairs that share no sensor (6.2.3, Fig. 14b):
+        those whose weaker sensors measure the most between them, as then the pairs enclose
+        the magnets. Where such pairs leave the sensor of the peak out, its stronger
+        neighbour is the second.
         """
-        from scipy.optimize import linear_sum_assignment
-
-        count = signal.amplitude_t.shape[1]
         together = self.tags.spacing_m / 2 / self.step_m
-        pairs = []
-        for peak in peaks:
-            mates = [other for other in peaks if abs(other.at - peak.at) < together]
-            gain = np.full((len(mates), count), -1.0)
-            for row, mate in zip(gain, mates, strict=True):
-                sides = [k for k in (mate.sensor - 1, mate.sensor + 1) if 0 <= k < count]
-                row[sides] = signal.amplitude_t[round(mate.at), sides]
-            own = mates.index(peak)
-            stronger = int(gain[own].argmax())
-            free = gain.copy()
-            free[:, [mate.sensor for mate in mates]] = -1.0
-            rows, chosen = linear_sum_assignment(free, maximize=True)
-            second = dict(zip(rows.tolist(), chosen.tolist(), strict=True)).get(own, stronger)
-            pairs.append((peak.sensor, second if free[own, second] >= 0 else stronger))
-        return pairs
+        mates: dict[int, Peak] = {}  # by sensor; peaks come strongest first
+        for other in peaks:
+            if abs(other.at - peak.at) < together:
+                mates.setdefault(other.sensor, other)
+        own = peak.sensor
+        if mates[own] is not peak:
+            return None
+        gains = []
+        for k in range(signal.amplitude_t.shape[1] - 1):
+            inside = [mates[sensor] for sensor in (k, k + 1) if sensor in mates]
+            at = round(max(inside, key=lambda mate: mate.amplitude_t).at) if inside else None
+            gains.append(0.0 if at is None else float(signal.amplitude_t[at, k : k + 2].min()))
+        for k in disjoint_pairs(gains):
+            if own in (k, k + 1):
+                second = 2 * k + 1 - own
+                stronger = second in mates and mates[second].amplitude_t > peak.amplitude_t
+                return None if stronger else (own, second)
+        beside = [k for k in (own - 1, own + 1) if 0 <= k < signal.amplitude_t.shape[1]]
+        return own, max(beside, key=lambda k: float(signal.amplitude_t[round(peak.at), k]))
 
     def located(self, signal: Signals, path: Array, peak: Peak, pair: tuple[int, int]) -> _Magnet:
         first, second = pair
@@ -226,6 +214,21 @@ class _Pipeline:
         sensor[..., 1] -= magnet.y_m
         sensor[..., 2] = self.tags.clearance_m
         return dipole_field(sensor, magnet.moment_am2 * _direction(magnet.angle_rad))
+
+
+def disjoint_pairs(gains: Sequence[float]) -> list[int]:
+    """Of pairs (k, k + 1) in a row those that share no member and gain the most together:
+    their k. Pairs without gain are left out."""
+    best = [0.0, 0.0]
+    for k, gain in enumerate(gains):
+        best.append(max(best[-1], best[k] + gain))
+    chosen, k = [], len(gains) - 1
+    while k >= 0:
+        if best[k + 2] > best[k + 1]:
+            chosen.append(k)
+            k -= 1
+        k -= 1
+    return chosen[::-1]
 
 
 def field_strength(offset_m: Array, angle_rad: float, clearance_m: float) -> Array:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solveh_banded
+from scipy.linalg import block_diag, cho_factor, cho_solve, solveh_banded
 
 from locatk.core.polaris.dipoles import Offsets
 
@@ -30,6 +30,9 @@ FIXED = 1e18
 NUISANCES = ("crab", "tilt")
 """What is taken for zero until the samples show it: a way askew to the bar, magnets that do
 not lie flat."""
+
+LONGEST_STEP = 0.7
+"""How far a magnet may move in one step of the fit, in heights."""
 
 NONE = 1e-6
 """Share of its standard deviation that a nuisance is left while it is taken for zero."""
@@ -46,26 +49,30 @@ class Window:
     sensors_m : (N, 3) ndarray
         In the array's frame.
     noise_t : (N, 3) ndarray
+        Of one sample.
     frames : (n,) ndarray
         Times in sample periods, ascending; their gaps are lost samples.
+    counts : (n,) ndarray
+        How many samples each is the mean of.
     order : (3,) ndarray
         When each axis is converted: -1, 0 and 1 for first to last, or zeros.
-    common_t : float
-        Standard deviation of a field that all sensors share in a sample (motors).
     path_m : (n,) ndarray or None
         How far the array has moved, where that is known.
     thickness_m2 : float
         Of the magnets (:func:`locatk.core.polaris.dipoles.thickness`).
+    trends : int
+        Terms of each background: 2 are a level and a slope.
     """
 
     field_t: Array
     sensors_m: Array
     noise_t: Array
     frames: Array
+    counts: NDArray[np.intp]
     order: Array
-    common_t: float = 0.0
     path_m: Array | None = None
     thickness_m2: float = 0.0
+    trends: int = 2
 
 
 @dataclass(frozen=True)
@@ -118,25 +125,45 @@ class State:
     crab_rad: float = 0.0
 
 
+def trends(frames: Array, count: int) -> Array:
+    """Slow courses (n, count) that a background is made of: Legendre polynomials."""
+    time = 2 * (frames - frames[0]) / max(frames[-1] - frames[0], 1.0) - 1
+    return np.polynomial.legendre.legvander(time, count - 1)
+
+
+def solve_scaled(gram: Array, side: Array) -> Array:
+    """``gram^-1 side`` of a positive matrix whose unknowns have very different units.
+
+    Raises
+    ------
+    LinAlgError
+        It is not positive.
+    """
+    diagonal = np.diag(gram)
+    if not (np.all(np.isfinite(gram)) and np.all(diagonal > 0)):
+        raise np.linalg.LinAlgError("not a positive matrix")
+    scale = 1 / np.sqrt(diagonal)
+    factor = cho_factor(gram * scale[:, None] * scale + 1e-13 * np.eye(len(gram)))
+    side = (side.T * scale).T
+    return np.asarray((cho_solve(factor, side).T * scale).T)
+
+
 @dataclass(frozen=True)
 class Trial:
     """A state with the best moments for it, and what it leaves.
 
     Attributes
     ----------
-    rows : (n, N, 3, 3 M) ndarray
-        Fields of unit moments.
-    moments : (3 N n, 3 M) ndarray
-        The same in units of the noise.
-    cross : (3 M, 6 N) ndarray
+    moments : (3 N, n, 3 M) ndarray
+        Fields of unit moments in units of the noise.
+    cross : (3 N, D, 3 M) ndarray
         Their products with the backgrounds.
-    residual : (3 N n,) ndarray
+    residual : (3 N, n) ndarray
         In units of the noise.
     """
 
     state: State
     offsets: Offsets
-    rows: Array
     moments: Array
     cross: Array
     residual: Array
@@ -175,61 +202,46 @@ GLOBALS = ("height_m", "skew", "crab_rad")
 
 
 class Problem:
-    """A window and its priors, with what stays the same from step to step."""
+    """A window and its priors, with what stays the same from step to step.
+
+    Rows are ordered by channel (sensor and axis), then by sample, so that each channel's
+    background is a block of its own.
+
+    Parameters
+    ----------
+    weight : (n, N, 3) ndarray
+        One over the variance of each sample, 0 where there is none.
+    start : State
+        Tells where the path is zero, and how large a step's jitter may be.
+    """
 
     def __init__(self, window: Window, priors: Priors, weight: Array, start: State) -> None:
-        """``weight`` (n, N, 3) is one over the variance of each sample, 0 where there is
-        none; ``start`` tells where the path is zero, and how large a step's jitter may be."""
         self.window, self.priors = window, priors
         self.ref = int(np.argmin(np.abs(start.path_m)))
         self.jitter = priors.jitter * abs(start.speed_m) + 1e-6
         self.free: frozenset[str] = frozenset()
-        n, sensors, _ = window.field_t.shape
-        self.shape = (n, 3 * sensors)
-        self.root = np.sqrt(weight)
-        self.data = np.nan_to_num(window.field_t)
-        # A field that all sensors share has covariance tau^2 u u^T beside the unit noise.
-        square = (self.root**2).sum(axis=1, keepdims=True)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shrink = (1 - 1 / np.sqrt(1 + window.common_t**2 * square)) / square
-        self.shrink = np.nan_to_num(shrink) if window.common_t else None
-        time = window.frames - window.frames.mean()
-        trend = np.stack([np.ones(n), time / max(np.ptp(time) / 2, 1.0)], axis=1)
-        columns = np.zeros((n, sensors, 3, 3 * sensors * 2))
-        channel = np.arange(3 * sensors).reshape(sensors, 3)
-        for power in range(2):
-            at = 2 * channel + power
-            columns[:, np.arange(sensors)[:, None], np.arange(3), at] = trend[:, power, None, None]
-        self.background = self.whiten(columns).reshape(-1, columns.shape[-1])
-        gram = self.background.T @ self.background
-        # Channels that gave nothing have no background to find.
-        gram[np.diag_indices(len(gram))] += 1e-9 * np.max(np.diag(gram))
-        self.background_gram = gram
-        self.background_factor = cho_factor(gram, check_finite=False)
         self.spans = np.diff(window.frames)
-        self.target = self.whiten(self.data[..., None]).reshape(-1)
-        self.background_target = self.background.T @ self.target
-
-    def whiten(self, rows: Array) -> Array:
-        """Rows (n, N, 3, k) in units of their noise, without what all sensors share."""
-        scaled = rows * self.root[..., None]
-        if self.shrink is not None:
-            mean = (scaled * self.root[..., None]).sum(axis=1, keepdims=True)
-            scaled -= (self.root * self.shrink)[..., None] * mean
-        return scaled
+        n, sensors, _ = window.field_t.shape
+        self.shape = (3 * sensors, n)
+        self.root = np.ascontiguousarray(np.sqrt(weight).reshape(n, -1).T)
+        self.target = np.nan_to_num(window.field_t).reshape(n, -1).T * self.root
+        # (C, n, D); a channel that gave nothing has no background to find.
+        self.background = self.root[:, :, None] * trends(window.frames, window.trends)
+        gram = self.background.transpose(0, 2, 1) @ self.background
+        least = 1e-9 * max(float(gram.max(initial=0.0)), 1e-300)
+        self.background_gram = gram + least * np.eye(window.trends)
+        self.background_inverse = np.linalg.inv(self.background_gram)
 
     # ---- the model
 
     def offsets(self, state: State) -> Offsets:
-        """From the magnets to the sensors, in the order of the samples."""
+        """From the magnets to the sensors at each sample."""
         sensors = self.window.sensors_m
-        along = state.path_m[:, None] + self.window.order * state.skew * self.pace(state)[:, None]
-        across = sensors[:, 1] + np.tan(state.crab_rad) * state.path_m[:, None]
-        if not state.crab_rad:
-            across = across[:1]
+        along = state.path_m + np.outer(self.window.order * state.skew, self.pace(state))
+        across = np.tan(state.crab_rad) * (state.path_m if state.crab_rad else np.zeros(1))
         return Offsets.of(
-            along[:, None, :, None] + (sensors[:, 0, None] - state.place_m[:, 0])[:, None],
-            across[:, :, None, None] - state.place_m[:, 1],
+            along[:, :, None] + (sensors[:, 0, None] - state.place_m[:, 0])[:, None, None],
+            across[:, None] + (sensors[:, 1, None] - state.place_m[:, 1])[:, None, None],
             state.height_m,
         )
 
@@ -246,23 +258,21 @@ class Problem:
         offsets = self.offsets(state)
         units = offsets.unit_fields(self.window.thickness_m2)
         m = units.shape[3]
-        rows = units.reshape(*units.shape[:3], 3 * m)
-        moments = self.whiten(rows).reshape(-1, 3 * m)
-        cross = moments.T @ self.background
-        solved = cho_solve(
-            self.background_factor,
-            np.column_stack([cross.T, self.background_target]),
-            check_finite=False,
-        )
-        gram = moments.T @ moments - cross @ solved[:, :-1]
+        rows = units.reshape(*self.shape, 3 * m)
+        moments = rows * self.root[:, :, None]
+        transposed = self.background.transpose(0, 2, 1)
+        cross, level = transposed @ moments, transposed @ self.target[:, :, None]
+        solved = self.background_inverse @ np.concatenate([cross, level], axis=2)
+        flat, flat_cross = moments.reshape(-1, 3 * m), cross.reshape(-1, 3 * m)
+        gram = flat.T @ flat - flat_cross.T @ solved[..., :-1].reshape(-1, 3 * m)
         gram[np.diag_indices(3 * m)] += self.moment_weights(m)
-        side = moments.T @ self.target - cross @ solved[:, -1]
+        side = flat.T @ self.target.ravel() - flat_cross.T @ solved[..., -1].ravel()
         best = np.linalg.solve(gram, side)
-        level = solved[:, -1] - solved[:, :-1] @ best
-        residual = self.target - moments @ best - self.background @ level
+        levels = solved[..., -1:] - solved[..., :-1] @ best[:, None]
+        residual = self.target - moments @ best - (self.background @ levels)[..., 0]
         state = replace(state, moment_am2=best.reshape(m, 3))
-        cost = residual @ residual + self.moment_weights(m) @ best**2 + self.prior_cost(state)
-        return Trial(state, offsets, rows, moments, cross, residual, float(cost))
+        cost = (residual**2).sum() + self.moment_weights(m) @ best**2 + self.prior_cost(state)
+        return Trial(state, offsets, moments, cross, residual, float(cost))
 
     def moment_weights(self, m: int) -> Array:
         """Inverse variances (3 M,) of the moments."""
@@ -280,6 +290,7 @@ class Problem:
         return 0.0, priors.crab_rad * (1.0 if "crab" in self.free else NONE)
 
     def prior_cost(self, state: State) -> float:
+        """What the priors add to the squares of the residual, the moments' aside."""
         cost = 0.0
         for name in GLOBALS:
             mean, sigma = self.spread(name)
@@ -298,33 +309,35 @@ class Problem:
 
     def normal(self, trial: Trial) -> Normal:
         """Normal equations around a trial, the path eliminated."""
-        n, channels = self.shape
+        channels, n = self.shape
         state = trial.state
         m = len(state.place_m)
-        along_x, along_y, along_z = trial.offsets.gradients(state.moment_am2)
-        total_x, total_y = along_x.sum(axis=-1), along_y.sum(axis=-1)
+        by_x, by_y, by_z = trial.offsets.gradients(state.moment_am2)
+        total_x, total_y = by_x.sum(axis=-1), by_y.sum(axis=-1)
         tangent = np.tan(state.crab_rad)
-        columns = np.empty((*total_x.shape, 2 * m + len(GLOBALS) + 1))
-        np.negative(along_x, out=columns[..., :m])
-        np.negative(along_y, out=columns[..., m : 2 * m])
-        columns[..., 2 * m] = along_z.sum(axis=-1)
-        columns[..., 2 * m + 1] = total_x * (self.pace(state)[:, None, None] * self.window.order)
-        columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))[:, None, None]
-        columns[..., 2 * m + 3] = total_x + tangent * total_y
-        white = self.whiten(columns).reshape(n * channels, -1)
-        rest, along = white[:, :-1], white[:, -1].reshape(n, channels)
+        p = 2 * m + len(GLOBALS)
+        columns = np.empty((*total_x.shape, p))
+        np.negative(by_x, out=columns[..., :m])
+        np.negative(by_y, out=columns[..., m : 2 * m])
+        columns[..., 2 * m] = by_z.sum(axis=-1)
+        columns[..., 2 * m + 1] = total_x * np.outer(self.window.order, self.pace(state))
+        columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
+        inner = np.concatenate(
+            [columns.reshape(channels, n, p) * self.root[:, :, None], trial.moments], axis=2
+        )
+        along = (total_x + tangent * total_y).reshape(channels, n) * self.root
         # Order: places and globals, moments, the mean step, backgrounds.
-        p = rest.shape[1]
-        inner = np.hstack([rest, trial.moments])
-        q = inner.shape[1]
-        size = q + 1 + self.background.shape[1]
+        q = inner.shape[2]
+        size = q + 1 + self.background_gram[..., 0].size
         gram, side = np.zeros((size, size)), np.zeros(size)
-        gram[:q, :q] = inner.T @ inner
-        cross = np.vstack([rest.T @ self.background, trial.cross])
-        gram[:q, q + 1 :], gram[q + 1 :, :q] = cross, cross.T
-        gram[q + 1 :, q + 1 :] = self.background_gram
-        side[:q] = inner.T @ trial.residual
-        side[q + 1 :] = self.background.T @ trial.residual
+        flat = inner.reshape(-1, q)
+        gram[:q, :q] = flat.T @ flat
+        transposed = self.background.transpose(0, 2, 1)
+        cross = np.concatenate([transposed @ inner[..., :p], trial.cross], axis=2).reshape(-1, q)
+        gram[:q, q + 1 :], gram[q + 1 :, :q] = cross.T, cross
+        gram[q + 1 :, q + 1 :] = block_diag(*self.background_gram)
+        side[:q] = flat.T @ trial.residual.ravel()
+        side[q + 1 :] = (transposed @ trial.residual[:, :, None]).ravel()
         for place, name in enumerate(GLOBALS, 2 * m):
             mean, sigma = self.spread(name)
             gram[place, place] += 1 / sigma**2
@@ -336,20 +349,18 @@ class Problem:
             gram[q, q] += FIXED
             return Normal(gram, side, p, gram)
         # The path: a tridiagonal block, coupled to all else.
-        by_sample = inner.reshape(n, channels, q)
         coupling = np.zeros((size, n))
-        coupling[:q] = np.matmul(along[:, None], by_sample)[:, 0].T
-        background = self.background.reshape(n, channels, -1)
-        coupling[q + 1 :] = np.matmul(along[:, None], background)[:, 0].T
+        coupling[:q] = np.einsum("cn,cnq->qn", along, inner)
+        coupling[q + 1 :] = (along[:, :, None] * self.background).transpose(0, 2, 1).reshape(-1, n)
         excess, scale = self.excess(state)
         weight = 2 / (scale**2 + excess**2)
         band = np.zeros((2, n))
-        band[1] = np.einsum("nc,nc->n", along, along)
+        band[1] = (along**2).sum(axis=0)
         band[1, :-1] += weight
         band[1, 1:] += weight
         band[0, 1:] = -weight
         band[1, self.ref] += FIXED
-        steps = np.einsum("nc,nc->n", along, trial.residual.reshape(n, channels))
+        steps = (along * trial.residual).sum(axis=0)
         steps[:-1] += weight * excess
         steps[1:] -= weight * excess
         gram[q, q] += weight @ self.spans**2
@@ -368,16 +379,15 @@ class Problem:
         gram = normal.gram.copy()
         diagonal = np.diag_indices(len(gram))
         gram[diagonal] += damping * np.diag(normal.whole)
-        scale = 1 / np.sqrt(gram[diagonal])
-        gram *= scale[:, None] * scale
-        gram[diagonal] += 1e-13
-        moved = scale * cho_solve(
-            cho_factor(gram, check_finite=False), scale * normal.side, check_finite=False
-        )
+        moved = solve_scaled(gram, normal.side)
+        # A magnet that moves by more than this has left what the derivatives know.
+        furthest = np.abs(moved[: 2 * m]).max(initial=0.0)
+        moved *= min(1.0, LONGEST_STEP * state.height_m / max(furthest, 1e-12))
         values = {
             name: getattr(state, name) + moved[2 * m + place] for place, name in enumerate(GLOBALS)
         }
-        values["height_m"] = max(values["height_m"], 0.3 * state.height_m)
+        low, high = 0.7 * state.height_m, 1.4 * state.height_m
+        values["height_m"] = float(np.clip(values["height_m"], low, high))
         path, speed = state.path_m, state.speed_m
         if normal.path is not None and normal.coupling is not None:
             path = path + normal.path - normal.coupling @ moved

@@ -21,11 +21,12 @@ accepted, so one misread more is always noticed (and a third too where nothing i
 Beyond that the code refuses most, not all: of random words it accepts about
 ``(1 + M (q - 1)) / q^4``.
 
-Why not a library: reedsolo 1.7.0 decodes to the full ``2 e + f <= 4`` and says nothing more;
-with one error beyond that, 31 of 300 words RS(7, 3) over GF(8), and 219 of 300 with two
-checks, came out wrong without a word (facts/polaris.md section 6). Here one misread of
-correction is given up to notice the next two. Also, it has no field but GF(2^m), none of
-length q + 1, and eight magnets of eight orientations need both the length and the field.
+Why not a library: reedsolo 1.7.0 decodes to the full ``2 e + f <= 4`` and notices nothing
+beyond. Of 1000 random words with four checks, M = 7 at P = 8, it answered wrong without a
+word to 131 with three misread (this code: 0), 258 with four (12), 103 with two misread and
+one missing (0), 439 with one misread and three missing (0). The price: it corrects two
+misread where nothing is missing, and one beside two missing, which are refused here. Also,
+it has no field but GF(2^m) and no words of length q + 1.
 """
 
 from __future__ import annotations

@@ -57,13 +57,15 @@ class Scanner:
         margin = BESIDE * height_m
         count = int(np.ceil((left - right + 2 * margin) / (ACROSS * height_m))) + 1
         self.across_m = np.linspace(right - margin, left + margin, count)
-        shape = (len(along), len(sensors_m), 3, count)
+        shape = (len(sensors_m), 3, len(along), count)
         offsets = Offsets.of(
-            np.broadcast_to((along[:, None] + sensors_m[:, 0])[:, :, None, None], shape),
-            (sensors_m[:, 1:2] - self.across_m)[None, :, None],
+            np.broadcast_to((sensors_m[:, 0, None] + along)[:, None, :, None], shape),
+            (sensors_m[:, 1:2] - self.across_m)[:, None, None],
             height_m,
         )
-        columns = offsets.unit_fields()[..., :2] / noise_t[:, :, None, None]
+        units = offsets.unit_fields()[..., :2] / noise_t[:, :, None, None, None]
+        # (N, axis, rows, places, moment) to rows x (N, axis) x places x moment
+        columns = units.transpose(2, 0, 1, 3, 4)
         self.half, self.channels = half, 3 * len(sensors_m)
         pairs = np.ascontiguousarray(columns.reshape(-1, count, 2).transpose(1, 0, 2))
         # Orthogonal for each place, so that energies are sums of squares.
@@ -76,7 +78,9 @@ class Scanner:
 
         ``scaled`` (n, 3 N) are samples in units of their noise, without background.
         """
-        path = np.maximum.accumulate(path_m) + 1e-9 * np.arange(len(path_m))
+        order = np.argsort(path_m, kind="stable")
+        scaled = scaled[order]
+        path = path_m[order] + 1e-9 * np.arange(len(path_m))
         count = max(int((path[-1] - path[0]) / self.row_m), 1)
         edges = path[0] + self.row_m * np.arange(count + 1)
         middle = (path[1:] + path[:-1]) / 2

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.polaris import joint, paper, passes
+from locatk.core.polaris import joint, paper, passes, task
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.identify import Seen, identify
 from locatk.core.polaris.route import along, corrections, joined, tag_poses
@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 METHODS = ("joint", "paper")
 
 FEWEST_SAMPLES = 20
+
+GIVEN_UP = 0.7
+"""A way that was given is left where the free one has a residual of less than this share."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,9 @@ def solve(
     for recording in samples:
         _check(recording)
         driven = next((t for t in odometry if t.device == recording.device), None)
-        seen = _seen(recording, tags, options, driven)
+        seen, empty = _seen(recording, tags, options, driven)
+        if empty:
+            rejected["no_magnets"] += empty
         for item in seen:
             detections.append(item.detection(recording.device, recording.time_ns))
             if item.refused:
@@ -101,6 +106,8 @@ def solve(
             poses = joined(poses, driven)
         trajectories += poses
         turns += corrections(recording, read, tags)
+        if any(item.sighting.free_path for item in seen) and options.speed_mps is not None:
+            notes.append(f"{recording.device}: the speed given does not explain the samples")
         lost = np.isnan(recording.field_t).any(axis=2).mean()
         if lost > 0:
             notes.append(f"{recording.device}: {100 * lost:.2g} % of the sensors' samples missing")
@@ -131,8 +138,9 @@ def _check(recording: Samples) -> None:
 
 def _seen(
     recording: Samples, tags: Tags | None, options: SolveOptions, driven: Trajectory | None
-) -> list[Seen]:
-    """What each pass over magnets has shown, in order of time."""
+) -> tuple[list[Seen], int]:
+    """What each pass over magnets has shown, in order of time, and in how many passes the
+    field changed but no magnet explains it."""
     if options.method == "paper":
         if tags is None:
             raise InputError(
@@ -140,7 +148,7 @@ def _seen(
                 hint="Give it as --artifact, or import with --tag",
             )
         sightings = paper.sightings(recording, tags, options.speed_mps)
-        return [seen for sighting in sightings for seen in identify(sighting, recording, tags)]
+        return [seen for sighting in sightings for seen in identify(sighting, recording, tags)], 0
     path = None
     if options.speed_mps is not None:
         path = (recording.time_ns - recording.time_ns[0]) * 1e-9 * options.speed_mps
@@ -148,9 +156,11 @@ def _seen(
         path = along(driven, recording.time_ns)
     noise = passes.noise(recording)
     found: list[tuple[Sighting, list[Seen]]] = []
+    empty = 0
     for part in passes.find(recording, noise):
         fresh = _solved(recording, part, noise, tags, path)
         if fresh is None:
+            empty += 1
             continue
         if found and tags is not None and _may_be_one(found[-1], fresh, tags):
             both = passes.Pass(found[-1][0].first, fresh[0].stop)
@@ -159,7 +169,7 @@ def _seen(
                 found[-1] = whole
                 continue
         found.append(fresh)
-    return [seen for _, group in found for seen in group]
+    return [seen for _, group in found for seen in group], empty
 
 
 def _solved(
@@ -169,12 +179,21 @@ def _solved(
     tags: Tags | None,
     path: Array | None,
 ) -> tuple[Sighting, list[Seen]] | None:
-    """One pass as a sighting and what it is read as; None where there is no magnet."""
-    task = joint.prepare(recording, part, noise, tags, path)
-    fitted = joint.solve_pass(task)
+    """One pass as a sighting and what it is read as; None where there is no magnet.
+
+    A way that was given but does not explain the samples (lost ones, a start from rest) is
+    left for the one that the field itself tells.
+    """
+    prepared = task.prepare(recording, part, noise, tags, path)
+    fitted = joint.solve_pass(prepared)
+    if path is not None and (fitted is None or fitted.sigma > joint.WHITE):
+        free = task.prepare(recording, part, noise, tags)
+        other = joint.solve_pass(free)
+        if other is not None and (fitted is None or other.sigma < GIVEN_UP * fitted.sigma):
+            prepared, fitted = free, other
     if fitted is None:
         return None
-    sighting = joint.sighting(recording, task, fitted)
+    sighting = joint.sighting(recording, prepared, fitted)
     return sighting, identify(sighting, recording, tags)
 
 

@@ -29,15 +29,9 @@ from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import heading_of
 from locatk.formats.bench import Figure
-from locatk.formats.bench.dots_print import (
-    SEED,
-    codec_figures,
-    cpu_seconds,
-    measured,
-    page,
-    print_figures,
-)
+from locatk.formats.bench.dots_print import codec_figures, page, print_figures
 from locatk.formats.bench.dots_study import study_figures
+from locatk.formats.bench.timing import SEED, cpu_seconds, measured
 
 Array = NDArray[np.float64]
 

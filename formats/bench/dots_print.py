@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +13,7 @@ from locatk.core.dots.codec import DISPLACEMENT, MAIN, PERIOD, RANGE, Codec, cod
 from locatk.core.dots.decode import THRESHOLD, Decoded, decode
 from locatk.core.dots.sheet import Manifest
 from locatk.formats.bench import Figure
-
-SEED = 20_000
-"""First of the seeds that belong to benches; nothing is tuned on them."""
+from locatk.formats.bench.timing import SEED, cpu_seconds, measured
 
 ORIGIN = (RANGE // 2, RANGE // 4)
 WINDOW = 8
@@ -44,43 +36,6 @@ FAINT = 5
 
 PRINTS = {"A4": (0.15, 70.0, 45.6, 12_500.0), "A0": (2.0, 1100.0, None, None)}
 """Paper to seconds and kB that were promised, and those of reportlab with circles."""
-
-
-def cpu_seconds(call: Callable[[], object], repeats: int = 5) -> float:
-    """Least processor time of several runs: what one core needs, whoever else is busy."""
-    best = math.inf
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        best = min(best, time.process_time() - start)
-    return best
-
-
-def alone(call: str) -> list[float]:
-    """Numbers that a function of a bench measures in a process of its own, with one thread.
-
-    Parameters
-    ----------
-    call : str
-        An expression after ``locatk.formats.bench.``, as in ``"dots_print.memory()"``.
-
-    Raises
-    ------
-    OSError
-        It failed; the message is the last line that it said.
-    """
-    module = call.split(".")[0]
-    code = f"from locatk.formats.bench import {module}; print(*{call})"
-    threads = ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "OPENCV_FOR")
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        env={**os.environ, **{f"{name}_NUM_THREADS": "1" for name in threads}},
-    )
-    if run.returncode:
-        raise OSError((run.stderr.strip().splitlines() or ["no answer"])[-1])
-    return [float(word) for word in run.stdout.split()]
 
 
 def page(paper: str) -> Manifest:
@@ -144,26 +99,6 @@ def _decoding() -> Figure:
         f"decode() of {WINDOWS} windows in one call, any place, section and turn, one thread",
         5.0, "lower", f"{MICRODOTS}, 6x6 of it, no turn", 150.0,
     )  # fmt: skip
-
-
-def measured(
-    name: str,
-    unit: str,
-    call: str,
-    factor: float,
-    how: str,
-    target: float | None,
-    better: Literal["lower", "higher"] = "lower",
-    peer: str | None = None,
-    peer_value: float | None = None,
-) -> Figure:
-    """The last number of :func:`alone`, times ``factor``; ``{0}`` in ``how`` is the first."""
-    try:
-        numbers = alone(call)
-    except OSError as error:
-        return Figure(name, None, unit, f"not measured: {error}", target, better, peer, peer_value)
-    value = factor * numbers[-1]
-    return Figure(name, value, unit, how.format(*numbers), target, better, peer, peer_value)
 
 
 def _spoilt(

@@ -13,7 +13,7 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulate_courses import Course
 from locatk.core.dots.solver import METHODS, SolveOptions, solve
 from locatk.formats.bench import Figure
-from locatk.formats.bench.dots_print import SEED
+from locatk.formats.bench.timing import SEED
 
 Array = NDArray[np.float64]
 

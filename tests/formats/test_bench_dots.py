@@ -13,7 +13,7 @@ from locatk.core.dots import layout
 from locatk.core.dots.codec import codec
 from locatk.core.dots.exact import decode_exact
 from locatk.core.dots.located import nothing
-from locatk.formats.bench import Figure, dots, dots_print, dots_study
+from locatk.formats.bench import Figure, dots, dots_print, dots_study, timing
 from locatk.formats.pdf import pattern
 
 PROMISED = {
@@ -204,13 +204,13 @@ def test_a_wrong_print_is_noticed() -> None:
 
 
 def test_a_measure_that_fails_says_why() -> None:
-    figure = dots_print.measured("f", "s", "dots_print.nothing()", 1.0, "how", 1.0)
+    figure = timing.measured("f", "s", "dots_print.nothing()", 1.0, "how", 1.0)
     assert figure.value is None
     assert figure.met is None
     assert "nothing" in figure.how
     with pytest.raises(OSError, match="division"):
-        dots_print.alone("dots_print.SEED / 0")
-    assert dots_print.alone("dots_print.ORIGIN") == list(dots_print.ORIGIN)
+        timing.alone("dots_print.SEED / 0")
+    assert timing.alone("dots_print.ORIGIN") == list(dots_print.ORIGIN)
 
 
 def test_the_command_lists_them(

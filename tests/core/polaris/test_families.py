@@ -46,6 +46,7 @@ def designs_and_ids(draw, count: int) -> tuple[Tags, list[int]]:
     return tags, [draw(some) for _ in range(count)]
 
 
+@settings(deadline=None)
 @given(designs_and_ids(3))
 def test_distance_is_the_documented_metric(case) -> None:
     tags, (a, b, c) = case

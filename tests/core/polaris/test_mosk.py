@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
@@ -27,7 +27,7 @@ TABLE = {
     (1, 3, 5, 6, 8): "101",
     (1, 3, 6, 7, 8): "110",
 }
-BITS = "111 110 010 011 001 000 100 101".split()
+BITS = ["111", "110", "010", "011", "001", "000", "100", "101"]
 NUMBERED = {1: (0, 0), 2: (1, 0), 3: (0, 1), 4: (1, 1), 5: (2, 1), 6: (0, 2), 7: (1, 2), 8: (2, 2)}
 
 
@@ -62,6 +62,7 @@ def test_capacity_of_the_papers_large_tag() -> None:
     assert math.log2(codec.capacity(tags)) == pytest.approx(41.6, abs=0.05)
 
 
+@settings(deadline=None)
 @given(tags_and_ids())
 def test_every_id_has_a_layout_and_comes_back(case: tuple[Tags, int]) -> None:
     tags, tag_id = case
@@ -70,6 +71,7 @@ def test_every_id_has_a_layout_and_comes_back(case: tuple[Tags, int]) -> None:
     assert codec.id_of(tags, layout) == tag_id
 
 
+@settings(deadline=None)
 @given(designs(), st.data())
 def test_every_layout_has_an_id_and_comes_back(tags: Tags, data) -> None:
     last = tags.order - 1
@@ -121,6 +123,7 @@ def by_word(base: int) -> list[int]:
     return sorted(range(base), key=words.__getitem__)
 
 
+@settings(deadline=None)
 @given(st.integers(1, 200).map(lambda half: 2 * half))
 def test_neighbouring_orientations_differ_in_one_bit(base: int) -> None:
     words = mosk.gray_words(base)
@@ -130,6 +133,7 @@ def test_neighbouring_orientations_differ_in_one_bit(base: int) -> None:
     assert max(words).bit_length() == (base - 1).bit_length()
 
 
+@settings(deadline=None)
 @given(st.integers(1, 100).map(lambda half: 2 * half + 1))
 def test_odd_orientations_differ_in_one_bit_but_at_the_wrap(base: int) -> None:
     words = mosk.gray_words(base)
@@ -138,6 +142,7 @@ def test_odd_orientations_differ_in_one_bit_but_at_the_wrap(base: int) -> None:
     assert bits_apart(words[-1], words[0]) == 2
 
 
+@settings(deadline=None)
 @given(st.integers(2, 400))
 def test_digits_are_a_permutation(base: int) -> None:
     digits = mosk.gray_digits(base)
@@ -147,6 +152,7 @@ def test_digits_are_a_permutation(base: int) -> None:
         assert digits == tuple(s ^ s >> 1 for s in range(base))
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_a_step_changes_one_bit_of_the_id(data) -> None:
     tags = Tags(orientations=data.draw(st.sampled_from([4, 8, 16])))
@@ -164,6 +170,7 @@ def test_released_ids_are_the_published_ones() -> None:
     assert codec.id_of(RELEASED, Layout(cells, (0, 1, 2, 3, 4))) == 255183
 
 
+@settings(deadline=None)
 @given(st.sampled_from(sorted(TABLE)), st.lists(st.integers(0, 7), min_size=5, max_size=5))
 def test_released_ids_follow_the_table(numbers: tuple[int, ...], symbols: list[int]) -> None:
     layout = Layout(tuple(NUMBERED[n] for n in numbers), tuple(symbols))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import csv
+import functools
 import itertools
 import math
 from dataclasses import replace
@@ -20,6 +21,7 @@ from locatk.core.errors import InputError
 from locatk.core.geometry import umeyama
 from locatk.core.polaris import paper
 from locatk.core.polaris.array import Samples, SensorArray, bar
+from locatk.core.polaris.peaks import find_peaks, signals
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Layout, Tags, angles, places
 
@@ -161,7 +163,7 @@ def test_no_pattern_without_a_right_angle(points: list[tuple[float, float]]) -> 
 # ---- Drives over cylinders
 
 
-@pytest.mark.parametrize("degrees", range(0, 360, 30))
+@pytest.mark.parametrize("degrees", range(0, 360, 40))
 def test_magnets_of_a_tag_at_any_heading(degrees: int) -> None:
     # The paper has 1.93 to 2.49 mm over its headings (8.3.2).
     truth = lying(0.17, 0.004, math.radians(degrees))
@@ -172,6 +174,43 @@ def test_magnets_of_a_tag_at_any_heading(degrees: int) -> None:
     assert wrong[:, 0].max() < 5.5e-3
     assert np.median(wrong[:, 1]) < math.radians(10)
     assert sighting.moment_am2 == pytest.approx(TAGS.magnet.moment, rel=0.35)
+
+
+@pytest.mark.parametrize(("lateral", "expected"), [(0.0, {4}), (0.004, {4}), (0.01, {4, 5})])
+def test_a_magnet_counts_where_it_is_nearest(lateral: float, expected: set[int]) -> None:
+    samples = drive([(np.array([[0.1, lateral]]), np.array([0.5]))], 0.2)
+    found = find_peaks(signals(samples, 1.0), 20.0)
+    assert {peak.sensor for peak in found} == expected
+    assert [peak.at for peak in found] == pytest.approx([100] * len(found), abs=6)
+    assert found[0].amplitude_t > 5e-5
+
+
+@given(st.lists(st.floats(0, 1), max_size=8))
+def test_pairs_in_a_row_that_gain_the_most(gains: list[float]) -> None:
+    chosen = paper.disjoint_pairs(gains)
+    assert all(b - a > 1 for a, b in itertools.pairwise(chosen))
+    every = itertools.chain.from_iterable(
+        itertools.combinations(range(len(gains)), count) for count in range(6)
+    )
+    apart = [ks for ks in every if all(b - a > 1 for a, b in itertools.pairwise(ks))]
+    best = max(sum(gains[k] for k in ks) for ks in apart)
+    assert sum(gains[k] for k in chosen) == pytest.approx(best)
+    assert all(gains[k] > 0 for k in chosen)
+
+
+@pytest.mark.parametrize(
+    "magnets",
+    [
+        [(0.1, -0.0225), (0.1, 0.0175)],
+        [(0.1, 0.0105), (0.115, 0.0475)],
+        [(0.1, -0.05), (0.104, -0.01), (0.101, 0.03)],
+    ],
+)
+def test_magnets_passed_together_share_no_sensor(magnets: list[tuple[float, float]]) -> None:
+    truth = np.array(magnets), np.zeros(len(magnets))
+    samples = drive([truth], 0.2)
+    (sighting,) = paper.sightings(samples, TAGS, SPEED)
+    assert compared(sighting, samples, truth)[:, 0].max() < 2.5e-3
 
 
 def test_the_frame_is_the_array_s_at_the_middle_of_the_pass() -> None:
@@ -272,6 +311,7 @@ ANCHORED_MM = {"default": 1.68, "varying": 2.71}
 """The authors' own: facts/polaris.md 1."""
 
 
+@functools.cache
 def published(file: Path) -> Samples:
     with file.open(newline="") as lines:
         rows = list(csv.reader(lines))[1:]
@@ -282,15 +322,20 @@ def published(file: Path) -> Samples:
     return Samples("bar", SensorArray(bar(9, 0.02)), time, field)
 
 
-@pytest.fixture(scope="module")
-def scored(data: Path) -> dict[str, list[tuple[float, float, Array, Array]]]:
-    """By set and run: rigid and anchored error in mm, angles less their nominal, heading."""
-    found: dict[str, list[tuple[float, float, Array, Array]]] = {}
+Scores = dict[str, list[tuple[float, float, Array, float]]]
+"""By set and run: rigid and anchored error in mm, angles less their nominal, heading."""
+
+
+@pytest.fixture(scope="module", params=[0.010, 0.015], ids=["10 mm", "15 mm"])
+def scored(data: Path, request: pytest.FixtureRequest) -> Scores:
+    """With the clearance of the paper, and with that of the authors' code."""
+    tags = replace(TAGS, clearance_m=request.param)
+    found: Scores = {}
     for kind, runs in RUNS.items():
         found[kind] = []
         for run in runs:
             samples = published(data / "polaris" / kind / f"RawData_{run}.csv")
-            (sighting,) = paper.sightings(samples, TAGS, 0.105)
+            (sighting,) = paper.sightings(samples, tags, 0.105)
             assert len(sighting) == 5
             place = 1e3 * np.column_stack([-sighting.place_m[:, 1], sighting.place_m[:, 0]])
             apart = np.linalg.norm(place[:, None] - place[0] - TRUE_MM, axis=2)
@@ -298,7 +343,7 @@ def scored(data: Path) -> dict[str, list[tuple[float, float, Array, Array]]]:
             assert sorted(order.tolist()) == [0, 1, 2, 3, 4]
             place = place[order]
             laid = umeyama(place, TRUE_MM, with_scale=False).apply(place)
-            pattern = paper.pose_and_angles(sighting, TAGS)
+            pattern = paper.pose_and_angles(sighting, tags)
             assert pattern is not None
             assert [pattern[1][k] for k in order] == list(LAYOUT.cells)
             turn = sighting.angle_rad[order] - NOMINAL[kind]
@@ -307,27 +352,25 @@ def scored(data: Path) -> dict[str, list[tuple[float, float, Array, Array]]]:
                     float(np.linalg.norm(laid - TRUE_MM, axis=1).mean()),
                     float(np.linalg.norm(place - place[0] - TRUE_MM, axis=1).mean()),
                     np.remainder(turn + math.pi, math.tau) - math.pi,
-                    np.array(pattern[0][2]),
+                    pattern[0][2],
                 )
             )
     return found
 
 
 @pytest.mark.parametrize("kind", RUNS)
-def test_places_are_no_worse_than_the_authors(
-    scored: dict[str, list[tuple[float, float, Array, Array]]], kind: str
-) -> None:
+def test_places_are_no_worse_than_the_authors(scored: Scores, kind: str) -> None:
     rigid, anchored = np.mean([run[:2] for run in scored[kind]], axis=0)
     assert rigid <= RIGID_MM[kind]
     assert anchored <= ANCHORED_MM[kind]
 
 
 def test_orientations_and_headings_of_the_published_runs(
-    scored: dict[str, list[tuple[float, float, Array, Array]]],
+    scored: Scores, request: pytest.FixtureRequest
 ) -> None:
     runs = [run for kind in RUNS for run in scored[kind]]
-    turns = np.degrees([run[2] for run in runs])
-    # With the paper's clearance of 10 mm, though the recordings were made at 11.6 mm.
-    assert np.median(np.abs(turns)) < 12
-    assert np.mean(np.abs(turns) > 22.5) < 0.1
-    assert np.mean([abs(math.degrees(run[3])) for run in runs]) < 1.5
+    turns = np.abs(np.degrees([run[2] for run in runs]))
+    assert np.median(turns) < 12
+    # The recordings were made at about 11.6 mm: templates for 10 mm are too narrow.
+    assert np.sum(turns > 22.5) <= (6 if "10 mm" in request.node.name else 0)
+    assert np.mean([abs(math.degrees(run[3])) for run in runs]) < 1.3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 
@@ -23,8 +24,10 @@ WIDE = Tags(order=4, magnets=13, orientations=20)
 REDUNDANT = Tags(magnets=6, codec="redundant")
 
 
-def family(tags: Tags, count: int, distance: int) -> Tags:
-    return replace(tags, ids=families.generate(tags, count, distance), min_distance=distance)
+@cache
+def family(count: int, distance: int) -> Tags:
+    ids = families.generate(DEFAULT, count, distance)
+    return replace(DEFAULT, ids=ids, min_distance=distance)
 
 
 def magnets(tags: Tags, tag_id: int) -> tuple[list[Cell], np.ndarray]:
@@ -43,7 +46,7 @@ def apart(tags: Tags, one: float, other: float) -> float:
 
 
 def soft_distance(
-    tags: Tags, tag_id: int, cells: list[Cell], steps: np.ndarray, built: bool = False
+    tags: Tags, tag_id: int, cells: list[Cell], steps: Iterable[float], built: bool = False
 ) -> float:
     """The definition, magnet by magnet."""
     layout = codec.layout_of(tags, tag_id)
@@ -76,6 +79,7 @@ designs = st.sampled_from([SMALL, DEFAULT, RELEASED, WIDE])
 # --- every id may occur
 
 
+@settings(deadline=None)
 @given(designs, st.data())
 def test_what_is_laid_is_read(tags: Tags, data) -> None:
     """In any order of the magnets, at any wrap, off by less than half a step."""
@@ -91,6 +95,7 @@ def test_what_is_laid_is_read(tags: Tags, data) -> None:
     assert reading.margin == pytest.approx(1 - 2 * np.abs(off).max())
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_the_released_ids_are_read(data) -> None:
     cells = [(0, 0), (1, 1), (2, 1), (0, 2), (2, 2)]
@@ -99,6 +104,7 @@ def test_the_released_ids_are_read(data) -> None:
     assert read(RELEASED, cells, np.arange(5) + off).tag_id == 255183
 
 
+@settings(deadline=None)
 @given(designs, st.data())
 def test_an_orientation_between_two_is_a_tie(tags: Tags, data) -> None:
     cells, steps = magnets(tags, data.draw(st.integers(0, codec.capacity(tags) - 1)))
@@ -214,7 +220,7 @@ def test_a_tag_that_is_not_as_it_was_built_is_not_another() -> None:
 @given(st.data())
 def test_members_are_read_as_by_brute_force(data) -> None:
     """Whatever is seen: the nearest member within reach, else nothing."""
-    tags = family(DEFAULT, 40, 7)
+    tags = family(40, 7)
     member = data.draw(st.sampled_from(tags.ids))
     if data.draw(st.booleans()):
         shift = [data.draw(st.floats(-0.3, 0.3)) for _ in range(5)]
@@ -222,23 +228,28 @@ def test_members_are_read_as_by_brute_force(data) -> None:
     cells, steps = magnets(tags, member)
     steps += [data.draw(st.floats(-1.6, 1.6)) for _ in cells]
     best, margin = brute(tags, tags.ids, cells, steps)
+    assume(abs(margin - TIE) > 1e-9)
+    # Whole steps from what is expected of the best, magnet by magnet.
+    as_built = best in tags.built
+    alone = [
+        soft_distance(tags, best, [c], [s], as_built) for c, s in zip(cells, steps, strict=True)
+    ]
+    assume(all(abs(d % 1 - 0.5) > 1e-9 for d in alone))
+    corrected = sum(round(d) for d in alone)
     reading = read(tags, cells, steps)
     assert reading.margin == pytest.approx(margin)
+    assert reading.tag_id == (best if margin >= TIE and corrected <= 3 else None)
     if reading.tag_id is not None:
-        assert reading.tag_id == best
-        assert reading.corrected <= 3
-        assert margin >= TIE
-    else:
-        assert margin < TIE or len(tags.built) or soft_distance(tags, best, cells, steps) > 1.5
+        assert reading.corrected == corrected
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_a_family_corrects_half_its_distance(data) -> None:
     """Distance 7: three steps, in one magnet or in three, whoever is misread."""
-    tags = family(DEFAULT, 200, 7)
+    tags = family(200, 7)
     member = data.draw(st.sampled_from(tags.ids))
     cells, steps = magnets(tags, member)
-    wrong = 0
     for k in data.draw(st.lists(st.integers(0, 4), max_size=3)):
         steps[k] += data.draw(st.sampled_from([-1, 1]))
     hit = np.rint(steps - magnets(tags, member)[1])
@@ -249,10 +260,11 @@ def test_a_family_corrects_half_its_distance(data) -> None:
     assert reading.margin >= 7 - 2 * wrong
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_beyond_half_its_distance_nothing_is_read_as_another(data) -> None:
     """Distance 7, four steps: as far as another member may be three, else noticed."""
-    tags = family(DEFAULT, 200, 7)
+    tags = family(200, 7)
     member = data.draw(st.sampled_from(tags.ids))
     cells, steps = magnets(tags, member)
     k, other = data.draw(st.permutations(range(5)))[:2]
@@ -284,7 +296,7 @@ def _turned_layouts(tag_id: int, by):
 
 
 def test_a_foreign_tag_is_not_in_the_family() -> None:
-    tags = family(DEFAULT, 100, 6)
+    tags = family(100, 6)
     near = {i for i in range(0, 327680, 997) if families.distance(tags, i, tags.ids[0]) > 0}
     for tag_id in sorted(near)[:60]:
         nearest = min(families.distance(tags, tag_id, member) for member in tags.ids)
@@ -298,10 +310,11 @@ def test_a_foreign_tag_is_not_in_the_family() -> None:
     assert read(exact, *magnets(tags, foreign)).refused == "not_in_family"
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_a_missing_magnet_takes_half_a_turn_from_the_distance(data) -> None:
     """Distance 9, P = 8: one missing leaves 5, so that two steps are corrected beside it."""
-    tags = family(DEFAULT, 30, 9)
+    tags = family(30, 9)
     member = data.draw(st.sampled_from(tags.ids))
     cells, steps = magnets(tags, member)
     gone, *turn = data.draw(st.permutations(range(5)))
@@ -311,6 +324,23 @@ def test_a_missing_magnet_takes_half_a_turn_from_the_distance(data) -> None:
     rest = [k for k in range(5) if k != gone]
     reading = read(tags, [cells[k] for k in rest], steps[rest])
     assert (reading.tag_id, reading.erased, reading.corrected) == (member, 1, wrong)
+
+
+def test_beside_a_missing_magnet_less_is_corrected() -> None:
+    """Distance 9 bears four steps, with one magnet missing two, with two missing none."""
+    tags = family(30, 9)
+    member = tags.ids[11]
+    for missing, borne in ((0, 4), (1, 2), (2, 0)):
+        for wrong in range(5):
+            cells, steps = magnets(tags, member)
+            steps[missing] += min(wrong, 2)
+            steps[missing + 1] -= max(wrong - 2, 0)
+            reading = read(tags, cells[missing:], steps[missing:])
+            if wrong <= borne:
+                assert (reading.tag_id, reading.corrected) == (member, wrong)
+                assert reading.erased == missing
+            else:
+                assert reading.tag_id is None
 
 
 def test_a_magnet_missing_from_two_members_alike_is_no_guess() -> None:
@@ -328,7 +358,7 @@ def test_a_magnet_missing_from_two_members_alike_is_no_guess() -> None:
 
 
 def test_a_magnet_in_a_wrong_cell_counts_half_a_turn() -> None:
-    tags = family(DEFAULT, 30, 9)
+    tags = family(30, 9)
     member = tags.ids[7]
     cells, steps = magnets(tags, member)
     k = next(k for k, cell in enumerate(cells) if cell not in [(0, 0), (0, 2), (2, 2)])

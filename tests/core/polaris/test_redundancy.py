@@ -39,7 +39,8 @@ def errors(word: tuple[int, ...], seen: tuple[int | None, ...]) -> int:
 
 
 @pytest.mark.parametrize(
-    ("orientations", "size"), [(4, 4), (5, 5), (6, 5), (8, 8), (10, 8), (12, 11), (16, 16), (20, 19)]
+    ("orientations", "size"),
+    [(4, 4), (5, 5), (6, 5), (8, 8), (10, 8), (12, 11), (16, 16), (20, 19)],
 )
 def test_the_field_is_the_largest_that_fits(orientations: int, size: int) -> None:
     assert redundancy.field_size(orientations) == size
@@ -112,7 +113,7 @@ def damaged(draw) -> tuple[Tags, tuple[int, ...], list[int | None], int, int]:
     return tags, word, seen, misread, missing
 
 
-@settings(max_examples=400)
+@settings(deadline=None, max_examples=400)
 @given(damaged())
 def test_the_promise_holds_at_any_size(case) -> None:
     """Within the budget the word comes back; one misread more is noticed."""
@@ -121,6 +122,7 @@ def test_the_promise_holds_at_any_size(case) -> None:
     assert redundancy.decode(tags, seen) == expected
 
 
+@settings(deadline=None)
 @given(st.sampled_from([t for t in DESIGNS if t.magnets > 5]), st.data())
 def test_three_misreads_of_a_whole_tag_are_noticed(tags: Tags, data) -> None:
     size = redundancy.field_size(tags.orientations)
@@ -130,6 +132,7 @@ def test_three_misreads_of_a_whole_tag_are_noticed(tags: Tags, data) -> None:
     assert redundancy.decode(tags, seen) is None
 
 
+@settings(deadline=None)
 @given(st.sampled_from(DESIGNS), st.data())
 def test_ids_come_back(tags: Tags, data) -> None:
     tag_id = data.draw(st.integers(0, codec.capacity(tags) - 1))
@@ -156,6 +159,7 @@ def test_words_never_change() -> None:
     assert codec.layout_of(design(8, 16), 54321).symbols == (13, 4, 3, 1, 15, 9, 6, 11)
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_the_checks_are_the_documented_ones(data) -> None:
     """Where the field is a prime's, plain arithmetic tells."""

@@ -1,0 +1,353 @@
+"""The figures of Polaris: the published recordings, simulations, and speed.
+
+The recordings are those of the paper's authors: ten runs over their default tag and three
+over one of varying orientations, read as ``locatk import polaris-csv --rate 40 --spacing 20``
+does. Nobody measured where the tags lay: the truth is their layout, and a car that was set
+straight by hand. So nothing is known of the pose, and places are scored against each other:
+
+- *rigid-aligned*: mean distance of the magnets from their cells after the rotation and
+  translation that fit best, with no scale.
+- *authors' metric*: as ``sensing_offline.py`` of the released code has it, with no rotation;
+  see :func:`anchored_error`.
+
+No figure of a run is fitted on its truth but for that alignment. Along the track the default
+method measures with the tag's known spacing as a ruler, which is part of solving (the speed
+is not told to it); rows "without the ruler" take that back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import LocatkError
+from locatk.core.geometry import umeyama
+from locatk.core.polaris.array import Samples
+from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.solver import SolveOptions, solve
+from locatk.core.polaris.tag import places
+from locatk.formats.bench import Figure
+from locatk.formats.bench.polaris_speed import speed_figures
+from locatk.formats.bench.polaris_study import study_figures
+from locatk.formats.bench.timing import alone, cpu_seconds
+from locatk.formats.importers.polaris_csv import PUBLISHED_TAGS, read_polaris
+
+Array = NDArray[np.float64]
+
+RATE_HZ, SPACING_M = 40.0, 0.020
+SPEED_MPS = 0.105
+"""Of the published runs, as the released code has them."""
+
+RUNS = {"default": 10, "varying": 3}
+IDS = {"default": 262143, "varying": 255183}
+"""Sets, their runs, and the id of their tag in the released table."""
+
+AUTHORS = "authors"
+TEN = "authors, ten runs of the set"
+"""Of the set of varying orientations only three runs are here."""
+
+
+def figures(data: Path) -> list[Figure]:
+    """All figures of Polaris; ``data`` is the folder of published recordings."""
+    folder = data / "polaris"
+    return [*published_figures(folder), *study_figures(), *speed_figures()]
+
+
+# ---- the published runs
+
+
+@dataclass(frozen=True)
+class Run:
+    """What was found in one recording. The tag's five magnets are in the order of its cells.
+
+    Attributes
+    ----------
+    read : bool
+        Whether any id was.
+    wrong_bits : int
+        Of the ids that were read.
+    place_m : (5, 2) ndarray
+        In the array's frame; ``nan`` where the magnets were not found on the tag's cells.
+    angle_rad : (5,) ndarray
+    heading_rad : float
+        Of the tag in the array's frame; the true one is nominally 0.
+    scale : float
+        By which the tag as a ruler has stretched lengths along the track.
+    residual_sigma : float
+    """
+
+    read: bool
+    wrong_bits: int
+    place_m: Array
+    angle_rad: Array
+    heading_rad: float
+    scale: float
+    residual_sigma: float
+
+    @property
+    def unruled_m(self) -> Array:
+        """Places as they were found before the tag served as ruler."""
+        return self.place_m / [self.scale, 1.0]
+
+
+Sets = Mapping[str, Sequence[Run]]
+
+
+def read_runs(folder: Path) -> dict[str, list[Samples]]:
+    """The published recordings by set.
+
+    Raises
+    ------
+    LocatkError
+        One is not there, or cannot be read.
+    """
+    return {
+        name: [
+            read_polaris(
+                folder / name / f"RawData_{k}.csv", rate_hz=RATE_HZ, spacing_m=SPACING_M
+            ).samples
+            for k in range(1, count + 1)
+        ]
+        for name, count in RUNS.items()
+    }
+
+
+def solve_run(samples: Samples, method: str) -> list[dict[str, Any]]:
+    """Detections of one recording. The published algorithm is told the speed."""
+    speed = SPEED_MPS if method == "paper" else None
+    return solve([samples], PUBLISHED_TAGS, SolveOptions(method, speed)).detections
+
+
+def as_run(detections: Sequence[Mapping[str, Any]], tag_id: int) -> Run:
+    """What detections of one pass over ``tag_id`` say of it."""
+    cells = layout_of(PUBLISHED_TAGS, tag_id).cells
+    ids = [found["tag_id"] for found in detections if found["tag_id"] is not None]
+    wrong = sum((one ^ tag_id).bit_count() for one in ids)
+    for found in detections:
+        by_cell = {tuple(m["cell"]): m for m in found["magnets"] if m["cell"] is not None}
+        if set(by_cell) != set(cells):
+            continue
+        magnets = [by_cell[cell] for cell in cells]
+        return Run(
+            bool(ids),
+            wrong,
+            np.array([[magnet["x_m"], magnet["y_m"]] for magnet in magnets]),
+            np.array([magnet["angle_rad"] for magnet in magnets]),
+            found["heading_rad"],
+            found["scale"],
+            found["residual_sigma"],
+        )
+    nowhere = np.full((len(cells), 2), np.nan)
+    return Run(bool(ids), wrong, nowhere, nowhere[:, 0], math.nan, math.nan, math.nan)
+
+
+def rigid_error(place_m: Array, tag_id: int) -> float:
+    """Mean distance in mm of magnets (5, 2) from their cells, after the best rotation and
+    translation; ``nan`` where they were not found."""
+    if not np.isfinite(place_m).all():
+        return math.nan
+    nominal = places(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, tag_id).cells)
+    aligned = umeyama(place_m, nominal, with_scale=False).apply(place_m)
+    return 1e3 * float(np.linalg.norm(aligned - nominal, axis=1).mean())
+
+
+def anchored_error(place_m: Array, tag_id: int) -> float:
+    """The authors' metric in mm: no rotation, and two anchors in place of the best shift.
+
+    Their coordinates have x to the right and y along the track. Laterally the magnets are
+    compared relative to the first of them (v1), along the track relative to the one that
+    is passed first: whatever is wrong with these two is counted at all others, and nothing
+    at themselves.
+    """
+    column, row = np.array(layout_of(PUBLISHED_TAGS, tag_id).cells, float).T
+    nominal = PUBLISHED_TAGS.spacing_m * np.column_stack([column, row])
+    found = np.column_stack([-place_m[:, 1], place_m[:, 0]])
+    found = found - [found[0, 0], found[:, 1].min()]
+    return 1e3 * float(np.linalg.norm(found - nominal, axis=1).mean())
+
+
+def scatter(angle_rad: Array) -> float:
+    """Rms in degrees of angles (runs, magnets) about each magnet's own mean over the runs."""
+    mean = np.angle(np.exp(1j * angle_rad).mean(axis=0))
+    away = np.angle(np.exp(1j * (angle_rad - mean)))
+    return math.degrees(float(np.sqrt(np.mean(away**2))))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A row of the published runs: a figure that waits for its value."""
+
+    figure: Figure
+    value: Callable[[Sets], float]
+
+
+def published_figures(folder: Path) -> list[Figure]:
+    """Figures of both methods on the published runs, without values where those are absent."""
+    try:
+        recordings, absent = read_runs(folder), ""
+    except (LocatkError, OSError) as error:
+        recordings, absent = {}, f"not measured: {error}"
+    rows = []
+    for method, measures in (("joint", list(_joint())), ("paper", list(_paper()))):
+        sets = {
+            name: [as_run(solve_run(samples, method), IDS[name]) for samples in runs]
+            for name, runs in recordings.items()
+        }
+        for measure in measures:
+            if absent:
+                rows.append(replace(measure.figure, how=absent))
+            else:
+                rows.append(replace(measure.figure, value=measure.value(sets)))
+    return [*rows, *_times(folder, absent)]
+
+
+def _joint() -> Iterator[Measure]:
+    yield from _bits("", 0.0, "authors, 540 bits of 30 runs", 5.0)
+    for name, count in RUNS.items():
+        yield Measure(
+            Figure(f"{name}: read as {IDS[name]}", None, "%", f"of {count} runs", 100.0, "higher"),
+            lambda sets, name=name: (
+                100  # type: ignore[misc]
+                * float(np.mean([run.read and not run.wrong_bits for run in sets[name]]))
+            ),
+        )
+    ruler = "speed unknown; lengths along the track by the tag's 40 mm as ruler"
+    none = "the same fit, but lengths along the track by the field's shape alone"
+    for name, target, peer in (("default", 0.75, 1.46), ("varying", 0.80, 2.36)):
+        yield _position(name, "position, rigid-aligned", "place_m", rigid_error, target, peer,
+                        f"mean over magnets and runs, best rotation and translation; {ruler}")  # fmt: skip
+    for name, target, peer in (("default", 1.5, 1.68), ("varying", 1.6, 2.71)):
+        yield _position(name, "position, authors' metric", "place_m", anchored_error, target, peer,
+                        f"relative to v1 and to the first magnet, no alignment; {ruler}")  # fmt: skip
+    for name, rigid, anchored in (("default", 1.46, 1.68), ("varying", 2.36, 2.71)):
+        yield _position(name, "position, rigid-aligned, without the ruler", "unruled_m",
+                        rigid_error, None, rigid, none)  # fmt: skip
+        yield _position(name, "position, authors' metric, without the ruler", "unruled_m",
+                        anchored_error, None, anchored, none)  # fmt: skip
+    for name, angle in (("default", 4.7), ("varying", 9.8)):
+        yield Measure(
+            Figure(f"{name}: orientation scatter", None, "deg",
+                   "rms about each magnet's own mean, directions in the array's frame",
+                   0.65, peer=_whose(name), peer_value=angle),
+            lambda sets, name=name: scatter(np.array([r.angle_rad for r in sets[name]])),  # type: ignore[misc]
+        )  # fmt: skip
+        yield Measure(
+            Figure(f"{name}: orientation scatter, tag's frame", None, "deg",
+                   "the same, each run's directions less its heading", 0.65,
+                   peer=_whose(name), peer_value=angle),
+            lambda sets, name=name: scatter(  # type: ignore[misc]
+                np.array([r.angle_rad - r.heading_rad for r in sets[name]])
+            ),
+        )  # fmt: skip
+    yield from _headings("", 0.5)
+    for name in RUNS:
+        yield Measure(
+            Figure(f"{name}: residual", None, "sigma", "rms in standard deviations, mean of runs"),
+            lambda sets, name=name: float(np.mean([r.residual_sigma for r in sets[name]])),  # type: ignore[misc]
+        )
+
+
+def _paper() -> Iterator[Measure]:
+    told = f"speed told: {SPEED_MPS} m/s, as the authors did"
+    label = ", --method paper"
+    yield from _bits(label, None, "authors, ten runs of both sets", 4.0)
+    for name, rigid, anchored in (("default", 1.46, 1.68), ("varying", 2.36, 2.71)):
+        yield _position(name, f"position, rigid-aligned{label}", "place_m", rigid_error, rigid,
+                        rigid, f"mean over magnets and runs; {told}")  # fmt: skip
+        yield _position(name, f"position, authors' metric{label}", "place_m", anchored_error,
+                        anchored, anchored, f"no alignment; {told}")  # fmt: skip
+    yield from _headings(label, None)
+
+
+def _bits(label: str, target: float | None, peer: str, peer_value: float) -> Iterator[Measure]:
+    """Wrong bits, and runs that were refused."""
+    yield Measure(
+        Figure(f"published runs: wrong bits{label}", None, "bits",
+               "of all ids that were read, 18 bits each", target,
+               peer=peer, peer_value=peer_value),
+        lambda sets: float(sum(run.wrong_bits for run in _all(sets))),
+    )  # fmt: skip
+    yield Measure(
+        Figure(f"published runs: not read{label}", None, "runs", "of 13: refused, with a reason, "
+               "instead of a guess", target),
+        lambda sets: float(sum(not run.read for run in _all(sets))),
+    )  # fmt: skip
+
+
+def _all(sets: Sets) -> list[Run]:
+    return [run for runs in sets.values() for run in runs]
+
+
+def _whose(name: str) -> str:
+    return AUTHORS if name == "default" else TEN
+
+
+def _position(
+    name: str,
+    what: str,
+    attribute: str,
+    error: Callable[[Array, int], float],
+    target: float | None,
+    peer: float,
+    how: str,
+) -> Measure:
+    return Measure(
+        Figure(f"{name}: {what}", None, "mm", how, target, peer=_whose(name), peer_value=peer),
+        lambda sets: float(
+            np.mean([error(getattr(run, attribute), IDS[name]) for run in sets[name]])
+        ),
+    )
+
+
+def _headings(label: str, target: float | None) -> Iterator[Measure]:
+    """Mean absolute headings of each set, and of all runs."""
+    for title, names, peer in (
+        ("default", ["default"], 1.14),
+        ("varying", ["varying"], 1.78),
+        ("published runs", list(RUNS), None),
+    ):
+        yield Measure(
+            Figure(f"{title}: heading{label}", None, "deg",
+                   "mean absolute, no alignment; true headings are nominally 0, set by hand",
+                   target, peer=_whose(title) if peer else None, peer_value=peer),
+            lambda sets, names=names: math.degrees(  # type: ignore[misc]
+                np.mean([abs(run.heading_rad) for name in names for run in sets[name]])
+            ),
+        )  # fmt: skip
+
+
+# ---- time a run
+
+
+KINDS = ("median", "mean", "longest")
+
+
+def _times(folder: Path, absent: str) -> list[Figure]:
+    how = "solve() from arrays in memory: processor time, one thread, best of 3 of each run"
+    rows = []
+    for method, target in (("joint", 0.1), ("paper", None)):
+        label = "" if method == "joint" else ", --method paper"
+        seconds: list[float | None] = [None] * len(KINDS)
+        said = absent
+        if not absent:
+            try:
+                seconds = list(alone(f"polaris.run_times({str(folder)!r}, {method!r})"))
+            except OSError as error:
+                said = f"not measured: {error}"
+        for kind, value in zip(KINDS, seconds, strict=True):
+            promised = None if kind == "longest" else target
+            rows.append(Figure(f"time a run, {kind}{label}", value, "s", said or how, promised))
+    return rows
+
+
+def run_times(folder: str, method: str) -> tuple[float, float, float]:
+    """Seconds of processor time that a published run takes: median, mean and longest."""
+    runs = [samples for runs in read_runs(Path(folder)).values() for samples in runs]
+    seconds = [cpu_seconds(lambda one=samples: solve_run(one, method), 3) for samples in runs]  # type: ignore[misc]
+    return float(np.median(seconds)), float(np.mean(seconds)), max(seconds)
