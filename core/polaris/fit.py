@@ -9,16 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from locatk.core.errors import DegenerateError
-from locatk.core.polaris.problem import (
-    NUISANCES,
-    Normal,
-    Priors,
-    Problem,
-    State,
-    Trial,
-    Window,
-    solve_scaled,
-)
+from locatk.core.polaris.problem import NUISANCES, Normal, Problem, Trial, solve_scaled
+from locatk.core.polaris.window import Priors, State, Window
 
 Array = NDArray[np.float64]
 
@@ -101,7 +93,7 @@ def _fit(
     problem = Problem(window, priors, weight, start)
     trial, converged = _descend(problem, problem.project(start), iterations, tolerance)
     if not final:
-        return _fitted(problem, trial, converged, None)
+        return _fitted(problem, trial, weight, converged, None)
     if _outliers(_residual(problem, trial)):
         for _ in range(3):
             problem = _reweighted(problem, trial, weight, start)
@@ -114,7 +106,7 @@ def _fit(
         trial, converged = _descend(problem, problem.project(trial.state), 10, tolerance)
     problem.free = frozenset(NUISANCES)
     normal = problem.normal(trial)
-    return _fitted(problem, trial, converged, normal)
+    return _fitted(problem, trial, weight, converged, normal)
 
 
 def _descend(
@@ -143,6 +135,12 @@ def _residual(problem: Problem, trial: Trial) -> Array:
     return shown.T.reshape(problem.window.field_t.shape)
 
 
+def _unweighted(problem: Problem, trial: Trial, weight: Array) -> Array:
+    """The residual (n, N, 3) as if no sample had been weighted down."""
+    used = problem.root.T.reshape(weight.shape)
+    return _residual(problem, trial) * np.sqrt(weight) / np.where(used > 0, used, 1.0)
+
+
 def _outliers(residual: Array) -> bool:
     """Whether samples stand out that a normal distribution does not have."""
     z = np.abs(residual[np.isfinite(residual)])
@@ -151,9 +149,7 @@ def _outliers(residual: Array) -> bool:
 
 def _reweighted(problem: Problem, trial: Trial, weight: Array, start: State) -> Problem:
     """The same with samples weighted by Student's t of their own residual."""
-    used = problem.root.T.reshape(weight.shape)
-    z = np.nan_to_num(_residual(problem, trial))
-    z *= np.sqrt(weight) / np.where(used > 0, used, 1.0)
+    z = np.nan_to_num(_unweighted(problem, trial, weight))
     scale = max(1.0, float(np.median(np.abs(z[weight > 0])) * 1.4826))
     share = (ROBUST_FREEDOM + 1) / (ROBUST_FREEDOM + (z / scale) ** 2)
     return Problem(problem.window, problem.priors, weight * share, start)
@@ -179,9 +175,11 @@ def _seen(problem: Problem, trial: Trial) -> str:
     return best if best and gains[best] > SEEN else ""
 
 
-def _fitted(problem: Problem, trial: Trial, converged: bool, normal: Normal | None) -> Fitted:
+def _fitted(
+    problem: Problem, trial: Trial, weight: Array, converged: bool, normal: Normal | None
+) -> Fitted:
     window, state = problem.window, trial.state
-    residual = _residual(problem, trial)
+    residual = _unweighted(problem, trial, weight)
     count = int(np.isfinite(residual).sum())
     unknowns = 5 * len(state.place_m) + problem.background_gram[..., 0].size
     if window.path_m is None:

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 MISFIT_M = 0.1
 """Largest rms distance of the magnets from their cells, in spacings."""
 
+SCALE_OFF = 0.1
+"""Largest deviation of the way's scale from 1."""
+
 RESIDUAL = 4.0
 """Largest rms residual of a tag that is read, in standard deviations of the noise."""
 
@@ -141,7 +144,7 @@ def _best(sighting: Sighting, recording: Samples, tags: Tags, used: frozenset[in
     if not read_as:
         match, reading = readings[0]
         reason = reading.refused
-        if reason in ("magnets_missing", "vertex_missing", "no_such_placement"):
+        if reason in ("magnets_missing", "vertex_missing") and len(match.cells) < tags.magnets:
             reason = _incomplete(sighting, recording, tags, match)
         return Seen(sighting, match, reading, reason)
     match, reading = read_as[0]
@@ -156,7 +159,7 @@ def _best(sighting: Sighting, recording: Samples, tags: Tags, used: frozenset[in
         at = [layout.cells.index(cell) for cell in match.cells]
         match = refitted(sighting, tags, match, place[at])
     refused = ""
-    if match.misfit_m > MISFIT_M * tags.spacing_m:
+    if match.misfit_m > MISFIT_M * tags.spacing_m or abs(match.scale - 1) > SCALE_OFF:
         refused = "misfit"
     elif sighting.residual_sigma > RESIDUAL:
         refused = "residual"
@@ -182,7 +185,7 @@ def _incomplete(sighting: Sighting, recording: Samples, tags: Tags, match: Match
         beside = sin * place[:, 0] + cos * place[:, 1] + match.y_m
         if np.any(np.abs(beside) > reach):
             return "partial"
-    elif np.any(np.abs(sighting.place_m[:, 1]) > reach - tags.spacing_m):
+    elif np.any(np.abs(sighting.place_m[:, 1]) > reach - 0.5 * tags.spacing_m):
         return "partial"
     ends = sighting.first <= 1 or sighting.stop >= len(recording) - 1
     return "partial" if ends else "magnets_missing"

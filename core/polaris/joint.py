@@ -8,6 +8,7 @@ white the search begins again from another speed or height.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,15 +17,21 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.fit import Fitted, fit
-from locatk.core.polaris.problem import Priors, State, Window, trends
-from locatk.core.polaris.scan import BESIDE, Atom, Scanner
+from locatk.core.polaris.scan import BESIDE, FEW_SENSORS, Atom, Scanner
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.task import Task, clocks
+from locatk.core.polaris.window import Priors, State, Window, trends
 
 Array = NDArray[np.float64]
 
 SPEEDS_M = np.geomspace(0.02e-3, 10e-3, 16)
 """Steps of a sample period that are tried."""
+
+COMMON_T = 3e-6
+"""Shared field that is allowed for while magnets are looked for."""
+
+ENOUGH = 0.95
+"""Share of its residual above which one more round of sources was not worth it."""
 
 BAD = 3.0
 """Rms of a residual that has nothing to do with the samples."""
@@ -44,8 +51,10 @@ TRENDS = 5
 """Terms of a background that drifts more than a slope."""
 
 UNEVEN = 6.0
-"""Mean square of a residual's slow or shared part, in units of the noise, that is not left
-to chance."""
+"""Mean square of a residual's slow part, in units of the noise, that is not left to it."""
+
+SHARED = 2.0
+"""The same of the part that all sensors share."""
 
 WEAK = 0.4
 """A magnet has at least this share of the median moment."""
@@ -108,14 +117,13 @@ def _state(atoms: list[Atom], path: Array, speed: float, priors: Priors) -> Stat
     )
 
 
-def solve_pass(task: Task) -> Fitted | None:
-    """The best fit of a pass; None where there is no magnet in it.
+def fits(task: Task) -> Iterator[Fitted]:
+    """Fits of a pass, from one start after the other; nothing where it holds no magnet.
 
-    Of all speeds, heights and clocks those come first that explain the samples best. The
-    first that leaves a white residual is taken; an array that drives backward is thought
-    of where none does.
+    Of all speeds, heights and clocks those come first that explain the samples best. An
+    array that drives backward is thought of last, and only where nothing else will do.
     """
-    best: Fitted | None = None
+    best = np.inf
     for sign in (1.0, -1.0):
         tried = [(clocked, start) for clocked in clocks(task) for start in starts(clocked, sign)]
         tried.sort(key=lambda pair: pair[1].left)
@@ -124,43 +132,29 @@ def solve_pass(task: Task) -> Fitted | None:
                 fitted = _grow(clocked, start)
             except DegenerateError:
                 continue
-            if best is None or fitted.sigma < best.sigma:
-                best = fitted
-            if best.sigma < WHITE:
-                return best
-        if task.window.path_m is not None or (best is not None and best.sigma < BAD):
+            best = min(best, fitted.sigma)
+            yield fitted
+        if task.window.path_m is not None or best < BAD:
             break
-    return best
 
 
 def _grow(task: Task, start: _Start) -> Fitted:
     """Fit from one start, with magnets added from the residual until it holds none."""
     window, priors = task.window, start.priors
+    coarse = replace(window, common_t=COMMON_T if len(window.sensors_m) >= FEW_SENSORS else 0.0)
     scanner = Scanner(window.sensors_m, window.noise_t, start.state.height_m)
     path = start.state.path_m
     atoms, _ = scanner.atoms(path, task.scaled, task.most, LEAST_ENERGY)
     state = _state(_distinct(atoms, start.state.height_m), path, start.state.speed_m, priors)
-    fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
+    fitted = fit(coarse, state, priors, iterations=12, tolerance=1e-3, final=False)
     for _ in range(4):
-        state = fitted.state
-        scanner = Scanner(window.sensors_m, window.noise_t, state.height_m)
-        residual = np.nan_to_num(fitted.residual / np.sqrt(window.counts)[:, None, None])
-        residual = residual.reshape(len(window.frames), -1)
-        room = task.most - len(state.place_m)
-        least_energy = max(LEAST_ENERGY, 12 * fitted.sigma**2)
-        new, _ = scanner.atoms(state.path_m, residual, min(4, room), least_energy)
-        # What is weak is looked at where it is needed only.
-        least = 0.0 if fitted.sigma > DEBRIS else 0.5 * WEAK * np.median(_sizes(state))
-        new = [
-            atom
-            for atom in new
-            if np.hypot(*atom.moment_am2) > least
-            and _far(atom.place_m, state, SAME_M * state.height_m)
-        ]
-        if not new:
+        state = _with(fitted.state, _missed(task, fitted))
+        if len(state.place_m) == len(fitted.state.place_m):
             break
-        state = _with(state, new)
-        fitted = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
+        before = fitted
+        fitted = fit(coarse, state, priors, iterations=12, tolerance=1e-3, final=False)
+        if fitted.sigma > ENOUGH * before.sigma:
+            break
     while True:
         state = _without_ghosts(fitted.state, task)
         fitted = fit(window, state, priors)
@@ -172,16 +166,39 @@ def _grow(task: Task, start: _Start) -> Fitted:
             return fitted
 
 
-def _with_background(window: Window, fitted: Fitted) -> Window:
-    """The window with a background that drifts more, where the residual shows one.
+def _missed(task: Task, fitted: Fitted) -> list[Atom]:
+    """Sources that the residual still holds."""
+    window, state = task.window, fitted.state
+    scanner = Scanner(window.sensors_m, window.noise_t, state.height_m)
+    residual = np.nan_to_num(fitted.residual / np.sqrt(window.counts)[:, None, None])
+    residual = residual.reshape(len(window.frames), -1)
+    room = min(4, task.most - len(state.place_m))
+    new, _ = scanner.atoms(state.path_m, residual, room, max(LEAST_ENERGY, 12 * fitted.sigma**2))
+    # What is weak is looked at where it is needed only.
+    least = 0.0 if fitted.sigma > DEBRIS else 0.5 * WEAK * np.median(_sizes(state))
+    return [
+        atom
+        for atom in new
+        if np.hypot(*atom.moment_am2) > least and _far(atom.place_m, state, SAME_M * state.height_m)
+    ]
 
-    In units of the noise, a white residual has squares of 1 along each course in time.
+
+def _with_background(window: Window, fitted: Fitted) -> Window:
+    """The window with a background that drifts more, or with a field that all sensors share,
+    where the residual shows one.
+
+    In units of the noise, a white residual has squares of 1 along each course in time, and
+    along each sample's mean over the bar.
     """
+    n, sensors, _ = fitted.residual.shape
     residual = np.nan_to_num(fitted.residual)
-    n = len(residual)
     course = np.linalg.qr(trends(window.frames, TRENDS))[0][:, window.trends :]
     slow = (course.T @ residual.reshape(n, -1)) ** 2
-    if window.trends < TRENDS and slow.mean() > UNEVEN:
+    shared = float((residual.sum(axis=1) ** 2).mean() / sensors)
+    if sensors >= FEW_SENSORS and shared > max(SHARED, 2 * fitted.sigma**2):
+        size = np.sqrt((shared - 1) / sensors / np.mean(window.counts)) * np.median(window.noise_t)
+        window = replace(window, common_t=float(size))
+    elif window.trends < TRENDS and slow.mean() > UNEVEN:
         window = replace(window, trends=TRENDS)
     return window
 
@@ -206,6 +223,8 @@ def _far(place: Array, state: State, limit: float) -> bool:
 
 
 def _with(state: State, atoms: list[Atom]) -> State:
+    if not atoms:
+        return state
     places = np.vstack([state.place_m, [atom.place_m for atom in atoms]])
     moments = np.vstack([state.moment_am2, [[*atom.moment_am2, 0.0] for atom in atoms]])
     return replace(state, place_m=places, moment_am2=moments)
@@ -238,17 +257,24 @@ def _without_ghosts(state: State, task: Task) -> State:
     return replace(state, place_m=state.place_m[kept], moment_am2=state.moment_am2[kept])
 
 
-def magnets(fitted: Fitted) -> NDArray[np.intp]:
-    """Which of the sources are magnets of a tag: the others are weaker by far."""
-    size = _sizes(fitted.state)
-    strong = size[size > WEAK * size.max()]
-    return np.flatnonzero(size > WEAK * np.median(strong))
+def magnets(fitted: Fitted, task: Task) -> NDArray[np.intp]:
+    """Which of the sources are magnets of a tag: under the bar, and not weaker by far."""
+    state, sensors = fitted.state, task.window.sensors_m
+    reach = BESIDE * state.height_m
+    under = state.place_m[:, 1] > sensors[:, 1].min() - reach
+    under &= state.place_m[:, 1] < sensors[:, 1].max() + reach
+    size = np.where(under, _sizes(state), 0.0)
+    expected = task.priors[0].moment_am2
+    usual = size[(size > WEAK / 2 * expected) & (size < 3 * expected)]
+    if len(usual) == 0:
+        usual = size[size > WEAK * size.max()]
+    return np.flatnonzero(size > WEAK * np.median(usual))
 
 
 def sighting(samples: Samples, task: Task, fitted: Fitted) -> Sighting:
     """What a fit says, in the array's frame at a sample near the magnets' middle."""
     state = fitted.state
-    chosen = magnets(fitted)
+    chosen = magnets(fitted, task)
     place = state.place_m[chosen]
     middle = place.mean(axis=0)
     number = np.arange(task.samples)

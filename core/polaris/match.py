@@ -133,7 +133,7 @@ def _layings(
             for k in np.flatnonzero(good.sum(axis=1) >= max(2, good.sum(axis=1).max() - 1)):
                 chosen = np.flatnonzero(good[k])
                 cells = [(int(near_column[k, m]), int(near_row[k, m])) for m in chosen]
-                if len(set(cells)) < len(cells) or len(cells) > tags.magnets:
+                if len(set(cells)) < len(cells):
                     continue
                 pairs = sorted(
                     zip(chosen.tolist(), cells, strict=True), key=lambda pair: pair[1][::-1]
@@ -180,7 +180,8 @@ def _fitted(
         shift, heading, scale = shift + moved[:2], heading + moved[2], scale + moved[3]
     misfit = float(np.sqrt((residual**2).sum() / m))
     # A way that was no straight line shows in the grid, not in the samples.
-    excess = max(1.0, float(residual @ weight @ residual) / max(2 * m - 3, 1))
+    squares = float(residual @ weight @ residual) + prior[3] * (scale - 1) ** 2
+    excess = max(1.0, squares / max(2 * m - 3, 1))
     return Match(
         magnets,
         cells,

@@ -63,10 +63,13 @@ def activity(samples: Samples, noise_t: Array) -> Array:
     """
     n = len(samples)
     scaled = samples.field_t / noise_t
-    with np.errstate(all="ignore"):
-        scaled = scaled - np.nan_to_num(np.nanmean(scaled, axis=1, keepdims=True))
+    there = np.isfinite(scaled)
     scaled = np.nan_to_num(scaled)
-    freedom = max(3 * (len(samples.array) - 1), 1)
+    freedom = 3 * len(samples.array)
+    if len(samples.array) > 2:
+        number = np.maximum(there.sum(axis=1, keepdims=True), 1)
+        scaled = np.where(there, scaled - scaled.sum(axis=1, keepdims=True) / number, 0.0)
+        freedom -= 3
     best = np.zeros(n)
     for lag in LAGS:
         if lag >= n:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve, solveh_banded
 
 from locatk.core.polaris.dipoles import Offsets
+from locatk.core.polaris.window import Priors, State, Window, trends
 
 Array = NDArray[np.float64]
 
@@ -36,99 +37,6 @@ LONGEST_STEP = 0.7
 
 NONE = 1e-6
 """Share of its standard deviation that a nuisance is left while it is taken for zero."""
-
-
-@dataclass(frozen=True)
-class Window:
-    """The samples of one pass.
-
-    Attributes
-    ----------
-    field_t : (n, N, 3) ndarray
-        Tesla; ``nan`` where missing.
-    sensors_m : (N, 3) ndarray
-        In the array's frame.
-    noise_t : (N, 3) ndarray
-        Of one sample.
-    frames : (n,) ndarray
-        Times in sample periods, ascending; their gaps are lost samples.
-    counts : (n,) ndarray
-        How many samples each is the mean of.
-    order : (3,) ndarray
-        When each axis is converted: -1, 0 and 1 for first to last, or zeros.
-    path_m : (n,) ndarray or None
-        How far the array has moved, where that is known.
-    thickness_m2 : float
-        Of the magnets (:func:`locatk.core.polaris.dipoles.thickness`).
-    trends : int
-        Terms of each background: 2 are a level and a slope.
-    """
-
-    field_t: Array
-    sensors_m: Array
-    noise_t: Array
-    frames: Array
-    counts: NDArray[np.intp]
-    order: Array
-    path_m: Array | None = None
-    thickness_m2: float = 0.0
-    trends: int = 2
-
-
-@dataclass(frozen=True)
-class Priors:
-    """What is known before the samples are looked at; pairs are (mean, standard deviation).
-
-    Attributes
-    ----------
-    height_m, skew : (float, float)
-        Of the sensors over the magnets; between two axes' conversions, in sample periods.
-    moment_am2 : float
-        Size that is expected of a magnet.
-    tilt : float
-        By how much of its moment a magnet may point up.
-    crab_rad : float
-        Between the array's x and its way.
-    jitter : float
-        Half width of a step's deviation, as a share of the mean step.
-    """
-
-    height_m: tuple[float, float] = (0.01, 0.003)
-    skew: tuple[float, float] = (0.0, 0.5)
-    moment_am2: float = 1.5e-3
-    tilt: float = 0.05
-    crab_rad: float = 0.009
-    jitter: float = 0.3
-
-
-@dataclass(frozen=True)
-class State:
-    """One hypothesis of a pass.
-
-    Attributes
-    ----------
-    place_m : (M, 2) ndarray
-    moment_am2 : (M, 3) ndarray
-    path_m : (n,) ndarray
-    speed_m : float
-        Mean step of a sample period.
-    height_m, skew, crab_rad : float
-        See :class:`Priors`.
-    """
-
-    place_m: Array
-    moment_am2: Array
-    path_m: Array
-    speed_m: float
-    height_m: float
-    skew: float = 0.0
-    crab_rad: float = 0.0
-
-
-def trends(frames: Array, count: int) -> Array:
-    """Slow courses (n, count) that a background is made of: Legendre polynomials."""
-    time = 2 * (frames - frames[0]) / max(frames[-1] - frames[0], 1.0) - 1
-    return np.polynomial.legendre.legvander(time, count - 1)
 
 
 def solve_scaled(gram: Array, side: Array) -> Array:
@@ -224,13 +132,35 @@ class Problem:
         n, sensors, _ = window.field_t.shape
         self.shape = (3 * sensors, n)
         self.root = np.ascontiguousarray(np.sqrt(weight).reshape(n, -1).T)
-        self.target = np.nan_to_num(window.field_t).reshape(n, -1).T * self.root
+        # A shared field has covariance tau^2 u u^T beside the unit noise of each axis.
+        square = (self.root.reshape(-1, 3, n) ** 2).sum(axis=0)
+        least = np.maximum(square, 1e-300)
+        self.shared = (1 - 1 / np.sqrt(1 + window.common_t**2 * square)) / least
+        self.target = self.whiten(np.nan_to_num(window.field_t).reshape(n, -1).T)
         # (C, n, D); a channel that gave nothing has no background to find.
         self.background = self.root[:, :, None] * trends(window.frames, window.trends)
         gram = self.background.transpose(0, 2, 1) @ self.background
-        least = 1e-9 * max(float(gram.max(initial=0.0)), 1e-300)
-        self.background_gram = gram + least * np.eye(window.trends)
+        gram += 1e-9 * max(float(gram.max(initial=0.0)), 1e-300) * np.eye(window.trends)
+        self.background_gram = gram
         self.background_inverse = np.linalg.inv(self.background_gram)
+
+    def whiten(self, rows: Array) -> Array:
+        """Rows (C, n) or (C, n, k) in units of the noise, and without most of what all
+        sensors share.
+
+        That leaves the backgrounds what they are: courses of their own for each channel.
+        """
+        wide = rows.ndim == 3
+        root = self.root[..., None] if wide else self.root
+        scaled = rows * root
+        if not self.window.common_t:
+            return scaled
+        shape = (-1, 3, *rows.shape[1:])
+        scaled, root = scaled.reshape(shape), root.reshape((-1, 3, *root.shape[1:]))
+        shared = self.shared[..., None] if wide else self.shared
+        return np.asarray(
+            (scaled - root * (shared * (root * scaled).sum(axis=0))).reshape(rows.shape)
+        )
 
     # ---- the model
 
@@ -259,7 +189,7 @@ class Problem:
         units = offsets.unit_fields(self.window.thickness_m2)
         m = units.shape[3]
         rows = units.reshape(*self.shape, 3 * m)
-        moments = rows * self.root[:, :, None]
+        moments = self.whiten(rows)
         transposed = self.background.transpose(0, 2, 1)
         cross, level = transposed @ moments, transposed @ self.target[:, :, None]
         solved = self.background_inverse @ np.concatenate([cross, level], axis=2)
@@ -323,9 +253,9 @@ class Problem:
         columns[..., 2 * m + 1] = total_x * np.outer(self.window.order, self.pace(state))
         columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
         inner = np.concatenate(
-            [columns.reshape(channels, n, p) * self.root[:, :, None], trial.moments], axis=2
+            [self.whiten(columns.reshape(channels, n, p)), trial.moments], axis=2
         )
-        along = (total_x + tangent * total_y).reshape(channels, n) * self.root
+        along = self.whiten((total_x + tangent * total_y).reshape(channels, n))
         # Order: places and globals, moments, the mean step, backgrounds.
         q = inner.shape[2]
         size = q + 1 + self.background_gram[..., 0].size

@@ -25,6 +25,8 @@ REACH = 3.0
 ACROSS = 0.5
 """Steps across the track, in heights."""
 
+FEW_SENSORS = 5
+
 BESIDE = 1.5
 """How far beyond the last sensor magnets are looked for, in heights."""
 
@@ -37,6 +39,14 @@ class Atom:
     place_m: Array
     moment_am2: Array
     energy: float
+
+
+def unshared(fields: Array) -> Array:
+    """Fields (N, ...) without what all sensors of the bar share: the Earth's that turns with
+    the robot, and its motors'. A bar of few sensors has no magnet that some do not see."""
+    if len(fields) < FEW_SENSORS:
+        return fields
+    return fields - fields.mean(axis=0)
 
 
 class Scanner:
@@ -63,7 +73,7 @@ class Scanner:
             (sensors_m[:, 1:2] - self.across_m)[:, None, None],
             height_m,
         )
-        units = offsets.unit_fields()[..., :2] / noise_t[:, :, None, None, None]
+        units = unshared(offsets.unit_fields()[..., :2] / noise_t[:, :, None, None, None])
         # (N, axis, rows, places, moment) to rows x (N, axis) x places x moment
         columns = units.transpose(2, 0, 1, 3, 4)
         self.half, self.channels = half, 3 * len(sensors_m)
@@ -79,7 +89,8 @@ class Scanner:
         ``scaled`` (n, 3 N) are samples in units of their noise, without background.
         """
         order = np.argsort(path_m, kind="stable")
-        scaled = scaled[order]
+        by_sensor = scaled[order].reshape(len(order), -1, 3).swapaxes(0, 1)
+        scaled = unshared(by_sensor).swapaxes(0, 1).reshape(len(order), -1)
         path = path_m[order] + 1e-9 * np.arange(len(path_m))
         count = max(int((path[-1] - path[0]) / self.row_m), 1)
         edges = path[0] + self.row_m * np.arange(count + 1)

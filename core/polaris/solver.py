@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.polaris import joint, paper, passes, task
 from locatk.core.polaris.array import Samples
+from locatk.core.polaris.clean import cleaned
 from locatk.core.polaris.identify import Seen, identify
 from locatk.core.polaris.route import along, corrections, joined, tag_poses
 from locatk.core.polaris.sighting import Sighting
@@ -26,8 +27,7 @@ METHODS = ("joint", "paper")
 
 FEWEST_SAMPLES = 20
 
-GIVEN_UP = 0.7
-"""A way that was given is left where the free one has a residual of less than this share."""
+NOT_THE_WAY = "the speed or odometry given does not explain the samples of a pass"
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,11 @@ def solve(
     turns: list[dict[str, Any]] = []
     for recording in samples:
         _check(recording)
+        noise = passes.noise(recording)
+        recording, faults = cleaned(recording, noise)
+        notes += faults
         driven = next((t for t in odometry if t.device == recording.device), None)
-        seen, empty = _seen(recording, tags, options, driven)
+        seen, empty = _seen(recording, noise, tags, options, driven)
         if empty:
             rejected["no_magnets"] += empty
         for item in seen:
@@ -106,8 +109,8 @@ def solve(
             poses = joined(poses, driven)
         trajectories += poses
         turns += corrections(recording, read, tags)
-        if any(item.sighting.free_path for item in seen) and options.speed_mps is not None:
-            notes.append(f"{recording.device}: the speed given does not explain the samples")
+        remarks = dict.fromkeys(note for item in seen for note in item.sighting.notes)
+        notes += [f"{recording.device}: {remark}" for remark in remarks]
         lost = np.isnan(recording.field_t).any(axis=2).mean()
         if lost > 0:
             notes.append(f"{recording.device}: {100 * lost:.2g} % of the sensors' samples missing")
@@ -134,10 +137,18 @@ def _check(recording: Samples) -> None:
         raise InputError(
             f"no sensor of {recording.device} gave a sample", hint="Check wiring and range"
         )
+    if np.any(np.diff(recording.time_ns) < 0) or recording.time_ns[0] == recording.time_ns[-1]:
+        raise InputError(
+            f"the time stamps of {recording.device} do not ascend", hint="Check the recording"
+        )
 
 
 def _seen(
-    recording: Samples, tags: Tags | None, options: SolveOptions, driven: Trajectory | None
+    recording: Samples,
+    noise: Array,
+    tags: Tags | None,
+    options: SolveOptions,
+    driven: Trajectory | None,
 ) -> tuple[list[Seen], int]:
     """What each pass over magnets has shown, in order of time, and in how many passes the
     field changed but no magnet explains it."""
@@ -154,7 +165,6 @@ def _seen(
         path = (recording.time_ns - recording.time_ns[0]) * 1e-9 * options.speed_mps
     elif driven is not None:
         path = along(driven, recording.time_ns)
-    noise = passes.noise(recording)
     found: list[tuple[Sighting, list[Seen]]] = []
     empty = 0
     for part in passes.find(recording, noise):
@@ -165,7 +175,7 @@ def _seen(
         if found and tags is not None and _may_be_one(found[-1], fresh, tags):
             both = passes.Pass(found[-1][0].first, fresh[0].stop)
             whole = _solved(recording, both, noise, tags, path)
-            if whole is not None and any(seen.tag_id is not None for seen in whole[1]):
+            if whole is not None and whole[1][0].tag_id is not None:
                 found[-1] = whole
                 continue
         found.append(fresh)
@@ -181,20 +191,29 @@ def _solved(
 ) -> tuple[Sighting, list[Seen]] | None:
     """One pass as a sighting and what it is read as; None where there is no magnet.
 
-    A way that was given but does not explain the samples (lost ones, a start from rest) is
-    left for the one that the field itself tells.
+    The first fit is taken that leaves a white residual and is read; else the one with the
+    least residual. A way that was given but does not explain the samples (lost ones, a
+    start from rest) is left for the one that the field itself tells.
     """
-    prepared = task.prepare(recording, part, noise, tags, path)
-    fitted = joint.solve_pass(prepared)
-    if path is not None and (fitted is None or fitted.sigma > joint.WHITE):
-        free = task.prepare(recording, part, noise, tags)
-        other = joint.solve_pass(free)
-        if other is not None and (fitted is None or other.sigma < GIVEN_UP * fitted.sigma):
-            prepared, fitted = free, other
-    if fitted is None:
-        return None
-    sighting = joint.sighting(recording, prepared, fitted)
-    return sighting, identify(sighting, recording, tags)
+    best: tuple[Sighting, list[Seen]] | None = None
+    for way in (path, None) if path is not None else (None,):
+        prepared = task.prepare(recording, part, noise, tags, way)
+        for fitted in joint.fits(prepared):
+            sighting = joint.sighting(recording, prepared, fitted)
+            if way is None and path is not None:
+                sighting = replace(sighting, notes=(NOT_THE_WAY,))
+            found = sighting, identify(sighting, recording, tags)
+            white = sighting.residual_sigma < joint.WHITE
+            if white and (tags is None or found[1][0].tag_id is not None):
+                return found
+            if best is None or _rank(found) < _rank(best):
+                best = found
+    return best
+
+
+def _rank(found: tuple[Sighting, list[Seen]]) -> tuple[bool, float]:
+    """What is read comes before what is not; then by the residual."""
+    return found[1][0].tag_id is None, found[0].residual_sigma
 
 
 def _may_be_one(

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.dipoles import thickness
 from locatk.core.polaris.passes import Pass
-from locatk.core.polaris.problem import Priors, Window
 from locatk.core.polaris.tag import Tags
+from locatk.core.polaris.window import Priors, Window
 
 Array = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def prepare(
     """
     at = slice(part.first, part.stop)
     field = samples.field_t[at]
-    usual_ns = float(np.median(np.diff(samples.time_ns)))
+    usual_ns = period_ns(samples)
     frames = (samples.time_ns[at] - samples.time_ns[part.first]) / usual_ns
     starts = _groups(np.nan_to_num(field / noise_t).reshape(len(field), -1))
     counts = np.diff(np.append(starts, len(field)))
@@ -146,6 +146,13 @@ def prepare(
     )
 
 
+def period_ns(samples: Samples) -> float:
+    """Usual time from one sample to the next; the mean where a host stamped many at once."""
+    usual = float(np.median(np.diff(samples.time_ns)))
+    mean = float(samples.time_ns[-1] - samples.time_ns[0]) / (len(samples) - 1)
+    return usual if usual > 0.2 * mean else mean
+
+
 def _groups(scaled: Array) -> NDArray[np.intp]:
     """First samples of groups in which the field has not changed; ``scaled`` (n, C) is in
     units of the noise."""
@@ -177,14 +184,17 @@ def _level(scaled: Array) -> Array:
 
 
 def clocks(task: Task) -> Iterator[Task]:
-    """The task as it is, and where the array may have stood still, with the clock stopped
-    meanwhile."""
+    """The task as it is, and where the array may have stood still, or samples are missing
+    for long, with the clock stopped meanwhile."""
     yield task
     window = task.window
+    if window.path_m is not None:
+        return
     standing = window.counts >= STANDING
     standing[[0, -1]] = False
-    if window.path_m is not None or not standing.any():
-        return
-    excess = np.where(standing, window.counts - 1.0, 0.0)
-    stopped = np.cumsum(excess) - excess / 2
-    yield replace(task, window=replace(window, frames=window.frames - stopped))
+    waited = np.where(standing, window.counts - 1.0, 0.0)
+    silent = np.diff(window.frames) - (window.counts[1:] + window.counts[:-1]) / 2
+    silent = np.where(silent > STANDING, silent, 0.0)
+    if standing.any() or silent.any():
+        stopped = np.cumsum(waited) - waited / 2 + np.append(0.0, np.cumsum(silent))
+        yield replace(task, window=replace(window, frames=window.frames - stopped))

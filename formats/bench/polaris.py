@@ -48,9 +48,12 @@ RUNS = {"default": 10, "varying": 3}
 IDS = {"default": 262143, "varying": 255183}
 """Sets, their runs, and the id of their tag in the released table."""
 
-AUTHORS = "authors"
-TEN = "authors, ten runs of the set"
-"""Of the set of varying orientations only three runs are here."""
+RIGID_MM = {"default": 1.46, "varying": 2.36}
+ANCHORED_MM = {"default": 1.68, "varying": 2.71}
+"""Position errors of the authors' own results in both metrics (facts/polaris.md 1)."""
+
+PEERS = {"default": "authors", "varying": "authors, ten runs of the set"}
+"""Of the set of varying orientations only three of its ten runs are in the data folder."""
 
 
 def figures(data: Path) -> list[Figure]:
@@ -68,6 +71,8 @@ class Run:
 
     Attributes
     ----------
+    tag_id : int
+        The true one.
     read : bool
         Whether any id was.
     wrong_bits : int
@@ -82,6 +87,7 @@ class Run:
     residual_sigma : float
     """
 
+    tag_id: int
     read: bool
     wrong_bits: int
     place_m: Array
@@ -94,9 +100,6 @@ class Run:
     def unruled_m(self) -> Array:
         """Places as they were found before the tag served as ruler."""
         return self.place_m / [self.scale, 1.0]
-
-
-Sets = Mapping[str, Sequence[Run]]
 
 
 def read_runs(folder: Path) -> dict[str, list[Samples]]:
@@ -135,6 +138,7 @@ def as_run(detections: Sequence[Mapping[str, Any]], tag_id: int) -> Run:
             continue
         magnets = [by_cell[cell] for cell in cells]
         return Run(
+            tag_id,
             bool(ids),
             wrong,
             np.array([[magnet["x_m"], magnet["y_m"]] for magnet in magnets]),
@@ -144,7 +148,7 @@ def as_run(detections: Sequence[Mapping[str, Any]], tag_id: int) -> Run:
             found["residual_sigma"],
         )
     nowhere = np.full((len(cells), 2), np.nan)
-    return Run(bool(ids), wrong, nowhere, nowhere[:, 0], math.nan, math.nan, math.nan)
+    return Run(tag_id, bool(ids), wrong, nowhere, nowhere[:, 0], math.nan, math.nan, math.nan)
 
 
 def rigid_error(place_m: Array, tag_id: int) -> float:
@@ -179,12 +183,16 @@ def scatter(angle_rad: Array) -> float:
     return math.degrees(float(np.sqrt(np.mean(away**2))))
 
 
+Value = Callable[[Sequence[Run]], float]
+
+
 @dataclass(frozen=True)
 class Measure:
-    """A row of the published runs: a figure that waits for its value."""
+    """A row of the published runs: a figure that waits for its value, and whose it is."""
 
+    sets: tuple[str, ...]
+    value: Value
     figure: Figure
-    value: Callable[[Sets], float]
 
 
 def published_figures(folder: Path) -> list[Figure]:
@@ -194,8 +202,8 @@ def published_figures(folder: Path) -> list[Figure]:
     except (LocatkError, OSError) as error:
         recordings, absent = {}, f"not measured: {error}"
     rows = []
-    for method, measures in (("joint", list(_joint())), ("paper", list(_paper()))):
-        sets = {
+    for method, measures in (("joint", _joint()), ("paper", _paper())):
+        solved = {
             name: [as_run(solve_run(samples, method), IDS[name]) for samples in runs]
             for name, runs in recordings.items()
         }
@@ -203,127 +211,126 @@ def published_figures(folder: Path) -> list[Figure]:
             if absent:
                 rows.append(replace(measure.figure, how=absent))
             else:
-                rows.append(replace(measure.figure, value=measure.value(sets)))
+                runs = [run for name in measure.sets for run in solved[name]]
+                rows.append(replace(measure.figure, value=measure.value(runs)))
     return [*rows, *_times(folder, absent)]
+
+
+def _mean(of: Callable[[Run], float]) -> Value:
+    return lambda runs: float(np.mean([of(run) for run in runs]))
+
+
+READ = _mean(lambda run: 100.0 * (run.read and not run.wrong_bits))
+RIGID = _mean(lambda run: rigid_error(run.place_m, run.tag_id))
+ANCHORED = _mean(lambda run: anchored_error(run.place_m, run.tag_id))
+RIGID_UNRULED = _mean(lambda run: rigid_error(run.unruled_m, run.tag_id))
+ANCHORED_UNRULED = _mean(lambda run: anchored_error(run.unruled_m, run.tag_id))
+HEADING = _mean(lambda run: abs(math.degrees(run.heading_rad)))
+RESIDUAL = _mean(lambda run: run.residual_sigma)
+
+
+def _wrong(runs: Sequence[Run]) -> float:
+    return float(sum(run.wrong_bits for run in runs))
+
+
+def _not_read(runs: Sequence[Run]) -> float:
+    return float(sum(not run.read for run in runs))
+
+
+def _scatter(runs: Sequence[Run]) -> float:
+    return scatter(np.array([run.angle_rad for run in runs]))
+
+
+def _scatter_in_tag(runs: Sequence[Run]) -> float:
+    return scatter(np.array([run.angle_rad - run.heading_rad for run in runs]))
 
 
 def _joint() -> Iterator[Measure]:
     yield from _bits("", 0.0, "authors, 540 bits of 30 runs", 5.0)
     for name, count in RUNS.items():
-        yield Measure(
-            Figure(f"{name}: read as {IDS[name]}", None, "%", f"of {count} runs", 100.0, "higher"),
-            lambda sets, name=name: (
-                100  # type: ignore[misc]
-                * float(np.mean([run.read and not run.wrong_bits for run in sets[name]]))
-            ),
-        )
+        title = f"{name}: read as {IDS[name]}"
+        yield Measure((name,), READ, Figure(title, None, "%", f"of {count} runs", 100.0, "higher"))
     ruler = "speed unknown; lengths along the track by the tag's 40 mm as ruler"
-    none = "the same fit, but lengths along the track by the field's shape alone"
-    for name, target, peer in (("default", 0.75, 1.46), ("varying", 0.80, 2.36)):
-        yield _position(name, "position, rigid-aligned", "place_m", rigid_error, target, peer,
-                        f"mean over magnets and runs, best rotation and translation; {ruler}")  # fmt: skip
-    for name, target, peer in (("default", 1.5, 1.68), ("varying", 1.6, 2.71)):
-        yield _position(name, "position, authors' metric", "place_m", anchored_error, target, peer,
-                        f"relative to v1 and to the first magnet, no alignment; {ruler}")  # fmt: skip
-    for name, rigid, anchored in (("default", 1.46, 1.68), ("varying", 2.36, 2.71)):
-        yield _position(name, "position, rigid-aligned, without the ruler", "unruled_m",
-                        rigid_error, None, rigid, none)  # fmt: skip
-        yield _position(name, "position, authors' metric, without the ruler", "unruled_m",
-                        anchored_error, None, anchored, none)  # fmt: skip
-    for name, angle in (("default", 4.7), ("varying", 9.8)):
-        yield Measure(
-            Figure(f"{name}: orientation scatter", None, "deg",
-                   "rms about each magnet's own mean, directions in the array's frame",
-                   0.65, peer=_whose(name), peer_value=angle),
-            lambda sets, name=name: scatter(np.array([r.angle_rad for r in sets[name]])),  # type: ignore[misc]
-        )  # fmt: skip
-        yield Measure(
-            Figure(f"{name}: orientation scatter, tag's frame", None, "deg",
-                   "the same, each run's directions less its heading", 0.65,
-                   peer=_whose(name), peer_value=angle),
-            lambda sets, name=name: scatter(  # type: ignore[misc]
-                np.array([r.angle_rad - r.heading_rad for r in sets[name]])
-            ),
-        )  # fmt: skip
+    aligned = f"mean over magnets and runs, best rotation and translation; {ruler}"
+    for name, target in (("default", 0.75), ("varying", 0.80)):
+        yield _rigid(name, "", aligned, target)
+    anchored = f"relative to v1 and to the first magnet, no alignment; {ruler}"
+    for name, target in (("default", 1.5), ("varying", 1.6)):
+        yield _anchored(name, "", anchored, target)
+    without = "the same fit, but lengths along the track by the field's shape alone"
+    for name in RUNS:
+        yield _rigid(name, ", without the ruler", without, None, RIGID_UNRULED)
+        yield _anchored(name, ", without the ruler", without, None, ANCHORED_UNRULED)
+    own = "rms about each magnet's own mean over the runs"
+    for name, peer in (("default", 4.7), ("varying", 9.8)):
+        for label, how, value in (
+            ("", f"{own}, directions in the array's frame", _scatter),
+            (", tag's frame", f"{own}, directions less the run's heading", _scatter_in_tag),
+        ):
+            title = f"{name}: orientation scatter{label}"
+            yield Measure(
+                (name,), value,
+                Figure(title, None, "deg", how, 0.65, peer=PEERS[name], peer_value=peer),
+            )  # fmt: skip
     yield from _headings("", 0.5)
     for name in RUNS:
-        yield Measure(
-            Figure(f"{name}: residual", None, "sigma", "rms in standard deviations, mean of runs"),
-            lambda sets, name=name: float(np.mean([r.residual_sigma for r in sets[name]])),  # type: ignore[misc]
-        )
+        how = "rms in standard deviations of the noise, mean of the runs"
+        yield Measure((name,), RESIDUAL, Figure(f"{name}: residual", None, "sigma", how))
 
 
 def _paper() -> Iterator[Measure]:
-    told = f"speed told: {SPEED_MPS} m/s, as the authors did"
-    label = ", --method paper"
+    label, told = ", --method paper", f"speed told: {SPEED_MPS} m/s, as the authors did"
     yield from _bits(label, None, "authors, ten runs of both sets", 4.0)
-    for name, rigid, anchored in (("default", 1.46, 1.68), ("varying", 2.36, 2.71)):
-        yield _position(name, f"position, rigid-aligned{label}", "place_m", rigid_error, rigid,
-                        rigid, f"mean over magnets and runs; {told}")  # fmt: skip
-        yield _position(name, f"position, authors' metric{label}", "place_m", anchored_error,
-                        anchored, anchored, f"no alignment; {told}")  # fmt: skip
+    for name in RUNS:
+        yield _rigid(name, label, f"mean over magnets and runs; {told}", RIGID_MM[name])
+        yield _anchored(name, label, f"no alignment; {told}", ANCHORED_MM[name])
     yield from _headings(label, None)
 
 
 def _bits(label: str, target: float | None, peer: str, peer_value: float) -> Iterator[Measure]:
     """Wrong bits, and runs that were refused."""
-    yield Measure(
-        Figure(f"published runs: wrong bits{label}", None, "bits",
-               "of all ids that were read, 18 bits each", target,
-               peer=peer, peer_value=peer_value),
-        lambda sets: float(sum(run.wrong_bits for run in _all(sets))),
-    )  # fmt: skip
-    yield Measure(
-        Figure(f"published runs: not read{label}", None, "runs", "of 13: refused, with a reason, "
-               "instead of a guess", target),
-        lambda sets: float(sum(not run.read for run in _all(sets))),
-    )  # fmt: skip
+    for title, value, figure in (
+        ("wrong bits", _wrong,
+         Figure("", None, "bits", "of all ids that were read, 18 bits each", target,
+                peer=peer, peer_value=peer_value)),
+        ("not read", _not_read,
+         Figure("", None, "runs", "of 13: refused instead of guessed", target)),
+    ):  # fmt: skip
+        yield Measure(tuple(RUNS), value, replace(figure, name=f"published runs: {title}{label}"))
 
 
-def _all(sets: Sets) -> list[Run]:
-    return [run for runs in sets.values() for run in runs]
-
-
-def _whose(name: str) -> str:
-    return AUTHORS if name == "default" else TEN
-
-
-def _position(
-    name: str,
-    what: str,
-    attribute: str,
-    error: Callable[[Array, int], float],
-    target: float | None,
-    peer: float,
-    how: str,
-) -> Measure:
+def _rigid(name: str, label: str, how: str, target: float | None, value: Value = RIGID) -> Measure:
+    title = f"{name}: position, rigid-aligned{label}"
     return Measure(
-        Figure(f"{name}: {what}", None, "mm", how, target, peer=_whose(name), peer_value=peer),
-        lambda sets: float(
-            np.mean([error(getattr(run, attribute), IDS[name]) for run in sets[name]])
-        ),
-    )
+        (name,), value,
+        Figure(title, None, "mm", how, target, peer=PEERS[name], peer_value=RIGID_MM[name]),
+    )  # fmt: skip
+
+
+def _anchored(
+    name: str, label: str, how: str, target: float | None, value: Value = ANCHORED
+) -> Measure:
+    title = f"{name}: position, authors' metric{label}"
+    return Measure(
+        (name,), value,
+        Figure(title, None, "mm", how, target, peer=PEERS[name], peer_value=ANCHORED_MM[name]),
+    )  # fmt: skip
 
 
 def _headings(label: str, target: float | None) -> Iterator[Measure]:
     """Mean absolute headings of each set, and of all runs."""
-    for title, names, peer in (
-        ("default", ["default"], 1.14),
-        ("varying", ["varying"], 1.78),
-        ("published runs", list(RUNS), None),
-    ):
+    how = "mean absolute, no alignment; true headings are nominally 0, set by hand"
+    for name, peer in (("default", 1.14), ("varying", 1.78)):
+        title = f"{name}: heading{label}"
         yield Measure(
-            Figure(f"{title}: heading{label}", None, "deg",
-                   "mean absolute, no alignment; true headings are nominally 0, set by hand",
-                   target, peer=_whose(title) if peer else None, peer_value=peer),
-            lambda sets, names=names: math.degrees(  # type: ignore[misc]
-                np.mean([abs(run.heading_rad) for name in names for run in sets[name]])
-            ),
+            (name,), HEADING,
+            Figure(title, None, "deg", how, target, peer=PEERS[name], peer_value=peer),
         )  # fmt: skip
+    title = f"published runs: heading{label}"
+    yield Measure(tuple(RUNS), HEADING, Figure(title, None, "deg", how, target))
 
 
 # ---- time a run
-
 
 KINDS = ("median", "mean", "longest")
 

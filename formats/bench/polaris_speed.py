@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -45,8 +46,8 @@ def speed_figures() -> list[Figure]:
         peer, peer_ms = ALIGNED[count]
         rows.append(
             measured(f"DDTW, {name}", "ms", f"polaris_speed.aligning({count})", 1e3,
-                     f"distances() of one window of {POINTS} x 3 samples, one thread, best of 20; "
-                     f"templates' slopes are ready; {KERNEL}", align_ms, peer=peer, peer_value=peer_ms)
+                     f"distances() of one window of {POINTS} x 3 samples to slopes that are ready, "
+                     f"one thread, best of 20; {KERNEL}", align_ms, peer=peer, peer_value=peer_ms)
         )  # fmt: skip
         rows += [_beside(peer, count) for peer in PEERS]
         peer, peer_ms = MADE[count]
@@ -95,24 +96,21 @@ def aligning(count: int, peer: str = "") -> tuple[float, ...]:
 
 
 def _aeon(window: Array, field: Array) -> Callable[[], object]:
-    from aeon.distances import ddtw_pairwise_distance
-
+    distance = import_module("aeon.distances").ddtw_pairwise_distance
     query, others = (np.ascontiguousarray(part.swapaxes(-1, -2)) for part in (window[None], field))
-    return lambda: ddtw_pairwise_distance(query, others)
+    return lambda: distance(query, others)
 
 
 def _dtaidistance(window: Array, field: Array) -> Callable[[], object]:
-    from dtaidistance import dtw_ndim
-
+    distance = import_module("dtaidistance.dtw_ndim").distance_fast
     query, others = ddtw.normalised_slopes(window), list(ddtw.normalised_slopes(field))
-    return lambda: [dtw_ndim.distance_fast(query, other) for other in others]
+    return lambda: [distance(query, other) for other in others]
 
 
 def _tslearn(window: Array, field: Array) -> Callable[[], object]:
-    from tslearn.metrics import cdist_dtw
-
+    distance = import_module("tslearn.metrics").cdist_dtw
     query, others = ddtw.normalised_slopes(window)[None], ddtw.normalised_slopes(field)
-    return lambda: cdist_dtw(query, others)
+    return lambda: distance(query, others)
 
 
 _CALLS: dict[str, Callable[[Array, Array], Callable[[], object]]] = {

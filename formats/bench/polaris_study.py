@@ -308,7 +308,7 @@ def mini_figures() -> Iterator[Figure]:
                     speed_mps=car.speed_mps,
                     heading_rad=math.radians(heading),
                     seed=seed,
-                )  # fmt: skip
+                )
             )
         magnets, poses = _of(outcomes)
         how = f"{PASSES} passes, four sides, turned by up to {turn:.0f} deg"
