@@ -11,6 +11,7 @@ from scipy.linalg import solveh_banded
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.problem import NUISANCES, Normal, Problem, Trial, solve_scaled
 from locatk.core.polaris.window import Priors, State, Window
+from locatk.core.robust import robust_sigma
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,11 @@ class Fitted:
         Weighted squares and priors.
     sigma : float
         Rms of the residual over the degrees of freedom.
+    usual_sigma : float
+        The same by the median, which no outlier moves.
+    shared : float
+        Mean square of what all sensors share of it, in units of the noise: 1 where that is
+        noise alone.
     covariance : (3 M, 3 M) ndarray
         Of x, y and angle of each magnet, in m and rad, with the noise as stated.
     path_sigma_m : (n,) ndarray
@@ -48,6 +54,8 @@ class Fitted:
     residual: Array
     cost: float
     sigma: float
+    usual_sigma: float
+    shared: float
     covariance: Array
     path_sigma_m: Array
     height_sigma_m: float
@@ -184,14 +192,21 @@ def _fitted(
     unknowns = 5 * len(state.place_m) + problem.background_gram[..., 0].size
     if window.path_m is None:
         unknowns += len(window.frames)
-    sigma = float(np.sqrt(np.nansum(residual**2) / max(count - unknowns, 1)))
+    share = np.sqrt(count / max(count - unknowns, 1))
+    sigma = float(np.sqrt(np.nansum(residual**2) / max(count, 1)) * share)
+    usual = robust_sigma(residual) * float(share)
+    shared = problem.shared_square(trial)
     if normal is None:
         size = 3 * len(state.place_m)
         nothing = np.full((size, size), np.nan)
         path = np.full(len(window.frames), np.nan)
-        return Fitted(state, residual, trial.cost, sigma, nothing, path, np.nan, converged)
+        return Fitted(
+            state, residual, trial.cost, sigma, usual, shared, nothing, path, np.nan, converged
+        )
     covariance, path, height = _covariances(normal, state)
-    return Fitted(state, residual, trial.cost, sigma, covariance, path, height, converged)
+    return Fitted(
+        state, residual, trial.cost, sigma, usual, shared, covariance, path, height, converged
+    )
 
 
 def _covariances(normal: Normal, state: State) -> tuple[Array, Array, float]:

@@ -23,8 +23,8 @@ MISFIT_M = 0.1
 SCALE_OFF = 0.1
 """Largest deviation of the way's scale from 1."""
 
-RESIDUAL = 4.0
-"""Largest rms residual of a tag that is read, in standard deviations of the noise."""
+RESIDUAL = 3.0
+"""Largest usual residual of a tag that is read, in standard deviations of the noise."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def _best(sighting: Sighting, recording: Samples, tags: Tags, used: frozenset[in
     refused = ""
     if match.misfit_m > MISFIT_M * tags.spacing_m or abs(match.scale - 1) > SCALE_OFF:
         refused = "misfit"
-    elif sighting.residual_sigma > RESIDUAL:
+    elif sighting.usual_sigma > RESIDUAL:
         refused = "residual"
     scale = match.scale
     return Seen(ruled(sighting, scale), replace(match, scale=scale), reading, refused)

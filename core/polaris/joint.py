@@ -155,12 +155,16 @@ def _grow(task: Task, start: _Start) -> Fitted:
         fitted = fit(coarse, state, priors, iterations=12, tolerance=1e-3, final=False)
         if fitted.sigma > ENOUGH * before.sigma:
             break
+    # Whether the bar sees a field that all sensors share is told by the fit that allows it.
+    if coarse.common_t and fitted.shared > max(SHARED, 2 * fitted.sigma**2):
+        information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
+        size = np.sqrt((fitted.shared - 1) / information)
+        window = replace(window, common_t=float(size))
     while True:
         state = _without_ghosts(fitted.state, task)
         fitted = fit(window, state, priors)
-        better = _with_background(window, fitted)
-        if better is not window:
-            window = better
+        if _drifts(window, fitted):
+            window = replace(window, trends=TRENDS)
             fitted = fit(window, fitted.state, priors)
         if len(_without_ghosts(fitted.state, task).place_m) == len(state.place_m):
             return fitted
@@ -183,24 +187,16 @@ def _missed(task: Task, fitted: Fitted) -> list[Atom]:
     ]
 
 
-def _with_background(window: Window, fitted: Fitted) -> Window:
-    """The window with a background that drifts more, or with a field that all sensors share,
-    where the residual shows one.
+def _drifts(window: Window, fitted: Fitted) -> bool:
+    """Whether the residual holds slow courses that a level and a slope do not take out.
 
-    In units of the noise, a white residual has squares of 1 along each course in time, and
-    along each sample's mean over the bar.
+    In units of the noise, a white residual has squares of 1 along each course in time.
     """
-    n, sensors, _ = fitted.residual.shape
-    residual = np.nan_to_num(fitted.residual)
+    if window.trends >= TRENDS:
+        return False
+    residual = np.nan_to_num(fitted.residual).reshape(len(window.frames), -1)
     course = np.linalg.qr(trends(window.frames, TRENDS))[0][:, window.trends :]
-    slow = (course.T @ residual.reshape(n, -1)) ** 2
-    shared = float((residual.sum(axis=1) ** 2).mean() / sensors)
-    if sensors >= FEW_SENSORS and shared > max(SHARED, 2 * fitted.sigma**2):
-        size = np.sqrt((shared - 1) / sensors / np.mean(window.counts)) * np.median(window.noise_t)
-        window = replace(window, common_t=float(size))
-    elif window.trends < TRENDS and slow.mean() > UNEVEN:
-        window = replace(window, trends=TRENDS)
-    return window
+    return bool(((course.T @ residual) ** 2).mean() > UNEVEN)
 
 
 def _distinct(atoms: list[Atom], height: float) -> list[Atom]:
@@ -285,9 +281,9 @@ def sighting(samples: Samples, task: Task, fitted: Fitted) -> Sighting:
     index = 3 * chosen[:, None] + np.arange(3)
     covariance = fitted.covariance[np.ix_(index.ravel(), index.ravel())]
     # What the model does not know shows in the residual.
-    covariance = covariance * max(1.0, fitted.sigma) ** 2
+    covariance = covariance * max(1.0, fitted.usual_sigma) ** 2
     here = path[at] * np.array([1.0, np.tan(state.crab_rad)])
-    spread = np.interp(number, task.times, fitted.path_sigma_m) * max(1.0, fitted.sigma)
+    spread = np.interp(number, task.times, fitted.path_sigma_m) * max(1.0, fitted.usual_sigma)
     moment = state.moment_am2[chosen]
     return Sighting(
         time_ns=int(samples.time_ns[task.first + at]),
@@ -302,7 +298,8 @@ def sighting(samples: Samples, task: Task, fitted: Fitted) -> Sighting:
         crab_rad=state.crab_rad,
         free_path=task.window.path_m is None,
         height_m=state.height_m,
-        height_sigma_m=fitted.height_sigma_m * max(1.0, fitted.sigma),
+        height_sigma_m=fitted.height_sigma_m * max(1.0, fitted.usual_sigma),
         residual_sigma=fitted.sigma,
+        usual_sigma=fitted.usual_sigma,
         others=len(state.place_m) - len(chosen),
     )

@@ -132,11 +132,15 @@ class Problem:
         n, sensors, _ = window.field_t.shape
         self.shape = (3 * sensors, n)
         self.root = np.ascontiguousarray(np.sqrt(weight).reshape(n, -1).T)
-        # A shared field has covariance tau^2 u u^T beside the unit noise of each axis.
+        # A shared field has covariance tau^2 u u^T beside the unit noise of each axis; a mean
+        # of several samples has less of both.
         square = (self.root.reshape(-1, 3, n) ** 2).sum(axis=0)
-        least = np.maximum(square, 1e-300)
-        self.shared = (1 - 1 / np.sqrt(1 + window.common_t**2 * square)) / least
-        self.target = self.whiten(np.nan_to_num(window.field_t).reshape(n, -1).T)
+        self.excess_square = window.common_t**2 / window.counts * square
+        self.shared = (1 - 1 / np.sqrt(1 + self.excess_square)) / np.maximum(square, 1e-300)
+        # Near zero, where weights that change from sample to sample mix no levels.
+        field = np.nan_to_num(window.field_t).reshape(n, -1).T
+        level = (field * self.root).sum(axis=1) / np.maximum(self.root.sum(axis=1), 1e-300)
+        self.target = self.whiten(field - level[:, None])
         # (C, n, D); a channel that gave nothing has no background to find.
         self.background = self.root[:, :, None] * trends(window.frames, window.trends)
         gram = self.background.transpose(0, 2, 1) @ self.background
@@ -161,6 +165,16 @@ class Problem:
         return np.asarray(
             (scaled - root * (shared * (root * scaled).sum(axis=0))).reshape(rows.shape)
         )
+
+    def shared_square(self, trial: Trial) -> float:
+        """Mean square of the part of a residual that all sensors share, in units of the noise
+        and before :meth:`whiten` has made it smaller."""
+        n = self.shape[1]
+        root = self.root.reshape(-1, 3, n)
+        square = (root**2).sum(axis=0)
+        part = (root * trial.residual.reshape(-1, 3, n)).sum(axis=0) ** 2
+        part *= 1 + self.excess_square
+        return float((part[square > 0] / square[square > 0]).mean())
 
     # ---- the model
 

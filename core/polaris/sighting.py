@@ -45,6 +45,8 @@ class Sighting:
     residual_sigma : float
         Rms of what the model leaves, in standard deviations of the noise; ``nan`` where
         the method has no model of the samples.
+    usual_sigma : float
+        The same by the median, which no outlier moves.
     others : int
         Further sources that are no magnets of a tag (debris).
     notes : tuple of str
@@ -64,6 +66,7 @@ class Sighting:
     height_m: float = np.nan
     height_sigma_m: float = np.nan
     residual_sigma: float = np.nan
+    usual_sigma: float = np.nan
     others: int = 0
     notes: tuple[str, ...] = field(default=())
 

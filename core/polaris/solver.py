@@ -27,6 +27,9 @@ METHODS = ("joint", "paper")
 
 FEWEST_SAMPLES = 20
 
+USUAL = 1.25
+"""Usual residual of a pass that is explained but for some outliers, in sigma."""
+
 NOT_THE_WAY = "the speed or odometry given does not explain the samples of a pass"
 
 
@@ -204,6 +207,8 @@ def _solved(
                 sighting = replace(sighting, notes=(NOT_THE_WAY,))
             found = sighting, identify(sighting, recording, tags)
             white = sighting.residual_sigma < joint.WHITE
+            # Debris leaves peaks that no other start would explain.
+            white |= way is None and sighting.usual_sigma < USUAL
             if white and (tags is None or found[1][0].tag_id is not None):
                 return found
             if best is None or _rank(found) < _rank(best):

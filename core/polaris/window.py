@@ -33,7 +33,7 @@ class Window:
     thickness_m2 : float
         Of the magnets (:func:`locatk.core.polaris.dipoles.thickness`).
     common_t : float
-        Standard deviation of a field that all sensors share, from sample to sample.
+        Standard deviation, in one sample, of a field that all sensors share.
     trends : int
         Terms of each background: 2 are a level and a slope.
     """

@@ -34,10 +34,10 @@ Array = NDArray[np.float64]
 Random = np.random.Generator
 
 HEADINGS_DEG = range(0, 360, 15)
-REPEATS = 4
+REPEATS = 3
 """Passes at each heading, behind the ratio to the bound; one where the speed is unknown."""
 
-CASES = 120
+CASES = 100
 """Random designs of tags."""
 
 PASSES = 20
@@ -59,6 +59,14 @@ MINI = "paper, its miniature car"
 
 # ---- one pass
 
+Verdict = Literal["right", "wrong", "misplaced", "refused", "silent"]
+
+POSE = ("x_m", "y_m", "heading_rad")
+
+OFF, SIGMAS = np.array([1e-3, 1e-3, math.radians(1.0)]), 5.0
+"""A pose is misplaced where it is off by more than this and by so many of its own standard
+deviations."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -68,7 +76,8 @@ class Outcome:
     ----------
     verdict : str
         ``"right"``: read as what it is, and as nothing else; ``"wrong"``: any other id was
-        read; ``"refused"``: found, and the reason given; ``"silent"``: nothing said.
+        read; ``"misplaced"``: the right one, but its pose is further off than it may be;
+        ``"refused"``: found, and the reason given; ``"silent"``: nothing said.
     reasons : tuple of str
         Of what was refused.
     missed : int
@@ -76,10 +85,10 @@ class Outcome:
     magnets : (M, 3) ndarray
         Errors of x, y in m and of the direction in rad; ``nan`` unless right.
     pose : (3,) ndarray
-        The same of the tag.
+        The same of the tag, where its id was read.
     """
 
-    verdict: Literal["right", "wrong", "refused", "silent"]
+    verdict: Verdict
     reasons: tuple[str, ...]
     missed: int
     magnets: Array
@@ -97,26 +106,29 @@ def judged(made: Simulated, detections: Sequence[Mapping[str, Any]]) -> Outcome:
     """Compare the detections of a pass over one tag with the truth."""
     tag_id = made.magnets.tag_id[0]
     count = len(made.magnets)
-    magnets, pose = np.full((count, 3), np.nan), np.full(3, np.nan)
+    magnets, pose, sigma = np.full((count, 3), np.nan), np.full(3, np.nan), np.zeros(3)
     near = made.tags.spacing_m / 2
     seen = np.zeros(count, bool)
     for found in detections:
         true, lies = _true(made, found["time_s"])
         each = np.array([[m["x_m"], m["y_m"], m["angle_rad"]] for m in found["magnets"]])
+        each = each.reshape(-1, 3)
         apart = np.linalg.norm(true[:, None, :2] - each[None, :, :2], axis=2)
-        seen |= apart.min(axis=1) < near
+        seen |= apart.min(axis=1, initial=np.inf) < near
         if found["tag_id"] == tag_id:
             magnets = each[apart.argmin(axis=1)] - true
-            pose = np.array([found["x_m"], found["y_m"], found["heading_rad"]]) - lies
+            pose = np.array([found[name] for name in POSE]) - lies
+            sigma = np.array([found[f"sigma_{name}"] for name in POSE])
     for errors in (magnets, pose):
         errors[..., 2] = np.angle(np.exp(1j * errors[..., 2]))
     reasons = tuple(found["refused"] for found in detections if found["refused"])
     read = {found["tag_id"] for found in detections} - {None}
-    verdict: Literal["right", "wrong", "refused", "silent"]
+    verdict: Verdict
     if read - {tag_id}:
         verdict = "wrong"
     elif read:
-        verdict = "right"
+        off = (np.abs(pose) > OFF) & (np.abs(pose) > SIGMAS * sigma)
+        verdict = "misplaced" if off.any() else "right"
     else:
         verdict = "refused" if reasons else "silent"
     return Outcome(verdict, reasons, int(count - seen.sum()), magnets, pose)
@@ -270,12 +282,16 @@ def random_figures() -> list[Figure]:
     )
     seeds = f"seeds that failed: {', '.join(map(str, failed)) or 'none'}"
     magnets, poses = _of(outcomes)
-    wrong = sum(o.verdict == "wrong" for o in outcomes)
+    wrong, misplaced = (
+        sum(o.verdict == verdict for o in outcomes) for verdict in ("wrong", "misplaced")
+    )
     return [
         Figure("random designs: every bit right", _share(outcomes), "%", how, 100.0, "higher"),
         Figure("random designs: magnets missed", sum(o.missed for o in outcomes), "magnets",
                f"{seeds}", 0.0),
         Figure("random designs: wrong ids", wrong, "passes", "the same", 0.0),
+        Figure("random designs: misplaced", misplaced, "passes",
+               "right ids, off by more than 1 mm or 1 deg and by 5 of the sigmas told", 0.0),
         Figure("random designs: place across the track", rms(magnets)[1] * 1e3, "mm",
                "rms of a magnet"),
         Figure("random designs: direction", math.degrees(rms(magnets)[2]), "deg",
@@ -357,7 +373,7 @@ def fault_figures() -> Iterator[Figure]:
                 options["dead"] = (int(rng.integers(len(SimulationOptions().array))),)
             outcomes.append(drive(tags, tag_id, seed=seed, **options))
         failed = [SEED + 7000 + 100 * number + k for k, o in enumerate(outcomes)
-                  if o.verdict in ("wrong", "silent")]  # fmt: skip
+                  if o.verdict in ("wrong", "misplaced", "silent")]  # fmt: skip
         yield Figure(f"{name}: wrong, or nothing said", len(failed), "passes",
                      f"of {PASSES}, each at a random heading" +
                      (f"; seeds {', '.join(map(str, failed))}" if failed else ""), 0.0)  # fmt: skip

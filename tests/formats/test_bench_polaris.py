@@ -43,6 +43,7 @@ PROMISED = {
     "random designs: every bit right": 100.0,
     "random designs: magnets missed": 0.0,
     "random designs: wrong ids": 0.0,
+    "random designs: misplaced": 0.0,
     "mini tag, known speed: position": 0.58,
     "mini tag, known speed: heading": 1.0,
     "one dead sensor: wrong, or nothing said": 0.0,
@@ -209,6 +210,9 @@ def told(made: Simulated, tag_id: int | None, refused: str | None = None) -> dic
         "x_m": x,
         "y_m": y,
         "heading_rad": -heading + math.tau,
+        "sigma_x_m": 1e-4,
+        "sigma_y_m": 1e-4,
+        "sigma_heading_rad": 1e-3,
         "magnets": [
             {"x_m": a, "y_m": b, "angle_rad": angle - heading - math.tau}
             for (a, b), angle in zip(magnets, made.magnets.angle_rad, strict=True)
@@ -224,10 +228,20 @@ def test_the_truth_has_no_errors_in_any_order(made: Simulated) -> None:
     assert outcome.magnets == pytest.approx(np.zeros((5, 3)), abs=1e-9)
     assert outcome.pose == pytest.approx(np.zeros(3), abs=1e-9)
     found["magnets"][0]["x_m"] += 2e-3
-    found["y_m"] -= 1e-3
+    found["y_m"] -= 0.9e-3
     outcome = polaris_study.judged(made, [found])
     assert polaris_study.rms(outcome.magnets)[0] == pytest.approx(2e-3 / math.sqrt(5))
-    assert outcome.pose == pytest.approx([0, -1e-3, 0], abs=1e-9)
+    assert outcome.pose == pytest.approx([0, -0.9e-3, 0], abs=1e-9)
+
+
+def test_a_right_id_at_another_place_is_misplaced(made: Simulated) -> None:
+    found = told(made, 1234)
+    found["x_m"] += 2e-3
+    assert polaris_study.judged(made, [found]).verdict == "misplaced"
+    found["sigma_x_m"] = 1e-3
+    assert polaris_study.judged(made, [found]).verdict == "right"
+    found["heading_rad"] += math.radians(2)
+    assert polaris_study.judged(made, [found]).verdict == "misplaced"
 
 
 def test_a_pass_is_right_wrong_refused_or_silent(made: Simulated) -> None:

@@ -1,0 +1,159 @@
+"""Laying the grid over magnets that were seen, built here without the tag's own geometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike, NDArray
+
+from locatk.core.polaris.match import matches, refitted, ruled
+from locatk.core.polaris.sighting import Sighting
+from locatk.core.polaris.tag import Tags
+
+Array = NDArray[np.float64]
+
+TAGS = Tags()
+CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
+
+
+def laid(
+    cells: tuple[tuple[int, int], ...],
+    pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    order: int = 3,
+    spacing: float = 0.04,
+) -> Array:
+    """Places of a tag's magnets, in complex numbers: columns to the right, rows ahead."""
+    x, y, heading = pose
+    half = (order - 1) / 2
+    ahead = np.exp(1j * heading)
+    z = [x + 1j * y + ahead * spacing * ((r - half) - 1j * (c - half)) for c, r in cells]
+    return np.column_stack([np.real(z), np.imag(z)])
+
+
+def seen(places: ArrayLike, *, free: bool = False, sigma: float = 2e-5) -> Sighting:
+    place = np.asarray(places, float)
+    m = len(place)
+    return Sighting(
+        time_ns=0,
+        first=0,
+        stop=101,
+        path_m=np.linspace(-0.1, 0.1, 101),
+        place_m=place,
+        angle_rad=np.zeros(m),
+        moment_am2=np.full(m, 1.8e-3),
+        covariance=sigma**2 * np.eye(3 * m),
+        path_sigma_m=np.full(101, sigma),
+        free_path=free,
+        residual_sigma=1.0,
+    )
+
+
+coordinate = st.floats(-0.2, 0.2)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    coordinate, coordinate, st.floats(-3.1, 3.1), st.permutations(range(5)), st.integers(0, 1000)
+)
+def test_any_pose_in_any_order(
+    x: float, y: float, heading: float, order: list[int], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    places = laid(CELLS, (x, y, heading))[order] + 2e-4 * rng.standard_normal((5, 2))
+    best = matches(seen(places), TAGS)[0]
+    assert best.cells == CELLS
+    assert [order[k] for k in best.magnets] == [0, 1, 2, 3, 4]
+    assert abs(best.x_m - x) < 8e-4
+    assert abs(best.y_m - y) < 8e-4
+    assert abs(np.angle(np.exp(1j * (best.heading_rad - heading)))) < 0.02
+    assert best.misfit_m < 6e-4
+
+
+def test_every_way_to_lay_it_is_offered() -> None:
+    """Four magnets in a small square lie on the grid in many ways, three of the corners
+    of the tag in one."""
+    assert len(matches(seen(laid(((0, 0), (0, 2), (2, 2)))), TAGS)) == 1
+    square = matches(seen(laid(((0, 0), (0, 1), (1, 0), (1, 1)))), TAGS)
+    assert len({match.cells + match.magnets for match in square}) == len(square) > 4
+
+
+def test_the_position_pattern_comes_first() -> None:
+    """Turned by a quarter the same magnets would put one on the corner that stays empty."""
+    for quarter in range(4):
+        found = matches(seen(laid(CELLS, (0, 0, quarter * np.pi / 2))), TAGS)
+        assert {match.cells for match in found} == {CELLS}
+        turned = found[0].heading_rad - quarter * np.pi / 2
+        assert abs(np.angle(np.exp(1j * turned))) < 1e-9
+
+
+def test_covariance_is_that_of_many_draws() -> None:
+    """Of a tag whose magnets were set by hand, 0.4 mm each way, and measured well."""
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(150):
+        places = laid(CELLS, (0.01, -0.02, 0.5)) + 4e-4 * rng.standard_normal((5, 2))
+        best = matches(seen(places), TAGS)[0]
+        found.append([best.x_m, best.y_m, best.heading_rad])
+    ratio = np.std(found, axis=0) / np.sqrt(np.diag(best.covariance))
+    assert np.all(ratio > 0.75)
+    assert np.all(ratio < 1.25)
+
+
+def test_worse_magnets_give_a_worse_pose() -> None:
+    sure = matches(seen(laid(CELLS), sigma=1e-5), TAGS)[0]
+    unsure = matches(seen(laid(CELLS), sigma=2e-3), TAGS)[0]
+    off = matches(seen(laid(CELLS) + [[2e-3, 0], [0, -2e-3], [0, 0], [0, 2e-3], [-2e-3, 0]]), TAGS)[
+        0
+    ]
+    for other in (unsure, off):
+        assert np.all(np.diag(other.covariance) > 2 * np.diag(sure.covariance))
+
+
+def test_the_tag_is_the_ruler_of_a_way_unknown() -> None:
+    places = laid(CELLS, (0.0, 0.01, 0.3))
+    short = places * [0.97, 1.0]
+    best = matches(seen(short, free=True), TAGS)[0]
+    assert best.scale == pytest.approx(1 / 0.97, abs=0.006)
+    assert abs(best.heading_rad - 0.3) < 0.01
+    assert matches(seen(places), TAGS)[0].scale == pytest.approx(1.0, abs=1e-6)
+    measured = ruled(seen(short, free=True), best.scale)
+    np.testing.assert_allclose(measured.place_m, places, atol=4e-4)
+    np.testing.assert_allclose(np.ptp(measured.path_m), 0.2 * best.scale)
+    assert not measured.free_path
+
+
+def test_as_built_places_are_used() -> None:
+    nominal = laid(CELLS)
+    real = nominal + 1e-3 * np.array([[1, 0], [0, 1], [-1, 0], [0.5, 1], [1, -1]])
+    turn, shift = np.array([[0.8, -0.6], [0.6, 0.8]]), np.array([0.03, 0.01])
+    sighting = seen(real @ turn.T + shift)
+    best = matches(sighting, TAGS)[0]
+    again = refitted(sighting, TAGS, best, real)
+    assert again.misfit_m < 1e-9 < best.misfit_m
+    assert [again.x_m, again.y_m] == pytest.approx(shift, abs=1e-9)
+    assert again.heading_rad == pytest.approx(np.arctan2(0.6, 0.8))
+
+
+@pytest.mark.parametrize("spacing", [0.028, 0.055])
+def test_another_grid_does_not_fit(spacing: float) -> None:
+    for match in matches(seen(laid(CELLS, spacing=spacing)), TAGS):
+        assert len(match.magnets) < 5 or match.misfit_m > 3e-3
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_magnets_lie_on_no_grid(count: int) -> None:
+    assert matches(seen(laid(CELLS)[:count].reshape(-1, 2)), TAGS) == []
+
+
+def test_larger_grids() -> None:
+    tags = replace(TAGS, order=5, magnets=9, spacing_m=0.02)
+    cells = ((0, 0), (2, 0), (1, 1), (4, 1), (0, 2), (3, 3), (0, 4), (2, 4), (4, 4))
+    places = laid(cells, (0.02, 0.0, 2.6), order=5, spacing=0.02)
+    best = matches(seen(places), tags)[0]
+    assert best.cells == cells
+    assert best.heading_rad == pytest.approx(2.6)

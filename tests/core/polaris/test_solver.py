@@ -1,0 +1,481 @@
+"""The whole way, from samples to tags and poses, on magnets of magpylib.
+
+What each pass measures is the independent world's (conftest), which the solver cannot see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.errors import InputError
+from locatk.core.polaris import codec
+from locatk.core.polaris.array import Samples
+from locatk.core.polaris.solver import SolveOptions, solve
+from locatk.core.polaris.tag import Layout, Placed, Tags
+from locatk.core.solution import Solution
+
+Array = NDArray[np.float64]
+
+TAGS = Tags()
+CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
+SYMBOLS = (0, 3, 5, 2, 6)
+OTHER = (1, 7, 4, 4, 3)
+
+
+def id_of(symbols: tuple[int, ...], tags: Tags = TAGS) -> int:
+    return codec.id_of(tags, Layout(CELLS, symbols))
+
+
+def the_tag(solution: Solution) -> dict[str, Any]:
+    """The one detection that was read."""
+    (found,) = [d for d in solution.detections if d["tag_id"] is not None]
+    return found
+
+
+def errors(world: Any, found: dict[str, Any], course: Any, tag: Any) -> Array:
+    """Of the pose (x, y in m, heading in rad) against the truth at that time."""
+    truth = world.seen_from(course, round(found["time_s"] * 1e9), tag)
+    seen = np.array([found["x_m"], found["y_m"], found["heading_rad"]]) - truth
+    seen[2] = world.turn(seen[2])
+    return seen
+
+
+def sigmas(found: dict[str, Any]) -> Array:
+    return np.array([found["sigma_x_m"], found["sigma_y_m"], found["sigma_heading_rad"]])
+
+
+def magnets_seen(world: Any, found: dict[str, Any], course: Any, tag: Any) -> tuple[Array, Array]:
+    """Errors (M, 3) of the magnets' x, y, angle in the array's frame, and their sigmas."""
+    rows, spread = [], []
+    for magnet in found["magnets"]:
+        k = tag.cells.index(tuple(magnet["cell"]))
+        place, angle = tag.places[k], tag.angles[k]
+        single = replace(tag, x=float(place[0]), y=float(place[1]), heading=float(angle))
+        x, y, turned = world.seen_from(course, round(found["time_s"] * 1e9), single)
+        rows.append([magnet["x_m"] - x, magnet["y_m"] - y, world.turn(magnet["angle_rad"], turned)])
+        spread.append([magnet["sigma_x_m"], magnet["sigma_y_m"], magnet["sigma_angle_rad"]])
+    return np.array(rows), np.array(spread)
+
+
+# ---- every heading, speed known: at the bound
+
+
+@dataclass(frozen=True)
+class Round:
+    """A tag passed over at headings 0 .. 345 degrees."""
+
+    found: list[dict[str, Any]]
+    pose: Array  # (24, 3) errors
+    magnets: Array  # (24 * 5, 3) errors
+    sigma: Array  # (24 * 5, 3)
+
+
+@pytest.fixture(scope="module")
+def known_speed(world: Any) -> Round:
+    found, pose, magnets, sigma = [], [], [], []
+    for k, degrees in enumerate(range(0, 360, 15)):
+        tag = world.Tag(CELLS, SYMBOLS, heading=np.radians(degrees))
+        course = world.line(length=0.26, lateral=0.004 * np.sin(k))
+        recording = world.record([tag], course, seed=k)
+        seen = the_tag(solve([recording], TAGS, SolveOptions(speed_mps=0.1)))
+        error, spread = magnets_seen(world, seen, course, tag)
+        found.append(seen)
+        pose.append(errors(world, seen, course, tag))
+        magnets.append(error)
+        sigma.append(spread)
+    return Round(found, np.array(pose), np.vstack(magnets), np.vstack(sigma))
+
+
+def test_every_heading_is_read(known_speed: Round) -> None:
+    assert {found["tag_id"] for found in known_speed.found} == {id_of(SYMBOLS)}
+    assert min(found["margin"] for found in known_speed.found) > 0.9
+    symbols = [
+        [m["symbol"] for m in sorted(found["magnets"], key=lambda m: m["cell"][::-1])]
+        for found in known_speed.found
+    ]
+    assert np.all(np.array(symbols) == SYMBOLS)
+
+
+def test_known_speed_is_at_the_bound(known_speed: Round) -> None:
+    """facts/polaris.md 3, case B, at 0.5 uT: 0.0068 and 0.0072 mm, 0.056 degrees."""
+    x, y, angle = np.sqrt(np.mean(known_speed.magnets**2, axis=0))
+    assert x < 1.15 * 7.2e-6
+    assert y < 1.15 * 7.2e-6
+    assert np.degrees(angle) < 1.15 * 0.056
+
+
+def test_covariance_of_the_magnets_is_honest(known_speed: Round) -> None:
+    """Errors in units of their own standard deviations have a mean square of 1: over 120
+    magnets within a third."""
+    z = known_speed.magnets / known_speed.sigma
+    assert np.all(np.abs(np.mean(z**2, axis=0) - 1) < 0.35)
+    assert np.abs(z).max() < 4.5
+
+
+def test_white_residual(known_speed: Round) -> None:
+    residual = np.array([found["residual_sigma"] for found in known_speed.found])
+    assert np.all(np.abs(residual - 1) < 0.1)
+    assert all(found["other_sources"] == 0 for found in known_speed.found)
+
+
+def test_height_and_moments(known_speed: Round) -> None:
+    for found in known_speed.found:
+        assert found["height_m"] == pytest.approx(0.010, abs=5e-5)
+        for magnet in found["magnets"]:
+            assert magnet["moment_am2"] == pytest.approx(TAGS.magnet.moment, rel=0.02)
+
+
+def test_array_in_the_tags_frame_is_the_inverse(world: Any, known_speed: Round) -> None:
+    """Checked by going there and back with complex numbers."""
+    for found in known_speed.found:
+        tag = complex(found["x_m"], found["y_m"])
+        turned = np.exp(1j * found["heading_rad"])
+        array = complex(found["array"]["x_m"], found["array"]["y_m"])
+        assert abs(tag + turned * array) < 1e-12
+        assert abs(world.turn(found["array"]["heading_rad"] + found["heading_rad"])) < 1e-12
+
+
+# ---- unknown speed, tags laid by hand
+
+
+@pytest.fixture(scope="module")
+def by_hand(world: Any) -> tuple[Array, Array, Array]:
+    """Errors of pose (n, 3), their sigmas, and z of the magnets' angles and places across."""
+    rng = np.random.default_rng(7)
+    pose, sigma, z = [], [], []
+    for k in range(20):
+        tag = world.Tag(
+            CELLS,
+            SYMBOLS,
+            heading=rng.uniform(-np.pi, np.pi),
+            moved=4e-4 * rng.standard_normal((5, 2)),
+            turned=np.radians(4) * rng.standard_normal(5),
+            strength=tuple(rng.uniform(0.8, 1.2, 5)),
+        )
+        course = world.line(length=0.26, lateral=rng.uniform(-0.015, 0.015))
+        u = np.linspace(0, 1, 50)
+        profile = u + 0.3 / (2 * np.pi) * np.sin(2 * np.pi * u + k)
+        profile = (profile - profile[0]) / (profile[-1] - profile[0])
+        course = world.driven(course, 2.6 * u, profile)
+        recording = world.record([tag], course, seed=k)
+        found = the_tag(solve([recording], TAGS))
+        assert found["tag_id"] == id_of(SYMBOLS)
+        pose.append(errors(world, found, course, tag))
+        sigma.append(sigmas(found))
+        error, spread = magnets_seen(world, found, course, tag)
+        z.append((error / spread)[:, 1:])
+    return np.array(pose), np.array(sigma), np.vstack(z)
+
+
+def test_unknown_speed_profile(by_hand: tuple[Array, Array, Array]) -> None:
+    pose, _, _ = by_hand
+    rms = np.sqrt(np.mean(pose**2, axis=0))
+    # The middle of a tag whose magnets are 0.4 mm off is 0.18 mm off itself.
+    assert np.all(rms < [4e-4, 4e-4, np.radians(0.6)])
+
+
+def test_covariance_of_the_pose_is_honest(by_hand: tuple[Array, Array, Array]) -> None:
+    """Over 20 tags that hands have laid: neither too small nor of no use."""
+    pose, sigma, _ = by_hand
+    square = np.mean((pose / sigma) ** 2, axis=0)
+    assert np.all(square < 2.2)
+    assert np.all(square > 0.3)
+
+
+def test_covariance_of_magnets_on_a_way_unknown(by_hand: tuple[Array, Array, Array]) -> None:
+    _, _, z = by_hand
+    assert np.all(np.mean(z**2, axis=0) < 1.6)
+    assert np.all(np.mean(z**2, axis=0) > 0.6)
+
+
+# ---- what goes wrong on floors and in wires
+
+
+def passed(world: Any, **more: Any) -> tuple[Any, Any, Samples]:
+    tag = world.Tag(CELLS, SYMBOLS, heading=more.pop("heading", 2.2))
+    course = more.pop("course", world.line(length=0.28))
+    return tag, course, world.record([tag], course, **more)
+
+
+def spoiled(kind: str, samples: Samples) -> Samples:
+    """The same recording with one thing wrong."""
+    rng = np.random.default_rng(3)
+    b = samples.field_t.copy()
+    n = len(b)
+    u = np.linspace(0, 1, n)[:, None, None]
+    keep = np.ones(n, bool)
+    if kind == "dead sensor":
+        b[:, 5] = np.nan
+    elif kind == "dead axis":
+        b[:, 4, 2] = np.nan
+    elif kind == "stuck sensor":
+        b[:, 4] = b[0, 4]
+    elif kind == "lost frames":
+        keep = rng.random(n) > 0.02
+    elif kind == "burst of nan":
+        b[120:140] = np.nan
+    elif kind == "saturated":
+        b[np.abs(b) > 90e-6] = np.nan
+    elif kind == "spikes":
+        b[rng.random(b.shape) < 0.003] += 3e-4
+    elif kind == "one garbage frame":
+        b[130] = 1e-3 * rng.standard_normal(b[130].shape)
+    elif kind == "drift":
+        b += 15e-6 * u * rng.uniform(-1, 1, b.shape[1:])
+    elif kind == "the Earth turns":
+        b += 10e-6 * np.concatenate([np.cos(3 * u), np.sin(3 * u), 0 * u], axis=2)
+    elif kind == "motor":
+        b += 8e-6 * np.sin(1.3 * np.arange(n))[:, None, None] * np.array([1.0, 0.5, -0.3])
+    elif kind == "motor noise":
+        b += 3e-6 * rng.standard_normal((n, 1, 3))
+    else:
+        raise AssertionError(kind)
+    return Samples(samples.device, samples.array, samples.time_ns[keep], b[keep])
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "dead sensor", "dead axis", "stuck sensor", "lost frames", "burst of nan", "saturated",
+        "spikes", "one garbage frame", "drift", "the Earth turns", "motor", "motor noise",
+    ],
+)  # fmt: skip
+def test_read_in_spite_of(kind: str, world: Any) -> None:
+    tag, course, recording = passed(world, seed=8)
+    found = the_tag(solve([spoiled(kind, recording)], TAGS))
+    assert found["tag_id"] == id_of(SYMBOLS)
+    error = errors(world, found, course, tag)
+    assert np.all(np.abs(error) < [6e-4, 2e-4, np.radians(0.3)])
+    assert np.all(np.abs(error) < 4 * sigmas(found))
+
+
+def test_missing_samples_are_told(world: Any) -> None:
+    _, _, recording = passed(world)
+    solution = solve([spoiled("dead sensor", recording)], TAGS)
+    assert any("missing" in note and "11 %" in note for note in solution.notes)
+
+
+def test_iron_debris_is_no_magnet(world: Any) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, heading=0.5)
+    debris = [world.Debris(0.02, 0.025, 3e-3), world.Debris(-0.05, 0.0, 2e-3)]
+    debris += [world.Debris(0.01, -0.055, 4e-3)]
+    course = world.line(length=0.28)
+    found = the_tag(solve([world.record([tag, *debris], course, seed=4)], TAGS))
+    assert found["tag_id"] == id_of(SYMBOLS)
+    assert len(found["magnets"]) == 5
+    assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 2e-4, np.radians(0.3)])
+
+
+@pytest.mark.parametrize("step_mm", [0.1, 0.4, 3.0, 7.0])
+def test_slow_and_fast(step_mm: float, world: Any) -> None:
+    tag, course, recording = passed(world, course=world.line(length=0.26, speed=step_mm / 10))
+    found = the_tag(solve([recording], TAGS))
+    assert found["tag_id"] == id_of(SYMBOLS)
+    assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
+    assert found["speed_mps"] == pytest.approx(step_mm / 10, rel=0.03)
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_from_any_side(backward: bool, world: Any) -> None:
+    """The floor knows no forward: courses in all directions over a tag that lies askew."""
+    for direction in (-2.5, 0.8):
+        tag = world.Tag(CELLS, SYMBOLS, x=1.0, y=-2.0, heading=0.3)
+        course = world.line(direction=direction, past=(1.0, -2.0), length=0.28)
+        if backward:
+            course = world.driven(course, [0, 2.8], [1, 0])
+        found = the_tag(solve([world.record([tag], course, seed=1)], TAGS))
+        assert found["tag_id"] == id_of(SYMBOLS)
+        assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
+
+
+def test_standing_still_over_the_tag(world: Any) -> None:
+    course = world.driven(world.line(length=0.28), [0, 1.2, 2.7, 4.3], [0, 0.43, 0.43, 1])
+    tag, _, recording = passed(world, course=course, heading=np.radians(33), seed=2)
+    solution = solve([recording], TAGS)
+    for found in solution.detections:
+        assert found["tag_id"] in (None, id_of(SYMBOLS))  # read, or refused; never wrong
+        if found["tag_id"] is not None:
+            error = errors(world, found, course, tag)
+            assert np.all(np.abs(error) < np.maximum(4 * sigmas(found), [6e-4, 1e-4, 3e-3]))
+
+
+# ---- what must be refused
+
+
+@pytest.mark.parametrize("lateral", [-0.1, 0.09, 0.12])
+def test_tag_beside_the_bar_is_partial(lateral: float, world: Any) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, heading=0.1)
+    recording = world.record([tag], world.line(lateral=lateral, length=0.28), seed=5)
+    solution = solve([recording], TAGS)
+    assert [d["tag_id"] for d in solution.detections] == [None]
+    assert solution.rejected == {"partial": 1}
+    assert solution.trajectories == ()
+
+
+@pytest.mark.parametrize("part", [slice(0, 110), slice(170, 280)])
+def test_recording_cut_within_the_tag_is_partial(part: slice, world: Any) -> None:
+    _, _, recording = passed(world, heading=0.0)
+    cut = Samples("bar", recording.array, recording.time_ns[part], recording.field_t[part])
+    solution = solve([cut], TAGS)
+    assert solution.rejected == {"partial": 1}
+
+
+@pytest.mark.parametrize("gone", range(5))
+def test_plain_tag_without_a_magnet_is_refused(gone: int, world: Any) -> None:
+    strength = tuple(float(k != gone) for k in range(5))
+    tag = world.Tag(CELLS, SYMBOLS, heading=1.0, strength=strength)
+    solution = solve([world.record([tag], world.line(length=0.28), seed=gone)], TAGS)
+    assert solution.rejected == {"magnets_missing": 1}
+    (found,) = solution.detections
+    assert len(found["magnets"]) == 4
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"spacing_m": 0.03},
+        {"spacing_m": 0.05},
+        {"order": 4},
+        {"magnets": 6},
+        {"orientations": 20},
+        {"ids": (1, 2, 3), "min_distance": 2},
+    ],
+)
+def test_tag_of_another_design_is_refused(wrong: dict[str, Any], world: Any) -> None:
+    _, _, recording = passed(world, seed=6)
+    solution = solve([recording], replace(TAGS, **wrong))
+    assert [d["tag_id"] for d in solution.detections] == [None]
+    assert sum(solution.rejected.values()) == 1
+
+
+@pytest.mark.parametrize("spacing", [0.036, 0.045])
+def test_slightly_wrong_spacing_is_never_a_surely_wrong_pose(spacing: float, world: Any) -> None:
+    tag, course, recording = passed(world, heading=0.0)
+    for found in solve([recording], replace(TAGS, spacing_m=spacing)).detections:
+        if found["tag_id"] is not None:
+            assert np.all(np.abs(errors(world, found, course, tag)) < 4 * sigmas(found))
+
+
+def test_wrong_clearance_does_not_matter(world: Any) -> None:
+    tag, course, recording = passed(world)
+    for clearance in (0.006, 0.015):
+        found = the_tag(solve([recording], replace(TAGS, clearance_m=clearance)))
+        assert found["tag_id"] == id_of(SYMBOLS)
+        assert found["height_m"] == pytest.approx(0.010, abs=1e-4)
+        assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
+
+
+def test_without_a_tag_there_are_magnets_but_no_ids(world: Any) -> None:
+    tag, _, recording = passed(world)
+    solution = solve([recording], None)
+    assert solution.rejected == {"no_tag_given": 1}
+    (found,) = solution.detections
+    assert found["tag_id"] is None
+    places = np.array([[m["x_m"], m["y_m"]] for m in found["magnets"]])
+    apart = np.sort(np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(5, 1)])
+    grid = tag.places
+    expected = np.sort(np.linalg.norm(grid[:, None] - grid[None], axis=2)[np.triu_indices(5, 1)])
+    np.testing.assert_allclose(apart, expected, atol=1e-3)
+
+
+# ---- several tags
+
+
+@pytest.mark.parametrize(
+    ("ahead", "aside"), [(0.5, 0.0), (0.2, 0.0), (0.13, 0.0), (0.0, 0.13)]
+)  # far, near, as near as tags can lie, side by side
+def test_two_tags(ahead: float, aside: float, world: Any) -> None:
+    first = world.Tag(CELLS, SYMBOLS, x=-ahead / 2, y=-aside / 2, heading=0.2)
+    second = world.Tag(CELLS, OTHER, x=ahead / 2, y=aside / 2, heading=-1.0)
+    course = world.line(length=0.28 + ahead)
+    array = world.bar(9 if not aside else 15)
+    recording = world.record([first, second], course, array=array, seed=2)
+    solution = solve([recording], TAGS)
+    truth = {id_of(SYMBOLS): first, id_of(OTHER): second}
+    assert {d["tag_id"] for d in solution.detections} == set(truth)
+    for found in solution.detections:
+        error = errors(world, found, course, truth[found["tag_id"]])
+        assert np.all(np.abs(error) < np.maximum([8e-4, 1e-4, 3e-3], 3 * sigmas(found)))
+
+
+def test_order_is_that_of_time_and_the_site_places_the_array(world: Any) -> None:
+    tags = [
+        world.Tag(CELLS, SYMBOLS, x=0.0, y=0.01, heading=0.4),
+        world.Tag(CELLS, OTHER, x=0.6, y=-0.01, heading=2.0),
+    ]
+    ids = [id_of(SYMBOLS), id_of(OTHER)]
+    site = {i: Placed(t.x, t.y, t.heading) for i, t in zip(ids, tags, strict=True)}
+    course = world.line(length=0.9, past=(0.3, 0.0))
+    solution = solve([world.record(tags, course, seed=9)], replace(TAGS, site=site))
+    assert [d["tag_id"] for d in solution.detections] == ids
+    (poses,) = solution.trajectories
+    assert poses.frame == "site"
+    x, y, _ = course.at((poses.time_ns - world.start_ns) * 1e-9)
+    error = poses.position[:, :2] - np.column_stack([x, y])
+    assert np.sqrt(np.mean(error**2)) < 3e-4
+    assert np.all(np.abs(error) < 4 * poses.sigma[:, :2] + 1e-4)
+    (turn,) = solution.facts["heading_corrections"]
+    assert (turn["from"], turn["to"]) == tuple(ids)
+
+
+# ---- input that is none
+
+
+def test_bad_input_is_named(world: Any) -> None:
+    _, _, recording = passed(world)
+
+    def solved(rows: slice = slice(None), field_t: Array | None = None) -> Solution:
+        field_t = recording.field_t if field_t is None else field_t
+        return solve(
+            [Samples("bar", recording.array, recording.time_ns[rows], field_t[rows])], TAGS
+        )
+
+    with pytest.raises(InputError, match="5 samples of bar"):
+        solved(slice(0, 5))
+    with pytest.raises(InputError, match="0 samples"):
+        solved(slice(0, 0))
+    with pytest.raises(InputError, match="no sensor of bar"):
+        solved(field_t=np.full_like(recording.field_t, np.nan))
+    with pytest.raises(InputError, match="method"):
+        SolveOptions(method="best")
+    with pytest.raises(InputError, match="speed"):
+        SolveOptions(speed_mps=-1.0)
+    backwards = replace(recording, time_ns=recording.time_ns[::-1].copy())
+    with pytest.raises(InputError, match="time stamps"):
+        solve([backwards], TAGS)
+
+
+@pytest.mark.parametrize("kind", ["zeros", "constant", "noise", "one spike", "earth only"])
+def test_nothing_there_is_nothing_found(kind: str, world: Any) -> None:
+    rng = np.random.default_rng(0)
+    recording = world.record([], world.line(), seed=1)
+    b = recording.field_t
+    spike = np.full_like(b, 5e-5)
+    spike[100, 4] = 1e-3
+    field = {
+        "zeros": np.zeros_like(b),
+        "constant": np.full_like(b, 5e-5),
+        "noise": 5e-7 * rng.standard_normal(b.shape),
+        "one spike": spike,
+        "earth only": b,
+    }[kind]
+    solution = solve([world.spoiled(recording, field)], TAGS)
+    assert solution.detections == []
+    assert solution.trajectories == ()
+
+
+def test_devices_stay_apart(world: Any) -> None:
+    tag, course, left = passed(world, device="left", seed=1)
+    right = world.record([world.Tag(CELLS, OTHER)], course, device="right", seed=2)
+    solution = solve([left, right], TAGS)
+    assert {(d["device"], d["tag_id"]) for d in solution.detections} == {
+        ("left", id_of(SYMBOLS)),
+        ("right", id_of(OTHER)),
+    }
+    assert [t.device for t in solution.trajectories] == ["left", "right"]
+    assert tag.cells == CELLS
