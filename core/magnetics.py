@@ -32,10 +32,10 @@ def dipole_tensor(offsets: ArrayLike) -> Array:
     square = np.einsum("...i,...i->...", r, r)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = MU0_4PI / (square * square * np.sqrt(square))
-    tensor = 3 * r[..., :, None] * r[..., None, :]
-    for axis in range(3):
-        tensor[..., axis, axis] -= square
-    return np.asarray(tensor * scale[..., None, None])
+        tensor = 3 * r[..., :, None] * r[..., None, :]
+        for axis in range(3):
+            tensor[..., axis, axis] -= square
+        return np.asarray(tensor * scale[..., None, None])
 
 
 def dipole_field(offsets: ArrayLike, moments: ArrayLike) -> Array:

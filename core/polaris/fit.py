@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from locatk.core.errors import DegenerateError
-from locatk.core.polaris.problem import NUISANCES, Normal, Problem, Trial, solve_scaled
+from locatk.core.polaris.problem import (
+    FIXED,
+    GLOBALS,
+    NUISANCES,
+    Normal,
+    Problem,
+    Trial,
+    solve_scaled,
+)
 from locatk.core.polaris.window import Priors, State, Window
 from locatk.core.robust import robust_sigma
 
@@ -45,7 +53,7 @@ class Fitted:
     covariance : (3 M, 3 M) ndarray
         Of x, y and angle of each magnet, in m and rad, with the noise as stated.
     path_sigma_m : (n,) ndarray
-        Of the path against its middle, with the noise as stated; 0 where it was known.
+        Of the path against where most is felt, with the noise as stated; 0 where it is known.
     height_sigma_m : float
     converged : bool
     """
@@ -106,15 +114,13 @@ def _fit(
         for _ in range(3):
             problem = _reweighted(problem, trial, weight, start)
             trial, converged = _descend(problem, problem.project(trial.state), 5, tolerance)
-    for _ in NUISANCES:
-        seen = _seen(problem, trial)
+    while True:
+        normal = _all_free(problem, trial)
+        seen = _seen(problem, normal, len(start.place_m))
         if not seen:
-            break
+            return _fitted(problem, trial, weight, converged, normal)
         problem.free |= {seen}
         trial, converged = _descend(problem, problem.project(trial.state), 10, tolerance)
-    problem.free = frozenset(NUISANCES)
-    normal = problem.normal(trial)
-    return _fitted(problem, trial, weight, converged, normal)
 
 
 def _descend(
@@ -163,22 +169,34 @@ def _reweighted(problem: Problem, trial: Trial, weight: Array, start: State) -> 
     return Problem(problem.window, problem.priors, weight * share, start)
 
 
-def _seen(problem: Problem, trial: Trial) -> str:
+def _all_free(problem: Problem, trial: Trial) -> Normal:
+    """Normal equations in which no nuisance is taken for zero."""
+    closed, problem.free = problem.free, frozenset(NUISANCES)
+    normal = problem.normal(trial)
+    problem.free = closed
+    return normal
+
+
+def _seen(problem: Problem, normal: Normal, magnets: int) -> str:
     """The nuisance that would explain the samples best, "" where none is needed.
 
     A score test: the fall of the cost is predicted from the normal equations in which it
     is free.
     """
-    m = len(trial.state.place_m)
-    closed, gains = problem.free, {}
-    for name in NUISANCES:
-        if name in closed:
-            continue
-        problem.free = closed | {name}
-        normal = problem.normal(trial)
-        gain = float(normal.side @ solve_scaled(normal.gram, normal.side))
-        gains[name] = gain - (m if name == "tilt" else 1)
-    problem.free = closed
+    places = {
+        "crab": [2 * magnets + GLOBALS.index("crab_rad")],
+        "tilt": [normal.moments + 3 * k + 2 for k in range(magnets)],
+    }
+    closed = [name for name in NUISANCES if name not in problem.free]
+    gains = {}
+    for name in closed:
+        gram = normal.gram.copy()
+        for other in closed:
+            if other != name:
+                at = places[other]
+                gram[at, at] *= FIXED
+        gain = float(normal.side @ solve_scaled(gram, normal.side))
+        gains[name] = gain - len(places[name])
     best = max(gains, key=gains.__getitem__, default="")
     return best if best and gains[best] > SEEN else ""
 

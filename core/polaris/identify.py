@@ -23,7 +23,7 @@ MISFIT_M = 0.1
 SCALE_OFF = 0.1
 """Largest deviation of the way's scale from 1."""
 
-RESIDUAL = 3.0
+RESIDUAL = 2.0
 """Largest usual residual of a tag that is read, in standard deviations of the noise."""
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
@@ -24,7 +25,7 @@ from locatk.core.polaris.window import Priors, State, Window, trends
 
 Array = NDArray[np.float64]
 
-SPEEDS_M = np.geomspace(0.02e-3, 10e-3, 16)
+SPEEDS_M = np.geomspace(0.02e-3, 10e-3, 14)
 """Steps of a sample period that are tried."""
 
 COMMON_T = 3e-6
@@ -132,10 +133,12 @@ def fits(task: Task) -> Iterator[Fitted]:
                 fitted = _grow(clocked, start)
             except DegenerateError:
                 continue
-            best = min(best, fitted.sigma)
             yield fitted
+            if best < BAD and fitted.sigma > ENOUGH * best:
+                return  # what is left is not for want of a better start
+            best = min(best, fitted.sigma)
         if task.window.path_m is not None or best < BAD:
-            break
+            return
 
 
 def _grow(task: Task, start: _Start) -> Fitted:
@@ -277,13 +280,15 @@ def sighting(samples: Samples, task: Task, fitted: Fitted) -> Sighting:
     path = np.interp(number, task.times, state.path_m)
     if task.path_m is not None and task.window.path_m is not None:
         path = task.path_m + (state.path_m[0] - task.window.path_m[0])
-    at = int(np.argmin(np.abs(path - middle[0])))
+    spread = np.interp(number, task.times, fitted.path_sigma_m) * max(1.0, fitted.usual_sigma)
+    # Of samples at the magnets' middle one that is sure: where nothing is felt, or a sample
+    # was misread, the path may be anywhere.
+    at = int(np.argmin(np.abs(median_filter(path, 5) - middle[0]) + 3 * spread))
     index = 3 * chosen[:, None] + np.arange(3)
     covariance = fitted.covariance[np.ix_(index.ravel(), index.ravel())]
     # What the model does not know shows in the residual.
     covariance = covariance * max(1.0, fitted.usual_sigma) ** 2
     here = path[at] * np.array([1.0, np.tan(state.crab_rad)])
-    spread = np.interp(number, task.times, fitted.path_sigma_m) * max(1.0, fitted.usual_sigma)
     moment = state.moment_am2[chosen]
     return Sighting(
         time_ns=int(samples.time_ns[task.first + at]),

@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 NEAR = 0.3
 """How far from its cell a magnet may be before the grid is fitted, in spacings."""
 
+GOOD, FAIR = 0.05, 0.12
+"""Rms distance of the magnets from their cells, in spacings: what is looked for first, and
+what will do."""
+
 LENGTH = 0.15
 """By how much a distance along the track may be wrong."""
 
@@ -81,16 +85,19 @@ def matches(sighting: Sighting, tags: Tags, used: frozenset[int] = frozenset()) 
     found = _layings(points, tags, LENGTH if sighting.free_path else 0.05)
     if not found:
         return []
-    most = max(len(cells) for cells in found.values())
     corners = set(vertices(tags.order)[:3])
-    laid = []
-    for key, cells in found.items():
-        if len(cells) == most:
-            magnets = tuple(int(free[k]) for k, _ in key)
-            laid.append(_fitted(sighting, tags, magnets, cells))
-    laid = [match for match in laid if match.misfit_m < 0.12 * tags.spacing_m]
-    whole = [match for match in laid if corners <= set(match.cells)]
-    return sorted(whole or laid, key=lambda match: match.misfit_m)
+    for misfit in (GOOD, FAIR):
+        for count in sorted({len(cells) for cells in found.values()}, reverse=True):
+            laid = [
+                _fitted(sighting, tags, tuple(int(free[k]) for k, _ in key), cells)
+                for key, cells in found.items()
+                if len(cells) == count
+            ]
+            laid = [match for match in laid if match.misfit_m < misfit * tags.spacing_m]
+            whole = [match for match in laid if corners <= set(match.cells)]
+            if laid and (count > 2 or misfit == FAIR):
+                return sorted(whole or laid, key=lambda match: match.misfit_m)
+    return []
 
 
 def _layings(
@@ -130,7 +137,8 @@ def _layings(
             good &= (near_row >= 0) & (near_row < order)
             good &= (near_column >= 0) & (near_column < order)
             good &= ~((near_column == order - 1) & (near_row == 0))
-            for k in np.flatnonzero(good.sum(axis=1) >= max(2, good.sum(axis=1).max() - 1)):
+            number = np.minimum(good.sum(axis=1), tags.magnets)
+            for k in np.flatnonzero(number >= max(2, number.max() - 1)):
                 chosen = np.flatnonzero(good[k])
                 cells = [(int(near_column[k, m]), int(near_row[k, m])) for m in chosen]
                 if len(set(cells)) < len(cells):

@@ -95,7 +95,7 @@ def sightings(samples: Samples, tags: Tags, speed_mps: float | None) -> list[Sig
     for first, stop in _passes(find_peaks(signal, reach), tags, step, len(path)):
         magnets = pipeline.magnets(signal.part(first, stop), path[first:stop])
         if magnets:
-            found.append(_sighting(magnets, bar, path, (first, stop), notes))
+            found.append(_sighting(magnets, bar, path, (first, stop), tags.clearance_m, notes))
     return found
 
 
@@ -376,6 +376,7 @@ def _sighting(
     samples: Samples,
     path: Array,
     span: tuple[int, int],
+    clearance_m: float,
     notes: tuple[str, ...],
 ) -> Sighting:
     ways = np.array([magnet.way_m for magnet in magnets])
@@ -393,5 +394,6 @@ def _sighting(
         moment_am2=np.array([m.moment_am2 for m in chosen]),
         covariance=np.full((3 * len(chosen), 3 * len(chosen)), np.nan),
         path_sigma_m=np.full(stop - first, np.nan),
+        height_m=clearance_m,
         notes=notes,
     )

@@ -19,7 +19,10 @@ ACTIVE = 8.0
 standard deviations of the sum of squares over the bar."""
 
 LEAST_NOISE_T = 2e-8
-"""What a sensor without noise and without a known quantum is taken to have."""
+"""What a bar without noise and without a known quantum is taken to have."""
+
+FEWEST = 20
+"""Samples from which a sensor's noise can be told."""
 
 _QUANTILE, _NORMAL = 0.3, 0.38532
 """A quantile of the absolute value of a normal distribution: low, so that passes over
@@ -43,16 +46,19 @@ def noise(samples: Samples) -> Array:
     stated = np.broadcast_to(samples.array.noise_t, (len(samples.array), 3))
     least = np.maximum(samples.array.quantum_t / 4, LEAST_NOISE_T)
     bend = np.abs(np.diff(samples.field_t, n=2, axis=0))
-    if len(bend) < 20:
-        found = np.array(stated)
-    else:
-        filled = np.where(np.isfinite(bend), bend, np.inf)
-        usable = np.isfinite(bend).sum(axis=0)
-        rank = np.maximum((_QUANTILE * usable).astype(int), 0)
-        ordered = np.sort(filled, axis=0)
-        found = np.take_along_axis(ordered, rank[None], axis=0)[0] / _NORMAL / np.sqrt(6)
-        found = np.where(usable >= 20, found, stated)
-    return np.maximum(np.where(np.isfinite(found), found, LEAST_NOISE_T), least)
+    usable = np.isfinite(bend).sum(axis=0)
+    found = np.array(stated)
+    if len(bend) >= FEWEST:
+        ordered = np.sort(np.where(np.isfinite(bend), bend, np.inf), axis=0)
+        rank = (_QUANTILE * usable).astype(int)
+        value = np.take_along_axis(ordered, rank[None], axis=0)[0] / _NORMAL / np.sqrt(6)
+        found = np.where(usable >= FEWEST, value, stated)
+    # A sensor that gave nothing is taken for one like the others.
+    known = np.isfinite(found)
+    for axis in range(3):
+        usual = np.median(found[known[:, axis], axis]) if known[:, axis].any() else 0.0
+        found[~known[:, axis], axis] = usual
+    return np.maximum(found, least)
 
 
 def activity(samples: Samples, noise_t: Array) -> Array:
@@ -84,9 +90,7 @@ def activity(samples: Samples, noise_t: Array) -> Array:
 def find(samples: Samples, noise_t: Array) -> list[Pass]:
     """Passes of a recording, in order of time; none where nothing has changed."""
     active = activity(samples, noise_t) > ACTIVE
-    # A single sample is a spike; what is active is so for some samples.
-    sure = active & (np.convolve(active, np.ones(5), "same") >= 3)
-    at = np.flatnonzero(sure)
+    at = np.flatnonzero(active)
     if len(at) == 0:
         return []
     found: list[Pass] = []

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve, solveh_banded
+from scipy.ndimage import median_filter
 
 from locatk.core.polaris.dipoles import Offsets
 from locatk.core.polaris.window import Priors, State, Window, trends
@@ -120,12 +121,11 @@ class Problem:
     weight : (n, N, 3) ndarray
         One over the variance of each sample, 0 where there is none.
     start : State
-        Tells where the path is zero, and how large a step's jitter may be.
+        Tells how large a step's jitter may be.
     """
 
     def __init__(self, window: Window, priors: Priors, weight: Array, start: State) -> None:
         self.window, self.priors = window, priors
-        self.ref = int(np.argmin(np.abs(start.path_m)))
         self.jitter = priors.jitter * abs(start.speed_m) + 1e-6
         self.free: frozenset[str] = frozenset()
         self.spans = np.diff(window.frames)
@@ -141,6 +141,8 @@ class Problem:
         field = np.nan_to_num(window.field_t).reshape(n, -1).T
         level = (field * self.root).sum(axis=1) / np.maximum(self.root.sum(axis=1), 1e-300)
         self.target = self.whiten(field - level[:, None])
+        # Places are counted from where most is felt; the path's variance is zero there.
+        self.ref = int(np.argmax(median_filter((self.target**2).sum(axis=0), 5)))
         # (C, n, D); a channel that gave nothing has no background to find.
         self.background = self.root[:, :, None] * trends(window.frames, window.trends)
         gram = self.background.transpose(0, 2, 1) @ self.background

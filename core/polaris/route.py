@@ -18,6 +18,9 @@ from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+UNSURE_M = 0.01
+"""No poses are given where the way is not known to this standard deviation."""
+
 NEAR_M = 0.03
 """Poses are given up to so far before the first and after the last magnet."""
 
@@ -89,6 +92,7 @@ def _over(
     assert match is not None
     near = sighting.path_m >= sighting.place_m[:, 0].min() - NEAR_M
     near &= sighting.path_m <= sighting.place_m[:, 0].max() + NEAR_M
+    near &= np.nan_to_num(sighting.path_sigma_m) < UNSURE_M
     way = sighting.path_m[near]
     heading = placed.heading_rad - match.heading_rad
     cos, sin = np.cos(heading), np.sin(heading)

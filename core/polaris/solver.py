@@ -30,6 +30,9 @@ FEWEST_SAMPLES = 20
 USUAL = 1.25
 """Usual residual of a pass that is explained but for some outliers, in sigma."""
 
+ALIKE = 1.2
+"""Residuals that differ by no more say nothing of which fit is the better one."""
+
 NOT_THE_WAY = "the speed or odometry given does not explain the samples of a pass"
 
 
@@ -96,6 +99,7 @@ def solve(
         _check(recording)
         noise = passes.noise(recording)
         recording, faults = cleaned(recording, noise)
+        noise = passes.noise(recording)  # a stuck sensor seems to have none
         notes += faults
         driven = next((t for t in odometry if t.device == recording.device), None)
         seen, empty = _seen(recording, noise, tags, options, driven)
@@ -198,7 +202,7 @@ def _solved(
     least residual. A way that was given but does not explain the samples (lost ones, a
     start from rest) is left for the one that the field itself tells.
     """
-    best: tuple[Sighting, list[Seen]] | None = None
+    tried: list[tuple[Sighting, list[Seen]]] = []
     for way in (path, None) if path is not None else (None,):
         prepared = task.prepare(recording, part, noise, tags, way)
         for fitted in joint.fits(prepared):
@@ -211,14 +215,12 @@ def _solved(
             white |= way is None and sighting.usual_sigma < USUAL
             if white and (tags is None or found[1][0].tag_id is not None):
                 return found
-            if best is None or _rank(found) < _rank(best):
-                best = found
-    return best
-
-
-def _rank(found: tuple[Sighting, list[Seen]]) -> tuple[bool, float]:
-    """What is read comes before what is not; then by the residual."""
-    return found[1][0].tag_id is None, found[0].residual_sigma
+            tried.append(found)
+    if not tried:
+        return None
+    least = min(found[0].residual_sigma for found in tried)
+    alike = [found for found in tried if found[0].residual_sigma <= ALIKE * least]
+    return min(alike, key=lambda found: (found[1][0].tag_id is None, found[0].residual_sigma))
 
 
 def _may_be_one(

@@ -36,7 +36,8 @@ class Tag:
     ``x``, ``y`` and ``heading`` (counter-clockwise) place the middle of the grid on the
     floor. ``strength`` (M,) are shares of the magnet's remanence, 0 for one that is
     missing; ``moved`` (M, 2) and ``turned`` (M,) how a hand has misplaced them (metres
-    ahead and to the left, radians counter-clockwise).
+    ahead and to the left, radians counter-clockwise); ``tilted`` (M,) by how many radians
+    they are magnetised upward.
     """
 
     cells: tuple[tuple[int, int], ...]
@@ -53,6 +54,7 @@ class Tag:
     strength: tuple[float, ...] = ()
     moved: Array | None = None
     turned: Array | None = None
+    tilted: Array | None = None
 
     @property
     def places(self) -> Array:
@@ -79,14 +81,17 @@ class Tag:
 
     def sources(self) -> list[magpylib.magnet.Cylinder]:
         strength = self.strength or (1.0,) * len(self.cells)
+        tilted = np.zeros(len(self.cells)) if self.tilted is None else self.tilted
         return [
             magpylib.magnet.Cylinder(
-                polarization=(self.remanence * share, 0, 0),
+                polarization=self.remanence * share * np.array([np.cos(up), 0, np.sin(up)]),
                 dimension=(self.diameter, self.height),
                 position=(*place, 0),
                 orientation=Rotation.from_euler("z", angle),
             )
-            for place, angle, share in zip(self.places, self.angles, strength, strict=True)
+            for place, angle, share, up in zip(
+                self.places, self.angles, strength, tilted, strict=True
+            )
             if share
         ]
 
