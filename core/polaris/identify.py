@@ -23,8 +23,9 @@ MISFIT_M = 0.1
 SCALE_OFF = 0.1
 """Largest deviation of the way's scale from 1."""
 
-RESIDUAL = 2.0
-"""Largest usual residual of a tag that is read, in standard deviations of the noise."""
+USUAL_RESIDUAL, RESIDUAL = 2.0, 4.0
+"""Largest residual of a tag that is read, in standard deviations of the noise: by the median,
+and its rms (debris leaves peaks; a way that was another one, too)."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,9 @@ def identify(sighting: Sighting, recording: Samples, tags: Tags | None) -> list[
         used |= frozenset(seen.match.magnets)
         if len(sighting) - len(used) < 3:
             break
+    if len({item.tag_id for item in found}) < len(found):
+        # A tag lies in one place: the way was another one than it seems.
+        return [replace(item, refused="ambiguous") for item in found]
     return found or [seen]
 
 
@@ -161,7 +165,7 @@ def _best(sighting: Sighting, recording: Samples, tags: Tags, used: frozenset[in
     refused = ""
     if match.misfit_m > MISFIT_M * tags.spacing_m or abs(match.scale - 1) > SCALE_OFF:
         refused = "misfit"
-    elif sighting.usual_sigma > RESIDUAL:
+    elif sighting.usual_sigma > USUAL_RESIDUAL or sighting.residual_sigma > RESIDUAL:
         refused = "residual"
     scale = match.scale
     return Seen(ruled(sighting, scale), replace(match, scale=scale), reading, refused)
@@ -185,7 +189,7 @@ def _incomplete(sighting: Sighting, recording: Samples, tags: Tags, match: Match
         beside = sin * place[:, 0] + cos * place[:, 1] + match.y_m
         if np.any(np.abs(beside) > reach):
             return "partial"
-    elif np.any(np.abs(sighting.place_m[:, 1]) > reach - 0.5 * tags.spacing_m):
+    elif np.any(np.abs(sighting.place_m[:, 1]) > reach - tags.spacing_m):
         return "partial"
     ends = sighting.first <= 1 or sighting.stop >= len(recording) - 1
     return "partial" if ends else "magnets_missing"

@@ -267,6 +267,8 @@ def magnets(fitted: Fitted, task: Task) -> NDArray[np.intp]:
     usual = size[(size > WEAK / 2 * expected) & (size < 3 * expected)]
     if len(usual) == 0:
         usual = size[size > WEAK * size.max()]
+    if len(usual) == 0:
+        raise DegenerateError("no magnet is left under the bar")
     return np.flatnonzero(size > WEAK * np.median(usual))
 
 

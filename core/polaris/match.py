@@ -75,8 +75,8 @@ class Match:
 def matches(sighting: Sighting, tags: Tags, used: frozenset[int] = frozenset()) -> list[Match]:
     """Ways to lay the grid over magnets that are not in ``used``, the best first.
 
-    All of them have as many magnets on cells as can be; with the three position magnets
-    among them where one has those.
+    All of them have as many magnets as a tag has, else as many on cells as can be; with the
+    three position magnets among them where one has those.
     """
     free = np.array([k for k in range(len(sighting)) if k not in used], int)
     if len(free) < 2:
@@ -86,17 +86,20 @@ def matches(sighting: Sighting, tags: Tags, used: frozenset[int] = frozenset()) 
     if not found:
         return []
     corners = set(vertices(tags.order)[:3])
-    for misfit in (GOOD, FAIR):
-        for count in sorted({len(cells) for cells in found.values()}, reverse=True):
-            laid = [
-                _fitted(sighting, tags, tuple(int(free[k]) for k, _ in key), cells)
-                for key, cells in found.items()
-                if len(cells) == count
-            ]
-            laid = [match for match in laid if match.misfit_m < misfit * tags.spacing_m]
+    counts = sorted({len(cells) for cells in found.values()}, reverse=True)
+    # A whole tag is what is looked for first; more magnets on cells may be two tags' at once.
+    whole_tag = [(tags.magnets, misfit) for misfit in (GOOD, FAIR) if tags.magnets in counts]
+    others = [(count, misfit) for misfit in (GOOD, FAIR) for count in counts if count > 2]
+    for count, misfit in [*whole_tag, *others, (2, FAIR)]:
+        laid = [
+            _fitted(sighting, tags, tuple(int(free[k]) for k, _ in key), cells)
+            for key, cells in found.items()
+            if len(cells) == count
+        ]
+        laid = [match for match in laid if match.misfit_m < misfit * tags.spacing_m]
+        if laid:
             whole = [match for match in laid if corners <= set(match.cells)]
-            if laid and (count > 2 or misfit == FAIR):
-                return sorted(whole or laid, key=lambda match: match.misfit_m)
+            return sorted(whole or laid, key=lambda match: match.misfit_m)
     return []
 
 

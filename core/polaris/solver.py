@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import InputError
+from locatk.core.errors import DegenerateError, InputError
 from locatk.core.polaris import joint, paper, passes, task
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.clean import cleaned
@@ -206,7 +206,10 @@ def _solved(
     for way in (path, None) if path is not None else (None,):
         prepared = task.prepare(recording, part, noise, tags, way)
         for fitted in joint.fits(prepared):
-            sighting = joint.sighting(recording, prepared, fitted)
+            try:
+                sighting = joint.sighting(recording, prepared, fitted)
+            except DegenerateError:
+                continue
             if way is None and path is not None:
                 sighting = replace(sighting, notes=(NOT_THE_WAY,))
             found = sighting, identify(sighting, recording, tags)

@@ -157,6 +157,15 @@ def test_magnets_off_their_cells_are_refused(world: Any) -> None:
     assert all(item.tag_id is None for item in identify(seen(tag), recording(), TAGS))
 
 
+def test_a_way_of_another_scale_is_refused(world: Any) -> None:
+    """The tag is the ruler of a way unknown, but for a tenth at most: beyond, it is not
+    the tag."""
+    sighting = seen(world.Tag(CELLS, SYMBOLS), free_path=True)
+    for scale, reason in ((0.96, ""), (0.87, "misfit"), (1.14, "misfit")):
+        stretched = replace(sighting, place_m=sighting.place_m * [scale, 1.0])
+        assert one(identify(stretched, recording(), TAGS)).refused == reason
+
+
 @pytest.mark.parametrize("gone", range(8))
 def test_redundant_tag_survives_a_missing_magnet(gone: int, world: Any) -> None:
     layout = codec.layout_of(REDUNDANT, 1234)

@@ -93,6 +93,18 @@ def test_poses_on_the_site(world: Any, tour: tuple[Any, Samples]) -> None:
     assert len(poses) > 300
 
 
+def test_an_unsure_heading_makes_places_away_from_the_tag_unsure(
+    world: Any, tour: tuple[Any, Samples]
+) -> None:
+    """Variance across the track grows by that of the heading with the distance squared."""
+    course, recording = tour
+    poses = only(solve([recording], replace(TAGS, site={IDS[1]: SITE[IDS[1]]})))
+    ahead = truth(world, course, poses)[:, 0] - SITE[IDS[1]].x_m
+    assert np.ptp(ahead) > 0.1
+    growth = np.polyfit(ahead, poses.covariance[:, 1, 1], 2)[0]
+    assert growth == pytest.approx(np.median(poses.covariance[:, 5, 5]), rel=0.1)
+
+
 def test_without_a_site_the_first_tag_is_the_frame(world: Any, tour: tuple[Any, Samples]) -> None:
     course, recording = tour
     solution = solve([recording], TAGS)
