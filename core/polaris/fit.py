@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 ROBUST_FREEDOM = 4.0
 """Degrees of freedom of Student's t by which samples are weighted once the fit stands."""
 
+REWEIGHTED = 2
+"""How often."""
+
 SEEN = 9.0
 """Squares, in units of the noise, by which a nuisance must explain the samples better to be
 believed. Before that it only widens the covariance: none of them is the rule, and each
@@ -111,7 +114,7 @@ def _fit(
     if not final:
         return _fitted(problem, trial, weight, converged, None)
     if _outliers(_residual(problem, trial)):
-        for _ in range(3):
+        for _ in range(REWEIGHTED):
             problem = _reweighted(problem, trial, weight, start)
             trial, converged = _descend(problem, problem.project(trial.state), 5, tolerance)
     while True:
@@ -207,7 +210,7 @@ def _fitted(
     window, state = problem.window, trial.state
     residual = _unweighted(problem, trial, weight)
     count = int(np.isfinite(residual).sum())
-    unknowns = 5 * len(state.place_m) + problem.background_gram[..., 0].size
+    unknowns = 5 * len(state.place_m) + len(problem.background_gram)
     if window.path_m is None:
         unknowns += len(window.frames)
     share = np.sqrt(count / max(count - unknowns, 1))

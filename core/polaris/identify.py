@@ -182,7 +182,7 @@ def _incomplete(sighting: Sighting, recording: Samples, tags: Tags, match: Match
     """Why magnets are missing: the tag reaches beyond the bar or the recording, or not."""
     across = recording.array.position_m[:, 1]
     reach = np.max(np.abs(across)) + 0.5 * tags.clearance_m
-    if match is not None:
+    if match is not None and len(match.cells) > 2:
         grid = tuple((c, r) for r in range(tags.order) for c in range(tags.order))
         place = places(tags, grid)
         sin, cos = np.sin(match.heading_rad), np.cos(match.heading_rad)

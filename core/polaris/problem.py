@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve, solveh_banded
+from scipy.linalg import cho_factor, cho_solve, solveh_banded
 from scipy.ndimage import median_filter
 
 from locatk.core.polaris.dipoles import Offsets
@@ -147,8 +147,11 @@ class Problem:
         self.background = self.root[:, :, None] * trends(window.frames, window.trends)
         gram = self.background.transpose(0, 2, 1) @ self.background
         gram += 1e-9 * max(float(gram.max(initial=0.0)), 1e-300) * np.eye(window.trends)
-        self.background_gram = gram
-        self.background_inverse = np.linalg.inv(self.background_gram)
+        self.background_inverse = np.linalg.inv(gram)
+        self.background_gram = np.zeros((gram[..., 0].size, gram[..., 0].size))
+        for channel, block in enumerate(gram):
+            at = slice(channel * window.trends, (channel + 1) * window.trends)
+            self.background_gram[at, at] = block
 
     def whiten(self, rows: Array) -> Array:
         """Rows (C, n) or (C, n, k) in units of the noise, and without most of what all
@@ -274,14 +277,14 @@ class Problem:
         along = self.whiten((total_x + tangent * total_y).reshape(channels, n))
         # Order: places and globals, moments, the mean step, backgrounds.
         q = inner.shape[2]
-        size = q + 1 + self.background_gram[..., 0].size
+        size = q + 1 + len(self.background_gram)
         gram, side = np.zeros((size, size)), np.zeros(size)
         flat = inner.reshape(-1, q)
         gram[:q, :q] = flat.T @ flat
         transposed = self.background.transpose(0, 2, 1)
         cross = np.concatenate([transposed @ inner[..., :p], trial.cross], axis=2).reshape(-1, q)
         gram[:q, q + 1 :], gram[q + 1 :, :q] = cross.T, cross
-        gram[q + 1 :, q + 1 :] = block_diag(*self.background_gram)
+        gram[q + 1 :, q + 1 :] = self.background_gram
         side[:q] = flat.T @ trial.residual.ravel()
         side[q + 1 :] = (transposed @ trial.residual[:, :, None]).ravel()
         for place, name in enumerate(GLOBALS, 2 * m):

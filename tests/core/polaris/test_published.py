@@ -150,12 +150,16 @@ def test_heading(runs: dict[str, list[Run]]) -> None:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_uncertainty_covers_the_error(name: str, runs: dict[str, list[Run]]) -> None:
+def test_uncertainty_is_of_the_size_of_the_errors(name: str, runs: dict[str, list[Run]]) -> None:
+    """How the car stood is not known (one of the ten runs is 1.6 degrees askew, the others
+    scatter by 0.3), nor where the tag lay: so much only."""
     for run in runs[name]:
         found = run.detection
-        assert abs(found["heading_rad"]) < 4 * found["sigma_heading_rad"]
-        assert 1e-4 < found["sigma_y_m"] < 2e-3
-        assert found["residual_sigma"] < 2.5
+        assert 0.1 < np.degrees(found["sigma_heading_rad"]) < 1.0
+        assert 1e-4 < found["sigma_y_m"] < 1e-3
+        assert 0.8 < found["residual_sigma"] < 1.6
+    askew = [abs(run.heading_rad / run.detection["sigma_heading_rad"]) for run in runs[name]]
+    assert np.median(askew) < 2.5
 
 
 def test_height_and_magnets_are_those_of_the_facts(runs: dict[str, list[Run]]) -> None:
