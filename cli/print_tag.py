@@ -126,7 +126,7 @@ def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int
     """The tags to draw; an id that the solver would not read is refused."""
     from locatk.core.polaris.codec import layout_of
 
-    if not ids and tags.ids is None:
+    if not ids and tags.ids is None and not tags.site:
         raise click.UsageError(f"{tag_file} names no family, so any id may be meant; give --id.")
     for number in ids:
         if tags.ids is not None and number not in tags.ids:
@@ -137,7 +137,8 @@ def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int
                 "--id all are drawn",
             )
     try:
-        return [(number, layout_of(tags, number)) for number in ids or tags.ids or ()]
+        wanted = ids or tags.ids or tuple(sorted(tags.site))
+        return [(number, layout_of(tags, number)) for number in wanted]
     except InputError as error:
         raise InputError(error.message, file=tag_file, hint=error.hint) from None
 

@@ -203,7 +203,7 @@ def text(session: Path, output: Path, solved: Solved) -> str:
 
 def tags_seen(detections: list[dict[str, Any]]) -> str | None:
     """Tags as the array saw them, in its own frame; None where there was none."""
-    header = ("tag", "margin", "magnets", "x", "y [mm]", "heading [deg]")
+    header = ("tag", "margin [steps]", "magnets", "x [mm]", "y [mm]", "heading [deg]")
     sigmas = ("sigma x", "sigma y [mm]", "sigma heading [deg]")
     rows = [
         (

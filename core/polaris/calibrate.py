@@ -284,8 +284,9 @@ def _notes(tags: Tags, report: TagReport) -> list[str]:
         cell = layout_of(tags, report.tag_id).cells[int(np.argmax(np.abs(report.built.angle_rad)))]
         worst = math.degrees(np.abs(report.built.angle_rad).max())
         notes.append(
-            f"{tag}: the magnet on cell {cell} is {worst:.1f} degrees off, more than half of what "
-            "can be told apart: turn it, or count on this file"
+            f"{tag}: the magnet on cell {cell} is {worst:.1f} degrees off, more than half of "
+            f"the {2 * math.degrees(limit):.4g} degrees at which it would be misread: turn it, or "
+            "solve with this file (--artifact)"
         )
     if report.scatter_rad.max() > limit or report.scatter_m.max() > tags.spacing_m / 10:
         notes.append(

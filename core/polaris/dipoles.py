@@ -75,13 +75,12 @@ class Offsets:
         Second derivatives of 1/r; with ``thickness`` (m^2) the fourth ones along z too.
         """
         own = self.own()
-        factor = 3.0
+        leading = 3.0 * own * self.scale
         diagonal = -1.0 / self.inverse
         if thickness:
             flat = self.z * self.z * self.inverse
-            factor = 3.0 + thickness * self.inverse * (105.0 * flat - 15.0)
-            diagonal = diagonal + thickness * (3.0 - 15.0 * flat)
-        leading = factor * own * self.scale
+            leading *= 1.0 + thickness * self.inverse * (35.0 * flat - 5.0)
+            diagonal += thickness * (3.0 - 15.0 * flat)
         fields = np.empty((*self.x.shape, 3))
         fields[..., 0] = leading * self.x
         fields[..., 1] = leading * self.y

@@ -73,7 +73,7 @@ def sightings(samples: Samples, tags: Tags, speed_mps: float | None) -> list[Sig
     """
     if speed_mps is None:
         raise InputError(
-            "the paper's method needs the speed of the array",
+            "no speed, which the paper's method needs,",
             hint="Give it with --speed, in m/s",
         )
     bar, notes = _living(samples)

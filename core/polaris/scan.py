@@ -132,7 +132,7 @@ class Scanner:
         while len(found) < most:
             products = self.correlate(left)
             energies = products[:, 0] ** 2 + products[:, 1] ** 2
-            row, place = np.unravel_index(int(np.argmax(energies)), energies.shape)
+            row, place = divmod(int(np.argmax(energies)), energies.shape[1])
             energy = float(energies[row, place])
             if energy < floor:
                 break

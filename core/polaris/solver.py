@@ -92,7 +92,9 @@ def solve(
         A recording is empty or too short, or the method needs a speed.
     """
     options = options or SolveOptions()
-    trajectories, detections, notes = [], [], []
+    trajectories: list[Trajectory] = []
+    detections: list[dict[str, Any]] = []
+    notes: list[str] = []
     rejected: Counter[str] = Counter()
     turns: list[dict[str, Any]] = []
     for recording in samples:
