@@ -7,6 +7,7 @@ opens at once; tests/cli/test_app.py holds that, and that the two agree.
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 import sys
 import warnings
@@ -121,6 +122,8 @@ def main() -> None:
     """Entry point of the `locatk` script."""
     # With protobuf 6, each schema of foxglove warns that it was generated for protobuf 5.
     warnings.filterwarnings("ignore", message="Protobuf gencode version", category=UserWarning)
+    # Matrices are small: threads for them only wait for each other, and for other processes.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # As an exception, so that files in the making are removed.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     app(prog_name="locatk")

@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.match import Match, matches, refitted, ruled
+from locatk.core.polaris.match import FAIR, Match, matches, refitted, ruled
 from locatk.core.polaris.reading import Reading, read
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Tags, built_magnets, places
 
 Array = NDArray[np.float64]
-
-MISFIT_M = 0.1
-"""Largest rms distance of the magnets from their cells, in spacings."""
 
 SCALE_OFF = 0.1
 """Largest deviation of the way's scale from 1."""
@@ -118,8 +115,8 @@ class Seen:
 
 
 def identify(sighting: Sighting, recording: Samples, tags: Tags | None) -> list[Seen]:
-    """The tags in a sighting, in order of how many magnets they have; at least one entry,
-    which is refused where nothing could be read."""
+    """The tags in a sighting, as they were read one after the other; at least one entry, which
+    is refused where nothing could be read."""
     if tags is None:
         return [Seen(sighting, None, None, "no_tag_given")]
     found: list[Seen] = []
@@ -163,12 +160,11 @@ def _best(sighting: Sighting, recording: Samples, tags: Tags, used: frozenset[in
         at = [layout.cells.index(cell) for cell in match.cells]
         match = refitted(sighting, tags, match, place[at])
     refused = ""
-    if match.misfit_m > MISFIT_M * tags.spacing_m or abs(match.scale - 1) > SCALE_OFF:
+    if match.misfit_m > FAIR * tags.spacing_m or abs(match.scale - 1) > SCALE_OFF:
         refused = "misfit"
     elif sighting.usual_sigma > USUAL_RESIDUAL or sighting.residual_sigma > RESIDUAL:
         refused = "residual"
-    scale = match.scale
-    return Seen(ruled(sighting, scale), replace(match, scale=scale), reading, refused)
+    return Seen(ruled(sighting, match), match, reading, refused)
 
 
 def _read(sighting: Sighting, tags: Tags, match: Match) -> Reading:
@@ -191,5 +187,7 @@ def _incomplete(sighting: Sighting, recording: Samples, tags: Tags, match: Match
             return "partial"
     elif np.any(np.abs(sighting.place_m[:, 1]) > reach - tags.spacing_m):
         return "partial"
+    if np.any(np.abs(sighting.place_m[:, 1]) > reach - 0.25 * tags.spacing_m):
+        return "partial"  # a tag goes on where a magnet lies at the very end
     ends = sighting.first <= 1 or sighting.stop >= len(recording) - 1
     return "partial" if ends else "magnets_missing"

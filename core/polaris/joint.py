@@ -25,7 +25,7 @@ from locatk.core.polaris.window import Priors, State, Window, trends
 
 Array = NDArray[np.float64]
 
-SPEEDS_M = np.geomspace(0.02e-3, 10e-3, 14)
+STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
 """Steps of a sample period that are tried."""
 
 COMMON_T = 3e-6
@@ -37,7 +37,7 @@ ENOUGH = 0.95
 BAD = 3.0
 """Rms of a residual that has nothing to do with the samples."""
 
-MOST_STARTS = 3
+MOST_STARTS = 4
 
 LONGEST_M = 2.0
 """A pass is never longer than this."""
@@ -91,7 +91,7 @@ def starts(task: Task, sign: float = 1.0) -> list[_Start]:
             span = window.frames[-1] - window.frames[0]
             paths = [
                 (sign * speed * (window.frames - window.frames.mean()), sign * speed)
-                for speed in SPEEDS_M
+                for speed in STEPS_M
                 if 2 * height < speed * span < LONGEST_M
             ]
         for path, speed in paths:
@@ -134,7 +134,7 @@ def fits(task: Task) -> Iterator[Fitted]:
             except DegenerateError:
                 continue
             yield fitted
-            if best < BAD and fitted.sigma > ENOUGH * best:
+            if WHITE < best < BAD and fitted.sigma > ENOUGH * best:
                 return  # what is left is not for want of a better start
             best = min(best, fitted.sigma)
         if task.window.path_m is not None or best < BAD:
@@ -158,6 +158,8 @@ def _grow(task: Task, start: _Start) -> Fitted:
         fitted = fit(coarse, state, priors, iterations=12, tolerance=1e-3, final=False)
         if fitted.sigma > ENOUGH * before.sigma:
             break
+    if window.path_m is not None and fitted.sigma > BAD:
+        raise DegenerateError("the samples contradict the way that was given")
     # Whether the bar sees a field that all sensors share is told by the fit that allows it.
     if coarse.common_t and fitted.shared > max(SHARED, 2 * fitted.sigma**2):
         information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)

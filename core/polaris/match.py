@@ -21,12 +21,13 @@ Array = NDArray[np.float64]
 NEAR = 0.3
 """How far from its cell a magnet may be before the grid is fitted, in spacings."""
 
-GOOD, FAIR = 0.05, 0.12
+GOOD, FAIR = 0.05, 0.1
 """Rms distance of the magnets from their cells, in spacings: what is looked for first, and
 what will do."""
 
-LENGTH = 0.15
-"""By how much a distance along the track may be wrong."""
+FREE_LENGTH, KNOWN_LENGTH = 0.15, 0.05
+"""By how much a distance along the track may be wrong, where the way was found from the field
+alone and where it was known."""
 
 BUILD_M = 4e-4
 """Standard deviation of a magnet's place that is set by hand."""
@@ -37,9 +38,6 @@ MEASURED_M = 1e-4
 SCALE = 0.03
 """Standard deviation of a way's scale that was found from the field alone: on the published
 recordings it is 2.5 % short, in each of them (docs/polaris.md)."""
-
-SCALE_LEFT = 1e-3
-"""The same once the tag has served as ruler."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class Match:
         Pose of the tag in the array's frame.
     covariance : (3, 3) ndarray
         Of these.
-    scale : float
-        True over found length along the track.
+    scale, scale_sigma : float
+        True over found length along the track, and its standard deviation.
     misfit_m : float
         Rms distance of the magnets from their cells.
     """
@@ -69,6 +67,7 @@ class Match:
     heading_rad: float
     covariance: Array
     scale: float
+    scale_sigma: float
     misfit_m: float
 
 
@@ -82,7 +81,7 @@ def matches(sighting: Sighting, tags: Tags, used: frozenset[int] = frozenset()) 
     if len(free) < 2:
         return []
     points = sighting.place_m[free]
-    found = _layings(points, tags, LENGTH if sighting.free_path else 0.05)
+    found = _layings(points, tags, FREE_LENGTH if sighting.free_path else KNOWN_LENGTH)
     if not found:
         return []
     corners = set(vertices(tags.order)[:3])
@@ -192,15 +191,16 @@ def _fitted(
     misfit = float(np.sqrt((residual**2).sum() / m))
     # A way that was no straight line shows in the grid, not in the samples.
     squares = float(residual @ weight @ residual) + prior[3] * (scale - 1) ** 2
-    excess = max(1.0, squares / max(2 * m - 3, 1))
+    covariance = np.linalg.inv(gram) * max(1.0, squares / max(2 * m - 3, 1))
     return Match(
         magnets,
         cells,
         float(shift[0]),
         float(shift[1]),
         float(np.remainder(heading + np.pi, 2 * np.pi) - np.pi),
-        np.linalg.inv(gram)[:3, :3] * excess,
+        covariance[:3, :3],
         float(scale),
+        float(np.sqrt(covariance[3, 3])),
         misfit,
     )
 
@@ -210,10 +210,11 @@ def refitted(sighting: Sighting, tags: Tags, match: Match, nominal: Array) -> Ma
     return _fitted(sighting, tags, match.magnets, match.cells, nominal)
 
 
-def ruled(sighting: Sighting, scale: float) -> Sighting:
+def ruled(sighting: Sighting, match: Match) -> Sighting:
     """The sighting with lengths along the track measured by the tag itself."""
-    if scale == 1.0:
+    if not sighting.free_path:
         return sighting
+    scale = match.scale
     place = sighting.place_m * [scale, 1.0]
     along = np.zeros(3 * len(place))
     along[0::3] = place[:, 0]
@@ -223,7 +224,7 @@ def ruled(sighting: Sighting, scale: float) -> Sighting:
     # What was not known of the scale is known now.
     known = along @ np.linalg.solve(covariance, along)
     if known > 0:
-        covariance = covariance + (SCALE_LEFT**2 - 1 / known) * np.outer(along, along)
+        covariance = covariance + (match.scale_sigma**2 - 1 / known) * np.outer(along, along)
     return replace(
         sighting,
         place_m=place,

@@ -36,7 +36,7 @@ not lie flat."""
 LONGEST_STEP = 0.7
 """How far a magnet may move in one step of the fit, in heights."""
 
-NONE = 1e-6
+CLOSED = 1e-6
 """Share of its standard deviation that a nuisance is left while it is taken for zero."""
 
 
@@ -226,7 +226,7 @@ class Problem:
     def moment_weights(self, m: int) -> Array:
         """Inverse variances (3 M,) of the moments."""
         size = self.priors.moment_am2
-        tilt = self.priors.tilt * (1.0 if "tilt" in self.free else NONE)
+        tilt = self.priors.tilt * (1.0 if "tilt" in self.free else CLOSED)
         return np.tile(1 / np.array([3 * size, 3 * size, tilt * size]) ** 2, m)
 
     def spread(self, name: str) -> tuple[float, float]:
@@ -236,7 +236,7 @@ class Problem:
             return priors.height_m
         if name == "skew":
             return priors.skew if np.any(self.window.order) else (0.0, 1e-9)
-        return 0.0, priors.crab_rad * (1.0 if "crab" in self.free else NONE)
+        return 0.0, priors.crab_rad * (1.0 if "crab" in self.free else CLOSED)
 
     def prior_cost(self, state: State) -> float:
         """What the priors add to the squares of the residual, the moments' aside."""

@@ -28,7 +28,8 @@ NEAR_M = 0.03
 def along(driven: Trajectory, time_ns: NDArray[np.int64]) -> Array:
     """How far (n,) a robot had driven by its odometry at each time, in m.
 
-    Backwards counts as negative, by the heading of the odometry.
+    Backwards counts as negative, by the heading of the odometry; before its first and after
+    its last pose the robot is taken to stand.
     """
     step = np.diff(driven.position[:, :2], axis=0)
     heading = heading_of(driven.quaternion)

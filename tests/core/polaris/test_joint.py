@@ -230,7 +230,8 @@ def design(rng: np.random.Generator, order: int, magnets: int, p: int) -> tuple[
 def test_every_bit_of_other_designs(
     order: int, magnets: int, p: int, spacing: float, world: Any
 ) -> None:
-    """At the paper's noise of 0.5 uT, over a bar that covers the tag."""
+    """At the paper's noise of 0.5 uT, over a bar that covers the tag. One pass each: of the
+    densest, 13 magnets 16 mm apart, some passes are refused."""
     rng = np.random.default_rng([order, magnets, p])
     tags = Tags(order=order, magnets=magnets, orientations=p, spacing_m=spacing)
     side = (order - 1) * spacing

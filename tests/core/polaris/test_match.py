@@ -121,7 +121,7 @@ def test_the_tag_is_the_ruler_of_a_way_unknown() -> None:
     assert best.scale == pytest.approx(1 / 0.97, abs=0.006)
     assert abs(best.heading_rad - 0.3) < 0.01
     assert matches(seen(places), TAGS)[0].scale == pytest.approx(1.0, abs=1e-6)
-    measured = ruled(seen(short, free=True), best.scale)
+    measured = ruled(seen(short, free=True), best)
     np.testing.assert_allclose(measured.place_m, places, atol=4e-4)
     np.testing.assert_allclose(np.ptp(measured.path_m), 0.2 * best.scale)
     assert not measured.free_path
