@@ -175,6 +175,29 @@ def _grow(task: Task, start: _Start) -> Fitted:
             return fitted
 
 
+def seeded(task: Task, fitted: Fitted, places_m: Array) -> Fitted:
+    """Fit again with a source at each of ``places_m`` (M, 2), in the frame of the fit: those
+    that are no magnets drop out by themselves.
+
+    Raises
+    ------
+    DegenerateError
+        The samples do not determine it.
+    """
+    window, priors = task.window, task.priors[0]
+    moments = np.full((len(places_m), 3), 0.0)
+    state = replace(fitted.state, place_m=places_m, moment_am2=moments)
+    coarse = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
+    size = _sizes(coarse.state)
+    strong = size > WEAK * np.median(np.sort(size)[-3:])
+    state = replace(
+        coarse.state,
+        place_m=coarse.state.place_m[strong],
+        moment_am2=coarse.state.moment_am2[strong],
+    )
+    return fit(window, _without_ghosts(state, task), priors)
+
+
 def _missed(task: Task, fitted: Fitted) -> list[Atom]:
     """Sources that the residual still holds."""
     window, state = task.window, fitted.state
@@ -310,5 +333,6 @@ def sighting(samples: Samples, task: Task, fitted: Fitted) -> Sighting:
         height_sigma_m=fitted.height_sigma_m * max(1.0, fitted.usual_sigma),
         residual_sigma=fitted.sigma,
         usual_sigma=fitted.usual_sigma,
+        origin_m=here,
         others=len(state.place_m) - len(chosen),
     )

@@ -47,6 +47,8 @@ class Sighting:
         the method has no model of the samples.
     usual_sigma : float
         The same by the median, which no outlier moves.
+    origin_m : (2,) ndarray
+        Where the array was at ``time_ns``, in the coordinates of the fit.
     others : int
         Further sources that are no magnets of a tag (debris).
     notes : tuple of str
@@ -67,6 +69,7 @@ class Sighting:
     height_sigma_m: float = np.nan
     residual_sigma: float = np.nan
     usual_sigma: float = np.nan
+    origin_m: Array = field(default_factory=lambda: np.zeros(2))
     others: int = 0
     notes: tuple[str, ...] = field(default=())
 

@@ -14,10 +14,11 @@ from locatk.core.errors import DegenerateError, InputError
 from locatk.core.polaris import joint, paper, passes, task
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.clean import cleaned
+from locatk.core.polaris.fit import Fitted
 from locatk.core.polaris.identify import Seen, identify
 from locatk.core.polaris.route import along, corrections, joined, tag_poses
 from locatk.core.polaris.sighting import Sighting
-from locatk.core.polaris.tag import Tags
+from locatk.core.polaris.tag import Tags, places
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -32,6 +33,9 @@ USUAL = 1.25
 
 ALIKE = 1.2
 """Residuals that differ by no more say nothing of which fit is the better one."""
+
+FEWEST_LAID = 5
+"""Magnets on cells from which a grid is worth to be tried whole."""
 
 NOT_THE_WAY = "the speed or odometry given does not explain the samples of a pass"
 
@@ -221,11 +225,46 @@ def _solved(
             if white and (tags is None or found[1][0].tag_id is not None):
                 return found
             tried.append(found)
+            again = _on_grid(recording, prepared, fitted, found, tags)
+            if again is not None:
+                return again
     if not tried:
         return None
     least = min(found[0].residual_sigma for found in tried)
     alike = [found for found in tried if found[0].residual_sigma <= ALIKE * least]
     return min(alike, key=lambda found: (found[1][0].tag_id is None, found[0].residual_sigma))
+
+
+def _on_grid(
+    recording: Samples,
+    prepared: task.Task,
+    fitted: Fitted,
+    found: tuple[Sighting, list[Seen]],
+    tags: Tags | None,
+) -> tuple[Sighting, list[Seen]] | None:
+    """The same pass with a source on each cell of the grid that was laid, if it is read then.
+
+    Where magnets lie closer than one and a half clearances, their fields run into one
+    another, and the scan takes two for one.
+    """
+    sighting, seen = found
+    match = seen[0].match
+    if tags is None or match is None or len(match.cells) < FEWEST_LAID:
+        return None
+    grid = tuple((c, r) for r in range(tags.order) for c in range(tags.order))
+    nominal = places(tags, grid)
+    cos, sin = np.cos(match.heading_rad), np.sin(match.heading_rad)
+    laid = nominal @ np.array([[cos, sin], [-sin, cos]]) + [match.x_m, match.y_m]
+    laid[:, 0] /= match.scale
+    try:
+        again = joint.seeded(prepared, fitted, laid + sighting.origin_m)
+        sighting = joint.sighting(recording, prepared, again)
+    except DegenerateError:
+        return None
+    read = identify(sighting, recording, tags)
+    if read[0].tag_id is None or sighting.residual_sigma > joint.WHITE:
+        return None
+    return sighting, read
 
 
 def _may_be_one(
