@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
+from locatk.core.polaris.joint import WHITE
 from locatk.core.polaris.match import FAIR, Match, matches, refitted, ruled
 from locatk.core.polaris.reading import Reading, read
 from locatk.core.polaris.sighting import Sighting
@@ -23,6 +24,11 @@ SCALE_OFF = 0.1
 USUAL_RESIDUAL, RESIDUAL = 2.0, 4.0
 """Largest residual of a tag that is read, in standard deviations of the noise: by the median,
 and its rms (debris leaves peaks; a way that was another one, too)."""
+
+
+DOUBT = 0.2
+"""Margin in steps that a residual above WHITE must leave, for each standard deviation: a
+magnet that the fit has put wrongly bends the directions of its neighbours."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +168,11 @@ def _best(sighting: Sighting, recording: Samples, tags: Tags, used: frozenset[in
     refused = ""
     if match.misfit_m > FAIR * tags.spacing_m or abs(match.scale - 1) > SCALE_OFF:
         refused = "misfit"
-    elif sighting.usual_sigma > USUAL_RESIDUAL or sighting.residual_sigma > RESIDUAL:
+    elif (
+        sighting.usual_sigma > USUAL_RESIDUAL
+        or sighting.residual_sigma > RESIDUAL
+        or (sighting.residual_sigma > WHITE and reading.margin < DOUBT * sighting.residual_sigma)
+    ):
         refused = "residual"
     return Seen(ruled(sighting, match), match, reading, refused)
 
