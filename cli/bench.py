@@ -37,6 +37,7 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
     Examples:
       locatk bench lighthouse
       locatk bench dots
+      locatk bench polaris
       locatk bench lighthouse --data ~/data --json
     """
     from locatk.formats.data import data_folder
