@@ -73,6 +73,7 @@ class _Start:
     priors: Priors
     state: State
     left: float
+    scanner: Scanner
 
 
 def starts(task: Task, sign: float = 1.0) -> list[_Start]:
@@ -97,7 +98,7 @@ def starts(task: Task, sign: float = 1.0) -> list[_Start]:
         for path, speed in paths:
             atoms, left = scanner.atoms(path, task.scaled, 3, LEAST_ENERGY)
             if atoms:
-                found.append(_Start(priors, _state(atoms, path, speed, priors), left))
+                found.append(_Start(priors, _state(atoms, path, speed, priors), left, scanner))
     return found
 
 
@@ -145,9 +146,8 @@ def _grow(task: Task, start: _Start) -> Fitted:
     """Fit from one start, with magnets added from the residual until it holds none."""
     window, priors = task.window, start.priors
     coarse = replace(window, common_t=COMMON_T if len(window.sensors_m) >= FEW_SENSORS else 0.0)
-    scanner = Scanner(window.sensors_m, window.noise_t, start.state.height_m)
     path = start.state.path_m
-    atoms, _ = scanner.atoms(path, task.scaled, task.most, LEAST_ENERGY)
+    atoms, _ = start.scanner.atoms(path, task.scaled, task.most, LEAST_ENERGY)
     state = _state(_distinct(atoms, start.state.height_m), path, start.state.speed_m, priors)
     fitted = fit(coarse, state, priors, iterations=12, tolerance=1e-3, final=False)
     for _ in range(4):

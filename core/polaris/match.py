@@ -114,9 +114,7 @@ def _layings(
     found: dict[tuple[tuple[int, Cell], ...], tuple[Cell, ...]] = {}
     n = len(points)
     for i in range(n):
-        for j in range(n):
-            if i == j:
-                continue
+        for j in range(i):
             span = points[j] - points[i]
             size = np.linalg.norm(span)
             a, b = np.nonzero(
