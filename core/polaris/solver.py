@@ -258,7 +258,7 @@ def _on_grid(
     laid[:, 0] /= match.scale
     try:
         again = joint.seeded(prepared, fitted, laid + sighting.origin_m)
-        sighting = joint.sighting(recording, prepared, again)
+        sighting = replace(joint.sighting(recording, prepared, again), notes=found[0].notes)
     except DegenerateError:
         return None
     read = identify(sighting, recording, tags)
