@@ -150,6 +150,23 @@ def test_bad_residual_is_refused(world: Any) -> None:
     assert (found.tag_id, found.refused) == (None, "residual")
 
 
+@pytest.mark.parametrize(("rms", "usual"), [(5.0, 1.0), (3.0, 2.5)])
+def test_either_residual_refuses(rms: float, usual: float, world: Any) -> None:
+    bad = seen(world.Tag(CELLS, SYMBOLS), residual_sigma=rms, usual_sigma=usual)
+    assert one(identify(bad, recording(), TAGS)).refused == "residual"
+
+
+@pytest.mark.parametrize(("rms", "refused"), [(1.2, ""), (2.2, "residual")])
+def test_a_doubtful_residual_needs_a_margin(rms: float, refused: str, world: Any) -> None:
+    """A magnet 17 degrees off its orientation: a margin of a quarter step."""
+    tag = world.Tag(CELLS, SYMBOLS, turned=np.radians([0, 0, 17.0, 0, 0]))
+    found = one(identify(seen(tag, residual_sigma=rms, usual_sigma=1.0), recording(), TAGS))
+    assert found.reading is not None
+    assert 0.2 < found.reading.margin < 0.3
+    assert found.refused == refused
+    assert found.tag_id == (None if refused else id_of())
+
+
 def test_magnets_off_their_cells_are_refused(world: Any) -> None:
     """A fifth of a spacing: no hand is so bad, it is another grid."""
     rng = np.random.default_rng(1)
