@@ -219,6 +219,20 @@ def design(rng: np.random.Generator, order: int, magnets: int, p: int) -> tuple[
     return cells, tuple(int(s) for s in rng.integers(p, size=magnets))
 
 
+def test_a_dense_tag_is_read_by_its_grid(world: Any) -> None:
+    """Thirteen magnets at 1.6 clearances, of which the scan takes two for one: read
+    only because all cells of the grid are tried (it was refused before that was so)."""
+    rng = np.random.default_rng([4, 13, 8])
+    cells, symbols = design(rng, 4, 13, 8)
+    tags = Tags(order=4, magnets=13, orientations=8, spacing_m=0.016)
+    turn = rng.uniform(-np.pi, np.pi)
+    tag = world.Tag(cells, symbols, heading=turn, order=4, orientations=8, spacing=0.016)
+    course = world.line(length=1.5 * 0.048 + 0.12)
+    made = world.record([tag], course, array=world.bar(7), seed=0)
+    found = the_tag(solve([made], tags))
+    assert found["tag_id"] == codec.id_of(tags, Layout(cells, symbols))
+
+
 @pytest.mark.parametrize(
     ("order", "magnets", "p", "spacing"),
     [
