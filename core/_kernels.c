@@ -7,32 +7,12 @@
  * against each other. Constants come in as arguments, so that they stand in one place.
  * Only the stable ABI of Python 3.11 is used, and buffers instead of numpy's own interface.
  */
-#define PY_SSIZE_T_CLEAN
-#ifndef Py_LIMITED_API
-#define Py_LIMITED_API 0x030B0000
-#endif
-#include <Python.h>
+#include "_kernels.h"
 #include <float.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
-
-/* Loops over arrays are compiled for wide registers too, and the processor's own version is
- * taken at run time, where compiler and C library can do that. */
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
-#define HOT __attribute__((target_clones("avx2", "default")))
-#else
-#define HOT
-#endif
-
-/* Releases the buffers of a call; None, or MemoryError where there was none to work in. */
-static PyObject *done(Py_buffer *buffers, int count, int stored)
-{
-    for (int k = 0; k < count; k++) PyBuffer_Release(buffers + k);
-    if (!stored) return PyErr_NoMemory();
-    Py_RETURN_NONE;
-}
 
 /* ---- Sorting ---------------------------------------------------------------------------- */
 
@@ -1280,6 +1260,8 @@ static PyMethodDef methods[] = {
     {"soft_bits", soft_bits, METH_VARARGS, "Twin of locatk.core.dots.softbits.soft_bits_numpy."},
     {"poses", poses, METH_VARARGS, "Twin of locatk.core.dots.pose.poses_numpy."},
     {"ddtw", ddtw, METH_VARARGS, "Twin of locatk.core.polaris.ddtw.distances_numpy."},
+    {"bar_fields", bar_fields, METH_VARARGS,
+     "Twin of locatk.core.landmarks.bars.evaluate_numpy."},
     {NULL, NULL, 0, NULL},
 };
 

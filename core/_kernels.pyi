@@ -115,3 +115,17 @@ def ddtw(
     cost: Buffer,
     /,
 ) -> None: ...
+def bar_fields(
+    at: Buffer,
+    count: int,
+    half_length: float,
+    half_width: float,
+    height: float,
+    radius: float,
+    remanence: float,
+    nearest: float,
+    gradient: bool,
+    field: Buffer,
+    slope: Buffer,
+    /,
+) -> None: ...

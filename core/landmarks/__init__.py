@@ -1,0 +1,19 @@
+"""Floors of four-bar magnets: from hall sensors and odometry to a place on the map."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from locatk.core.landmarks.solver import SolveOptions, solve
+
+__all__ = ["SolveOptions", "solve"]
+
+
+def __getattr__(name: str) -> Any:
+    # scipy belongs to the call, not to `import locatk.core.landmarks`.
+    if name in __all__:
+        from locatk.core.landmarks import solver
+
+        return getattr(solver, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
