@@ -20,6 +20,7 @@ from locatk.cli import console, failures
 
 COMMANDS = {
     "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),
+    "map": ("locatk.cli.map", "Design floors of landmarks, check and exchange them."),
     "print": ("locatk.cli.print_", "Draw sheets at true size."),
     "import": ("locatk.cli.import_", "Turn recordings of other tools into a session."),
     "simulate": ("locatk.cli.simulate", "Make a session with known truth, without hardware."),
