@@ -1262,6 +1262,8 @@ static PyMethodDef methods[] = {
     {"ddtw", ddtw, METH_VARARGS, "Twin of locatk.core.polaris.ddtw.distances_numpy."},
     {"bar_fields", bar_fields, METH_VARARGS,
      "Twin of locatk.core.landmarks.bars.evaluate_numpy."},
+    {"scan_landmarks", scan_landmarks, METH_VARARGS,
+     "Twin of locatk.core.landmarks.scan.scan_numpy."},
     {NULL, NULL, 0, NULL},
 };
 

@@ -129,3 +129,20 @@ def bar_fields(
     slope: Buffer,
     /,
 ) -> None: ...
+def scan_landmarks(
+    points: Buffer,
+    values: Buffer,
+    weights: Buffer,
+    count: int,
+    centres: Buffer,
+    nodes: int,
+    turns: Buffer,
+    turn_count: int,
+    table: Buffer,
+    size: int,
+    step: float,
+    least: float,
+    most: float,
+    cost: Buffer,
+    /,
+) -> None: ...

@@ -3,6 +3,7 @@
  */
 #include "_kernels.h"
 #include <math.h>
+#include <stddef.h>
 
 typedef struct {
     double half_length, half_width, height, radius, scale, least;
@@ -75,6 +76,82 @@ PyObject *bar_fields(PyObject *self, PyObject *args)
             const double turned = -sin;
             sin = cos;
             cos = turned;
+        }
+    }
+    Py_END_ALLOW_THREADS
+    return done(b, BUFFERS, 1);
+}
+
+/* Bilinear value at (i, j) of a square table, 0 outside. */
+static inline float look_up(const float *table, int size, float i, float j)
+{
+    const float last = (float)(size - 1);
+    if (!(i >= 0 && j >= 0 && i < last && j < last)) return 0;
+    const int a = (int)i, b = (int)j;
+    const float di = i - (float)a, dj = j - (float)b;
+    const float *at = table + (ptrdiff_t)a * size + b;
+    return (1 - di) * ((1 - dj) * at[0] + dj * at[1])
+           + di * ((1 - dj) * at[size] + dj * at[size + 1]);
+}
+
+/* Costs of the sixteen codes from the normal matrix of the four bars. */
+static void costs(const double *normal, const double *right, double power, double least,
+                  double most, double *out)
+{
+    for (int code = 0; code < 16; code++) {
+        double sign[4], top = 0, square = 0;
+        for (int k = 0; k < 4; k++) sign[k] = code >> k & 1 ? 1 : -1;
+        for (int k = 0; k < 4; k++) {
+            top += sign[k] * right[k];
+            for (int l = 0; l < 4; l++) square += sign[k] * sign[l] * normal[4 * k + l];
+        }
+        const double gain = fmin(fmax(top / fmax(square, 1e-300), least), most);
+        out[code] = power - 2 * gain * top + gain * gain * square;
+    }
+}
+
+PyObject *scan_landmarks(PyObject *self, PyObject *args)
+{
+    enum { POINTS, VALUES, WEIGHTS, CENTRES, TURNS, TABLE, COST, BUFFERS };
+    Py_buffer b[BUFFERS];
+    int count, nodes, turns, size;
+    double step, least, most;
+    if (!PyArg_ParseTuple(args, "y*y*y*iy*iy*iy*idddw*", &b[POINTS], &b[VALUES], &b[WEIGHTS],
+                          &count, &b[CENTRES], &nodes, &b[TURNS], &turns, &b[TABLE], &size, &step,
+                          &least, &most, &b[COST]))
+        return NULL;
+    const double *points = b[POINTS].buf, *values = b[VALUES].buf, *weights = b[WEIGHTS].buf;
+    const double *centres = b[CENTRES].buf, *angle = b[TURNS].buf;
+    const float *table = b[TABLE].buf;
+    double *out = b[COST].buf;
+    const float middle = (float)(size - 1) / 2;
+    Py_BEGIN_ALLOW_THREADS
+    double power = 0;
+    for (int i = 0; i < count; i++) power += weights[i] * values[i] * values[i];
+    for (int t = 0; t < turns; t++) {
+        const double c = cos(angle[t]) / step, s = sin(angle[t]) / step;
+        for (int m = 0; m < nodes; m++, out += 16) {
+            double normal[16] = {0}, right[4] = {0};
+            for (int i = 0; i < count; i++) {
+                const double x = points[2 * i] - centres[2 * m];
+                const double y = points[2 * i + 1] - centres[2 * m + 1];
+                const float u = (float)(c * x + s * y), v = (float)(c * y - s * x);
+                if (fabsf(u) >= middle || fabsf(v) >= middle) continue;
+                const float unit[4] = {
+                    look_up(table, size, u + middle, v + middle),
+                    look_up(table, size, v + middle, -u + middle),
+                    look_up(table, size, -u + middle, -v + middle),
+                    look_up(table, size, -v + middle, u + middle),
+                };
+                for (int k = 0; k < 4; k++) {
+                    const double weighted = weights[i] * unit[k];
+                    right[k] += weighted * values[i];
+                    for (int l = 0; l <= k; l++) normal[4 * k + l] += weighted * unit[l];
+                }
+            }
+            for (int k = 0; k < 4; k++)
+                for (int l = k + 1; l < 4; l++) normal[4 * k + l] = normal[4 * l + k];
+            costs(normal, right, power, least, most, out);
         }
     }
     Py_END_ALLOW_THREADS

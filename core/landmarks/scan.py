@@ -1,0 +1,166 @@
+"""First places: where, under which turn and of which code a landmark may lie, on a grid."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.kernels import kernels
+from locatk.core.landmarks import bars
+from locatk.core.landmarks.landmark import CODES, Geometry, signs
+from locatk.core.landmarks.trace import Trace
+
+Array = NDArray[np.float64]
+
+STEP_M = 7e-3
+
+TURNS = np.radians(np.arange(-45, 45, 9))
+
+REACH_M = 0.11
+"""Of a landmark's field, as far as the scan looks."""
+
+TABLE_STEP_M = 1e-3
+
+FARTHEST_M = 0.062
+"""From a place of strong field to the landmark's centre."""
+
+STRONG = 0.6
+"""Field of a place near a landmark, in units of the threshold."""
+
+SLACK = 0.2
+"""Of a field, for the grid's coarseness."""
+
+FLOOR_T = 3e-4
+
+GAINS = (0.6, 1.15)
+
+APART_M = 0.012
+
+APART_RAD = math.radians(16)
+
+
+def candidates(trace: Trace, geometry: Geometry, most: int) -> tuple[Array, NDArray[np.int64]]:
+    """The likeliest places of the landmark under a trace.
+
+    Parameters
+    ----------
+    trace : Trace
+        Best thinned: each sample costs.
+    geometry : Geometry
+    most : int
+        Number of candidates.
+
+    Returns
+    -------
+    (K, 3) ndarray, (K,) ndarray
+        x, y, heading in the trace's frame and the code; the best first, no two alike. Empty
+        where no field is strong.
+    """
+    place = trace.places()
+    seen = ~np.isnan(trace.value_t)
+    strong = seen & (np.abs(np.where(seen, trace.value_t, 0)) > STRONG * geometry.threshold_t)
+    if not strong.any():
+        return np.empty((0, 3)), np.empty(0, np.int64)
+    centres = _centres(place[strong])
+    cost = scan(place[seen], trace.value_t[seen], centres, geometry)
+    return _distinct(cost, centres, most)
+
+
+def scan(points: Array, values: Array, centres: Array, geometry: Geometry) -> Array:
+    """Cost (turns, centres, 16) of each code at each place: weighted squares left over.
+
+    One normal matrix of the four bars serves all sixteen codes; a common gain is free
+    within :data:`GAINS`.
+    """
+    weight = 1 / (FLOOR_T**2 + (SLACK * values) ** 2)
+    table = _table(geometry)
+    if kernels is None:
+        return scan_numpy(points, values, weight, centres, table)
+    cost = np.empty((len(TURNS), len(centres), CODES))
+    kernels.scan_landmarks(
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(values),
+        weight,
+        len(values),
+        np.ascontiguousarray(centres),
+        len(centres),
+        TURNS,
+        len(TURNS),
+        table,
+        len(table),
+        TABLE_STEP_M,
+        *GAINS,
+        cost,
+    )
+    return cost
+
+
+def scan_numpy(
+    points: Array, values: Array, weight: Array, centres: Array, table: NDArray[np.float32]
+) -> Array:
+    """Twin of the compiled loop."""
+    last = len(table) - 1
+    every = signs(np.arange(CODES))
+    cost = np.empty((len(TURNS), len(centres), CODES))
+    power = (weight * values**2).sum()
+    for number, turn in enumerate(TURNS):
+        x, y = np.moveaxis(points - centres[:, None], -1, 0)
+        c, s = math.cos(turn), math.sin(turn)
+        u, v = (c * x + s * y) / TABLE_STEP_M, (c * y - s * x) / TABLE_STEP_M
+        unit = np.empty((4, *u.shape))
+        for k in range(4):
+            i, j = u + last / 2, v + last / 2
+            inside = (i >= 0) & (j >= 0) & (i < last) & (j < last)
+            i, j = np.where(inside, i, 0), np.where(inside, j, 0)
+            a, b = i.astype(int), j.astype(int)
+            di, dj = i - a, j - b
+            unit[k] = inside * (
+                (1 - di) * ((1 - dj) * table[a, b] + dj * table[a, b + 1])
+                + di * ((1 - dj) * table[a + 1, b] + dj * table[a + 1, b + 1])
+            )
+            u, v = v, -u
+        right = np.einsum("kmn,n->mk", unit, weight * values)
+        normal = np.einsum("kmn,lmn,n->mkl", unit, unit, weight, optimize=True)
+        top = right @ every.T
+        square = np.einsum("ck,mkl,cl->mc", every, normal, every)
+        gain = np.clip(top / np.maximum(square, 1e-300), *GAINS)
+        cost[number] = power - 2 * gain * top + gain * gain * square
+    return cost
+
+
+def _centres(strong: Array) -> Array:
+    """Nodes (m, 2) of the grid within reach of places (p, 2) of strong field."""
+    low = strong.min(axis=0) - FARTHEST_M
+    high = strong.max(axis=0) + FARTHEST_M
+    x, y = (np.arange(a, b + STEP_M, STEP_M) for a, b in zip(low, high, strict=True))
+    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    gap = ((nodes[:, None] - strong) ** 2).sum(axis=-1).min(axis=1)
+    return nodes[gap < FARTHEST_M**2]
+
+
+def _distinct(cost: Array, centres: Array, most: int) -> tuple[Array, NDArray[np.int64]]:
+    """The best nodes, none of which is a neighbour of a better one of the same code."""
+    order = np.argsort(cost, axis=None)[: 60 * most]
+    turn, node, code = np.unravel_index(order, cost.shape)
+    pose = np.column_stack([centres[node], TURNS[turn]])
+    left = np.ones(len(order), bool)
+    chosen: list[int] = []
+    while left.any() and len(chosen) < most:
+        best = int(np.argmax(left))
+        chosen.append(best)
+        near = np.hypot(*(pose[:, :2] - pose[best, :2]).T) < APART_M
+        near &= np.abs(pose[:, 2] - pose[best, 2]) < APART_RAD
+        left &= ~(near & (code == code[best]))
+    return pose[chosen], code[chosen].astype(np.int64)
+
+
+@functools.lru_cache(maxsize=4)
+def _table(geometry: Geometry) -> NDArray[np.float32]:
+    """Field of bar 0 over the landmark's plane, [x, y] from -REACH_M up in even steps."""
+    count = round(REACH_M / TABLE_STEP_M)
+    line = np.arange(-count, count + 1) * TABLE_STEP_M
+    plane = np.stack(np.meshgrid(line, line, indexing="ij"), -1)
+    return np.ascontiguousarray(bars.basis(geometry, plane)[..., 0], np.float32)
