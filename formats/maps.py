@@ -2,7 +2,7 @@
 
 Its keys are described in docs/formats.md. Lengths are in mm and angles in degrees,
 exactly: what is written and read again is the same to the last bit. The other artifact of
-landmarks, ``halls.toml``, is in :mod:`.halls`, whose functions are also found here.
+landmarks, ``halls.toml``, is in :mod:`.hall_sensors`, whose functions are also found here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.floor import ALPHABETS, HOLE, WINDOWS, AsBuilt, Cell, FloorMap, Wall
 from locatk.core.landmarks.landmark import Geometry, code_of, name
 from locatk.formats import toml
-from locatk.formats.halls import (
+from locatk.formats.hall_sensors import (
     HALLS_FILE,
     attached_halls,
     dumps_halls,

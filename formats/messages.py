@@ -16,7 +16,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 from locatk.formats.proto.lighthouse_pb2 import LighthouseSweep
-from locatk.formats.proto.magnetics_pb2 import MagnetometerArray
+from locatk.formats.proto.magnetics_pb2 import HallArray, MagnetometerArray
 from locatk.formats.proto.poses_pb2 import Odometry, PoseTrack
 
 
@@ -215,6 +215,15 @@ def magnetometers(sensors: int) -> Layout:
         MagnetometerArray,
         ("device", "frame_id"),
         (Column("time_ns", "<i8"), Column("b_tesla", "<f4", 3 * sensors)),
+    )
+
+
+def halls(sensors: int) -> Layout:
+    """Layout of the samples of so many hall sensors, which the message tells."""
+    return Layout(
+        HallArray,
+        ("device", "frame_id"),
+        (Column("time_ns", "<i8"), Column("b_tesla", "<f4", sensors)),
     )
 
 
