@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_exp
-from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.floor import Cell, FloorMap
 from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS, Geometry, code_of, signs
 from locatk.core.landmarks.simulate_options import Errors, Faults
 
@@ -205,10 +205,3 @@ def floor_field(geometry: Geometry, landmarks: Iterable[Laid], points: Array) ->
             each = bar_fields(geometry, mark.middle_m, mark.axes, flat[near][:, None])
             field[near] += each @ mark.strength
     return field.reshape(points.shape[:-1])
-
-
-def designed_code(floor: FloorMap, cell: Cell) -> int:
-    """Code of a cell, :data:`HOLE` outside of the map."""
-    rows, columns = floor.shape
-    inside = 0 <= cell[0] < rows and 0 <= cell[1] < columns
-    return int(floor.codes[cell]) if inside else HOLE

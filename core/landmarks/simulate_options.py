@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 
 from locatk.core.landmarks.floor import Cell
+from locatk.core.landmarks.halls import NAMES, HallSensors
+from locatk.core.landmarks.landmark import PATTERNS
+from locatk.core.landmarks.simulate_robot import Limits
 from locatk.core.simulation import check_options
 
 PASS_M = 0.23
 """Way of one pass in facts/landmarks.md 3, on which the heading drifts by one degree."""
+
+START_M = 0.115
+"""Radius of the circle of starts of the paper's passes (section 3.5.1)."""
+
+ASIDE_RAD = math.pi / 4
+"""How far their heading is off the landmark's centre, at most."""
+
+STRATEGIES = ("paper", "path", "pass")
 
 
 @dataclass(frozen=True)
@@ -123,3 +134,148 @@ class Faults:
     dead: tuple[str, ...] = ()
     stuck: tuple[str, ...] = ()
     swapped: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Aims:
+    """How well the robot hits what it aims for, which it finds without any solver.
+
+    Attributes
+    ----------
+    first_m, second_m, step_m : float
+        Mean distance between a landmark's centre and where the robot takes it to be: after
+        the first pass, after a spin, and where it comes from the last landmark or follows a
+        path. The defaults are about what the paper reports (sections 3.5.2 and 5.2.2).
+    heading_rad : float
+        Standard deviation of its heading when it has aligned with a landmark (5.2.3).
+    """
+
+    first_m: float = 0.007
+    second_m: float = 0.002
+    step_m: float = 0.003
+    heading_rad: float = math.radians(1.0)
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """What to simulate.
+
+    Attributes
+    ----------
+    strategy : str
+        One of :data:`STRATEGIES`. ``"paper"``: search, spin, compensate, and on to the
+        neighbours of the map's window (Fig. 12). ``"path"``: straight from waypoint to
+        waypoint. ``"pass"``: one straight pass over one landmark (section 3.5).
+    start : (x, y, heading) or None
+        Of the strategy ``paper``; None for anywhere between the landmarks.
+    landmarks : int or None
+        How many it visits; None for as many as the map's window has.
+    spins : int or None
+        At how many of these it spins, the others being passed with a stop; None for those
+        of the window.
+    waypoints : tuple of (x, y)
+        Of the strategy ``path``, in metres of the map's frame.
+    cells : tuple of cell
+        Or the same as cells, which the robot hits as well as its aims allow.
+    cell : (row, column) or None
+        Of the strategy ``pass``; None for any (of that pattern).
+    pattern : str
+        Of the strategy ``pass``: one of the six patterns, ``""`` for any.
+    offset_m : float or None
+        By how far it passes left of the centre; None for a heading within 45 degrees.
+    approach_rad : float or None
+        Where on the circle of starts it begins, in the map's frame; None for anywhere.
+    limits : Limits
+    aims : Aims
+    errors : Errors
+    faults : Faults
+    sensors : HallSensors or None
+        None for four on the circle of the map's geometry.
+    range_t : float
+        Greatest field that they tell, where ``sensors`` is None.
+    rate_hz, odometry_hz : float
+    rest_s, stop_s : float
+        Standing at the start and at the end, and on each landmark.
+    device : str
+    seed : int
+
+    Raises
+    ------
+    InputError
+        A value is out of its range.
+    """
+
+    strategy: str = "paper"
+    start: tuple[float, float, float] | None = None
+    landmarks: int | None = None
+    spins: int | None = None
+    waypoints: tuple[tuple[float, float], ...] = ()
+    cells: tuple[Cell, ...] = ()
+    cell: Cell | None = None
+    pattern: str = ""
+    offset_m: float | None = None
+    approach_rad: float | None = None
+    limits: Limits = field(default_factory=Limits)
+    aims: Aims = field(default_factory=Aims)
+    errors: Errors = field(default_factory=Errors)
+    faults: Faults = field(default_factory=Faults)
+    sensors: HallSensors | None = None
+    range_t: float = math.inf
+    rate_hz: float = 200.0
+    odometry_hz: float = 50.0
+    rest_s: float = 0.5
+    stop_s: float = 0.5
+    device: str = "robot"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        above_0, from_0 = "a number above 0", "0 or more"
+        names = self.sensors.names if self.sensors else NAMES
+        faults = self.faults
+        told = {*faults.dead, *faults.stuck, *(name for pair in faults.swapped for name in pair)}
+        path = self.strategy == "path"
+        check_options(
+            self,
+            (
+                ("strategy", self.strategy in STRATEGIES, f"one of {', '.join(STRATEGIES)}"),
+                ("start", _finite(self.start), "three numbers"),
+                ("landmarks", (self.landmarks or 1) >= 1, "1 or more"),
+                ("spins", (self.spins or 0) >= 0, from_0),
+                ("waypoints", all(map(_finite, self.waypoints)), "numbers"),
+                ("waypoints", not (self.waypoints and self.cells), "waypoints or cells"),
+                (
+                    "waypoints",
+                    not path or len(self.waypoints or self.cells) >= 2,
+                    "two waypoints or cells, or more",
+                ),
+                (
+                    "pattern",
+                    self.pattern in ("", *PATTERNS),
+                    f"one of {', '.join(PATTERNS)}",
+                ),
+                (
+                    "offset_m",
+                    self.offset_m is None or abs(self.offset_m) <= START_M,
+                    f"at most {START_M * 1e3:g} mm either way",
+                ),
+                (
+                    "approach_rad",
+                    self.approach_rad is None or math.isfinite(self.approach_rad),
+                    "a number",
+                ),
+                ("limits", all(0 < value < math.inf for value in astuple(self.limits)), above_0),
+                ("aims", all(0 <= value < math.inf for value in astuple(self.aims)), from_0),
+                ("faults", 0 <= faults.misread_rate <= 1, "a misread_rate of 0 to 1"),
+                ("faults", told <= set(names), f"sensors of {', '.join(names)}"),
+                ("range_t", self.range_t > 0, above_0),
+                ("rate_hz", 0 < self.rate_hz < math.inf, above_0),
+                ("odometry_hz", 0 < self.odometry_hz < math.inf, above_0),
+                ("rest_s", 0 <= self.rest_s < math.inf, from_0),
+                ("stop_s", 0 <= self.stop_s < math.inf, from_0),
+                ("seed", self.seed >= 0, from_0),
+            ),
+        )
+
+
+def _finite(values: tuple[float, ...] | None) -> bool:
+    return values is None or all(map(math.isfinite, values))

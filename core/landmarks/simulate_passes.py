@@ -18,7 +18,7 @@ from locatk.core.geometry import quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import CODES, Geometry, signs
 from locatk.core.landmarks.simulate_floor import bar_fields, scatter_bars
-from locatk.core.landmarks.simulate_options import PASS_M, Errors
+from locatk.core.landmarks.simulate_options import ASIDE_RAD, PASS_M, START_M, Errors
 from locatk.core.landmarks.simulate_sensors import digitise, gains, odometry
 from locatk.core.trajectory import Trajectory
 
@@ -26,12 +26,6 @@ Array = NDArray[np.float64]
 
 EPOCH_NS = 1_767_225_600_000_000_000
 """Start of every simulated session: 2026-01-01T00:00:00Z."""
-
-START_M = 0.115
-"""Radius of the circle of starts (section 3.5.1)."""
-
-ASIDE_RAD = math.pi / 4
-"""How far a heading is off the landmark's centre, at most (section 3.5.1)."""
 
 STEP_M = 0.002
 """Between the samples of a pass."""
@@ -135,7 +129,9 @@ def passes(
         No such code or sequel.
     """
     geometry, errors = geometry or Geometry(), errors or Errors()
-    sensors = sensors or HallSensors(position_m=circle(geometry.circle_m))
+    sensors = sensors or HallSensors(
+        position_m=circle(geometry.circle_m), noise_t=errors.noise_t or float("nan")
+    )
     if then not in THEN:
         raise InputError(f"a pass with the sequel {then!r}", hint=f"Give one of {THEN[1:]}")
     codes = _codes(count, code, np.random.default_rng([seed, 30]))
@@ -178,7 +174,9 @@ def passes(
     return made
 
 
-def _codes(count: int, code: int | Sequence[int] | None, rng: np.random.Generator) -> Array:
+def _codes(
+    count: int, code: int | Sequence[int] | None, rng: np.random.Generator
+) -> NDArray[np.int64]:
     if code is None:
         return rng.integers(0, CODES, count)
     given = np.atleast_1d(np.asarray(code, np.int64))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,10 +51,8 @@ def digitise(read: Array, range_t: float, quantum_t: float) -> tuple[Array, int]
     return np.clip(read, -range_t, range_t), int(np.count_nonzero(np.abs(read) >= range_t))
 
 
-def odometry(
-    poses: Array, errors: Errors, rng: np.random.Generator
-) -> tuple[Array, Sequence[float]]:
-    """Poses (n, 3) as the wheels tell them, from (0, 0, 0), and their own distances.
+def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Array, list[int]]:
+    """Poses (n, 3) as the wheels tell them, from (0, 0, 0), and where they slipped.
 
     Parameters
     ----------
@@ -68,7 +64,7 @@ def odometry(
 
     Returns
     -------
-    (n, 3) ndarray, and the distances at which a wheel slipped.
+    (n, 3) ndarray, and the numbers of the poses at which a wheel began to slip.
 
     Notes
     -----
@@ -88,7 +84,7 @@ def odometry(
         errors.odometry_turn,
     ]
     told = wheels + errors.wheel_noise_m * np.sqrt(np.abs(wheels)) * rng.normal(size=wheels.shape)
-    slips = []
+    slips: list[int] = []
     travelled = np.cumsum(np.abs(way))
     if errors.slips_per_m > 0 and len(travelled):
         count = rng.poisson(errors.slips_per_m * travelled[-1])
@@ -96,7 +92,7 @@ def odometry(
             wheel = int(rng.integers(2))
             within = (travelled >= start) & (travelled < start + SLIP_M)
             told[within, wheel] += np.abs(wheels[within, wheel]) * errors.slip_m / SLIP_M
-            slips.append(float(start))
+            slips.append(int(np.argmax(within)))
     ahead = told.mean(axis=1)
     turned = (told[:, 1] - told[:, 0]) / TRACK_M * (1 + turn) + drift * ahead
     heading = np.r_[0.0, np.cumsum(turned)]
