@@ -27,6 +27,6 @@ static inline PyObject *done(Py_buffer *buffers, int count, int stored)
 PyObject *bar_fields(PyObject *self, PyObject *args);
 PyObject *scan_landmarks(PyObject *self, PyObject *args);
 /* core/_maps.c */
-PyObject *anneal_map(PyObject *self, PyObject *args);
+PyObject *search_map(PyObject *self, PyObject *args);
 
 #endif
