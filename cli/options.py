@@ -75,10 +75,11 @@ as_json = click.option(
 
 method = click.option(
     "--method",
-    type=click.Choice(("bundle", "joint", "lattice", "paper")),
+    type=click.Choice(("bundle", "field", "joint", "lattice", "paper")),
     default=None,
     help="Algorithm: `paper` is the published one as written; the better one is `bundle` of "
-    "lighthouse, `joint` of polaris, `lattice` of dots.  [default: the system's better one]",
+    "lighthouse, `joint` of polaris, `lattice` of dots, `field` of landmarks.  "
+    "[default: the system's better one]",
 )
 
 artifact = input_option(

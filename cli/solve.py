@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, failures, options
+from locatk.cli import console, failures, options, seen
 from locatk.core.errors import LocatkError
 
 if TYPE_CHECKING:
     from locatk.cli.systems import Solved
-    from locatk.core.solution import Solution
-
-DEGREES = math.degrees(1)
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 
@@ -71,8 +67,9 @@ def command(
 ) -> None:
     """Solve SESSIONS and write the poses to OUTPUT.
 
-    The exit status is 3 where a session could not be solved, a device in it has no pose, or
-    a tag was not read; the rest is written all the same.
+    The exit status is 3 where a session could not be solved, a device in it has no pose, a
+    tag was not read, or a robot does not know where on the map it is; the rest is written
+    all the same.
 
     \b
     Examples:
@@ -82,6 +79,7 @@ def command(
       locatk solve day/*.mcap -o solved/ --artifact scene.toml
       locatk solve frames.mcap -o solved.mcap --camera camera.toml
       locatk solve pass.mcap -o solved.mcap --artifact tag.toml --speed 0.105
+      locatk solve drive.mcap -o solved.mcap --artifact map.toml --method field
     """
     from locatk.cli.systems import Request, solve_session, system_of
     from locatk.formats import artifacts, solutions
@@ -89,7 +87,11 @@ def command(
     outputs = plan_outputs(sessions, output)
     if save_scene is not None and len(sessions) > 1:
         raise click.UsageError("--save-scene needs exactly one session.")
-    if save_scene is not None and (system := system_of(sessions[0])) in ("dots", "polaris"):
+    if save_scene is not None and (system := system_of(sessions[0])) in (
+        "dots",
+        "landmarks",
+        "polaris",
+    ):
         raise click.UsageError(f"--save-scene is for lighthouse: {system} solves no scene.")
     aside = [path for path in (artifact, camera) if path is not None]
     for path in outputs:
@@ -118,7 +120,7 @@ def command(
                 entries.append({"session": session, "error": error.message, "hint": error.hint})
                 continue
             entries.append(entry(session, target, solved))
-            losses += [f"{session}: {loss}" for loss in lost(solved.solution)]
+            losses += [f"{session}: {loss}" for loss in seen.lost(solved.solution)]
             said.append((text(session, target, solved), notes(session, solved)))
 
     for results, remarks in said:  # not inside the loop: a progress bar is there
@@ -133,21 +135,6 @@ def command(
         if all("error" in item for item in entries):
             raise click.ClickException(losses[0])
         raise failures.Incomplete(losses[0])
-
-
-def lost(solution: Solution) -> list[str]:
-    """What is left unsolved: devices without a pose, and tags that were not read."""
-    if not solution.trajectories:
-        losses = ["no pose at all"]
-    else:
-        losses = [f"no pose for {t.device}" for t in solution.trajectories if len(t) == 0]
-    if solution.system == "polaris":
-        unread = Counter(d["refused"] or "?" for d in solution.detections if d["tag_id"] is None)
-        losses += [
-            f"{n} {'tag' if n == 1 else 'tags'} not read ({why.replace('_', ' ')})"
-            for why, n in unread.items()
-        ]
-    return losses
 
 
 def plan_outputs(sessions: tuple[Path, ...], output: Path) -> list[Path]:
@@ -176,6 +163,7 @@ def entry(session: Path, output: Path, solved: Solved) -> dict[str, Any]:
         "rejected": solution.rejected,
         "solve_s": solved.solve_s,
         "detections": solution.detections,
+        **({"facts": solution.facts} if solution.system == "landmarks" else {}),
     }
 
 
@@ -189,43 +177,16 @@ def text(session: Path, output: Path, solved: Solved) -> str:
     rejected = ", ".join(
         f"{count} {reason.replace('_', ' ')}" for reason, count in solution.rejected.items()
     )
-    seen = tags_seen(solution.detections) if solution.system == "polaris" else None
+    saw = seen.seen(solution)
     return "\n".join(
         [
             f"{session} -> {output}: {solution.poses} poses, {solution.system} by "
             f"{solution.method}, {solved.solve_s:.3g} s",
-            *([seen] if seen else []),
+            *([saw] if saw else []),
             *([console.table(header, rows)] if rows else []),
             f"rejected: {rejected or 'nothing'}",
         ]
     )
-
-
-def tags_seen(detections: list[dict[str, Any]]) -> str | None:
-    """Tags as the array saw them, in its own frame; None where there was none."""
-    header = ("tag", "margin [steps]", "magnets", "x [mm]", "y [mm]", "heading [deg]")
-    sigmas = ("sigma x", "sigma y [mm]", "sigma heading [deg]")
-    rows = [
-        (
-            "-" if seen["tag_id"] is None else seen["tag_id"],
-            _number(seen["margin"], 1, ".2f"),
-            len(seen["magnets"]),
-            _number(seen["x_m"], 1e3, ".2f"),
-            _number(seen["y_m"], 1e3, ".2f"),
-            _number(seen["heading_rad"], DEGREES, ".2f"),
-            _number(seen["sigma_x_m"], 1e3, ".2g"),
-            _number(seen["sigma_y_m"], 1e3, ".2g"),
-            _number(seen["sigma_heading_rad"], DEGREES, ".2g"),
-        )
-        for seen in detections
-    ]
-    return console.table((*header, *sigmas), rows) if rows else None
-
-
-def _number(value: float | None, scale: float, form: str) -> str:
-    if value is None or not math.isfinite(value):
-        return "-"
-    return format(value * scale, form)
 
 
 def notes(session: Path, solved: Solved) -> list[str]:

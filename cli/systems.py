@@ -105,7 +105,37 @@ def polaris(session: Session, request: Request) -> Solved:
     return Solved(solution, time.perf_counter() - start)
 
 
-SYSTEMS: dict[str, Solver] = {"lighthouse": lighthouse, "dots": dots, "polaris": polaris}
+def landmarks(session: Session, request: Request) -> Solved:
+    """Solve a session of hall sensors over a floor of landmarks."""
+    from locatk.core import landmarks as system
+    from locatk.formats import maps, observations
+
+    _check(request, "landmarks", methods=("field", "paper"), refused=("scene", "camera", "speed"))
+    given = request.artifact
+    floor = observations.read_map(session) if given is None else maps.read_map(given)
+    samples = observations.read_halls(session)
+    odometry = observations.read_odometry(session)
+    driven = {trajectory.device for trajectory in odometry if len(trajectory) > 0}
+    for each in samples:
+        if each.device not in driven:
+            raise InputError(
+                f"no odometry of {each.device}",
+                file=session.path,
+                hint=f"Four sensors alone do not tell the way: record x, y and heading of the "
+                f"wheels too, on /odometry/{each.device}",
+            )
+    options = _given(system.SolveOptions, {"method": request.method})
+    start = time.perf_counter()
+    solution = system.solve(samples, floor, options, odometry=odometry)
+    return Solved(solution, time.perf_counter() - start)
+
+
+SYSTEMS: dict[str, Solver] = {
+    "lighthouse": lighthouse,
+    "dots": dots,
+    "polaris": polaris,
+    "landmarks": landmarks,
+}
 
 
 def solve_session(path: Path, request: Request) -> Solved:

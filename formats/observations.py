@@ -19,6 +19,8 @@ from locatk.formats import artifacts
 from locatk.formats.arrays import read_samples
 from locatk.formats.artifacts import attached_scene as read_scene
 from locatk.formats.frames import read_frames
+from locatk.formats.halls import read_samples as read_halls
+from locatk.formats.maps import attached_map as read_map
 from locatk.formats.messages import SWEEPS, batch_edges
 from locatk.formats.session import Session, SessionWriter
 from locatk.formats.sheets import attached_camera as read_camera
@@ -40,7 +42,9 @@ from locatk.formats.tracks import (
 __all__ = [
     "read_camera",
     "read_frames",
+    "read_halls",
     "read_manifest",
+    "read_map",
     "read_odometry",
     "read_samples",
     "read_scene",

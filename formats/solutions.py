@@ -13,11 +13,12 @@ import numpy as np
 
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError, LocatkError
+from locatk.core.landmarks.floor import FloorMap
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import artifacts, sheets, tags, viewers
+from locatk.formats import artifacts, maps, sheets, tags, viewers
 from locatk.formats.session import Session, SessionWriter
 from locatk.formats.tracks import (
     Timed,
@@ -36,6 +37,7 @@ ARTIFACTS: tuple[tuple[type, str, Callable[[Any], str]], ...] = (
     (Scene, artifacts.SCENE_FILE, artifacts.dumps_scene),
     (Manifest, sheets.SHEET_FILE, sheets.dumps_manifest),
     (Tags, tags.TAG_FILE, tags.dumps_tags),
+    (FloorMap, maps.MAP_FILE, maps.dumps_map),
 )
 """What a solution may stand on, and as what it is attached."""
 
@@ -168,7 +170,8 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
             detections=list(said["detections"]),
             artifact=artifacts.attached_scene(session)
             or sheets.attached_manifest(session)
-            or tags.attached_tags(session),
+            or tags.attached_tags(session)
+            or maps.attached_map(session),
             notes=tuple(said["notes"]),
             facts=dict(said["facts"]),
         )

@@ -186,10 +186,11 @@ def test_info_of_a_session_with_damaged_samples(locatk, tmp_path: Path) -> None:
     out = record(tmp_path / "run.mcap")
     session = Session.open(out)
     assert session.damage is None
+    from locatk.formats.proto.magnetics_pb2 import MagnetometerArray
     from locatk.formats.session import SessionWriter
 
     (samples,) = observations.read_samples(session)
-    message = next(iter(session.decoded("/magnetometers/bar", arrays.MagnetometerArray)))[1]
+    message = next(iter(session.decoded("/magnetometers/bar", MagnetometerArray)))[1]
     bad = tmp_path / "bad.mcap"
     with SessionWriter(bad, system="polaris") as writer:
         writer.attach("array.toml", tags.dumps_array(samples.array).encode(), "application/toml")
