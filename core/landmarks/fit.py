@@ -21,9 +21,6 @@ STEPS = 30
 CONVERGED = 1e-3
 """Change of the cost at which a descent ends."""
 
-MISSING = 0.02
-"""Prior probability that one given bar is missing or has lost its magnetisation."""
-
 
 @dataclass(frozen=True)
 class Priors:
@@ -43,8 +40,10 @@ class Priors:
         Of the sensors over the bars, common to all.
     noise_t : float
         Of a sample.
-    model : float
-        What the model itself leaves, in units of the field.
+    faulty : float
+        Probability that a given bar is weak or missing.
+    floor_t, model : float
+        What the model itself leaves, and the same in units of the field.
     drift : Drift
     """
 
@@ -54,6 +53,8 @@ class Priors:
     place_m: float = 0.5e-3
     height_m: float = 0.5e-3
     noise_t: float = 1.5e-4
+    faulty: float = 0.01
+    floor_t: float = 2e-5
     model: float = 0.005
     drift: Drift = field(default_factory=Drift)
 
@@ -125,8 +126,9 @@ class Problem:
         total = np.einsum("knsb,kb->kns", moved, strength)
         seen = ~np.isnan(trace.value_t)
         value = np.where(seen, trace.value_t, 0.0)
-        root = np.sqrt(trace.weight)[:, None] / np.hypot(priors.noise_t, priors.model * value)
-        root = np.where(seen, root, 0.0)
+        variance = priors.noise_t**2 / trace.weight[:, None] + priors.floor_t**2
+        variance = variance + (priors.model * value) ** 2
+        root = np.where(seen, np.sqrt(trace.share / variance), 0.0)
         g = 1 + priors.gain * gain[:, None]
         model = g * total + priors.offset_t * offset[:, None]
         residual = (root * (model - value)).reshape(hypotheses, -1)
@@ -198,13 +200,13 @@ class Fitted:
 
 def descend(problem: Problem, start: Array, steps: int = STEPS) -> Fitted:
     """Levenberg-Marquardt from each start (K, size), all at once."""
-    prior = np.zeros(problem.size)
-    prior[POSE:] = 1
+    prior = np.ones(problem.size)  # of a metre and a radian for the pose: as good as none
+    pull = np.where(np.arange(problem.size) < POSE, 0.0, 1.0)
     now = start.copy()
     residual, slope = problem.residuals(now, jacobian=True)
     cost = _cost(residual, now)
     matrix = slope.swapaxes(1, 2) @ slope + np.diag(prior)
-    gradient = np.einsum("krp,kr->kp", slope, residual) + prior * now
+    gradient = np.einsum("krp,kr->kp", slope, residual) + pull * now
     damping = np.full(len(now), 1e-3)
     running = np.ones(len(now), bool)
     diagonal = np.arange(problem.size)
@@ -227,7 +229,7 @@ def descend(problem: Problem, start: Array, steps: int = STEPS) -> Fitted:
         fresh = trial_slope[better]
         matrix[taken] = fresh.swapaxes(1, 2) @ fresh + np.diag(prior)
         gradient[taken] = (
-            np.einsum("krp,kr->kp", fresh, trial_residual[better]) + prior * trial[better]
+            np.einsum("krp,kr->kp", fresh, trial_residual[better]) + pull * trial[better]
         )
         running[which] = (gained > CONVERGED) & (damping[which] < 1e6)
     return Fitted(now, cost, matrix)

@@ -143,7 +143,9 @@ def _centres(strong: Array) -> Array:
 
 def _distinct(cost: Array, centres: Array, most: int) -> tuple[Array, NDArray[np.int64]]:
     """The best nodes, none of which is a neighbour of a better one of the same code."""
-    order = np.argsort(cost, axis=None)[: 60 * most]
+    flat = cost.ravel()
+    order = np.argpartition(flat, min(60 * most, len(flat) - 1))[: 60 * most]
+    order = order[np.argsort(flat[order])]
     turn, node, code = np.unravel_index(order, cost.shape)
     pose = np.column_stack([centres[node], TURNS[turn]])
     left = np.ones(len(order), bool)

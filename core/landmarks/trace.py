@@ -59,8 +59,10 @@ class Trace:
     lever_m : (N, 2) ndarray
         Sensors in the robot's frame.
     weight : (n,) ndarray
-        How many samples a sample stands for.
+        Samples of which each is the mean.
     reference : int
+    share : float
+        How many there were for each that was kept.
     """
 
     pose: Array
@@ -69,6 +71,7 @@ class Trace:
     lever_m: Array
     weight: Array
     reference: int
+    share: float = 1.0
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -88,8 +91,9 @@ class Trace:
             self.correction[keep],
             self.value_t[keep],
             self.lever_m,
-            self.weight[keep] * step,
+            self.weight[keep],
             self.reference // step,
+            self.share * step,
         )
 
 

@@ -1,0 +1,249 @@
+"""From one trace to the landmarks that may explain it, each with its probability."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.landmarks import fit, scan
+from locatk.core.landmarks.landmark import CODES, Geometry, rotated, signs
+from locatk.core.landmarks.trace import Trace
+
+Array = NDArray[np.float64]
+
+COARSE = 36
+"""Samples for the scan and the first descents."""
+
+FINE = 150
+"""Samples for the last descents."""
+
+STARTS = 10
+
+FIRST_STEPS = 7
+
+MARGIN = 12.0
+"""Logarithm of odds at which a hypothesis is dropped before the last descents."""
+
+MOST = 8
+"""Hypotheses that are kept."""
+
+SAME = 3e-3
+"""Difference of place (m) and heading (rad) up to which two ends are one."""
+
+HALF_PI = np.pi / 2
+
+FAULTY = 0.7
+"""Standard deviation of a bar's strength that may be weak or missing."""
+
+SUSPICIOUS = 2.5
+"""Strength of a bar, in standard deviations off, at which it may be faulty."""
+
+WHITE = 1.6
+"""Residual, in standard deviations, up to which nothing need be faulty."""
+
+GONE = 0.25
+"""Strength under which nobody can tell how a bar lay."""
+
+LEAST = 1e-9
+"""Probability under which a hypothesis is not told."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """One landmark that may explain a trace.
+
+    Attributes
+    ----------
+    code : int
+    log_odds : float
+        Logarithm of the evidence, but for a constant that is common to the trace.
+    parameters : (size,) ndarray
+        See :class:`.fit.Problem`.
+    covariance : (size, size) ndarray
+    strength : (4,) ndarray
+        Signed, in units of the nominal one.
+    strength_sigma : (4,) ndarray
+    residual_sigma : float
+        Rms of what is left over, in standard deviations of a sample.
+    probability : float
+    """
+
+    code: int
+    log_odds: float
+    parameters: Array
+    covariance: Array
+    strength: Array
+    strength_sigma: Array
+    residual_sigma: float
+    probability: float = math.nan
+
+
+def explain(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explanation]:
+    """All landmarks that may explain a trace, the most probable first.
+
+    Parameters
+    ----------
+    trace : Trace
+    geometry : Geometry
+    priors : Priors
+
+    Returns
+    -------
+    list of Explanation
+        Their probabilities sum to 1; empty where no field is strong.
+    """
+    coarse = trace.thinned(COARSE)
+    pose, code = scan.candidates(coarse, geometry, STARTS)
+    if not len(pose):
+        return []
+    problem = _problem(coarse, geometry, priors, code)
+    first = fit.descend(problem, problem.start(pose), FIRST_STEPS)
+    pose, code = _siblings(first, code)
+    fine = trace.thinned(FINE)
+    problem = _problem(coarse, geometry, priors, code)
+    start = np.concatenate([first.parameters, problem.start(pose[len(first.parameters) :])])
+    second = fit.descend(problem, start, FIRST_STEPS)
+    odds = second.evidence()
+    keep = np.flatnonzero(odds > odds.max() - MARGIN)
+    code, start = _in_one_frame(code[keep], second.parameters[keep], odds[keep])
+    code, start = _unlike(code, start, odds[keep])
+    problem = _problem(fine, geometry, priors, code)
+    last = fit.descend(problem, start)
+    found = _explanations(problem, last, code)
+    best = max(found, key=lambda one: one.log_odds)
+    off = np.abs(best.strength - signs(best.code)) / priors.strength
+    if off.max() > SUSPICIOUS or best.residual_sigma > WHITE:
+        found += _faulty(best, fine, geometry, priors)
+    return _shares(found)
+
+
+def _problem(
+    trace: Trace, geometry: Geometry, priors: fit.Priors, code: NDArray[np.int64]
+) -> fit.Problem:
+    strength = signs(code)
+    return fit.Problem(
+        trace, geometry, priors, strength, np.full(strength.shape, priors.strength)
+    )
+
+
+def _siblings(first: fit.Fitted, code: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """The descents' ends, and all other codes at the best of these."""
+    odds = first.evidence()
+    best = int(np.argmax(odds))
+    pose = first.parameters[:, :3]
+    others = np.array([c for c in range(CODES) if c != code[best]])
+    return (
+        np.concatenate([pose, np.repeat(pose[best : best + 1], len(others), axis=0)]),
+        np.concatenate([code, others]),
+    )
+
+
+def _in_one_frame(
+    code: NDArray[np.int64], parameters: Array, odds: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """The same landmarks in frames that differ by no quarter turn from that of the best."""
+    best = parameters[np.argmax(odds), 2]
+    best -= HALF_PI * np.round(best / HALF_PI)
+    turns = np.round((best - parameters[:, 2]) / HALF_PI).astype(np.int64)
+    turned = parameters.copy()
+    turned[:, 2] += HALF_PI * turns
+    return rotated(code, -turns), turned
+
+
+def _unlike(
+    code: NDArray[np.int64], parameters: Array, odds: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """The best of each group that is the same, and of no more than :data:`MOST` groups."""
+    kept: list[int] = []
+    for i in np.argsort(-odds):
+        gap = np.abs(parameters[kept, :3] - parameters[i, :3]).max(axis=1)
+        if not np.any((code[kept] == code[i]) & (gap < SAME)) and len(kept) < MOST:
+            kept.append(int(i))
+    return code[kept], parameters[kept]
+
+
+def _faulty(
+    best: Explanation, trace: Trace, geometry: Geometry, priors: fit.Priors
+) -> list[Explanation]:
+    """The best explanation with each bar in turn of any strength."""
+    strength = np.repeat(signs([best.code]), 4, axis=0)
+    sigma = np.full((4, 4), priors.strength)
+    every = np.arange(4)
+    start = np.repeat(best.parameters[None], 4, axis=0)
+    k = fit.POSE + 2 * len(trace.lever_m)
+    start[every, k + every] = best.strength / FAULTY
+    strength[every, every], sigma[every, every] = 0.0, FAULTY
+    problem = fit.Problem(trace, geometry, priors, strength, sigma)
+    fitted = fit.descend(problem, start)
+    found = []
+    for bar, one in enumerate(_explanations(problem, fitted, np.full(4, best.code))):
+        one = replace(one, log_odds=one.log_odds + math.log(priors.faulty))
+        same = best.code & ~(1 << bar) | (one.strength[bar] > 0) << bar
+        if abs(one.strength[bar]) > GONE:
+            found.append(replace(one, code=same))
+        else:  # of a bar that is gone nobody can tell how it lay
+            half = one.log_odds - math.log(2)
+            found += [replace(one, code=c, log_odds=half) for c in (same, same ^ 1 << bar)]
+    return found
+
+
+def _shares(found: list[Explanation]) -> list[Explanation]:
+    """Probabilities from the odds; the most probable first."""
+    odds = np.array([one.log_odds for one in found])
+    weight = np.exp(odds - odds.max())
+    weight /= weight.sum()
+    return [
+        replace(found[i], probability=float(weight[i]))
+        for i in np.argsort(-weight, kind="stable")
+        if weight[i] > LEAST
+    ]
+
+
+def _explanations(
+    problem: fit.Problem, fitted: fit.Fitted, code: NDArray[np.int64]
+) -> list[Explanation]:
+    odds = fitted.evidence()
+    covariance = np.linalg.inv(fitted.information)
+    k = fit.POSE + 2 * len(problem.trace.lever_m)
+    span = slice(k, k + 4)
+    strength = problem.strength + problem.strength_sigma * fitted.parameters[:, span]
+    sigma = problem.strength_sigma * np.sqrt(np.einsum("kii->ki", covariance)[:, span])
+    residual = problem.residuals(fitted.parameters, jacobian=False)[0]
+    seen = max(int((~np.isnan(problem.trace.value_t)).sum()), 1)
+    rms = np.sqrt(np.einsum("kr,kr->k", residual, residual) / (seen * problem.trace.share))
+    return [
+        Explanation(
+            int(code[i]),
+            float(odds[i]),
+            fitted.parameters[i],
+            covariance[i],
+            strength[i],
+            sigma[i],
+            float(rms[i]),
+        )
+        for i in range(len(code))
+    ]
+
+
+def robot(trace: Trace, explanation: Explanation, at: int) -> tuple[Array, Array]:
+    """Robot in the landmark's frame at sample ``at`` of the trace.
+
+    Returns
+    -------
+    (3,) ndarray, (3, 3) ndarray
+        x, y, heading and their covariance, in m and rad.
+    """
+    count = trace.correction.shape[2]
+    rows = np.r_[: fit.POSE, len(explanation.parameters) - count : len(explanation.parameters)]
+    mark = explanation.parameters[: fit.POSE]
+    wrong = explanation.parameters[len(explanation.parameters) - count :]
+    pose = trace.pose[at] + trace.correction[at] @ wrong
+    cos, sin = np.cos(mark[2]), np.sin(mark[2])
+    back = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]])
+    seen = back @ (pose - mark)
+    slope = np.hstack([-back, back @ trace.correction[at]])
+    slope[:2, 2] = [seen[1], -seen[0]]
+    return seen, slope @ explanation.covariance[np.ix_(rows, rows)] @ slope.T

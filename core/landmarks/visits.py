@@ -1,0 +1,258 @@
+"""Where in a recording the robot was at a landmark, and what it measured there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import InputError
+from locatk.core.geometry import heading_of
+from locatk.core.landmarks.halls import HallSamples
+from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.trace import Drift, Trace, corrections, relative, sensor_places
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+NEAR = 0.2
+"""Field that tells of a landmark, in units of the threshold."""
+
+NEAR_SIGMA = 6.0
+"""The same in standard deviations of the noise, whichever is larger."""
+
+MARGIN_M = 0.08
+"""Way before and after, on which nothing is felt, that belongs to a visit."""
+
+BIN_M = 2e-3
+"""Way of the sensors over which samples are averaged."""
+
+MOST_BINS = 400
+
+LEAST_NOISE_T = 2e-5
+
+QUIET_T = 5e-4
+"""Fields that offsets and noise may make alone."""
+
+FEWEST_QUIET = 30
+
+DEAD = 1e-3
+"""A sensor that varies less than this share of the others is dead."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A recording whose every sample has a pose by odometry.
+
+    Attributes
+    ----------
+    samples : HallSamples
+        ``nan`` where a sensor was saturated or dead.
+    pose : (n, 3) ndarray
+        Robot by its odometry: x, y, heading (unwrapped).
+    offset_t : (N,) ndarray
+        Of each sensor, as far as it shows in the recording.
+    noise_t : float
+        Standard deviation of a sample.
+    notes : tuple of str
+    """
+
+    samples: HallSamples
+    pose: Array
+    offset_t: Array
+    noise_t: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A stretch of a recording near one landmark.
+
+    Attributes
+    ----------
+    first, stop : int
+        Samples ``first`` to ``stop - 1``.
+    time_ns : (n,) int64 ndarray
+        Mean times of the bins of :attr:`trace`.
+    trace : Trace
+    origin : (3,) ndarray
+        Robot by its odometry where the frame of the trace stands: at ``trace.reference``.
+    """
+
+    first: int
+    stop: int
+    time_ns: NDArray[np.int64]
+    trace: Trace
+    origin: Array
+
+
+def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
+    """Samples with poses by odometry; dead and saturated sensors taken out.
+
+    Raises
+    ------
+    InputError
+        There is no odometry, it covers no sample, or no sensor can be used.
+    """
+    if odometry is None or len(odometry) < 2:
+        raise InputError(
+            f"no odometry of {samples.device}",
+            hint="Record it beside the hall sensors: a trace without a way says too little",
+        )
+    time = samples.time_ns
+    covered = (time >= odometry.time_ns[0]) & (time <= odometry.time_ns[-1])
+    if covered.sum() < 2:
+        raise InputError(
+            f"the odometry of {samples.device} covers none of its samples",
+            hint="Check that both clocks are the same",
+        )
+    notes = []
+    if not covered.all():
+        notes.append(f"{samples.device}: {int((~covered).sum())} samples without odometry left out")
+    field = samples.field_t[covered].copy()
+    time = time[covered]
+    pose = np.column_stack(
+        [
+            _interpolated(time, odometry.time_ns, column)
+            for column in (
+                odometry.position[:, 0],
+                odometry.position[:, 1],
+                np.unwrap(heading_of(odometry.quaternion)),
+            )
+        ]
+    )
+    saturated = np.abs(field) >= 0.999 * samples.sensors.range_t
+    field[saturated] = np.nan
+    if saturated.any():
+        notes.append(f"{samples.device}: {100 * saturated.mean():.2g} % of the readings saturated")
+    notes += _silenced(samples, field)
+    offset = _offsets(field)
+    kept = HallSamples(samples.device, samples.sensors, time, field)
+    return Driven(kept, pose, offset, _noise(samples, field), tuple(notes))
+
+
+def find(
+    run: Driven, geometry: Geometry, drift: Drift, pitch_m: float = 0.2
+) -> list[Visit]:
+    """The visits of a recording, in order of time.
+
+    A visit is where a field is felt, with what lies between while the places where it is
+    felt are, by middle, less than half the pitch apart; and a margin before and after.
+    """
+    field = run.samples.field_t - run.offset_t
+    place = sensor_places(run.pose, run.samples.sensors.position_m)
+    strength = np.where(np.isnan(field), 0.0, np.abs(field))
+    bound = max(NEAR * geometry.threshold_t, NEAR_SIGMA * run.noise_t)
+    felt = strength > bound
+    any_felt = felt.any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], any_felt, [False]]).astype(np.int8)))
+    way = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(run.pose[:, :2], axis=0).T))])
+    found: list[list[int]] = []
+    middles: list[Array] = []
+    for first, stop in edges.reshape(-1, 2).tolist():
+        inside = strength[first:stop]
+        if inside.max() < geometry.threshold_t / 2:
+            continue
+        middle = _middle(place[first:stop], inside)
+        if found and np.hypot(*(middle - middles[-1])) < pitch_m / 2:
+            found[-1][1] = stop
+            whole = slice(found[-1][0], stop)
+            middles[-1] = _middle(place[whole], strength[whole] * felt[whole])
+        else:
+            found.append([first, stop])
+            middles.append(middle)
+    visits = []
+    for number, ((first, stop), middle) in enumerate(zip(found, middles, strict=True)):
+        before = (found[number - 1][1] + first) // 2 if number else 0
+        after = (stop + found[number + 1][0]) // 2 if number + 1 < len(found) else len(way)
+        first = max(before, int(np.searchsorted(way, way[first] - MARGIN_M)))
+        stop = min(after, int(np.searchsorted(way, way[stop - 1] + MARGIN_M, "right")))
+        visits.append(_visit(run, first, stop, middle, drift))
+    return visits
+
+
+def _visit(run: Driven, first: int, stop: int, middle: Array, drift: Drift) -> Visit:
+    pose = run.pose[first:stop]
+    step = np.diff(pose, axis=0, prepend=pose[:1])
+    reach = float(np.hypot(*run.samples.sensors.position_m.T).max())
+    way = np.cumsum(np.hypot(step[:, 0], step[:, 1]) + reach * np.abs(step[:, 2]))
+    unit = max(BIN_M, way[-1] / MOST_BINS)
+    number = np.floor(way / unit).astype(np.int64)
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    field = run.samples.field_t[first:stop] - run.offset_t
+    seen = ~np.isnan(field)
+    count = np.add.reduceat(seen.astype(float), starts, axis=0)
+    with np.errstate(invalid="ignore"):
+        value = np.add.reduceat(np.where(seen, field, 0.0), starts, axis=0) / count
+    every = np.diff(np.append(starts, len(pose)))
+    mean = np.add.reduceat(pose, starts, axis=0) / every[:, None]
+    distance = np.hypot(*(mean[:, :2] - middle).T)
+    near = np.flatnonzero(distance < distance.min() + 5e-3)
+    reference = int(near[-1])
+    local = relative(mean, mean[reference])
+    trace = Trace(
+        local,
+        corrections(local, reference, drift),
+        value,
+        run.samples.sensors.position_m,
+        every.astype(float),
+        reference,
+    )
+    since = run.samples.time_ns[first:stop] - run.samples.time_ns[first]
+    times = run.samples.time_ns[first] + np.add.reduceat(since, starts) // every
+    return Visit(first, stop, times, trace, mean[reference])
+
+
+def _middle(place: Array, strength: Array) -> Array:
+    """Where fields of a stretch are felt, by middle (2,)."""
+    weight = strength**2
+    return np.asarray(np.einsum("ns,nsi->i", weight, place) / weight.sum())
+
+
+def _interpolated(at: NDArray[np.int64], time_ns: NDArray[np.int64], value: Array) -> Array:
+    return np.interp((at - time_ns[0]) * 1e-9, (time_ns - time_ns[0]) * 1e-9, value)
+
+
+def _silenced(samples: HallSamples, field: Array) -> list[str]:
+    """Takes dead sensors out of ``field``, and says which they are."""
+    notes = []
+    for number, name in enumerate(samples.sensors.names):
+        if np.isnan(samples.field_t[:, number]).all():
+            notes.append(f"{samples.device}: the {name} sensor gave nothing")
+    spread = np.array(
+        [np.nan if np.isnan(column).all() else np.nanstd(column) for column in field.T]
+    )
+    if np.isnan(spread).all():
+        raise InputError(
+            f"no hall sensor of {samples.device} can be used",
+            hint="All are dead or saturated: check wiring and range",
+        )
+    for number in np.flatnonzero(spread < DEAD * np.nanmax(spread)):
+        field[:, number] = np.nan
+        notes.append(
+            f"{samples.device}: the {samples.sensors.names[number]} sensor never moved; left out"
+        )
+    return notes
+
+
+def _offsets(field: Array) -> Array:
+    """(N,) what each sensor tells where there is no landmark; 0 where it never is away."""
+    quiet = field[np.all(np.isnan(field) | (np.abs(field) < QUIET_T), axis=1)]
+    if len(quiet) < FEWEST_QUIET:
+        return np.zeros(field.shape[1])
+    silent = np.isnan(quiet).all(axis=0)
+    return np.where(silent, 0.0, np.nanmedian(np.where(silent, 0.0, quiet), axis=0))
+
+
+def _noise(samples: HallSamples, field: Array) -> float:
+    """Standard deviation of a sample: as told, else from neighbours where fields are even."""
+    told = samples.sensors.noise_t
+    if math.isfinite(told) and told > 0:
+        return max(told, LEAST_NOISE_T)
+    second = np.abs(field[2:] - 2 * field[1:-1] + field[:-2])
+    if not len(second):
+        return 10 * LEAST_NOISE_T
+    quiet = np.nanquantile(second, 0.25) / 0.3186 / math.sqrt(6)
+    return max(float(quiet), LEAST_NOISE_T)
