@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from locatk.cli import console, options, simulate_dots, simulate_polaris
+from locatk.cli import console, options, simulate_dots, simulate_landmarks, simulate_polaris
 
 
 @click.group(short_help="Make a session with known truth, without hardware.")
@@ -18,11 +18,13 @@ def command() -> None:
       locatk simulate lighthouse -o run.mcap
       locatk simulate dots -o run.mcap
       locatk simulate polaris -o run.mcap --id 262143
+      locatk simulate landmarks map.toml -o run.mcap
     """
 
 
 command.add_command(simulate_dots.command, "dots")
 command.add_command(simulate_polaris.command, "polaris")
+command.add_command(simulate_landmarks.command, "landmarks")
 
 
 @command.command(short_help="Robots driving under Lighthouse stations.")

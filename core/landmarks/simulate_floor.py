@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_exp
 from locatk.core.landmarks.floor import Cell, FloorMap
-from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS, Geometry, code_of, signs
+from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, code_of, signs
 from locatk.core.landmarks.simulate_options import Errors, Faults
 
 Array = NDArray[np.float64]
@@ -64,6 +64,7 @@ def lay(floor: FloorMap, errors: Errors, faults: Faults, seed: int) -> dict[Cell
     """Lay the landmarks of a map, with errors.
 
     Each landmark has random numbers of its own: a fault of one leaves the others alone.
+    Where the map says how a landmark was built, it lies so, but for the places of its bars.
 
     Raises
     ------
@@ -103,6 +104,10 @@ def _lay_one(floor: FloorMap, cell: Cell, errors: Errors, faults: Faults, seed: 
         code = int(rng.choice(_others(floor.alphabet, designed)))
         told.append("misread")
     signed = signs(code) * strength[0]
+    built = floor.built.get(cell)
+    if built is not None and not wrong:
+        off_x, off_y, turned = built.x_m, built.y_m, built.heading_rad
+        signed = np.where(np.isfinite(built.strength), built.strength, signed)
     for bar in range(4):
         if (cell, bar) in faults.flipped:
             signed[bar] *= -1
@@ -132,13 +137,11 @@ def _lay_one(floor: FloorMap, cell: Cell, errors: Errors, faults: Faults, seed: 
 
 def _others(alphabet: str, code: int) -> list[int]:
     """Codes that an installer may lay where he should lay ``code``."""
-    codes = range(16)
     if alphabet == "6":
-        codes = [code_of(letters) for letters in PATTERNS]  # type: ignore[assignment]
-    elif alphabet == "compass":
-        codes = [code_of(letters) for letters in ("NNNS", "SSSN", "NNSS")]  # type: ignore[assignment]
-    same = (lambda c: PATTERN_OF[c] == PATTERN_OF[code]) if alphabet == "6" else code.__eq__
-    return [c for c in codes if not same(c)]
+        known = [code_of(letters) for letters in PATTERNS]
+        return [other for other in known if PATTERN_OF[other] != PATTERN_OF[code]]
+    compass = [code_of(letters) for letters in ("NNNS", "SSSN", "NNSS")]
+    return [c for c in (compass if alphabet == "compass" else range(CODES)) if c != code]
 
 
 def scatter_bars(

@@ -56,7 +56,8 @@ class Errors:
     wheel_noise_m : float
         Of the way of each wheel on a metre, as a random walk.
     slips_per_m, slip_m : float
-        How often a wheel slips, and how far it turns too much then; no standard deviations.
+        How often a wheel slips on a metre that the wheels go, and how far it turns too
+        much then; no standard deviations.
     """
 
     noise_t: float = 0.15e-3
@@ -181,7 +182,7 @@ class SimulationOptions:
         Of the strategy ``pass``; None for any (of that pattern).
     pattern : str
         Of the strategy ``pass``: one of the six patterns, ``""`` for any.
-    offset_m : float or None
+    lateral_m : float or None
         By how far it passes left of the centre; None for a heading within 45 degrees.
     approach_rad : float or None
         Where on the circle of starts it begins, in the map's frame; None for anywhere.
@@ -213,7 +214,7 @@ class SimulationOptions:
     cells: tuple[Cell, ...] = ()
     cell: Cell | None = None
     pattern: str = ""
-    offset_m: float | None = None
+    lateral_m: float | None = None
     approach_rad: float | None = None
     limits: Limits = field(default_factory=Limits)
     aims: Aims = field(default_factory=Aims)
@@ -254,8 +255,8 @@ class SimulationOptions:
                     f"one of {', '.join(PATTERNS)}",
                 ),
                 (
-                    "offset_m",
-                    self.offset_m is None or abs(self.offset_m) <= START_M,
+                    "lateral_m",
+                    self.lateral_m is None or abs(self.lateral_m) <= START_M,
                     f"at most {START_M * 1e3:g} mm either way",
                 ),
                 (

@@ -85,13 +85,13 @@ def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Ar
     ]
     told = wheels + errors.wheel_noise_m * np.sqrt(np.abs(wheels)) * rng.normal(size=wheels.shape)
     slips: list[int] = []
-    travelled = np.cumsum(np.abs(way))
+    travelled = np.cumsum(np.abs(wheels).mean(axis=1))
     if errors.slips_per_m > 0 and len(travelled):
         count = rng.poisson(errors.slips_per_m * travelled[-1])
         for start in np.sort(rng.uniform(0, travelled[-1], count)):
             wheel = int(rng.integers(2))
             within = (travelled >= start) & (travelled < start + SLIP_M)
-            told[within, wheel] += np.abs(wheels[within, wheel]) * errors.slip_m / SLIP_M
+            told[within, wheel] += wheels[within, wheel] * errors.slip_m / SLIP_M
             slips.append(int(np.argmax(within)))
     ahead = told.mean(axis=1)
     turned = (told[:, 1] - told[:, 0]) / TRACK_M * (1 + turn) + drift * ahead

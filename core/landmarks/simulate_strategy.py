@@ -307,9 +307,9 @@ def _pass(
     aside = rng.uniform(-ASIDE_RAD, ASIDE_RAD)
     if options.approach_rad is not None:
         angle = options.approach_rad
-    if options.offset_m is not None:
+    if options.lateral_m is not None:
         # To the left of a centre is where that lies to the right of the way.
-        aside = math.asin(options.offset_m / START_M)
+        aside = math.asin(options.lateral_m / START_M)
     robot = _begin(
         [
             mark.x_m + START_M * math.cos(angle),
