@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.import_landmarks import OPTIONS, import_samples, landmark_options
 
 MOST_WARNINGS = 10
 """So many are said on stderr; ``--json`` and the log of a camera session hold them all."""
@@ -33,6 +34,9 @@ FORMATS = {
     "video": Format("locatk.formats.importers.video:Video", "dots", ("sheet", "camera")),
     "polaris-csv": Format(
         "locatk.formats.importers.polaris_csv:read_polaris", "polaris", ("rate", "spacing", "tag")
+    ),
+    "landmark-csv": Format(
+        "locatk.formats.importers.landmark_csv:read_landmarks", "landmarks", OPTIONS
     ),
 }
 """Name of a foreign format to what is known of it."""
@@ -81,6 +85,7 @@ FORMATS = {
     metavar="FILE",
     help="polaris-csv: the tags that were passed (tag.toml). [default: the published design]",
 )
+@landmark_options
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -97,19 +102,23 @@ def command(
     tag: Path | None,
     overwrite: bool,
     as_json: bool,
+    **landmarks: Any,
 ) -> None:
     """Read PATHS, recorded by another tool in FORMAT, into one session.
 
     \b
     FORMAT is one of
-      dotbot-lh2  LFSR counts of Lighthouse V2 as published by DotBots (CSV)
-      images      camera frames of a dot sheet: files, folders or patterns, in
-                  the order of the file names (frame2 before frame10)
-      video       the same from one video file, whose times are kept
-      polaris-csv samples of a bar of magnetometers over magnetic tags, as
-                  published with Polaris: one row a sample, a column
-                  "Sensor 1" (the rightmost) and so on, with cells "(x, y, z)"
-                  in microtesla; row over --rate is the time
+      dotbot-lh2    LFSR counts of Lighthouse V2 as published by DotBots (CSV)
+      images        camera frames of a dot sheet: files, folders or patterns, in
+                    the order of the file names (frame2 before frame10)
+      video         the same from one video file, whose times are kept
+      polaris-csv   samples of a bar of magnetometers over magnetic tags, as
+                    published with Polaris: one row a sample, a column
+                    "Sensor 1" (the rightmost) and so on, with cells "(x, y, z)"
+                    in microtesla; row over --rate is the time
+      landmark-csv  hall sensors and odometry of a robot over landmarks: one row
+                    a sample, with columns t, x, y, heading, front, left, rear,
+                    right; units are in their names (x_mm) or said with --units
 
     Files that are no image or are damaged, and samples that are no number or saturated, are
     left out and named; the exit status is 3 then, and the rest is written all the same.
@@ -123,6 +132,10 @@ def command(
       locatk import images 'run/*.png' --sheet sheet.toml --camera camera.toml -o run.mcap
       locatk import video run.mp4 --sheet sheet.toml -o run.mcap
       locatk import polaris-csv RawData_1.csv --rate 40 --spacing 20 -o run.mcap
+      locatk import landmark-csv drive.csv --units s,mm,deg,mt --map map.toml -o drive.mcap
+      locatk import landmark-csv log.csv -o drive.mcap --circle 25 --units ms,m,rad,v \\
+          --columns t=time,x=odom_x,y=odom_y,heading=yaw,front=h1,left=h2,rear=h3,right=h4 \\
+          --volts-per-tesla 13 --zero-volts median
     """
     chosen = FORMATS[format_name]
     given = {
@@ -133,21 +146,27 @@ def command(
         "rate": rate,
         "spacing": spacing,
         "tag": tag,
+        **landmarks,
     }
     for name, value in given.items():
         if value not in (None, ()) and name not in chosen.options:
-            raise click.UsageError(f"--{name} means nothing to the format {format_name}.")
-    if format_name in ("video", "polaris-csv") and len(paths) > 1:
+            raise click.UsageError(
+                f"--{name.replace('_', '-')} means nothing to the format {format_name}."
+            )
+    if format_name in ("video", "polaris-csv", "landmark-csv") and len(paths) > 1:
         raise click.UsageError(f"The format {format_name} takes one PATH.")
     if format_name != "images":  # whose patterns are not there by that name
         options.must_exist(paths)
-    aside = [*truth, *(path for path in (calibration, sheet, camera, tag) if path is not None)]
+    named = (calibration, sheet, camera, tag, landmarks["halls"], landmarks["map"])
+    aside = [*truth, *(path for path in named if path is not None)]
     options.guard_output(output, overwrite=overwrite, inputs=[*paths, *aside])
     read = options.load(chosen.reader)
     if chosen.system == "dots":
         answer, lost = _frames(format_name, read, paths, output, sheet, camera, rate, overwrite)
     elif chosen.system == "polaris":
         answer, lost = _samples(read, paths[0], output, rate, spacing, tag, overwrite)
+    elif chosen.system == "landmarks":
+        answer, lost = import_samples(read, paths[0], output, landmarks, overwrite)
     else:
         answer, lost = _sweeps(read, paths, output, truth, calibration, overwrite), None
     for warning in answer["warnings"][:MOST_WARNINGS]:
