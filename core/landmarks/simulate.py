@@ -31,16 +31,13 @@ from locatk.core.landmarks.simulate_passes import sensor_points, trajectory
 from locatk.core.landmarks.simulate_robot import Limits as Limits
 from locatk.core.landmarks.simulate_robot import Robot
 from locatk.core.landmarks.simulate_sensors import measure, odometry
-from locatk.core.landmarks.simulate_strategy import steer
+from locatk.core.landmarks.simulate_strategy import VISIT_M, steer
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 LARGEST_SESSION = 1_000_000
 """Samples of a session, at most."""
-
-VISIT_M = 0.045
-"""A sensor as near to a landmark's centre is in its territory under any heading (r1)."""
 
 FINER = 4
 """Steps of the wheels for each pose of the odometry."""

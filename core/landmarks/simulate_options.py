@@ -240,8 +240,8 @@ class SimulationOptions:
             (
                 ("strategy", self.strategy in STRATEGIES, f"one of {', '.join(STRATEGIES)}"),
                 ("start", _finite(self.start), "three numbers"),
-                ("landmarks", (self.landmarks or 1) >= 1, "1 or more"),
-                ("spins", (self.spins or 0) >= 0, from_0),
+                ("landmarks", self.landmarks is None or self.landmarks >= 1, "1 or more"),
+                ("spins", self.spins is None or self.spins >= 0, from_0),
                 ("waypoints", all(map(_finite, self.waypoints)), "numbers"),
                 ("waypoints", not (self.waypoints and self.cells), "waypoints or cells"),
                 (

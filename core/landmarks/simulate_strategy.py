@@ -37,8 +37,8 @@ first one."""
 TERRITORY_M = 0.060
 """Beyond this distance from a landmark a sensor feels none of its territory (54 mm)."""
 
-MET_M = 0.035
-"""A landmark is met where a sensor passes its centre as near as that (r1 is 45 mm)."""
+VISIT_M = 0.045
+"""A sensor as near to a landmark's centre is in its territory under any heading (r1)."""
 
 SPIN_RAD = math.radians(370)
 
@@ -165,7 +165,7 @@ def _met(
     along = offset @ ahead
     aside = offset @ [-ahead[1], ahead[0]]
     reach = floor.geometry.circle_m + TERRITORY_M
-    near = np.flatnonzero((along > 0) & (np.abs(aside) < floor.geometry.circle_m + MET_M))
+    near = np.flatnonzero((along > 0) & (np.abs(aside) < floor.geometry.circle_m + VISIT_M))
     if not len(near):
         return None
     k = near[np.argmin(along[near])]

@@ -1,0 +1,274 @@
+"""`locatk simulate landmarks` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.core.geometry import heading_of
+from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.halls import HallSensors, circle
+from locatk.core.landmarks.landmark import name
+from locatk.core.landmarks.simulate import (
+    Aims,
+    Errors,
+    Faults,
+    Limits,
+    Simulated,
+    SimulationOptions,
+    simulate,
+)
+from locatk.formats import maps
+from locatk.formats.halls import read_samples
+from locatk.formats.session import Session
+from locatk.formats.tracks import read_odometry, read_truth
+
+CODES = np.array([[1, 5, 9, 14], [7, 3, 12, 8], [15, HOLE, 2, 6]])
+
+
+@pytest.fixture
+def floor(tmp_path: Path) -> Path:
+    """A map of three rows."""
+    path = tmp_path / "map.toml"
+    maps.write_map(path, FloorMap(CODES))
+    return path
+
+
+def holds(path: Path, wanted: Simulated) -> Session:
+    """The session at ``path``, which holds what was simulated."""
+    session = Session.open(path)
+    (samples,) = read_samples(session)
+    assert samples.field_t == pytest.approx(
+        wanted.samples[0].field_t, rel=1e-6, abs=1e-12, nan_ok=True
+    )
+    assert np.array_equal(samples.time_ns, wanted.samples[0].time_ns)
+    (truth,), (odometry,) = read_truth(session), read_odometry(session)
+    for read, exact in ((truth, wanted.truth[0]), (odometry, wanted.odometry[0])):
+        assert (read.device, read.frame) == (exact.device, exact.frame)
+        assert np.array_equal(read.time_ns, exact.time_ns)
+        assert read.position == pytest.approx(exact.position, abs=1e-9)
+        off = heading_of(read.quaternion) - heading_of(exact.quaternion)
+        assert np.cos(off) == pytest.approx(1)
+    return session
+
+
+def test_a_session_holds_samples_map_odometry_and_truth(locatk, floor: Path) -> None:
+    out = floor.with_name("run.mcap")
+    result = locatk("simulate", "landmarks", floor, "-o", out, "--seed", 3, "--json")
+    assert result.exit_code == 0, result.stderr
+    wanted = simulate(FloorMap(CODES), SimulationOptions(seed=3))
+    session = holds(out, wanted)
+    told = json.loads(result.stdout)
+    visits = told.pop("visits")
+    assert told == {
+        "version": 1,
+        "output": str(out),
+        "samples": len(wanted.samples[0]),
+        "device": "robot",
+        "frame": "floor",
+        "faults": [],
+        "saturated": 0,
+        "slips_s": [],
+        "odometry_poses": len(wanted.odometry[0]),
+        "truth_poses": len(wanted.truth[0]),
+    }
+    assert [tuple(visit["cell"]) for visit in visits] == [one.cell for one in wanted.events]
+    assert session.facts["system"] == "landmarks"
+    attached = maps.attached_map(session)
+    assert attached is not None
+    assert np.array_equal(attached.codes, CODES)
+    assert not attached.built
+    facts = session.metadata()["facts"]
+    assert json.loads(facts["simulated_visits"]) == visits
+    lying = {tuple(mark["cell"]): mark for mark in json.loads(facts["simulated_floor"])}
+    assert set(lying) == {one.cell for one in wanted.events}
+    for mark in wanted.floor_as_laid:
+        if mark.cell in lying:
+            assert lying[mark.cell]["strength"] == pytest.approx(mark.strength.tolist())
+            assert lying[mark.cell]["code"] == name(int(CODES[mark.cell]))
+
+
+def test_each_option_reaches_the_session(locatk, floor: Path) -> None:
+    out = floor.with_name("run.mcap")
+    given = (
+        *("--start", "100,100,20", "--landmarks", 4, "--spins", 1, "--speed", 0.2),
+        *("--acceleration", 0.5, "--turn-rate", 120, "--turn-acceleration", 500),
+        *("--rest", 0.2, "--stop", 0.3, "--aim-first", 5, "--aim-second", 1, "--aim-step", 2),
+        *("--aim-heading", 0.5, "--rate", 120, "--odometry-rate", 40, "--range", 20),
+        *("--quantum", 0.02, "--noise", 0.1, "--offset", 0.2, "--gain", 0.02, "--earth", -30),
+        *("--height", 1, "--bar-strength", 0.05, "--bar-place", 0.4, "--bar-turn", 2),
+        *("--bar-lean", 1, "--landmark-place", 2, "--landmark-turn", 1, "--odometry-scale"),
+        *(0.02, "--odometry-turn", 0.03, "--odometry-drift", 2, "--wheel-noise", 0.1),
+        *("--slips", 1, "--slip", 3, "--flip", "0,1:2", "--flip", "1,1:0"),
+        *("--missing", "1,2:3", "--displace", "0,0:4,-2.5", "--misread-rate", 0.1),
+        *("--dead", "rear", "--stuck", "right", "--swap", "front:left", "--seed", 8),
+    )
+    result = locatk("simulate", "landmarks", floor, "-o", out, *given)
+    assert result.exit_code == 0, result.stderr
+    errors = Errors(
+        noise_t=1e-4,
+        offset_t=2e-4,
+        gain=0.02,
+        earth_t=-30e-6,
+        quantum_t=0.02e-3,
+        height_m=1e-3,
+        bar_strength=0.05,
+        bar_place_m=0.4e-3,
+        bar_turn_rad=math.radians(2),
+        bar_lean_rad=math.radians(1),
+        landmark_place_m=2e-3,
+        landmark_turn_rad=math.radians(1),
+        odometry_scale=0.02,
+        odometry_turn=0.03,
+        odometry_drift_rad_per_m=math.radians(2),
+        wheel_noise_m=1e-4,
+        slips_per_m=1.0,
+        slip_m=3e-3,
+    )
+    faults = Faults(
+        flipped=(((0, 1), 2), ((1, 1), 0)),
+        missing=(((1, 2), 3),),
+        displaced=(((0, 0), (4e-3, -2.5e-3)),),
+        misread_rate=0.1,
+        dead=("rear",),
+        stuck=("right",),
+        swapped=(("front", "left"),),
+    )
+    options = SimulationOptions(
+        start=(0.1, 0.1, math.radians(20)),
+        landmarks=4,
+        spins=1,
+        limits=Limits(0.2, 0.5, math.radians(120), math.radians(500)),
+        rest_s=0.2,
+        stop_s=0.3,
+        aims=Aims(5e-3, 1e-3, 2e-3, math.radians(0.5)),
+        rate_hz=120.0,
+        odometry_hz=40.0,
+        range_t=0.02,
+        errors=errors,
+        faults=faults,
+        seed=8,
+    )
+    wanted = simulate(FloorMap(CODES), options)
+    session = Session.open(out)
+    (samples,) = read_samples(session)
+    assert np.array_equal(samples.time_ns, wanted.samples[0].time_ns)
+    read, exact = samples.field_t, wanted.samples[0].field_t
+    assert np.array_equal(np.isnan(read), np.isnan(exact))
+    # To a step at most, where a rounding error of the units tipped the scale.
+    assert np.nanmax(np.abs(read - exact)) < 1.1 * 0.02e-3
+    assert np.nanmean(np.abs(read - exact)) < 1e-8
+    assert samples.sensors.range_t == pytest.approx(0.02)
+    (odometry,) = read_odometry(session)
+    assert odometry.position == pytest.approx(wanted.odometry[0].position, abs=1e-9)
+    # The map is attached as it was designed; only the facts know what is wrong with it.
+    attached = maps.attached_map(session)
+    assert attached is not None
+    assert np.array_equal(attached.codes, CODES)
+    facts = json.loads(session.metadata()["facts"]["simulated_floor"])
+    assert [0, 1] in [mark["cell"] for mark in facts if "flipped:2" in mark["faults"]]
+    assert json.loads(session.metadata()["facts"]["simulated_errors"])["gain"] == 0.02
+
+
+def test_a_path_from_a_file(locatk, floor: Path) -> None:
+    way, out = floor.with_name("way.csv"), floor.with_name("run.mcap")
+    way.write_text("name,x_mm,y_mm\na,0,0\n\nb,400,0\nc,400.5,200\n")
+    given = ("--strategy", "path", "--path", way, "--errors", 0, "--earth", 0)
+    result = locatk("simulate", "landmarks", floor, "-o", out, *given)
+    assert result.exit_code == 0, result.stderr
+    assert "over landmarks 0,0 0,1 0,2 1,2," in result.stdout
+    options = SimulationOptions(
+        strategy="path",
+        waypoints=((0.0, 0.0), (0.4, 0.0), (0.4005, 0.2)),
+        errors=replace(Errors().scaled(0), earth_t=0.0),
+    )
+    holds(out, simulate(FloorMap(CODES), options))
+    way.write_text("x,y\n0,0\n")
+    result = locatk("simulate", "landmarks", floor, "-o", out, "--overwrite", *given)
+    assert result.exit_code == 1
+    assert "no columns x_mm and y_mm in " in result.stderr
+    way.write_text("x_mm,y_mm\n0,0\n1,one\n")
+    result = locatk("simulate", "landmarks", floor, "-o", out, "--overwrite", *given)
+    assert result.exit_code == 1
+    assert "way.csv:3" in result.stderr
+
+
+def test_a_path_of_cells_and_a_pass_with_other_sensors(locatk, floor: Path) -> None:
+    out, file = floor.with_name("run.mcap"), floor.with_name("halls.toml")
+    cells = ("--cell", "0,0", "--cell", "0,3", "--cell", "1,3")
+    result = locatk("simulate", "landmarks", floor, "-o", out, "--strategy", "path", *cells)
+    assert result.exit_code == 0, result.stderr
+    assert "over landmarks 0,0 0,1 0,2 0,3 1,3," in result.stdout
+    sensors = HallSensors(position_m=circle(0.03), range_t=0.015, noise_t=1e-4)
+    maps.write_halls(file, sensors)
+    given = ("--strategy", "pass", "--cell", "1,1", "--lateral", 5, "--approach", 90)
+    result = locatk(
+        "simulate", "landmarks", floor, "-o", out, *given, "--sensors", file, "--overwrite"
+    )
+    assert result.exit_code == 0, result.stderr
+    assert "readings are at the end of the sensors' range" in result.stderr
+    options = SimulationOptions(
+        strategy="pass", cell=(1, 1), lateral_m=0.005, approach_rad=math.pi / 2, sensors=sensors
+    )
+    holds(out, simulate(FloorMap(CODES), options))
+
+
+def test_what_was_hardly_meant_is_warned_of(locatk, floor: Path) -> None:
+    out, way = floor.with_name("run.mcap"), floor.with_name("way.csv")
+    way.write_text("x_mm,y_mm\n0,-500\n400,-500\n")
+    result = locatk("simulate", "landmarks", floor, "-o", out, "--strategy", "path", "--path", way)
+    assert result.exit_code == 0
+    assert "over no landmark" in result.stdout
+    assert "passes over no landmark" in result.stderr
+    assert "leaves the map" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "status", "said"),
+    [
+        (("--cell", "0,0"), 2, "One --cell is for a pass"),
+        (("--strategy", "path"), 2, "--path or --cell"),
+        (("--strategy", "path", "--cell", "0,0"), 1, "two waypoints"),
+        (("--strategy", "path", "--cell", "0,0", "--cell", "2,1"), 1, "cell 2,1"),
+        (("--strategy", "pass", "--landmarks", 2), 2, "--landmarks is of --strategy paper"),
+        (("--lateral", 2), 2, "--lateral is of --strategy pass"),
+        (("--strategy", "pass", "--lateral", 200), 1, "lateral_m"),
+        (("--strategy", "pass", "--pattern", "NSN"), 1, "NSNS"),
+        (("--strategy", "pass", "--pattern", "SSSS", "--cell", "0,0"), 1, "no landmark SSSS"),
+        (("--start", "5"), 2, "X,Y,DEG"),
+        (("--start", "-50,-50,225"), 1, "meets no landmark"),
+        (("--flip", "0,1"), 2, "ROW,COLUMN:BAR"),
+        (("--flip", "2,1:0"), 1, "no landmark"),
+        (("--missing", "0,1:4"), 1, "bar 4"),
+        (("--displace", "0,1:4"), 2, "ROW,COLUMN:DX,DY"),
+        (("--dead", "top"), 1, "front, left, rear, right"),
+        (("--swap", "front"), 2, "NAME:NAME"),
+        (("--height", -12), 1, "top faces"),
+        (("--misread-rate", 2), 2, "--misread-rate"),
+        (("--rate", 1e6), 1, "samples"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    locatk, floor: Path, given: tuple[object, ...], status: int, said: str
+) -> None:
+    result = locatk("simulate", "landmarks", floor, "-o", floor.with_name("run.mcap"), *given)
+    assert result.exit_code == status, result.stderr
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+    assert [path.name for path in floor.parent.iterdir()] == ["map.toml"]
+
+
+def test_a_map_must_be_one(locatk, floor: Path) -> None:
+    out = floor.with_name("run.mcap")
+    result = locatk("simulate", "landmarks", floor.with_name("nowhere.toml"), "-o", out)
+    assert result.exit_code == 1
+    assert "nowhere.toml" in result.stderr
+    floor.write_text(floor.read_text().replace("15", "16").replace("f", "g"))
+    result = locatk("simulate", "landmarks", floor, "-o", out)
+    assert result.exit_code == 1
+    assert not out.exists()
