@@ -1,0 +1,115 @@
+"""Landmark maps as DXF, for CAD: true places in mm, a block for each way to lay a landmark.
+
+Layers: BARS (outlines of the bars), POLES (an arrow from south to north in each), CENTRES
+(a point each), LABELS (row, column and letters), WALLS. A landmark is an insert of the block
+``LANDMARK_<letters>``, so that CAD counts them for the bill of materials. The map's frame is
+that of the drawing. Landmarks lie as built where that is known; the bars are those of the
+design. Written with ezdxf as DXF R2010.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from locatk.core.drawing import Line, Polygon
+from locatk.core.landmarks.drawing import arrow, bar_outlines
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.gridfit import built_poses
+from locatk.core.landmarks.landmark import name
+
+if TYPE_CHECKING:
+    from ezdxf.document import Drawing
+
+LAYERS = {"BARS": 7, "POLES": 1, "CENTRES": 5, "LABELS": 8, "WALLS": 6}
+"""Layers and their colours, by AutoCAD's index."""
+
+
+def dumps_dxf(floor: FloorMap) -> str:
+    """A DXF of a map; the same map and ezdxf give the same text."""
+    import ezdxf
+    from ezdxf import units
+
+    # Otherwise each file bears the time and two random ids.
+    before = ezdxf.options.write_fixed_meta_data_for_testing
+    ezdxf.options.write_fixed_meta_data_for_testing = True
+    try:
+        document = ezdxf.new("R2010", units=units.MM)
+        _draw(document, floor)
+        # ezdxf would list the kinds of entities in the order of their hashes.
+        for kind in sorted(document.entitydb.dxf_types_in_use()):
+            document.classes.add_class(kind)
+        stream = io.StringIO()
+        document.write(stream)
+    finally:
+        ezdxf.options.write_fixed_meta_data_for_testing = before
+    return stream.getvalue()
+
+
+def _draw(document: Drawing, floor: FloorMap) -> None:
+    from ezdxf.enums import TextEntityAlignment
+
+    for layer, colour in LAYERS.items():
+        document.layers.add(layer, color=colour)
+    for code in sorted({int(floor.codes[cell]) for cell in floor.cells()}):
+        _block(document, floor, code)
+    space = document.modelspace()
+    pitch = 1e3 * floor.pitch_m
+    height = min(8.0, pitch / 12)
+    below = 1e3 * (floor.geometry.radius_m + floor.geometry.bar_width_m / 2) + 0.3 * height
+    for cell, (x, y, heading) in zip(floor.cells(), built_poses(floor).tolist(), strict=True):
+        letters = name(int(floor.codes[cell]))
+        at = (1e3 * x, 1e3 * y)
+        turn = {"rotation": math.degrees(heading)} if heading else {}
+        space.add_blockref(f"LANDMARK_{letters}", at, dxfattribs={"layer": "BARS", **turn})
+        space.add_point(at, dxfattribs={"layer": "CENTRES"})
+        space.add_text(
+            f"{cell[0]},{cell[1]} {letters}",
+            height=height,
+            dxfattribs={"layer": "LABELS"},
+        ).set_placement(
+            (at[0], at[1] - min(below, pitch / 2 - height)), align=TextEntityAlignment.TOP_CENTER
+        )
+    for (row, column), (other_row, _) in sorted(floor.walls):
+        x, y = floor.place((row, column))
+        right, top = 1e3 * x + pitch / 2, 1e3 * y + pitch / 2
+        start = (right - pitch, top) if other_row > row else (right, top - pitch)
+        space.add_line(start, (right, top), dxfattribs={"layer": "WALLS"})
+    _set_extents(document, floor)
+
+
+def _block(document: Drawing, floor: FloorMap, code: int) -> None:
+    """One way to lay a landmark, about its centre."""
+    from ezdxf.enums import TextEntityAlignment
+
+    block = document.blocks.new(f"LANDMARK_{name(code)}")
+    width = 1e3 * floor.geometry.bar_width_m
+    for corners, south, north, _ in bar_outlines(floor.geometry, code):
+        block.add_lwpolyline(corners.tolist(), close=True, dxfattribs={"layer": "BARS"})
+        along = np.subtract(north, south)
+        start, tip = (tuple(np.add(south, part * along).tolist()) for part in (0.28, 0.72))
+        head = min(0.5 * width, 0.2 * math.dist(south, north))
+        for mark in arrow(start, tip, head):
+            if isinstance(mark, Line):
+                block.add_line(mark.start, mark.end, dxfattribs={"layer": "POLES"})
+            elif isinstance(mark, Polygon):
+                block.add_solid(mark.corners, dxfattribs={"layer": "POLES"})
+        for letter, part in (("S", 0.13), ("N", 0.87)):
+            block.add_text(letter, height=0.4 * width, dxfattribs={"layer": "POLES"}).set_placement(
+                tuple(np.add(south, part * along).tolist()), align=TextEntityAlignment.MIDDLE_CENTER
+            )
+
+
+def _set_extents(document: Drawing, floor: FloorMap) -> None:
+    """What a viewer shows first."""
+    rows, columns = floor.shape
+    half = floor.pitch_m / 2
+    x, y = floor.origin_m
+    high_x, high_y = floor.place((rows - 1, columns - 1))
+    low, high = (1e3 * (x - half), 1e3 * (y - half)), (1e3 * (high_x + half), 1e3 * (high_y + half))
+    document.header["$EXTMIN"], document.header["$EXTMAX"] = (*low, 0.0), (*high, 0.0)
+    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
+    document.set_modelspace_vport(max(high[1] - low[1], high[0] - low[0]), middle)

@@ -1,0 +1,120 @@
+"""Landmark maps as an occupancy grid of ROS: the YAML and PGM of ``map_server``.
+
+The format is that of wiki.ros.org/map_server and of Nav2. Free floor around landmarks is
+white, the landmarks' territories (where the field of one reaches the threshold of the map's
+bars) a light grey that ``map_server`` still takes for free, cells without a landmark the grey
+of the unknown, walls black and one pixel wide. The picture's first row is the map's greatest
+y, and ``origin`` the lower left corner of its lower left pixel: half a pitch before cell
+(0, 0). Landmarks are drawn as built where that is known.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.bars import basis
+from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.gridfit import built_poses
+from locatk.core.landmarks.landmark import signs
+
+RESOLUTION_M = 0.010
+
+FREE, TERRITORY, UNKNOWN, OCCUPIED = 254, 230, 205, 0
+"""Grey levels; of :data:`FREE_THRESHOLD` all from 206 are free."""
+
+FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
+
+LARGEST_SIDE = 30_000
+
+Pixels = NDArray[np.uint8]
+
+
+def draw(floor: FloorMap, resolution_m: float = RESOLUTION_M) -> Pixels:
+    """Grey levels (height, width) of a map; the first row has the greatest y.
+
+    Raises
+    ------
+    InputError
+        The picture would be too large, or a cell no pixel.
+    """
+    rows, columns = floor.shape
+    size = [math.ceil(count * floor.pitch_m / resolution_m - 1e-9) for count in (rows, columns)]
+    if max(size) > LARGEST_SIDE:
+        raise InputError(
+            f"a picture of {size[1]} x {size[0]} pixels, more than {LARGEST_SIDE} a side",
+            hint="Give a coarser --resolution",
+        )
+    if resolution_m > floor.pitch_m / 4:
+        raise InputError(
+            f"pixels of {1e3 * resolution_m:g} mm are too coarse for a pitch of "
+            f"{1e3 * floor.pitch_m:g} mm",
+            hint="Give a --resolution of at most a quarter of the pitch",
+        )
+    left, bottom = _corner(floor)
+    centre = [(np.arange(n) + 0.5) * resolution_m for n in size]  # from the corner: y, x
+    cell = [np.floor(c / floor.pitch_m).astype(int) for c in centre]
+    known = np.full((max(cell[0][-1] + 1, rows), max(cell[1][-1] + 1, columns)), False)
+    known[:rows, :columns] = floor.codes != HOLE
+    upward = np.where(known[np.ix_(*cell)], FREE, UNKNOWN).astype(np.uint8)
+    for at, (x, y, heading) in zip(floor.cells(), built_poses(floor).tolist(), strict=True):
+        built = floor.built.get(at)
+        strength = signs(floor.codes[at]) if built is None else built.strength
+        spans = []
+        for middle, count in ((y - bottom, size[0]), (x - left, size[1])):
+            first, last = ((middle + s * floor.pitch_m / 2) / resolution_m for s in (-1, 1))
+            spans.append(slice(max(math.floor(first), 0), min(math.ceil(last), count)))
+        dy, dx = np.meshgrid(
+            centre[0][spans[0]] + bottom - y, centre[1][spans[1]] + left - x, indexing="ij"
+        )
+        c, s = math.cos(heading), math.sin(heading)
+        points = np.stack([c * dx + s * dy, c * dy - s * dx], -1)
+        inside = np.abs(basis(floor.geometry, points) @ strength) >= floor.geometry.threshold_t
+        window = upward[spans[0], spans[1]]
+        window[inside & (window == FREE)] = TERRITORY
+    _draw_walls(upward, floor, resolution_m)
+    return np.ascontiguousarray(upward[::-1])
+
+
+def pgm(pixels: Pixels) -> bytes:
+    """A binary PGM of grey levels."""
+    height, width = pixels.shape
+    return b"P5\n%d %d\n255\n" % (width, height) + pixels.tobytes()
+
+
+def yaml(floor: FloorMap, image: str, resolution_m: float = RESOLUTION_M) -> str:
+    """The YAML beside a picture called ``image``."""
+    left, bottom = _corner(floor)
+    return (
+        f"image: {json.dumps(image)}\n"
+        "mode: trinary\n"
+        f"resolution: {resolution_m:.9g}\n"
+        f"origin: [{round(left, 9)}, {round(bottom, 9)}, 0.0]\n"
+        "negate: 0\n"
+        f"occupied_thresh: {OCCUPIED_THRESHOLD}\n"
+        f"free_thresh: {FREE_THRESHOLD}\n"
+    )
+
+
+def _corner(floor: FloorMap) -> tuple[float, float]:
+    """x and y where the picture begins."""
+    x, y = floor.origin_m
+    return x - floor.pitch_m / 2, y - floor.pitch_m / 2
+
+
+def _draw_walls(upward: Pixels, floor: FloorMap, resolution_m: float) -> None:
+    """Black lines midway between cells; the first row of ``upward`` has the least y."""
+
+    def pixel(cells: float, axis: int) -> int:
+        return min(int(cells * floor.pitch_m / resolution_m + 1e-9), upward.shape[axis] - 1)
+
+    for (row, column), (other_row, _) in floor.walls:
+        top, right = pixel(row + 1, 0), pixel(column + 1, 1)
+        if other_row > row:
+            upward[top, pixel(column, 1) : right + 1] = OCCUPIED
+        else:
+            upward[pixel(row, 0) : top + 1, right] = OCCUPIED

@@ -1,0 +1,163 @@
+"""Landmark maps as SVG: a floor at true size, in layers.
+
+Width and height are in mm and the user unit is 1 mm, so that Inkscape and plotters take it at
+true size; the map's x is to the right and its y up. A layer each (in Inkscape's sense): the
+landmarks of each pattern, their centres, labels, walls. A bar is its outline, an arrow from
+its south to its north pole, and the letters of the poles. Landmarks lie as built where
+that is known; the bars are those of the design.
+"""
+
+from __future__ import annotations
+
+import math
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.drawing import Line, Point, Polygon
+from locatk.core.landmarks.drawing import arrow, bar_outlines
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.gridfit import built_poses
+from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS, name
+
+NAMESPACE = "http://www.w3.org/2000/svg"
+INKSCAPE = "http://www.inkscape.org/namespaces/inkscape"
+
+LINE_MM = 0.25
+
+_FONT = "Helvetica, Arial, 'Liberation Sans', sans-serif"
+
+
+def render(floor: FloorMap) -> bytes:
+    """An SVG of a map; the same map gives the same bytes."""
+    drawn = _Drawn(floor)
+    width, height = (_number(side) for side in drawn.size_mm)
+    root = Xml.Element(
+        "svg",
+        {
+            "xmlns": NAMESPACE,
+            "xmlns:inkscape": INKSCAPE,
+            "width": f"{width}mm",
+            "height": f"{height}mm",
+            "viewBox": f"0 0 {width} {height}",
+        },
+    )
+    Xml.SubElement(root, "title").text = f"Landmarks {floor.name}".strip()
+    ink = Xml.SubElement(
+        root,
+        "g",
+        {
+            "fill": "none",
+            "stroke": "black",
+            "stroke-width": _number(LINE_MM),
+            "font-family": _FONT,
+            "text-anchor": "middle",
+        },
+    )
+    drawn.draw(ink)
+    Xml.indent(root)
+    data: bytes = Xml.tostring(root, encoding="utf-8", xml_declaration=True)
+    return data + b"\n"
+
+
+class _Drawn:
+    """A map on its page, whose left lower corner is half a pitch before cell (0, 0)."""
+
+    def __init__(self, floor: FloorMap) -> None:
+        self.floor = floor
+        self.pitch = 1e3 * floor.pitch_m
+        rows, columns = floor.shape
+        self.size_mm = (self.pitch * columns, self.pitch * rows)
+        corner = 1e3 * np.array(floor.origin_m) - self.pitch / 2
+        poses = built_poses(floor)
+        self.places = 1e3 * poses[:, :2] - corner
+        self.headings = poses[:, 2].tolist()
+        self.outlines = [bar_outlines(floor.geometry, code) for code in range(16)]
+
+    def draw(self, ink: Xml.Element) -> None:
+        self._walls(_layer(ink, "walls"))
+        layers = {pattern: _layer(ink, pattern) for pattern in PATTERNS}
+        centres, labels = _layer(ink, "centres"), _layer(ink, "labels")
+        size = min(8.0, self.pitch / 12)
+        below = 1e3 * (self.floor.geometry.radius_m + self.floor.geometry.bar_width_m / 2)
+        for cell, place, heading in zip(
+            self.floor.cells(), self.places, self.headings, strict=True
+        ):
+            code = int(self.floor.codes[cell])
+            layer = layers[PATTERNS[PATTERN_OF[code] - 1]]
+            self._landmark(layer, f"r{cell[0]}c{cell[1]}", code, place, heading)
+            x, y = self._at(place)
+            cross = f"M{_number(x - 3)} {_number(y)}h6M{_number(x)} {_number(y - 3)}v6"
+            Xml.SubElement(centres, "path", d=cross)
+            words = f"{cell[0]},{cell[1]} {name(code)}"
+            under = min(below + 1.3 * size, self.pitch / 2 - 0.3 * size)
+            _text(labels, words, (x, y + under), size)
+
+    def _at(self, point: NDArray[np.float64]) -> Point:
+        """On the page, where y points down."""
+        return float(point[0]), self.size_mm[1] - float(point[1])
+
+    def _landmark(
+        self,
+        layer: Xml.Element,
+        ident: str,
+        code: int,
+        place: NDArray[np.float64],
+        heading: float,
+    ) -> None:
+        group = Xml.SubElement(layer, "g", id=ident)
+        c, s = math.cos(heading), math.sin(heading)
+        turn = np.array([[c, s], [-s, c]])  # of rows of points
+
+        def path(points: object) -> str:
+            moved = np.array(points, float) @ turn + place
+            pairs = (" ".join(map(_number, self._at(point))) for point in moved)
+            return "M" + "L".join(pairs)
+
+        width = 1e3 * self.floor.geometry.bar_width_m
+        outlines, lines, heads, letters = [], [], [], []
+        for corners, south, north, _ in self.outlines[code]:
+            outlines.append(path(corners) + "z")
+            along = np.subtract(north, south)
+            # The arrow takes the middle of the bar, the letters its two ends.
+            start, tip = np.add(south, 0.28 * along), np.add(south, 0.72 * along)
+            head = min(0.5 * width, 0.2 * float(np.hypot(*along)))
+            for mark in arrow(tuple(start), tuple(tip), head):
+                if isinstance(mark, Line):
+                    lines.append(path((mark.start, mark.end)))
+                elif isinstance(mark, Polygon):
+                    heads.append(path(mark.corners) + "z")
+            for letter, share in (("S", 0.13), ("N", 0.87)):
+                letters.append((letter, np.add(south, share * along) @ turn + place))
+        Xml.SubElement(group, "path", d="".join(outlines))
+        Xml.SubElement(group, "path", d="".join(lines))
+        Xml.SubElement(group, "path", d="".join(heads), fill="black", stroke="none")
+        size = 0.55 * width
+        for letter, point in letters:
+            x, y = self._at(point)
+            _text(group, letter, (x, y + 0.36 * size), size)
+
+    def _walls(self, layer: Xml.Element) -> None:
+        for (row, column), (other_row, _) in sorted(self.floor.walls):
+            right, top = (column + 1) * self.pitch, self.size_mm[1] - (row + 1) * self.pitch
+            along = f"h-{_number(self.pitch)}" if other_row > row else f"v{_number(self.pitch)}"
+            wall = {"d": f"M{_number(right)} {_number(top)}{along}", "stroke-width": "4"}
+            Xml.SubElement(layer, "path", wall)
+
+
+def _layer(parent: Xml.Element, title: str) -> Xml.Element:
+    return Xml.SubElement(
+        parent, "g", {"id": title, "inkscape:groupmode": "layer", "inkscape:label": title}
+    )
+
+
+def _text(parent: Xml.Element, text: str, at: Point, size: float) -> None:
+    style = {"x": _number(at[0]), "y": _number(at[1]), "font-size": _number(size)}
+    Xml.SubElement(parent, "text", {**style, "fill": "black", "stroke": "none"}).text = text
+
+
+def _number(value: float) -> str:
+    """To 0.1 um, without zeros that say nothing."""
+    text = f"{value:.4f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
