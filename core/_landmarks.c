@@ -94,34 +94,34 @@ static inline float look_up(const float *table, int size, float i, float j)
            + di * ((1 - dj) * at[size] + dj * at[size + 1]);
 }
 
-/* Costs of the sixteen codes from the normal matrix of the four bars. */
+/* Costs of what may be laid from the normal matrix of the four bars. */
 static void costs(const double *normal, const double *right, double power, double least,
-                  double most, double *out)
+                  double most, const double *laid, int kinds, double *out)
 {
-    for (int code = 0; code < 16; code++) {
-        double sign[4], top = 0, square = 0;
-        for (int k = 0; k < 4; k++) sign[k] = code >> k & 1 ? 1 : -1;
+    for (int kind = 0; kind < kinds; kind++, laid += 4) {
+        double top = 0, square = 0;
         for (int k = 0; k < 4; k++) {
-            top += sign[k] * right[k];
-            for (int l = 0; l < 4; l++) square += sign[k] * sign[l] * normal[4 * k + l];
+            top += laid[k] * right[k];
+            for (int l = 0; l < 4; l++) square += laid[k] * laid[l] * normal[4 * k + l];
         }
         const double gain = fmin(fmax(top / fmax(square, 1e-300), least), most);
-        out[code] = power - 2 * gain * top + gain * gain * square;
+        out[kind] = power - 2 * gain * top + gain * gain * square;
     }
 }
 
 PyObject *scan_landmarks(PyObject *self, PyObject *args)
 {
-    enum { POINTS, VALUES, WEIGHTS, CENTRES, TURNS, TABLE, COST, BUFFERS };
+    enum { POINTS, VALUES, WEIGHTS, CENTRES, TURNS, TABLE, LAID, COST, BUFFERS };
     Py_buffer b[BUFFERS];
-    int count, nodes, turns, size;
+    int count, nodes, turns, size, kinds;
     double step, least, most;
-    if (!PyArg_ParseTuple(args, "y*y*y*iy*iy*iy*idddw*", &b[POINTS], &b[VALUES], &b[WEIGHTS],
+    if (!PyArg_ParseTuple(args, "y*y*y*iy*iy*iy*idddy*iw*", &b[POINTS], &b[VALUES], &b[WEIGHTS],
                           &count, &b[CENTRES], &nodes, &b[TURNS], &turns, &b[TABLE], &size, &step,
-                          &least, &most, &b[COST]))
+                          &least, &most, &b[LAID], &kinds, &b[COST]))
         return NULL;
     const double *points = b[POINTS].buf, *values = b[VALUES].buf, *weights = b[WEIGHTS].buf;
     const double *centres = b[CENTRES].buf, *angle = b[TURNS].buf;
+    const double *laid = b[LAID].buf;
     const float *table = b[TABLE].buf;
     double *out = b[COST].buf;
     const float middle = (float)(size - 1) / 2;
@@ -130,7 +130,7 @@ PyObject *scan_landmarks(PyObject *self, PyObject *args)
     for (int i = 0; i < count; i++) power += weights[i] * values[i] * values[i];
     for (int t = 0; t < turns; t++) {
         const double c = cos(angle[t]) / step, s = sin(angle[t]) / step;
-        for (int m = 0; m < nodes; m++, out += 16) {
+        for (int m = 0; m < nodes; m++, out += kinds) {
             double normal[16] = {0}, right[4] = {0};
             for (int i = 0; i < count; i++) {
                 const double x = points[2 * i] - centres[2 * m];
@@ -151,7 +151,7 @@ PyObject *scan_landmarks(PyObject *self, PyObject *args)
             }
             for (int k = 0; k < 4; k++)
                 for (int l = k + 1; l < 4; l++) normal[4 * k + l] = normal[4 * l + k];
-            costs(normal, right, power, least, most, out);
+            costs(normal, right, power, least, most, laid, kinds, out);
         }
     }
     Py_END_ALLOW_THREADS

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks import fit, scan
-from locatk.core.landmarks.landmark import CODES, Geometry, rotated, signs
+from locatk.core.landmarks.landmark import Geometry, signs
 from locatk.core.landmarks.trace import Trace
 
 Array = NDArray[np.float64]
@@ -68,6 +68,8 @@ class Explanation:
     strength_sigma : (4,) ndarray
     residual_sigma : float
         Rms of what is left over, in standard deviations of a sample.
+    free : int
+        The bar that was taken to be of any strength; -1 for none.
     probability : float
     """
 
@@ -78,6 +80,7 @@ class Explanation:
     strength: Array
     strength_sigma: Array
     residual_sigma: float
+    free: int = -1
     probability: float = math.nan
 
 
@@ -95,99 +98,82 @@ def explain(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explan
     list of Explanation
         Their probabilities sum to 1; empty where no field is strong.
     """
-    coarse = trace.thinned(COARSE)
-    pose, code = scan.candidates(coarse, geometry, STARTS)
-    if not len(pose):
+    found = _explained(trace, geometry, priors, scan.WHOLE)
+    if not found:
         return []
-    problem = _problem(coarse, geometry, priors, code)
-    first = fit.descend(problem, problem.start(pose), FIRST_STEPS)
-    pose, code = _siblings(first, code)
-    fine = trace.thinned(FINE)
-    problem = _problem(coarse, geometry, priors, code)
-    start = np.concatenate([first.parameters, problem.start(pose[len(first.parameters) :])])
-    second = fit.descend(problem, start, FIRST_STEPS)
-    odds = second.evidence()
-    keep = np.flatnonzero(odds > odds.max() - MARGIN)
-    code, start = _in_one_frame(code[keep], second.parameters[keep], odds[keep])
-    code, start = _unlike(code, start, odds[keep])
-    problem = _problem(fine, geometry, priors, code)
-    last = fit.descend(problem, start)
-    found = _explanations(problem, last, code)
     best = max(found, key=lambda one: one.log_odds)
     off = np.abs(best.strength - signs(best.code)) / priors.strength
     if off.max() > SUSPICIOUS or best.residual_sigma > WHITE:
-        found += _faulty(best, fine, geometry, priors)
+        found += _faulty(trace, geometry, priors)
     return _shares(found)
 
 
-def _problem(
-    trace: Trace, geometry: Geometry, priors: fit.Priors, code: NDArray[np.int64]
-) -> fit.Problem:
-    strength = signs(code)
-    return fit.Problem(
-        trace, geometry, priors, strength, np.full(strength.shape, priors.strength)
-    )
+def _explained(
+    trace: Trace, geometry: Geometry, priors: fit.Priors, laid: Array
+) -> list[Explanation]:
+    """Explanations by ``laid`` (L, 4), the bars that may be there."""
+    coarse = trace.thinned(COARSE)
+    pose, which = scan.candidates(coarse, geometry, laid, STARTS)
+    if not len(pose):
+        return []
+    strength = laid[which]
+    problem = _problem(coarse, geometry, priors, strength)
+    start = problem.start(pose)
+    first = fit.descend(problem, start, FIRST_STEPS)
+    # Bars at the far side are weakly seen: the other ways to lay them, at the best place.
+    best = int(np.argmax(first.evidence()))
+    others = laid[(laid != strength[best]).any(axis=1)]
+    strength = np.concatenate([strength, others])
+    again = problem.start(np.repeat(first.parameters[best : best + 1, : fit.POSE], len(others), 0))
+    problem = _problem(coarse, geometry, priors, strength)
+    second = fit.descend(problem, np.concatenate([first.parameters, again]), FIRST_STEPS)
+    odds = second.evidence()
+    keep = np.flatnonzero(odds > odds.max() - MARGIN)
+    strength, start = _in_one_frame(strength[keep], second.parameters[keep], odds[keep])
+    strength, start = _unlike(strength, start, odds[keep])
+    problem = _problem(trace.thinned(FINE), geometry, priors, strength)
+    return _explanations(problem, fit.descend(problem, start))
 
 
-def _siblings(first: fit.Fitted, code: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """The descents' ends, and all other codes at the best of these."""
-    odds = first.evidence()
-    best = int(np.argmax(odds))
-    pose = first.parameters[:, :3]
-    others = np.array([c for c in range(CODES) if c != code[best]])
-    return (
-        np.concatenate([pose, np.repeat(pose[best : best + 1], len(others), axis=0)]),
-        np.concatenate([code, others]),
-    )
+def _problem(trace: Trace, geometry: Geometry, priors: fit.Priors, strength: Array) -> fit.Problem:
+    sigma = np.where(strength == 0, FAULTY, priors.strength)
+    return fit.Problem(trace, geometry, priors, strength, sigma)
 
 
-def _in_one_frame(
-    code: NDArray[np.int64], parameters: Array, odds: Array
-) -> tuple[NDArray[np.int64], Array]:
+def _faulty(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explanation]:
+    """Explanations by landmarks of which one bar is of any strength."""
+    found = []
+    for one in _explained(trace, geometry, priors, scan.ONE_MISSING):
+        bar = one.free
+        odds = one.log_odds + math.log(priors.faulty)
+        if abs(one.strength[bar]) > GONE:
+            found.append(replace(one, log_odds=odds))
+        else:  # of a bar that is gone nobody can tell how it lay
+            odds -= math.log(2)
+            found += [replace(one, code=c, log_odds=odds) for c in (one.code, one.code ^ 1 << bar)]
+    return found
+
+
+def _in_one_frame(strength: Array, parameters: Array, odds: Array) -> tuple[Array, Array]:
     """The same landmarks in frames that differ by no quarter turn from that of the best."""
     best = parameters[np.argmax(odds), 2]
     best -= HALF_PI * np.round(best / HALF_PI)
     turns = np.round((best - parameters[:, 2]) / HALF_PI).astype(np.int64)
     turned = parameters.copy()
     turned[:, 2] += HALF_PI * turns
-    return rotated(code, -turns), turned
+    bars = (np.arange(4) + turns[:, None]) % 4
+    return np.take_along_axis(strength, bars, axis=1), turned
 
 
-def _unlike(
-    code: NDArray[np.int64], parameters: Array, odds: Array
-) -> tuple[NDArray[np.int64], Array]:
+def _unlike(strength: Array, parameters: Array, odds: Array) -> tuple[Array, Array]:
     """The best of each group that is the same, and of no more than :data:`MOST` groups."""
     kept: list[int] = []
     for i in np.argsort(-odds):
         gap = np.abs(parameters[kept, :3] - parameters[i, :3]).max(axis=1)
-        if not np.any((code[kept] == code[i]) & (gap < SAME)) and len(kept) < MOST:
+        alike = (strength[kept] == strength[i]).all(axis=1)
+        if not np.any(alike & (gap < SAME)) and len(kept) < MOST:
             kept.append(int(i))
-    return code[kept], parameters[kept]
-
-
-def _faulty(
-    best: Explanation, trace: Trace, geometry: Geometry, priors: fit.Priors
-) -> list[Explanation]:
-    """The best explanation with each bar in turn of any strength."""
-    strength = np.repeat(signs([best.code]), 4, axis=0)
-    sigma = np.full((4, 4), priors.strength)
-    every = np.arange(4)
-    start = np.repeat(best.parameters[None], 4, axis=0)
-    k = fit.POSE + 2 * len(trace.lever_m)
-    start[every, k + every] = best.strength / FAULTY
-    strength[every, every], sigma[every, every] = 0.0, FAULTY
-    problem = fit.Problem(trace, geometry, priors, strength, sigma)
-    fitted = fit.descend(problem, start)
-    found = []
-    for bar, one in enumerate(_explanations(problem, fitted, np.full(4, best.code))):
-        one = replace(one, log_odds=one.log_odds + math.log(priors.faulty))
-        same = best.code & ~(1 << bar) | (one.strength[bar] > 0) << bar
-        if abs(one.strength[bar]) > GONE:
-            found.append(replace(one, code=same))
-        else:  # of a bar that is gone nobody can tell how it lay
-            half = one.log_odds - math.log(2)
-            found += [replace(one, code=c, log_odds=half) for c in (same, same ^ 1 << bar)]
-    return found
+    return strength[kept], parameters[kept]
 
 
 def _shares(found: list[Explanation]) -> list[Explanation]:
@@ -202,15 +188,16 @@ def _shares(found: list[Explanation]) -> list[Explanation]:
     ]
 
 
-def _explanations(
-    problem: fit.Problem, fitted: fit.Fitted, code: NDArray[np.int64]
-) -> list[Explanation]:
+def _explanations(problem: fit.Problem, fitted: fit.Fitted) -> list[Explanation]:
     odds = fitted.evidence()
     covariance = np.linalg.inv(fitted.information)
     k = fit.POSE + 2 * len(problem.trace.lever_m)
     span = slice(k, k + 4)
     strength = problem.strength + problem.strength_sigma * fitted.parameters[:, span]
     sigma = problem.strength_sigma * np.sqrt(np.einsum("kii->ki", covariance)[:, span])
+    gone = problem.strength == 0
+    free = np.where(gone.any(axis=1), gone.argmax(axis=1), -1)
+    code = (strength > 0) @ (1 << np.arange(4))
     residual = problem.residuals(fitted.parameters, jacobian=False)[0]
     seen = max(int((~np.isnan(problem.trace.value_t)).sum()), 1)
     rms = np.sqrt(np.einsum("kr,kr->k", residual, residual) / (seen * problem.trace.share))
@@ -223,6 +210,7 @@ def _explanations(
             strength[i],
             sigma[i],
             float(rms[i]),
+            int(free[i]),
         )
         for i in range(len(code))
     ]

@@ -42,7 +42,18 @@ APART_M = 0.012
 APART_RAD = math.radians(16)
 
 
-def candidates(trace: Trace, geometry: Geometry, most: int) -> tuple[Array, NDArray[np.int64]]:
+WHOLE = signs(np.arange(CODES))
+"""(16, 4) strengths of the bars of faultless landmarks."""
+
+ONE_MISSING = np.unique(
+    np.concatenate([WHOLE * (np.arange(4) != bar) for bar in range(4)]), axis=0
+)
+"""(32, 4) strengths where one bar is missing."""
+
+
+def candidates(
+    trace: Trace, geometry: Geometry, laid: Array, most: int
+) -> tuple[Array, NDArray[np.intp]]:
     """The likeliest places of the landmark under a trace.
 
     Parameters
@@ -50,36 +61,40 @@ def candidates(trace: Trace, geometry: Geometry, most: int) -> tuple[Array, NDAr
     trace : Trace
         Best thinned: each sample costs.
     geometry : Geometry
+    laid : (L, 4) ndarray
+        Strengths of the bars that may be there: :data:`WHOLE`, :data:`ONE_MISSING`.
     most : int
         Number of candidates.
 
     Returns
     -------
     (K, 3) ndarray, (K,) ndarray
-        x, y, heading in the trace's frame and the code; the best first, no two alike. Empty
-        where no field is strong.
+        x, y, heading in the trace's frame and the row of ``laid``; the best first, no two
+        alike. Empty where no field is strong.
     """
     place = trace.places()
     seen = ~np.isnan(trace.value_t)
     strong = seen & (np.abs(np.where(seen, trace.value_t, 0)) > STRONG * geometry.threshold_t)
     if not strong.any():
-        return np.empty((0, 3)), np.empty(0, np.int64)
+        return np.empty((0, 3)), np.empty(0, np.intp)
     centres = _centres(place[strong])
-    cost = scan(place[seen], trace.value_t[seen], centres, geometry)
+    cost = scan(place[seen], trace.value_t[seen], centres, geometry, laid)
     return _distinct(cost, centres, most)
 
 
-def scan(points: Array, values: Array, centres: Array, geometry: Geometry) -> Array:
-    """Cost (turns, centres, 16) of each code at each place: weighted squares left over.
+def scan(
+    points: Array, values: Array, centres: Array, geometry: Geometry, laid: Array
+) -> Array:
+    """Cost (turns, centres, L) of all that may be laid at each place: weighted squares left.
 
-    One normal matrix of the four bars serves all sixteen codes; a common gain is free
+    One normal matrix of the four bars serves all ``laid`` (L, 4); a common gain is free
     within :data:`GAINS`.
     """
     weight = 1 / (FLOOR_T**2 + (SLACK * values) ** 2)
     table = _table(geometry)
     if kernels is None:
-        return scan_numpy(points, values, weight, centres, table)
-    cost = np.empty((len(TURNS), len(centres), CODES))
+        return scan_numpy(points, values, weight, centres, table, laid)
+    cost = np.empty((len(TURNS), len(centres), len(laid)))
     kernels.scan_landmarks(
         np.ascontiguousarray(points),
         np.ascontiguousarray(values),
@@ -93,18 +108,24 @@ def scan(points: Array, values: Array, centres: Array, geometry: Geometry) -> Ar
         len(table),
         TABLE_STEP_M,
         *GAINS,
+        laid,
+        len(laid),
         cost,
     )
     return cost
 
 
 def scan_numpy(
-    points: Array, values: Array, weight: Array, centres: Array, table: NDArray[np.float32]
+    points: Array,
+    values: Array,
+    weight: Array,
+    centres: Array,
+    table: NDArray[np.float32],
+    laid: Array,
 ) -> Array:
     """Twin of the compiled loop."""
     last = len(table) - 1
-    every = signs(np.arange(CODES))
-    cost = np.empty((len(TURNS), len(centres), CODES))
+    cost = np.empty((len(TURNS), len(centres), len(laid)))
     power = (weight * values**2).sum()
     for number, turn in enumerate(TURNS):
         x, y = np.moveaxis(points - centres[:, None], -1, 0)
@@ -124,8 +145,8 @@ def scan_numpy(
             u, v = v, -u
         right = np.einsum("kmn,n->mk", unit, weight * values)
         normal = np.einsum("kmn,lmn,n->mkl", unit, unit, weight, optimize=True)
-        top = right @ every.T
-        square = np.einsum("ck,mkl,cl->mc", every, normal, every)
+        top = right @ laid.T
+        square = np.einsum("ck,mkl,cl->mc", laid, normal, laid)
         gain = np.clip(top / np.maximum(square, 1e-300), *GAINS)
         cost[number] = power - 2 * gain * top + gain * gain * square
     return cost
@@ -141,8 +162,8 @@ def _centres(strong: Array) -> Array:
     return nodes[gap < FARTHEST_M**2]
 
 
-def _distinct(cost: Array, centres: Array, most: int) -> tuple[Array, NDArray[np.int64]]:
-    """The best nodes, none of which is a neighbour of a better one of the same code."""
+def _distinct(cost: Array, centres: Array, most: int) -> tuple[Array, NDArray[np.intp]]:
+    """The best nodes, none of which is a neighbour of a better one that is laid alike."""
     flat = cost.ravel()
     order = np.argpartition(flat, min(60 * most, len(flat) - 1))[: 60 * most]
     order = order[np.argsort(flat[order])]
@@ -156,7 +177,7 @@ def _distinct(cost: Array, centres: Array, most: int) -> tuple[Array, NDArray[np
         near = np.hypot(*(pose[:, :2] - pose[best, :2]).T) < APART_M
         near &= np.abs(pose[:, 2] - pose[best, 2]) < APART_RAD
         left &= ~(near & (code == code[best]))
-    return pose[chosen], code[chosen].astype(np.int64)
+    return pose[chosen], code[chosen]
 
 
 @functools.lru_cache(maxsize=4)

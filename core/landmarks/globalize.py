@@ -1,0 +1,285 @@
+"""Which cells of the map were visited: a Bayes filter over cell and heading, and back again.
+
+The paper compares three patterns in an L with the map (section 4.2). Here every visit
+counts, with the probabilities of all that it may have been; a landmark may be misread,
+missing or laid a bit off, and odometry says how many cells lie between two visits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.landmark import CODES, rotated
+from locatk.core.landmarks.sighting import Hypothesis, Sighting
+from locatk.core.landmarks.trace import Drift
+
+Array = NDArray[np.float64]
+
+HALF_PI = math.pi / 2
+
+PAD = 3
+"""Cells around the map in which a robot may be too, though no landmark is told there."""
+
+UNTOLD = 1e-3
+"""Probability of a landmark where the map has none."""
+
+LOST = 1e-7
+"""Probability that a robot was carried to anywhere between two visits."""
+
+UNSEEN = 0.02
+"""Probability of no sighting of a landmark that lies on the way."""
+
+PLACE_M = 3e-3
+"""Standard deviation of a landmark's place, beside that of odometry."""
+
+FAINT = 1e-4
+"""Probability under which a hypothesis of a visit is not followed."""
+
+MOST = 6
+
+FAR = 9.0
+"""Logarithm of likelihood that a step of whole cells may lack."""
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where on the map one sighting was.
+
+    Attributes
+    ----------
+    cell : (row, column)
+    quarters : int
+        The heading of the hypothesis' frame in the map, in quarter turns.
+    hypothesis : int
+        Of the sighting, in its order.
+    probability : float
+        Of this cell and heading, given all sightings.
+    so_far : float
+        The highest of any cell and heading, given this sighting and those before it.
+    """
+
+    cell: tuple[int, int]
+    quarters: int
+    hypothesis: int
+    probability: float
+    so_far: float
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Whole cells from one visit to the next, in the frame of the first one's hypothesis."""
+
+    before: int
+    after: int
+    cells: tuple[int, int]
+    quarters: int
+    odds: float
+
+
+def locate(
+    sightings: Sequence[Sighting], floor: FloorMap, *, misread: float, drift: Drift
+) -> list[Located]:
+    """Places of sightings of one robot, in order of time.
+
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        Each with a hypothesis at least.
+    floor : FloorMap
+    misread : float
+        Probability that a landmark is laid otherwise than the map says, or is misread.
+    drift : Drift
+        Of the odometry between visits.
+
+    Returns
+    -------
+    list of Located
+    """
+    if not sightings:
+        return []
+    kept = [_followed(sighting) for sighting in sightings]
+    seen = [_seen(hypotheses, floor, misread) for hypotheses in kept]
+    steps = [
+        _steps(one, other, hypotheses, others, floor.pitch_m, drift)
+        for one, other, hypotheses, others in zip(
+            sightings, sightings[1:], kept, kept[1:], strict=False
+        )
+    ]
+    unseen = _unseen(floor)
+    forward = [seen[0] / seen[0].sum()]
+    for step, now in zip(steps, seen[1:], strict=True):
+        after = _moved(forward[-1], step, len(now), unseen) * now
+        forward.append(after / after.sum())
+    backward = [np.ones_like(seen[-1])]
+    for step, now, count in zip(
+        reversed(steps), reversed(seen[1:]), reversed([len(k) for k in kept[:-1]]), strict=True
+    ):
+        before = _moved_back(backward[-1] * now, step, count, unseen)
+        backward.append(before / before.sum())
+    found = []
+    for hypotheses, past, future in zip(kept, forward, reversed(backward), strict=True):
+        both = past * future
+        both /= both.sum()
+        state = both.sum(axis=0)
+        quarters, row, column = np.unravel_index(np.argmax(state), state.shape)
+        number = int(np.argmax(both[:, quarters, row, column]))
+        found.append(
+            Located(
+                (int(row) - PAD, int(column) - PAD),
+                int(quarters),
+                hypotheses[number][0],
+                float(state[quarters, row, column]),
+                float(past.sum(axis=0).max()),
+            )
+        )
+    return found
+
+
+def _followed(sighting: Sighting) -> list[tuple[int, Hypothesis]]:
+    """The likelier hypotheses with their numbers."""
+    every = list(enumerate(sighting.hypotheses))
+    return [(n, h) for n, h in every if n == 0 or h.probability > FAINT][:MOST]
+
+
+def _seen(
+    hypotheses: list[tuple[int, Hypothesis]], floor: FloorMap, misread: float
+) -> Array:
+    """Likelihood (H, 4, rows, columns) of each hypothesis in each state, the pad included."""
+    codes = np.pad(floor.codes, PAD, constant_values=HOLE)
+    turned = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
+    out = np.empty((len(hypotheses), 4, *codes.shape))
+    for place, (_, one) in enumerate(hypotheses):
+        same = np.where(turned == one.code, 1 - misread, misread / (CODES - 1))
+        out[place] = one.probability * np.where(codes == HOLE, UNTOLD / CODES, same)
+    return out
+
+
+def _unseen(floor: FloorMap) -> Array:
+    """Likelihood (rows, columns) of passing a cell without a sighting, the pad included."""
+    return np.where(np.pad(floor.codes, PAD, constant_values=HOLE) == HOLE, 1.0, UNSEEN)
+
+
+def _steps(
+    one: Sighting,
+    other: Sighting,
+    before: list[tuple[int, Hypothesis]],
+    after: list[tuple[int, Hypothesis]],
+    pitch_m: float,
+    drift: Drift,
+) -> list[_Step]:
+    """Steps of whole cells that odometry allows between two sightings."""
+    way = other.odometry[:2] - one.odometry[:2]
+    turn = float(other.odometry[2] - one.odometry[2])
+    back = -one.odometry[2]
+    ahead = np.array(
+        [
+            math.cos(back) * way[0] - math.sin(back) * way[1],
+            math.sin(back) * way[0] + math.cos(back) * way[1],
+        ]
+    )
+    length = float(np.hypot(*ahead))
+    swing = math.hypot(
+        drift.curvature_radpm * length, drift.turn_scale * abs(turn), drift.walk_rad
+    )
+    steps = []
+    for i, (_, first) in enumerate(before):
+        for j, (_, last) in enumerate(after):
+            facing = first.pose[2] + turn - last.pose[2]
+            quarters = round(facing / HALF_PI)
+            rest = facing - quarters * HALF_PI
+            angle = np.hypot(swing, math.radians(2))
+            cos, sin = math.cos(first.pose[2]), math.sin(first.pose[2])
+            place = first.pose[:2] + [
+                cos * ahead[0] - sin * ahead[1],
+                sin * ahead[0] + cos * ahead[1],
+            ]
+            c, s = math.cos(quarters * HALF_PI), math.sin(quarters * HALF_PI)
+            x, y = last.pose[:2]
+            cells = (place - [c * x - s * y, s * x + c * y]) / pitch_m
+            spread = math.hypot(
+                PLACE_M,
+                drift.scale * length,
+                swing * length,
+                _sigma(first),
+                _sigma(last),
+            )
+            sigma = spread / pitch_m
+            for a in range(math.floor(cells[0]), math.floor(cells[0]) + 2):
+                for b in range(math.floor(cells[1]), math.floor(cells[1]) + 2):
+                    miss = ((cells[0] - a) ** 2 + (cells[1] - b) ** 2) / sigma**2
+                    odds = -(miss + (rest / angle) ** 2) / 2
+                    if odds > -FAR:
+                        steps.append(_Step(i, j, (a, b), quarters, odds))
+    return steps
+
+
+def _sigma(hypothesis: Hypothesis) -> float:
+    """Standard deviation of its place, in metres."""
+    trace = float(np.trace(hypothesis.covariance[:2, :2]))
+    return math.sqrt(trace) if math.isfinite(trace) else 2 * PLACE_M
+
+
+def _moved(belief: Array, steps: list[_Step], count: int, unseen: Array) -> Array:
+    """Belief (count, 4, rows, columns) after steps from ``belief`` (H, 4, rows, columns)."""
+    out = np.full((count, *belief.shape[1:]), LOST * belief.sum() / belief[0].size)
+    for step in steps:
+        weight = math.exp(step.odds)
+        for quarters in range(4):
+            rows, columns = _on_map(step.cells, quarters)
+            passed = _passed(unseen, rows, columns)
+            moved = _shifted(belief[step.before, quarters] * passed, rows, columns)
+            out[step.after, (quarters + step.quarters) % 4] += weight * moved
+    return out
+
+
+def _moved_back(belief: Array, steps: list[_Step], count: int, unseen: Array) -> Array:
+    """The transpose of :func:`_moved`."""
+    out = np.full((count, *belief.shape[1:]), LOST * belief.sum() / belief[0].size)
+    for step in steps:
+        weight = math.exp(step.odds)
+        for quarters in range(4):
+            rows, columns = _on_map(step.cells, quarters)
+            passed = _passed(unseen, rows, columns)
+            back = _shifted(belief[step.after, (quarters + step.quarters) % 4], -rows, -columns)
+            out[step.before, quarters] += weight * passed * back
+    return out
+
+
+def _on_map(cells: tuple[int, int], quarters: int) -> tuple[int, int]:
+    """(rows, columns) of a step of (x, y) cells in a frame turned by quarters."""
+    x, y = cells
+    for _ in range(quarters % 4):
+        x, y = -y, x
+    return y, x
+
+
+def _passed(unseen: Array, rows: int, columns: int) -> Array:
+    """Likelihood, by the cell of departure, that nothing was seen on a straight way."""
+    out = np.ones_like(unseen)
+    if rows and columns:
+        return out
+    length = max(abs(rows), abs(columns))
+    for k in range(1, length):
+        out *= _shifted(unseen, -rows * k // length, -columns * k // length, fill=1.0)
+    return out
+
+
+def _shifted(values: Array, rows: int, columns: int, fill: float = 0.0) -> Array:
+    """``values`` (rows, columns) moved up by whole cells."""
+    out = np.full_like(values, fill)
+    height, width = values.shape
+    if abs(rows) < height and abs(columns) < width:
+        source = (_span(-rows, height), _span(-columns, width))
+        target = (_span(rows, height), _span(columns, width))
+        out[target] = values[source]
+    return out
+
+
+def _span(shift: int, size: int) -> slice:
+    return slice(max(shift, 0), size + min(shift, 0))

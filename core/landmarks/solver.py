@@ -1,0 +1,338 @@
+"""From hall sensors and odometry to landmarks that were seen and poses on the map."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks import globalize, route, smooth
+from locatk.core.landmarks.estimate import FAULTY, Explanation
+from locatk.core.landmarks.fit import Priors
+from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.globalize import HALF_PI, Located
+from locatk.core.landmarks.halls import HallSamples
+from locatk.core.landmarks.landmark import Geometry, pattern, rotated, signs
+from locatk.core.landmarks.sighting import Sighting
+from locatk.core.landmarks.sightings import check_order, sighting
+from locatk.core.landmarks.visits import Driven, Visit, driven, find
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+METHODS = ("field", "paper")
+
+CERTAIN = 0.9999
+"""Probability from which on a place on the map needs no remark."""
+
+LIKELY = 0.9
+"""Probability from which on poses on the map are given."""
+
+LAID_M, LAID_RAD = 1.5e-3, 0.012
+"""Standard deviations with which landmarks are taken to be laid."""
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """How to solve.
+
+    Attributes
+    ----------
+    method : str
+        ``"field"``, the default, or ``"paper"``: the published algorithm.
+    misread : float
+        Probability that a landmark is laid otherwise than the map says, or is misread.
+    priors : Priors
+        What is not known of sensors, bars and odometry, and how large that may be; the
+        noise is taken from the recording.
+    """
+
+    method: str = "field"
+    misread: float = 0.01
+    priors: Priors = Priors()
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"no method {self.method!r} for landmarks", hint="Use field or paper")
+        if not 0 < self.misread < 0.5:
+            raise InputError(
+                f"a rate of misread landmarks of {self.misread!r}", hint="Give 0.001 to 0.2"
+            )
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One visit, with what it has shown.
+
+    Attributes
+    ----------
+    visit : Visit
+    sighting : Sighting
+    explanations : list of Explanation
+        Behind the hypotheses of the sighting.
+    located : Located or None
+        Where that was on the map.
+    """
+
+    visit: Visit
+    sighting: Sighting
+    explanations: list[Explanation]
+    located: Located | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One robot's recording on its way through the solver."""
+
+    run: Driven
+    odometry: Trajectory
+    priors: Priors
+    seen: list[Seen]
+
+
+def solve(
+    samples: Sequence[HallSamples],
+    floor: FloorMap | None = None,
+    options: SolveOptions | None = None,
+    *,
+    odometry: Sequence[Trajectory] = (),
+) -> Solution:
+    """Find the landmarks that robots have met, and by them their places on the map.
+
+    Parameters
+    ----------
+    samples : sequence of HallSamples
+        One a robot.
+    floor : FloorMap or None
+        Without it landmarks are found, but no places on a map.
+    options : SolveOptions, optional
+    odometry : sequence of Trajectory
+        By device.
+
+    Returns
+    -------
+    Solution
+        Its detections are what was seen at each landmark (docs/formats.md).
+
+    Raises
+    ------
+    InputError
+        A recording has no odometry, no sensor of it can be used, or its sensors are in the
+        wrong order.
+    """
+    options = options or SolveOptions()
+    if options.method == "paper":
+        from locatk.core.landmarks import paper_solver
+
+        return paper_solver.solve(samples, floor, odometry=odometry)
+    trajectories: list[Trajectory] = []
+    detections: list[dict[str, Any]] = []
+    notes: list[str] = []
+    rejected: Counter[str] = Counter()
+    facts: dict[str, Any] = {"robots": {}}
+    for recording in samples:
+        driven_by = next((t for t in odometry if t.device == recording.device), None)
+        found = read(recording, driven_by, floor, options)
+        notes += found.run.notes
+        if floor is None:
+            notes.append(f"{recording.device}: no map, so that its landmarks have no cells")
+        solved, remarks, told = placed(found, floor)
+        trajectories += solved
+        notes += remarks
+        facts["robots"][recording.device] = told
+        for item in found.seen:
+            detections.append(detection(item, floor))
+            if why := detections[-1]["refused"]:
+                rejected[why] += 1
+    return Solution(
+        system="landmarks",
+        method=options.method,
+        trajectories=tuple(trajectories),
+        rejected=dict(rejected),
+        detections=detections,
+        artifact=floor,
+        notes=tuple(notes),
+        facts=facts,
+    )
+
+
+def read(
+    recording: HallSamples,
+    odometry: Trajectory | None,
+    floor: FloorMap | None,
+    options: SolveOptions,
+) -> Recording:
+    """What one robot has seen, and where on the map that was."""
+    geometry = floor.geometry if floor is not None else Geometry()
+    run = driven(recording, odometry)
+    assert odometry is not None  # `driven` refuses none
+    priors = replace(options.priors, noise_t=run.noise_t)
+    pitch = floor.pitch_m if floor is not None else 0.2
+    visits = find(run, geometry, priors.drift, pitch)
+    seen = [Seen(visit, *sighting(visit, run, geometry, priors)) for visit in visits]
+    check_order(visits, [one.sighting.residual_sigma for one in seen], run, geometry, priors)
+    if floor is not None:
+        used = [n for n, one in enumerate(seen) if not one.sighting.refused]
+        told = globalize.locate(
+            [seen[n].sighting for n in used], floor, misread=options.misread, drift=priors.drift
+        )
+        for n, located in zip(used, told, strict=True):
+            seen[n] = replace(seen[n], located=located)
+    return Recording(run, odometry, priors, seen)
+
+
+def placed(
+    found: Recording, floor: FloorMap | None
+) -> tuple[list[Trajectory], list[str], dict[str, Any]]:
+    """Poses on the map, remarks, and what is told of one robot's localization."""
+    device = found.run.samples.device
+    usable = on_map(found, floor) if floor is not None else []
+    located = [one.located for one in found.seen if one.located is not None]
+    sure = max((one.probability for one in located), default=0.0)
+    first = next((n for n, one in enumerate(located, 1) if one.so_far >= CERTAIN), None)
+    told = {
+        "localised": bool(usable),
+        "probability": sure,
+        "landmarks_seen": len(located),
+        "landmarks_to_localise": first,
+    }
+    if not usable or floor is None:
+        remarks = []
+        if located:
+            remarks = [
+                f"{device}: not localised; the likeliest place has a probability of {sure:.2g}"
+            ]
+        return [], remarks, told
+    remarks = []
+    if sure < CERTAIN:
+        remarks.append(
+            f"{device}: its place on the map has a probability of {sure:.4f}; one more landmark "
+            "would settle it"
+        )
+    marks = expected(usable, floor)
+    smoothed = smooth.smooth([as_run(usable, found, floor)], marks, floor.geometry, found.priors)
+    told["misfit_sigma"] = smoothed.misfit
+    path = route.poses(
+        device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
+    )
+    return [path], remarks, told
+
+
+def on_map(found: Recording, floor: FloorMap) -> list[Seen]:
+    """Visits whose landmark on the map is known."""
+    return [
+        one
+        for one in found.seen
+        if one.located is not None
+        and one.located.probability >= LIKELY
+        and _laid(floor, one.located.cell) != HOLE
+    ]
+
+
+def expected(usable: Sequence[Seen], floor: FloorMap) -> dict[Cell, smooth.Mark]:
+    """The landmarks of visits, as the map has them and as they were read."""
+    marks: dict[Cell, smooth.Mark] = {}
+    for one in usable:
+        assert one.located is not None
+        cell, quarters = one.located.cell, one.located.quarters
+        best = one.explanations[one.located.hypothesis]
+        strength = signs(rotated(best.code, quarters))
+        sigma = np.full(4, Priors().strength)
+        pose = np.array([*floor.place(cell), 0.0])
+        spread = np.array([LAID_M, LAID_M, LAID_RAD])
+        built = floor.built.get(cell)
+        if built is not None:
+            pose = pose + [built.x_m, built.y_m, built.heading_rad]
+            spread = np.fmax(np.where(np.isnan(built.sigma[:3]), spread, built.sigma[:3]), 1e-5)
+            same = np.sign(built.strength) == strength
+            known = np.where(np.isnan(built.sigma[3:]), sigma, np.fmax(built.sigma[3:], 1e-3))
+            strength = np.where(same, built.strength, strength)
+            sigma = np.where(same, known, sigma)
+        if best.free >= 0:
+            bar = (best.free + quarters) % 4
+            strength[bar], sigma[bar] = 0.0, FAULTY
+        if cell not in marks or best.free < 0:
+            marks[cell] = smooth.Mark(pose, spread, strength, sigma)
+    return marks
+
+
+def as_run(usable: Sequence[Seen], found: Recording, floor: FloorMap) -> smooth.Run:
+    """One robot's visits as a run for :func:`.smooth.smooth`."""
+    stays = []
+    for one in usable:
+        assert one.located is not None
+        best = one.sighting.hypotheses[one.located.hypothesis]
+        turn = one.located.quarters * HALF_PI
+        mark = np.array([*floor.place(one.located.cell), turn])
+        stays.append(smooth.Stay(one.visit.trace, one.located.cell, smooth.compose(mark, best.pose)))
+    visits = [one.visit for one in usable]
+    return smooth.Run(stays, route.links(visits, found.odometry, found.priors))
+
+
+def detection(item: Seen, floor: FloorMap | None) -> dict[str, Any]:
+    """What one visit has shown, in the JSON form of docs/formats.md."""
+    out: dict[str, Any] = {
+        "time_s": item.sighting.time_ns * 1e-9,
+        "device": item.sighting.device,
+        "cell": None,
+        "pattern": None,
+        "code": None,
+        "probability": 0.0,
+        "x_m": None,
+        "y_m": None,
+        "heading_rad": None,
+        "sigma_x_m": None,
+        "sigma_y_m": None,
+        "sigma_heading_rad": None,
+        "strength": None,
+        "residual_sigma": item.sighting.residual_sigma,
+        "refused": item.sighting.refused,
+    }
+    if not item.sighting.hypotheses:
+        return out
+    located, quarters = item.located, 0
+    best = item.sighting.best
+    if located is not None and located.probability >= LIKELY:
+        best = item.sighting.hypotheses[located.hypothesis]
+        quarters = located.quarters
+        out["cell"] = list(located.cell)
+        if floor is not None:
+            laid = _laid(floor, located.cell)
+            if laid == HOLE:
+                out["cell"], out["refused"] = None, "off_map"
+            elif laid != rotated(best.code, quarters):
+                out["refused"] = "misread"
+    elif located is not None:
+        out["refused"] = "not_localised"
+    code = int(rotated(best.code, quarters))
+    turn = quarters * HALF_PI
+    c, s = np.cos(turn), np.sin(turn)
+    x, y, heading = best.pose
+    sigma = np.sqrt(np.diag(best.covariance))
+    across = np.abs([[c, -s], [s, c]]) @ sigma[:2]
+    same = sum(h.probability for h in item.sighting.hypotheses if h.code == best.code)
+    out |= {
+        "pattern": pattern(code),
+        "code": code,
+        "probability": same,
+        "x_m": float(c * x - s * y),
+        "y_m": float(s * x + c * y),
+        "heading_rad": float(np.remainder(heading + turn + np.pi, 2 * np.pi) - np.pi),
+        "sigma_x_m": float(across[0]),
+        "sigma_y_m": float(across[1]),
+        "sigma_heading_rad": float(sigma[2]),
+        "strength": [float(v) for v in np.roll(best.strength, quarters)],
+    }
+    return out
+
+
+def _laid(floor: FloorMap, cell: Cell) -> int:
+    rows, columns = floor.shape
+    inside = 0 <= cell[0] < rows and 0 <= cell[1] < columns
+    return int(floor.codes[cell]) if inside else HOLE
