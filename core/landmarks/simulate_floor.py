@@ -19,11 +19,18 @@ from locatk.core.geometry import rotation_exp
 from locatk.core.landmarks.floor import Cell, FloorMap
 from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, code_of, signs
 from locatk.core.landmarks.simulate_options import Errors, Faults
+from locatk.core.magnetics import MU0_4PI, dipole_field
 
 Array = NDArray[np.float64]
 
 REACH_M = 0.3
 """How far a landmark is felt: a strong one makes 1 uT there, a hundredth of the noise."""
+
+DIPOLE_LENGTHS = 6
+"""Farther than so many of its lengths a bar is a dipole to 0.3 uT, which is quicker."""
+
+BAR_DRAWS = 24
+"""Random numbers for the bars of a landmark: of each a strength, a place, a turn, a lean."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,12 @@ def lay(floor: FloorMap, errors: Errors, faults: Faults, seed: int) -> dict[Cell
         A fault names a cell that bears no landmark, or a bar that it does not have.
     """
     _check(floor, faults)
-    return {cell: _lay_one(floor, cell, errors, faults, seed) for cell in floor.cells()}
+    cells = floor.cells()
+    rngs = [np.random.default_rng([seed, 40, *cell]) for cell in cells]
+    draws = np.array([rng.standard_normal(3 + BAR_DRAWS) for rng in rngs]).reshape(len(rngs), -1)
+    strength, middle, axes = scatter_bars(floor.geometry, draws[:, 3:], errors)
+    each = zip(cells, rngs, draws[:, :3], strength, middle, axes, strict=True)
+    return {cell: _lay_one(floor, cell, errors, faults, *one) for cell, *one in each}
 
 
 def _check(floor: FloorMap, faults: Faults) -> None:
@@ -91,19 +103,28 @@ def _check(floor: FloorMap, faults: Faults) -> None:
             )
 
 
-def _lay_one(floor: FloorMap, cell: Cell, errors: Errors, faults: Faults, seed: int) -> Laid:
-    rng = np.random.default_rng([seed, 40, *cell])
+def _lay_one(
+    floor: FloorMap,
+    cell: Cell,
+    errors: Errors,
+    faults: Faults,
+    rng: np.random.Generator,
+    draws: Array,
+    strength: Array,
+    middle: Array,
+    axes: Array,
+) -> Laid:
+    """The landmark of a cell, of bars in its own frame and draws for its place and turn."""
     designed = int(floor.codes[cell])
     x, y = floor.place(cell)
-    off_x, off_y = rng.normal(0.0, errors.landmark_place_m, 2)
-    turned = rng.normal(0.0, errors.landmark_turn_rad)
-    strength, middle, axes = scatter_bars(floor.geometry, 1, errors, rng)
+    off_x, off_y = draws[:2] * errors.landmark_place_m
+    turned = float(draws[2] * errors.landmark_turn_rad)
     wrong = rng.random() < faults.misread_rate
     code, told = designed, []
     if wrong:
         code = int(rng.choice(_others(floor.alphabet, designed)))
         told.append("misread")
-    signed = signs(code) * strength[0]
+    signed = signs(code) * strength
     built = floor.built.get(cell)
     if built is not None and not wrong:
         off_x, off_y, turned = built.x_m, built.y_m, built.heading_rad
@@ -119,7 +140,8 @@ def _lay_one(floor: FloorMap, cell: Cell, errors: Errors, faults: Faults, seed: 
         if where == cell:
             off_x, off_y = off_x + dx, off_y + dy
             told.append("displaced")
-    turn = rotation_exp(np.array([0.0, 0.0, turned]))
+    cos, sin = math.cos(turned), math.sin(turned)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     place = np.array([x + off_x, y + off_y, 0.0])
     return Laid(
         cell,
@@ -127,11 +149,11 @@ def _lay_one(floor: FloorMap, cell: Cell, errors: Errors, faults: Faults, seed: 
         code,
         float(place[0]),
         float(place[1]),
-        float(turned),
+        turned,
         signed,
         tuple(told),
-        middle[0] @ turn.T + place,
-        turn @ axes[0],
+        middle @ turn.T + place,
+        turn @ axes,
     )
 
 
@@ -144,26 +166,27 @@ def _others(alphabet: str, code: int) -> list[int]:
     return [c for c in (compass if alphabet == "compass" else range(CODES)) if c != code]
 
 
-def scatter_bars(
-    geometry: Geometry, count: int, errors: Errors, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """Bars of ``count`` landmarks with the errors of each, in the landmarks' frames.
+def scatter_bars(geometry: Geometry, draws: Array, errors: Errors) -> tuple[Array, Array, Array]:
+    """Bars of landmarks with the errors of each, in the landmarks' frames.
 
+    ``draws`` are :data:`BAR_DRAWS` standard normal numbers (count, 24) for each landmark.
     Returns strengths (count, 4), middles (count, 4, 3) and rotations (count, 4, 3, 3).
     """
-    strength = 1 + rng.normal(0.0, errors.bar_strength, (count, 4))
+    count = len(draws)
+    spread = np.split(draws.reshape(count, 4, BAR_DRAWS // 4), [1, 3, 4], axis=-1)
     angle = np.arange(4) * math.pi / 2
     middle = np.zeros((count, 4, 3))
     middle[..., 0] = geometry.radius_m * np.cos(angle)
     middle[..., 1] = geometry.radius_m * np.sin(angle)
     middle[..., 2] = -geometry.bar_height_m / 2
-    middle[..., :2] += rng.normal(0.0, errors.bar_place_m, (count, 4, 2))
-    vector = np.zeros((count, 4, 3))
+    middle[..., :2] += errors.bar_place_m * spread[1]
+    turn = np.zeros((count, 4, 3))
     # Counter-clockwise along the circle: a quarter turn on from where the bar is.
-    vector[..., 2] = angle + math.pi / 2 + rng.normal(0.0, errors.bar_turn_rad, (count, 4))
+    turn[..., 2] = angle + math.pi / 2 + errors.bar_turn_rad * spread[2][..., 0]
     lean = np.zeros((count, 4, 3))
-    lean[..., :2] = rng.normal(0.0, errors.bar_lean_rad, (count, 4, 2))
-    return strength, middle, rotation_exp(vector) @ rotation_exp(lean)
+    lean[..., :2] = errors.bar_lean_rad * spread[3]
+    strength = 1 + errors.bar_strength * spread[0][..., 0]
+    return strength, middle, rotation_exp(turn) @ rotation_exp(lean)
 
 
 def bar_fields(geometry: Geometry, middle: ArrayLike, axes: ArrayLike, points: ArrayLike) -> Array:
@@ -189,6 +212,16 @@ def bar_fields(geometry: Geometry, middle: ArrayLike, axes: ArrayLike, points: A
     return np.asarray(np.einsum("...j,...j->...", axes[..., 2, :], own))
 
 
+def dipole_fields(
+    geometry: Geometry, middle: ArrayLike, axes: ArrayLike, points: ArrayLike
+) -> Array:
+    """The same as :func:`bar_fields` of dipoles in the bars' middles."""
+    volume = geometry.bar_length_m * geometry.bar_width_m * geometry.bar_height_m
+    size = geometry.remanence_t * volume / (4 * math.pi * MU0_4PI)
+    moment = size * np.asarray(axes, float)[..., :, 0]
+    return dipole_field(np.asarray(points, float) - middle, moment)[..., 2]
+
+
 def floor_field(geometry: Geometry, landmarks: Iterable[Laid], points: Array) -> Array:
     """Upright field (...) in tesla of all landmarks at points (..., 3) of the map's frame.
 
@@ -203,8 +236,15 @@ def floor_field(geometry: Geometry, landmarks: Iterable[Laid], points: Array) ->
         return field.reshape(points.shape[:-1])
     tree = cKDTree(flat[:, :2])
     places = [(mark.x_m, mark.y_m) for mark in laid]
+    close_m = DIPOLE_LENGTHS * geometry.bar_length_m
     for mark, near in zip(laid, tree.query_ball_point(places, REACH_M), strict=True):
-        if near:
-            each = bar_fields(geometry, mark.middle_m, mark.axes, flat[near][:, None])
-            field[near] += each @ mark.strength
+        where = np.asarray(near, np.int64)
+        far = (
+            np.hypot(*(flat[where, :2] - [mark.x_m, mark.y_m]).T)
+            > DIPOLE_LENGTHS * geometry.bar_length_m
+        )
+        for some, fields in ((where[far], dipole_fields), (where[~far], bar_fields)):
+            if len(some):
+                each = fields(geometry, mark.middle_m, mark.axes, flat[some][:, None])
+                field[some] += each @ mark.strength
     return field.reshape(points.shape[:-1])

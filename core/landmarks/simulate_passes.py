@@ -17,7 +17,7 @@ from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import CODES, Geometry, signs
-from locatk.core.landmarks.simulate_floor import bar_fields, scatter_bars
+from locatk.core.landmarks.simulate_floor import BAR_DRAWS, bar_fields, scatter_bars
 from locatk.core.landmarks.simulate_options import ASIDE_RAD, PASS_M, START_M, Errors
 from locatk.core.landmarks.simulate_sensors import digitise, gains, odometry
 from locatk.core.trajectory import Trajectory
@@ -142,7 +142,8 @@ def passes(
     if start is not None:
         angle[:], aside[:] = start
     poses = [_way(*one, way_m, then) for one in zip(angle, aside, aim, strict=True)]
-    bars = scatter_bars(geometry, count, errors, np.random.default_rng([seed, 32]))
+    draws = np.random.default_rng([seed, 32]).standard_normal((count, BAR_DRAWS))
+    bars = scatter_bars(geometry, draws, errors)
     strength = signs(codes) * bars[0]
     fields = _fields(poses, geometry, sensors, errors, strength, bars[1], bars[2])
     read, wheels = np.random.default_rng([seed, 33]), np.random.default_rng([seed, 34])
