@@ -113,12 +113,13 @@ POSE = Form("X,Y,DEG", "120,80,45", _pose)
 @click.option("--stop", "stop_s", type=FROM_0, metavar="SECONDS",
               help="Standing on each landmark.  [default: 0.5]")  # fmt: skip
 @click.option("--aim-first", "first_mm", type=FROM_0, metavar="MM",
-              help="By how much it misses the centre on average: after the first pass  "
+              help="By how much it misses the centre on average after the first pass.  "
               "[default: 7]")  # fmt: skip
 @click.option("--aim-second", "second_mm", type=FROM_0, metavar="MM",
-              help="after a spin  [default: 2]")  # fmt: skip
+              help="The same after a spin.  [default: 2]")  # fmt: skip
 @click.option("--aim-step", "step_mm", type=FROM_0, metavar="MM",
-              help="from the last landmark, and on a path.  [default: 3]")  # fmt: skip
+              help="The same from landmark to landmark, and of a path.  [default: 3]",
+)  # fmt: skip
 @click.option("--aim-heading", "heading_deg", type=FROM_0, metavar="DEG",
               help="Standard deviation of its heading when aligned.  [default: 1]")  # fmt: skip
 @click.option("--rate", "rate_hz", type=ABOVE_0, metavar="HZ", help="[default: 200]")

@@ -239,10 +239,7 @@ def floor_field(geometry: Geometry, landmarks: Iterable[Laid], points: Array) ->
     close_m = DIPOLE_LENGTHS * geometry.bar_length_m
     for mark, near in zip(laid, tree.query_ball_point(places, REACH_M), strict=True):
         where = np.asarray(near, np.int64)
-        far = (
-            np.hypot(*(flat[where, :2] - [mark.x_m, mark.y_m]).T)
-            > DIPOLE_LENGTHS * geometry.bar_length_m
-        )
+        far = np.hypot(*(flat[where, :2] - [mark.x_m, mark.y_m]).T) > close_m
         for some, fields in ((where[far], dipole_fields), (where[~far], bar_fields)):
             if len(some):
                 each = fields(geometry, mark.middle_m, mark.axes, flat[some][:, None])
