@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from locatk.cli.print_landmarks import landmarks
 from locatk.cli.print_pattern import pattern
 from locatk.cli.print_tag import tag
 from locatk.cli.print_testsheet import testsheet
@@ -17,10 +18,12 @@ def command() -> None:
     Examples:
       locatk print pattern -o sheet.pdf
       locatk print tag tag.toml --id 262143 -o tag.pdf
+      locatk print landmarks map.toml -o pack.pdf
       locatk print testsheet -o test.pdf
     """
 
 
 command.add_command(pattern)
 command.add_command(tag)
+command.add_command(landmarks)
 command.add_command(testsheet)

@@ -253,11 +253,11 @@ def _marks(floor: FloorMap, corner: Point, box: Box) -> list[Mark]:
     for row in range(rows):
         y = 1e3 * floor.place((row, 0))[1] + shift[1]
         if box[1] <= y <= box[3]:
-            marks.append(Line((left + shift[0], y), (right + shift[0], y), 0.1, dash_mm=2.0))
+            marks.append(Line((left + shift[0], y), (right + shift[0], y), 0.08))
     for column in range(columns):
         x = 1e3 * floor.place((0, column))[0] + shift[0]
         if box[0] <= x <= box[2]:
-            marks.append(Line((x, bottom + shift[1]), (x, top + shift[1]), 0.1, dash_mm=2.0))
+            marks.append(Line((x, bottom + shift[1]), (x, top + shift[1]), 0.08))
     for cell in _cells_within(floor, corner, box):
         x, y = (1e3 * a + b for a, b in zip(floor.place(cell), shift, strict=True))
         code = int(floor.codes[cell])
@@ -271,7 +271,7 @@ def _marks(floor: FloorMap, corner: Point, box: Box) -> list[Mark]:
             words = (f"row {cell[0]}", f"column {cell[1]}", f"code {digit(code)}")
             marks += draw_landmark(floor.geometry, code, (x, y), words)
             marks += north_mark((x + 3.0, y + 3.0), 5.0, "+y")
-    marks += _walls(floor, shift)
+    marks += _walls(floor, shift, box)
     return marks
 
 
@@ -316,12 +316,14 @@ def _cells_within(floor: FloorMap, corner: Point, box: Box) -> list[Cell]:
     return [(row, column) for row in ranges[0] for column in ranges[1]]
 
 
-def _walls(floor: FloorMap, shift: Point) -> list[Mark]:
+def _walls(floor: FloorMap, shift: Point, box: Box) -> list[Mark]:
     marks: list[Mark] = []
     half = 0.5e3 * floor.pitch_m
     for one, other in sorted(floor.walls):
         (ax, ay), (bx, by) = floor.place(one), floor.place(other)
         x, y = 500 * (ax + bx) + shift[0], 500 * (ay + by) + shift[1]
+        if not (box[0] - half <= x <= box[2] + half and box[1] - half <= y <= box[3] + half):
+            continue
         u, v = (0.0, half) if one[0] == other[0] else (half, 0.0)
         marks.append(Line((x - u, y - v), (x + u, y + v), 2.0))
         marks.append(Words("wall", (x + 2.0, y + 2.0), TEXT))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from locatk.core.drawing import (
     CAPITAL,
@@ -173,7 +174,7 @@ def _block(
         base = y + 0.35 * step + 0.35 * step if index == 0 else y - (index - 0.45) * step
         for text, column in zip(row, columns, strict=True):
             place = (x + column.width_mm - 1.0, base) if column.right else (x, base)
-            anchor = "end" if column.right else "start"
+            anchor: Literal["start", "end"] = "end" if column.right else "start"
             marks.append(Words(text, place, points, anchor, bold=index == 0))
             x += column.width_mm
         if index and index % 5 == 0 and index < len(rows):

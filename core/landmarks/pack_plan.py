@@ -163,15 +163,15 @@ class _Drawn:
                 Line((x - half, y + half), (x + half, y - half), 0.1),
             ]
         if self.cell <= _WORDS_MM:
-            return draw_symbol(code, middle, 1.4 * self.cell)
+            return draw_symbol(code, middle, 1.2 * self.cell)
         marks = draw_symbol(code, middle, self.cell)
         place = ", ".join(mm_text(value) for value in self.floor.place(cell))
         points = SMALL * min(1.4, self.cell / 25)
-        left, top = x - half + 0.8, y + half - line_mm(points)
+        left, top = x - half + 1.2, y + half - line_mm(points) - 0.2
         return [
             *marks,
             Words(f"row {cell[0]}, column {cell[1]}", (left, top), points),
-            Words(place, (left, y - half + 0.8), points),
+            Words(place, (left, y - half + 1.2), points),
         ]
 
     def _grid(self, block: Block, zero: Point) -> list[Mark]:
@@ -244,7 +244,8 @@ class _Drawn:
         ):
             return []
         x, y = zero[0] + (column + 0.5) * self.cell, zero[1] + (row + 0.5) * self.cell
-        return [Circle((x, y), 0.485 * self.cell, 0.2)]
+        radius = (0.33 if self.cell > _WORDS_MM else 0.42) * self.cell
+        return [Circle((x, y), radius, 0.2)]
 
 
 def _within(cell: Cell, block: Block) -> bool:

@@ -104,8 +104,8 @@ def template_leaves(
         enough = [math.ceil(2 * least + 2 * CUT_MM + side) for side in lost]
         enough[1] = math.ceil(enough[1] + _head_mm() + _list_mm(2))
         raise InputError(
-            f"a template of {2 * least:.0f} x {2 * least:.0f} mm is larger than paper "
-            f"{paper_name} of {size_text(paper_mm)} leaves room for",
+            f"a template needs {2 * least:.0f} x {2 * least:.0f} mm and words beside it, more than "
+            f"paper {paper_name} of {size_text(paper_mm)} has room for",
             hint=f"Use a larger paper, as in --paper {enough[0]}x{enough[1]}mm",
         )
     # The larger template first, then the fewer pages, then the paper as it is.
