@@ -7,7 +7,7 @@
 /* What is searched: `items` of `length` cells each, whose words must differ. */
 typedef struct {
     Py_ssize_t cells, items, uses;
-    int length, letters, shift;
+    int length, letters;
     const int32_t *item_cells; /* (items, length) */
     const int32_t *first;      /* (cells + 1): the uses of a cell */
     const int32_t *use_item, *use_row;
@@ -16,13 +16,13 @@ typedef struct {
     int heats;
     uint8_t *values;  /* (cells) */
     uint64_t *words;  /* (items) */
-    uint32_t *counts; /* (slots): items with a word, */
+    uint32_t *counts; /* (possible words): items with a word, */
     uint32_t *mixed;  /* and all their numbers, xor */
     int32_t *listed;  /* items that may be in conflict */
     uint8_t *is_listed;
     Py_ssize_t suspects;
-    size_t slots;
-    uint64_t multiplier, state;
+    Py_ssize_t possible;
+    uint64_t state;
 } Search;
 
 /* Splitmix64 (Steele, Lea and Flood, OOPSLA 2014); a number below `limit` of its upper half. */
@@ -34,14 +34,9 @@ static inline uint64_t below(Search *s, uint64_t limit)
     return ((z ^ z >> 31) >> 32) * limit >> 32;
 }
 
-static inline size_t slot(const Search *s, uint64_t word)
-{
-    return (size_t)(word * s->multiplier >> s->shift);
-}
-
 static inline void put(Search *s, int32_t item, uint64_t word)
 {
-    const size_t at = slot(s, word);
+    const size_t at = (size_t)word;
     s->words[item] = word;
     s->mixed[at] ^= (uint32_t)item;
     if (s->counts[at]++ && !s->is_listed[item]) {
@@ -52,7 +47,7 @@ static inline void put(Search *s, int32_t item, uint64_t word)
 
 static inline void take(Search *s, int32_t item)
 {
-    const size_t at = slot(s, s->words[item]);
+    const size_t at = (size_t)s->words[item];
     s->mixed[at] ^= (uint32_t)item;
     s->counts[at]--;
 }
@@ -63,7 +58,7 @@ static int32_t conflict(Search *s)
     while (s->suspects) {
         const Py_ssize_t pick = (Py_ssize_t)below(s, (uint64_t)s->suspects);
         const int32_t item = s->listed[pick];
-        const size_t at = slot(s, s->words[item]);
+        const size_t at = (size_t)s->words[item];
         if (s->counts[at] == 2 && below(s, 2)) return (int32_t)(s->mixed[at] ^ (uint32_t)item);
         if (s->counts[at] > 1) return item;
         s->is_listed[item] = 0;
@@ -83,11 +78,11 @@ static void redraw(Search *s, int32_t cell)
         uint32_t sum = 0;
         for (int32_t k = from; k < to; k++) {
             const uint64_t *part = s->parts + (size_t)s->use_row[k] * letters;
-            sum += s->counts[slot(s, s->words[s->use_item[k]] + part[v] - part[old])]++;
+            sum += s->counts[s->words[s->use_item[k]] + part[v] - part[old]]++;
         }
         for (int32_t k = from; k < to; k++) {
             const uint64_t *part = s->parts + (size_t)s->use_row[k] * letters;
-            s->counts[slot(s, s->words[s->use_item[k]] + part[v] - part[old])]--;
+            s->counts[s->words[s->use_item[k]] + part[v] - part[old]]--;
         }
         cost[v] = sum;
         if (sum < least) least = sum;
@@ -117,7 +112,7 @@ static int64_t search(Search *s, int64_t steps)
         redraw(s, s->item_cells[(size_t)item * s->length + below(s, (uint64_t)s->length)]);
     }
     int64_t left = 0;
-    for (size_t at = 0; at < s->slots; at++)
+    for (Py_ssize_t at = 0; at < s->possible; at++)
         if (s->counts[at] > 1) left += s->counts[at] - 1;
     return left;
 }
@@ -127,14 +122,13 @@ PyObject *search_map(PyObject *self, PyObject *args)
     enum { ITEM_CELLS, FIRST, USE_ITEM, USE_ROW, PARTS, WEIGHTS, VALUES, WORDS, LEFT, BUFFERS };
     Py_buffer b[BUFFERS];
     Search s;
-    Py_ssize_t slots;
-    unsigned long long multiplier, seed;
+    unsigned long long seed;
     long long steps;
     memset(&s, 0, sizeof s);
-    if (!PyArg_ParseTuple(args, "y*y*y*y*y*y*w*w*w*nniiinKiKL", &b[ITEM_CELLS], &b[FIRST],
+    if (!PyArg_ParseTuple(args, "y*y*y*y*y*y*w*w*w*nniiinKL", &b[ITEM_CELLS], &b[FIRST],
                           &b[USE_ITEM], &b[USE_ROW], &b[PARTS], &b[WEIGHTS], &b[VALUES], &b[WORDS],
-                          &b[LEFT], &s.cells, &s.items, &s.length, &s.letters, &s.heats, &slots,
-                          &multiplier, &s.shift, &seed, &steps))
+                          &b[LEFT], &s.cells, &s.items, &s.length, &s.letters, &s.heats,
+                          &s.possible, &seed, &steps))
         return NULL;
     s.item_cells = b[ITEM_CELLS].buf;
     s.first = b[FIRST].buf;
@@ -145,14 +139,12 @@ PyObject *search_map(PyObject *self, PyObject *args)
     s.values = b[VALUES].buf;
     s.words = b[WORDS].buf;
     s.state = seed;
-    s.slots = (size_t)slots;
-    s.multiplier = multiplier;
-    s.counts = calloc(2 * s.slots, sizeof(uint32_t));
+    s.counts = calloc(2 * (size_t)s.possible, sizeof(uint32_t));
     s.listed = malloc((size_t)s.items * sizeof(int32_t) + 1);
     s.is_listed = calloc((size_t)s.items + 1, 1);
     const int stored = s.counts && s.listed && s.is_listed;
     if (stored) {
-        s.mixed = s.counts + s.slots;
+        s.mixed = s.counts + s.possible;
         Py_BEGIN_ALLOW_THREADS
         for (int32_t item = 0; item < s.items; item++) put(&s, item, s.words[item]);
         *(int64_t *)b[LEFT].buf = search(&s, steps);
