@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.info_text import text
 from locatk.core.errors import LocatkError
 
 if TYPE_CHECKING:
@@ -24,7 +23,8 @@ if TYPE_CHECKING:
 @options.verbosity
 def command(file: Path, as_json: bool) -> None:
     """Say what is in FILE: a session or a solution (.mcap, of any tool), or an artifact
-    (.toml): a lighthouse scene, a manifest of dot sheets, a camera, tags, a sensor array.
+    (.toml): a lighthouse scene, a manifest of dot sheets, a camera, tags, a sensor array, a map
+    of landmarks, hall sensors.
 
     A damaged or cut recording is described as far as it can be read; the exit status
     is 3 then.
@@ -36,19 +36,20 @@ def command(file: Path, as_json: bool) -> None:
       locatk info scene.toml
       locatk info sheet.toml
       locatk info tag.toml
+      locatk info map.toml
     """
     facts = _artifact(file) if file.suffix.lower() == ".toml" else _recording(file)
     facts = {"version": 1, "file": str(file), "bytes": file.stat().st_size, **facts}
     if as_json:
         console.emit_json(facts)
     else:
-        console.result(_text(facts))
+        console.result(text(facts))
     if facts.get("damage"):
         raise failures.Incomplete(f"{facts['damage']} in {file}")
 
 
 def _artifact(file: Path) -> dict[str, Any]:
-    from locatk.formats import artifacts, describe, sheets, tags, toml
+    from locatk.formats import artifacts, describe, hall_sensors, maps, sheets, tags, toml
 
     kinds: dict[str, Callable[[], dict[str, Any]]] = {
         artifacts.SCENE_FORMAT: lambda: {
@@ -75,6 +76,16 @@ def _artifact(file: Path) -> dict[str, Any]:
             "kind": "array",
             "system": "polaris",
             "arrays": [describe.array(tags.read_array(file))],
+        },
+        maps.MAP_FORMAT: lambda: {
+            "kind": "map",
+            "system": "landmarks",
+            **describe.floor(maps.read_map(file)),
+        },
+        hall_sensors.HALLS_FORMAT: lambda: {
+            "kind": "halls",
+            "system": "landmarks",
+            "halls": [describe.hall_sensors(maps.read_halls(file))],
         },
     }
     return kinds[toml.read(file).text("format", choices=tuple(kinds))]()
@@ -104,14 +115,10 @@ def _recording(file: Path) -> dict[str, Any]:
     }
     if facts.get("system") == "lighthouse":
         described |= _lighthouse(session)
-    elif facts.get("system") == "dots":
+    elif facts.get("system") in ("dots", "polaris", "landmarks"):
         from locatk.formats import describe
 
-        described |= describe.dots(session)
-    elif facts.get("system") == "polaris":
-        from locatk.formats import describe
-
-        described |= describe.polaris(session)
+        described |= getattr(describe, facts["system"])(session)
     return described
 
 
@@ -184,212 +191,3 @@ def _scene(scene: Scene, sweeps: dict[int, int] | None = None) -> dict[str, Any]
         "frame": scene.frame,
         "notes": list(scene.notes),
     }
-
-
-MOST_TAGS = 20
-"""So many tags of a family are listed for people; ``--json`` holds them all."""
-
-SHOWN_ABOVE = {("locatk", key) for key in ("format_version", "tool_version", "kind", "system")}
-
-
-def _text(facts: dict[str, Any]) -> str:
-    kind = facts.get("kind") or "recording of another tool"
-    lines = [f"{facts['file']}: {kind}" + (f", {facts['system']}" if facts.get("system") else "")]
-    for label, value in (
-        ("size", _size(facts["bytes"])),
-        ("made by", facts.get("library")),
-        ("start", _when(facts.get("start_ns"))),
-        ("duration", _seconds(facts.get("duration_s"))),
-        ("devices", ", ".join(facts.get("devices", ()))),
-        ("sweeps", facts.get("sweeps")),
-        ("markers", facts.get("markers")),
-        ("scale", facts.get("scale")),
-        ("frames", facts.get("frames")),
-        ("print", _print(facts)),
-        ("camera", _camera(facts.get("camera"))),
-        ("samples", facts.get("samples")),
-        ("tag", _design(facts)),
-        ("magnet", _magnet(facts.get("magnet"))),
-        ("damage", facts.get("damage")),
-    ):
-        if value not in (None, ""):
-            lines.append(f"  {label + ':':<10}{value}")
-    for note in facts.get("notes", ()):
-        lines.append(f"  note:     {note}")
-
-    def section(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
-        if rows:
-            lines.extend(["", console.table(header, rows)])
-
-    section(
-        ("stream", "schema", "messages", "Hz"),
-        [
-            (s["topic"], s["schema"], s["messages"], _rate(s["rate_hz"]))
-            for s in facts.get("streams", ())
-        ],
-    )
-    section(
-        ("channel", "id", "period", "sweeps", "calibration"),
-        [
-            tuple(
-                "-" if value is None else value
-                for value in (
-                    s["channel"],
-                    None if s["id"] is None else f"{s['id']:08x}",
-                    s["period_ticks"],
-                    s["sweeps"],
-                    s["calibration"],
-                )
-            )
-            for s in facts.get("stations", ())
-        ],
-    )
-    section(
-        ("camera", "frames", "px"),
-        [(c["device"], c["frames"], _by(c["size_px"])) for c in facts.get("cameras", ())],
-    )
-    section(
-        ("sheet", "origin", "dots", "section", "paper [mm]", "pattern [mm]", "frame", "place"),
-        [
-            (
-                s["id"],
-                ",".join(map(str, s["origin"])),
-                _by(s["size"]),
-                ",".join(map(str, s["section"])),
-                _by(s["page_mm"]),
-                _by(s["pattern_mm"]),
-                s["frame"],
-                "-" if s["position_mm"] is None else _place(s),
-            )
-            for s in facts.get("sheets", ())
-        ],
-    )
-    section(
-        ("array", "sensors", "Hz", "left out", "width [mm]", "noise [uT]", "range [uT]", "sensor"),
-        [
-            (
-                a.get("device", "-"),
-                a["sensors"],
-                _rate(a.get("rate_hz")),
-                a.get("left_out", "-"),
-                f"{max(p[1] for p in a['position_mm']) - min(p[1] for p in a['position_mm']):.6g}",
-                _axes(a["noise_ut"]),
-                _axes(a["range_ut"]),
-                a["sensor"] or "-",
-            )
-            for a in facts.get("arrays", ())
-        ],
-    )
-    tags = facts.get("tags", [])
-    section(
-        ("tag", "cell:orientation", "as built (passes)", "place"),
-        [
-            (
-                t["id"],
-                " ".join(
-                    f"{c},{r}:{s}" for (c, r), s in zip(t["cells"], t["symbols"], strict=True)
-                ),
-                "-" if t["passes"] is None else t["passes"],
-                "-" if t["position_mm"] is None else _place(t),
-            )
-            for t in tags[:MOST_TAGS]
-        ],
-    )
-    if len(tags) > MOST_TAGS:
-        lines.append(f"... and {len(tags) - MOST_TAGS} more: see --json")
-    section(
-        ("attachment", "type", "bytes"),
-        [(a["name"], a["media_type"], a["bytes"]) for a in facts.get("attachments", ())],
-    )
-    section(
-        ("metadata", "key", "value"),
-        [
-            (name, key, value)
-            for name, record in facts.get("metadata", {}).items()
-            for key, value in record.items()
-            if (name, key) not in SHOWN_ABOVE
-        ],
-    )
-    return "\n".join(lines)
-
-
-def _print(facts: dict[str, Any]) -> str | None:
-    if "pitch_mm" not in facts:
-        return None
-    scale = [facts["scale_x"], facts["scale_y"]]
-    measured = "" if scale == [1, 1] else f", scale {scale[0]:.6g} x {scale[1]:.6g}"
-    return (
-        f"{facts['codec']}, pitch {facts['pitch_mm']:.6g} mm, dots {facts['dot_mm']:.3g} mm, "
-        f"{facts['dpi']} dpi{measured}"
-    )
-
-
-def _camera(camera: dict[str, Any] | None) -> str | None:
-    if camera is None:
-        return None
-    x, y = camera["centre_px"]
-    return (
-        f"{_by(camera['size_px'])} px, focal length {camera['focal_px']:.6g} px, centre "
-        f"{x:.6g},{y:.6g}, radial {camera['radial']:.4g} ({camera['distortion_px']:.2g} px "
-        "in the corners)"
-    )
-
-
-def _design(facts: dict[str, Any]) -> str | None:
-    if "orientations" not in facts:
-        return None
-    family = "" if facts["family"] is None else f", a family of {facts['family']}"
-    apart = "" if facts["min_distance"] == 1 else f", {facts['min_distance']} steps apart"
-    return (
-        f"{facts['codec']}, {facts['magnets']} magnets of {facts['orientations']} orientations on "
-        f"{facts['order']} x {facts['order']} cells {facts['spacing_mm']:.6g} mm apart, "
-        f"{facts['clearance_mm']:.6g} mm below the sensors, {facts['capacity']} ids{family}{apart}"
-    )
-
-
-def _magnet(magnet: dict[str, Any] | None) -> str | None:
-    if magnet is None:
-        return None
-    grade = f"{magnet['grade']}, " if magnet["grade"] else ""
-    return (
-        f"{magnet['diameter_mm']:.6g} x {magnet['height_mm']:.6g} mm, {grade}"
-        f"{magnet['remanence_t']:.4g} T, {1e3 * magnet['moment_am2']:.4g} mA m2"
-    )
-
-
-def _axes(values: Sequence[float]) -> str:
-    """Numbers by axis, `-` where unknown."""
-    return " ".join(f"{value:.4g}" if math.isfinite(value) else "-" for value in values)
-
-
-def _place(found: dict[str, Any]) -> str:
-    x, y = found["position_mm"]
-    return f"{x:.6g},{y:.6g} mm, {found['heading_deg']:.4g} deg"
-
-
-def _by(pair: Sequence[float] | None) -> str:
-    return "-" if pair is None else f"{pair[0]:.6g} x {pair[1]:.6g}"
-
-
-def _when(time_ns: int | None) -> str | None:
-    if time_ns is None:
-        return None
-    try:
-        return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds")
-    except (OverflowError, ValueError, OSError):  # a damaged stamp beyond the year 9999
-        return f"{time_ns} ns"
-
-
-def _seconds(value: float | None) -> str | None:
-    return None if value is None else f"{value:.3f} s"
-
-
-def _rate(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
-def _size(count: int) -> str:
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count} bytes"

@@ -20,13 +20,11 @@ MOST_LANDMARKS = 40
 
 def lost(solution: Solution) -> list[str]:
     """What is left unsolved: devices without a pose, and what was seen but not read."""
-    if solution.system == "landmarks" and solution.facts.get("localised") is False:
-        losses = [_nowhere(solution)]
-        losses += [f"no pose for {t.device}" for t in solution.trajectories if len(t) == 0]
-    elif not solution.trajectories:
+    losses = [f"no pose for {t.device}" for t in solution.trajectories if len(t) == 0]
+    if solution.system == "landmarks":
+        losses += _not_localised(solution)
+    if not losses and not solution.trajectories:
         losses = ["no pose at all"]
-    else:
-        losses = [f"no pose for {t.device}" for t in solution.trajectories if len(t) == 0]
     if solution.system == "polaris":
         unread = [seen for seen in solution.detections if seen["tag_id"] is None]
         losses += _refused(unread, "tag", "not read")
@@ -36,12 +34,20 @@ def lost(solution: Solution) -> list[str]:
     return losses
 
 
-def _nowhere(solution: Solution) -> str:
-    """Why there is no place on the map."""
-    if solution.artifact is None:
-        return "not localised: no map of the floor, poses are relative to landmarks only"
-    places = len(solution.facts.get("hypotheses") or ())
-    return "not localised" + (f": {places} places are possible" if places > 1 else "")
+def _not_localised(solution: Solution) -> list[str]:
+    """Robots that do not know where on the map they are, and why."""
+    losses = []
+    for device, told in solution.facts.get("robots", {}).items():
+        if told["localised"]:
+            continue
+        if solution.artifact is None:
+            why = "no map of the floor"
+        elif not told["landmarks_seen"]:
+            why = "no landmark was seen"
+        else:
+            why = f"the likeliest place has a probability of {told['probability']:.2g}"
+        losses.append(f"{device} is not localised: {why}")
+    return losses
 
 
 def _refused(seen: list[dict[str, Any]], what: str, how: str) -> list[str]:

@@ -1,4 +1,5 @@
-"""What `locatk info` says of dots and polaris: artifacts and recordings, as plain values."""
+"""What `locatk info` says of dots, polaris and landmarks: artifacts and recordings, as plain
+values."""
 
 from __future__ import annotations
 
@@ -9,10 +10,13 @@ import numpy as np
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError, LocatkError
+from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.halls import HallSamples, HallSensors
+from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples, SensorArray
 from locatk.core.polaris.tag import Tags
-from locatk.formats import arrays, frames, sheets
+from locatk.formats import arrays, frames, halls, maps, sheets
 from locatk.formats import tags as tag_files
 from locatk.formats.session import Session
 
@@ -169,11 +173,96 @@ def polaris(session: Session) -> dict[str, Any]:
 
 
 def _samples(found: Samples) -> dict[str, Any]:
+    return {**_recorded(found), **array(found.array)}
+
+
+def _recorded(found: Samples | HallSamples) -> dict[str, Any]:
     span = float(found.time_ns[-1] - found.time_ns[0]) * 1e-9
     return {
         "device": found.device,
         "samples": len(found),
         "rate_hz": (len(found) - 1) / span if span > 0 else None,
         "left_out": int(np.count_nonzero(np.isnan(found.field_t))),
-        **array(found.array),
     }
+
+
+def floor(found: FloorMap) -> dict[str, Any]:
+    """A map of landmarks: its design, what lies where, and how it was really laid."""
+    geometry, laid = found.geometry, found.codes[found.codes != HOLE]
+    numbers = PATTERN_OF[laid]
+    return {
+        "name": found.name or None,
+        "rows": found.shape[0],
+        "columns": found.shape[1],
+        "landmarks": len(laid),
+        "patterns": {
+            letters: int(np.count_nonzero(numbers == number))
+            for number, letters in enumerate(PATTERNS, 1)
+        },
+        "alphabet": found.alphabet,
+        "window": found.window,
+        "detect": found.detect,
+        "seed": found.seed,
+        "pitch_mm": 1e3 * found.pitch_m,
+        "origin_mm": [1e3 * each for each in found.origin_m],
+        "walls": len(found.walls),
+        "bars": {
+            "size_mm": [
+                1e3 * size
+                for size in (geometry.bar_length_m, geometry.bar_width_m, geometry.bar_height_m)
+            ],
+            "remanence_t": geometry.remanence_t,
+            "radius_mm": 1e3 * geometry.radius_m,
+            "sensor_height_mm": 1e3 * geometry.sensor_height_m,
+            "circle_mm": 1e3 * geometry.circle_m,
+            "threshold_mt": 1e3 * geometry.threshold_t,
+        },
+        "map": maps.map_rows(found.codes),
+        "built": [
+            {
+                "cell": cell,
+                "x_mm": 1e3 * built.x_m,
+                "y_mm": 1e3 * built.y_m,
+                "heading_deg": float(np.degrees(built.heading_rad)),
+                "strength": built.strength,
+                "visits": built.visits,
+                "flags": list(built.flags),
+            }
+            for cell, built in sorted(found.built.items())
+        ],
+        "notes": list(found.notes),
+    }
+
+
+def hall_sensors(found: HallSensors) -> dict[str, Any]:
+    """Where hall sensors sit, and how they measure; None where unknown."""
+    return {
+        "sensor": found.sensor,
+        "sensors": len(found),
+        "names": list(found.names),
+        "position_mm": 1e3 * found.position_m,
+        "noise_ut": 1e6 * found.noise_t,
+        "range_mt": 1e3 * found.range_t,
+    }
+
+
+def landmarks(session: Session) -> dict[str, Any]:
+    """Samples, hall sensors and map of a session; what is damaged is left out and said.
+
+    A solution has a map and no samples.
+    """
+    described: dict[str, Any] = {}
+    try:
+        known = maps.attached_map(session)
+        if known is not None:
+            described |= floor(known)
+        if session.topics(halls.TOPIC, halls.SCHEMA):
+            found = halls.read_samples(session)
+            described["halls"] = [
+                {**_recorded(each), **hall_sensors(each.sensors)} for each in found
+            ]
+            described["devices"] = [each.device for each in found]
+            described["samples"] = sum(map(len, found))
+    except LocatkError as error:
+        described["damage"] = session.damage or error.message
+    return described

@@ -25,6 +25,7 @@ from locatk.core.metrics import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.output import atomic_write, check_output
+from locatk.formats.plot_floor import floor_of
 from locatk.formats.plot_map import IN_LEGEND, draw_map, legend, plain, tags_of
 
 Array = NDArray[np.float64]
@@ -94,10 +95,11 @@ def draw(
     unscaled = solution.system == "lighthouse" and scene.scale == "unit"
     if evaluation is None and not unscaled:
         evaluation = _compare(solution, truth)
-    tags = tags_of(solution)
+    tags, floor = tags_of(solution), floor_of(solution)
     if evaluation is not None:
         paths, scene = _aligned(solution.trajectories, scene, evaluation.alignment)
         tags = tuple(tag.moved(evaluation.alignment) for tag in tags)
+        floor = None if floor is None else floor.moved(evaluation.alignment)
         unscaled = unscaled and evaluation.align != "sim3"
     else:
         paths = {t.device: t.position for t in solution.trajectories}
@@ -109,8 +111,8 @@ def draw(
     left, right = figure.add_subfigure(grid[0, 0]), figure.add_subfigure(grid[0, 1])
     ground = left.subplots()
     unit = "unit" if unscaled else "m"
-    draw_map(ground, paths, times, () if unscaled else truth, scene, tags, colors, unit)
-    signs = legend(colors, scene, tags, bool(truth) and not unscaled)
+    draw_map(ground, paths, times, () if unscaled else truth, scene, tags, floor, colors, unit)
+    signs = legend(colors, scene, tags, floor, bool(truth) and not unscaled)
     widest = max((len(str(sign.get_label())) for sign in signs), default=0)
     left.legend(
         handles=signs,

@@ -1,4 +1,4 @@
-"""The map of a picture: paths, stations, markers and magnets, seen from above."""
+"""The map of a picture: paths, stations, markers, magnets and landmarks, seen from above."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.tag import Placed, Tags, built_magnets
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
+from locatk.formats import plot_floor
+from locatk.formats.plot_floor import Floor
 from locatk.formats.viewers import tags_in_frames
 
 Array = NDArray[np.float64]
@@ -104,13 +106,14 @@ def draw_map(
     truth: Sequence[Trajectory],
     scene: Scene,
     tags: Sequence[Tag],
+    floor: Floor | None,
     colors: dict[str, str],
     unit: str,
 ) -> None:
     """Draw all that lies on the ground, and fit the view to it.
 
-    ``paths`` are (n, 3) positions by device, ``times`` (n,) theirs in ns; ``truth``, ``scene``
-    and ``tags`` are in the same frame; ``unit`` is what lengths are in.
+    ``paths`` are (n, 3) positions by device, ``times`` (n,) theirs in ns; ``truth``, ``scene``,
+    ``tags`` and ``floor`` are in the same frame; ``unit`` is what lengths are in.
     """
     for t in truth:
         axes.plot(*_broken(t.position, t.time_ns), color=TRUTH_COLOR, lw=2.5, zorder=1)
@@ -122,9 +125,12 @@ def draw_map(
 
     for tag in tags:
         _draw_tag(axes, tag)
+    if floor is not None:
+        plot_floor.draw_floor(axes, floor)
 
     solid = [t.position for t in truth] + [m.position[None] for m in scene.markers]
     solid += [ends for tag in tags for ends in (tag.known.tail, tag.known.tip)]
+    solid += [] if floor is None else plot_floor.solid(floor)
     middle, half = _view(list(paths.values()), solid)
     places = np.array([s.position[:2] for s in scene.stations]).reshape(-1, 2)
     near = np.max(np.abs(places - middle), axis=1, initial=0.0) <= half * (1 + 2 * NEAR)
@@ -138,6 +144,8 @@ def draw_map(
     axes.set_xlim(middle[0] - half, middle[0] + half)
     axes.set_ylim(middle[1] - half, middle[1] + half)
     axes.set_aspect("equal")
+    if floor is not None:
+        plot_floor.name_landmarks(axes, floor)
     axes.grid(color="0.92")
     axes.set_axisbelow(True)
     axes.set_xlabel(f"x [{unit}]")
@@ -225,7 +233,11 @@ def _draw_station(
 
 
 def legend(
-    colors: dict[str, str], scene: Scene, tags: Sequence[Tag], with_truth: bool
+    colors: dict[str, str],
+    scene: Scene,
+    tags: Sequence[Tag],
+    floor: Floor | None,
+    with_truth: bool,
 ) -> list[Line2D]:
     """What the signs of the map mean."""
 
@@ -248,6 +260,8 @@ def legend(
         handles.append(sign("magnet", marker="o", mfc="none", ms=6))
     if any(tag.found for tag in tags):
         handles.append(sign("as found", color=FOUND_COLOR, marker="o", mfc="none", ms=3))
+    if floor is not None:
+        handles += [sign(**look) for look in plot_floor.signs(floor)]
     return handles
 
 

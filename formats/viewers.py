@@ -28,10 +28,13 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.sheet import Manifest
 from locatk.core.geometry import quaternion_from_heading, quaternion_from_matrix
+from locatk.core.landmarks.floor import Cell, FloorMap
+from locatk.core.landmarks.landmark import name
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris import codec
 from locatk.core.polaris.tag import Placed, Tags, built_magnets, places, vertices
 from locatk.core.trajectory import Trajectory
+from locatk.formats.floor_bars import WEAK, bars_on_floor, cells_near
 from locatk.formats.messages import timestamp
 from locatk.formats.session import Session
 
@@ -43,6 +46,9 @@ MARKER_COLOR = Color(r=0.85, g=0.25, b=0.2, a=1.0)
 PAPER_COLOR = Color(r=0.35, g=0.35, b=0.35, a=1.0)
 PATTERN_COLOR = Color(r=0.6, g=0.6, b=0.6, a=1.0)
 MAGNET_COLOR = Color(r=0.75, g=0.15, b=0.15, a=1.0)
+BAR_COLORS = {1: Color(r=0.75, g=0.15, b=0.15, a=1.0), -1: Color(r=0.15, g=0.35, b=0.75, a=1.0)}
+"""Of a bar that is N, and of one that is S."""
+WEAK_COLOR = Color(r=0.6, g=0.6, b=0.6, a=0.4)
 TEXT_COLOR = Color(r=0.5, g=0.5, b=0.5, a=1.0)
 PATH_COLORS = tuple(
     Color(r=r, g=g, b=b, a=1.0)
@@ -104,10 +110,10 @@ def log(message: str, time_ns: int, *, warning: bool = False) -> Log:
 
 
 def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: int) -> SceneUpdate:
-    """Stations and markers, sheets of paper, or tags, and paths as things to look at.
+    """Stations and markers, sheets of paper, tags, or landmarks, and paths as things to look at.
 
     Sizes are in the units of the scene, which has 0.1 m stations where its scale is
-    metric; sheets and tags are in metres. An artifact of another kind is not drawn.
+    metric; sheets, tags and landmarks are in metres. An artifact of another kind is not drawn.
     """
     entities = []
     if isinstance(artifact, Scene):
@@ -119,6 +125,9 @@ def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: 
     elif isinstance(artifact, Tags):
         found = tags_in_frames(artifact, trajectories)
         entities += [_tag(artifact, *where, time_ns) for where in found]
+    elif isinstance(artifact, FloorMap):
+        near = cells_near(artifact, [t.position for t in trajectories])
+        entities += [_landmark(artifact, cell, time_ns) for cell in near]
     for number, trajectory in enumerate(trajectories):
         if len(trajectory) > 0:
             color = PATH_COLORS[number % len(PATH_COLORS)]
@@ -289,6 +298,52 @@ def _tag(tags: Tags, tag_id: int, frame: str, placed: Placed, time_ns: int) -> S
         ],
         lines=[_loop(corners, PATTERN_COLOR, 1.0)],
         texts=[_text(f"tag {tag_id}", (*corners[0].tolist(), 0.0), 0.0)],
+    )
+
+
+def _landmark(floor: FloorMap, cell: Cell, time_ns: int) -> SceneEntity:
+    """The bars, each with an arrow to its north pole, and the cell's row and column."""
+    geometry = floor.geometry
+    middles, headings, strengths = bars_on_floor(floor, cell)
+    length, width, height = geometry.bar_length_m, geometry.bar_width_m, geometry.bar_height_m
+    cubes, arrows = [], []
+    for (x, y), quaternion, heading, strength in zip(
+        middles.tolist(),
+        quaternion_from_heading(headings).tolist(),
+        headings.tolist(),
+        strengths.tolist(),
+        strict=True,
+    ):
+        there = abs(strength) >= WEAK
+        color = BAR_COLORS[1 if strength > 0 else -1] if there else WEAK_COLOR
+        # The map's plane is that of the bars' tops.
+        below = _pose((x, y, -height / 2), quaternion)
+        cubes.append(CubePrimitive(pose=below, size=_vector(length, width, height), color=color))
+        if there:
+            tail = x - length / 2 * np.cos(heading), y - length / 2 * np.sin(heading), width / 4
+            arrows.append(
+                ArrowPrimitive(
+                    pose=_pose(tail, quaternion),
+                    shaft_length=0.6 * length,
+                    shaft_diameter=0.2 * width,
+                    head_length=0.4 * length,
+                    head_diameter=0.6 * width,
+                    color=color,
+                )
+            )
+    row, column = cell
+    facts = {"cell": f"{row},{column}", "bars": name(int(floor.codes[cell]))}
+    built = floor.built.get(cell)
+    if built is not None and built.flags:
+        facts["flags"] = ", ".join(built.flags)
+    return SceneEntity(
+        timestamp=timestamp(time_ns),
+        frame_id="map",
+        id=f"landmark/{row},{column}",
+        metadata=_pairs(facts),
+        cubes=cubes,
+        arrows=arrows,
+        texts=[_text(f"{row},{column}", (*floor.place(cell), 0.0), 0.0)],
     )
 
 

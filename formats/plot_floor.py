@@ -1,0 +1,226 @@
+"""The floor of landmarks on the map of a picture: bars, walls, and where landmarks were seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from numpy.typing import NDArray
+
+from locatk.core.geometry import Similarity
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats.floor_bars import WEAK, bars_on_floor, cells_near
+
+Array = NDArray[np.float64]
+
+NORTH_COLOR, SOUTH_COLOR, WALL_COLOR = "#C0392B", "#8FA8C8", "0.35"
+SEEN_COLOR, REFUSED_COLOR = "#009E73", "#7F3C8D"
+
+MOST_NAMED = 40
+"""So many landmarks in the picture get their row and column, at most."""
+
+LATE_NS = 1_000_000_000
+"""A sighting without a place of its own is drawn on the path, where that is no farther away."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Landmarks on the map; all (..., 3) in metres.
+
+    Attributes
+    ----------
+    north, south, weak : (M, 4, 3) ndarray
+        Corners of the halves of bars, and of whole bars that are weak or missing.
+    walls : (W, 2, 3) ndarray
+        Their ends.
+    centres : (L, 3) ndarray
+    names : tuple of str
+        Row and column of each.
+    met : (L,) bool ndarray
+        Which were seen.
+    seen, refused : (K, 3) ndarray
+        Where the robots were when they saw a landmark, and what was refused of that.
+    reach_m : float
+        From a landmark's centre to the far side of its bars.
+    """
+
+    north: Array
+    south: Array
+    weak: Array
+    walls: Array
+    centres: Array
+    names: tuple[str, ...]
+    met: NDArray[np.bool_]
+    seen: Array
+    refused: Array
+    reach_m: float
+
+    def moved(self, to: Similarity) -> Floor:
+        """The same in another frame."""
+
+        def there(points: Array) -> Array:
+            return to.apply(points.reshape(-1, 3)).reshape(points.shape)
+
+        return Floor(
+            there(self.north),
+            there(self.south),
+            there(self.weak),
+            there(self.walls),
+            there(self.centres),
+            self.names,
+            self.met,
+            there(self.seen),
+            there(self.refused),
+            self.reach_m,
+        )
+
+
+def floor_of(solution: Solution) -> Floor | None:
+    """The floor on which the poses of a solution stand, None where there is none."""
+    floor = solution.artifact
+    if not isinstance(floor, FloorMap):
+        return None
+    cells = cells_near(floor, [t.position for t in solution.trajectories])
+    met = {tuple(found["cell"]) for found in solution.detections if found["cell"] is not None}
+    north, south, weak = _bars(floor, cells)
+    seen, refused = _sightings(solution, floor)
+    return Floor(
+        north,
+        south,
+        weak,
+        _walls(floor),
+        _flat([floor.place(cell) for cell in cells]),
+        tuple(f"{row},{column}" for row, column in cells),
+        np.array([cell in met for cell in cells], bool),
+        seen,
+        refused,
+        floor.geometry.radius_m + floor.geometry.bar_width_m / 2,
+    )
+
+
+def _bars(floor: FloorMap, cells: Sequence[tuple[int, int]]) -> tuple[Array, Array, Array]:
+    """Corners of the north and the south halves of bars, and of weak ones."""
+    if not cells:
+        return (np.zeros((0, 4, 3)),) * 3
+    laid = [bars_on_floor(floor, cell) for cell in cells]
+    middle = np.concatenate([bars[0] for bars in laid])
+    heading = np.concatenate([bars[1] for bars in laid])
+    strong = np.abs(np.concatenate([bars[2] for bars in laid])) >= WEAK
+    way = np.column_stack([np.cos(heading), np.sin(heading)])
+    long = way * floor.geometry.bar_length_m / 2
+    wide = way[:, ::-1] * [-1, 1] * floor.geometry.bar_width_m / 2
+
+    def corners(start: Array, stop: Array, which: NDArray[np.bool_]) -> Array:
+        ring = np.stack([start - wide, stop - wide, stop + wide, start + wide], axis=1)
+        return _flat(ring[which])
+
+    return (
+        corners(middle, middle + long, strong),
+        corners(middle - long, middle, strong),
+        corners(middle - long, middle + long, ~strong),
+    )
+
+
+def _walls(floor: FloorMap) -> Array:
+    """Ends of a line between the two cells of each wall, across the way from one to the other."""
+    ends = []
+    for one, other in sorted(floor.walls):
+        a, b = np.array(floor.place(one)), np.array(floor.place(other))
+        across = (b - a)[::-1] * [-1, 1] / 2
+        ends.append([(a + b) / 2 - across, (a + b) / 2 + across])
+    return _flat(np.array(ends).reshape(-1, 2, 2))
+
+
+def _sightings(solution: Solution, floor: FloorMap) -> tuple[Array, Array]:
+    """Places of the robots at their sightings: used ones, and refused ones."""
+    paths = {t.device: t for t in solution.trajectories if len(t)}
+    used, refused = [], []
+    for found in solution.detections:
+        place = _on_path(paths.get(found["device"]), round(1e9 * found["time_s"]))
+        if place is None and found["cell"] is not None and found["x_m"] is not None:
+            x, y = floor.place(tuple(found["cell"]))
+            place = np.array([x + found["x_m"], y + found["y_m"]])
+        if place is not None:
+            (refused if found["refused"] else used).append(place)
+    return _flat(used), _flat(refused)
+
+
+def _on_path(path: Trajectory | None, time_ns: int) -> Array | None:
+    if path is None:
+        return None
+    nearest = int(np.argmin(np.abs(path.time_ns - time_ns)))
+    late = abs(int(path.time_ns[nearest]) - time_ns) > LATE_NS
+    return None if late else path.position[nearest, :2]
+
+
+def _flat(points: Any) -> Array:
+    """(..., 2) as (..., 3), on the ground."""
+    flat = np.asarray(points, float)
+    flat = flat.reshape(*flat.shape[:-1], 2) if flat.size else flat.reshape(-1, 2)
+    return np.concatenate([flat, np.zeros((*flat.shape[:-1], 1))], axis=-1)
+
+
+def solid(floor: Floor) -> list[Array]:
+    """What of the floor the view must hold: the landmarks that were seen, else all."""
+    shown = floor.centres[floor.met] if floor.met.any() else floor.centres
+    return [shown - floor.reach_m, shown + floor.reach_m]
+
+
+def draw_floor(axes: Axes, floor: Floor) -> None:
+    """Bars with their north and south halves, walls, and marks where landmarks were seen."""
+    for rings, look in (
+        (floor.south, {"facecolor": SOUTH_COLOR}),
+        (floor.north, {"facecolor": NORTH_COLOR}),
+        (floor.weak, {"facecolor": "none", "edgecolor": "0.6", "linewidth": 0.6}),
+    ):
+        if len(rings):
+            axes.add_collection(PolyCollection(list(rings[:, :, :2]), zorder=1.5, **look))
+    if len(floor.walls):
+        ends = list(floor.walls[:, :, :2])
+        axes.add_collection(LineCollection(ends, colors=WALL_COLOR, linewidths=2, zorder=1.5))
+    axes.plot(*floor.seen[:, :2].T, "o", color=SEEN_COLOR, mfc="none", ms=7, mew=1.2, zorder=4)
+    axes.plot(*floor.refused[:, :2].T, "x", color=REFUSED_COLOR, ms=7, mew=1.5, zorder=4)
+
+
+def name_landmarks(axes: Axes, floor: Floor) -> None:
+    """Row and column beside each landmark in the view, where there is room for all."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    x, y = floor.centres[:, 0], floor.centres[:, 1]
+    inside = (left < x) & (x < right) & (low < y) & (y < high)
+    if np.count_nonzero(inside) > MOST_NAMED:
+        return
+    for k in np.flatnonzero(inside):
+        axes.annotate(
+            floor.names[k],
+            (x[k] + floor.reach_m, y[k] + floor.reach_m),
+            ha="left",
+            va="bottom",
+            fontsize=7,
+            color="0.35",
+            zorder=1.6,
+            clip_on=True,
+        )
+
+
+def signs(floor: Floor) -> list[dict[str, Any]]:
+    """Label and look of each sign, for the legend."""
+    square = {"marker": "s", "ms": 6}
+    found = [
+        {"label": "north pole", "color": NORTH_COLOR, **square},
+        {"label": "south pole", "color": SOUTH_COLOR, **square},
+    ]
+    if len(floor.weak):
+        found.append({"label": "weak or missing", "color": "0.6", "mfc": "none", **square})
+    if len(floor.walls):
+        found.append({"label": "wall", "color": WALL_COLOR, "ls": "-", "lw": 2})
+    if len(floor.seen):
+        found.append({"label": "landmark seen", "color": SEEN_COLOR, "marker": "o", "mfc": "none"})
+    if len(floor.refused):
+        found.append({"label": "refused", "color": REFUSED_COLOR, "marker": "x"})
+    return found
