@@ -1,0 +1,197 @@
+"""What ``locatk map design --landmark`` tells of a geometry: for people and as JSON."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from locatk.cli import console
+
+if TYPE_CHECKING:
+    from locatk.core.landmarks.analysis import Analysis, Shape
+    from locatk.core.landmarks.landmark import Geometry
+
+
+def text(found: Analysis, pitch_m: float) -> str:
+    """The tables for people, in 100 columns."""
+    return "\n\n".join(
+        (
+            head(found.geometry),
+            "Valleys on the circle of the sensors, counter-clockwise from x:\n"
+            + console.table(
+                ("no", "bars", "valleys", "at degrees, + where the field rises"),
+                (_valleys(shape) for shape in found.shapes),
+            ),
+            "Mountains between them, territory, and where the paper's crossing puts the centre:\n"
+            + console.table(
+                ("bars", "mountains mT", "r1 mm", "r2 mm", "gulfs deg", "centre off mm"),
+                (_territory(shape) for shape in found.shapes),
+            ),
+            "Field over the bars, along them: slope in mT/mm, zero off the bar's middle in mm, "
+            "and\nthe largest error of that line, within a quarter of the bar's length:\n"
+            + console.table(
+                ("bars", *(f"bar {k} at {90 * k}" for k in range(4))),
+                ((shape.letters, *_lines(shape)) for shape in found.shapes),
+            ),
+            console.table(("needed", "", "because"), _needed(found, pitch_m)),
+            "What a deviation does to landmark 3, NNNS:\n"
+            + console.table(
+                ("", "r1 mm", "r2 mm", "centre off mm", "largest field mT"),
+                (
+                    (
+                        row.what,
+                        _number(1e3 * row.r1_m, 1),
+                        _number(1e3 * row.r2_m, 1),
+                        _number(1e3 * row.bias_m, 2),
+                        _number(1e3 * row.largest_t, 1),
+                    )
+                    for row in found.tolerances
+                ),
+            ),
+        )
+    )
+
+
+def entry(found: Analysis, pitch_m: float) -> dict[str, Any]:
+    """The same for ``--json``: SI units, as each key says (docs/commands.md)."""
+    from locatk.core.landmarks.territory import neighbour_field
+
+    one, all_eight = neighbour_field(found.geometry, pitch_m)
+    hall = found.hall_class
+    return {
+        "geometry": asdict(found.geometry),
+        "patterns": [
+            {
+                **asdict(shape),
+                "valleys": len(shape.valleys_rad),
+                "collapsed": shape.collapsed,
+                "skew_rad": shape.skew_rad,
+            }
+            for shape in found.shapes
+        ],
+        "sensor_heights_m": found.heights_m,
+        "pitch_m": pitch_m,
+        "contour_pitch_m": found.contour_pitch_m,
+        "field_pitch_m": found.field_pitch_m,
+        "neighbour_t": one,
+        "all_neighbours_t": all_eight,
+        "neighbour_limit_t": found.neighbour_t,
+        "largest_t": found.largest_t,
+        "hall_range_t": found.range_t,
+        "hall_class": hall and {"mv_per_mt": hall[0], "range_t": hall[1]},
+        "tolerances": [asdict(row) for row in found.tolerances],
+    }
+
+
+def head(geometry: Geometry) -> str:
+    """The landmark in two lines."""
+    g = geometry
+    return (
+        f"Landmark  four bars of {bar(g)}, {_mm(g.radius_m)} from the middle\n"
+        f"Sensors   {_mm(g.sensor_height_m)} above the bars, on a circle of {_mm(g.circle_m)}, "
+        f"threshold {1e3 * g.threshold_t:.4g} mT"
+    )
+
+
+def bar(geometry: Geometry) -> str:
+    """One bar in words."""
+    g = geometry
+    return (
+        f"{1e3 * g.bar_length_m:g} x {1e3 * g.bar_width_m:g} x {_mm(g.bar_height_m)}, "
+        f"{g.remanence_t:g} T"
+    )
+
+
+def _valleys(shape: Shape) -> tuple[object, ...]:
+    count = str(len(shape.valleys_rad)) + (f", not {shape.expected}" if shape.collapsed else "")
+    at = (
+        f"{_clean(math.degrees(angle), 2):>6}{'+' if up else '-'}"
+        for angle, up in zip(shape.valleys_rad.tolist(), shape.rising.tolist(), strict=True)
+    )
+    return shape.number, shape.letters, count, " ".join(at).ljust(63)
+
+
+def _territory(shape: Shape) -> tuple[str, ...]:
+    sizes = abs(shape.mountains_t)
+    heights = sorted({f"{1e3 * size:.1f}" for size in sizes.tolist()}, key=float)
+    gulfs = sorted({f"{math.degrees(g):.0f}" for g in shape.gulfs_rad.tolist() if g == g}, key=int)
+    return (
+        shape.letters,
+        _span(heights),
+        _number(1e3 * shape.r1_m, 1),
+        _number(1e3 * shape.r2_m, 1),
+        _span(gulfs),
+        _number(1e3 * math.hypot(*shape.bias_m.tolist()), 2),
+    )
+
+
+def _lines(shape: Shape) -> list[str]:
+    return [
+        "none"
+        if zero != zero
+        else f"{slope:5.2f} {_clean(1e3 * zero, 1):>4} {1e3 * off:5.2f}".rjust(16)
+        for slope, zero, off in zip(
+            shape.slope_t_per_m.tolist(),
+            shape.zero_m.tolist(),
+            shape.departure_m.tolist(),
+            strict=True,
+        )
+    ]
+
+
+def _needed(found: Analysis, pitch_m: float) -> list[tuple[str, str, str]]:
+    from locatk.core.landmarks.territory import neighbour_field
+
+    low, high = found.heights_m
+    one, all_eight = (1e6 * float(field) for field in neighbour_field(found.geometry, pitch_m))
+    hall = found.hall_class
+    return [
+        (
+            "height of the sensors",
+            "none" if high != high else f"{1e3 * low:.1f} to {1e3 * high:.1f} mm",
+            "all six patterns have 4, 6, 6, 6, 8, 8 valleys",
+        ),
+        (
+            "pitch",
+            f"at least {_number(1e3 * found.contour_pitch_m, 0)} mm",
+            "2 x (r2 + circle): no sensor is in two territories",
+        ),
+        (
+            "pitch",
+            f"at least {_number(1e3 * found.field_pitch_m, 0)} mm",
+            f"the nearest neighbour adds {1e6 * found.neighbour_t:.0f} uT at the circle",
+        ),
+        (
+            "neighbours' field",
+            f"{one:.1f} uT",
+            f"one at {_mm(pitch_m)}; all eight up to {all_eight:.0f} uT, Earth 25-65 uT",
+        ),
+        (
+            "range of the hall sensors",
+            f"+-{1e3 * found.range_t:.1f} mT",
+            f"largest field {1e3 * found.largest_t:.1f} mT and 25 % headroom",
+        ),
+        (
+            "sensitivity",
+            f"{hall[0]:g} mV/mT" if hall else "none",
+            f"as TI DRV5055 at 5 V, +-{1e3 * hall[1]:g} mT" if hall else "the field is too strong",
+        ),
+    ]
+
+
+def _span(values: list[str]) -> str:
+    return "-" if not values else values[0] if len(values) == 1 else f"{values[0]}-{values[-1]}"
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else _clean(value, digits)
+
+
+def _clean(value: float, digits: int) -> str:
+    """Without the sign of what is rounded to zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.4g} mm"
