@@ -134,7 +134,8 @@ class _Line:
         """A whole number."""
         index = self._where[name]
         text = self._cells[index] if index < len(self._cells) else ""
-        if not (text.isascii() and text.isdigit() and low <= int(text[:9]) <= high):
+        whole = text.isascii() and text.isdigit() and len(text) < 10
+        if not (whole and low <= int(text) <= high):
             raise self._error(
                 f"{text!r} under {name!r}, expected a whole number from {low} to {high}: how the "
                 "landmark is laid"
@@ -147,7 +148,8 @@ class _Line:
 
 def _header(cells: list[str], file: str | os.PathLike[str], line: int) -> dict[str, int]:
     """Columns by their names, in any case, with or without the unit."""
-    plain = {cell.lower().removesuffix("mm").strip(" []()"): n for n, cell in enumerate(cells)}
+    bare = [cell.lower().translate(str.maketrans("", "", "[]()")) for cell in cells]
+    plain = {cell.removesuffix("mm").strip(): number for number, cell in enumerate(bare)}
     found = {
         name: plain[key]
         for name in HEADER
