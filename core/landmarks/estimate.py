@@ -35,7 +35,7 @@ SAME = 3e-3
 
 HALF_PI = np.pi / 2
 
-FAULTY = 0.7
+FAULTY = 0.5
 """Standard deviation of a bar's strength that may be weak or missing."""
 
 SUSPICIOUS = 2.5

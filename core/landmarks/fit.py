@@ -54,7 +54,7 @@ class Priors:
     height_m: float = 0.5e-3
     noise_t: float = 1.5e-4
     faulty: float = 0.01
-    floor_t: float = 2e-5
+    floor_t: float = 1.5e-4
     model: float = 0.005
     drift: Drift = field(default_factory=Drift)
 

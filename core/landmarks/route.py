@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_of, quaternion_from_heading
 from locatk.core.landmarks.fit import POSE, Priors
-from locatk.core.landmarks.smooth import FINEST, SYSTEMATIC, Link, StayPose, compose, link
-from locatk.core.landmarks.trace import relative
+from locatk.core.landmarks.smooth import FINEST, SYSTEMATIC, Link, StayPose, link
+from locatk.core.landmarks.trace import compose, relative
 from locatk.core.landmarks.visits import Visit
 from locatk.core.trajectory import Trajectory
 

@@ -30,8 +30,10 @@ FARTHEST_M = 0.062
 STRONG = 0.6
 """Field of a place near a landmark, in units of the threshold."""
 
-SLACK = 0.2
-"""Of a field, for the grid's coarseness."""
+SLACK = 0.25
+"""By which share of the strongest field near a sample the grid's coarseness may be off."""
+
+NEAR_M = 8e-3
 
 FLOOR_T = 3e-4
 
@@ -78,19 +80,20 @@ def candidates(
     if not strong.any():
         return np.empty((0, 3)), np.empty(0, np.intp)
     centres = _centres(place[strong])
-    cost = scan(place[seen], trace.value_t[seen], centres, geometry, laid)
+    slack = _slack(trace)
+    cost = scan(place[seen], trace.value_t[seen], slack[seen], centres, geometry, laid)
     return _distinct(cost, centres, most)
 
 
 def scan(
-    points: Array, values: Array, centres: Array, geometry: Geometry, laid: Array
+    points: Array, values: Array, slack: Array, centres: Array, geometry: Geometry, laid: Array
 ) -> Array:
     """Cost (turns, centres, L) of all that may be laid at each place: weighted squares left.
 
     One normal matrix of the four bars serves all ``laid`` (L, 4); a common gain is free
-    within :data:`GAINS`.
+    within :data:`GAINS`. ``slack`` is how far each value may be off.
     """
-    weight = 1 / (FLOOR_T**2 + (SLACK * values) ** 2)
+    weight = 1 / slack**2
     table = _table(geometry)
     if kernels is None:
         return scan_numpy(points, values, weight, centres, table, laid)
@@ -150,6 +153,18 @@ def scan_numpy(
         gain = np.clip(top / np.maximum(square, 1e-300), *GAINS)
         cost[number] = power - 2 * gain * top + gain * gain * square
     return cost
+
+
+def _slack(trace: Trace) -> Array:
+    """(n, N) how far a field may be off, where the nearest node is a few millimetres away."""
+    step = np.hypot(*np.diff(trace.pose[:, :2], axis=0).T)
+    turn = np.abs(np.diff(trace.pose[:, 2])) * np.hypot(*trace.lever_m.T).max()
+    way = np.concatenate([[0], np.cumsum(step + turn)])
+    reach = max(NEAR_M, 1.01 * float(np.median(np.diff(way))))
+    near = np.abs(way[:, None] - way) <= reach
+    strength = np.abs(np.nan_to_num(trace.value_t))
+    most = np.where(near[:, :, None], strength, 0.0).max(axis=1)
+    return np.hypot(FLOOR_T, SLACK * most)
 
 
 def _centres(strong: Array) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.fit import POSE, Priors, Problem
 from locatk.core.landmarks.floor import Cell
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.trace import Trace, corrections, relative
+from locatk.core.landmarks.trace import Trace, compose, corrections, relative
 
 Array = NDArray[np.float64]
 
@@ -355,20 +355,6 @@ class _System:
         right = np.zeros((self.size, len(place)))
         right[place, np.arange(len(place))] = 1
         return np.asarray(solve(right)[place])
-
-
-def compose(pose: Array, local: Array) -> Array:
-    """Poses (..., 3) in the outer frame of what is at ``local`` (..., 3) as seen from ``pose``."""
-    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x, y = local[..., 0], local[..., 1]
-    return np.stack(
-        [
-            pose[..., 0] + cos * x - sin * y,
-            pose[..., 1] + sin * x + cos * y,
-            pose[..., 2] + local[..., 2],
-        ],
-        -1,
-    )
 
 
 def _seen_from(pose: Array, mark: Array) -> tuple[Array, Array, Array]:

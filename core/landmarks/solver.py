@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks import globalize, route, smooth
+from locatk.core.landmarks import globalize, neighbours, route, smooth
 from locatk.core.landmarks.estimate import FAULTY, Explanation
 from locatk.core.landmarks.fit import Priors
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
@@ -20,6 +20,7 @@ from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, pattern, rotated, signs
 from locatk.core.landmarks.sighting import Sighting
 from locatk.core.landmarks.sightings import check_order, sighting
+from locatk.core.landmarks.trace import compose
 from locatk.core.landmarks.visits import Driven, Visit, driven, find
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -33,6 +34,9 @@ CERTAIN = 0.9999
 
 LIKELY = 0.9
 """Probability from which on poses on the map are given."""
+
+ALONE_T = 3e-5
+"""What the model leaves where the neighbours' fields are taken off."""
 
 LAID_M, LAID_RAD = 1.5e-3, 0.012
 """Standard deviations with which landmarks are taken to be laid."""
@@ -216,7 +220,8 @@ def placed(
             "would settle it"
         )
     marks = expected(usable, floor)
-    smoothed = smooth.smooth([as_run(usable, found, floor)], marks, floor.geometry, found.priors)
+    alone = replace(found.priors, floor_t=ALONE_T)
+    smoothed = smooth.smooth([as_run(usable, found, floor)], marks, floor.geometry, alone)
     told["misfit_sigma"] = smoothed.misfit
     path = route.poses(
         device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
@@ -245,7 +250,10 @@ def expected(usable: Sequence[Seen], floor: FloorMap) -> dict[Cell, smooth.Mark]
         strength = signs(rotated(best.code, quarters))
         sigma = np.full(4, Priors().strength)
         pose = np.array([*floor.place(cell), 0.0])
-        spread = np.array([LAID_M, LAID_M, LAID_RAD])
+        spread = np.array([LAID_M, ALONE_T = 3e-5
+"""What the model leaves where the neighbours' fields are taken off."""
+
+LAID_M, LAID_RAD])
         built = floor.built.get(cell)
         if built is not None:
             pose = pose + [built.x_m, built.y_m, built.heading_rad]
@@ -270,7 +278,10 @@ def as_run(usable: Sequence[Seen], found: Recording, floor: FloorMap) -> smooth.
         best = one.sighting.hypotheses[one.located.hypothesis]
         turn = one.located.quarters * HALF_PI
         mark = np.array([*floor.place(one.located.cell), turn])
-        stays.append(smooth.Stay(one.visit.trace, one.located.cell, smooth.compose(mark, best.pose)))
+        pose, trace = compose(mark, best.pose), one.visit.trace
+        wrong = one.explanations[one.located.hypothesis].parameters[-trace.correction.shape[2] :]
+        trace = neighbours.without(trace, pose, wrong, one.located.cell, floor)
+        stays.append(smooth.Stay(trace, one.located.cell, pose))
     visits = [one.visit for one in usable]
     return smooth.Run(stays, route.links(visits, found.odometry, found.priors))
 

@@ -105,6 +105,20 @@ def sensor_places(pose: Array, lever_m: Array) -> Array:
     return np.stack([x, y], -1)
 
 
+def compose(pose: Array, local: Array) -> Array:
+    """Poses (..., 3) in the outer frame of what is at ``local`` (..., 3) as seen from ``pose``."""
+    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x, y = local[..., 0], local[..., 1]
+    return np.stack(
+        [
+            pose[..., 0] + cos * x - sin * y,
+            pose[..., 1] + sin * x + cos * y,
+            pose[..., 2] + local[..., 2],
+        ],
+        -1,
+    )
+
+
 def relative(pose: Array, origin: Array) -> Array:
     """Poses (n, 3) as seen from the pose ``origin`` (3,)."""
     cos, sin = math.cos(origin[2]), math.sin(origin[2])

@@ -23,7 +23,7 @@ NEAR = 0.2
 NEAR_SIGMA = 6.0
 """The same in standard deviations of the noise, whichever is larger."""
 
-MARGIN_M = 0.08
+MARGIN_M = 0.06
 """Way before and after, on which nothing is felt, that belongs to a visit."""
 
 BIN_M = 2e-3

@@ -1,0 +1,48 @@
+"""What the other landmarks of the map add to a visit, taken off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.landmarks import bars
+from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.landmark import signs
+from locatk.core.landmarks.trace import Trace, compose, sensor_places
+
+Array = NDArray[np.float64]
+
+REACH_M = 0.3
+"""Distance from which on a landmark's field is not felt (facts/landmarks.md 2.3)."""
+
+
+def without(trace: Trace, pose: Array, wrong: Array, cell: Cell, floor: FloorMap) -> Trace:
+    """The trace of a visit to ``cell`` less the fields of all other landmarks of the map.
+
+    Parameters
+    ----------
+    trace : Trace
+    pose : (3,) ndarray
+        Robot at the trace's reference, in the map's frame.
+    wrong : (m,) ndarray
+        Of the trace's corrections.
+    cell : (row, column)
+    floor : FloorMap
+    """
+    way = compose(pose, trace.pose + trace.correction @ wrong)
+    place = sensor_places(way, trace.lever_m)
+    value = trace.value_t.copy()
+    span = int(np.ceil(REACH_M / floor.pitch_m))
+    rows, columns = floor.shape
+    for row in range(max(0, cell[0] - span), min(rows, cell[0] + span + 1)):
+        for column in range(max(0, cell[1] - span), min(columns, cell[1] + span + 1)):
+            if (row, column) == cell or floor.codes[row, column] == HOLE:
+                continue
+            local = place - np.array(floor.place((row, column)))
+            near = np.hypot(local[..., 0], local[..., 1]) < REACH_M
+            if near.any():
+                strength = signs(floor.codes[row, column])
+                value[near] -= bars.basis(floor.geometry, local[near]) @ strength
+    return replace(trace, value_t=value)
