@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,11 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.landmarks.floor import HOLE, STEPS, Cell, FloorMap
 from locatk.core.landmarks.landmark import PATTERN_OF, rotated
+from locatk.core.landmarks.sighting import Sighting
 
 Array = NDArray[np.float64]
 
 L_TURNS = (0, 1)
 """Quarter turns before each of the two steps of an L: ahead, then to the left."""
+
+QUARTER = math.pi / 2
+
+ASTRAY = 0.25
+"""Of the pitch and of a quarter turn: what a step to the next landmark may be off."""
 
 STRAIGHT = 1e7
 """Radius over distance from which on two arcs are a straight line to rounding."""
@@ -127,6 +134,53 @@ def _sweep(before: Array, after: Array, side: float) -> float:
     turn = math.atan2(before[0] * after[1] - before[1] * after[0], float(before @ after)) * side
     # A turn of nothing may come out a rounding below it.
     return turn % math.tau if turn < -1e-9 else max(turn, 0.0)
+
+
+def sequence(
+    sightings: Sequence[Sighting], pitch_m: float
+) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+    """Codes and turns of landmarks that were visited one after the other, for :func:`locate`.
+
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        Each with a hypothesis; the best counts.
+    pitch_m : float
+        Between neighbouring cells.
+
+    Returns
+    -------
+    codes, turns : tuple of int
+        None where by odometry two of them in a row are not one cell apart: then one was
+        not seen between them.
+    """
+    places, frames = [], []
+    for seen in sightings:
+        x, y, turn = seen.best.pose
+        frame = float(seen.odometry[2] - turn)
+        cos, sin = math.cos(frame), math.sin(frame)
+        places.append(seen.odometry[:2] - [cos * x - sin * y, sin * x + cos * y])
+        frames.append(frame)
+    # All in the frame of the first landmark, in quarter turns.
+    quarters = [round((frame - frames[0]) / QUARTER) for frame in frames]
+    steps = []
+    for k in range(len(places) - 1):
+        way = places[k + 1] - places[k]
+        if abs(np.hypot(*way) - pitch_m) > ASTRAY * pitch_m:
+            return None
+        # Each step is seen in the frame of where it began, which odometry has not yet left.
+        ahead = (math.atan2(way[1], way[0]) - frames[k]) / QUARTER
+        if abs(ahead - round(ahead)) > ASTRAY:
+            return None
+        steps.append(quarters[k] + round(ahead))
+    headings = [*steps[:1], *steps] or [0]
+    codes = tuple(
+        int(rotated(seen.best.code, q - heading))
+        for seen, q, heading in zip(sightings, quarters, headings, strict=True)
+    )
+    turns = tuple((b - a + 1) % 4 - 1 for a, b in pairwise(headings))
+    # The heading at a landmark is that of arrival; at the first one that of leaving.
+    return codes, turns
 
 
 @dataclass(frozen=True)
