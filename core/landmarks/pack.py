@@ -10,7 +10,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing import check
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.materials import SPARES_PERCENT, bill
-from locatk.core.landmarks.pack_page import Leaf, bind, check_margin
+from locatk.core.landmarks.pack_page import Leaf, bind, check_margin, printable
 from locatk.core.landmarks.pack_plan import plan_leaves
 from locatk.core.landmarks.pack_templates import PlacedTemplate, template_leaves
 from locatk.core.landmarks.pack_words import bill_leaves, checklist_leaves, list_leaves
@@ -102,8 +102,3 @@ def pack(
             hint="Use a larger paper, or the templates and an exported list of the map",
         )
     return Pack(bind(leaves), found, templates)
-
-
-def printable(text: str) -> str:
-    """What the letters of a PDF's own fonts can show of a text."""
-    return text.encode("cp1252", "replace").decode("cp1252")

@@ -11,7 +11,7 @@ from locatk.core.drawing import Line, Mark, Point, Words
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing import card_mm, check, digit, draw_landmark, north_mark
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
-from locatk.core.landmarks.pack_page import TEXT, check_margin, mm_text, size_text
+from locatk.core.landmarks.pack_page import TEXT, check_margin, mm_text, printable, size_text
 from locatk.core.landmarks.pack_plan import block_name
 
 MOST_TILES = 500
@@ -235,7 +235,7 @@ def _words(
         [1e-3 * (a + b) for a, b in zip(corner, room, strict=True)] for room in ((0, 0), room)
     )
     return (
-        f"{name} of {count[0]} x {count[1]}" if tiles > 1 else floor.name or "floor",
+        f"{name} of {count[0]} x {count[1]}" if tiles > 1 else printable(floor.name) or "floor",
         "Print at 100 %",
         "map +y is up",
         *(["Cut along the dashed seams and join the marks"] if tiles > 1 else []),

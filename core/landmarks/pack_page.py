@@ -120,6 +120,11 @@ def size_text(size_mm: Point) -> str:
     return f"{size_mm[0]:g} x {size_mm[1]:g} mm"
 
 
+def printable(text: str) -> str:
+    """What the letters of a PDF's own fonts can show of a text."""
+    return text.encode("cp1252", "replace").decode("cp1252")
+
+
 def mm_text(value_m: float) -> str:
     """A length or coordinate in mm, to 0.1 mm, without zeros that say nothing."""
     text = f"{1e3 * value_m:.1f}".removesuffix(".0")

@@ -94,8 +94,8 @@ def _layout(floor: FloorMap, title: str, size: Point, margin: float) -> _Layout:
     name = f"{title}: floor plan"
     count = len(floor.cells())
     words = (
-        f"{rows} rows x {columns} columns, {count} landmarks, pitch {mm_text(floor.pitch_m)} mm, "
-        f"alphabet {floor.alphabet}, window {floor.window}. {_KEY}",
+        f"{_count(rows, 'row')} x {_count(columns, 'column')}, {_count(count, 'landmark')}, "
+        f"pitch {mm_text(floor.pitch_m)} mm, alphabet {floor.alphabet}, window {floor.window}. {_KEY}",
     )
     frame = Frame(size, margin, name, words)
     left, bottom, right, top = frame.box
@@ -119,6 +119,10 @@ def _layout(floor: FloorMap, title: str, size: Point, margin: float) -> _Layout:
             end = min(floor.shape[1], (column + 1) * columns)
             blocks.append((first, column * columns, last, end))
     return _Layout(frame, tuple(blocks), across, nice_scale(1e3 * floor.pitch_m / cell))
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def _labels_mm(floor: FloorMap) -> Point:
@@ -263,11 +267,18 @@ def _key_map(
     marks: list[Mark] = []
     holes = [(r, c) for r in range(rows) for c in range(columns) if floor.codes[r, c] == HOLE]
     for row, column in holes:
-        marks.append(_square(left + column * cell, bottom + row * cell, cell, cell, True))
+        x, y = left + column * cell, bottom + row * cell
+        # One thin diagonal only, as names of pages may lie over it.
+        marks.append(Line((x, y), (x + cell, y + cell), 0.05))
+    for one, other in sorted(floor.walls):
+        x, y = left + max(one[1], other[1]) * cell, bottom + max(one[0], other[0]) * cell
+        end = (x, y + cell) if one[0] == other[0] else (x + cell, y)
+        marks.append(Line((x, y), end, 0.8))
     for number, block in enumerate(layout.blocks):
         x, y = left + block[1] * cell, bottom + block[0] * cell
         width, height = (block[3] - block[1]) * cell, (block[2] - block[0]) * cell
-        marks.append(_square(x, y, width, height, False))
+        corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
+        marks.append(Polygon(corners, width_mm=0.25))
         name = block_name(number, layout.across)
         points = min(14.0, 0.5 * height / MM_PER_POINT, 0.8 * width / text_width(name, 1.0))
         middle = (x + width / 2, y + height / 2)
@@ -277,8 +288,3 @@ def _key_map(
         below = (middle[0], middle[1] - 1.3 * line_mm(small))
         marks.append(Words(cells, below, small, "middle"))
     return [*marks, *north_mark((left - 5.0, bottom), 8.0, "")]
-
-
-def _square(x: float, y: float, width: float, height: float, filled: bool) -> Mark:
-    corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
-    return Polygon(corners, filled, 0.25)
