@@ -250,10 +250,7 @@ def expected(usable: Sequence[Seen], floor: FloorMap) -> dict[Cell, smooth.Mark]
         strength = signs(rotated(best.code, quarters))
         sigma = np.full(4, Priors().strength)
         pose = np.array([*floor.place(cell), 0.0])
-        spread = np.array([LAID_M, ALONE_T = 3e-5
-"""What the model leaves where the neighbours' fields are taken off."""
-
-LAID_M, LAID_RAD])
+        spread = np.array([LAID_M, LAID_M, LAID_RAD])
         built = floor.built.get(cell)
         if built is not None:
             pose = pose + [built.x_m, built.y_m, built.heading_rad]
