@@ -34,6 +34,19 @@ class LazyMapGroup(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, short) for name, (_, short) in COMMANDS.items()])
 
+    def shell_complete(
+        self, ctx: click.Context, incomplete: str
+    ) -> list[click.shell_completion.CompletionItem]:
+        # click's own would import every command for its short help.
+        from click.shell_completion import CompletionItem
+
+        names = [
+            CompletionItem(name, help=short)
+            for name, (_, short) in COMMANDS.items()
+            if name.startswith(incomplete)
+        ]
+        return [*names, *click.Command.shell_complete(self, ctx, incomplete)]
+
 
 @click.group(cls=LazyMapGroup, short_help="Design floors of landmarks, check and exchange them.")
 def command() -> None:

@@ -19,7 +19,7 @@ from locatk.core.drawing import Line, Point, Polygon
 from locatk.core.landmarks.drawing import arrow, bar_outlines
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.gridfit import built_poses
-from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS, name
+from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, name
 
 NAMESPACE = "http://www.w3.org/2000/svg"
 INKSCAPE = "http://www.inkscape.org/namespaces/inkscape"
@@ -61,6 +61,37 @@ def render(floor: FloorMap) -> bytes:
     return data + b"\n"
 
 
+class _Shape:
+    """The bars of one way to lay a landmark: all its points, and which of them make what."""
+
+    def __init__(self, geometry: Geometry, code: int) -> None:
+        self.outlines: list[slice] = []
+        self.shafts: list[slice] = []
+        self.heads: list[slice] = []
+        self.letters: list[tuple[str, int]] = []
+        points: list[NDArray[np.float64]] = []
+
+        def add(part: object) -> slice:
+            points.append(np.asarray(part, float).reshape(-1, 2))
+            stop = sum(map(len, points))
+            return slice(stop - len(points[-1]), stop)
+
+        for corners, south, north, _ in bar_outlines(geometry, code):
+            self.outlines.append(add(corners))
+            along = np.subtract(north, south)
+            # The arrow takes the middle of the bar, the letters its two ends.
+            start, tip = (tuple(np.add(south, part * along).tolist()) for part in (0.28, 0.72))
+            head = min(0.5e3 * geometry.bar_width_m, 0.2 * math.dist(south, north))
+            for mark in arrow(start, tip, head):
+                if isinstance(mark, Line):
+                    self.shafts.append(add((mark.start, mark.end)))
+                elif isinstance(mark, Polygon):
+                    self.heads.append(add(mark.corners))
+            for letter, part in (("S", 0.13), ("N", 0.87)):
+                self.letters.append((letter, add(np.add(south, part * along)).start))
+        self.points = np.concatenate(points)
+
+
 class _Drawn:
     """A map on its page, whose left lower corner is half a pitch before cell (0, 0)."""
 
@@ -73,7 +104,7 @@ class _Drawn:
         poses = built_poses(floor)
         self.places = 1e3 * poses[:, :2] - corner
         self.headings = poses[:, 2].tolist()
-        self.outlines = [bar_outlines(floor.geometry, code) for code in range(16)]
+        self.shapes = [_Shape(floor.geometry, code) for code in range(CODES)]
 
     def draw(self, ink: Xml.Element) -> None:
         self._walls(_layer(ink, "walls"))
@@ -107,36 +138,22 @@ class _Drawn:
         heading: float,
     ) -> None:
         group = Xml.SubElement(layer, "g", id=ident)
+        shape = self.shapes[code]
         c, s = math.cos(heading), math.sin(heading)
-        turn = np.array([[c, s], [-s, c]])  # of rows of points
+        moved = shape.points @ np.array([[c, s], [-s, c]]) + place
+        moved[:, 1] = self.size_mm[1] - moved[:, 1]
+        x, y = ([_number(value) for value in axis] for axis in moved.T.tolist())
 
-        def path(points: object) -> str:
-            moved = np.array(points, float) @ turn + place
-            pairs = (" ".join(map(_number, self._at(point))) for point in moved)
-            return "M" + "L".join(pairs)
+        def path(parts: list[slice], end: str) -> str:
+            pairs = (map(" ".join, zip(x[part], y[part], strict=True)) for part in parts)
+            return "".join("M" + "L".join(pair) + end for pair in pairs)
 
-        width = 1e3 * self.floor.geometry.bar_width_m
-        outlines, lines, heads, letters = [], [], [], []
-        for corners, south, north, _ in self.outlines[code]:
-            outlines.append(path(corners) + "z")
-            along = np.subtract(north, south)
-            # The arrow takes the middle of the bar, the letters its two ends.
-            start, tip = np.add(south, 0.28 * along), np.add(south, 0.72 * along)
-            head = min(0.5 * width, 0.2 * float(np.hypot(*along)))
-            for mark in arrow(tuple(start), tuple(tip), head):
-                if isinstance(mark, Line):
-                    lines.append(path((mark.start, mark.end)))
-                elif isinstance(mark, Polygon):
-                    heads.append(path(mark.corners) + "z")
-            for letter, share in (("S", 0.13), ("N", 0.87)):
-                letters.append((letter, np.add(south, share * along) @ turn + place))
-        Xml.SubElement(group, "path", d="".join(outlines))
-        Xml.SubElement(group, "path", d="".join(lines))
-        Xml.SubElement(group, "path", d="".join(heads), fill="black", stroke="none")
-        size = 0.55 * width
-        for letter, point in letters:
-            x, y = self._at(point)
-            _text(group, letter, (x, y + 0.36 * size), size)
+        Xml.SubElement(group, "path", d=path(shape.outlines, "z"))
+        Xml.SubElement(group, "path", d=path(shape.shafts, ""))
+        Xml.SubElement(group, "path", d=path(shape.heads, "z"), fill="black", stroke="none")
+        size = 0.55e3 * self.floor.geometry.bar_width_m
+        for letter, at in shape.letters:
+            _text(group, letter, (moved[at, 0], moved[at, 1] + 0.36 * size), size)
 
     def _walls(self, layer: Xml.Element) -> None:
         for (row, column), (other_row, _) in sorted(self.floor.walls):
