@@ -11,7 +11,8 @@ from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS
 from locatk.core.polaris.materials import GRADES_T, Item
 
 FERRITE_T = (0.20, 0.45)
-"""Remanence of sintered hard ferrite, Y8T to Y40 (SJ/T 10410, as makers list it)."""
+"""Remanence of sintered hard ferrite, Y8T to Y40 (SJ/T 10410-2000, as makers list
+it: http://magneticalloy.com/ferrite-magnet.htm)."""
 
 SPARES_PERCENT = 5.0
 

@@ -95,7 +95,8 @@ def _layout(floor: FloorMap, title: str, size: Point, margin: float) -> _Layout:
     count = len(floor.cells())
     words = (
         f"{_count(rows, 'row')} x {_count(columns, 'column')}, {_count(count, 'landmark')}, "
-        f"pitch {mm_text(floor.pitch_m)} mm, alphabet {floor.alphabet}, window {floor.window}. {_KEY}",
+        f"pitch {mm_text(floor.pitch_m)} mm, alphabet {floor.alphabet}, "
+        f"window {floor.window}. {_KEY}",
     )
     frame = Frame(size, margin, name, words)
     left, bottom, right, top = frame.box
