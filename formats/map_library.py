@@ -23,7 +23,9 @@ from locatk.core.landmarks.windows import ALPHABET_CODES
 
 Codes = NDArray[np.int64]
 
-NAME = re.compile(r"(?P<alphabet>\w+)_(?P<window>\w+)_(?P<detect>\d+)_(?P<rows>\d+)x(?P<columns>\d+)")
+NAME = re.compile(
+    r"(?P<alphabet>\w+)_(?P<window>\w+)_(?P<detect>\d+)_(?P<rows>\d+)x(?P<columns>\d+)"
+)
 
 
 @dataclass(frozen=True)

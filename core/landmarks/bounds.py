@@ -81,7 +81,11 @@ def refuse_readings(
     under = ""
     if alphabet == "compass":
         # Words of another heading are of no use: the fullest one decides.
-        asked, bound, under = int(np.bincount(heading, minlength=4).max()), words, "under a heading "
+        asked, bound, under = (
+            int(np.bincount(heading, minlength=4).max()),
+            words,
+            "under a heading ",
+        )
     elif asked <= words and bound < words:
         # Where a wall lets a robot pass in one direction only, no word falls out.
         asked = _turnable(cells, heading)

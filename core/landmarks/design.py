@@ -94,9 +94,7 @@ def design(
     there = blank.codes != HOLE
     cells, heading = placements(there, ways(blank), options.window)
     alphabet = options.alphabet
-    refuse_readings(
-        cells, heading, alphabet=alphabet, window=options.window, detect=options.detect
-    )
+    refuse_readings(cells, heading, alphabet=alphabet, window=options.window, detect=options.detect)
     count, letters = there.size, LETTERS[alphabet]
     flat = cells[..., 0] * options.columns + cells[..., 1]
     task = problem(count, flat, heading, options.window, alphabet, options.detect)

@@ -258,4 +258,6 @@ class _Valid:
         if self.table is not None:
             return np.asarray((words < TABLE) & self.table[np.minimum(words, TABLE - 1)])
         at = np.minimum(np.searchsorted(self.words, words), len(self.words) - 1)
-        return np.asarray(self.words[at] == words) if len(self.words) else np.zeros(words.shape, bool)
+        return (
+            np.asarray(self.words[at] == words) if len(self.words) else np.zeros(words.shape, bool)
+        )

@@ -2,75 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.floor import ALPHABETS, HOLE, STEPS, WINDOWS, Cell, FloorMap
-from locatk.core.landmarks.landmark import PATTERNS, code_of, pattern, rotated
-from locatk.core.landmarks.windows import ALPHABET_CODES, readings, ways
+from locatk.core.landmarks.floor import HOLE, WINDOWS, FloorMap
+from locatk.core.landmarks.landmark import code_of
+from locatk.core.landmarks.windows import readings, ways
 
-WALKS = {
-    "L": "AL",
-    "I2": "A",
-    "I3": "AA",
-    "2x2": "ALL",
-    "3x3": "AALLARRA",
-}
-"""Each letter is a step: ahead, or after a turn to the left or right."""
+SEEDS = st.integers(0, 2**32 - 1)
 
 
-def walked(floor: FloorMap) -> dict[tuple[Cell, int], tuple[list[Cell], tuple[int, ...]]]:
-    """Cells and letters by first cell and heading, as a robot finds them."""
-    found = {}
-    for cell in floor.cells():
-        for start in range(4):
-            at, heading, visited = cell, start, [cell]
-            for step in WALKS[floor.window]:
-                heading += {"A": 0, "L": 1, "R": -1}[step]
-                if not floor.open(at, heading):
-                    break
-                at = (at[0] + STEPS[heading % 4][0], at[1] + STEPS[heading % 4][1])
-                visited.append(at)
-            else:
-                codes = [int(floor.codes[visit]) for visit in visited]
-                if floor.alphabet == "6":
-                    letters = tuple(PATTERNS.index(pattern(code)) + 1 for code in codes)
-                else:
-                    letters = tuple(int(rotated(code, -start)) for code in codes)
-                found[cell, start] = (visited, letters)
-    return found
-
-
-def floors(
-    windows: tuple[str, ...] = WINDOWS, alphabets: tuple[str, ...] = ALPHABETS
-) -> st.SearchStrategy[FloorMap]:
-    """Small floors with holes and walls, and letters drawn at random."""
-
-    def build(window: str, alphabet: str, rows: int, columns: int, seed: int) -> FloorMap:
-        random = np.random.default_rng(seed)
-        codes = random.choice(ALPHABET_CODES[alphabet], (rows, columns))
-        codes[random.random(codes.shape) < random.choice([0, 0.1])] = HOLE
-        walls = set()
-        for row in range(rows):
-            for column in range(columns):
-                for step in STEPS[:2]:
-                    other = (row + step[0], column + step[1])
-                    if random.random() < 0.1 and other[0] < rows and other[1] < columns:
-                        walls.add(((row, column), other))
-        return FloorMap(codes, window=window, alphabet=alphabet, walls=frozenset(walls))
-
-    size = st.integers(1, 6)
-    numbers = st.integers(0, 2**32 - 1)
-    return st.builds(
-        build, st.sampled_from(windows), st.sampled_from(alphabets), size, size, numbers
-    )
-
-
-@given(floors())
+@given(seed=SEEDS)
 @settings(deadline=None, max_examples=150)
-def test_as_a_robot_walks(floor: FloorMap) -> None:
+def test_as_a_robot_walks(
+    seed: int, random_floor: Callable[[int], FloorMap], walked: Callable[[FloorMap], Any]
+) -> None:
+    floor = random_floor(seed)
     seen = readings(floor)
     found = {
         (tuple(cells[0].tolist()), int(heading)): (
@@ -83,9 +35,12 @@ def test_as_a_robot_walks(floor: FloorMap) -> None:
     assert found == walked(floor)
 
 
-@given(floors())
+@given(seed=SEEDS)
 @settings(deadline=None, max_examples=50)
-def test_ways_are_where_the_floor_is_open(floor: FloorMap) -> None:
+def test_ways_are_where_the_floor_is_open(
+    seed: int, random_floor: Callable[[int], FloorMap]
+) -> None:
+    floor = random_floor(seed)
     free = ways(floor)
     for cell in floor.cells():
         assert [floor.open(cell, heading) for heading in range(4)] == free[cell].tolist()
@@ -106,7 +61,11 @@ def test_a_left_turn_by_hand() -> None:
 def test_counts_are_those_of_the_facts(window: str) -> None:
     """Facts 4, counting bounds."""
     m, n = 5, 7
-    counts = {"L": 4 * (m - 1) * (n - 1), "2x2": 4 * (m - 1) * (n - 1), "3x3": 4 * (m - 2) * (n - 2)}
+    counts = {
+        "L": 4 * (m - 1) * (n - 1),
+        "2x2": 4 * (m - 1) * (n - 1),
+        "3x3": 4 * (m - 2) * (n - 2),
+    }
     for k in (2, 3):
         counts[f"I{k}"] = 2 * (m * (n - k + 1) + n * (m - k + 1))
     assert len(readings(FloorMap(np.zeros((m, n), int), window=window))) == counts[window]

@@ -1,0 +1,88 @@
+"""What no map can do."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.bounds import readings_bound, refuse, square_bound
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.proof import prove
+from locatk.core.landmarks.windows import ALPHABET_CODES
+
+
+@pytest.mark.parametrize(
+    ("alphabet", "window", "shape"),
+    [("6", "I3", (1, 3)), ("16", "I2", (1, 2)), ("6", "2x2", (2, 2)), ("6", "L", (2, 2))],
+)
+def test_useful_words_are_those_of_floors_of_one_window(
+    alphabet: str, window: str, shape: tuple[int, int]
+) -> None:
+    """Each such floor holds as many words as it has headings; none is of two floors."""
+    codes = product(ALPHABET_CODES[alphabet], repeat=shape[0] * shape[1])
+    floors = [FloorMap(np.reshape(c, shape), window=window, alphabet=alphabet) for c in codes]
+    proofs = [prove(floor, steps=False) for floor in floors]
+    if window == "L":  # here each word is of the first window of some floor
+        assert readings_bound(alphabet, window) == 6**3
+        assert min(proof.duplicate_count for proof in proofs) == 0
+        return
+    assert readings_bound(alphabet, window) == sum(proof.unique for proof in proofs)
+
+
+def test_bounds_of_the_facts() -> None:
+    """Facts 4; the words of I2 and 2x2 that turn into themselves fall out in addition."""
+    assert readings_bound("6", "L") == 216
+    assert readings_bound("6", "I3") == 180
+    assert readings_bound("16", "L") == 4096
+    assert readings_bound("16", "I2") == 240
+    assert readings_bound("6", "2x2") == 1296 - 36
+    assert readings_bound("16", "2x2") == 65536 - 256
+    assert readings_bound("compass", "2x2") == 4 * 81
+    assert square_bound("16", "L") == 33
+    assert square_bound("6", "L") == 8
+    assert [square_bound("16", w, 1) for w in ("L", "2x2")] == [9, 33]
+    assert [square_bound("6", w, 1) for w in ("L", "2x2")] == [4, 8]
+    assert square_bound("compass", "2x2") == 10
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "alphabet", "window", "detect", "bound"),
+    [
+        (34, 33, "16", "L", 0, 4096),
+        (8, 9, "16", "I2", 0, 240),
+        (8, 8, "6", "I3", 0, 180),
+        (19, 19, "6", "2x2", 0, 1260),
+        (9, 10, "16", "L", 1, 256),
+        (11, 10, "compass", "2x2", 0, 81),
+        (1, 3, "compass", "I2", 1, 0),
+    ],
+)
+def test_too_large_floors_are_refused_with_the_bound(
+    rows: int, columns: int, alphabet: str, window: str, detect: int, bound: int
+) -> None:
+    if bound:
+        with pytest.raises(InputError, match=f"only {bound} ") as error:
+            refuse(rows, columns, alphabet=alphabet, window=window, detect=detect)
+        side = square_bound(alphabet, window, detect)
+        assert f"{side} x {side}" in str(error.value.hint)
+    refuse(rows - 1 or 1, columns - 1, alphabet=alphabet, window=window, detect=detect)
+
+
+def test_holes_and_walls_make_room() -> None:
+    with pytest.raises(InputError, match="256 readings"):
+        refuse(9, 9, alphabet="6", window="L")
+    middle = {(r, c) for r in range(3, 6) for c in range(3, 6)}
+    refuse(9, 9, alphabet="6", window="L", forbidden=middle)
+    fence = {((r, c), (r, c + 1)) for r in range(9) for c in (2, 5)}
+    refuse(9, 9, alphabet="6", window="L", walls=fence)
+
+
+def test_a_one_way_square_may_read_like_itself_turned() -> None:
+    """One wall leaves one of the four ways around a square, and no word is useless then."""
+    codes = np.zeros((2, 2), int)
+    walls = frozenset({((0, 0), (0, 1))})
+    assert prove(FloorMap(codes, alphabet="6", window="2x2", walls=walls)).unique
+    refuse(2, 2, alphabet="6", window="2x2", walls=walls)
