@@ -140,7 +140,8 @@ def _walls(floor: FloorMap) -> Array:
 def _sightings(solution: Solution, floor: FloorMap) -> tuple[Array, Array]:
     """Places of the robots at their sightings: used ones, and refused ones."""
     paths = {t.device: t for t in solution.trajectories if len(t)}
-    used, refused = [], []
+    used: list[Array] = []
+    refused: list[Array] = []
     for found in solution.detections:
         place = _on_path(paths.get(found["device"]), round(1e9 * found["time_s"]))
         if place is None and found["cell"] is not None and found["x_m"] is not None:

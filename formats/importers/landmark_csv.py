@@ -171,7 +171,7 @@ def read_landmarks(
         imported.facts["zero_volts"] = ", ".join(f"{v:g}" for v in zero) if zero else "median"
     if downward:
         imported.facts["positive"] = "downward in the file, upward here"
-    lines = [line for line, kept in zip(table.lines, there, strict=True) if kept]
+    lines = [table.lines[row] for row in np.flatnonzero(there)]
     _leave_out(imported, table, [column.name for column in readings], lines)
     imported.warnings += _doubts(odometry)
     if imported.left_out == field_t.size:
