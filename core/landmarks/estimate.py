@@ -235,3 +235,31 @@ def robot(trace: Trace, explanation: Explanation, at: int) -> tuple[Array, Array
     slope = np.hstack([-back, back @ trace.correction[at]])
     slope[:2, 2] = [seen[1], -seen[0]]
     return seen, slope @ explanation.covariance[np.ix_(rows, rows)] @ slope.T
+
+
+def stand(
+    trace: Trace, geometry: Geometry, priors: fit.Priors, strength: Array, start: Array
+) -> tuple[Array, Array]:
+    """Robot at a landmark that is known, from what is known of its place already.
+
+    Parameters
+    ----------
+    trace : Trace
+        One sample or more: the four fields of a robot that stands still are enough.
+    geometry : Geometry
+    priors : Priors
+    strength : (4,) ndarray
+        Expected signed strengths of the bars in the landmark's frame.
+    start : (3,) ndarray
+        Robot in the landmark's frame, within a centimetre and some ten degrees.
+
+    Returns
+    -------
+    (3,) ndarray, (3, 3) ndarray
+        Robot in the landmark's frame at the trace's reference, and the covariance.
+    """
+    problem = _problem(trace, geometry, priors, np.asarray(strength, float)[None])
+    cos, sin = math.cos(start[2]), math.sin(start[2])
+    mark = [-cos * start[0] - sin * start[1], sin * start[0] - cos * start[1], -start[2]]
+    fitted = fit.descend(problem, problem.start(np.array([mark])))
+    return robot(trace, _explanations(problem, fitted)[0], trace.reference)

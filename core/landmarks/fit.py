@@ -122,7 +122,9 @@ class Problem:
         # A bar that lies off its place is met as if the sensor were off: to first order.
         unit, slope = bars.basis_gradient(self.geometry, own, at[:, None, None])
         push = priors.place_m * place
-        moved = unit - slope[..., 0] * push[:, None, None, 0] - slope[..., 1] * push[:, None, None, 1]
+        moved = (
+            unit - slope[..., 0] * push[:, None, None, 0] - slope[..., 1] * push[:, None, None, 1]
+        )
         total = np.einsum("knsb,kb->kns", moved, strength)
         seen = ~np.isnan(trace.value_t)
         value = np.where(seen, trace.value_t, 0.0)
@@ -237,4 +239,6 @@ def descend(problem: Problem, start: Array, steps: int = STEPS) -> Fitted:
 
 def _cost(residual: Array, parameters: Array) -> Array:
     nuisance = parameters[:, POSE:]
-    return (np.einsum("kr,kr->k", residual, residual) + np.einsum("kp,kp->k", nuisance, nuisance)) / 2
+    return (
+        np.einsum("kr,kr->k", residual, residual) + np.einsum("kp,kp->k", nuisance, nuisance)
+    ) / 2

@@ -147,9 +147,7 @@ def _followed(sighting: Sighting) -> list[tuple[int, Hypothesis]]:
     return [(n, h) for n, h in every if n == 0 or h.probability > FAINT][:MOST]
 
 
-def _seen(
-    hypotheses: list[tuple[int, Hypothesis]], floor: FloorMap, misread: float
-) -> Array:
+def _seen(hypotheses: list[tuple[int, Hypothesis]], floor: FloorMap, misread: float) -> Array:
     """Likelihood (H, 4, rows, columns) of each hypothesis in each state, the pad included."""
     codes = np.pad(floor.codes, PAD, constant_values=HOLE)
     turned = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
@@ -184,9 +182,7 @@ def _steps(
         ]
     )
     length = float(np.hypot(*ahead))
-    swing = math.hypot(
-        drift.curvature_radpm * length, drift.turn_scale * abs(turn), drift.walk_rad
-    )
+    swing = math.hypot(drift.curvature_radpm * length, drift.turn_scale * abs(turn), drift.walk_rad)
     steps = []
     for i, (_, first) in enumerate(before):
         for j, (_, last) in enumerate(after):

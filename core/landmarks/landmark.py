@@ -82,7 +82,8 @@ def rotated(codes: ArrayLike, quarters: ArrayLike) -> NDArray[np.int64]:
 
 def signs(codes: ArrayLike) -> Array:
     """Directions (..., 4) of the bars: 1 where N, -1 where S."""
-    return (np.asarray(codes, np.int64)[..., None] >> np.arange(4) & 1) * 2.0 - 1.0
+    bits = np.asarray(codes, np.int64)[..., None] >> np.arange(4) & 1
+    return np.where(bits == 1, 1.0, -1.0)
 
 
 PATTERN_OF = np.zeros(CODES, np.int64)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,10 +19,7 @@ Array = NDArray[np.float64]
 
 def links(visits: list[Visit], odometry: Trajectory, priors: Priors) -> list[Link]:
     """Odometry between visits, each from the last bin of one to the first of the next."""
-    return [
-        link(_way(odometry, one, other)[1], priors)
-        for one, other in zip(visits, visits[1:], strict=False)
-    ]
+    return [link(_way(odometry, one, other)[1], priors) for one, other in pairwise(visits)]
 
 
 def poses(
@@ -47,41 +46,28 @@ def poses(
     Trajectory
         Height, roll and pitch are 0 and not observed.
     """
-    times, found, spread = [], [], []
+    plane = _plane(odometry)
+    parts = [_tail(visits[0], stays[0], odometry, priors, before=True)]
     for number, (visit, stay) in enumerate(zip(visits, stays, strict=True)):
-        if number == 0:
-            part = _tail(visit, stay, odometry, priors, before=True)
-            _append(times, found, spread, part)
         inside = (odometry.time_ns >= visit.time_ns[0]) & (odometry.time_ns <= visit.time_ns[-1])
         at = odometry.time_ns[inside]
-        _append(times, found, spread, (at, *_at_visit(visit, stay, at, _plane(odometry)[inside])))
+        parts.append((at, *_at_visit(visit, stay, at, plane[inside])))
         if number + 1 < len(visits):
-            part = _between(visits[number : number + 2], stays[number : number + 2],
-                            odometry, priors)
-        else:
-            part = _tail(visit, stay, odometry, priors, before=False)
-        _append(times, found, spread, part)
-    time_ns = np.concatenate(times)
-    pose, plane = np.concatenate(found), np.concatenate(spread)
-    covariance = np.full((len(pose), 6, 6), np.nan)
-    rows = [0, 1, 5]
-    covariance[:, np.array(rows)[:, None], rows] = plane
-    position = np.column_stack([pose[:, :2], np.zeros(len(pose))])
-    heading = quaternion_from_heading(pose[:, 2])
-    return Trajectory(device, "map", time_ns, position, heading, covariance)
-
-
-def _append(times: list, found: list, spread: list, part: tuple[Array, Array, Array]) -> None:
-    times.append(part[0])
-    found.append(part[1])
-    spread.append(part[2])
+            pair = slice(number, number + 2)
+            parts.append(_between(visits[pair], stays[pair], odometry, priors))
+    parts.append(_tail(visits[-1], stays[-1], odometry, priors, before=False))
+    times, found, spread = (np.concatenate(each) for each in zip(*parts, strict=True))
+    covariance = np.full((len(found), 6, 6), np.nan)
+    rows = np.array([0, 1, 5])
+    covariance[:, rows[:, None], rows] = spread
+    position = np.column_stack([found[:, :2], np.zeros(len(found))])
+    heading = quaternion_from_heading(found[:, 2])
+    return Trajectory(device, "map", times, position, heading, covariance)
 
 
 def _plane(odometry: Trajectory) -> Array:
     """(n, 3) x, y and unwrapped heading."""
-    return np.column_stack(
-        [odometry.position[:, :2], np.unwrap(heading_of(odometry.quaternion))]
-    )
+    return np.column_stack([odometry.position[:, :2], np.unwrap(heading_of(odometry.quaternion))])
 
 
 def _way(odometry: Trajectory, one: Visit, other: Visit) -> tuple[NDArray[np.int64], Array]:
@@ -182,7 +168,5 @@ def _tail(
 
 def _end(visit: Visit, stay: StayPose, at: int) -> tuple[Array, Array]:
     """Pose and covariance at one bin of a visit."""
-    pose, covariance = _laid(
-        stay, visit.trace.pose[[at]], visit.trace.correction[[at]]
-    )
+    pose, covariance = _laid(stay, visit.trace.pose[[at]], visit.trace.correction[[at]])
     return pose[0], covariance[0]

@@ -47,9 +47,7 @@ APART_RAD = math.radians(16)
 WHOLE = signs(np.arange(CODES))
 """(16, 4) strengths of the bars of faultless landmarks."""
 
-ONE_MISSING = np.unique(
-    np.concatenate([WHOLE * (np.arange(4) != bar) for bar in range(4)]), axis=0
-)
+ONE_MISSING = np.unique(np.concatenate([WHOLE * (np.arange(4) != bar) for bar in range(4)]), axis=0)
 """(32, 4) strengths where one bar is missing."""
 
 

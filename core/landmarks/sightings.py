@@ -30,9 +30,9 @@ CLEARLY = 3.0
 """By how much another order must leave less."""
 
 
-def sighting(visit: Visit, run: Driven, geometry: Geometry, priors: Priors) -> tuple[
-    Sighting, list[Explanation]
-]:
+def sighting(
+    visit: Visit, run: Driven, geometry: Geometry, priors: Priors
+) -> tuple[Sighting, list[Explanation]]:
     """What one visit has shown, and the explanations behind the hypotheses, in their order."""
     device = run.samples.device
     found = [] if len(visit.trace) < FEWEST_BINS else explain(visit.trace, geometry, priors)

@@ -9,8 +9,9 @@ of every visit, the odometry between visits, and priors.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.trace import Trace, compose, corrections, relative
 
 Array = NDArray[np.float64]
+Solve = Callable[[Array], Array]
 
 SYSTEMATIC = 3
 """Leading columns of a trace's correction, which are the same all through a recording."""
@@ -140,7 +142,8 @@ class Smoothed:
         By run.
     marks : dict of cell to MarkFound
     misfit : float
-        Rms of the rows of the fields, in standard deviations.
+        Rms of the rows of the fields, in standard deviations. Where it is above 1 the
+        covariances are larger by its square.
     """
 
     stays: list[list[StayPose]]
@@ -232,7 +235,7 @@ class _System:
                 state[place[:POSE]] = stay.pose
         return state
 
-    def normal(self, state: Array) -> tuple:
+    def normal(self, state: Array) -> tuple[Any, Array, float]:
         """Normal matrix (sparse), gradient, and the rms of the fields' rows."""
         from scipy.sparse import coo_array
 
@@ -292,8 +295,9 @@ class _System:
         slope = slope[0]
         edges = np.cumsum([POSE, sensors, 12, 1 + SYSTEMATIC])
         marked, tuned, bars, driven, walked = np.split(slope, edges, axis=1)
-        place = np.concatenate([own[:POSE], laid[:POSE], robot[:sensors], laid[POSE:],
-                                robot[sensors:], own[POSE:]])
+        place = np.concatenate(
+            [own[:POSE], laid[:POSE], robot[:sensors], laid[POSE:], robot[sensors:], own[POSE:]]
+        )
         whole = np.hstack(
             [marked @ by_pose, marked @ (by_mark * mark.sigma), tuned, bars, driven, walked]
         )
@@ -323,10 +327,10 @@ class _System:
         white = np.linalg.inv(np.linalg.cholesky(walk @ walk.T + np.diag(FINEST**2)))
         return np.concatenate([own, other, robot]), white @ slope, white @ residual
 
-    def told(self, state: Array, solve, misfit: float) -> Smoothed:
+    def told(self, state: Array, solve: Solve, misfit: float) -> Smoothed:
         """The answer: values of the unknowns, with the covariances that are asked for."""
         found = []
-        for number, run in enumerate(self.runs):
+        for number in range(len(self.runs)):
             steady = self.robots[number][-SYSTEMATIC:]
             here = []
             for own in self.stays[number]:
@@ -335,10 +339,9 @@ class _System:
                     StayPose(
                         state[own[:POSE]],
                         state[place[POSE:]],
-                        self._covariance(place, solve),
+                        self._covariance(place, solve, misfit),
                     )
                 )
-            assert len(here) == len(run.stays)
             found.append(here)
         marks = {}
         for cell, mark in self.marks.items():
@@ -347,14 +350,14 @@ class _System:
             marks[cell] = MarkFound(
                 self._mark(state, cell),
                 mark.strength + mark.strength_sigma * state[place[POSE:]],
-                unit[:, None] * self._covariance(place, solve) * unit,
+                unit[:, None] * self._covariance(place, solve, misfit) * unit,
             )
         return Smoothed(found, marks, misfit)
 
-    def _covariance(self, place: NDArray[np.intp], solve) -> Array:
+    def _covariance(self, place: NDArray[np.intp], solve: Solve, misfit: float) -> Array:
         right = np.zeros((self.size, len(place)))
         right[place, np.arange(len(place))] = 1
-        return np.asarray(solve(right)[place])
+        return np.asarray(solve(right)[place]) * max(1.0, misfit) ** 2
 
 
 def _seen_from(pose: Array, mark: Array) -> tuple[Array, Array, Array]:

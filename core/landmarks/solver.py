@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks import globalize, neighbours, route, smooth
+from locatk.core.landmarks.detections import LIKELY, detection, laid_at
 from locatk.core.landmarks.estimate import FAULTY, Explanation
 from locatk.core.landmarks.fit import Priors
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
 from locatk.core.landmarks.globalize import HALF_PI, Located
 from locatk.core.landmarks.halls import HallSamples
-from locatk.core.landmarks.landmark import Geometry, pattern, rotated, signs
+from locatk.core.landmarks.landmark import Geometry, rotated, signs
 from locatk.core.landmarks.sighting import Sighting
 from locatk.core.landmarks.sightings import check_order, sighting
 from locatk.core.landmarks.trace import compose
@@ -31,9 +32,6 @@ METHODS = ("field", "paper")
 
 CERTAIN = 0.9999
 """Probability from which on a place on the map needs no remark."""
-
-LIKELY = 0.9
-"""Probability from which on poses on the map are given."""
 
 ALONE_T = 3e-5
 """What the model leaves where the neighbours' fields are taken off."""
@@ -59,7 +57,7 @@ class SolveOptions:
 
     method: str = "field"
     misread: float = 0.01
-    priors: Priors = Priors()
+    priors: Priors = field(default_factory=Priors)
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -151,7 +149,7 @@ def solve(
         notes += remarks
         facts["robots"][recording.device] = told
         for item in found.seen:
-            detections.append(detection(item, floor))
+            detections.append(detection(item.sighting, item.located, floor))
             if why := detections[-1]["refused"]:
                 rejected[why] += 1
     return Solution(
@@ -236,7 +234,7 @@ def on_map(found: Recording, floor: FloorMap) -> list[Seen]:
         for one in found.seen
         if one.located is not None
         and one.located.probability >= LIKELY
-        and _laid(floor, one.located.cell) != HOLE
+        and laid_at(floor, one.located.cell) != HOLE
     ]
 
 
@@ -281,66 +279,3 @@ def as_run(usable: Sequence[Seen], found: Recording, floor: FloorMap) -> smooth.
         stays.append(smooth.Stay(trace, one.located.cell, pose))
     visits = [one.visit for one in usable]
     return smooth.Run(stays, route.links(visits, found.odometry, found.priors))
-
-
-def detection(item: Seen, floor: FloorMap | None) -> dict[str, Any]:
-    """What one visit has shown, in the JSON form of docs/formats.md."""
-    out: dict[str, Any] = {
-        "time_s": item.sighting.time_ns * 1e-9,
-        "device": item.sighting.device,
-        "cell": None,
-        "pattern": None,
-        "code": None,
-        "probability": 0.0,
-        "x_m": None,
-        "y_m": None,
-        "heading_rad": None,
-        "sigma_x_m": None,
-        "sigma_y_m": None,
-        "sigma_heading_rad": None,
-        "strength": None,
-        "residual_sigma": item.sighting.residual_sigma,
-        "refused": item.sighting.refused,
-    }
-    if not item.sighting.hypotheses:
-        return out
-    located, quarters = item.located, 0
-    best = item.sighting.best
-    if located is not None and located.probability >= LIKELY:
-        best = item.sighting.hypotheses[located.hypothesis]
-        quarters = located.quarters
-        out["cell"] = list(located.cell)
-        if floor is not None:
-            laid = _laid(floor, located.cell)
-            if laid == HOLE:
-                out["cell"], out["refused"] = None, "off_map"
-            elif laid != rotated(best.code, quarters):
-                out["refused"] = "misread"
-    elif located is not None:
-        out["refused"] = "not_localised"
-    code = int(rotated(best.code, quarters))
-    turn = quarters * HALF_PI
-    c, s = np.cos(turn), np.sin(turn)
-    x, y, heading = best.pose
-    sigma = np.sqrt(np.diag(best.covariance))
-    across = np.abs([[c, -s], [s, c]]) @ sigma[:2]
-    same = sum(h.probability for h in item.sighting.hypotheses if h.code == best.code)
-    out |= {
-        "pattern": pattern(code),
-        "code": code,
-        "probability": same,
-        "x_m": float(c * x - s * y),
-        "y_m": float(s * x + c * y),
-        "heading_rad": float(np.remainder(heading + turn + np.pi, 2 * np.pi) - np.pi),
-        "sigma_x_m": float(across[0]),
-        "sigma_y_m": float(across[1]),
-        "sigma_heading_rad": float(sigma[2]),
-        "strength": [float(v) for v in np.roll(best.strength, quarters)],
-    }
-    return out
-
-
-def _laid(floor: FloorMap, cell: Cell) -> int:
-    rows, columns = floor.shape
-    inside = 0 <= cell[0] < rows and 0 <= cell[1] < columns
-    return int(floor.codes[cell]) if inside else HOLE

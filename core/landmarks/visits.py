@@ -133,9 +133,7 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
     return Driven(kept, pose, offset, _noise(samples, field), tuple(notes))
 
 
-def find(
-    run: Driven, geometry: Geometry, drift: Drift, pitch_m: float = 0.2
-) -> list[Visit]:
+def find(run: Driven, geometry: Geometry, drift: Drift, pitch_m: float = 0.2) -> list[Visit]:
     """The visits of a recording, in order of time.
 
     A visit is where a field is felt, with what lies between while the places where it is
@@ -229,7 +227,7 @@ def _silenced(samples: HallSamples, field: Array) -> list[str]:
             f"no hall sensor of {samples.device} can be used",
             hint="All are dead or saturated: check wiring and range",
         )
-    for number in np.flatnonzero(spread < DEAD * np.nanmax(spread)):
+    for number in np.flatnonzero(spread < DEAD * np.nanmax(spread)).tolist():
         field[:, number] = np.nan
         notes.append(
             f"{samples.device}: the {samples.sensors.names[number]} sensor never moved; left out"
