@@ -13,7 +13,7 @@ from locatk.cli import console, options
 if TYPE_CHECKING:
     from locatk.core.trajectory import Trajectory
 
-SYSTEMS = ("lighthouse", "dots", "polaris")
+SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
 
 SPEED_MPS = 0.1
 """Of the robot over the tags; the published algorithm has to be told."""
@@ -34,7 +34,8 @@ def command(
     Two robots drive under two Lighthouse stations whose places are unknown; a camera
     drives over a printed A4 sheet of dots, of which some are missing and some are dust; a
     bar of magnetometers drives over three tags of magnets that were laid by hand, iron bits
-    among them. Writes the session, the solution and a plot of each, and what to print.
+    among them; a robot with four hall sensors finds where it is on a floor of landmarks, of
+    which one lacks a bar. Writes the session, the solution and a plot of each, and what to print.
 
     \b
     Examples:
@@ -44,7 +45,12 @@ def command(
     """
     folder = _folder(output)
     chosen = [name for name in SYSTEMS if name in systems or not systems]
-    makers = {"lighthouse": _lighthouse, "dots": _dots, "polaris": _polaris}
+    makers = {
+        "lighthouse": _lighthouse,
+        "dots": _dots,
+        "polaris": _polaris,
+        "landmarks": _landmarks,
+    }
     for name in chosen:
         for path in _files(folder, name):
             options.guard_output(path, overwrite=overwrite)
@@ -68,7 +74,8 @@ def command(
         )
     )
     console.say(
-        "error: mean distance from the truth, in the frame of the markers, the sheet or the site"
+        "error: mean distance from the truth, in the frame of the markers, the sheet, the site or "
+        "the map"
     )
     for row in rows:
         for file in row["files"]:
@@ -86,7 +93,11 @@ def _folder(output: Path | None) -> Path:
 
 def _files(folder: Path, system: str) -> list[Path]:
     """Session, solution and plot, and what is to be printed."""
-    printed = {"dots": ["-sheet.pdf"], "polaris": ["-tags.pdf"]}.get(system, [])
+    printed = {
+        "dots": ["-sheet.pdf"],
+        "polaris": ["-tags.pdf"],
+        "landmarks": ["-pack.pdf"],
+    }.get(system, [])
     return [folder / f"{system}{end}" for end in (".mcap", "-solved.mcap", ".png", *printed)]
 
 
@@ -227,3 +238,34 @@ def _polaris(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory,
     with atomic_write(files[3], overwrite=overwrite) as stream:
         stream.write(tag.render(drawn.pages, "locatk demo"))
     return (simulated.truth,)
+
+
+def _landmarks(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    from locatk.core.landmarks import simulate
+    from locatk.core.landmarks.design import DesignOptions, design
+    from locatk.core.landmarks.pack import pack
+    from locatk.formats import halls
+    from locatk.formats.output import atomic_write
+    from locatk.formats.pdf import landmarks
+
+    floor = design(DesignOptions(rows=6, columns=8, seed=seed))
+    wanted = simulate.SimulationOptions(
+        start=(0.3, 0.3, 0.4),
+        landmarks=9,
+        spins=9,
+        faults=simulate.Faults(missing=(((2, 2), 1),)),
+        seed=seed,
+    )
+    simulated = simulate.simulate(floor, wanted)
+    halls.write_session(
+        files[0],
+        simulated.samples,
+        floor=floor,
+        truth=simulated.truth,
+        odometry=simulated.odometry,
+        overwrite=overwrite,
+    )
+    made = pack(floor, (210.0, 297.0), paper_name="A4")
+    with atomic_write(files[3], overwrite=overwrite) as stream:
+        stream.write(landmarks.render(made.pages, "locatk demo"))
+    return simulated.truth

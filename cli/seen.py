@@ -41,12 +41,14 @@ def _not_localised(solution: Solution) -> list[str]:
         if told["localised"]:
             continue
         if solution.artifact is None:
-            why = "no map of the floor"
+            why = ": no map of the floor"
         elif not told["landmarks_seen"]:
-            why = "no landmark was seen"
+            why = ": no landmark was seen"
+        elif told.get("probability") is not None:
+            why = f": the likeliest place has a probability of {told['probability']:.2g}"
         else:
-            why = f"the likeliest place has a probability of {told['probability']:.2g}"
-        losses.append(f"{device} is not localised: {why}")
+            why = ""
+        losses.append(f"{device} is not localised{why}")
     return losses
 
 

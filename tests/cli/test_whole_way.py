@@ -60,16 +60,17 @@ def test_demo(locatk, tmp_path: Path) -> None:
     result = locatk("demo", "-o", folder, "--json")
     assert result.exit_code == 0, result.stderr
     rows = {row["system"]: row for row in json.loads(result.stdout)["systems"]}
-    assert set(rows) == {"lighthouse", "dots", "polaris"}
-    for system, mae_m in (("lighthouse", 0.005), ("dots", 5e-6), ("polaris", 2e-3)):
+    limits = {"lighthouse": 0.005, "dots": 5e-6, "polaris": 2e-3, "landmarks": 3e-3}
+    assert set(rows) == set(limits)
+    for system, mae_m in limits.items():
         row = rows[system]
         assert row["poses"] > 100
         assert row["mae_m"] < mae_m
-        # Between tags the published algorithm of polaris has no poses, or none at all.
-        assert row["paper_mae_m"] is not None or system == "polaris"
+        # Where tags or landmarks were not read, the published algorithm has no poses.
+        assert row["paper_mae_m"] is not None or system in ("polaris", "landmarks")
         assert row["mae_m"] < (row["paper_mae_m"] or math.inf)
         assert (folder / f"{system}.png").read_bytes().startswith(b"\x89PNG")
-    for printed in ("dots-sheet.pdf", "polaris-tags.pdf"):
+    for printed in ("dots-sheet.pdf", "polaris-tags.pdf", "landmarks-pack.pdf"):
         assert (folder / printed).read_bytes().startswith(b"%PDF")
     files = [path for row in rows.values() for path in row["files"]]
     assert sorted(files) == sorted(str(path) for path in folder.iterdir())
