@@ -22,7 +22,11 @@ FINE = 150
 
 STARTS = 10
 
-FIRST_STEPS = 7
+RACE = (3, 4)
+"""Steps of the first descents, after which those far behind drop out."""
+
+HOPELESS = 60.0
+"""Logarithm of odds behind the best at which they do."""
 
 MARGIN = 12.0
 """Logarithm of odds at which a hypothesis is dropped before the last descents."""
@@ -116,23 +120,40 @@ def _explained(
     pose, which = scan.candidates(coarse, geometry, laid, STARTS)
     if not len(pose):
         return []
-    strength = laid[which]
-    problem = _problem(coarse, geometry, priors, strength)
-    start = problem.start(pose)
-    first = fit.descend(problem, start, FIRST_STEPS)
+    problem = _problem(coarse, geometry, priors, laid[which])
+    problem, first = _race(problem, problem.start(pose))
     # Bars at the far side are weakly seen: the other ways to lay them, at the best place.
     best = int(np.argmax(first.evidence()))
-    others = laid[(laid != strength[best]).any(axis=1)]
-    strength = np.concatenate([strength, others])
-    again = problem.start(np.repeat(first.parameters[best : best + 1, : fit.POSE], len(others), 0))
-    problem = _problem(coarse, geometry, priors, strength)
-    second = fit.descend(problem, np.concatenate([first.parameters, again]), FIRST_STEPS)
-    odds = second.evidence()
+    others = laid[(laid != problem.strength[best]).any(axis=1)]
+    again = _problem(coarse, geometry, priors, others)
+    start = problem.start(np.repeat(first.parameters[[best], : fit.POSE], len(others), axis=0))
+    again, second = _race(again, start, first.evidence().max())
+    odds = np.concatenate([first.evidence(), second.evidence()])
+    strength = np.concatenate([problem.strength, again.strength])
+    parameters = np.concatenate([first.parameters, second.parameters])
     keep = np.flatnonzero(odds > odds.max() - MARGIN)
-    strength, start = _in_one_frame(strength[keep], second.parameters[keep], odds[keep])
+    strength, start = _in_one_frame(strength[keep], parameters[keep], odds[keep])
     strength, start = _unlike(strength, start, odds[keep])
     problem = _problem(trace.thinned(FINE), geometry, priors, strength)
     return _explanations(problem, fit.descend(problem, start))
+
+
+def _race(
+    problem: fit.Problem, start: Array, ahead: float = -math.inf
+) -> tuple[fit.Problem, fit.Fitted]:
+    """Descents from all starts, of which the hopeless drop out on the way.
+
+    ``ahead`` is the evidence that others have reached already.
+    """
+    for steps in RACE:
+        fitted = fit.descend(problem, start, steps)
+        odds = fitted.evidence()
+        keep = np.flatnonzero(odds > max(odds.max(), ahead) - HOPELESS)
+        problem, fitted = problem.chosen(keep), fitted.chosen(keep)
+        start = fitted.parameters
+        if not len(keep):
+            break
+    return problem, fitted
 
 
 def _problem(trace: Trace, geometry: Geometry, priors: fit.Priors, strength: Array) -> fit.Problem:
