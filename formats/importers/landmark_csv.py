@@ -44,6 +44,9 @@ VOLTS = ("v", "mv")
 SILENT_ROWS = 10
 """A sensor that says the same in all rows, and at least so many, is dead or saw nothing."""
 
+FEWEST_UPDATES = 10
+"""With fewer poses that differ nothing is said of how often odometry is new."""
+
 _STRIDE_M = 0.02
 _ALONG = 0.5
 _FASTEST_MPS = 10.0
@@ -171,6 +174,9 @@ def read_landmarks(
         imported.facts["zero_volts"] = ", ".join(f"{v:g}" for v in zero) if zero else "median"
     if downward:
         imported.facts["positive"] = "downward in the file, upward here"
+    poses = np.count_nonzero(~np.isnan(found["x"].numbers()))
+    if len(odometry) < poses:
+        imported.facts["odometry"] = f"{poses - len(odometry)} repeated poses are passed over"
     lines = [table.lines[row] for row in np.flatnonzero(there)]
     _leave_out(imported, table, [column.name for column in readings], lines)
     imported.warnings += _doubts(odometry)
@@ -280,16 +286,33 @@ def _odometry(table: Table, found: Mapping[str, Column], time_ns: NDArray[np.int
             file=table.file,
             hint="Record the wheels too: four sensors alone do not tell the way",
         )
-    x, y, heading = values[there].T
+    fresh = np.flatnonzero(there)[_updates(values[there])]
+    x, y, heading = values[fresh].T
     n = len(x)
     return Trajectory(
         DEVICE,
         FRAME,
-        time_ns[there],
+        time_ns[fresh],
         np.column_stack([x, y, np.zeros(n)]),
         quaternion_from_heading(heading),
         np.full((n, 6, 6), np.nan),
     )
+
+
+def _updates(poses: Array) -> NDArray[np.int64]:
+    """Rows in which odometry is new, where most rows repeat the pose of the one before.
+
+    A logger that is faster than the odometry writes a staircase, which no robot drives.
+    Where the robot stands for long, the last of the equal rows counts as well.
+    """
+    n = len(poses)
+    first = np.concatenate([[0], np.flatnonzero((np.diff(poses, axis=0) != 0).any(axis=1)) + 1])
+    last = np.concatenate([first[1:] - 1, [n - 1]])
+    held = float(np.median(last - first + 1))
+    if len(first) < FEWEST_UPDATES or held < 2:
+        return np.arange(n)
+    stands = last[last - first + 1 > 2 * held]
+    return np.unique(np.concatenate([first, stands, [n - 1]]))
 
 
 def _leave_out(

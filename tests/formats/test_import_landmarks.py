@@ -199,6 +199,30 @@ def test_odometry_may_be_slower_than_the_sensors(tmp_path: Path) -> None:
         read(path)
 
 
+def test_odometry_that_is_held_is_no_staircase(tmp_path: Path) -> None:
+    """A logger of 100 Hz, odometry of 25 Hz, and a robot that stands in the middle."""
+    rows = drive(120)
+    rows[40:80, 1:4] = rows[40, 1:4]
+    held = rows.copy()
+    held[:, 1:4] = rows[np.arange(120) // 4 * 4, 1:4]
+    found = read(write(tmp_path / "run.csv", held))
+    at = np.round((found.odometry.time_ns - START_NS) * 1e-7).astype(int)
+    assert at.tolist() == [*range(0, 41, 4), 79, *range(80, 117, 4), 119]
+    np.testing.assert_allclose(found.odometry.position[:, 0], held[at, 1])
+    assert len(found.samples) == 120
+    assert found.facts["odometry"] == "97 repeated poses are passed over"
+    # Who stands, or is logged no faster than he is driven, has no stairs.
+    for still in (
+        rows,
+        rows[40:80],
+        rows[:1].repeat(30, axis=0) + [[0.01 * n] + [0] * 7 for n in range(30)],
+    ):
+        still[:, 4:] = drive(len(still))[:, 4:]
+        found = read(write(tmp_path / "run.csv", still))
+        assert len(found.odometry) == len(still)
+        assert "odometry" not in found.facts
+
+
 def test_missing_and_dead_readings_are_left_out(tmp_path: Path) -> None:
     rows = drive(30)
     rows[:, 6] = 1e-4
