@@ -105,19 +105,30 @@ def explain(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explan
     found = _explained(trace, geometry, priors, scan.WHOLE)
     if not found:
         return []
-    best = max(found, key=lambda one: one.log_odds)
+    if _best(found).residual_sigma > WHITE:
+        found = _explained(trace, geometry, priors, scan.WHOLE, scan.FINE)
+    best = _best(found)
     off = np.abs(best.strength - signs(best.code)) / priors.strength
     if off.max() > SUSPICIOUS or best.residual_sigma > WHITE:
         found += _faulty(trace, geometry, priors)
     return _shares(found)
 
 
+def _best(found: list[Explanation]) -> Explanation:
+    return max(found, key=lambda one: one.log_odds)
+
+
 def _explained(
-    trace: Trace, geometry: Geometry, priors: fit.Priors, laid: Array
+    trace: Trace,
+    geometry: Geometry,
+    priors: fit.Priors,
+    laid: Array,
+    grid: scan.Grid = scan.COARSE,
 ) -> list[Explanation]:
     """Explanations by ``laid`` (L, 4), the bars that may be there."""
     coarse = trace.thinned(COARSE)
-    pose, which = scan.candidates(coarse, geometry, laid, STARTS)
+    starts = STARTS if grid == scan.COARSE else 3 * STARTS
+    pose, which = scan.candidates(coarse, geometry, laid, starts, grid)
     if not len(pose):
         return []
     problem = _problem(coarse, geometry, priors, laid[which])

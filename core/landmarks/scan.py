@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,30 @@ from locatk.core.landmarks.trace import Trace
 
 Array = NDArray[np.float64]
 
-STEP_M = 7e-3
 
-TURNS = np.radians(np.arange(-45, 45, 9))
+@dataclass(frozen=True)
+class Grid:
+    """How finely places are searched.
+
+    Attributes
+    ----------
+    step_m : float
+        Between neighbouring centres.
+    turns : int
+        In a quarter turn.
+    """
+
+    step_m: float = 7e-3
+    turns: int = 10
+
+    def headings(self) -> Array:
+        """(turns,) headings from -45 degrees on."""
+        return -math.pi / 4 + math.pi / 2 / self.turns * np.arange(self.turns)
+
+
+COARSE = Grid()
+
+FINE = Grid(4e-3, 15)
 
 REACH_M = 0.11
 """Of a landmark's field, as far as the scan looks."""
@@ -32,6 +54,10 @@ STRONG = 0.6
 
 SLACK = 0.25
 """By which share of the strongest field near a sample the grid's coarseness may be off."""
+
+BESIDE = 0.12
+"""The same of the strongest field of any sensor: one that runs along a valley tells of
+nothing, but a node beside the valley would have it feel much."""
 
 NEAR_M = 8e-3
 
@@ -52,7 +78,7 @@ ONE_MISSING = np.unique(np.concatenate([WHOLE * (np.arange(4) != bar) for bar in
 
 
 def candidates(
-    trace: Trace, geometry: Geometry, laid: Array, most: int
+    trace: Trace, geometry: Geometry, laid: Array, most: int, grid: Grid = COARSE
 ) -> tuple[Array, NDArray[np.intp]]:
     """The likeliest places of the landmark under a trace.
 
@@ -65,6 +91,7 @@ def candidates(
         Strengths of the bars that may be there: :data:`WHOLE`, :data:`ONE_MISSING`.
     most : int
         Number of candidates.
+    grid : Grid, optional
 
     Returns
     -------
@@ -77,14 +104,21 @@ def candidates(
     strong = seen & (np.abs(np.where(seen, trace.value_t, 0)) > STRONG * geometry.threshold_t)
     if not strong.any():
         return np.empty((0, 3)), np.empty(0, np.intp)
-    centres = _centres(place[strong])
+    centres = _centres(place[strong], grid.step_m)
     slack = _slack(trace)
-    cost = scan(place[seen], trace.value_t[seen], slack[seen], centres, geometry, laid)
-    return _distinct(cost, centres, most)
+    turns = grid.headings()
+    cost = scan(place[seen], trace.value_t[seen], slack[seen], centres, turns, geometry, laid)
+    return _distinct(cost, centres, turns, most)
 
 
 def scan(
-    points: Array, values: Array, slack: Array, centres: Array, geometry: Geometry, laid: Array
+    points: Array,
+    values: Array,
+    slack: Array,
+    centres: Array,
+    turns: Array,
+    geometry: Geometry,
+    laid: Array,
 ) -> Array:
     """Cost (turns, centres, L) of all that may be laid at each place: weighted squares left.
 
@@ -94,8 +128,8 @@ def scan(
     weight = 1 / slack**2
     table = _table(geometry)
     if kernels is None:
-        return scan_numpy(points, values, weight, centres, table, laid)
-    cost = np.empty((len(TURNS), len(centres), len(laid)))
+        return scan_numpy(points, values, weight, centres, turns, table, laid)
+    cost = np.empty((len(turns), len(centres), len(laid)))
     kernels.scan_landmarks(
         np.ascontiguousarray(points),
         np.ascontiguousarray(values),
@@ -103,8 +137,8 @@ def scan(
         len(values),
         np.ascontiguousarray(centres),
         len(centres),
-        TURNS,
-        len(TURNS),
+        turns,
+        len(turns),
         table,
         len(table),
         TABLE_STEP_M,
@@ -121,14 +155,15 @@ def scan_numpy(
     values: Array,
     weight: Array,
     centres: Array,
+    turns: Array,
     table: NDArray[np.float32],
     laid: Array,
 ) -> Array:
     """Twin of the compiled loop."""
     last = len(table) - 1
-    cost = np.empty((len(TURNS), len(centres), len(laid)))
+    cost = np.empty((len(turns), len(centres), len(laid)))
     power = (weight * values**2).sum()
-    for number, turn in enumerate(TURNS):
+    for number, turn in enumerate(turns):
         x, y = np.moveaxis(points - centres[:, None], -1, 0)
         c, s = math.cos(turn), math.sin(turn)
         u, v = (c * x + s * y) / TABLE_STEP_M, (c * y - s * x) / TABLE_STEP_M
@@ -162,26 +197,29 @@ def _slack(trace: Trace) -> Array:
     near = np.abs(way[:, None] - way) <= reach
     strength = np.abs(np.nan_to_num(trace.value_t))
     most = np.where(near[:, :, None], strength, 0.0).max(axis=1)
-    return np.hypot(FLOOR_T, SLACK * most)
+    beside = most.max(axis=1, keepdims=True)
+    return np.sqrt(FLOOR_T**2 + (SLACK * most) ** 2 + (BESIDE * beside) ** 2)
 
 
-def _centres(strong: Array) -> Array:
+def _centres(strong: Array, step_m: float) -> Array:
     """Nodes (m, 2) of the grid within reach of places (p, 2) of strong field."""
     low = strong.min(axis=0) - FARTHEST_M
     high = strong.max(axis=0) + FARTHEST_M
-    x, y = (np.arange(a, b + STEP_M, STEP_M) for a, b in zip(low, high, strict=True))
+    x, y = (np.arange(a, b + step_m, step_m) for a, b in zip(low, high, strict=True))
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
     gap = ((nodes[:, None] - strong) ** 2).sum(axis=-1).min(axis=1)
     return nodes[gap < FARTHEST_M**2]
 
 
-def _distinct(cost: Array, centres: Array, most: int) -> tuple[Array, NDArray[np.intp]]:
+def _distinct(
+    cost: Array, centres: Array, turns: Array, most: int
+) -> tuple[Array, NDArray[np.intp]]:
     """The best nodes, none of which is a neighbour of a better one that is laid alike."""
     flat = cost.ravel()
     order = np.argpartition(flat, min(60 * most, len(flat) - 1))[: 60 * most]
     order = order[np.argsort(flat[order])]
     turn, node, code = np.unravel_index(order, cost.shape)
-    pose = np.column_stack([centres[node], TURNS[turn]])
+    pose = np.column_stack([centres[node], turns[turn]])
     left = np.ones(len(order), bool)
     chosen: list[int] = []
     while left.any() and len(chosen) < most:
