@@ -1264,7 +1264,8 @@ static PyMethodDef methods[] = {
      "Twin of locatk.core.landmarks.bars.evaluate_numpy."},
     {"scan_landmarks", scan_landmarks, METH_VARARGS,
      "Twin of locatk.core.landmarks.scan.scan_numpy."},
-    {"search_map", search_map, METH_VARARGS, "Twin of locatk.core.landmarks.search.search_python."},
+    {"search_map", search_map, METH_VARARGS,
+     "Twin of locatk.core.landmarks.search.search_python."},
     {NULL, NULL, 0, NULL},
 };
 
