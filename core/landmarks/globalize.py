@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.landmarks.built import laid_codes
 from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.landmark import CODES, rotated
 from locatk.core.landmarks.sighting import Hypothesis, Sighting
@@ -149,7 +150,7 @@ def _followed(sighting: Sighting) -> list[tuple[int, Hypothesis]]:
 
 def _seen(hypotheses: list[tuple[int, Hypothesis]], floor: FloorMap, misread: float) -> Array:
     """Likelihood (H, 4, rows, columns) of each hypothesis in each state, the pad included."""
-    codes = np.pad(floor.codes, PAD, constant_values=HOLE)
+    codes = np.pad(laid_codes(floor), PAD, constant_values=HOLE)
     turned = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
     out = np.empty((len(hypotheses), 4, *codes.shape))
     for place, (_, one) in enumerate(hypotheses):

@@ -1,15 +1,16 @@
-"""What the other landmarks of the map add to a visit, taken off."""
+"""What the other landmarks of the map, as they were built, add to a visit, taken off."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks import bars
+from locatk.core.landmarks.built import laid_mark
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
-from locatk.core.landmarks.landmark import signs
 from locatk.core.landmarks.trace import Trace, compose, sensor_places
 
 Array = NDArray[np.float64]
@@ -40,9 +41,16 @@ def without(trace: Trace, pose: Array, wrong: Array, cell: Cell, floor: FloorMap
         for column in range(max(0, cell[1] - span), min(columns, cell[1] + span + 1)):
             if (row, column) == cell or floor.codes[row, column] == HOLE:
                 continue
-            local = place - np.array(floor.place((row, column)))
-            near = np.hypot(local[..., 0], local[..., 1]) < REACH_M
+            mark, strength = laid_mark(floor, (row, column))
+            away = place - mark[:2]
+            near = np.hypot(away[..., 0], away[..., 1]) < REACH_M
             if near.any():
-                strength = signs(floor.codes[row, column])
-                value[near] -= bars.basis(floor.geometry, local[near]) @ strength
+                local = away[near] @ _turn(mark[2])
+                value[near] -= bars.basis(floor.geometry, local) @ strength
     return replace(trace, value_t=value)
+
+
+def _turn(heading: float) -> Array:
+    """(2, 2): rows of places times it are as seen under a heading."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    return np.array([[cos, -sin], [sin, cos]])
