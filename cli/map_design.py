@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, map_landmark, map_proof, options
+from locatk.cli import console, failures, map_landmark, map_proof, options
 from locatk.cli.map_options import Cells, Size, Walls, geometry_of, geometry_options, on_floor
 from locatk.cli.tag_options import metres, number
 from locatk.core.errors import InputError
@@ -98,7 +98,8 @@ def command(
 
     With --landmark no map is made: the valleys of the six patterns, r1 and r2, the heights
     at which they can be told, the least pitch, the range of the hall sensors and tolerances
-    are printed for the bars of the options. What will not work is a warning.
+    are printed for the bars of the options. What will not work is a warning; the map is
+    written all the same, and the exit status is 3.
 
     \b
     Examples:
@@ -188,9 +189,9 @@ def _tell(output: Path, floor: FloorMap, proof: Proof, analysis: Analysis, as_js
                 "warnings": said,
             }
         )
-    _warn(said)
     for note in floor.notes:
         console.detail(f"{note[0].upper()}{note[1:]}.")
+    _warn(said)
 
 
 def _landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
@@ -217,8 +218,10 @@ def _check_pitch(geometry: Geometry, pitch_m: float) -> None:
 
 
 def _warn(said: list[str]) -> None:
-    for text in said:
+    for text in said[1:]:
         console.warn(f"{text[0].upper()}{text[1:]}.")
+    if said:
+        raise failures.Incomplete(said[0])
 
 
 @contextmanager

@@ -88,7 +88,9 @@ class Explanation:
     probability: float = math.nan
 
 
-def explain(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explanation]:
+def explain(
+    trace: Trace, geometry: Geometry, priors: fit.Priors, *, thorough: bool = True
+) -> list[Explanation]:
     """All landmarks that may explain a trace, the most probable first.
 
     Parameters
@@ -96,6 +98,8 @@ def explain(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explan
     trace : Trace
     geometry : Geometry
     priors : Priors
+    thorough : bool
+        Search more finely, and for faulty bars, where nothing explains the trace.
 
     Returns
     -------
@@ -105,6 +109,8 @@ def explain(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explan
     found = _explained(trace, geometry, priors, scan.WHOLE)
     if not found:
         return []
+    if not thorough:
+        return _shares(found)
     if _best(found).residual_sigma > WHITE:
         found = _explained(trace, geometry, priors, scan.WHOLE, scan.FINE)
     best = _best(found)

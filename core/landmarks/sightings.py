@@ -91,16 +91,20 @@ def check_order(
         return
     bad = sorted(bad, key=lambda n: -len(visits[n].trace))[:ORDERS_TRIED]
     same = tuple(range(len(names)))
-    left: dict[tuple[int, ...], float] = {}
-    for order in itertools.permutations(same):
-        worst = []
-        for n in bad:
+
+    def left(order: tuple[int, ...], which: list[int]) -> float:
+        """What the best explanations leave if the sensors are in another order."""
+        residuals = []
+        for n in which:
             trace = replace(visits[n].trace, value_t=visits[n].trace.value_t[:, list(order)])
-            found = explain(trace, geometry, priors)
-            worst.append(found[0].residual_sigma if found else math.inf)
-        left[order] = float(np.median(worst))
-    best = min(left, key=lambda order: left[order])
-    if best != same and left[best] < UNEXPLAINED and CLEARLY * left[best] < left[same]:
+            found = explain(trace, geometry, priors, thorough=False)
+            residuals.append(found[0].residual_sigma if found else math.inf)
+        return float(np.median(residuals))
+
+    tried = {order: left(order, bad[:1]) for order in itertools.permutations(same)}
+    likely = sorted(tried, key=lambda order: tried[order])[:3]
+    best = min(likely, key=lambda order: left(order, bad))
+    if best != same and left(best, bad) < min(UNEXPLAINED, left(same, bad) / CLEARLY):
         given = ", ".join(names)
         right = ", ".join(names[best.index(k)] for k in same)
         raise InputError(

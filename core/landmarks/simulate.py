@@ -73,7 +73,7 @@ class Simulated:
     samples : tuple of HallSamples
         One a robot.
     truth : tuple of Trajectory
-        In the frame ``"floor"``, the map's; one pose a sample.
+        In the frame ``"map"``; one pose a sample.
     odometry : tuple of Trajectory
         In the frame ``"odometry"``, which is the robot's at the start.
     floor : FloorMap
@@ -138,7 +138,7 @@ def simulate(floor: FloorMap, options: SimulationOptions | None = None) -> Simul
     told, slips = _odometry(robot, options)
     return Simulated(
         samples=(HallSamples(options.device, sensors, time_ns, read),),
-        truth=(trajectory(options.device, "floor", time_ns, poses),),
+        truth=(trajectory(options.device, "map", time_ns, poses),),
         odometry=(told,),
         floor=floor,
         floor_as_laid=tuple(laid.values()),

@@ -36,6 +36,9 @@ CERTAIN = 0.9999
 ALONE_T = 3e-5
 """What the model leaves where the neighbours' fields are taken off."""
 
+FEWEST_REVERSED = 3
+"""Landmarks from which on a fit of exchanged poles says something."""
+
 LAID_M, LAID_RAD = 1.5e-3, 0.012
 """Standard deviations with which landmarks are taken to be laid."""
 
@@ -144,7 +147,7 @@ def solve(
         notes += found.run.notes
         if floor is None:
             notes.append(f"{recording.device}: no map, so that its landmarks have no cells")
-        solved, remarks, told = placed(found, floor)
+        solved, remarks, told = placed(found, floor, options.misread)
         trajectories += solved
         notes += remarks
         facts["robots"][recording.device] = told
@@ -190,7 +193,7 @@ def read(
 
 
 def placed(
-    found: Recording, floor: FloorMap | None
+    found: Recording, floor: FloorMap | None, misread: float
 ) -> tuple[list[Trajectory], list[str], dict[str, Any]]:
     """Poses on the map, remarks, and what is told of one robot's localization."""
     device = found.run.samples.device
@@ -210,6 +213,11 @@ def placed(
             remarks = [
                 f"{device}: not localised; the likeliest place has a probability of {sure:.2g}"
             ]
+        if floor is not None and reversed_fits(found, floor, misread):
+            remarks.append(
+                f"{device}: with N and S exchanged it would be localised; are the sensors or "
+                "all bars the other way up?"
+            )
         return [], remarks, told
     remarks = []
     if sure < CERTAIN:
@@ -225,6 +233,22 @@ def placed(
         device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
     )
     return [path], remarks, told
+
+
+def reversed_fits(found: Recording, floor: FloorMap, misread: float) -> bool:
+    """Whether the map fits what was seen if all fields had the other sign."""
+    turned = [
+        replace(
+            one.sighting,
+            hypotheses=tuple(replace(h, code=15 - h.code) for h in one.sighting.hypotheses),
+        )
+        for one in found.seen
+        if not one.sighting.refused
+    ]
+    if len(turned) < FEWEST_REVERSED:
+        return False
+    told = globalize.locate(turned, floor, misread=misread, drift=found.priors.drift)
+    return max(one.probability for one in told) >= LIKELY
 
 
 def on_map(found: Recording, floor: FloorMap) -> list[Seen]:

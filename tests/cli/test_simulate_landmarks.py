@@ -70,7 +70,7 @@ def test_a_session_holds_samples_map_odometry_and_truth(locatk, floor: Path) -> 
         "output": str(out),
         "samples": len(wanted.samples[0]),
         "device": "robot",
-        "frame": "floor",
+        "frame": "map",
         "faults": [],
         "saturated": 0,
         "slips_s": [],
