@@ -11,7 +11,7 @@ from locatk.core.landmarks.globalize import HALF_PI, Located
 from locatk.core.landmarks.landmark import pattern, rotated
 from locatk.core.landmarks.sighting import Sighting
 
-LIKELY = 0.9
+LIKELY = 0.8
 """Probability from which on a place on the map is told."""
 
 

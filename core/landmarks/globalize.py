@@ -28,10 +28,20 @@ PAD = 3
 """Cells around the map in which a robot may be too, though no landmark is told there."""
 
 UNTOLD = 1e-3
-"""Probability of a landmark where the map has none."""
+"""Probability of a landmark in a cell of the map that has none."""
+
+BEYOND = 0.3
+"""The same beside the map, of which it says nothing."""
 
 LOST = 1e-7
 """Probability that a robot was carried to anywhere between two visits."""
+
+ELSEWHERE = 1e-4
+"""Probability that a recording begins where the map has nothing to say: it is of another
+floor, or all fields have the other sign."""
+
+BACK = 1e-2
+"""Probability of coming onto the map, from one visit to the next, from elsewhere."""
 
 UNSEEN = 0.02
 """Probability of no sighting of a landmark that lies on the way."""
@@ -113,20 +123,23 @@ def locate(
         )
     ]
     unseen = _unseen(floor)
-    forward = [seen[0] / seen[0].sum()]
-    for step, now in zip(steps, seen[1:], strict=True):
-        after = _moved(forward[-1], step, len(now), unseen) * now
-        forward.append(after / after.sum())
-    backward = [np.ones_like(seen[-1])]
-    for step, now, count in zip(
-        reversed(steps), reversed(seen[1:]), reversed([len(k) for k in kept[:-1]]), strict=True
-    ):
-        before = _moved_back(backward[-1] * now, step, count, unseen)
-        backward.append(before / before.sum())
+    every = [one.sum() / CODES for one in (_share(hypotheses) for hypotheses in kept)]
+    forward = [_normal(seen[0] / (4 * unseen.size) * (1 - ELSEWHERE), ELSEWHERE * every[0])]
+    for step, now, share in zip(steps, seen[1:], every[1:], strict=True):
+        belief, away = _moved(*forward[-1], step, len(now), unseen)
+        forward.append(_normal(belief * now, away * share))
+    backward = [(np.ones_like(seen[-1]), 1.0)]
+    for k in range(len(steps) - 1, -1, -1):
+        belief, away = backward[-1]
+        later = _moved_back(
+            belief * seen[k + 1], away * every[k + 1], steps[k], len(kept[k]), unseen
+        )
+        backward.append(_normal(*later))
     found = []
-    for hypotheses, past, future in zip(kept, forward, reversed(backward), strict=True):
-        both = past * future
-        both /= both.sum()
+    for hypotheses, (past, out), (future, still) in zip(
+        kept, forward, reversed(backward), strict=True
+    ):
+        both, away = _normal(past * future, out * still)
         state = both.sum(axis=0)
         quarters, row, column = np.unravel_index(np.argmax(state), state.shape)
         number = int(np.argmax(both[:, quarters, row, column]))
@@ -142,6 +155,16 @@ def locate(
     return found
 
 
+def _normal(belief: Array, away: float) -> tuple[Array, float]:
+    """Both, so that they sum to 1."""
+    total = float(belief.sum()) + away
+    return belief / total, away / total
+
+
+def _share(hypotheses: list[tuple[int, Hypothesis]]) -> Array:
+    return np.array([one.probability for _, one in hypotheses])
+
+
 def _followed(sighting: Sighting) -> list[tuple[int, Hypothesis]]:
     """The likelier hypotheses with their numbers."""
     every = list(enumerate(sighting.hypotheses))
@@ -152,10 +175,12 @@ def _seen(hypotheses: list[tuple[int, Hypothesis]], floor: FloorMap, misread: fl
     """Likelihood (H, 4, rows, columns) of each hypothesis in each state, the pad included."""
     codes = np.pad(laid_codes(floor), PAD, constant_values=HOLE)
     turned = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
+    inside = np.pad(np.ones(floor.shape, bool), PAD)
+    untold = np.where(inside, UNTOLD, BEYOND) / CODES
     out = np.empty((len(hypotheses), 4, *codes.shape))
     for place, (_, one) in enumerate(hypotheses):
         same = np.where(turned == one.code, 1 - misread, misread / (CODES - 1))
-        out[place] = one.probability * np.where(codes == HOLE, UNTOLD / CODES, same)
+        out[place] = one.probability * np.where(codes == HOLE, untold, same)
     return out
 
 
@@ -222,30 +247,40 @@ def _sigma(hypothesis: Hypothesis) -> float:
     return math.sqrt(trace) if math.isfinite(trace) else 2 * PLACE_M
 
 
-def _moved(belief: Array, steps: list[_Step], count: int, unseen: Array) -> Array:
-    """Belief (count, 4, rows, columns) after steps from ``belief`` (H, 4, rows, columns)."""
-    out = np.full((count, *belief.shape[1:]), LOST * belief.sum() / belief[0].size)
+def _moved(
+    belief: Array, away: float, steps: list[_Step], count: int, unseen: Array
+) -> tuple[Array, float]:
+    """Belief (count, 4, rows, columns) after steps from ``belief`` (H, 4, rows, columns), and
+    that of being nowhere on the map."""
+    total = float(belief.sum())
+    anywhere = (LOST * total + BACK * away) / belief[0].size / count
+    out = np.full((count, *belief.shape[1:]), anywhere)
+    left = (1 - BACK) * away + LOST * total
     for step in steps:
         weight = math.exp(step.odds)
         for quarters in range(4):
             rows, columns = _on_map(step.cells, quarters)
-            passed = _passed(unseen, rows, columns)
-            moved = _shifted(belief[step.before, quarters] * passed, rows, columns)
-            out[step.after, (quarters + step.quarters) % 4] += weight * moved
-    return out
+            going = weight * belief[step.before, quarters] * _passed(unseen, rows, columns)
+            moved = _shifted(going, rows, columns)
+            out[step.after, (quarters + step.quarters) % 4] += moved
+            left += float(going.sum() - moved.sum())
+    return out, max(left, 0.0)
 
 
-def _moved_back(belief: Array, steps: list[_Step], count: int, unseen: Array) -> Array:
+def _moved_back(
+    belief: Array, away: float, steps: list[_Step], count: int, unseen: Array
+) -> tuple[Array, float]:
     """The transpose of :func:`_moved`."""
-    out = np.full((count, *belief.shape[1:]), LOST * belief.sum() / belief[0].size)
+    total = float(belief.sum()) / belief[0].size / len(belief)
+    out = np.full((count, *belief.shape[1:]), LOST * (total + away))
     for step in steps:
         weight = math.exp(step.odds)
         for quarters in range(4):
             rows, columns = _on_map(step.cells, quarters)
-            passed = _passed(unseen, rows, columns)
-            back = _shifted(belief[step.after, (quarters + step.quarters) % 4], -rows, -columns)
-            out[step.before, quarters] += weight * passed * back
-    return out
+            there = belief[step.after, (quarters + step.quarters) % 4]
+            back = _shifted(there, -rows, -columns, fill=away)
+            out[step.before, quarters] += weight * _passed(unseen, rows, columns) * back
+    return out, (1 - BACK) * away + BACK * total
 
 
 def _on_map(cells: tuple[int, int], quarters: int) -> tuple[int, int]:

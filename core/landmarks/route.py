@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import heading_of, quaternion_from_heading
 from locatk.core.landmarks.fit import POSE, Priors
 from locatk.core.landmarks.smooth import FINEST, SYSTEMATIC, Link, StayPose, link
-from locatk.core.landmarks.trace import compose, relative
+from locatk.core.landmarks.trace import bent, compose, relative
 from locatk.core.landmarks.visits import Visit
 from locatk.core.trajectory import Trajectory
 
@@ -119,7 +119,7 @@ def _between(
     start, start_spread = _end(visits[0], stays[0], -1)
     goal, goal_spread = _end(visits[1], stays[1], 0)
     steady = stays[0].wrong[:SYSTEMATIC]
-    local = joint.pose + joint.correction[:, :, :SYSTEMATIC] @ steady
+    local = bent(joint.pose, steady, priors.drift)
     walk = joint.correction[:, :, SYSTEMATIC:]
     cos, sin = np.cos(start[2]), np.sin(start[2])
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -149,11 +149,11 @@ def _tail(
     way = np.vstack([_bin_odometry(visit, edge), way[order]])
     joint = link(way, priors)
     start, spread = _end(visit, stay, edge)
-    steady = joint.correction[:, :, :SYSTEMATIC]
+    # What turns the way as it is driven turns it the other way backward.
+    sign = np.array([1.0, 1.0, -1.0 if before else 1.0])
+    steady = joint.correction[:, :, :SYSTEMATIC] * sign
     walk = joint.correction[:, :, SYSTEMATIC:]
-    if before:  # what turns the way as it is driven turns it the other way backward
-        steady = steady * np.array([1.0, 1.0, -1.0])
-    local = joint.pose + steady @ stay.wrong[:SYSTEMATIC]
+    local = bent(joint.pose, sign * stay.wrong[:SYSTEMATIC], priors.drift)
     cos, sin = np.cos(start[2]), np.sin(start[2])
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     known = stay.covariance[POSE : POSE + SYSTEMATIC, POSE : POSE + SYSTEMATIC]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.fit import POSE, Priors, Problem
 from locatk.core.landmarks.floor import Cell
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.trace import Trace, compose, corrections, relative
+from locatk.core.landmarks.trace import Drift, Trace, bent, compose, corrections, relative
 
 Array = NDArray[np.float64]
 Solve = Callable[[Array], Array]
@@ -62,10 +62,13 @@ class Link:
         Along the way, as seen from its begin.
     correction : (n, 3, m) ndarray
         As of :class:`.trace.Trace`.
+    drift : Drift
+        In whose standard deviations it is.
     """
 
     pose: Array
     correction: Array
+    drift: Drift
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ class Smoothed:
 def link(pose: Array, priors: Priors) -> Link:
     """The link along odometry's poses (n, 3), both ends included."""
     local = relative(pose, pose[0])
-    return Link(local, corrections(local, 0, priors.drift))
+    return Link(local, corrections(local, 0, priors.drift), priors.drift)
 
 
 def smooth(
@@ -317,7 +320,8 @@ class _System:
         (own, left, left_slope), (other, reached, reached_slope) = ends
         seen, by_left, by_reached = _seen_from(left, reached)
         steady, walk = np.split(joint.correction[-1], [SYSTEMATIC], axis=1)
-        residual = seen - joint.pose[-1] - steady @ state[robot]
+        # A long way bends too much for first order.
+        residual = seen - bent(joint.pose, state[robot], joint.drift)[-1]
         residual[2] = math.remainder(residual[2], math.tau)
         count = len(own) + SYSTEMATIC
         slope = np.hstack([by_left @ left_slope, by_reached @ reached_slope])

@@ -36,6 +36,11 @@ CERTAIN = 0.9999
 ALONE_T = 3e-5
 """What the model leaves where the neighbours' fields are taken off."""
 
+FEWEST_WRONG = 2
+
+MOST_WRONG = 1 / 3
+"""Share of misread landmarks from which on a map is not believed."""
+
 FEWEST_REVERSED = 3
 """Landmarks from which on a fit of exchanged poles says something."""
 
@@ -207,6 +212,12 @@ def placed(
         "landmarks_seen": len(located),
         "landmarks_to_localise": first,
     }
+    if floor is not None and contradicted(usable, floor):
+        remarks = [
+            f"{device}: not localised; too many of its landmarks are not those of the map: is "
+            "it the map of this floor?"
+        ]
+        return [], remarks, told | {"localised": False}
     if not usable or floor is None:
         remarks = []
         if located:
@@ -233,6 +244,14 @@ def placed(
         device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
     )
     return [path], remarks, told
+
+
+def contradicted(usable: list[Seen], floor: FloorMap) -> bool:
+    """Whether the map is as often wrong about what was seen as no map of the floor can be."""
+    wrong = sum(
+        detection(one.sighting, one.located, floor)["refused"] == "misread" for one in usable
+    )
+    return wrong >= FEWEST_WRONG and wrong > MOST_WRONG * len(usable)
 
 
 def reversed_fits(found: Recording, floor: FloorMap, misread: float) -> bool:

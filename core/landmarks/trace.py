@@ -162,6 +162,25 @@ def corrections(pose: Array, reference: int, drift: Drift) -> Array:
     )
 
 
+def bent(pose: Array, steady: Array, drift: Drift) -> Array:
+    """Poses (n, 3) of a way with its constant errors taken off, from its first pose on.
+
+    ``steady`` (3,) are scale, turn scale and curvature in standard deviations of ``drift``:
+    what the first three columns of :func:`corrections` are to first order, exactly.
+    """
+    step = np.diff(pose, axis=0, prepend=pose[:1])
+    way = np.cumsum(np.hypot(step[:, 0], step[:, 1]))
+    turn = pose[:, 2] - pose[0, 2]
+    wrong = drift.turn_scale * steady[1] * turn + drift.curvature_radpm * steady[2] * way
+    middle = wrong.copy()
+    middle[1:] = (wrong[1:] + wrong[:-1]) / 2
+    cos, sin = np.cos(middle), np.sin(middle)
+    stretch = 1 + drift.scale * steady[0]
+    x = np.cumsum(stretch * (cos * step[:, 0] - sin * step[:, 1]))
+    y = np.cumsum(stretch * (sin * step[:, 0] + cos * step[:, 1]))
+    return np.column_stack([pose[0, 0] + x, pose[0, 1] + y, pose[:, 2] + wrong])
+
+
 def _swung(heading: Array, step: Array, reference: int) -> Array:
     """(n, m, 3) what errors (n, m) of the heading do to the whole pose: the way swings."""
     middle = heading.copy()

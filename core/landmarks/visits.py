@@ -23,6 +23,12 @@ NEAR = 0.2
 NEAR_SIGMA = 6.0
 """The same in standard deviations of the noise, whichever is larger."""
 
+WEAK = 0.5
+"""Strongest field of a visit, in units of the threshold, under which it says too little."""
+
+STRETCH_M = 5e-3
+"""Way of the sensors over which fields are joined to find visits."""
+
 MARGIN_M = 0.06
 """Way before and after, on which nothing is felt, that belongs to a visit."""
 
@@ -140,39 +146,57 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
 def find(run: Driven, geometry: Geometry, drift: Drift, pitch_m: float = 0.2) -> list[Visit]:
     """The visits of a recording, in order of time.
 
-    A visit is where a field is felt, with what lies between while the places where it is
-    felt are, by middle, less than half the pitch apart; and a margin before and after.
+    A visit goes on while fields are felt no farther than half the pitch from where they
+    were felt so far, by middle; what lies between and a margin before and after belong to
+    it, but nothing that is nearer to the next one.
     """
-    field = run.samples.field_t - run.offset_t
-    place = sensor_places(run.pose, run.samples.sensors.position_m)
-    strength = np.where(np.isnan(field), 0.0, np.abs(field))
-    bound = max(NEAR * geometry.threshold_t, NEAR_SIGMA * run.noise_t)
-    felt = strength > bound
-    any_felt = felt.any(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], any_felt, [False]]).astype(np.int8)))
-    way = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(run.pose[:, :2], axis=0).T))])
+    starts, power, place = _felt(run, geometry)
     found: list[list[int]] = []
     middles: list[Array] = []
-    for first, stop in edges.reshape(-1, 2).tolist():
-        inside = strength[first:stop]
-        if inside.max() < geometry.threshold_t / 2:
-            continue
-        middle = _middle(place[first:stop], inside)
-        if found and np.hypot(*(middle - middles[-1])) < pitch_m / 2:
-            found[-1][1] = stop
-            whole = slice(found[-1][0], stop)
-            middles[-1] = _middle(place[whole], strength[whole] * felt[whole])
+    weight = 0.0
+    for number in np.flatnonzero(power > 0).tolist():
+        if found and np.hypot(*(place[number] - middles[-1])) < pitch_m / 2:
+            found[-1][1] = number
+            weight += power[number]
+            middles[-1] = middles[-1] + (place[number] - middles[-1]) * power[number] / weight
         else:
-            found.append([first, stop])
-            middles.append(middle)
+            found.append([number, number])
+            middles.append(place[number])
+            weight = power[number]
+    strength = np.nan_to_num(np.abs(run.samples.field_t - run.offset_t)).max(axis=1)
+    edges = np.append(starts, len(strength))
+    spans = [(int(edges[a]), int(edges[b + 1])) for a, b in found]
+    kept = [
+        n
+        for n, (first, stop) in enumerate(spans)
+        if strength[first:stop].max() >= WEAK * geometry.threshold_t
+    ]
+    spans, middles = [spans[n] for n in kept], [middles[n] for n in kept]
+    way = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(run.pose[:, :2], axis=0).T))])
     visits = []
-    for number, ((first, stop), middle) in enumerate(zip(found, middles, strict=True)):
-        before = (found[number - 1][1] + first) // 2 if number else 0
-        after = (stop + found[number + 1][0]) // 2 if number + 1 < len(found) else len(way)
+    for number, ((first, stop), middle) in enumerate(zip(spans, middles, strict=True)):
+        before = (spans[number - 1][1] + first) // 2 if number else 0
+        after = (stop + spans[number + 1][0]) // 2 if number + 1 < len(spans) else len(way)
         first = max(before, int(np.searchsorted(way, way[first] - MARGIN_M)))
         stop = min(after, int(np.searchsorted(way, way[stop - 1] + MARGIN_M, "right")))
         visits.append(_visit(run, first, stop, middle, drift))
     return visits
+
+
+def _felt(run: Driven, geometry: Geometry) -> tuple[NDArray[np.intp], Array, Array]:
+    """First samples (g,) of short ways, the squares (g,) of the fields that are felt on each,
+    and the middles (g, 2) of where."""
+    step = np.diff(run.pose, axis=0, prepend=run.pose[:1])
+    reach = float(np.hypot(*run.samples.sensors.position_m.T).max())
+    way = np.cumsum(np.hypot(step[:, 0], step[:, 1]) + reach * np.abs(step[:, 2]))
+    starts = np.flatnonzero(np.diff(np.floor(way / STRETCH_M), prepend=-1.0))
+    strength = np.nan_to_num(np.abs(run.samples.field_t - run.offset_t))
+    strength[strength < max(NEAR * geometry.threshold_t, NEAR_SIGMA * run.noise_t)] = 0.0
+    place = sensor_places(run.pose, run.samples.sensors.position_m)
+    power = np.add.reduceat((strength**2).sum(axis=1), starts)
+    middle = np.add.reduceat(np.einsum("ns,nsi->ni", strength**2, place), starts, axis=0)
+    with np.errstate(invalid="ignore"):
+        return starts, power, middle / power[:, None]
 
 
 def _visit(run: Driven, first: int, stop: int, middle: Array, drift: Drift) -> Visit:
@@ -205,12 +229,6 @@ def _visit(run: Driven, first: int, stop: int, middle: Array, drift: Drift) -> V
     since = run.samples.time_ns[first:stop] - run.samples.time_ns[first]
     times = run.samples.time_ns[first] + np.add.reduceat(since, starts) // every
     return Visit(first, stop, times, trace, mean[reference])
-
-
-def _middle(place: Array, strength: Array) -> Array:
-    """Where fields of a stretch are felt, by middle (2,)."""
-    weight = strength**2
-    return np.asarray(np.einsum("ns,nsi->i", weight, place) / weight.sum())
 
 
 def _interpolated(at: NDArray[np.int64], time_ns: NDArray[np.int64], value: Array) -> Array:
