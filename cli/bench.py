@@ -13,6 +13,7 @@ BENCHES = {
     "lighthouse": "locatk.formats.bench.lighthouse:figures",
     "dots": "locatk.formats.bench.dots:figures",
     "polaris": "locatk.formats.bench.polaris:figures",
+    "landmarks": "locatk.formats.bench.landmarks:figures",
 }
 """Name of a system to the function that measures its figures."""
 
@@ -38,6 +39,7 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
       locatk bench lighthouse
       locatk bench dots
       locatk bench polaris
+      locatk bench landmarks
       locatk bench lighthouse --data ~/data --json
     """
     from locatk.formats.data import data_folder

@@ -1,0 +1,162 @@
+"""Whole sessions on the map of 24 x 24 landmarks, simulated and solved as a user does it.
+
+The floor is that of every bar (magpylib), with nominal errors; landmarks lie 1 mm off along
+each axis and half a degree turned, of which the solver knows nothing. Poses are compared
+with the truth in the map's frame.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import LocatkError
+from locatk.core.geometry import heading_of
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.simulate import Simulated, simulate
+from locatk.core.landmarks.simulate_options import Faults, SimulationOptions
+from locatk.core.landmarks.solver import CERTAIN, solve
+from locatk.core.solution import Solution
+from locatk.formats.bench import Figure
+from locatk.formats.bench.landmarks_global import MISREAD, the_floor
+from locatk.formats.bench.timing import SEED
+
+Array = NDArray[np.float64]
+
+SESSIONS = 30
+
+SESSION_LANDMARKS = 5
+"""Of the sessions with misread landmarks."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a solved session was worth.
+
+    Attributes
+    ----------
+    given : bool
+        Whether poses on the map are given.
+    silent : bool
+        Without a remark that the place is not certain.
+    wrong : int
+        Landmarks that are told to be of another cell.
+    error_m : (n,) ndarray
+        Of the poses; empty where none are given.
+    heading_rad : (n,) ndarray
+    nees : (n,) ndarray
+        Of x, y and heading.
+    """
+
+    given: bool
+    silent: bool
+    wrong: int
+    error_m: Array
+    heading_rad: Array
+    nees: Array
+
+    @property
+    def lost(self) -> bool:
+        """Whether the poses, or a landmark's cell, are those of another place."""
+        return bool(self.wrong or (len(self.error_m) and np.median(self.error_m) > 0.05))
+
+
+def session(floor: FloorMap, options: SimulationOptions) -> Session:
+    """Simulate a session, solve it, and compare."""
+    made = simulate(floor, options)
+    return judged(made, solve(made.samples, floor, odometry=made.odometry))
+
+
+def judged(made: Simulated, solution: Solution) -> Session:
+    """Compare a solution with the truth."""
+    truth = made.truth[0]
+    start = truth.time_ns[0]
+    columns = (*truth.position[:, :2].T, np.unwrap(heading_of(truth.quaternion)))
+
+    def true_at(time_ns: NDArray[np.int64]) -> Array:
+        at, time = time_ns - start, truth.time_ns - start
+        return np.column_stack([np.interp(at, time, column) for column in columns])
+
+    wrong = 0
+    for found in solution.detections:
+        if found["cell"] is None:
+            continue
+        here = true_at(np.array([round(found["time_s"] * 1e9)]))[0]
+        mark = here[:2] - [found["x_m"], found["y_m"]]
+        wrong += bool(np.hypot(*(mark - made.floor.place(found["cell"]))) > made.floor.pitch_m / 2)
+    none = np.empty(0)
+    (facts,) = solution.facts["robots"].values()
+    silent = facts["probability"] >= CERTAIN
+    if not solution.trajectories:
+        return Session(False, silent, wrong, none, none, none)
+    track = solution.trajectories[0]
+    off = np.column_stack([track.position[:, :2], heading_of(track.quaternion)])
+    off -= true_at(track.time_ns)
+    off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
+    covariance = track.covariance[:, [0, 1, 5]][:, :, [0, 1, 5]]
+    nees = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+    return Session(True, silent, wrong, np.hypot(off[:, 0], off[:, 1]), off[:, 2], nees)
+
+
+def session_figures(folder: Path) -> list[Figure]:
+    """L sessions, and longer ones on floors with wrong landmarks.
+
+    ``folder`` has the published maps.
+    """
+    floor, which = the_floor(folder)
+    plain = SimulationOptions()
+    faulty = replace(plain, faults=Faults(misread_rate=MISREAD), landmarks=SESSION_LANDMARKS)
+    clean, clean_failed = _sessions(floor, plain, SEED + 400)
+    hard, hard_failed = _sessions(floor, faulty, SEED + 600)
+    good = [one for one in clean if one.given and not one.lost] or [
+        Session(False, False, 0, *(np.array([math.nan]),) * 3)
+    ]
+    error = np.concatenate([one.error_m for one in good]) * 1e3
+    heading = np.degrees(np.concatenate([one.heading_rad for one in good]))
+    nees = np.concatenate([one.nees for one in good])
+    how = (
+        f"{SESSIONS} simulated sessions of the paper's strategy with an L of three from anywhere, "
+        f"{which}, nominal errors; every pose on the way from the first landmark to the last"
+    )
+    right = 100 * sum(one.given and not one.lost for one in clean) / SESSIONS
+    lost = [one for one in hard if one.lost and one.silent]
+    return [
+        Figure("L sessions: right cells, and poses given", right, "%", how + clean_failed,
+               100.0, "higher"),
+        Figure("L sessions: position, mean", float(error.mean()), "mm", "of those that are right",
+               peer="paper, at a landmark", peer_value=1.0),
+        Figure("L sessions: position, p95", float(np.quantile(error, 0.95)), "mm", "the same"),
+        Figure("L sessions: heading, rms", float(np.sqrt(np.mean(heading**2))), "deg",
+               "the same", peer="paper, at a landmark", peer_value=1.5),
+        Figure("L sessions: NEES", float(nees.mean()), "",
+               "squared errors of x, y and heading in units of their covariance, mean",
+               peer="consistent", peer_value=3.0),
+        Figure("sessions with 5 % misread landmarks: wrong silently", float(len(lost)), "sessions",
+               f"of {SESSIONS} with {SESSION_LANDMARKS} landmarks each: a wrong cell, or poses "
+               f"elsewhere, at a probability of {CERTAIN} or more{hard_failed}", 0.0),
+        Figure("sessions with 5 % misread landmarks: right, and poses given",
+               100 * sum(one.given and not one.lost for one in hard) / SESSIONS, "%",
+               "the same", better="higher"),
+    ]  # fmt: skip
+
+
+def _sessions(floor: FloorMap, options: SimulationOptions, seed: int) -> tuple[list[Session], str]:
+    """Sessions of seeds from ``seed`` on, and in words those that failed."""
+    found, words = [], []
+    for k in range(seed, seed + SESSIONS):
+        try:
+            one = session(floor, replace(options, seed=k))
+        except LocatkError as error:
+            one = Session(False, False, 0, *(np.empty(0),) * 3)
+            words.append(f"{k}: {error}")
+        else:
+            if one.lost:
+                words.append(f"{k}: elsewhere, {'silently' if one.silent else 'with a remark'}")
+            elif not one.given:
+                words.append(f"{k}: no poses")
+        found.append(one)
+    return found, f"; seeds {', '.join(words)}" if words else ""
