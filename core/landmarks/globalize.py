@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ PAD = 3
 UNTOLD = 1e-3
 """Probability of a landmark in a cell of the map that has none."""
 
-BEYOND = 0.3
+BEYOND = 0.05
 """The same beside the map, of which it says nothing."""
 
 LOST = 1e-7
@@ -238,7 +238,9 @@ def _steps(
                     odds = -(miss + (rest / angle) ** 2) / 2
                     if odds > -FAR:
                         steps.append(_Step(i, j, (a, b), quarters, odds))
-    return steps
+    # How well odometry fits says nothing of the map: the best step counts in full.
+    best = max((step.odds for step in steps), default=0.0)
+    return [replace(step, odds=step.odds - best) for step in steps]
 
 
 def _sigma(hypothesis: Hypothesis) -> float:
