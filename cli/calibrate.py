@@ -8,6 +8,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.calibrate_camera import camera
+from locatk.cli.calibrate_map import map_
 from locatk.cli.calibrate_printer import printer
 from locatk.cli.calibrate_tag import tag
 from locatk.cli.solve import scene_option
@@ -23,10 +24,12 @@ def command() -> None:
       locatk calibrate camera run.mcap -o camera.toml
       locatk calibrate printer scan.png -o printer.toml
       locatk calibrate tag pass*.mcap -o tag.toml
+      locatk calibrate map day/*.mcap -o built.toml
     """
 
 
 command.add_command(camera)
+command.add_command(map_)
 command.add_command(printer)
 command.add_command(tag)
 

@@ -49,7 +49,7 @@ TABLE_STEP_M = 1e-3
 FARTHEST_M = 0.062
 """From a place of strong field to the landmark's centre."""
 
-STRONG = 0.6
+STRONG = 0.45
 """Field of a place near a landmark, in units of the threshold."""
 
 SLACK = 0.25

@@ -64,7 +64,7 @@ class Sighting:
         Rms of what the best hypothesis leaves, in standard deviations of the noise;
         ``nan`` where the method has no model of the samples.
     refused : str
-        Why it is not used, ``""`` where it is: ``"no_landmark"``, ``"too_short"``, ...
+        Why it is not used, ``""`` where it is: ``"too_weak"``, ``"too_short"``, ...
     notes : tuple of str
     """
 

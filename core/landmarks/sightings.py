@@ -45,7 +45,7 @@ def sighting(
         (),
     )
     if not found:
-        why = "too_short" if len(visit.trace) < FEWEST_BINS else "no_landmark"
+        why = "too_short" if len(visit.trace) < FEWEST_BINS else "too_weak"
         return replace(base, refused=why), []
     hypotheses = []
     for one in found:

@@ -234,9 +234,7 @@ def perfect_figures(floor: FloorMap, which: str) -> list[Figure]:
         right.append([(cell, quarters) for cell, quarters, _ in places] == true)
         probability.append(places[-1][2])
     least, mean = min(probability), float(np.mean(probability))
-    given = 100 * float(
-        np.mean([r and p >= LIKELY for r, p in zip(right, probability, strict=True)])
-    )
+    given = [r and p >= LIKELY for r, p in zip(right, probability, strict=True)]
     how = (
         f"{len(walks)} starts (cell, heading) with an L, {which}; the filter alone, perfect reads, "
         "nominal odometry"
