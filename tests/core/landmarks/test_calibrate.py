@@ -1,0 +1,325 @@
+"""Floors that were laid with errors and faults, found again from drives over them.
+
+The truth is the simulator's (magpylib's fields, bars at places of their own); none of it is
+in the map that the calibration is given.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks import gauge, simulate, smooth, solver
+from locatk.core.landmarks.calibrate import CalibrationReport, Drive, calibrate, read
+from locatk.core.landmarks.calibrate_marks import _flags, landmarks
+from locatk.core.landmarks.floor import Cell, FloorMap
+from locatk.core.landmarks.landmark import signs
+from locatk.core.landmarks.simulate import Errors, Faults, Simulated, SimulationOptions
+from locatk.core.landmarks.simulate_floor import Laid, lay
+
+CODES = np.array([[13, 5, 4, 12], [3, 7, 2, 15], [1, 11, 6, 8]])
+FLOOR = FloorMap(CODES)
+FAULTS = Faults(
+    flipped=(((1, 1), 2), ((0, 3), 0)),
+    missing=(((2, 2), 0),),
+    displaced=(((0, 2), (0.006, -0.008)),),
+)
+ROWS = tuple((r, c if r % 2 == 0 else 3 - c) for r in range(3) for c in range(4))
+COLUMNS = tuple((r if c % 2 == 0 else 2 - r, c) for c in range(4) for r in range(3))
+
+
+def drive(
+    cells: tuple[Cell, ...],
+    seed: int,
+    *,
+    floor: FloorMap = FLOOR,
+    floor_seed: int = 5,
+    faults: Faults = FAULTS,
+    errors: Errors | None = None,
+) -> Simulated:
+    """A robot of its own on the floor of ``floor_seed``."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "lay", lambda f, e, x, _: lay(f, e, x, floor_seed))
+        return simulate.simulate(
+            floor,
+            SimulationOptions(
+                strategy="path", cells=cells, seed=seed, faults=faults, errors=errors or Errors()
+            ),
+        )
+
+
+def taken(session: Simulated, name: str = "run", floor: FloorMap = FLOOR) -> Drive:
+    found = read(name, session.samples[0], session.odometry[0], floor)
+    assert isinstance(found, Drive)
+    return found
+
+
+@dataclass
+class Case:
+    floor_seed: int
+    drives: list[Drive]
+    report: CalibrationReport
+    laid: dict[Cell, Laid]
+
+
+@pytest.fixture(scope="module", params=[5, 6])
+def case(request: pytest.FixtureRequest) -> Case:
+    """Two drives over twelve landmarks, by rows and by columns."""
+    sessions = [
+        drive(cells, 100 * request.param + k, floor_seed=request.param)
+        for k, cells in enumerate((ROWS, COLUMNS))
+    ]
+    drives = [taken(session, f"run{k}") for k, session in enumerate(sessions)]
+    laid = {one.cell: one for one in sessions[0].floor_as_laid}
+    return Case(request.param, drives, calibrate(FLOOR, drives), laid)
+
+
+def middles(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (n, 2) as found, the true middles of the bars, and nominal places."""
+    cells = [one.cell for one in case.report.found]
+    found = [[one.built.x_m, one.built.y_m] for one in case.report.found]
+    nominal = np.array([FLOOR.place(cell) for cell in cells])
+    true = np.array([case.laid[cell].middle_m[:, :2].mean(axis=0) for cell in cells])
+    return np.array(found) + nominal, true, nominal
+
+
+def off_frame(error: np.ndarray, place: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
+    """Errors ``at`` places less the motion that fits the errors at ``place`` best."""
+    middle = place.mean(axis=0)
+
+    def shape(points: np.ndarray) -> np.ndarray:
+        off = points - middle
+        one, zero = np.ones(len(off)), np.zeros(len(off))
+        return np.stack(
+            [np.stack([one, zero, -off[:, 1]], 1), np.stack([zero, one, off[:, 0]], 1)], 1
+        )
+
+    motion = np.linalg.lstsq(shape(place).reshape(-1, 3), error.ravel(), rcond=None)[0]
+    if at is None:
+        return error - shape(place) @ motion
+    return -(shape(at) @ motion)
+
+
+def test_flags_are_exactly_the_faults(case: Case) -> None:
+    flags = {one.cell: one.built.flags for one in case.report.found if one.built.flags}
+    assert flags == {
+        (0, 2): ("displaced",),
+        (0, 3): ("flipped:0",),
+        (1, 1): ("flipped:2",),
+        (2, 2): ("missing:0",),
+    }
+    assert case.report.unvisited == ()
+    assert case.report.left_out == {}
+    assert [one.why for one in case.report.found] == [""] * 12
+    assert case.report.misfit < 1.2
+
+
+def test_centres_headings_and_strengths_are_the_true_ones(case: Case) -> None:
+    found, true, nominal = middles(case)
+    error = off_frame(found - true, nominal)
+    assert np.hypot(*error.T).max() < 0.5e-3
+    for one in case.report.found:
+        laid = case.laid[one.cell]
+        assert one.built.visits == 2
+        assert one.built.heading_rad == pytest.approx(laid.heading_rad, abs=math.radians(0.4))
+        assert one.built.strength == pytest.approx(laid.strength, abs=0.02)
+    before = off_frame(nominal - true, nominal)
+    assert np.hypot(*before.T).max() > 5e-3
+
+
+def test_standard_deviations_are_those_of_the_errors(case: Case) -> None:
+    found, true, nominal = middles(case)
+    error = off_frame(found - true, nominal)
+    sigma = np.array([one.built.sigma for one in case.report.found])
+    # The bars' own places, of which the middle is told here, are in the sigmas too.
+    assert 0.05 < np.mean((error / sigma[:, :2]) ** 2) < 1.5
+    assert np.all(sigma[:, :2] < 0.5e-3)
+    strength = np.array(
+        [one.built.strength - case.laid[one.cell].strength for one in case.report.found]
+    )
+    assert 0.2 < np.mean((strength / sigma[:, 3:]) ** 2) < 4
+
+
+def test_later_drives_are_solved_better_with_the_floor_as_built(case: Case) -> None:
+    later = drive(ROWS[::-1][:8], 77, floor_seed=case.floor_seed)
+    errors = {}
+    found, true, nominal = middles(case)
+    for floor, told in ((FLOOR, nominal), (case.report.floor, found)):
+        solution = solver.solve(later.samples, floor, None, odometry=later.odometry)
+        (path,), truth = solution.trajectories, later.truth[0]
+        at = np.column_stack(
+            [
+                np.interp(path.time_ns - truth.time_ns[0], truth.time_ns - truth.time_ns[0], axis)
+                for axis in truth.position[:, :2].T
+            ]
+        )
+        # A pose is one in the frame of the map: less how that lies on the true floor.
+        sound = [n for n, one in enumerate(case.report.found) if "displaced" not in one.built.flags]
+        frame = off_frame((told - true)[sound], nominal[sound], at)
+        errors[floor is FLOOR] = np.hypot(*(path.position[:, :2] - at + frame).T)
+    assert errors[False].mean() < 0.4e-3
+    assert errors[False].mean() < 0.6 * errors[True].mean()
+    assert errors[False].max() < errors[True].max()
+
+
+def test_what_an_earlier_calibration_says_is_no_evidence(case: Case) -> None:
+    wrong = {
+        cell: replace(built, x_m=built.x_m + 0.004, strength=0.9 * built.strength)
+        for cell, built in case.report.floor.built.items()
+    }
+    again = calibrate(replace(FLOOR, built=wrong), case.drives)
+    for cell, built in case.report.floor.built.items():
+        assert again.floor.built[cell].x_m == built.x_m
+        assert np.array_equal(again.floor.built[cell].strength, built.strength)
+
+
+def test_a_visit_that_was_read_wrongly_is_left_out(case: Case) -> None:
+    """Its place is 15 mm off what odometry and the other visits say."""
+    first, second = case.drives
+    seen = list(first.found.seen)
+    which = 5
+    hypotheses = tuple(
+        replace(one, pose=one.pose + [0.0, 0.015, 0.0]) for one in seen[which].sighting.hypotheses
+    )
+    seen[which] = replace(
+        seen[which], sighting=replace(seen[which].sighting, hypotheses=hypotheses)
+    )
+    report = calibrate(FLOOR, [replace(first, found=replace(first.found, seen=seen)), second])
+    (name,) = report.left_out
+    assert name.startswith("run0 at ")
+    cell = seen[which].located.cell  # type: ignore[union-attr]
+    assert report.left_out[name].startswith(f"the visit to {cell[0]},{cell[1]} ")
+    count = {one.cell: one.built.visits for one in report.found}
+    assert count.pop(cell) == 1
+    assert set(count.values()) == {2}
+
+
+def test_parts_without_a_landmark_in_common_are_told() -> None:
+    rows = [drive(tuple((r, c) for c in range(4)), 30 + r, faults=Faults()) for r in (0, 2)]
+    report = calibrate(FLOOR, [taken(session) for session in rows])
+    assert report.unvisited == tuple((1, c) for c in range(4))
+    assert "2 parts of the floor" in report.notes[0]
+    for row in (0, 2):
+        built = [report.floor.built[row, c] for c in range(4)]
+        assert np.median([one.y_m for one in built]) == pytest.approx(0, abs=1e-3)
+    assert set(report.floor.built) == {(r, c) for r in (0, 2) for c in range(4)}
+
+
+def test_where_the_whole_floor_lies_cannot_be_seen() -> None:
+    moved = Faults(displaced=tuple((cell, (0.008, 0.003)) for cell in FLOOR.cells()))
+    cells = ROWS[:6]
+    quiet = replace(Errors(), landmark_place_m=0.0, bar_place_m=0.0, landmark_turn_rad=0.0)
+    report = calibrate(FLOOR, [taken(drive(cells, 40, faults=moved, errors=quiet))])
+    for one in report.found:
+        assert np.hypot(one.built.x_m, one.built.y_m) < 1e-3
+        assert "displaced" not in one.built.flags
+
+
+def test_magnets_that_are_all_weaker_are_no_weak_bars() -> None:
+    """A quarter off: gains and height take a part of it, the typical bar tells the rest."""
+    strong = replace(FLOOR, geometry=replace(FLOOR.geometry, remanence_t=1.6))
+    session = drive(ROWS[:6], 41, faults=Faults())
+    report = calibrate(strong, [taken(session, floor=strong)])
+    assert report.strength < 0.9
+    assert any("typical bar" in note and "remanence_t" in note for note in report.notes)
+    assert all(one.built.flags == () for one in report.found)
+
+
+def test_nothing_to_calibrate_from() -> None:
+    with pytest.raises(InputError, match=r"no landmark of the map .* \(a.mcap: not localised\)"):
+        calibrate(FLOOR, [], {"a.mcap": "not localised"})
+    session = drive(ROWS[:2], 42, faults=Faults())
+    samples = session.samples[0]
+    quiet = replace(samples, field_t=1e-5 * np.sign(samples.field_t))
+    assert read("a", quiet, session.odometry[0], FLOOR) == "no landmark was seen"
+    other = FloorMap(np.zeros((1, 1), np.int64))
+    assert read("a", samples, session.odometry[0], other) == "not localised on the map"
+
+
+# ---- flags
+
+
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        ({}, ()),
+        ({"strength": [1, -1, -0.85, 1]}, ()),
+        ({"strength": [1, -1, -0.75, 1]}, ("weak:2",)),
+        ({"strength": [1, -1, -0.75, 1], "sigma": 0.1}, ()),
+        ({"strength": [1, 0.9, -1, 1]}, ("flipped:1",)),
+        ({"strength": [1, 0.5, -1, 1]}, ("flipped:1", "weak:1")),
+        ({"strength": [0.2, -1, -1, -0.1]}, ("missing:0", "missing:3")),
+        ({"left": [3e-3, 3e-3, 0]}, ()),
+        ({"left": [4e-3, 4e-3, 0]}, ("displaced",)),
+        ({"left": [4e-3, 4e-3, 0], "place": 2e-3}, ()),
+        ({"left": [0, 0, -0.06]}, ("turned",)),
+    ],
+)
+def test_flags(change: dict, wanted: tuple[str, ...]) -> None:
+    sigma = np.full(7, change.get("place", 3e-4))
+    sigma[3:] = change.get("sigma", 0.01)
+    left = np.array(change.get("left", [0.0, 0.0, 0.0]))
+    strength = np.array(change.get("strength", [1.0, -1.0, -1.0, 1.0]))
+    assert _flags(np.array([1.0, -1.0, -1.0, 1.0]), left, strength, sigma) == wanted
+
+
+def test_a_landmark_alone_has_bars_but_no_place() -> None:
+    pose = np.array([*FLOOR.place((1, 1)), 0.0]) + [3e-3, -2e-3, 0.01]
+    strength = signs(CODES[1, 1])
+    sigma = np.full(3, 0.01)
+    smoothed = smooth.Smoothed(
+        [], {(1, 1): smooth.MarkFound(pose, strength, np.diag([1e-4] * 3 + [1e-4] * 4))}, 0.9
+    )
+    marks = {(1, 1): smooth.Mark(pose, sigma, strength, np.full(4, 0.5))}
+    found = landmarks(smoothed, marks, FLOOR, [[(1, 1)]], [])[1, 1]
+    assert (found.built.x_m, found.built.y_m, found.built.heading_rad) == (0, 0, 0)
+    assert np.isnan(found.built.sigma[:3]).all()
+    assert np.array_equal(found.built.strength, strength)
+    assert found.why == ""
+
+
+# ---- where the floor lies as a whole
+
+
+def test_groups_that_share_a_member_are_one() -> None:
+    assert gauge.joined([[3, 1], [7], [1, 4], [9, 8], [4, 9]]) == [[1, 3, 4, 8, 9], [7]]
+    assert gauge.joined([]) == []
+
+
+def test_the_few_that_lie_off_pull_no_others() -> None:
+    random = np.random.default_rng(1)
+    design = np.column_stack([random.uniform(0, 1, (8, 2)), np.zeros(8)])
+    off = np.zeros((8, 3))
+    off[3] = [0.012, -0.009, 0.1]
+    turn = 0.004
+    c, s = math.cos(turn), math.sin(turn)
+    pose = design + off
+    pose[:, :2] = pose[:, :2] @ [[c, s], [-s, c]] + [0.02, 0.03]
+    pose[:, 2] += turn
+    left = gauge.unlike_design(pose, design, np.array([1.5e-3, 1.5e-3, 0.012]))
+    assert left == pytest.approx(off, abs=3e-4)
+
+
+def test_own_covariances_are_those_without_the_motions() -> None:
+    """Against the whole matrix: A has the motions as its null space, the priors are W."""
+    random = np.random.default_rng(2)
+    place = random.uniform(0, 1, (5, 2))
+    motion = gauge.motions(place).reshape(15, 3)
+    rows = random.normal(size=(40, 15))
+    rows -= rows @ motion @ np.linalg.pinv(motion)
+    information = 1e6 * rows.T @ rows
+    sigma = np.tile([0.01, 0.01, 0.08], (5, 1))
+    sigma[2] *= 0.2
+    inverse = np.linalg.inv(information + np.diag(sigma.ravel() ** -2.0))
+    # Known to be 0: what the motions W-averaged over all landmarks are.
+    held = motion.T @ np.diag(sigma.ravel() ** -2.0)
+    whole = inverse - inverse @ held.T @ np.linalg.inv(held @ inverse @ held.T) @ held @ inverse
+    blocks = np.array([inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(5)])
+    own = gauge.own_covariances(4 * blocks, place, sigma, 4)
+    for k in range(5):
+        part = slice(3 * k, 3 * k + 3)
+        assert own[k] == pytest.approx(4 * whole[part, part], rel=1e-6, abs=1e-12)
