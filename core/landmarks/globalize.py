@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,15 +116,20 @@ def locate(
     if not sightings:
         return []
     kept = [_followed(sighting) for sighting in sightings]
-    seen = [_seen(hypotheses, floor, misread) for hypotheses in kept]
     steps = [
         _steps(one, other, hypotheses, others, floor.pitch_m, drift)
-        for one, other, hypotheses, others in zip(
-            sightings, sightings[1:], kept, kept[1:], strict=False
+        for (one, other), (hypotheses, others) in zip(
+            pairwise(sightings), pairwise(kept), strict=True
         )
     ]
+    seen = [_seen(hypotheses, floor, misread) for hypotheses in kept]
+    every = [sum(one.probability for _, one in hypotheses) / CODES for hypotheses in kept]
+    for number, code in _again(kept, steps).items():
+        # How a landmark is laid is drawn once: a second look tells nothing of where it is.
+        known = _known(kept[number], code, misread)
+        seen[number] = np.broadcast_to(known[:, None, None, None], seen[number].shape)
+        every[number] = float(known.sum())
     unseen = _unseen(floor)
-    every = [one.sum() / CODES for one in (_share(hypotheses) for hypotheses in kept)]
     forward = [_normal(seen[0] / (4 * unseen.size) * (1 - ELSEWHERE), ELSEWHERE * every[0])]
     for step, now, share in zip(steps, seen[1:], every[1:], strict=True):
         belief, away = _moved(*forward[-1], step, len(now), unseen)
@@ -161,8 +167,41 @@ def _normal(belief: Array, away: float) -> tuple[Array, float]:
     return belief / total, away / total
 
 
-def _share(hypotheses: list[tuple[int, Hypothesis]]) -> Array:
-    return np.array([one.probability for _, one in hypotheses])
+def _again(kept: list[list[tuple[int, Hypothesis]]], steps: list[list[_Step]]) -> dict[int, int]:
+    """Visits to a landmark that another visit has told better, and its code by that one.
+
+    Which visits are of one landmark is taken from the likeliest steps. Codes are in the
+    frame of the visit's likeliest hypothesis.
+    """
+    place: list[tuple[int, tuple[int, int], int]] = [(0, (0, 0), 0)]
+    for number, several in enumerate(steps, 1):
+        chain, (x, y), turn = place[-1]
+        straight = [step for step in several if step.before == 0 and step.after == 0]
+        if straight:
+            step = max(straight, key=lambda one: one.odds)
+            rows, columns = _on_map(step.cells, turn)
+            place.append((chain, (x + columns, y + rows), (turn + step.quarters) % 4))
+        else:
+            place.append((number, (0, 0), 0))
+    groups: dict[tuple[int, tuple[int, int]], list[int]] = {}
+    for number, (chain, cell, _) in enumerate(place):
+        groups.setdefault((chain, cell), []).append(number)
+    again = {}
+    for numbers in groups.values():
+        best = max(numbers, key=lambda n: kept[n][0][1].probability)
+        laid = int(rotated(kept[best][0][1].code, place[best][2]))
+        again |= {n: int(rotated(laid, -place[n][2])) for n in numbers if n != best}
+    return again
+
+
+def _known(hypotheses: list[tuple[int, Hypothesis]], code: int, misread: float) -> Array:
+    """Likelihood (H,) of hypotheses of a landmark whose code is known, wherever it is."""
+    return np.array(
+        [
+            one.probability * (1 - misread if one.code == code else misread / (CODES - 1))
+            for _, one in hypotheses
+        ]
+    )
 
 
 def _followed(sighting: Sighting) -> list[tuple[int, Hypothesis]]:

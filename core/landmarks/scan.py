@@ -49,6 +49,9 @@ TABLE_STEP_M = 1e-3
 FARTHEST_M = 0.062
 """From a place of strong field to the landmark's centre."""
 
+LARGEST_M = 0.5
+"""Strong fields farther apart are of no one landmark."""
+
 STRONG = 0.45
 """Field of a place near a landmark, in units of the threshold."""
 
@@ -103,6 +106,8 @@ def candidates(
     seen = ~np.isnan(trace.value_t)
     strong = seen & (np.abs(np.where(seen, trace.value_t, 0)) > STRONG * geometry.threshold_t)
     if not strong.any():
+        return np.empty((0, 3)), np.empty(0, np.intp)
+    if np.ptp(place[strong], axis=0).max() > LARGEST_M:
         return np.empty((0, 3)), np.empty(0, np.intp)
     centres = _centres(place[strong], grid.step_m)
     slack = _slack(trace)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,14 @@ FEWEST_BINS = 4
 UNEXPLAINED = 6.0
 """Residual, in standard deviations, from which on no landmark explains a visit."""
 
-ORDERS_TRIED = 3
-"""Unexplained visits for which the sensors' order is questioned."""
+VISITS_TRIED = 3
+"""Unexplained visits by which the sensors are questioned."""
+
+MOST_SENSORS = 4
+"""Sensors up to which every order is tried."""
 
 CLEARLY = 3.0
-"""By how much another order must leave less."""
+"""By how much less must be left if the sensors are otherwise."""
 
 
 def sighting(
@@ -66,10 +69,10 @@ def sighting(
     return done, found
 
 
-def check_order(
+def check_sensors(
     visits: list[Visit], residual: list[float], run: Driven, geometry: Geometry, priors: Priors
-) -> None:
-    """Raise if another order of the sensors explains what the order given does not.
+) -> int | None:
+    """What is wrong with the sensors, where visits are explained without one of them only.
 
     Parameters
     ----------
@@ -80,35 +83,69 @@ def check_order(
     geometry : Geometry
     priors : Priors
 
+    Returns
+    -------
+    int or None
+        The sensor that is better left out.
+
     Raises
     ------
     InputError
-        The sensors are in the wrong order; the error names the right one.
+        The sensors are in the wrong order, or one has the other sign; the error names them.
     """
     bad = [n for n, value in enumerate(residual) if value > UNEXPLAINED]
     names = run.samples.sensors.names
-    if 2 * len(bad) <= len(visits) or len(names) > 4:
-        return
-    bad = sorted(bad, key=lambda n: -len(visits[n].trace))[:ORDERS_TRIED]
-    same = tuple(range(len(names)))
+    if 2 * len(bad) <= len(visits) or len(names) > MOST_SENSORS:
+        return None
+    bad = sorted(bad, key=lambda n: -len(visits[n].trace))[:VISITS_TRIED]
 
-    def left(order: tuple[int, ...], which: list[int]) -> float:
-        """What the best explanations leave if the sensors are in another order."""
+    def left(change: Change, which: list[int]) -> float:
+        """What the best explanations leave if the sensors are otherwise."""
         residuals = []
         for n in which:
-            trace = replace(visits[n].trace, value_t=visits[n].trace.value_t[:, list(order)])
-            found = explain(trace, geometry, priors, thorough=False)
+            value = visits[n].trace.value_t[:, list(change.order)] * change.factor
+            found = explain(
+                replace(visits[n].trace, value_t=value), geometry, priors, thorough=False
+            )
             residuals.append(found[0].residual_sigma if found else math.inf)
         return float(np.median(residuals))
 
-    tried = {order: left(order, bad[:1]) for order in itertools.permutations(same)}
-    likely = sorted(tried, key=lambda order: tried[order])[:3]
-    best = min(likely, key=lambda order: left(order, bad))
-    if best != same and left(best, bad) < min(UNEXPLAINED, left(same, bad) / CLEARLY):
-        given = ", ".join(names)
-        right = ", ".join(names[best.index(k)] for k in same)
+    as_given, *others = _changes(len(names))
+    likely = sorted(others, key=lambda change: left(change, bad[:1]))[:3]
+    best = min(likely, key=lambda change: left(change, bad))
+    if left(best, bad) > min(UNEXPLAINED, left(as_given, bad) / CLEARLY):
+        return None
+    device = run.samples.device
+    if best.order != as_given.order:
+        right = ", ".join(names[best.order.index(k)] for k in as_given.order)
         raise InputError(
-            f"the hall sensors of {run.samples.device} are in the wrong order: what is called "
-            f"{given} are {right}",
+            f"the hall sensors of {device} are in the wrong order: what is called "
+            f"{', '.join(names)} are {right}",
             hint="Name the columns in that order, or mend halls.toml",
         )
+    changed = int(np.flatnonzero(np.asarray(best.factor) != 1)[0])
+    if best.factor[changed] == -1:
+        raise InputError(
+            f"the {names[changed]} sensor of {device} has the other sign than the rest",
+            hint="Turn it round, or its column's sign",
+        )
+    return changed
+
+
+@dataclass(frozen=True)
+class Change:
+    """Another order of the sensors' columns, and a factor for each: -1 for the other sign,
+    ``nan`` for one that is left out."""
+
+    order: tuple[int, ...]
+    factor: tuple[float, ...]
+
+
+def _changes(count: int) -> list[Change]:
+    """As given; then every other order, every one sign, every one left out."""
+    same, ones = tuple(range(count)), (1.0,) * count
+    found = [Change(order, ones) for order in itertools.permutations(same)]
+    for value in (-1.0, math.nan):
+        for k in same:
+            found.append(Change(same, (*ones[:k], value, *ones[k + 1 :])))
+    return found

@@ -20,9 +20,9 @@ from locatk.core.landmarks.globalize import HALF_PI, Located
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
 from locatk.core.landmarks.sighting import Sighting
-from locatk.core.landmarks.sightings import check_order, sighting
+from locatk.core.landmarks.sightings import check_sensors, sighting
 from locatk.core.landmarks.trace import compose
-from locatk.core.landmarks.visits import Driven, Visit, driven, find
+from locatk.core.landmarks.visits import Driven, Visit, check_way, driven, find
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -41,7 +41,10 @@ FEWEST_WRONG = 2
 MOST_WRONG = 1 / 3
 """Share of misread landmarks from which on a map is not believed."""
 
-FEWEST_REVERSED = 3
+MISFIT = 2.0
+"""Rms of what is left of all fields, in standard deviations, from which on it is told."""
+
+FEWEST_EXCHANGED = 3
 """Landmarks from which on a fit of exchanged poles says something."""
 
 LAID_M, LAID_RAD = 1.5e-3, 0.012
@@ -184,9 +187,18 @@ def read(
     assert odometry is not None  # `driven` refuses none
     priors = replace(options.priors, noise_t=run.noise_t)
     pitch = floor.pitch_m if floor is not None else 0.2
-    visits = find(run, geometry, priors.drift, pitch)
-    seen = [Seen(visit, *sighting(visit, run, geometry, priors)) for visit in visits]
-    check_order(visits, [one.sighting.residual_sigma for one in seen], run, geometry, priors)
+    check_way(run, geometry)
+    seen = sightings_of(run, geometry, priors, pitch)
+    faulty = check_sensors(
+        [one.visit for one in seen],
+        [one.sighting.residual_sigma for one in seen],
+        run,
+        geometry,
+        priors,
+    )
+    if faulty is not None:
+        run = run.lacking(faulty)
+        seen = sightings_of(run, geometry, priors, pitch)
     if floor is not None:
         used = [n for n, one in enumerate(seen) if not one.sighting.refused]
         told = globalize.locate(
@@ -195,6 +207,14 @@ def read(
         for n, located in zip(used, told, strict=True):
             seen[n] = replace(seen[n], located=located)
     return Recording(run, odometry, priors, seen)
+
+
+def sightings_of(run: Driven, geometry: Geometry, priors: Priors, pitch_m: float) -> list[Seen]:
+    """What each visit of a recording has shown."""
+    return [
+        Seen(visit, *sighting(visit, run, geometry, priors))
+        for visit in find(run, geometry, priors.drift, pitch_m)
+    ]
 
 
 def placed(
@@ -218,18 +238,10 @@ def placed(
             "it the map of this floor?"
         ]
         return [], remarks, told | {"localised": False}
-    if not usable or floor is None:
-        remarks = []
-        if located:
-            remarks = [
-                f"{device}: not localised; the likeliest place has a probability of {sure:.2g}"
-            ]
-        if floor is not None and reversed_fits(found, floor, misread):
-            remarks.append(
-                f"{device}: with N and S exchanged it would be localised; are the sensors or "
-                "all bars the other way up?"
-            )
-        return [], remarks, told
+    if floor is None:
+        return [], [], told
+    if not usable:
+        return [], [*why_not(found, sure), *exchanged(found, floor, misread)], told
     remarks = []
     if sure < CERTAIN:
         remarks.append(
@@ -240,6 +252,11 @@ def placed(
     alone = replace(found.priors, floor_t=ALONE_T)
     smoothed = smooth.smooth([as_run(usable, found, floor)], marks, floor.geometry, alone)
     told["misfit_sigma"] = smoothed.misfit
+    if smoothed.misfit > MISFIT:
+        remarks.append(
+            f"{device}: fields miss the model by {smoothed.misfit:.2g} standard deviations; check "
+            "clocks and scale of the odometry, the sensors and the landmarks' geometry"
+        )
     path = route.poses(
         device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
     )
@@ -254,8 +271,23 @@ def contradicted(usable: list[Seen], floor: FloorMap) -> bool:
     return wrong >= FEWEST_WRONG and wrong > MOST_WRONG * len(usable)
 
 
-def reversed_fits(found: Recording, floor: FloorMap, misread: float) -> bool:
-    """Whether the map fits what was seen if all fields had the other sign."""
+def why_not(found: Recording, sure: float) -> list[str]:
+    """Why a robot is not localised."""
+    device = found.run.samples.device
+    explained = [one for one in found.seen if not one.sighting.refused]
+    if explained:
+        return [f"{device}: not localised; the likeliest place has a probability of {sure:.2g}"]
+    if found.seen:
+        return [
+            f"{device}: {len(found.seen)} visits, but no landmark explains one of them; check "
+            "the landmarks' geometry, the sensors and the odometry"
+        ]
+    largest = 1e3 * float(np.nanmax(np.abs(found.run.samples.field_t)))
+    return [f"{device}: no landmark was met; the strongest field is {largest:.2g} mT"]
+
+
+def exchanged(found: Recording, floor: FloorMap, misread: float) -> list[str]:
+    """A remark where the map fits what was seen if all fields had the other sign."""
     turned = [
         replace(
             one.sighting,
@@ -264,10 +296,15 @@ def reversed_fits(found: Recording, floor: FloorMap, misread: float) -> bool:
         for one in found.seen
         if not one.sighting.refused
     ]
-    if len(turned) < FEWEST_REVERSED:
-        return False
+    if len(turned) < FEWEST_EXCHANGED:
+        return []
     told = globalize.locate(turned, floor, misread=misread, drift=found.priors.drift)
-    return max(one.probability for one in told) >= LIKELY
+    if max(one.probability for one in told) < LIKELY:
+        return []
+    return [
+        f"{found.run.samples.device}: with N and S exchanged it would be localised; are the "
+        "sensors or all bars the other way up?"
+    ]
 
 
 def on_map(found: Recording, floor: FloorMap) -> list[Seen]:

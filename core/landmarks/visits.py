@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,12 @@ LEAST_NOISE_T = 2e-5
 UNTOLD = 0.02
 """Share of the samples that may lie before or after the odometry without a word."""
 
+LONGEST_M = 1.0
+"""Way during which no one landmark can be felt."""
+
+LEAST_M = 1e-3
+"""Way of the sensors without which no field can change."""
+
 QUIET_T = 5e-4
 """Fields that offsets and noise may make alone."""
 
@@ -73,6 +79,15 @@ class Driven:
     offset_t: Array
     noise_t: float
     notes: tuple[str, ...] = ()
+
+    def lacking(self, sensor: int) -> Driven:
+        """The same without one sensor, which is noted."""
+        field = self.samples.field_t.copy()
+        field[:, sensor] = np.nan
+        name = self.samples.sensors.names[sensor]
+        note = f"{self.samples.device}: the {name} sensor fits no landmark; left out"
+        samples = replace(self.samples, field_t=field)
+        return replace(self, samples=samples, notes=(*self.notes, note))
 
 
 @dataclass(frozen=True)
@@ -123,16 +138,9 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
         notes.append(f"{samples.device}: {without} samples without odometry left out")
     field = samples.field_t[covered].copy()
     time = time[covered]
-    pose = np.column_stack(
-        [
-            _interpolated(time, odometry.time_ns, column)
-            for column in (
-                odometry.position[:, 0],
-                odometry.position[:, 1],
-                np.unwrap(heading_of(odometry.quaternion)),
-            )
-        ]
-    )
+    heading = np.unwrap(heading_of(odometry.quaternion))
+    way = np.column_stack([odometry.position[:, :2], heading])
+    pose = _interpolated(time, odometry.time_ns, way)
     saturated = np.abs(field) >= 0.999 * samples.sensors.range_t
     field[saturated] = np.nan
     if saturated.any():
@@ -141,6 +149,37 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
     offset = _offsets(field)
     kept = HallSamples(samples.device, samples.sensors, time, field)
     return Driven(kept, pose, offset, _noise(samples, field), tuple(notes))
+
+
+def check_way(run: Driven, geometry: Geometry) -> None:
+    """Refuse odometry that cannot be of these fields.
+
+    Raises
+    ------
+    InputError
+        It leads over metres while one landmark is felt, or nowhere while fields change.
+    """
+    device = run.samples.device
+    strength = np.nan_to_num(np.abs(run.samples.field_t)).max(axis=1)
+    over = np.diff((strength > geometry.threshold_t).astype(np.int8), prepend=0, append=0)
+    spans = np.column_stack([np.flatnonzero(over > 0), np.flatnonzero(over < 0)])
+    if not len(spans):
+        return
+    extent = [float(np.hypot(*np.ptp(run.pose[a:b, :2], axis=0))) for a, b in spans]
+    if np.median(extent) > LONGEST_M:
+        raise InputError(
+            f"by its odometry {device} drove {np.median(extent):.3g} m over one landmark",
+            hint="Positions are in metres and headings in radians: check the units",
+        )
+    moved = max(
+        np.ptp(run.pose[:, :2], axis=0).max(),
+        run.samples.sensors.position_m.max() * np.ptp(run.pose[:, 2]),
+    )
+    if moved < LEAST_M and np.nanmax(np.ptp(run.samples.field_t, axis=0)) > geometry.threshold_t:
+        raise InputError(
+            f"the odometry of {device} stands still while its fields change",
+            hint="Positions are in metres and headings in radians: check the units",
+        )
 
 
 def find(run: Driven, geometry: Geometry, drift: Drift, pitch_m: float = 0.2) -> list[Visit]:
@@ -232,7 +271,13 @@ def _visit(run: Driven, first: int, stop: int, middle: Array, drift: Drift) -> V
 
 
 def _interpolated(at: NDArray[np.int64], time_ns: NDArray[np.int64], value: Array) -> Array:
-    return np.interp((at - time_ns[0]) * 1e-9, (time_ns - time_ns[0]) * 1e-9, value)
+    """Values (n, k) at times between those of ``value``: smooth, but still where it is still."""
+    from scipy.interpolate import Akima1DInterpolator
+
+    known, wanted = (time_ns - time_ns[0]) * 1e-9, (at - time_ns[0]) * 1e-9
+    if len(known) < 3:
+        return np.column_stack([np.interp(wanted, known, column) for column in value.T])
+    return np.asarray(Akima1DInterpolator(known, value, method="makima")(wanted))
 
 
 def _silenced(samples: HallSamples, field: Array) -> list[str]:
