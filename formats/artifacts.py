@@ -7,21 +7,18 @@ written and read again is the same to the last bit.
 from __future__ import annotations
 
 import math
-import os
 import re
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, Scene, Sighting, Station
 from locatk.formats import toml
-from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.toml import Inline, Shifted, Table
-
-if TYPE_CHECKING:
-    from locatk.formats.session import Session
+from locatk.formats.toml_checks import above
+from locatk.formats.toml_files import Artifact, head
 
 SCENE_FILE = "scene.toml"
 """Name of the attachment that holds the scene of a session or a solution."""
@@ -43,52 +40,11 @@ _MM = 3
 _METRES = -3
 
 
-def write_scene(path: str | os.PathLike[str], scene: Scene, *, overwrite: bool = False) -> None:
-    """Write a scene as TOML.
-
-    Raises
-    ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    """
-    with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(dumps_scene(scene).encode())
-
-
-def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene that a person or :func:`write_scene` has written.
-
-    Raises
-    ------
-    MissingDataError
-        There is no such file.
-    ArtifactError
-        It is no valid scene; the error names the key and what was expected.
-    """
-    return _parse(toml.read(path))
-
-
-def attached_scene(session: Session) -> Scene | None:
-    """The lighthouse scene that is attached to a session, or None.
-
-    Raises
-    ------
-    FormatError, ArtifactError
-        The attachment is damaged, or no valid scene.
-    """
-    data = session.attachment(SCENE_FILE)
-    if data is None:
-        return None
-    return loads_scene(data, file=f"{session.path}:{SCENE_FILE}")
-
-
 def dumps_scene(scene: Scene) -> str:
     """TOML text of a scene; the same scene gives the same text."""
     in_units = bool(scene.stations) and scene.scale == "unit"
     table: dict[str, Any] = {
-        "format": SCENE_FORMAT,
-        "format_version": SCENE_VERSION,
-        "tool_version": tool_version(),
+        **head(SCENE_FORMAT, SCENE_VERSION),
         "frame": scene.frame,
         "scale": scene.scale,
         "planar": scene.planar,
@@ -169,17 +125,6 @@ def _sighting_table(sighting: Sighting) -> dict[str, Any]:
         "start": None if sighting.start_ns is None else format_time(sighting.start_ns),
         "end": None if sighting.end_ns is None else format_time(sighting.end_ns),
     }
-
-
-def loads_scene(text: str | bytes, *, file: str | os.PathLike[str] | None = None) -> Scene:
-    """Scene of TOML text; ``file`` is named in errors.
-
-    Raises
-    ------
-    ArtifactError
-        A key is missing, unknown or wrong; the error names it and what was expected.
-    """
-    return _parse(toml.loads(text, file if file is not None else "<scene>"))
 
 
 def _parse(table: Table) -> Scene:
@@ -271,9 +216,7 @@ def _marker(table: Table) -> Marker:
 
 
 def _distance(table: Table) -> Distance:
-    distance = table.number("distance_mm", shift=_METRES)
-    if distance <= 0:
-        raise table.error("distance_mm", "expected a number above 0")
+    distance = above(table, "distance_mm", shift=_METRES)
     first, second = (_sighting(table.table(name)) for name in ("first", "second"))
     table.end()
     return Distance(first, second, distance)
@@ -315,6 +258,13 @@ def _time(table: Table, key: str) -> int:
     if time_ns is None:
         raise table.error(key, 'expected a time with its zone, as in "2023-07-27T15:34:22.700963Z"')
     return time_ns
+
+
+SCENE = Artifact(SCENE_FILE, dumps_scene, _parse)
+"""The scene as a file; these are its methods."""
+
+write_scene, read_scene = SCENE.write, SCENE.read
+loads_scene, attached_scene = SCENE.loads, SCENE.attached
 
 
 def parse_time(text: str) -> int | None:

@@ -17,7 +17,8 @@ from locatk.core.dots.codec import check_window
 from locatk.core.dots.ledger import Area
 from locatk.core.errors import InputError
 from locatk.formats import toml
-from locatk.formats.output import atomic_write, check_output, tool_version
+from locatk.formats.output import atomic_write, check_output
+from locatk.formats.toml_files import head
 
 LEDGER_FILE = "locatk-ledger.toml"
 
@@ -94,9 +95,7 @@ def _dumps(areas: Sequence[Area]) -> str:
     return toml.dumps(
         {
             "#": "Areas of the dot pattern that are in use: keep this file, one for all sheets.",
-            "format": LEDGER_FORMAT,
-            "format_version": LEDGER_VERSION,
-            "tool_version": tool_version(),
+            **head(LEDGER_FORMAT, LEDGER_VERSION),
             "areas": [
                 {
                     "id": area.id,

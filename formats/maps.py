@@ -8,9 +8,8 @@ landmarks, ``halls.toml``, is in :mod:`.hall_sensors`, whose functions are also 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +26,9 @@ from locatk.formats.hall_sensors import (
     read_halls,
     write_halls,
 )
-from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.toml import Degrees, Shifted, Table
-
-if TYPE_CHECKING:
-    from locatk.formats.session import Session
+from locatk.formats.toml_checks import above, check_remanence
+from locatk.formats.toml_files import Artifact, head
 
 __all__ = [
     "HALLS_FILE",
@@ -63,8 +60,6 @@ NO_LANDMARK = "."
 """How a cell without a landmark is written."""
 
 LARGEST_SIDE = 2_000
-LARGEST_REMANENCE_T = 2.0
-"""No magnet has more: what is above is in another unit."""
 
 COMPASS = frozenset(map(code_of, ("NNNS", "SSSN", "NNSS")))
 """Codes of the alphabet ``compass``: each pattern in the one way to lay it."""
@@ -82,59 +77,11 @@ _NEAR_M = 1e-9
 """Bars may touch."""
 
 
-def write_map(path: str | os.PathLike[str], floor: FloorMap, *, overwrite: bool = False) -> None:
-    """Write a map as TOML.
-
-    Raises
-    ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    """
-    with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(dumps_map(floor).encode())
-
-
-def read_map(path: str | os.PathLike[str]) -> FloorMap:
-    """Read a map that a person or :func:`write_map` has written.
-
-    Raises
-    ------
-    MissingDataError
-        There is no such file.
-    ArtifactError
-        It is no valid map; the error names the key and what was expected.
-    """
-    return _map(toml.read(path))
-
-
-def loads_map(text: str | bytes, *, file: str | os.PathLike[str] | None = None) -> FloorMap:
-    """Map of TOML text; ``file`` is named in errors.
-
-    Raises
-    ------
-    ArtifactError
-        A key is missing, unknown or wrong; the error names it and what was expected.
-    """
-    return _map(toml.loads(text, file if file is not None else "<map>"))
-
-
-def attached_map(session: Session) -> FloorMap | None:
-    """The map that is attached to a session, or None.
-
-    Raises
-    ------
-    FormatError, ArtifactError
-        The attachment is damaged, or holds no valid map.
-    """
-    data = session.attachment(MAP_FILE)
-    return None if data is None else loads_map(data, file=f"{session.path}:{MAP_FILE}")
-
-
 def dumps_map(floor: FloorMap) -> str:
     """TOML text of a map; the same map gives the same text."""
     x, y = floor.origin_m
     table = {
-        **_head(MAP_FORMAT),
+        **head(MAP_FORMAT, VERSION),
         "notes": list(floor.notes) or None,
         "map": {
             "name": floor.name or None,
@@ -167,10 +114,6 @@ def map_rows(codes: NDArray[np.int64]) -> list[str]:
     """Codes as the rows of a map are written, the one of the least y first."""
     letters = np.array([NO_LANDMARK, *LETTERS])[codes + 1]
     return ["".join(row) for row in letters.tolist()]
-
-
-def _head(what: str) -> dict[str, Any]:
-    return {"format": what, "format_version": VERSION, "tool_version": tool_version()}
 
 
 def _geometry_table(geometry: Geometry) -> dict[str, Any]:
@@ -214,7 +157,7 @@ def _map(table: Table) -> FloorMap:
     geometry = _geometry(table.table("landmark"))
     alphabet = sheet.text("alphabet", choices=ALPHABETS)
     codes = _codes(sheet, alphabet)
-    pitch = _above(sheet, "pitch_mm", _METRES)
+    pitch = above(sheet, "pitch_mm", shift=_METRES)
     least = 2 * geometry.radius_m + geometry.bar_width_m
     if pitch < least - _NEAR_M:
         raise sheet.error(
@@ -312,22 +255,17 @@ def _cell(table: Table, key: str, value: Any, shape: tuple[int, ...]) -> Cell:
 
 def _geometry(table: Table) -> Geometry:
     geometry = Geometry(
-        bar_length_m=_above(table, "bar_length_mm", _METRES),
-        bar_width_m=_above(table, "bar_width_mm", _METRES),
-        bar_height_m=_above(table, "bar_height_mm", _METRES),
-        remanence_t=_above(table, "remanence_t"),
-        radius_m=_above(table, "radius_mm", _METRES),
-        sensor_height_m=_above(table, "sensor_height_mm", _METRES),
-        circle_m=_above(table, "circle_mm", _METRES),
-        threshold_t=_above(table, "threshold_mt", -_MT),
+        bar_length_m=above(table, "bar_length_mm", shift=_METRES),
+        bar_width_m=above(table, "bar_width_mm", shift=_METRES),
+        bar_height_m=above(table, "bar_height_mm", shift=_METRES),
+        remanence_t=above(table, "remanence_t"),
+        radius_m=above(table, "radius_mm", shift=_METRES),
+        sensor_height_m=above(table, "sensor_height_mm", shift=_METRES),
+        circle_m=above(table, "circle_mm", shift=_METRES),
+        threshold_t=above(table, "threshold_mt", shift=-_MT),
     )
     table.end()
-    if geometry.remanence_t > LARGEST_REMANENCE_T:
-        raise table.error(
-            "remanence_t",
-            f"expected tesla, at most {LARGEST_REMANENCE_T:g}",
-            "10,000 gauss are 1 tesla; N52 has 1.45",
-        )
+    check_remanence(table, geometry.remanence_t)
     least = (geometry.bar_length_m + geometry.bar_width_m) / 2
     if geometry.radius_m < least - _NEAR_M:
         raise table.error(
@@ -384,8 +322,7 @@ def _built(table: Table, pitch_m: float) -> AsBuilt:
     return built
 
 
-def _above(table: Table, key: str, shift: int = 0) -> float:
-    value: float = table.number(key, shift=shift)
-    if value <= 0:
-        raise table.error(key, "expected a number above 0")
-    return value
+MAP = Artifact(MAP_FILE, dumps_map, _map)
+"""The floor as a file; these are its methods."""
+
+write_map, read_map, loads_map, attached_map = MAP.write, MAP.read, MAP.loads, MAP.attached

@@ -13,7 +13,8 @@ from typing import Any
 from locatk.core.dots.printer import PrinterReport
 from locatk.core.dots.sheet import Manifest
 from locatk.formats import toml
-from locatk.formats.output import atomic_write, tool_version
+from locatk.formats.output import atomic_write
+from locatk.formats.toml_files import head
 
 PRINTER_FORMAT = "locatk-printer"
 PRINTER_VERSION = 1
@@ -64,9 +65,7 @@ def dumps_printer(report: PrinterReport, scale: tuple[float, float] | None) -> s
         }
     return toml.dumps(
         {
-            "format": PRINTER_FORMAT,
-            "format_version": PRINTER_VERSION,
-            "tool_version": tool_version(),
+            **head(PRINTER_FORMAT, PRINTER_VERSION),
             "printer": printer,
             "sheet": {"paper": sheet.paper, "dpi": sheet.dpi, "codec": sheet.codec},
             "fields": [field_row(report, number) for number in range(len(report.fields))],

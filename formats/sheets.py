@@ -7,8 +7,7 @@ read again is the same to the last bit.
 from __future__ import annotations
 
 import math
-import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,11 +17,9 @@ from locatk.core.dots.codec import PERIOD, RANGE, check_window
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import InputError
 from locatk.formats import toml
-from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.toml import Table
-
-if TYPE_CHECKING:
-    from locatk.formats.session import Session
+from locatk.formats.toml_checks import above
+from locatk.formats.toml_files import Artifact, head
 
 SHEET_FILE = "sheet.toml"
 """Name of the attachment that holds the manifest of a session or a solution."""
@@ -40,50 +37,11 @@ SCALES = (0.5, 2.0)
 LARGEST_FRAME_PX = 65_535
 
 
-def write_manifest(
-    path: str | os.PathLike[str], manifest: Manifest, *, overwrite: bool = False
-) -> None:
-    """Write a manifest as TOML.
-
-    Raises
-    ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    """
-    with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(dumps_manifest(manifest).encode())
-
-
-def read_manifest(path: str | os.PathLike[str]) -> Manifest:
-    """Read a manifest that a person or :func:`write_manifest` has written.
-
-    Raises
-    ------
-    MissingDataError
-        There is no such file.
-    ArtifactError
-        It is no valid manifest; the error names the key and what was expected.
-    """
-    return _manifest(toml.read(path))
-
-
-def attached_manifest(session: Session) -> Manifest | None:
-    """The manifest that is attached to a session, or None.
-
-    Raises
-    ------
-    FormatError, ArtifactError
-        The attachment is damaged, or no valid manifest.
-    """
-    data = session.attachment(SHEET_FILE)
-    return None if data is None else loads_manifest(data, file=f"{session.path}:{SHEET_FILE}")
-
-
 def dumps_manifest(manifest: Manifest) -> str:
     """TOML text of a manifest; the same manifest gives the same text."""
     return toml.dumps(
         {
-            **_head(MANIFEST_FORMAT),
+            **head(MANIFEST_FORMAT, VERSION),
             "codec": manifest.codec,
             "pitch_mm": float(manifest.pitch_mm),
             "dot_mm": float(manifest.dot_mm),
@@ -97,80 +55,17 @@ def dumps_manifest(manifest: Manifest) -> str:
     )
 
 
-def loads_manifest(text: str | bytes, *, file: str | os.PathLike[str] | None = None) -> Manifest:
-    """Manifest of TOML text; ``file`` is named in errors.
-
-    Raises
-    ------
-    ArtifactError
-        A key is missing, unknown or wrong; the error names it and what was expected.
-    """
-    return _manifest(toml.loads(text, file if file is not None else "<sheet>"))
-
-
-def write_camera(path: str | os.PathLike[str], camera: Camera, *, overwrite: bool = False) -> None:
-    """Write a camera as TOML.
-
-    Raises
-    ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    """
-    with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(dumps_camera(camera).encode())
-
-
-def read_camera(path: str | os.PathLike[str]) -> Camera:
-    """Read a camera that a person or :func:`write_camera` has written.
-
-    Raises
-    ------
-    MissingDataError
-        There is no such file.
-    ArtifactError
-        It is no valid camera; the error names the key and what was expected.
-    """
-    return _camera(toml.read(path))
-
-
-def attached_camera(session: Session) -> Camera | None:
-    """The camera that is attached to a session, or None.
-
-    Raises
-    ------
-    FormatError, ArtifactError
-        The attachment is damaged, or no valid camera.
-    """
-    data = session.attachment(CAMERA_FILE)
-    return None if data is None else loads_camera(data, file=f"{session.path}:{CAMERA_FILE}")
-
-
 def dumps_camera(camera: Camera) -> str:
     """TOML text of a camera; the same camera gives the same text."""
     return toml.dumps(
         {
-            **_head(CAMERA_FORMAT),
+            **head(CAMERA_FORMAT, VERSION),
             "size_px": [int(n) for n in camera.size],
             "focal_px": float(camera.focal_px),
             "centre_px": [float(x) for x in camera.centre_px],
             "radial": float(camera.radial),
         }
     )
-
-
-def loads_camera(text: str | bytes, *, file: str | os.PathLike[str] | None = None) -> Camera:
-    """Camera of TOML text; ``file`` is named in errors.
-
-    Raises
-    ------
-    ArtifactError
-        A key is missing, unknown or wrong; the error names it and what was expected.
-    """
-    return _camera(toml.loads(text, file if file is not None else "<camera>"))
-
-
-def _head(name: str) -> dict[str, Any]:
-    return {"format": name, "format_version": VERSION, "tool_version": tool_version()}
 
 
 def _sheet_table(sheet: Sheet, pitch_mm: float) -> dict[str, Any]:
@@ -192,9 +87,9 @@ def _sheet_table(sheet: Sheet, pitch_mm: float) -> dict[str, Any]:
 def _manifest(table: Table) -> Manifest:
     toml.check_format(table, MANIFEST_FORMAT, VERSION)
     name = table.text("codec", choices=tuple(sequences.FOURTH))
-    pitch = _above(table, "pitch_mm")
-    dot = _above(table, "dot_mm", pitch / 6)
-    offset = _above(table, "offset_mm", pitch / 6)
+    pitch = above(table, "pitch_mm")
+    dot = above(table, "dot_mm", pitch / 6)
+    offset = above(table, "offset_mm", pitch / 6)
     for key, value, most, words in (
         ("dot_mm", dot, pitch, "the pitch"),
         ("offset_mm", offset, pitch / 2, "half the pitch"),
@@ -281,7 +176,7 @@ def _camera(table: Table) -> Camera:
     toml.check_format(table, CAMERA_FORMAT, VERSION)
     camera = Camera(
         size=_whole(table, "size_px", 1, LARGEST_FRAME_PX),
-        focal_px=_above(table, "focal_px"),
+        focal_px=above(table, "focal_px"),
         centre_px=_pair(table, "centre_px"),
         radial=table.number("radial", 0.0),
     )
@@ -299,13 +194,6 @@ def _camera(table: Table) -> Camera:
             "k is for offsets in focal lengths: multiply one in px^-2 by focal_px squared",
         )
     return camera
-
-
-def _above(table: Table, key: str, default: float | None = None) -> float:
-    value: float = table.number(key) if default is None else table.number(key, default)
-    if value <= 0:
-        raise table.error(key, "expected a number above 0")
-    return value
 
 
 def _scale(table: Table, key: str) -> float:
@@ -337,3 +225,13 @@ def _whole(
     ):
         raise table.error(key, f"expected a list of 2 whole numbers from {low} to {high}")
     return value[0], value[1]
+
+
+MANIFEST = Artifact(SHEET_FILE, dumps_manifest, _manifest)
+CAMERA = Artifact(CAMERA_FILE, dumps_camera, _camera)
+"""Manifests and cameras as files; these are their methods."""
+
+write_manifest, read_manifest = MANIFEST.write, MANIFEST.read
+loads_manifest, attached_manifest = MANIFEST.loads, MANIFEST.attached
+write_camera, read_camera = CAMERA.write, CAMERA.read
+loads_camera, attached_camera = CAMERA.loads, CAMERA.attached

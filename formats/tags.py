@@ -7,11 +7,9 @@ exactly: what is written and read again is the same to the last bit.
 from __future__ import annotations
 
 import math
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,11 +17,9 @@ from locatk.core.errors import InputError
 from locatk.core.polaris.array import Array, SensorArray
 from locatk.core.polaris.tag import CODECS, AsBuilt, Magnet, Placed, Tags
 from locatk.formats import toml
-from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.toml import Degrees, Shifted, Table
-
-if TYPE_CHECKING:
-    from locatk.formats.session import Session
+from locatk.formats.toml_checks import above, check_remanence, twin
+from locatk.formats.toml_files import Artifact, head
 
 TAG_FILE = "tag.toml"
 """Name of the attachment that holds the tags of a session or a solution."""
@@ -38,49 +34,10 @@ VERSION = 1
 LARGEST_ORDER = 100
 LARGEST_ORIENTATIONS = 360
 LARGEST_ARRAY = 10_000
-LARGEST_REMANENCE_T = 2.0
-"""No magnet has more: what is above is in another unit."""
 
 _MM, _METRES = 3, -3
 _UT, _TESLA = 6, -6
 _MS, _SECONDS = 3, -3
-
-
-def write_tags(path: str | os.PathLike[str], tags: Tags, *, overwrite: bool = False) -> None:
-    """Write tags as TOML.
-
-    Raises
-    ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    """
-    with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(dumps_tags(tags).encode())
-
-
-def read_tags(path: str | os.PathLike[str]) -> Tags:
-    """Read tags that a person or :func:`write_tags` has written.
-
-    Raises
-    ------
-    MissingDataError
-        There is no such file.
-    ArtifactError
-        They are no valid tags; the error names the key and what was expected.
-    """
-    return _tags(toml.read(path))
-
-
-def attached_tags(session: Session) -> Tags | None:
-    """The tags that are attached to a session, or None.
-
-    Raises
-    ------
-    FormatError, ArtifactError
-        The attachment is damaged, or holds no valid tags.
-    """
-    data = session.attachment(TAG_FILE)
-    return None if data is None else loads_tags(data, file=f"{session.path}:{TAG_FILE}")
 
 
 def dumps_tags(tags: Tags) -> str:
@@ -91,7 +48,7 @@ def dumps_tags(tags: Tags) -> str:
         "min_distance": int(tags.min_distance),
     }
     table = {
-        **_head(TAG_FORMAT),
+        **head(TAG_FORMAT, VERSION),
         "codec": tags.codec,
         "order": int(tags.order),
         "magnets": int(tags.magnets),
@@ -128,68 +85,6 @@ def dumps_tags(tags: Tags) -> str:
     return toml.dumps({key: value for key, value in table.items() if value != []})
 
 
-def loads_tags(text: str | bytes, *, file: str | os.PathLike[str] | None = None) -> Tags:
-    """Tags of TOML text; ``file`` is named in errors.
-
-    Raises
-    ------
-    ArtifactError
-        A key is missing, unknown or wrong, or the design is none; the error names it and
-        what was expected.
-    """
-    return _tags(toml.loads(text, file if file is not None else "<tag>"))
-
-
-def write_array(
-    path: str | os.PathLike[str], array: SensorArray, *, overwrite: bool = False
-) -> None:
-    """Write an array as TOML.
-
-    Raises
-    ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    """
-    with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(dumps_array(array).encode())
-
-
-def read_array(path: str | os.PathLike[str]) -> SensorArray:
-    """Read an array that a person or :func:`write_array` has written.
-
-    Raises
-    ------
-    MissingDataError
-        There is no such file.
-    ArtifactError
-        It is no valid array; the error names the key and what was expected.
-    """
-    return _array(toml.read(path))
-
-
-def attached_array(session: Session, device: str | None = None) -> SensorArray | None:
-    """The array that is attached to a session for ``device``, or None.
-
-    That is ``array-<device>.toml`` where the devices of a session have different arrays,
-    ``array.toml`` where they share one.
-
-    Raises
-    ------
-    FormatError, ArtifactError
-        The attachment is damaged, or no valid array.
-    """
-    for name in [ARRAY_FILE] if device is None else [array_file(device), ARRAY_FILE]:
-        data = session.attachment(name)
-        if data is not None:
-            return loads_array(data, file=f"{session.path}:{name}")
-    return None
-
-
-def array_file(device: str) -> str:
-    """Name of the attachment that holds the array of one device alone."""
-    return f"array-{device}.toml"
-
-
 def dumps_array(array: SensorArray) -> str:
     """TOML text of an array; the same array gives the same text. What is not known of it
     is left out."""
@@ -197,7 +92,7 @@ def dumps_array(array: SensorArray) -> str:
     limit = np.where(np.isinf(limit), np.nan, limit)
     return toml.dumps(
         {
-            **_head(ARRAY_FORMAT),
+            **head(ARRAY_FORMAT, VERSION),
             "sensor": array.sensor or None,
             "noise_ut": None if np.isnan(noise).all() else Shifted(noise, _UT),
             "delay_ms": Shifted(np.asarray(array.delay_s, float), _MS),
@@ -208,21 +103,6 @@ def dumps_array(array: SensorArray) -> str:
     )
 
 
-def loads_array(text: str | bytes, *, file: str | os.PathLike[str] | None = None) -> SensorArray:
-    """Array of TOML text; ``file`` is named in errors.
-
-    Raises
-    ------
-    ArtifactError
-        A key is missing, unknown or wrong; the error names it and what was expected.
-    """
-    return _array(toml.loads(text, file if file is not None else "<array>"))
-
-
-def _head(name: str) -> dict[str, Any]:
-    return {"format": name, "format_version": VERSION, "tool_version": tool_version()}
-
-
 # ---- reading tags
 
 
@@ -231,7 +111,7 @@ def _tags(table: Table) -> Tags:
     codec = table.text("codec", choices=CODECS)
     order = table.integer("order", 2, LARGEST_ORDER)
     magnets = table.integer("magnets", 3, order * order - 1)
-    spacing = _above(table, "spacing_mm", _METRES)
+    spacing = above(table, "spacing_mm", shift=_METRES)
     magnet = _magnet(table.table("magnet"), spacing)
     ids, distance = _family(table.table("family", None))
     design = Tags(
@@ -241,7 +121,7 @@ def _tags(table: Table) -> Tags:
         spacing_m=spacing,
         codec=codec,
         magnet=magnet,
-        clearance_m=_above(table, "clearance_mm", _METRES),
+        clearance_m=above(table, "clearance_mm", shift=_METRES),
         ids=ids,
         min_distance=distance,
         notes=table.texts("notes", ()),
@@ -258,20 +138,15 @@ def _tags(table: Table) -> Tags:
 
 def _magnet(table: Table, spacing_m: float) -> Magnet:
     magnet = Magnet(
-        diameter_m=_above(table, "diameter_mm", _METRES),
-        height_m=_above(table, "height_mm", _METRES),
-        remanence_t=_above(table, "remanence_t"),
+        diameter_m=above(table, "diameter_mm", shift=_METRES),
+        height_m=above(table, "height_mm", shift=_METRES),
+        remanence_t=above(table, "remanence_t"),
         grade=table.text("grade", ""),
     )
     table.end()
     if magnet.diameter_m > spacing_m:
         raise table.error("diameter_mm", "expected no more than spacing_mm")
-    if magnet.remanence_t > LARGEST_REMANENCE_T:
-        raise table.error(
-            "remanence_t",
-            f"expected tesla, at most {LARGEST_REMANENCE_T:g}",
-            "10,000 gauss are 1 tesla; N52 has 1.45",
-        )
+    check_remanence(table, magnet.remanence_t)
     return magnet
 
 
@@ -350,13 +225,6 @@ def _placed(table: Table) -> Placed:
     return place
 
 
-def _above(table: Table, key: str, shift: int = 0) -> float:
-    value: float = table.number(key, shift=shift)
-    if value <= 0:
-        raise table.error(key, "expected a number above 0")
-    return value
-
-
 # ---- reading arrays
 
 
@@ -366,11 +234,8 @@ def _array(table: Table) -> SensorArray:
     if not isinstance(rows, list) or not 1 <= len(rows) <= LARGEST_ARRAY:
         raise table.error("position_mm", "expected a list of [x, y, z], one a sensor")
     position = table.array("position_mm", (len(rows), 3), shift=_METRES)
-    _, first, count = np.unique(position, axis=0, return_index=True, return_counts=True)
-    if (count > 1).any():
-        raise table.error(
-            "position_mm", f"two sensors at the place of sensor {first[count > 1][0]}"
-        )
+    if (one := twin(position)) is not None:
+        raise table.error("position_mm", f"two sensors at the place of sensor {one}")
     limit = _axes(table, "range_ut", _TESLA, np.nan)
     array = SensorArray(
         position_m=position,
@@ -397,3 +262,12 @@ def _axes(table: Table, key: str, shift: int, default: float) -> Array:
         table.raw(key, None)  # known also where it is missing
         return np.full(3, default)
     return table.array(key, (3,), shift=shift, nan=math.isnan(default))
+
+
+TAGS = Artifact(TAG_FILE, dumps_tags, _tags)
+ARRAY = Artifact(ARRAY_FILE, dumps_array, _array)
+"""Tags and arrays as files; these are their methods."""
+
+write_tags, read_tags, loads_tags, attached_tags = TAGS.write, TAGS.read, TAGS.loads, TAGS.attached
+write_array, read_array, loads_array = ARRAY.write, ARRAY.read, ARRAY.loads
+attached_array, array_file = ARRAY.attached_for, ARRAY.file_for
