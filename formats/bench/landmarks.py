@@ -180,6 +180,8 @@ def _place(
     every = errors_mm(found)
     lost = [one.number for one in found if not math.isfinite(one.error_m)]
     said = f"; not found or refused: {_numbers(lost)} of seed {seed}" if lost else ""
+    if split := [one.number for one in found if one.visits > 1]:
+        said += f"; taken for several visits, of which the last counts: {_numbers(split)}"
     worst = sorted((one for one in found if one.error_m > 0), key=lambda one: -one.error_m)[:3]
     numbers = _numbers([one.number for one in worst])
     by_lines = ", ".join(

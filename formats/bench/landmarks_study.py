@@ -67,6 +67,8 @@ class Found:
         Of the visit, among all that were simulated.
     lines : int
         Of sensors that entered the territory.
+    visits : int
+        Into which the recording fell: one is right. The last of them counts.
     error_m : float
         Of the landmark's centre in the robot's last frame; ``nan`` where nothing was found.
     heading_rad : float
@@ -85,6 +87,7 @@ class Found:
 
     number: int
     lines: int
+    visits: int = 1
     error_m: float = math.nan
     heading_rad: float = math.nan
     right: bool = False
@@ -106,17 +109,17 @@ def visited(count: int, then: str, seed: int) -> list[tuple[int, Pass]]:
     return made[:count]
 
 
-def longest_visit(one: Pass) -> tuple[Driven, Visit | None]:
-    """The recording, and the visit in it with the most samples."""
+def last_visit(one: Pass) -> tuple[Driven, Visit | None, int]:
+    """The recording, the last visit that is found in it, and how many were."""
     run = driven(one.samples, one.odometry)
     found = find(run, GEOMETRY, Drift())
-    return run, max(found, key=lambda visit: visit.stop - visit.first, default=None)
+    return run, found[-1] if found else None, len(found)
 
 
 def by_field(number: int, one: Pass) -> Found:
     """What the default method says of one visit, on the solver's own road."""
-    nothing = Found(number, one.lines)
-    run, visit = longest_visit(one)
+    run, visit, visits = last_visit(one)
+    nothing = Found(number, one.lines, visits)
     if visit is None:
         return nothing
     priors = replace(SolveOptions().priors, noise_t=run.noise_t)
@@ -140,6 +143,7 @@ def by_field(number: int, one: Pass) -> Found:
     return Found(
         number,
         one.lines,
+        visits,
         centre_error(last, one.end),
         float(off[2]),
         best.code == code_in_frame(one, seen, at_ns),
@@ -154,21 +158,21 @@ def by_voting(number: int, one: Pass) -> tuple[Found, Found]:
     """First estimates of the same visit by the paper's rules and by voting."""
     steps = paper.first_steps(one.samples, one.odometry, GEOMETRY)
     if not steps:
-        return Found(number, one.lines), Found(number, one.lines)
+        return (Found(number, one.lines, 0),) * 2
     step = max(steps, key=lambda step: step.stop - step.first)
     end = last_odometry(one)
     return (
-        Found(number, one.lines, _off_centre(step.centre_m, end, one)),
-        Found(number, one.lines, _off_centre(step.voted_m, end, one)),
+        Found(number, one.lines, len(steps), _off_centre(step.centre_m, end, one)),
+        Found(number, one.lines, len(steps), _off_centre(step.voted_m, end, one)),
     )
 
 
 def by_valleys(number: int, one: Pass) -> Found:
     """The paper's second step alone: the valleys of the spin, with no voltages after it."""
-    run, visit = longest_visit(one)
+    run, visit, visits = last_visit(one)
     spins = paper.spins(run.pose)
     if visit is None or not spins:
-        return Found(number, one.lines)
+        return Found(number, one.lines, visits)
     turning = slice(*spins[-1])
     middle = np.median(run.pose[turning, :2], axis=0)
     lever = run.samples.sensors.position_m
@@ -176,11 +180,11 @@ def by_valleys(number: int, one: Pass) -> Found:
     field = run.samples.field_t[turning] - run.offset_t
     around = paper_valleys.profile(place, field, middle)
     if np.isnan(around).any():
-        return Found(number, one.lines)
+        return Found(number, one.lines, visits)
     valleys = paper_valleys.valleys(around, paper.HYSTERESIS * GEOMETRY.threshold_t)
     found = paper_valleys.recognise(valleys, GEOMETRY.circle_m)
     if found is None:
-        return Found(number, one.lines)
+        return Found(number, one.lines, visits)
     end = run.pose[-1]
     code, mark = found.seen_under(float(end[2]))
     seen = relative(end[None], np.array([*(found.centre_m + middle), mark]))[0]
@@ -188,6 +192,7 @@ def by_valleys(number: int, one: Pass) -> Found:
     return Found(
         number,
         one.lines,
+        visits,
         centre_error(seen, one.end),
         float(error(seen, true_pose(one, at_ns))[2]),
         code == code_in_frame(one, seen, at_ns),

@@ -178,6 +178,7 @@ def test_a_visit_without_errors_has_none(spun: list[Pass]) -> None:
         assert found.error_m < 0.1e-3
         assert abs(found.heading_rad) < 1e-3
         assert found.right
+        assert found.visits == 1
         assert found.true_probability == pytest.approx(found.probability)
         by_valleys = landmarks_study.by_valleys(number, one)
         assert by_valleys.right
