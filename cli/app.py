@@ -6,7 +6,6 @@ opens at once; tests/cli/test_app.py holds that, and that the two agree.
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import sys
@@ -17,6 +16,7 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures
+from locatk.cli.lazy import LazyGroup
 
 COMMANDS = {
     "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),
@@ -37,34 +37,8 @@ COMMANDS = {
 TERMINATED = 143
 
 
-class LazyGroup(click.Group):
-    """Group of :data:`COMMANDS`, each imported when it is first needed."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        if name not in COMMANDS:
-            return None
-        command: click.Command = importlib.import_module(COMMANDS[name][0]).command
-        return command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, short) for name, (_, short) in COMMANDS.items()])
-
-    def shell_complete(
-        self, ctx: click.Context, incomplete: str
-    ) -> list[click.shell_completion.CompletionItem]:
-        # click's own would import every command for its short help.
-        from click.shell_completion import CompletionItem
-
-        names = [
-            CompletionItem(name, help=short)
-            for name, (_, short) in COMMANDS.items()
-            if name.startswith(incomplete)
-        ]
-        return [*names, *click.Command.shell_complete(self, ctx, incomplete)]
+class App(LazyGroup):
+    """Group of :data:`COMMANDS`, whose errors are reported as those of locatk."""
 
     def main(
         self,
@@ -94,7 +68,8 @@ def _show_version(ctx: click.Context, param: click.Parameter, value: bool) -> No
 
 
 @click.group(
-    cls=LazyGroup,
+    cls=App,
+    table=COMMANDS,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.option(

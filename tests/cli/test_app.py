@@ -125,7 +125,7 @@ def failing(error: BaseException) -> Callable[..., Result]:
         raise error
 
     def run(*args: str) -> Result:
-        group = app_module.LazyGroup("locatk")
+        group = app_module.App("locatk", table=COMMANDS)
         group.get_command = lambda ctx, name: broken  # type: ignore[method-assign]
         return CliRunner().invoke(group, ["broken", *args], prog_name="locatk")
 
@@ -232,7 +232,7 @@ def test_termination_cleans_up(tmp_path: Path) -> None:
         "def slow():\n"
         f"    with atomic_write({str(tmp_path / 'x.bin')!r}) as f:\n"
         "        f.write(b'1'); print('ready', flush=True); time.sleep(60)\n"
-        "m.LazyGroup.get_command = lambda self, ctx, name: slow\n"
+        "m.App.get_command = lambda self, ctx, name: slow\n"
         "sys.argv = ['locatk', 'slow']\n"
         "m.main()\n"
     )

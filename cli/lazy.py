@@ -1,0 +1,49 @@
+"""Groups that import a command's module when it is called."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import click
+
+
+class LazyGroup(click.Group):
+    """Group of the commands of a table, each imported when it is first needed.
+
+    Parameters
+    ----------
+    table : mapping
+        Name of a command to its module and short help. The module holds it as ``command``.
+    """
+
+    def __init__(self, *args: Any, table: Mapping[str, tuple[str, str]], **rest: Any) -> None:
+        super().__init__(*args, **rest)
+        self._table = table
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._table)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in self._table:
+            return None
+        command: click.Command = importlib.import_module(self._table[name][0]).command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, short) for name, (_, short) in self._table.items()])
+
+    def shell_complete(
+        self, ctx: click.Context, incomplete: str
+    ) -> list[click.shell_completion.CompletionItem]:
+        # click's own would import every command for its short help.
+        from click.shell_completion import CompletionItem
+
+        names = [
+            CompletionItem(name, help=short)
+            for name, (_, short) in self._table.items()
+            if name.startswith(incomplete)
+        ]
+        return [*names, *click.Command.shell_complete(self, ctx, incomplete)]
