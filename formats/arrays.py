@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import Unpack
 
 from locatk.core.polaris.array import Samples, SensorArray
 from locatk.core.polaris.tag import Tags
-from locatk.core.trajectory import Trajectory
 from locatk.formats import samples as recordings
 from locatk.formats import tags as artifacts
 from locatk.formats.messages import magnetometers
-from locatk.formats.samples import Kind, Recorded
+from locatk.formats.samples import Beside, Kind, Recorded
 from locatk.formats.session import Session
 
 KIND: Kind[SensorArray] = Kind(
@@ -35,11 +35,7 @@ def write_session(
     samples: Sequence[Samples],
     *,
     tags: Tags | None = None,
-    truth: Sequence[Trajectory] = (),
-    odometry: Sequence[Trajectory] = (),
-    facts: Mapping[str, object] | None = None,
-    warnings: Sequence[str] = (),
-    overwrite: bool = False,
+    **beside: Unpack[Beside],
 ) -> None:
     """Write samples, the tags over which they were taken and what is known beside them.
 
@@ -53,33 +49,21 @@ def write_session(
         are kept as float32, which is finer than any sensor.
     tags : Tags, optional
         Attached as ``tag.toml``.
-    truth, odometry : sequence of Trajectory
-        As in :func:`locatk.formats.observations.write_session`.
-    facts : mapping, optional
-        Written as texts to the metadata record ``facts``.
-    warnings : sequence of str
-        Written to ``/log``.
-    overwrite : bool
-        Replace an existing file.
+    **beside
+        Truth, odometry, facts, warnings and ``overwrite``, as :func:`.samples.write`
+        takes them.
 
     Raises
     ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    InputError
-        There is no sample, times do not ascend or are before 1970, a field is infinite, or
-        two arrays or trajectories have the same name.
+    OutputExistsError, MissingDataError, InputError
+        See :func:`.samples.write`.
     """
     recordings.write(
         path,
         KIND,
         [Recorded(each.device, each.array, each.time_ns, each.field_t) for each in samples],
         artifact=None if tags is None else (artifacts.TAG_FILE, artifacts.dumps_tags(tags)),
-        truth=truth,
-        odometry=odometry,
-        facts=facts,
-        warnings=warnings,
-        overwrite=overwrite,
+        **beside,
     )
 
 

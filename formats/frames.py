@@ -27,11 +27,17 @@ from locatk.core.dots.frames import Frames
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats import images, sheets, viewers
+from locatk.formats import images, sheets
 from locatk.formats.mcap_places import Place, Places
 from locatk.formats.messages import timestamp
 from locatk.formats.session import Session, SessionWriter
-from locatk.formats.tracks import Timed, check_devices, truth_messages, write_streams
+from locatk.formats.tracks import (
+    Timed,
+    check_devices,
+    truth_messages,
+    write_streams,
+    write_warnings,
+)
 
 FRAMES_FILE = "frames.json"
 """Name of the attachment that holds the names of the frames, where they have names."""
@@ -274,12 +280,11 @@ def write_shots(
     check_devices(truth, "truth")
     names: dict[str, list[str]] = {device: [] for device in cameras}
     with SessionWriter(path, system="dots", overwrite=overwrite) as writer:
-        if facts:
-            writer.metadata("facts", {key: str(value) for key, value in facts.items()})
+        writer.facts(facts)
         if manifest is not None:
-            _attach(writer, sheets.SHEET_FILE, sheets.dumps_manifest(manifest))
+            writer.attach_toml(sheets.SHEET_FILE, sheets.dumps_manifest(manifest))
         if camera is not None:
-            _attach(writer, sheets.CAMERA_FILE, sheets.dumps_camera(camera))
+            writer.attach_toml(sheets.CAMERA_FILE, sheets.dumps_camera(camera))
         streams = [
             _frame_messages(device, shots, camera, names[device])
             for device, shots in cameras.items()
@@ -288,8 +293,7 @@ def write_shots(
         counts = {device: len(found) for device, found in names.items()}
         if not any(counts.values()):
             raise InputError("no camera frame at all")
-        for line in warnings:
-            writer.write("/log", viewers.log(line, end_ns, warning=True), end_ns)
+        write_warnings(writer, warnings, end_ns)
         # Frames that are called by their number need no list that says so.
         own = {
             device: found
@@ -300,10 +304,6 @@ def write_shots(
             said = {"version": FRAMES_VERSION, "names": own}
             writer.attach(FRAMES_FILE, json.dumps(said, indent=0).encode(), "application/json")
     return counts
-
-
-def _attach(writer: SessionWriter, name: str, text: str) -> None:
-    writer.attach(name, text.encode(), "application/toml")
 
 
 def _frame_messages(

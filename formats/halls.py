@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.halls import HallSamples, HallSensors
-from locatk.core.trajectory import Trajectory
 from locatk.formats import maps as artifacts
 from locatk.formats import samples as recordings
 from locatk.formats.messages import halls
-from locatk.formats.samples import Kind, Recorded
+from locatk.formats.samples import Beside, Kind, Recorded
 from locatk.formats.session import Session
 
 KIND: Kind[HallSensors] = Kind(
@@ -38,11 +38,7 @@ def write_session(
     samples: Sequence[HallSamples],
     *,
     floor: FloorMap | None = None,
-    truth: Sequence[Trajectory] = (),
-    odometry: Sequence[Trajectory] = (),
-    facts: Mapping[str, object] | None = None,
-    warnings: Sequence[str] = (),
-    overwrite: bool = False,
+    **beside: Unpack[Beside],
 ) -> None:
     """Write samples, the map of the floor on which they were taken and what is known beside
     them.
@@ -57,33 +53,21 @@ def write_session(
         float32, which is finer than any sensor.
     floor : FloorMap, optional
         Attached as ``map.toml``.
-    truth, odometry : sequence of Trajectory
-        As in :func:`locatk.formats.observations.write_session`.
-    facts : mapping, optional
-        Written as texts to the metadata record ``facts``.
-    warnings : sequence of str
-        Written to ``/log``.
-    overwrite : bool
-        Replace an existing file.
+    **beside
+        Truth, odometry, facts, warnings and ``overwrite``, as :func:`.samples.write`
+        takes them.
 
     Raises
     ------
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
-    InputError
-        There is no sample, times do not ascend or are before 1970, a field is infinite, or
-        two robots or trajectories have the same name.
+    OutputExistsError, MissingDataError, InputError
+        See :func:`.samples.write`.
     """
     recordings.write(
         path,
         KIND,
         [Recorded(each.device, each.sensors, each.time_ns, each.field_t) for each in samples],
         artifact=None if floor is None else (artifacts.MAP_FILE, artifacts.dumps_map(floor)),
-        truth=truth,
-        odometry=odometry,
-        facts=facts,
-        warnings=warnings,
-        overwrite=overwrite,
+        **beside,
     )
 
 

@@ -30,12 +30,10 @@ from locatk.formats.tags import attached_tags as read_tags
 from locatk.formats.tracks import (
     LARGEST_BATCH,
     Timed,
-    check_devices,
-    odometry_messages,
+    known_streams,
     read_batches,
     read_odometry,
     read_truth,
-    truth_messages,
     write_streams,
 )
 
@@ -181,17 +179,11 @@ def write_session(
     InputError
         A time is before 1970, or two trajectories have the same device.
     """
-    for kind, trajectories in (("truth", truth), ("odometry", odometry)):
-        check_devices(trajectories, kind)
-    streams = [sweep_messages(sweeps), *truth_messages(truth)]
-    for trajectory in odometry:
-        streams.append(odometry_messages(f"/odometry/{trajectory.device}", trajectory))
+    streams = [sweep_messages(sweeps), *known_streams(truth, odometry)]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
-        if facts:
-            writer.metadata("facts", {key: str(value) for key, value in facts.items()})
+        writer.facts(facts)
         if scene is not None:
-            text = artifacts.dumps_scene(scene)
-            writer.attach(artifacts.SCENE_FILE, text.encode(), "application/toml")
+            writer.attach_toml(artifacts.SCENE_FILE, artifacts.dumps_scene(scene))
         write_streams(writer, streams)
 
 

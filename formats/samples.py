@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypedDict, TypeVar
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -17,16 +17,14 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats import viewers
 from locatk.formats.messages import BatchError, Layout, batch_edges
 from locatk.formats.session import Session, SessionWriter
 from locatk.formats.tracks import (
     LARGEST_BATCH,
     Timed,
-    check_devices,
-    odometry_messages,
-    truth_messages,
+    known_streams,
     write_streams,
+    write_warnings,
 )
 
 BATCH_NS = 500_000_000
@@ -84,6 +82,16 @@ class Recorded(Generic[G]):
     field_t: NDArray[np.float64]
 
 
+class Beside(TypedDict, total=False):
+    """What :func:`write` takes beside samples, whatever the sensors are."""
+
+    truth: Sequence[Trajectory]
+    odometry: Sequence[Trajectory]
+    facts: Mapping[str, object] | None
+    warnings: Sequence[str]
+    overwrite: bool
+
+
 def write(
     path: str | os.PathLike[str],
     kind: Kind[G],
@@ -96,9 +104,27 @@ def write(
     warnings: Sequence[str] = (),
     overwrite: bool = False,
 ) -> None:
-    """Write a session of samples; ``artifact`` is the name and the text of an attachment.
+    """Write a session of samples and what is known beside them.
 
-    Fields are kept as float32, which is finer than any sensor.
+    Parameters
+    ----------
+    path : path
+        The output.
+    kind : Kind
+    samples : sequence of Recorded
+        One a device, on its topic; the geometry is attached as one file, or where those of
+        the devices differ as a file each. Fields are kept as float32, which is finer than
+        any sensor.
+    artifact : (name, text), optional
+        An attachment: what is on the floor.
+    truth, odometry : sequence of Trajectory
+        As in :func:`locatk.formats.observations.write_session`.
+    facts : mapping, optional
+        Written as texts to the metadata record ``facts``.
+    warnings : sequence of str
+        Written to ``/log``.
+    overwrite : bool
+        Replace an existing file.
 
     Raises
     ------
@@ -115,29 +141,19 @@ def write(
         _check(each.device, each.time_ns, each.field_t)
     if not any(len(each.time_ns) for each in samples):
         raise InputError("no sample at all")
-    for what, trajectories in (("truth", truth), ("odometry", odometry)):
-        check_devices(trajectories, what)
-    streams = [*(_messages(kind, each) for each in samples), *truth_messages(truth)]
-    for trajectory in odometry:
-        streams.append(odometry_messages(f"/odometry/{trajectory.device}", trajectory))
+    streams = [*(_messages(kind, each) for each in samples), *known_streams(truth, odometry)]
     with SessionWriter(path, system=kind.system, overwrite=overwrite) as writer:
-        if facts:
-            writer.metadata("facts", {key: str(value) for key, value in facts.items()})
+        writer.facts(facts)
         if artifact is not None:
-            _attach(writer, *artifact)
+            writer.attach_toml(*artifact)
         texts = {each.device: kind.dumps(each.geometry) for each in samples}
         if len(set(texts.values())) == 1:
-            _attach(writer, kind.file, texts[devices[0]])
+            writer.attach_toml(kind.file, texts[devices[0]])
         else:
             for device, text in texts.items():
-                _attach(writer, kind.device_file(device), text)
+                writer.attach_toml(kind.device_file(device), text)
         end_ns = write_streams(writer, streams)
-        for line in warnings:
-            writer.write("/log", viewers.log(line, end_ns, warning=True), end_ns)
-
-
-def _attach(writer: SessionWriter, name: str, text: str) -> None:
-    writer.attach(name, text.encode(), "application/toml")
+        write_warnings(writer, warnings, end_ns)
 
 
 def _messages(kind: Kind[G], samples: Recorded[G]) -> Iterator[Timed]:

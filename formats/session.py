@@ -359,9 +359,18 @@ class SessionWriter:
         return self._open_writer.register_channel(topic, "protobuf", self._schemas[name])
 
     def attach(self, name: str, data: bytes, media_type: str, time_ns: int = 0) -> None:
-        """Attach a file, as in ``attach("scene.toml", text, "application/toml")``."""
+        """Attach a file of a media type; artifacts with :meth:`attach_toml`."""
         self._open_writer.add_attachment(time_ns, time_ns, name, media_type, data)
 
     def metadata(self, name: str, record: Mapping[str, str]) -> None:
         """Add a metadata record."""
         self._open_writer.add_metadata(name, dict(record))
+
+    def attach_toml(self, name: str, text: str) -> None:
+        """Attach an artifact as ``name``, as in ``attach_toml("scene.toml", text)``."""
+        self.attach(name, text.encode(), "application/toml")
+
+    def facts(self, facts: Mapping[str, object] | None) -> None:
+        """Write what is known of a recording as texts to the metadata record ``facts``."""
+        if facts:
+            self.metadata("facts", {key: str(value) for key, value in facts.items()})

@@ -83,7 +83,7 @@ def write_solution(
     ) as writer:
         for kind, file, dumps in ARTIFACTS:
             if isinstance(artifact, kind):
-                writer.attach(file, dumps(artifact).encode(), "application/toml")
+                writer.attach_toml(file, dumps(artifact))
         text = _json(plain(_statement(solution, name)))
         writer.attach(SOLUTION_FILE, text.encode(), "application/json")
         streams = [iter(_once(solution, start))]

@@ -73,6 +73,28 @@ def truth_messages(truth: Iterable[Trajectory]) -> list[Iterator[Timed]]:
     return streams
 
 
+def known_streams(
+    truth: Sequence[Trajectory], odometry: Sequence[Trajectory]
+) -> list[Iterator[Timed]]:
+    """Streams of the trajectories that are known beside what was recorded.
+
+    Raises
+    ------
+    InputError
+        Two of them have the same device.
+    """
+    for kind, trajectories in (("truth", truth), ("odometry", odometry)):
+        check_devices(trajectories, kind)
+    driven = [odometry_messages(f"/odometry/{each.device}", each) for each in odometry]
+    return [*truth_messages(truth), *driven]
+
+
+def write_warnings(writer: SessionWriter, warnings: Iterable[str], end_ns: int) -> None:
+    """Write warnings to ``/log``, at the end of a session."""
+    for line in warnings:
+        writer.write("/log", viewers.log(line, end_ns, warning=True), end_ns)
+
+
 def write_streams(writer: SessionWriter, streams: Iterable[Iterator[Timed]]) -> int:
     """Write messages of several ascending streams in the order of their times.
 
