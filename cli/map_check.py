@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,8 +25,8 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
 
     Every window under every heading is read and compared: duplicates with both places, how
     many landmarks any two readings differ in, how many a robot must visit until it knows its
-    place, and what one fault breaks. Where bars were built otherwise, a warning says so: the
-    proof is of the map as designed.
+    place, and what one fault breaks. Of a map as built (`locatk calibrate map`) the bars count
+    as they lie.
 
     For scripts: the exit status is 0 where each map is unique and notices as many misread
     landmarks as its file promises (`detect`), and 1 where one does not or cannot be read.
@@ -36,6 +37,7 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
       locatk map check floors/*.toml -q && echo good
       locatk map check map.toml --json | jq '.maps[0].proof.duplicates'
     """
+    from locatk.core.landmarks.built import laid_codes
     from locatk.core.landmarks.proof import prove
     from locatk.formats.maps import read_map
 
@@ -43,7 +45,7 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
     floors = [(path, read_map(path)) for path in maps]
     with console.progress(floors, "Proving") as bar:
         for path, floor in bar:
-            proved.append((path, floor, prove(floor)))
+            proved.append((path, floor, prove(replace(floor, codes=laid_codes(floor)))))
     for number, (path, floor, proof) in enumerate(proved):
         if number:
             console.result("")
@@ -89,8 +91,8 @@ def _tell(path: Path, floor: FloorMap, proof: Proof) -> None:
         first = ", ".join(f"{row},{column}" for row, column in flagged[:5])
         more = " ..." if len(flagged) > 5 else ""
         console.warn(
-            f"{count} of {path} not built as designed (at {first}{more}); "
-            "the proof is of the design."
+            f"{count} of {path} not built as designed (at {first}{more}); the proof is of how "
+            "they lie."
         )
 
 

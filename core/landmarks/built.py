@@ -18,14 +18,22 @@ def laid_codes(floor: FloorMap) -> NDArray[np.int64]:
     Of a bar that is missing nobody can tell how it lies: its bit stays the design's.
     """
     codes = floor.codes.copy()
-    for cell, built in floor.built.items():
-        if codes[cell] == HOLE:
-            continue
-        designed = signs(codes[cell])
-        there = np.abs(built.strength) >= GONE  # False where it is nan
-        north = np.where(there, built.strength, designed) > 0
-        codes[cell] = int(north @ (1 << np.arange(4)))
+    for cell in floor.built:
+        codes[cell] = laid_code(floor, cell)
     return codes
+
+
+def laid_code(floor: FloorMap, cell: Cell) -> int:
+    """The same of one cell; a hole also beside the map."""
+    rows, columns = floor.shape
+    if not (0 <= cell[0] < rows and 0 <= cell[1] < columns) or floor.codes[cell] == HOLE:
+        return HOLE
+    built = floor.built.get(cell)
+    if built is None:
+        return int(floor.codes[cell])
+    there = np.abs(built.strength) >= GONE  # False where it is nan
+    north = np.where(there, built.strength, signs(floor.codes[cell])) > 0
+    return int(north @ (1 << np.arange(4)))
 
 
 def laid_mark(floor: FloorMap, cell: Cell) -> tuple[Array, Array]:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.built import laid_code
+from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.globalize import HALF_PI, Located
 from locatk.core.landmarks.landmark import pattern, rotated
 from locatk.core.landmarks.sighting import Sighting
@@ -45,7 +46,7 @@ def detection(
         quarters = located.quarters
         out["cell"] = list(located.cell)
         if floor is not None:
-            laid = laid_at(floor, located.cell)
+            laid = laid_code(floor, located.cell)
             if laid == HOLE:
                 out["cell"], out["refused"] = None, "off_map"
             elif laid != rotated(best.code, quarters):
@@ -72,10 +73,3 @@ def detection(
         "strength": [float(v) for v in np.roll(best.strength, quarters)],
     }
     return out
-
-
-def laid_at(floor: FloorMap, cell: Cell) -> int:
-    """How the landmark of a cell is laid by the map; a hole where the map has none."""
-    rows, columns = floor.shape
-    inside = 0 <= cell[0] < rows and 0 <= cell[1] < columns
-    return int(floor.codes[cell]) if inside else HOLE

@@ -119,7 +119,8 @@ def simulate(floor: FloorMap, options: SimulationOptions | None = None) -> Simul
         raise InputError(
             f"sensors {height * 1e3:.3g} mm over the bars' top faces", hint="Give a height above 0"
         )
-    laid = lay(floor, errors, options.faults, options.seed)
+    seed = options.seed if options.floor_seed is None else options.floor_seed
+    laid = lay(floor, errors, options.faults, seed)
     robot, notes = steer(floor, laid, options)
     if robot.time_s * options.rate_hz >= LARGEST_SESSION:
         raise InputError(

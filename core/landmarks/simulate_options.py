@@ -199,6 +199,8 @@ class SimulationOptions:
         Standing at the start and at the end, and on each landmark.
     device : str
     seed : int
+    floor_seed : int or None
+        Of how the bars lie, where it is another one: several drives over the same floor.
 
     Raises
     ------
@@ -228,6 +230,7 @@ class SimulationOptions:
     stop_s: float = 0.5
     device: str = "robot"
     seed: int = 0
+    floor_seed: int | None = None
 
     def __post_init__(self) -> None:
         above_0, from_0 = "a number above 0", "0 or more"
@@ -274,6 +277,7 @@ class SimulationOptions:
                 ("rest_s", 0 <= self.rest_s < math.inf, from_0),
                 ("stop_s", 0 <= self.stop_s < math.inf, from_0),
                 ("seed", self.seed >= 0, from_0),
+                ("floor_seed", self.floor_seed is None or self.floor_seed >= 0, from_0),
             ),
         )
 

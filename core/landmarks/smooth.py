@@ -177,20 +177,30 @@ def smooth(
     -------
     Smoothed
     """
-    from scipy.sparse.linalg import splu
-
     system = _System(runs, marks, geometry, priors)
     state = system.start()
     for _ in range(STEPS):
         matrix, gradient, misfit = system.normal(state)
-        solved = splu(matrix.tocsc())
+        solved = _factored(matrix)
         step = solved.solve(gradient)
         state = state - step
         if np.abs(step[system.metres]).max() < CONVERGED_M:
             break
     matrix, _, misfit = system.normal(state)
-    solved = splu(matrix.tocsc())
+    solved = _factored(matrix)
     return system.told(state, solved.solve, misfit)
+
+
+def _factored(matrix: Any) -> Any:
+    """Factors of a symmetric positive matrix: much of it stays sparse in this order."""
+    from scipy.sparse.linalg import splu
+
+    return splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 class _System:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks import globalize, neighbours, route, smooth
-from locatk.core.landmarks.detections import LIKELY, detection, laid_at
-from locatk.core.landmarks.estimate import FAULTY, Explanation
+from locatk.core.landmarks.built import laid_code
+from locatk.core.landmarks.detections import LIKELY, detection
+from locatk.core.landmarks.estimate import FAULTY, GONE, Explanation
 from locatk.core.landmarks.fit import Priors
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
 from locatk.core.landmarks.globalize import HALF_PI, Located
@@ -40,6 +41,15 @@ FEWEST_WRONG = 2
 
 MOST_WRONG = 1 / 3
 """Share of misread landmarks from which on a map is not believed."""
+
+FEWEST_MARKS = 3
+"""Landmarks from which on one of them can be known to be off its place."""
+
+FAR_OFF = 2.5
+"""Standard deviations that a landmark is found off its place to be called so."""
+
+ASTRAY_M, ASTRAY_RAD = 0.02, 0.1
+"""Standard deviations with which such a one is laid."""
 
 MISFIT = 2.0
 """Rms of what is left of all fields, in standard deviations, from which on it is told."""
@@ -250,7 +260,16 @@ def placed(
         )
     marks = expected(usable, floor)
     alone = replace(found.priors, floor_t=ALONE_T)
-    smoothed = smooth.smooth([as_run(usable, found, floor)], marks, floor.geometry, alone)
+    run = as_run(usable, found, floor)
+    smoothed = smooth.smooth([run], marks, floor.geometry, alone)
+    if off := displaced(marks, smoothed):
+        for cell, shift in off.items():
+            marks[cell] = replace(marks[cell], sigma=np.array([ASTRAY_M, ASTRAY_M, ASTRAY_RAD]))
+            remarks.append(
+                f"{device}: the landmark at {cell[0]},{cell[1]} lies {1e3 * shift:.2g} mm or more "
+                "off its place; `locatk calibrate map` would tell how far"
+            )
+        smoothed = smooth.smooth([run], marks, floor.geometry, alone)
     told["misfit_sigma"] = smoothed.misfit
     if smoothed.misfit > MISFIT:
         remarks.append(
@@ -261,6 +280,18 @@ def placed(
         device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
     )
     return [path], remarks, told
+
+
+def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict[Cell, float]:
+    """Landmarks that were found far off where the map has them, and how far (m)."""
+    if len(marks) < FEWEST_MARKS:
+        return {}
+    found = {}
+    for cell, mark in marks.items():
+        shift = smoothed.marks[cell].pose - mark.pose
+        if np.abs(shift / mark.sigma).max() > FAR_OFF:
+            found[cell] = float(np.hypot(*shift[:2]))
+    return found
 
 
 def contradicted(usable: list[Seen], floor: FloorMap) -> bool:
@@ -314,7 +345,7 @@ def on_map(found: Recording, floor: FloorMap) -> list[Seen]:
         for one in found.seen
         if one.located is not None
         and one.located.probability >= LIKELY
-        and laid_at(floor, one.located.cell) != HOLE
+        and laid_code(floor, one.located.cell) != HOLE
     ]
 
 
@@ -333,12 +364,13 @@ def expected(usable: Sequence[Seen], floor: FloorMap) -> dict[Cell, smooth.Mark]
         if built is not None:
             pose = pose + [built.x_m, built.y_m, built.heading_rad]
             spread = np.fmax(np.where(np.isnan(built.sigma[:3]), spread, built.sigma[:3]), 1e-5)
-            same = np.sign(built.strength) == strength
+            gone = np.abs(built.strength) < GONE
+            same = (np.sign(built.strength) == strength) | gone
             known = np.where(np.isnan(built.sigma[3:]), sigma, np.fmax(built.sigma[3:], 1e-3))
             strength = np.where(same, built.strength, strength)
             sigma = np.where(same, known, sigma)
-        if best.free >= 0:
-            bar = (best.free + quarters) % 4
+        bar = (best.free + quarters) % 4
+        if best.free >= 0 and not (built is not None and gone[bar]):
             strength[bar], sigma[bar] = 0.0, FAULTY
         if cell not in marks or best.free < 0:
             marks[cell] = smooth.Mark(pose, spread, strength, sigma)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_of
+from locatk.core.landmarks.clean import cleaned
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.trace import Drift, Trace, corrections, relative, sensor_places
@@ -52,9 +53,6 @@ QUIET_T = 5e-4
 """Fields that offsets and noise may make alone."""
 
 FEWEST_QUIET = 30
-
-DEAD = 1e-3
-"""A sensor that varies less than this share of the others is dead."""
 
 
 @dataclass(frozen=True)
@@ -136,19 +134,14 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
     without = int((~covered).sum())
     if without > UNTOLD * len(time):
         notes.append(f"{samples.device}: {without} samples without odometry left out")
-    field = samples.field_t[covered].copy()
-    time = time[covered]
+    field, faults = cleaned(samples)
+    field, time = field[covered], time[covered]
     heading = np.unwrap(heading_of(odometry.quaternion))
     way = np.column_stack([odometry.position[:, :2], heading])
     pose = _interpolated(time, odometry.time_ns, way)
-    saturated = np.abs(field) >= 0.999 * samples.sensors.range_t
-    field[saturated] = np.nan
-    if saturated.any():
-        notes.append(f"{samples.device}: {100 * saturated.mean():.2g} % of the readings saturated")
-    notes += _silenced(samples, field)
     offset = _offsets(field)
     kept = HallSamples(samples.device, samples.sensors, time, field)
-    return Driven(kept, pose, offset, _noise(samples, field), tuple(notes))
+    return Driven(kept, pose, offset, _noise(samples, field), (*notes, *faults))
 
 
 def check_way(run: Driven, geometry: Geometry) -> None:
@@ -278,28 +271,6 @@ def _interpolated(at: NDArray[np.int64], time_ns: NDArray[np.int64], value: Arra
     if len(known) < 3:
         return np.column_stack([np.interp(wanted, known, column) for column in value.T])
     return np.asarray(Akima1DInterpolator(known, value, method="makima")(wanted))
-
-
-def _silenced(samples: HallSamples, field: Array) -> list[str]:
-    """Takes dead sensors out of ``field``, and says which they are."""
-    notes = []
-    for number, name in enumerate(samples.sensors.names):
-        if np.isnan(samples.field_t[:, number]).all():
-            notes.append(f"{samples.device}: the {name} sensor gave nothing")
-    spread = np.array(
-        [np.nan if np.isnan(column).all() else np.nanstd(column) for column in field.T]
-    )
-    if np.isnan(spread).all():
-        raise InputError(
-            f"no hall sensor of {samples.device} can be used",
-            hint="All are dead or saturated: check wiring and range",
-        )
-    for number in np.flatnonzero(spread < DEAD * np.nanmax(spread)).tolist():
-        field[:, number] = np.nan
-        notes.append(
-            f"{samples.device}: the {samples.sensors.names[number]} sensor never moved; left out"
-        )
-    return notes
 
 
 def _offsets(field: Array) -> Array:
