@@ -149,7 +149,7 @@ def by_field(number: int, one: Pass) -> Found:
         best.code == code_in_frame(one, seen, at_ns),
         codes[best.code],
         true,
-        float(-(share * np.log(share)).sum()),
+        max(0.0, float(-(share * np.log(share)).sum())),
         float(off @ np.linalg.solve(covariance, off)),
     )
 
@@ -290,7 +290,7 @@ def calibration(found: Sequence[Found]) -> tuple[float, str]:
 
 def log_loss(found: Sequence[Found]) -> float:
     """Mean of ``-ln p`` of the true codes; what was not found or not told counts as 1e-9."""
-    return float(np.mean([-math.log(max(one.true_probability, 1e-9)) for one in found]))
+    return float(np.mean([-math.log(np.clip(one.true_probability, 1e-9, 1.0)) for one in found]))
 
 
 # ---- standing at a landmark
