@@ -12,7 +12,7 @@ import click
 
 from locatk.cli import console, failures, map_landmark, map_proof, options
 from locatk.cli.map_options import Cells, Size, Walls, geometry_of, geometry_options, on_floor
-from locatk.cli.tag_options import metres, number
+from locatk.cli.options import metres, number
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:

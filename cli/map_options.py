@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli.tag_options import metres, number, together
+from locatk.cli.options import metres, number, together
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.floor import Cell, Wall

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -86,6 +87,28 @@ artifact = input_option(
     "--artifact",
     help="Solved artifact (scene, tag, sheet, map) to use instead of the session's.",
 )
+
+
+def together(*decorators: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Several options as one decorator, in the order of the help."""
+
+    def decorate(command: Any) -> Any:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return decorate
+
+
+def number(*names: str, default: Any, help: str, **more: Any) -> Callable[[Any], Any]:
+    """An option with a default, of the default's type where none is given."""
+    more.setdefault("type", type(default))
+    return click.option(*names, default=default, show_default=True, help=help, **more)
+
+
+def metres(millimetres: float) -> float:
+    """The point is moved, so that 39.7 mm come back as 39.7 mm from a file."""
+    return float(Decimal(repr(millimetres)).scaleb(-3))
 
 
 def verbosity(command: F) -> F:

@@ -9,16 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, options
+from locatk.cli.simulate_options import ABOVE_0, FROM_0, SHARE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from locatk.core.dots.sheet import Manifest
     from locatk.core.dots.simulate import SimulationOptions
-
-SHARE = click.FloatRange(0, 1)
-ABOVE_0 = click.FloatRange(min=0, min_open=True)
-FROM_0 = click.FloatRange(min=0)
 
 
 class Pair(click.ParamType):

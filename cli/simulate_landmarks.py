@@ -11,26 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, options
+from locatk.cli.simulate_options import ABOVE_0, ANY, FROM_0, SHARE, in_si
 from locatk.core.errors import FormatError
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.simulate import Simulated, SimulationOptions
-
-ANY = click.FLOAT
-ABOVE_0 = click.FloatRange(min=0, min_open=True)
-FROM_0 = click.FloatRange(min=0)
-SHARE = click.FloatRange(0, 1)
-
-UNITS = {
-    "_mm": ("_m", 1e-3),
-    "_mt": ("_t", 1e-3),
-    "_ut": ("_t", 1e-6),
-    "_deg": ("_rad", math.pi / 180),
-    "_deg_per_m": ("_rad_per_m", math.pi / 180),
-    "_dps": ("_rps", math.pi / 180),
-    "_dps2": ("_rps2", math.pi / 180),
-}
-"""From units of the command line to those of the simulation."""
 
 
 class Form(click.ParamType):
@@ -173,6 +158,11 @@ POSE = Form("X,Y,DEG", "120,80,45", _pose)
 @click.option("--stuck", multiple=True, metavar="NAME", help="Or always the same.")
 @click.option("--swap", "swapped", type=NAMES, multiple=True, help="Sensors wired wrongly.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option(
+    "--floor-seed",
+    type=click.IntRange(0),
+    help="Of how the bars lie: the same for several drives over one floor. [default: --seed]",
+)
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -199,7 +189,7 @@ def command(map_file: Path, output: Path, overwrite: bool, as_json: bool, **give
     files = [given[name] for name in ("path_file", "sensors_file") if given[name]]
     options.guard_output(output, overwrite=overwrite, inputs=[map_file, *files])
     floor = maps.read_map(map_file)
-    wanted = _wanted({name: value for name, value in given.items() if value not in (None, ())})
+    wanted = _wanted(given)
     with console.working("Simulating"):
         simulated = simulate.simulate(floor, wanted)
         warnings = _warnings(simulated)
@@ -233,12 +223,7 @@ def _wanted(given: dict[str, Any]) -> SimulationOptions:
     from locatk.core.landmarks import simulate
     from locatk.formats import maps
 
-    said: dict[str, Any] = {}
-    for name, value in given.items():
-        for unit, (si, factor) in UNITS.items():
-            if name.endswith(unit):
-                name, value = name.removesuffix(unit) + si, value * factor
-        said[name] = value
+    said = in_si(given)
     parts: dict[str, Any] = {
         "errors": simulate.Errors().scaled(said.pop("factor")),
         "faults": simulate.Faults(),

@@ -3,28 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from locatk.cli import console, options
+from locatk.cli.simulate_options import ABOVE_0, ANY, FROM_0, SHARE, in_si
 
 if TYPE_CHECKING:
     from locatk.core.polaris.simulate import Simulated, SimulationOptions
-
-ANY = click.FLOAT
-ABOVE_0 = click.FloatRange(min=0, min_open=True)
-FROM_0 = click.FloatRange(min=0)
-SHARE = click.FloatRange(0, 1)
-
-UNITS = {
-    "_mm": ("_m", 1e-3),
-    "_ut": ("_t", 1e-6),
-    "_deg": ("_rad", math.pi / 180),
-}
-"""From units of the command line to those of the simulation."""
 
 
 @click.command(short_help="Passes of a magnetometer bar over tags.")
@@ -146,7 +134,7 @@ def command(
         output, overwrite=overwrite, inputs=[path for path in (tag, array_file) if path]
     )
     artifact = tags.read_tags(tag) if tag else simulate.CARS[car].tags
-    wanted = _wanted(car, {name: value for name, value in given.items() if value not in (None, ())})
+    wanted = _wanted(car, given)
     with console.working("Simulating"):
         simulated = simulate.simulate(artifact, wanted)
         warnings = _warnings(simulated)
@@ -177,12 +165,7 @@ def _wanted(car: str, given: dict[str, Any]) -> SimulationOptions:
     from locatk.core.polaris import simulate
     from locatk.formats import tags
 
-    said: dict[str, Any] = {}
-    for name, value in given.items():
-        for unit, (si, factor) in UNITS.items():
-            if name.endswith(unit):
-                name, value = name.removesuffix(unit) + si, value * factor
-        said[name] = value
+    said = in_si(given)
     usual = simulate.CARS[car]
     said.setdefault("speed_mps", usual.speed_mps)
     rate_hz = said.setdefault("rate_hz", usual.rate_hz)

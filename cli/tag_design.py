@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.tag_options import design_options, metres, number, use_of, use_options
+from locatk.cli.options import metres, number
+from locatk.cli.tag_options import design_options, use_of, use_options
 from locatk.core.errors import OutputExistsError
 
 if TYPE_CHECKING:

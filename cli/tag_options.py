@@ -3,41 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from click.core import ParameterSource
+
+from locatk.cli.options import metres, number, together
 
 if TYPE_CHECKING:
     from locatk.core.polaris.planning import Use
     from locatk.core.polaris.tag import Tags
 
 CODECS = ("mosk", "redundant", "polaris-released")
-
-
-def together(*decorators: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Several options as one decorator, in the order of the help."""
-
-    def decorate(command: Any) -> Any:
-        for decorator in reversed(decorators):
-            command = decorator(command)
-        return command
-
-    return decorate
-
-
-def number(*names: str, default: Any, help: str, **more: Any) -> Callable[[Any], Any]:
-    """An option with a default, of the default's type where none is given."""
-    more.setdefault("type", type(default))
-    return click.option(*names, default=default, show_default=True, help=help, **more)
-
-
-def metres(millimetres: float) -> float:
-    """The point is moved, so that 39.7 mm come back as 39.7 mm from a file."""
-    return float(Decimal(repr(millimetres)).scaleb(-3))
 
 
 design_options = together(
