@@ -11,7 +11,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
@@ -138,6 +138,19 @@ def progress(items: _Counted[T], label: str) -> AbstractContextManager[Iterable[
     if len(items) < 2 or _state.json or _state.verbosity < 0 or not sys.stderr.isatty():
         return contextlib.nullcontext(items)
     return click.progressbar(items, label=label, file=sys.stderr)
+
+
+@contextlib.contextmanager
+def steps(count: int, label: str) -> Iterator[Callable[[], None]]:
+    """A progress bar whose steps are calls, for work that does not walk a list itself."""
+    with progress(range(count), label) as bar:
+        left = iter(bar)
+        next(left, None)
+
+        def done() -> None:
+            next(left, None)
+
+        yield done
 
 
 @contextlib.contextmanager

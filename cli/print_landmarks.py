@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +14,7 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.floor import FloorMap
     from locatk.core.landmarks.pack import Pack
     from locatk.core.landmarks.pack_floor import Paper, Tile
-    from locatk.core.polaris.materials import Item
+    from locatk.core.materials import Item
 
 
 @click.command(short_help="Installation pack of a landmark floor.")
@@ -170,7 +168,7 @@ def _pack(
         margin_mm=margin_mm,
         spares_percent=spares_percent,
     )
-    with _steps(len(made.pages)) as done:
+    with console.steps(len(made.pages), "Drawing") as done:
         data = render(made.pages, _title(floor), done=done)
     return data, _pack_entry(made)
 
@@ -182,26 +180,13 @@ def _floor(
     from locatk.formats.pdf.landmarks import render_floor
 
     tiles = floor_tiles(floor, on, margin_mm=margin_mm, overlap_mm=overlap_mm)
-    with _steps(len(tiles)) as done:
+    with console.steps(len(tiles), "Drawing") as done:
         data = render_floor(tiles, _title(floor), done=done)
     return data, _floor_entry(tiles)
 
 
 def _title(floor: FloorMap) -> str:
     return f"locatk landmarks {floor.name}".strip()
-
-
-@contextmanager
-def _steps(count: int) -> Iterator[Callable[[], None]]:
-    """A progress bar whose steps are calls."""
-    with console.progress(range(count), "Drawing") as bar:
-        steps = iter(bar)
-        next(steps, None)
-
-        def done() -> None:
-            next(steps, None)
-
-        yield done
 
 
 def _pack_entry(made: Pack) -> dict[str, Any]:

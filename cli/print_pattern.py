@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -237,7 +236,7 @@ def pattern(
         files = _files(output, format_name, manifest)
         for path in files:
             options.guard_output(path, overwrite=overwrite, inputs=inputs)
-        with _steps(printing.steps(manifest, overlay)) as done:
+        with console.steps(printing.steps(manifest, overlay), "Drawing") as done:
             drawn = printing.draw(
                 manifest,
                 format_name,
@@ -304,19 +303,6 @@ def _files(output: Path, format_name: str, manifest: Manifest) -> list[Path]:
     if len(manifest.sheets) > MOST_FILES:
         raise click.UsageError(f"More than {MOST_FILES} files; print fewer sheets or use a PDF.")
     return [output.with_stem(f"{output.stem}-{sheet.id}") for sheet in manifest.sheets]
-
-
-@contextmanager
-def _steps(count: int) -> Iterator[Callable[[], None]]:
-    """A progress bar whose steps are calls."""
-    with console.progress(range(count), "Drawing") as bar:
-        steps = iter(bar)
-        next(steps, None)
-
-        def done() -> None:
-            next(steps, None)
-
-        yield done
 
 
 def _tell_cramped(manifest: Manifest, wanted: bool) -> None:

@@ -6,6 +6,7 @@ degrees, counter-clockwise. Everything is in one ink, black.
 
 from __future__ import annotations
 
+import math
 import textwrap
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -130,6 +131,36 @@ def cut_marks(left: float, bottom: float, right: float, top: float) -> tuple[Lin
     for y, out in ((bottom, -1), (top, 1)):
         marks += [Line((x, y + out * near), (x, y + out * CUT_MM)) for x in (left, right)]
     return tuple(marks)
+
+
+def arrow(start: Point, tip: Point, head_mm: float, width_mm: float = 0.2) -> list[Mark]:
+    """A line with a filled head of this length."""
+    length = math.dist(start, tip)
+    u, v = (tip[0] - start[0]) / length, (tip[1] - start[1]) / length
+    back = (tip[0] - head_mm * u, tip[1] - head_mm * v)
+    wing = 0.35 * head_mm
+    left = (back[0] - wing * v, back[1] + wing * u)
+    right = (back[0] + wing * v, back[1] - wing * u)
+    return [Line(start, back, width_mm), Polygon((tip, left, right), filled=True)]
+
+
+TRUE_SIZE = "Print at 100 %, without scaling, and measure the rulers."
+"""What a page at true size says."""
+
+RULER_MM = 100
+
+
+def page_rulers(size: Point, margin: float) -> list[Mark]:
+    """Rulers along the lower and the left edge of a page, as far as there is room."""
+    corner = margin + RULER_DEPTH_MM
+    marks: list[Mark] = []
+    for side, upright in ((size[0], False), (size[1], True)):
+        # The number at the far end, and "mm" after it, need some room.
+        length = min(RULER_MM, int(side - margin - corner - 8) // 10 * 10)
+        if length > 0:
+            start = (corner, corner + 2) if upright else (corner + 2, corner)
+            marks += ruler(start, length, upright=upright)
+    return marks
 
 
 def text_width(text: str, points: float) -> float:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from locatk.core.drawing import Line, Polygon
-from locatk.core.landmarks.drawing import arrow, bar_outlines
+from locatk.core.drawing import Line, Polygon, arrow
+from locatk.core.landmarks.drawing import bar_outlines
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.gridfit import built_poses
 from locatk.core.landmarks.landmark import name

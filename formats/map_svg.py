@@ -15,8 +15,8 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.drawing import Line, Point, Polygon
-from locatk.core.landmarks.drawing import arrow, bar_outlines
+from locatk.core.drawing import Line, Point, Polygon, arrow
+from locatk.core.landmarks.drawing import bar_outlines
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.gridfit import built_poses
 from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, name

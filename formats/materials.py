@@ -6,7 +6,7 @@ import csv
 import os
 from collections.abc import Sequence
 
-from locatk.core.polaris.materials import Item
+from locatk.core.materials import Item
 from locatk.formats.output import atomic_write
 
 COLUMNS = ("part", "count", "detail", "price_usd", "source")

@@ -6,7 +6,6 @@ the map's, and are drawn as designed, not as built.
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
@@ -21,6 +20,7 @@ from locatk.core.drawing import (
     Point,
     Polygon,
     Words,
+    arrow,
     text_width,
 )
 from locatk.core.errors import InputError
@@ -66,17 +66,6 @@ def _turned(point: Point, quarters: int) -> Point:
     for _ in range(quarters % 4):
         x, y = 0.0 - y, x
     return x, y
-
-
-def arrow(start: Point, tip: Point, head_mm: float, width_mm: float = 0.2) -> list[Mark]:
-    """A line with a filled head of this length."""
-    length = math.dist(start, tip)
-    u, v = (tip[0] - start[0]) / length, (tip[1] - start[1]) / length
-    back = (tip[0] - head_mm * u, tip[1] - head_mm * v)
-    wing = 0.35 * head_mm
-    left = (back[0] - wing * v, back[1] + wing * u)
-    right = (back[0] + wing * v, back[1] - wing * u)
-    return [Line(start, back, width_mm), Polygon((tip, left, right), filled=True)]
 
 
 def reach_mm(geometry: Geometry) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from locatk.core.errors import InputError
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS
-from locatk.core.polaris.materials import GRADES_T, Item
+from locatk.core.materials import GRADES_T, Item
 
 FERRITE_T = (0.20, 0.45)
 """Remanence of sintered hard ferrite, Y8T to Y40 (SJ/T 10410-2000, as makers list

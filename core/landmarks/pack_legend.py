@@ -5,8 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 
-from locatk.core.drawing import CAPITAL, MM_PER_POINT, Circle, Line, Mark, Point, Polygon, Words
-from locatk.core.landmarks.drawing import arrow, draw_symbol, north_mark
+from locatk.core.drawing import (
+    CAPITAL,
+    MM_PER_POINT,
+    Circle,
+    Line,
+    Mark,
+    Point,
+    Polygon,
+    Words,
+    arrow,
+)
+from locatk.core.landmarks.drawing import draw_symbol, north_mark
 from locatk.core.landmarks.floor import Cell, FloorMap
 from locatk.core.landmarks.landmark import PATTERNS, code_of, name
 from locatk.core.landmarks.pack_page import TEXT, line_mm

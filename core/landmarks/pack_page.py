@@ -16,14 +16,10 @@ from locatk.core.drawing import (
     Page,
     Point,
     Words,
-    ruler,
+    page_rulers,
     wrap,
 )
 from locatk.core.errors import InputError
-
-RULER_MM = 100
-
-TRUE_SIZE = "Print at 100 %, without scaling, and measure the rulers."
 
 TITLE, TEXT, SMALL = 10.0, 7.0, 5.0
 """Sizes of text in points."""
@@ -68,13 +64,7 @@ class Frame:
     def furniture(self, number: int, count: int) -> Group:
         """Everything around the box on page ``number`` of ``count``."""
         width, height = self.size
-        corner = self.margin + RULER_DEPTH_MM
-        marks: list[Mark] = []
-        for side, upright in ((width, False), (height, True)):
-            length = min(RULER_MM, int(side - self.margin - corner - 8) // 10 * 10)
-            if length > 0:
-                start = (corner, corner + 2) if upright else (corner + 2, corner)
-                marks += ruler(start, length, upright=upright)
+        marks = page_rulers(self.size, self.margin)
         top = height - self.margin - CAPITAL * TITLE * MM_PER_POINT
         title = wrap(self.title, TITLE, width - 2 * self.margin - _NUMBER_MM)[0]
         marks.append(Words(title, (self.margin, top), TITLE, bold=True))

@@ -15,9 +15,10 @@ from locatk.core.drawing import (
     Point,
     Polygon,
     Words,
+    arrow,
     text_width,
 )
-from locatk.core.landmarks.drawing import arrow, draw_symbol, north_mark
+from locatk.core.landmarks.drawing import draw_symbol, north_mark
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
 from locatk.core.landmarks.pack_legend import LEGEND_MM, legend
 from locatk.core.landmarks.pack_page import SMALL, TEXT, Frame, Leaf, line_mm, mm_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from locatk.core.drawing import Group, Line, Mark, Polygon, Words, text_width, wrap
+from locatk.core.drawing import TRUE_SIZE, Group, Line, Mark, Polygon, Words, text_width, wrap
 from locatk.core.landmarks.drawing import digit
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.landmark import PATTERN_OF, name
@@ -13,7 +13,6 @@ from locatk.core.landmarks.materials import patterns
 from locatk.core.landmarks.pack_page import (
     TEXT,
     TITLE,
-    TRUE_SIZE,
     Column,
     Frame,
     Leaf,
@@ -21,7 +20,7 @@ from locatk.core.landmarks.pack_page import (
     mm_text,
     table,
 )
-from locatk.core.polaris.materials import Item
+from locatk.core.materials import Item
 
 _POINTS = 9.0
 

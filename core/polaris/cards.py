@@ -11,20 +11,20 @@ from locatk.core.drawing import (
     CUT_MM,
     MM_PER_POINT,
     RULER_DEPTH_MM,
+    TRUE_SIZE,
     Group,
     Mark,
     Page,
     Point,
     Words,
     cut_marks,
-    ruler,
+    page_rulers,
     wrap,
 )
 from locatk.core.errors import InputError
 from locatk.core.polaris.drawing import AXIS_MM, TICK_MM, draw_tag, field_mm
 from locatk.core.polaris.tag import Layout, Tags
 
-RULER_MM = 100
 MOST_PAGES = 200
 
 _GAP_MM = 5.0
@@ -41,8 +41,6 @@ _LEADING = 1.25
 
 _PAGE_MM = 30.0
 """Room for the number of a page."""
-
-_TRUE_SIZE = "Print at 100 %, without scaling, and measure the rulers."
 
 _LEGEND = (
     "Circle: magnet. Arrow: its north, in degrees clockwise from x, seen from above. "
@@ -179,7 +177,7 @@ class _Sheet:
     def _words(self) -> list[str]:
         """Lines at the top of a page: what must not be missed, then what the signs mean."""
         width = self.size[0] - 2 * self.margin
-        return [*wrap(_TRUE_SIZE, _HEADER, width - _PAGE_MM), *wrap(_LEGEND, _HEADER, width)]
+        return [*wrap(TRUE_SIZE, _HEADER, width - _PAGE_MM), *wrap(_LEGEND, _HEADER, width)]
 
     def _grid(self, card: _Card) -> tuple[int, int]:
         """Columns and rows of cards that fit."""
@@ -218,14 +216,7 @@ class _Sheet:
     def furniture(self, number: int, count: int) -> Group:
         """Rulers and words of one page."""
         width, height = self.size
-        corner = self.margin + RULER_DEPTH_MM
-        marks: list[Mark] = []
-        for side, upright in ((width, False), (height, True)):
-            # The number at the far end, and "mm" after it, need some room.
-            length = min(RULER_MM, int(side - self.margin - corner - 8) // 10 * 10)
-            if length > 0:
-                start = (corner, corner + 2) if upright else (corner + 2, corner)
-                marks += ruler(start, length, upright=upright)
+        marks = page_rulers(self.size, self.margin)
         line = _HEADER * MM_PER_POINT
         top = height - self.margin - CAPITAL * line
         page = f"page {number + 1} of {count}"

@@ -19,6 +19,7 @@ from locatk.core.drawing import (
     Point,
     Polygon,
     Words,
+    arrow,
 )
 from locatk.core.polaris.tag import Cell, Layout, Tags, places, vertices
 
@@ -122,19 +123,7 @@ class _Drawn:
         ]
 
     def _arrow(self, start: Point, tip: Point, head: float, width: float) -> list[Mark]:
-        length = math.dist(start, tip)
-        u, v = (tip[0] - start[0]) / length, (tip[1] - start[1]) / length
-        back = (tip[0] - head * u, tip[1] - head * v)
-        wing = 0.35 * head
-        corners = (
-            tip,
-            (back[0] - wing * v, back[1] + wing * u),
-            (back[0] + wing * v, back[1] - wing * u),
-        )
-        return [
-            Line(self._at(*start), self._at(*back), width),
-            Polygon(tuple(self._at(*corner) for corner in corners), filled=True),
-        ]
+        return arrow(self._at(*start), self._at(*tip), head, width)
 
     def _magnet(self, cell: Cell, symbol: int) -> list[Mark]:
         """Outline, line along the moment, line across, N, and the angle."""

@@ -17,11 +17,12 @@ from scipy.optimize import brentq
 
 from locatk.core.errors import InputError
 from locatk.core.magnetics import dipole_field
+from locatk.core.materials import Item
 from locatk.core.polaris import advice, codec
 from locatk.core.polaris.advice import FEWEST_SAMPLES, MERGED, SIGMAS
 from locatk.core.polaris.array import SensorArray
 from locatk.core.polaris.bound import Bound, Unknown, bound
-from locatk.core.polaris.materials import Item, bill
+from locatk.core.polaris.materials import bill
 from locatk.core.polaris.mlx90393 import Settings, published_bar
 from locatk.core.polaris.tag import Layout, Magnet, Tags
 

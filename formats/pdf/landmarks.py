@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from reportlab.lib.units import mm
 from reportlab.pdfgen.canvas import Canvas
@@ -11,56 +11,29 @@ from reportlab.pdfgen.canvas import Canvas
 from locatk.core.drawing import Page
 from locatk.core.landmarks.pack_floor import Tile
 from locatk.formats.pdf import page
-
-_HINT = "Use a smaller paper"
+from locatk.formats.pdf.drawings import bind, sheets
 
 
 def render(
     pages: Sequence[Page], title: str, *, done: Callable[[], object] = lambda: None
 ) -> bytes:
-    """A PDF of drawings at true size, which viewers print at 100 %.
-
-    The same drawings give the same bytes. ``done`` is called after each page.
-
-    Raises
-    ------
-    InputError
-        A page is longer than a PDF may be.
-    """
-    stream = io.BytesIO()
-    canvas = page.open_document(stream, title)
-    for drawn in pages:
-        page.start_page(canvas, drawn.size_mm, hint=_HINT)
-        for group in drawn.groups:
-            page.draw(canvas, group.marks)
-        canvas.showPage()
-        done()
-    canvas.save()
-    return stream.getvalue()
+    """A PDF of drawings at true size; see :func:`.drawings.bind`."""
+    return bind(sheets(pages), title, done=done)
 
 
 def render_floor(
     tiles: Sequence[Tile], title: str, *, done: Callable[[], object] = lambda: None
 ) -> bytes:
-    """A PDF of a floor at true size, a page a tile, with rulers and joining marks.
+    """A PDF of a floor at true size, a page a tile, with rulers and joining marks; see
+    :func:`.drawings.bind`."""
+    return bind([(tile.size_mm, partial(_draw_tile, tile)) for tile in tiles], title, done=done)
 
-    Raises
-    ------
-    InputError
-        A page is longer than a PDF may be.
-    """
-    stream = io.BytesIO()
-    canvas = page.open_document(stream, title)
-    for tile in tiles:
-        page.start_page(canvas, tile.size_mm, hint=_HINT)
-        box = page.Box(*tile.box)
-        _draw_within(canvas, tile, box)
-        seams = (list(tile.seams[0]), list(tile.seams[1]))
-        page.furnish(canvas, box, tile.words, seams, marks=True, crop=False)
-        canvas.showPage()
-        done()
-    canvas.save()
-    return stream.getvalue()
+
+def _draw_tile(tile: Tile, canvas: Canvas) -> None:
+    box = page.Box(*tile.box)
+    _draw_within(canvas, tile, box)
+    seams = (list(tile.seams[0]), list(tile.seams[1]))
+    page.furnish(canvas, box, tile.words, seams, marks=True, crop=False)
 
 
 def _draw_within(canvas: Canvas, tile: Tile, box: page.Box) -> None:

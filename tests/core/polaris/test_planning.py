@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
+from locatk.core.materials import GRADES_T, remanence
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.materials import GRADES_T, bill, disc, remanence
+from locatk.core.polaris.materials import bill, disc
 from locatk.core.polaris.mlx90393 import Settings
 from locatk.core.polaris.planning import (
     PLACEMENT_RAD,
