@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks import gauge, smooth, solver
+from locatk.core.landmarks import gauge, recording, smooth, solver
 from locatk.core.landmarks.built import laid_codes
 from locatk.core.landmarks.calibrate_marks import (
     SURE,
@@ -60,7 +60,7 @@ class Drive:
     """One robot's recording, read; ``name`` is for people."""
 
     name: str
-    found: solver.Recording
+    found: recording.Recording
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def read(
     samples: HallSamples,
     odometry: Trajectory | None,
     floor: FloorMap,
-    options: solver.SolveOptions | None = None,
+    options: recording.SolveOptions | None = None,
 ) -> Drive | str:
     """One robot's recording, localised on the map; or why it cannot be used.
 
@@ -107,10 +107,10 @@ def read(
     InputError
         See :func:`.solver.solve`.
     """
-    found = solver.read(samples, odometry, floor, options or solver.SolveOptions())
+    found = recording.read(samples, odometry, floor, options or recording.SolveOptions())
     if not found.seen:
         return "no landmark was seen"
-    if not solver.on_map(found, floor):
+    if not recording.on_map(found, floor):
         return "not localised on the map"
     return Drive(name, found)
 
@@ -140,7 +140,7 @@ def calibrate(
         No visit can be used.
     """
     out = dict(left_out or {})
-    used = [(drive, solver.on_map(drive.found, floor)) for drive in drives]
+    used = [(drive, recording.on_map(drive.found, floor)) for drive in drives]
     used = [(drive, visits) for drive, visits in used if visits]
     if not used:
         why = f" ({'; '.join(f'{name}: {text}' for name, text in out.items())})" if out else ""
@@ -186,11 +186,11 @@ def calibrate(
     return replace(report, notes=tuple(_notes(report, parts, floor)))
 
 
-def _every(used: _Used) -> list[solver.Seen]:
+def _every(used: _Used) -> list[recording.Seen]:
     return [one for _, visits in used for one in visits]
 
 
-_Used = list[tuple[Drive, list[solver.Seen]]]
+_Used = list[tuple[Drive, list[recording.Seen]]]
 
 
 def _solved(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks import gauge, smooth, solver
+from locatk.core.landmarks import gauge, recording, smooth, solver
 from locatk.core.landmarks.estimate import FAULTY, GONE
 from locatk.core.landmarks.fit import Priors
 from locatk.core.landmarks.floor import AsBuilt, Cell, FloorMap
@@ -61,13 +61,13 @@ class Landmark:
     why: str = ""
 
 
-def cell_of(one: solver.Seen) -> Cell:
+def cell_of(one: recording.Seen) -> Cell:
     """Of a visit that is on the map."""
     assert one.located is not None
     return one.located.cell
 
 
-def unknown(visits: Sequence[solver.Seen], design: FloorMap) -> dict[Cell, smooth.Mark]:
+def unknown(visits: Sequence[recording.Seen], design: FloorMap) -> dict[Cell, smooth.Mark]:
     """Landmarks of which little is known but how their bars were read."""
     weight: dict[Cell, Array] = {}
     total: dict[Cell, Array] = {}
@@ -123,7 +123,7 @@ def landmarks(
     marks: Mapping[Cell, smooth.Mark],
     design: FloorMap,
     parts: Sequence[Sequence[Cell]],
-    visits: Sequence[solver.Seen],
+    visits: Sequence[recording.Seen],
 ) -> dict[Cell, Landmark]:
     """All landmarks, each part of the floor laid over its design."""
     count = Counter(cell_of(one) for one in visits)

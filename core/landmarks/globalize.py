@@ -31,7 +31,7 @@ PAD = 3
 UNTOLD = 1e-3
 """Probability of a landmark in a cell of the map that has none."""
 
-BEYOND = 0.05
+BEYOND = 0.01
 """The same beside the map, of which it says nothing."""
 
 LOST = 1e-7
@@ -186,7 +186,7 @@ def _again(kept: list[list[tuple[int, Hypothesis]]], steps: list[list[_Step]]) -
     groups: dict[tuple[int, tuple[int, int]], list[int]] = {}
     for number, (chain, cell, _) in enumerate(place):
         groups.setdefault((chain, cell), []).append(number)
-    again = {}
+    again: dict[int, int] = {}
     for numbers in groups.values():
         best = max(numbers, key=lambda n: kept[n][0][1].probability)
         laid = int(rotated(kept[best][0][1].code, place[best][2]))

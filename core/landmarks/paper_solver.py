@@ -111,7 +111,7 @@ def _spread(
     found: Sequence[Sighting], known: int, cell: tuple[int, int], arrival: int, floor: FloorMap
 ) -> dict[int, Located]:
     """Cells of all sightings, from one whose cell and heading on arrival are known."""
-    own = _landmark(found[known]) - _landmark(found[known - 1])
+    own = found[known].landmark_place() - found[known - 1].landmark_place()
     turn = arrival * HALF_PI - math.atan2(own[1], own[0])
     out = {known: Located(cell, _quarters(found[known], turn), 0, 1.0, 1.0)}
     for numbers in (range(known + 1, len(found)), range(known - 1, -1, -1)):
@@ -122,7 +122,7 @@ def _spread(
                 continue
             # The last landmark tells how odometry now lies on the map.
             swing = out[at].quarters * HALF_PI + found[at].best.pose[2] - found[at].odometry[2]
-            way = _landmark(one) - _landmark(found[at])
+            way = one.landmark_place() - found[at].landmark_place()
             step = (
                 np.array(
                     [
@@ -139,14 +139,6 @@ def _spread(
             out[n] = Located(there, _quarters(one, swing), 0, 1.0, 1.0)
             at = n
     return out
-
-
-def _landmark(seen: Sighting) -> Array:
-    """Place (2,) of its landmark by odometry."""
-    x, y, heading = seen.best.pose
-    frame = float(seen.odometry[2] - heading)
-    cos, sin = math.cos(frame), math.sin(frame)
-    return np.asarray(seen.odometry[:2] - [cos * x - sin * y, sin * x + cos * y])
 
 
 def _quarters(seen: Sighting, swing: float) -> int:

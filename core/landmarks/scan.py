@@ -34,7 +34,7 @@ class Grid:
 
     def headings(self) -> Array:
         """(turns,) headings from -45 degrees on."""
-        return -math.pi / 4 + math.pi / 2 / self.turns * np.arange(self.turns)
+        return np.asarray(-math.pi / 4 + math.pi / 2 / self.turns * np.arange(self.turns))
 
 
 COARSE = Grid()

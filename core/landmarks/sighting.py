@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,6 +83,13 @@ class Sighting:
     def best(self) -> Hypothesis:
         """The most probable hypothesis; ``IndexError`` where there is none."""
         return self.hypotheses[0]
+
+    def landmark_place(self) -> Array:
+        """(2,) where the best hypothesis has the landmark's centre, by the robot's odometry."""
+        x, y, heading = self.best.pose
+        turn = float(self.odometry[2] - heading)
+        cos, sin = math.cos(turn), math.sin(turn)
+        return np.asarray(self.odometry[:2] - [cos * x - sin * y, sin * x + cos * y])
 
     def code_probabilities(self) -> Array:
         """(16,) probability of each code in the frame of the hypotheses."""

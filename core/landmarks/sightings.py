@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.estimate import Explanation, explain, robot
-from locatk.core.landmarks.fit import Priors
+from locatk.core.landmarks.fit import POSE, Priors
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.sighting import Hypothesis, Sighting
 from locatk.core.landmarks.visits import Driven, Visit
@@ -28,6 +28,9 @@ VISITS_TRIED = 3
 
 MOST_SENSORS = 4
 """Sensors up to which every order is tried."""
+
+GAIN_SIGMAS = 4.0
+"""Standard deviations that a sensor's gain is off to be told."""
 
 CLEARLY = 3.0
 """By how much less must be left if the sensors are otherwise."""
@@ -67,6 +70,38 @@ def sighting(
         refused=refused,
     )
     return done, found
+
+
+def check_gains(found: list[Explanation], run: Driven, priors: Priors) -> list[str]:
+    """Notes on sensors whose gain is another one than was told.
+
+    Parameters
+    ----------
+    found : list of Explanation
+        The best of each visit.
+    run : Driven
+    priors : Priors
+
+    Raises
+    ------
+    InputError
+        A sensor has the other sign than the rest.
+    """
+    if not found:
+        return []
+    names, device = run.samples.sensors.names, run.samples.device
+    span = slice(POSE, POSE + len(names))
+    gain = 1 + priors.gain * np.median([one.parameters[span] for one in found], axis=0)
+    notes = []
+    for name, value in zip(names, gain.tolist(), strict=True):
+        if value < 0:
+            raise InputError(
+                f"the {name} sensor of {device} has the other sign than the rest",
+                hint="Turn it round, or its column's sign",
+            )
+        if abs(value - 1) > GAIN_SIGMAS * priors.gain:
+            notes.append(f"{device}: the {name} sensor reads {value:.2f} of what the others do")
+    return notes
 
 
 def check_sensors(

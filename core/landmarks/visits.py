@@ -43,7 +43,7 @@ LEAST_NOISE_T = 2e-5
 UNTOLD = 0.02
 """Share of the samples that may lie before or after the odometry without a word."""
 
-LONGEST_M = 1.0
+LONGEST_M = 2.0
 """Way during which no one landmark can be felt."""
 
 LEAST_M = 1e-3
@@ -159,9 +159,11 @@ def check_way(run: Driven, geometry: Geometry) -> None:
     if not len(spans):
         return
     extent = [float(np.hypot(*np.ptp(run.pose[a:b, :2], axis=0))) for a, b in spans]
-    if np.median(extent) > LONGEST_M:
+    # The longest of them may have been along a whole row of landmarks.
+    long = float(np.quantile(extent, 0.9))
+    if long > LONGEST_M:
         raise InputError(
-            f"by its odometry {device} drove {np.median(extent):.3g} m over one landmark",
+            f"by its odometry {device} drove {long:.3g} m over one landmark",
             hint="Positions are in metres and headings in radians: check the units",
         )
     moved = max(
@@ -229,6 +231,11 @@ def _felt(run: Driven, geometry: Geometry) -> tuple[NDArray[np.intp], Array, Arr
     middle = np.add.reduceat(np.einsum("ns,nsi->ni", strength**2, place), starts, axis=0)
     with np.errstate(invalid="ignore"):
         return starts, power, middle / power[:, None]
+
+
+def joined(run: Driven, one: Visit, other: Visit, middle: Array, drift: Drift) -> Visit:
+    """Two visits in a row, and what lies between them, as one to the landmark at ``middle``."""
+    return _visit(run, one.first, other.stop, middle, drift)
 
 
 def _visit(run: Driven, first: int, stop: int, middle: Array, drift: Drift) -> Visit:

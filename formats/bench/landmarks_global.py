@@ -20,10 +20,11 @@ from locatk.core.landmarks import globalize
 from locatk.core.landmarks.detections import LIKELY
 from locatk.core.landmarks.floor import STEPS, Cell, FloorMap
 from locatk.core.landmarks.landmark import CODES, PATTERNS, code_of, rotated
+from locatk.core.landmarks.recording import SolveOptions
+from locatk.core.landmarks.remarks import CERTAIN
 from locatk.core.landmarks.sighting import Hypothesis, Sighting
 from locatk.core.landmarks.simulate_options import Errors
 from locatk.core.landmarks.simulate_sensors import odometry
-from locatk.core.landmarks.solver import CERTAIN, SolveOptions
 from locatk.core.landmarks.trace import Drift
 from locatk.core.landmarks.windows import path, readings
 from locatk.formats.bench import Figure

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import heading_of
 from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.remarks import CERTAIN
 from locatk.core.landmarks.simulate import Simulated, simulate
 from locatk.core.landmarks.simulate_options import Faults, SimulationOptions
-from locatk.core.landmarks.solver import CERTAIN, SolveOptions, solve
+from locatk.core.landmarks.solver import SolveOptions, solve
 from locatk.core.solution import Solution
 from locatk.formats.bench import Figure
 from locatk.formats.bench.landmarks_global import MISREAD, the_floor

@@ -1,0 +1,82 @@
+"""What a user must be told of a solution: where the map, the floor or the robot are not as said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from locatk.core.landmarks import globalize, smooth
+from locatk.core.landmarks.detections import detection
+from locatk.core.landmarks.floor import Cell, FloorMap
+from locatk.core.landmarks.recording import Recording, Seen
+
+CERTAIN = 0.9999
+"""Probability from which on a place on the map needs no remark."""
+
+FEWEST_MARKS = 3
+"""Landmarks from which on one of them can be known to be off its place."""
+
+FAR_OFF = 2.5
+"""Standard deviations that a landmark is found off its place to be called so."""
+
+FEWEST_WRONG = 2
+
+MOST_WRONG = 1 / 3
+"""Share of misread landmarks from which on a map is not believed."""
+
+
+def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict[Cell, float]:
+    """Landmarks that were found far off where the map has them, and how far (m)."""
+    if len(marks) < FEWEST_MARKS:
+        return {}
+    found = {}
+    for cell, mark in marks.items():
+        shift = smoothed.marks[cell].pose - mark.pose
+        if np.abs(shift / mark.sigma).max() > FAR_OFF:
+            found[cell] = float(np.hypot(*shift[:2]))
+    return found
+
+
+def contradicted(usable: list[Seen], floor: FloorMap) -> bool:
+    """Whether the map is as often wrong about what was seen as no map of the floor can be."""
+    wrong = sum(
+        detection(one.sighting, one.located, floor)["refused"] == "misread" for one in usable
+    )
+    return wrong >= FEWEST_WRONG and wrong > MOST_WRONG * len(usable)
+
+
+def why_not(found: Recording, sure: float) -> list[str]:
+    """Why a robot is not localised."""
+    device = found.run.samples.device
+    explained = [one for one in found.seen if not one.sighting.refused]
+    if explained:
+        return [f"{device}: not localised; the likeliest place has a probability of {sure:.2g}"]
+    if found.seen:
+        return [
+            f"{device}: {len(found.seen)} visits, but no landmark explains one of them; check "
+            "the landmarks' geometry, the sensors and the odometry"
+        ]
+    largest = 1e3 * float(np.nanmax(np.abs(found.run.samples.field_t)))
+    return [f"{device}: no landmark was met; the strongest field is {largest:.2g} mT"]
+
+
+def exchanged(found: Recording, floor: FloorMap, misread: float) -> list[str]:
+    """A remark where the map fits what was seen if all fields had the other sign."""
+    turned = [
+        replace(
+            one.sighting,
+            hypotheses=tuple(replace(h, code=15 - h.code) for h in one.sighting.hypotheses),
+        )
+        for one in found.seen
+        if not one.sighting.refused
+    ]
+    if not turned:
+        return []
+    told = globalize.locate(turned, floor, misread=misread, drift=found.priors.drift)
+    if max(one.probability for one in told) < CERTAIN:
+        return []
+    return [
+        f"{found.run.samples.device}: with N and S exchanged it would be localised; are the "
+        "sensors or all bars the other way up?"
+    ]
