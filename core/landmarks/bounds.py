@@ -96,7 +96,7 @@ def refuse_readings(
         f"this floor has {asked} readings {under}of window {window}, and there are only {bound} "
         f"of alphabet {alphabet}" + (f" with {detect} misread noticed" if detect else ""),
         hint=f"make the floor smaller (a square has at most {side} x {side} landmarks, before any"
-        " search), the window larger, or the alphabet 16",
+        f" search), {'' if alphabet == '16' else 'the alphabet 16, '}or the window larger",
     )
 
 

@@ -76,7 +76,7 @@ def solve(
             notes.append(f"{device}: no map, so that its landmarks have no cells")
         for n, one in enumerate(found):
             detections.append(detection(one, located.get(n), floor))
-            notes += [f"{device}: {note}" for note in one.notes]
+            notes += [f"{device}: {note}" for note in one.notes if one.refused]
     refused = Counter(seen["refused"] for seen in detections if seen["refused"])
     return Solution(
         system="landmarks",
