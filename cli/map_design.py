@@ -12,8 +12,9 @@ import click
 
 from locatk.cli import console, failures, map_landmark, map_proof, options
 from locatk.cli.map_options import Cells, Size, Walls, geometry_of, geometry_options, on_floor
-from locatk.cli.options import metres, number
+from locatk.cli.options import number
 from locatk.core.errors import InputError
+from locatk.core.units import metres
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.analysis import Analysis

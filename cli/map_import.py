@@ -73,7 +73,7 @@ def command(
     """
     import numpy as np
 
-    from locatk.cli.options import metres
+    from locatk.core.units import metres
     from locatk.formats.maps import dumps_map, loads_map, read_map, write_map
 
     format_name = format_of(source, format_name, FORMATS)

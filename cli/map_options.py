@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli.options import metres, number, together
+from locatk.cli.options import number, together
+from locatk.core.units import metres
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.floor import Cell, Wall

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -104,11 +103,6 @@ def number(*names: str, default: Any, help: str, **more: Any) -> Callable[[Any],
     """An option with a default, of the default's type where none is given."""
     more.setdefault("type", type(default))
     return click.option(*names, default=default, show_default=True, help=help, **more)
-
-
-def metres(millimetres: float) -> float:
-    """The point is moved, so that 39.7 mm come back as 39.7 mm from a file."""
-    return float(Decimal(repr(millimetres)).scaleb(-3))
 
 
 def verbosity(command: F) -> F:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, options
-from locatk.core.errors import InputError, OutputExistsError
+from locatk.core.errors import OutputExistsError, about
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.floor import FloorMap
@@ -124,13 +124,11 @@ def landmarks(
             raise OutputExistsError("drawing and materials would be one file", file=bom)
     floor = read_map(map_file)
     items = bill(floor, spares_percent)
-    try:
+    with about(map_file):
         if whole_floor:
             data, answer = _floor(floor, on, margin_mm, 10.0 if overlap_mm is None else overlap_mm)
         else:
             data, answer = _pack(floor, on, margin_mm, spares_percent, templates_only)
-    except InputError as error:
-        raise InputError(error.message, file=map_file, hint=error.hint) from None
     with atomic_write(output, overwrite=overwrite) as stream:
         stream.write(data)
     if bom is not None:

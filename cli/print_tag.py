@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, options
-from locatk.core.errors import InputError
+from locatk.core.errors import InputError, about
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -136,11 +136,9 @@ def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int
                 hint=f"It has {len(tags.ids)}, from {min(tags.ids)} to {max(tags.ids)}; without "
                 "--id all are drawn",
             )
-    try:
-        wanted = ids or tags.ids or tuple(sorted(tags.site))
+    wanted = ids or tags.ids or tuple(sorted(tags.site))
+    with about(tag_file):
         return [(number, layout_of(tags, number)) for number in wanted]
-    except InputError as error:
-        raise InputError(error.message, file=tag_file, hint=error.hint) from None
 
 
 def _files(output: Path, format_name: str, pages: int) -> list[Path]:

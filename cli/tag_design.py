@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.options import metres, number
+from locatk.cli.options import number
 from locatk.cli.tag_options import design_options, use_of, use_options
 from locatk.core.errors import OutputExistsError
+from locatk.core.units import metres
 
 if TYPE_CHECKING:
     from locatk.core.polaris.planning import Plan

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from locatk.cli.options import metres, number, together
+from locatk.cli.options import number, together
+from locatk.core.units import metres
 
 if TYPE_CHECKING:
     from locatk.core.polaris.planning import Use

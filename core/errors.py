@@ -18,6 +18,8 @@ the builtin beside it.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class LocatkError(Exception):
@@ -82,3 +84,12 @@ class OutputExistsError(LocatkError, FileExistsError):
 
 class MissingDataError(LocatkError, FileNotFoundError):
     """A file or folder that is not there."""
+
+
+@contextmanager
+def about(file: str | os.PathLike[str]) -> Iterator[None]:
+    """Let an InputError name the file whose contents led to it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error.message, file=file, hint=error.hint) from None

@@ -19,12 +19,12 @@ import csv
 import io
 import math
 import os
-from decimal import Decimal
 
-from locatk.core.errors import FormatError, InputError
+from locatk.core.errors import FormatError, about
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.gridfit import TOLERANCE_M, built_poses, floor_of
 from locatk.core.landmarks.landmark import CODES
+from locatk.core.units import metres, mm_text
 
 HEADER = ("No", "Code", "X mm", "Y mm", "Attr1", "Attr2", "Attr3", "Attr4")
 
@@ -42,7 +42,9 @@ def dumps_csv(floor: FloorMap) -> str:
     for number, (cell, (x, y, heading)) in enumerate(zip(floor.cells(), poses, strict=True)):
         turn = round(100 * math.degrees(heading))
         code = int(floor.codes[cell])
-        lines.append(f"{number};{code};{_mm(x)};{_mm(y)};{turn};0;0;0")
+        lines.append(
+            f"{number};{code};{mm_text(x, FINEST_MM)};{mm_text(y, FINEST_MM)};{turn};0;0;0"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -91,7 +93,7 @@ def loads_csv(
             start = line.number("Attr4", 0) == 1  # its heading is that of vehicles
             turn = 0.0 if start else line.number("Attr1", 18_000)
             x, y = (line.number(name, FARTHEST_MM) for name in ("X mm", "Y mm"))
-            poses.append((_metres(x), _metres(y), math.radians(turn / 100)))
+            poses.append((metres(x), metres(y), math.radians(turn / 100)))
             names.append(f"line {rows.line_num}")
     except csv.Error as error:
         raise FormatError(str(error), file=file, where=rows.line_num) from None
@@ -99,10 +101,8 @@ def loads_csv(
         raise FormatError(
             "no landmarks", file=file, hint=f"Expected lines as in {';'.join(HEADER[:4])}"
         )
-    try:
+    with about(file):
         return floor_of(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
-    except InputError as error:
-        raise InputError(error.message, file=file, hint=error.hint) from None
 
 
 class _Line:
@@ -171,14 +171,3 @@ def _is_number(text: str) -> bool:
         return math.isfinite(float(text.replace(",", ".")))
     except ValueError:
         return False
-
-
-def _mm(metres: float) -> str:
-    """In mm, without zeros that say nothing: controllers' own tables hold whole ones."""
-    text = f"{1e3 * metres:.{FINEST_MM}f}".rstrip("0").rstrip(".")
-    return "0" if text == "-0" else text
-
-
-def _metres(millimetres: float) -> float:
-    """The point is moved, so that 39.7 mm come back as 39.7 mm from a file."""
-    return float(Decimal(repr(millimetres)).scaleb(-3))

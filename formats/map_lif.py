@@ -21,8 +21,8 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from locatk.core.errors import FormatError, InputError
-from locatk.core.landmarks.floor import STEPS, Cell, FloorMap
+from locatk.core.errors import FormatError, about
+from locatk.core.landmarks.floor import Cell, FloorMap, neighbour
 from locatk.core.landmarks.gridfit import TOLERANCE_M, built_poses, floor_of
 from locatk.core.landmarks.landmark import code_of, name
 from locatk.formats.output import tool_version
@@ -141,10 +141,8 @@ def loads_lif(
         names.append(f"node {node_id!r}")
     if not codes:
         raise read.error("a layout without nodes", "nodes")
-    try:
+    with about(file):
         floor = floor_of(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
-    except InputError as error:
-        raise InputError(error.message, file=file, hint=error.hint) from None
     ways = set()
     for number, edge in enumerate(read.objects(layout, "edges")):
         ends = [read.text(edge, key, f"edges[{number}]") for key in ("startNodeId", "endNodeId")]
@@ -234,9 +232,9 @@ def _node_id(cell: Cell) -> str:
 def _ways(floor: FloorMap) -> Iterator[tuple[Cell, Cell]]:
     """Cells between which a robot can go, in both directions."""
     for cell in floor.cells():
-        for heading, (up, right) in enumerate(STEPS):
+        for heading in range(4):
             if floor.open(cell, heading):
-                yield cell, (cell[0] + up, cell[1] + right)
+                yield cell, neighbour(cell, heading)
 
 
 def _cells(floor: FloorMap, poses: list[tuple[float, float, float]]) -> list[Cell]:

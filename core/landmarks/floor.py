@@ -30,6 +30,12 @@ STEPS: tuple[Cell, ...] = ((0, 1), (1, 0), (0, -1), (-1, 0))
 """(row, column) of one step under the heading of 0, 1, 2, 3 quarter turns from x."""
 
 
+def neighbour(cell: Cell, heading: int) -> Cell:
+    """The next cell in a heading of so many quarter turns."""
+    row, column = STEPS[heading % 4]
+    return cell[0] + row, cell[1] + column
+
+
 @dataclass(frozen=True)
 class AsBuilt:
     """How one landmark really lies, from ``locatk calibrate map``.
@@ -119,7 +125,7 @@ class FloorMap:
 
     def open(self, cell: Cell, heading: int) -> bool:
         """Whether a robot at ``cell`` can go one cell on under ``heading`` quarter turns."""
-        row, column = cell[0] + STEPS[heading % 4][0], cell[1] + STEPS[heading % 4][1]
+        row, column = neighbour(cell, heading)
         rows, columns = self.shape
         if not (0 <= row < rows and 0 <= column < columns):
             return False

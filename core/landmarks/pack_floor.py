@@ -11,8 +11,9 @@ from locatk.core.drawing import Line, Mark, Point, Words
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing import card_mm, check, digit, draw_landmark, north_mark
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
-from locatk.core.landmarks.pack_page import TEXT, check_margin, mm_text, printable, size_text
+from locatk.core.landmarks.pack_page import TEXT, check_margin, printable, size_text
 from locatk.core.landmarks.pack_plan import block_name
+from locatk.core.units import mm_text
 
 MOST_TILES = 500
 

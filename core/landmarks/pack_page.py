@@ -115,12 +115,6 @@ def printable(text: str) -> str:
     return text.encode("cp1252", "replace").decode("cp1252")
 
 
-def mm_text(value_m: float) -> str:
-    """A length or coordinate in mm, to 0.1 mm, without zeros that say nothing."""
-    text = f"{1e3 * value_m:.1f}".removesuffix(".0")
-    return "0" if text in ("-0", "-0.0") else text
-
-
 @dataclass(frozen=True)
 class Column:
     """Of a table: its head, its width, and on which side its words stand."""

@@ -21,7 +21,8 @@ from locatk.core.drawing import (
 from locatk.core.landmarks.drawing import draw_symbol, north_mark
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
 from locatk.core.landmarks.pack_legend import LEGEND_MM, legend
-from locatk.core.landmarks.pack_page import SMALL, TEXT, Frame, Leaf, line_mm, mm_text
+from locatk.core.landmarks.pack_page import SMALL, TEXT, Frame, Leaf, line_mm
+from locatk.core.units import mm_text
 
 SMALLEST_MM, LARGEST_MM = 6.5, 45.0
 """Sides of a cell on the paper before its scale is rounded."""

@@ -31,9 +31,9 @@ from locatk.core.landmarks.pack_page import (
     Frame,
     Leaf,
     line_mm,
-    mm_text,
     size_text,
 )
+from locatk.core.units import mm_text
 
 LARGEST_MM = 100.0
 """From a template's centre to its edge; a longer line turns a landmark no more exactly."""

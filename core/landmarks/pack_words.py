@@ -17,10 +17,10 @@ from locatk.core.landmarks.pack_page import (
     Frame,
     Leaf,
     line_mm,
-    mm_text,
     table,
 )
 from locatk.core.materials import Item
+from locatk.core.units import mm_text
 
 _POINTS = 9.0
 

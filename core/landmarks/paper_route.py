@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.landmarks.floor import HOLE, STEPS, Cell, FloorMap
+from locatk.core.landmarks.floor import HOLE, Cell, FloorMap, neighbour
 from locatk.core.landmarks.landmark import PATTERN_OF, rotated
 from locatk.core.landmarks.sighting import Sighting
 
@@ -233,7 +233,7 @@ def locate(floor: FloorMap, codes: Sequence[int], turns: Sequence[int] = L_TURNS
                 fits = fits and floor.open(cell, heading)
                 if not fits:
                     break
-                cell = cell[0] + STEPS[heading][0], cell[1] + STEPS[heading][1]
+                cell = neighbour(cell, heading)
                 fits = _reads(floor, cell, heading, code)
             if fits:
                 places.append((cell, heading))

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.floor import HOLE, STEPS, Cell, FloorMap
+from locatk.core.landmarks.floor import HOLE, STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.landmark import pattern
 from locatk.core.landmarks.simulate_floor import Laid
 from locatk.core.landmarks.simulate_options import ASIDE_RAD, PASS_M, START_M, SimulationOptions
@@ -51,6 +52,17 @@ STEP_M = 0.005
 """Between points of a way that are asked whether the floor is free there."""
 
 
+@dataclass(frozen=True)
+class _Job:
+    """What a robot is to do, where, and by which chance; ``notes`` are added to."""
+
+    floor: FloorMap
+    laid: Mapping[Cell, Laid]
+    options: SimulationOptions
+    rng: np.random.Generator
+    notes: list[str]
+
+
 def steer(
     floor: FloorMap, laid: Mapping[Cell, Laid], options: SimulationOptions
 ) -> tuple[Robot, list[str]]:
@@ -66,7 +78,7 @@ def steer(
     rng = np.random.default_rng([options.seed, 20])
     notes: list[str] = []
     way = {"paper": _paper, "path": _path, "pass": _pass}[options.strategy]
-    robot = way(floor, laid, options, rng, notes)
+    robot = way(_Job(floor, laid, options, rng, notes))
     robot.stand(options.rest_s)
     return robot, notes
 
@@ -88,16 +100,11 @@ def _aim(place: Sequence[float], mean_m: float, rng: np.random.Generator) -> Arr
 # ---- the paper's way
 
 
-def _paper(
-    floor: FloorMap,
-    laid: Mapping[Cell, Laid],
-    options: SimulationOptions,
-    rng: np.random.Generator,
-    notes: list[str],
-) -> Robot:
+def _paper(job: _Job) -> Robot:
     """Steps (a) to (p) of Fig. 12."""
+    floor, laid, options, rng = job.floor, job.laid, job.options, job.rng
     aims = options.aims
-    pose, cell, way = _search(floor, laid, options, rng)
+    pose, cell, way = _search(job)
     robot = _begin(pose, options)
     robot.straight(way)
     mark = laid[cell]
@@ -105,11 +112,11 @@ def _paper(
     tour = TOURS[floor.window]
     count = len(tour) + 1 if options.landmarks is None else options.landmarks
     spins = len(tour) + 1 if options.spins is None else options.spins
-    headings = _tour(floor, cell, float(robot.pose[2]), tour, count, rng, notes)
+    headings = _tour(job, cell, float(robot.pose[2]), tour, count)
     for number in range(len(headings) + 1):
         if number:
             heading = headings[number - 1]
-            cell = (cell[0] + STEPS[heading][0], cell[1] + STEPS[heading][1])
+            cell = neighbour(cell, heading)
             mark = laid[cell]
             robot.face(heading * QUARTER + rng.normal(0.0, aims.heading_rad))
             robot.land(_aim((mark.x_m, mark.y_m), aims.step_m, rng))
@@ -122,13 +129,9 @@ def _paper(
     return robot
 
 
-def _search(
-    floor: FloorMap,
-    laid: Mapping[Cell, Laid],
-    options: SimulationOptions,
-    rng: np.random.Generator,
-) -> tuple[Array, Cell, float]:
+def _search(job: _Job) -> tuple[Array, Cell, float]:
     """Where it starts, which landmark it meets, and how far it goes to pass that one."""
+    floor, laid, options, rng = job.floor, job.laid, job.options, job.rng
     cells = list(laid)
     centre = np.array([[laid[cell].x_m, laid[cell].y_m] for cell in cells])
     reach = floor.geometry.circle_m + TERRITORY_M
@@ -197,7 +200,7 @@ def free(floor: FloorMap, points: Array) -> bool:
             for heading in order:
                 if not floor.open(at, heading):
                     break
-                at = (at[0] + STEPS[heading][0], at[1] + STEPS[heading][1])
+                at = neighbour(at, heading)
             else:
                 break
         else:
@@ -205,19 +208,12 @@ def free(floor: FloorMap, points: Array) -> bool:
     return True
 
 
-def _tour(
-    floor: FloorMap,
-    cell: Cell,
-    heading_rad: float,
-    tour: Sequence[int],
-    count: int,
-    rng: np.random.Generator,
-    notes: list[str],
-) -> list[int]:
+def _tour(job: _Job, cell: Cell, heading_rad: float, tour: Sequence[int], count: int) -> list[int]:
     """Headings in quarter turns, from landmark to landmark: the window's tour, then any.
 
     The tour goes the way that needs the least turn, mirrored where it goes none.
     """
+    floor, notes = job.floor, job.notes
     facing = heading_rad / QUARTER
     ways = sorted(range(4), key=lambda q: abs(math.remainder(q - facing, 4)))
     tours = [[(q + side * turn) % 4 for turn in tour] for side in (1, -1) for q in ways]
@@ -227,15 +223,15 @@ def _tour(
     del headings[count - 1 :]
     at = cell
     for heading in headings:
-        at = (at[0] + STEPS[heading][0], at[1] + STEPS[heading][1])
+        at = neighbour(at, heading)
     while len(headings) < count - 1:
         choice = [q for q in range(4) if floor.open(at, q)]
         if not choice:
             notes.append(f"no way on from cell {at[0]},{at[1]}: {count} landmarks not reached")
             break
         onward = [q for q in choice if not headings or (q - headings[-1]) % 4 != 2]
-        headings.append(int(rng.choice(onward or choice)))
-        at = (at[0] + STEPS[headings[-1]][0], at[1] + STEPS[headings[-1]][1])
+        headings.append(int(job.rng.choice(onward or choice)))
+        at = neighbour(at, headings[-1])
     return headings
 
 
@@ -243,21 +239,16 @@ def _open(floor: FloorMap, cell: Cell, headings: Sequence[int]) -> bool:
     for heading in headings:
         if not floor.open(cell, heading):
             return False
-        cell = (cell[0] + STEPS[heading][0], cell[1] + STEPS[heading][1])
+        cell = neighbour(cell, heading)
     return True
 
 
 # ---- other ways
 
 
-def _path(
-    floor: FloorMap,
-    laid: Mapping[Cell, Laid],
-    options: SimulationOptions,
-    rng: np.random.Generator,
-    notes: list[str],
-) -> Robot:
+def _path(job: _Job) -> Robot:
     """From waypoint to waypoint, turning on each, with a stop on cells."""
+    floor, laid, options = job.floor, job.laid, job.options
     places: list[Sequence[float]] = list(options.waypoints)
     for cell in options.cells:
         mark = laid.get(cell)
@@ -267,7 +258,7 @@ def _path(
                 hint=f"Name cells row,column of {floor.shape[0]} x {floor.shape[1]}",
             )
         places.append((mark.x_m, mark.y_m))
-    aimed = [_aim(place, options.aims.step_m, rng) for place in places]
+    aimed = [_aim(place, options.aims.step_m, job.rng) for place in places]
     line = np.concatenate(
         [
             np.linspace(one, other, 2 + int(np.hypot(*(other - one)) / STEP_M))
@@ -275,7 +266,7 @@ def _path(
         ]
     )
     if not free(floor, line):
-        notes.append("the path leaves the map, or goes over a hole or through a wall")
+        job.notes.append("the path leaves the map, or goes over a hole or through a wall")
     dx, dy = aimed[1] - aimed[0]
     robot = _begin([*aimed[0], math.atan2(dy, dx)], options)
     for place in aimed[1:]:
@@ -285,14 +276,9 @@ def _path(
     return robot
 
 
-def _pass(
-    floor: FloorMap,
-    laid: Mapping[Cell, Laid],
-    options: SimulationOptions,
-    rng: np.random.Generator,
-    notes: list[str],
-) -> Robot:
+def _pass(job: _Job) -> Robot:
     """One straight pass over one landmark from the circle of starts (section 3.5)."""
+    laid, options, rng = job.laid, job.options, job.rng
     cells = [
         cell
         for cell, mark in laid.items()
