@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, failures, options
-from locatk.core.errors import InputError, LocatkError
+from locatk.cli import console, options, recordings
+from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.calibrate import CalibrationReport, Drive
@@ -65,17 +64,12 @@ def map_(
     with console.working("Solving all together"):
         report = calibrate(floor, drives, left_out)
     maps.write_map(output, report.floor, overwrite=overwrite)
-    console.result(_text(output, report))
-    for note in report.notes:
-        console.say(note)
-    for name, why in report.left_out.items():
-        console.warn(f"{name}: {why}")
+    recordings.tell(_text(output, report), report.notes, report.left_out)
     if as_json:
         console.emit_json(_entry(sessions, output, report))
-    if report.left_out:
-        count = len(report.left_out)
-        what = "recording or visit was" if count == 1 else "recordings or visits were"
-        raise failures.Incomplete(f"{count} {what} not used")
+    recordings.check_all_used(
+        report.left_out, "recording or visit was", "recordings or visits were"
+    )
 
 
 def _attached(path: Path) -> FloorMap:
@@ -101,10 +95,9 @@ def _drives(
 
     drives: list[Drive] = []
     left_out: dict[str, str] = {}
-    wait = console.working("Reading") if len(sessions) == 1 else contextlib.nullcontext()
-    with wait, console.progress(sessions, "Reading") as bar:
+    with recordings.walk(sessions, "Reading") as bar:
         for path in bar:
-            try:
+            with recordings.sparing(path, left_out, alone=len(sessions) == 1):
                 session = Session.open(path)
                 if same:
                     _check_same(floor, _attached(path), path)
@@ -117,11 +110,6 @@ def _drives(
                         left_out[name] = drive
                     else:
                         drives.append(drive)
-            except LocatkError as error:
-                if len(sessions) == 1:
-                    error.file = error.file or str(path)  # a solver knows arrays, not files
-                    raise
-                left_out[str(path)] = error.message
     return drives, left_out
 
 

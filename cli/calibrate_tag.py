@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, failures, options
+from locatk.cli import console, options, recordings
 from locatk.cli.solve import speed_option
-from locatk.core.errors import InputError, LocatkError
+from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
     from locatk.core.polaris.calibrate import CalibrationReport, Pass
@@ -59,16 +58,10 @@ def tag(
     passes, left_out = _passes(sessions, tags, speed, artifact is None)
     report = calibrate(tags, passes, left_out)
     files.write_tags(output, report.tags, overwrite=overwrite)
-    console.result(_text(output, report))
-    for note in report.notes:
-        console.say(note)
-    for name, why in report.left_out.items():
-        console.warn(f"{name}: {why}")
+    recordings.tell(_text(output, report), report.notes, report.left_out)
     if as_json:
         console.emit_json(_entry(sessions, output, report))
-    if report.left_out:
-        count = len(report.left_out)
-        raise failures.Incomplete(f"{count} {'pass was' if count == 1 else 'passes were'} not used")
+    recordings.check_all_used(report.left_out, "pass was", "passes were")
 
 
 def _attached(path: Path) -> Tags:
@@ -100,21 +93,17 @@ def _passes(
     wanted = polaris.SolveOptions(method="joint", speed_mps=speed)
     passes: list[Pass] = []
     left_out: dict[str, str] = {}
-    wait = console.working("Solving") if len(sessions) == 1 else contextlib.nullcontext()
-    with wait, console.progress(sessions, "Solving") as bar:
+    with recordings.walk(sessions, "Solving") as bar:
         for path in bar:
-            try:
+            solution = None
+            with recordings.sparing(path, left_out, alone=len(sessions) == 1):
                 session = Session.open(path)
                 if same:
                     _check_same(tags, _attached(path), path)
                 samples = observations.read_samples(session)
                 odometry = observations.read_odometry(session)
                 solution = polaris.solve(samples, design, wanted, odometry=odometry)
-            except LocatkError as error:
-                if len(sessions) == 1:
-                    error.file = error.file or str(path)  # a solver knows arrays, not files
-                    raise
-                left_out[str(path)] = error.message
+            if solution is None:
                 continue
             if not solution.detections:
                 left_out[str(path)] = "no tag was seen"

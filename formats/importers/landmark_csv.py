@@ -21,6 +21,7 @@ from locatk.core.geometry import heading_of, quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.columns import UNITS, Column, by_quantity, find
+from locatk.formats.importers.readings import leave_out, no_reading
 from locatk.formats.importers.table import Table, read_table
 
 Array = NDArray[np.float64]
@@ -40,9 +41,6 @@ POSE = ("x", "y", "heading")
 """What the columns of odometry are called."""
 
 VOLTS = ("v", "mv")
-
-SILENT_ROWS = 10
-"""A sensor that says the same in all rows, and at least so many, is dead or saw nothing."""
 
 FEWEST_UPDATES = 10
 """With fewer poses that differ nothing is said of how often odometry is new."""
@@ -178,7 +176,11 @@ def read_landmarks(
     if len(odometry) < poses:
         imported.facts["odometry"] = f"{poses - len(odometry)} repeated poses are passed over"
     lines = [table.lines[row] for row in np.flatnonzero(there)]
-    _leave_out(imported, table, [column.name for column in readings], lines)
+    by_axis = imported.samples.field_t[:, :, None]
+    names = [column.name for column in readings]
+    imported.left_out, imported.warnings = leave_out(
+        by_axis, no_reading(by_axis), table.file, names, lines
+    )
     imported.warnings += _doubts(odometry)
     if imported.left_out == field_t.size:
         raise InputError(
@@ -313,29 +315,6 @@ def _updates(poses: Array) -> NDArray[np.int64]:
         return np.arange(n)
     stands = last[last - first + 1 > 2 * held]
     return np.unique(np.concatenate([first, stands, [n - 1]]))
-
-
-def _leave_out(
-    imported: ImportedHalls, table: Table, names: Sequence[str], lines: Sequence[int]
-) -> None:
-    """Make ``nan`` of what cannot be used, and say so."""
-    field_t = imported.samples.field_t
-    missing = np.isnan(field_t)
-    dead = np.zeros_like(missing)
-    if len(field_t) >= SILENT_ROWS:
-        dead[:] = (field_t == field_t[0]).all(axis=0)
-    for bad, words in (
-        (missing, "no number"),
-        (dead, "the same in all rows, as of a sensor that is dead"),
-    ):
-        for sensor in np.flatnonzero(bad.any(axis=0)).tolist():
-            rows = int(np.count_nonzero(bad[:, sensor]))
-            line = lines[int(np.argmax(bad[:, sensor]))]
-            imported.warnings.append(
-                f"{table.file}:{line}: {names[sensor]} has {words} in {rows} rows: left out"
-            )
-    field_t[missing | dead] = np.nan
-    imported.left_out = int(np.count_nonzero(missing | dead))
 
 
 def _doubts(odometry: Trajectory) -> list[str]:

@@ -26,6 +26,7 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.polaris import mlx90393
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.tag import Tags
+from locatk.formats.importers.readings import Bad, leave_out, no_reading
 from locatk.formats.importers.table import TIME, Table, read_table
 
 Array = NDArray[np.float64]
@@ -40,9 +41,6 @@ PUBLISHED_TAGS = Tags(
     notes=("assumed on import: the design of the published tags, and all of their ids",),
 )
 """The paper's default tag: 3 x 3 cells of 40 mm, five magnets of 2 x 0.5 mm at 10 mm."""
-
-SILENT_ROWS = 10
-"""A sensor that says the same in all rows, and at least so many, is dead: others have noise."""
 
 RATES_AGREE = 0.05
 """Relative difference up to which stamps and rate are the same."""
@@ -119,7 +117,12 @@ def read_polaris(path: Path, *, rate_hz: float, spacing_m: float) -> ImportedSam
         },
         warnings,
     )
-    _leave_out(imported, table, sensors)
+    missing, dead = no_reading(field_t)
+    reasons = (missing, _beyond(imported.samples), dead)
+    imported.left_out, lost = leave_out(
+        imported.samples.field_t, reasons, table.file, sensors, table.lines
+    )
+    warnings += lost
     if imported.left_out == field_t.size:
         raise InputError("no value that can be used", file=path, hint=warnings[-1])
     return imported
@@ -217,26 +220,8 @@ def _times(table: Table, rate_hz: float, warnings: list[str]) -> NDArray[np.int6
     return start + np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
 
 
-def _leave_out(imported: ImportedSamples, table: Table, sensors: list[str]) -> None:
-    """Make ``nan`` of what cannot be used, and say so."""
-    field_t, array = imported.samples.field_t, imported.samples.array
-    missing = np.isnan(field_t)
-    # The last count of a scale is where everything above it ends up.
-    saturated = np.abs(field_t) > array.range_t - 1.5 * array.quantum_t
-    dead = np.zeros_like(missing)
-    if len(table) >= SILENT_ROWS:
-        dead[:] = (field_t == field_t[0]).all(axis=(0, 2))[:, None]
-    for bad, words in (
-        (missing, "no number"),
-        (saturated, f"more than an {array.sensor} can tell"),
-        (dead, "the same in all rows, as of a sensor that is dead"),
-    ):
-        for number in np.flatnonzero(bad.any(axis=(0, 2))).tolist():
-            mine = bad[:, number].any(axis=1)
-            rows, line = int(np.count_nonzero(mine)), table.lines[int(np.argmax(mine))]
-            imported.warnings.append(
-                f"{table.file}:{line}: {sensors[number]} has {words} in {rows} rows: left out"
-            )
-    bad = missing | saturated | dead
-    field_t[bad] = np.nan
-    imported.left_out = int(np.count_nonzero(bad))
+def _beyond(samples: Samples) -> Bad:
+    """What a sensor cannot tell: the last count of a scale is where all above it ends up."""
+    array = samples.array
+    saturated = np.abs(samples.field_t) > array.range_t - 1.5 * array.quantum_t
+    return saturated, f"more than an {array.sensor} can tell"
