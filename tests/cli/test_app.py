@@ -6,6 +6,7 @@ import errno
 import importlib
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -56,7 +57,7 @@ def test_examples_are_valid_usage(path: tuple[str, ...], monkeypatch: pytest.Mon
     for line in text.split("Examples:")[1].splitlines():
         if not line.strip().startswith("locatk "):
             continue
-        args = line.split()[1:]
+        args = shlex.split(line)[1:]
         context = click.Context(app)
         command: click.Command = app
         while isinstance(command, click.Group):
