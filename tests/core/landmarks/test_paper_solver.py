@@ -1,0 +1,78 @@
+"""The published method on whole recordings: what it finds, and what it says it does not."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.simulate import NONE, Simulated, SimulationOptions, simulate
+from locatk.core.landmarks.solver import SolveOptions, solve
+from locatk.core.solution import Solution
+
+PAPER = SolveOptions(method="paper")
+
+
+@pytest.fixture(scope="module")
+def published(data: Path) -> FloorMap:
+    lines = (data / "landmarks" / "or16_L_24x24.txt").read_text().splitlines()[1:]
+    return FloorMap(np.array([[int(letter, 16) for letter in line] for line in lines if line]))
+
+
+@functools.cache
+def session(codes: bytes, seed: int) -> Simulated:
+    floor = FloorMap(np.frombuffer(codes, np.int64).reshape(24, 24))
+    return simulate(floor, SimulationOptions(seed=seed, errors=NONE, rate_hz=100))
+
+
+def solved(floor: FloorMap, seed: int, told: FloorMap | None) -> tuple[Simulated, Solution]:
+    one = session(np.ascontiguousarray(floor.codes).tobytes(), seed)
+    return one, solve(one.samples, told, PAPER, odometry=one.odometry)
+
+
+def test_an_l_is_a_place_or_a_note(published: FloorMap) -> None:
+    located = 0
+    for seed in range(4):
+        one, found = solved(published, seed, published)
+        assert found.method == "paper"
+        if not found.trajectories:
+            assert any("not localised" in note for note in found.notes)
+            continue
+        located += 1
+        told, truth = found.trajectories[0], one.truth[0]
+        start = truth.time_ns[0]
+        at = [np.interp(told.time_ns - start, truth.time_ns - start, c) for c in truth.position.T]
+        away = np.hypot(*(told.position - np.column_stack(at))[:, :2].T)
+        assert away.max() < 0.03
+        assert np.median(away) < 0.01
+        cells = {event.cell for event in one.events}
+        told_cells = {tuple(s["cell"]) for s in found.detections if s["cell"]}
+        assert len(told_cells & cells) >= 3
+        np.testing.assert_array_equal(told.time_ns, one.odometry[0].time_ns)
+        assert np.isnan(told.covariance).all()
+    assert located >= 2
+
+
+def test_without_a_map_there_is_a_note_and_no_place(published: FloorMap) -> None:
+    _, found = solved(published, 0, None)
+    assert not found.trajectories
+    assert all(seen["cell"] is None for seen in found.detections)
+    assert any("no map" in note for note in found.notes)
+
+
+def test_no_odometry_is_an_error(published: FloorMap) -> None:
+    one, _ = solved(published, 0, None)
+    with pytest.raises(InputError, match="no odometry of robot"):
+        solve(one.samples, published, PAPER)
+
+
+def test_a_map_that_has_not_these_three_is_told(published: FloorMap) -> None:
+    other = FloorMap(np.zeros((24, 24), np.int64))
+    _, found = solved(published, 1, other)
+    assert not found.trajectories
+    assert not found.facts["robots"]["robot"]["localised"]
+    assert any("not localised" in note for note in found.notes)

@@ -1,0 +1,163 @@
+"""Where a recording has visits, and what is taken out of it, against simulated sessions."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.simulate import Errors, Simulated, SimulationOptions, simulate
+from locatk.core.landmarks.trace import Drift
+from locatk.core.landmarks.visits import Visit, check_way, driven, find
+
+CODES = np.random.default_rng(3).integers(0, 16, (6, 6))
+
+GEOMETRY = Geometry()
+
+
+@functools.cache
+def session(pitch_m: float = 0.2, noise_t: float = 1.5e-4) -> Simulated:
+    floor = FloorMap(CODES, pitch_m=pitch_m)
+    way = ((1, 1), (1, 4), (3, 4))
+    errors = Errors(noise_t=noise_t, offset_t=2e-4)
+    return simulate(
+        floor, SimulationOptions(strategy="path", cells=way, errors=errors, rate_hz=60, seed=4)
+    )
+
+
+def visits_of(one: Simulated) -> list[Visit]:
+    run = driven(one.samples[0], one.odometry[0])
+    return find(run, one.floor.geometry, Drift(), one.floor.pitch_m)
+
+
+@pytest.mark.parametrize("pitch_m", [0.16, 0.2, 0.3])
+@pytest.mark.parametrize("noise_t", [2e-5, 1.5e-4])
+def test_one_visit_a_landmark(pitch_m: float, noise_t: float) -> None:
+    one = session(pitch_m, noise_t)
+    want = [(1, 1), (1, 2), (1, 3), (1, 4), (2, 4), (3, 4)]
+    assert [event.cell for event in one.events] == want
+    found = visits_of(one)
+    assert len(found) == len(want)
+    for visit, event in zip(found, one.events, strict=True):
+        assert one.samples[0].time_ns[visit.first] <= event.nearest_ns
+        assert one.samples[0].time_ns[visit.stop - 1] >= event.nearest_ns
+    for before, after in pairwise(found):
+        assert before.stop <= after.first
+
+
+def test_the_reference_is_where_the_robot_is_near() -> None:
+    one = session()
+    truth = one.truth[0]
+    # The first and the last one are left or reached at rest on the landmark.
+    for visit, event in list(zip(visits_of(one), one.events, strict=True))[1:-1]:
+        at = np.searchsorted(truth.time_ns, visit.time_ns[visit.trace.reference])
+        away = np.hypot(*(truth.position[at, :2] - one.floor.place(event.cell)))
+        assert away < event.nearest_m + 0.025
+
+
+def test_bins_are_means_of_their_samples() -> None:
+    one = session()
+    run = driven(one.samples[0], one.odometry[0])
+    for visit in visits_of(one):
+        assert visit.trace.weight.sum() == visit.stop - visit.first
+        own = (run.samples.field_t - run.offset_t)[visit.first : visit.stop].sum(axis=0)
+        told = visit.trace.weight @ visit.trace.value_t
+        np.testing.assert_allclose(told, own, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(visit.trace.pose[visit.trace.reference], 0, atol=1e-12)
+
+
+def test_standing_for_minutes_costs_no_bins() -> None:
+    options = SimulationOptions(
+        strategy="path", cells=((1, 1), (1, 2)), stop_s=60, rate_hz=60, seed=1
+    )
+    for visit in visits_of(simulate(FloorMap(CODES), options)):
+        assert len(visit.trace) < 150
+
+
+def test_offsets_and_noise_are_found() -> None:
+    """With the Earth's field, as it is in the recording; the noise where it is not told."""
+    one = session()
+    silent = replace(one.samples[0], sensors=replace(one.samples[0].sensors, noise_t=float("nan")))
+    run = driven(silent, one.odometry[0])
+    assert run.noise_t == pytest.approx(1.5e-4, rel=0.25)
+    away = np.hypot(
+        *(one.truth[0].position[:, None, :2] - [one.floor.place(c) for c in one.floor.cells()]).T
+    ).min(axis=0)
+    quiet = one.samples[0].field_t[away > 0.13]
+    if len(quiet) > 50:
+        np.testing.assert_allclose(run.offset_t, np.median(quiet, axis=0), atol=1e-4)
+
+
+def test_saturated_readings_are_taken_out_and_told() -> None:
+    one = session()
+    limit = 0.02
+    clipped = replace(
+        one.samples[0],
+        sensors=replace(one.samples[0].sensors, range_t=limit),
+        field_t=np.clip(one.samples[0].field_t, -limit, limit),
+    )
+    run = driven(clipped, one.odometry[0])
+    gone = np.isnan(run.samples.field_t).sum()
+    assert gone == (np.abs(clipped.field_t) >= 0.999 * limit)[: len(run.samples)].sum()
+    assert any("saturated" in note for note in run.notes)
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e-3])
+def test_dead_sensors_are_taken_out_and_named(value: float) -> None:
+    one = session()
+    field = one.samples[0].field_t.copy()
+    field[:, 2] = value
+    run = driven(replace(one.samples[0], field_t=field), one.odometry[0])
+    assert np.isnan(run.samples.field_t[:, 2]).all()
+    assert not np.isnan(run.samples.field_t[:, :2]).any()
+    assert any("rear" in note for note in run.notes)
+
+
+def test_no_sensor_at_all_is_an_error() -> None:
+    one = session()
+    blind = replace(one.samples[0], field_t=np.full_like(one.samples[0].field_t, np.nan))
+    with pytest.raises(InputError, match="no hall sensor"):
+        driven(blind, one.odometry[0])
+
+
+def test_odometry_is_wanted() -> None:
+    one = session()
+    with pytest.raises(InputError, match="no odometry of robot"):
+        driven(one.samples[0], None)
+    later = replace(one.odometry[0], time_ns=one.odometry[0].time_ns + 10**12)
+    with pytest.raises(InputError, match="covers none"):
+        driven(one.samples[0], later)
+
+
+def test_samples_beyond_odometry_are_left_out_and_told() -> None:
+    one, own = session(), session().odometry[0]
+    half = len(own) // 2
+    short = replace(
+        own,
+        time_ns=own.time_ns[:half],
+        position=own.position[:half],
+        quaternion=own.quaternion[:half],
+        covariance=own.covariance[:half],
+    )
+    run = driven(one.samples[0], short)
+    assert run.samples.time_ns[-1] <= short.time_ns[-1]
+    left = len(one.samples[0]) - len(run.samples)
+    assert any(f"{left} samples without odometry" in note for note in run.notes)
+
+
+@pytest.mark.parametrize("factor", [1000, 100])
+def test_odometry_in_another_unit_is_an_error(factor: float) -> None:
+    one = session()
+    other = replace(one.odometry[0], position=one.odometry[0].position * factor)
+    with pytest.raises(InputError):
+        check_way(driven(one.samples[0], other), GEOMETRY)
+
+
+def test_odometry_in_metres_is_none() -> None:
+    check_way(driven(session().samples[0], session().odometry[0]), GEOMETRY)
