@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.simulate import Simulated, SimulationOptions
 
 
+MOST_TOLD = 12
+"""Landmarks of a way that are named."""
+
+
 class Form(click.ParamType):
     """Text of a fixed form, as in ``2,3:1``."""
 
@@ -206,7 +210,9 @@ def command(map_file: Path, output: Path, overwrite: bool, as_json: bool, **give
     for line in warnings:
         console.warn(line)
     told = _told(simulated)
-    visited = " ".join(f"{row},{column}" for row, column in _tour(simulated))
+    tour = [f"{row},{column}" for row, column in _tour(simulated)]
+    more = f" and {len(tour) - MOST_TOLD} more" if len(tour) > MOST_TOLD else ""
+    visited = " ".join(tour[:MOST_TOLD]) + more
     console.result(
         f"Wrote {output}: {told['samples']} samples of {told['device']}, over "
         f"{'landmarks ' + visited if visited else 'no landmark'}, "

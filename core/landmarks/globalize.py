@@ -122,7 +122,8 @@ def locate(
             pairwise(sightings), pairwise(kept), strict=True
         )
     ]
-    seen = [_seen(hypotheses, floor, misread) for hypotheses in kept]
+    read = [_seen(hypotheses, floor, misread) for hypotheses in kept]
+    seen = list(read)
     every = [sum(one.probability for _, one in hypotheses) / CODES for hypotheses in kept]
     for number, code in _again(kept, steps).items():
         # How a landmark is laid is drawn once: a second look tells nothing of where it is.
@@ -142,13 +143,14 @@ def locate(
         )
         backward.append(_normal(*later))
     found = []
-    for hypotheses, (past, out), (future, still) in zip(
-        kept, forward, reversed(backward), strict=True
+    for hypotheses, own, (past, out), (future, still) in zip(
+        kept, read, forward, reversed(backward), strict=True
     ):
         both, away = _normal(past * future, out * still)
         state = both.sum(axis=0)
         quarters, row, column = np.unravel_index(np.argmax(state), state.shape)
-        number = int(np.argmax(both[:, quarters, row, column]))
+        # Of a landmark seen again the map has a word too in which hypothesis is right.
+        number = int(np.argmax((both * own)[:, quarters, row, column]))
         found.append(
             Located(
                 (int(row) - PAD, int(column) - PAD),

@@ -23,7 +23,7 @@ FAR_OFF = 2.5
 FEWEST_WRONG = 2
 
 MOST_WRONG = 1 / 3
-"""Share of misread landmarks from which on a map is not believed."""
+"""Share of misread and unexplained landmarks from which on a map is not believed."""
 
 
 def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict[Cell, float]:
@@ -38,12 +38,14 @@ def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict
     return found
 
 
-def contradicted(usable: list[Seen], floor: FloorMap) -> bool:
-    """Whether the map is as often wrong about what was seen as no map of the floor can be."""
-    wrong = sum(
+def contradicted(found: Recording, usable: list[Seen], floor: FloorMap) -> bool:
+    """Whether map and recording differ as often as those of one floor cannot."""
+    misread = sum(
         detection(one.sighting, one.located, floor)["refused"] == "misread" for one in usable
     )
-    return wrong >= FEWEST_WRONG and wrong > MOST_WRONG * len(usable)
+    unexplained = sum(one.sighting.refused == "not_explained" for one in found.seen)
+    wrong = misread + unexplained
+    return wrong >= FEWEST_WRONG and wrong > MOST_WRONG * (len(usable) + unexplained)
 
 
 def why_not(found: Recording, sure: float) -> list[str]:

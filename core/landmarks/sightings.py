@@ -26,6 +26,9 @@ UNEXPLAINED = 6.0
 VISITS_TRIED = 3
 """Unexplained visits by which the sensors are questioned."""
 
+MOST_BAD = 0.25
+"""Share of unexplained visits at which the sensors are not yet questioned."""
+
 MOST_SENSORS = 4
 """Sensors up to which every order is tried."""
 
@@ -130,7 +133,7 @@ def check_sensors(
     """
     bad = [n for n, value in enumerate(residual) if value > UNEXPLAINED]
     names = run.samples.sensors.names
-    if 2 * len(bad) <= len(visits) or len(names) > MOST_SENSORS:
+    if len(bad) <= MOST_BAD * len(visits) or len(names) > MOST_SENSORS:
         return None
     bad = sorted(bad, key=lambda n: -len(visits[n].trace))[:VISITS_TRIED]
 

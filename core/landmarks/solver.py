@@ -32,7 +32,10 @@ ALONE_T = 3e-5
 """What the model leaves where the neighbours' fields are taken off."""
 
 MISFIT = 2.0
-"""Rms of what is left of all fields, in standard deviations, from which on it is told."""
+"""Rms of what is left of all fields, in standard deviations, from which on it is told..."""
+
+IMPOSSIBLE = 12.0
+"""... and from which on the poses are not."""
 
 LAID_M, LAID_RAD = 1.5e-3, 0.012
 """Standard deviations with which landmarks are taken to be laid."""
@@ -122,10 +125,10 @@ def placed(
         "landmarks_seen": len(located),
         "landmarks_to_localise": first,
     }
-    if floor is not None and contradicted(usable, floor):
+    if floor is not None and contradicted(found, usable, floor):
         remarks = [
             f"{device}: not localised; too many of its landmarks are not those of the map: is "
-            "it the map of this floor?"
+            "it the map of this floor, and the odometry the right way round?"
         ]
         return [], remarks, told | {"localised": False}
     if floor is None:
@@ -156,6 +159,8 @@ def placed(
             f"{device}: fields miss the model by {smoothed.misfit:.2g} standard deviations; check "
             "clocks and scale of the odometry, the sensors and the landmarks' geometry"
         )
+    if smoothed.misfit > IMPOSSIBLE:
+        return [], remarks, told | {"localised": False}
     path = route.poses(
         device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
     )
