@@ -54,7 +54,7 @@ def test_examples_are_valid_usage(path: tuple[str, ...], monkeypatch: pytest.Mon
     monkeypatch.setattr(Path, "exists", lambda self, **_: True)
     monkeypatch.delenv("LOCATK_DATA", raising=False)
     text = CliRunner().invoke(app, [*path, "--help"]).stdout
-    for line in text.split("Examples:")[1].splitlines():
+    for line in text.split("Examples:")[1].replace("\\\n", " ").splitlines():
         if not line.strip().startswith("locatk "):
             continue
         args = shlex.split(line)[1:]
