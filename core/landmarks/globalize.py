@@ -73,7 +73,7 @@ class Located:
     probability : float
         Of this cell and heading, given all sightings.
     so_far : float
-        The highest of any cell and heading, given this sighting and those before it.
+        The same, given this sighting and those before it only.
     """
 
     cell: tuple[int, int]
@@ -157,7 +157,7 @@ def locate(
                 int(quarters),
                 hypotheses[number][0],
                 float(state[quarters, row, column]),
-                float(past.sum(axis=0).max()),
+                float(past[:, quarters, row, column].sum()),
             )
         )
     return found

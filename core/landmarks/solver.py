@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -117,7 +118,10 @@ def placed(
     device = found.run.samples.device
     usable = on_map(found, floor) if floor is not None else []
     located = [one.located for one in found.seen if one.located is not None]
-    sure = max((one.probability for one in located), default=0.0)
+    # The least sure of the places that are told; where none is, the surest of all.
+    sure = min((one.located.probability for one in usable if one.located), default=math.nan)
+    if not usable:
+        sure = max((one.probability for one in located), default=0.0)
     first = next((n for n, one in enumerate(located, 1) if one.so_far >= CERTAIN), None)
     told = {
         "localised": bool(usable),
@@ -138,8 +142,8 @@ def placed(
     remarks = []
     if sure < CERTAIN:
         remarks.append(
-            f"{device}: its place on the map has a probability of {sure:.4f}; one more landmark "
-            "would settle it"
+            f"{device}: its place on the map has a probability of {sure:.4f}"
+            + ("; one more landmark would settle it" if first is None else " at one landmark")
         )
     marks = expected(usable, floor)
     alone = replace(found.priors, floor_t=ALONE_T)
