@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from hypothesis import strategies as st
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import RANGE
 from locatk.core.dots.sheet import Manifest, Sheet
-from locatk.core.errors import ArtifactError, MissingDataError, OutputExistsError
 from locatk.formats import sheets
 from locatk.formats.sheets import dumps_camera, dumps_manifest, loads_camera, loads_manifest
 
@@ -99,21 +99,8 @@ def test_every_camera_comes_back_to_the_last_bit(camera: Camera) -> None:
 A4 = Sheet("A4-0001", (0, 3000), (393, 555), (24, 32), (210.0, 297.0), (5.08, 7.62))
 
 
-def test_files(tmp_path: Path) -> None:
-    path, lens = tmp_path / "sheet.toml", tmp_path / "camera.toml"
-    manifest, camera = Manifest((A4,), codec="libdots"), Camera((188, 120), 900.0, (93.5, 59.5))
-    for write, read, file, value in (
-        (sheets.write_manifest, sheets.read_manifest, path, manifest),
-        (sheets.write_camera, sheets.read_camera, lens, camera),
-    ):
-        write(file, value)
-        assert read(file) == value
-        with pytest.raises(OutputExistsError):
-            write(file, value)
-        write(file, value, overwrite=True)
-        with pytest.raises(MissingDataError):
-            read(tmp_path / "none.toml")
-    assert "# 199.6 x 281.9 mm of pattern" in path.read_text("utf-8")
+def test_sheets_tell_how_large_they_are() -> None:
+    assert "# 199.6 x 281.9 mm of pattern" in dumps_manifest(Manifest((A4,), codec="libdots"))
 
 
 def test_the_examples_of_the_documentation(root: Path) -> None:
@@ -215,13 +202,10 @@ def test_tiles_share_their_rims_and_lie_on_the_floor() -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_named(text: str, where: str, words: str) -> None:
-    with pytest.raises(ArtifactError) as caught:
-        loads_manifest(text, file="sheet.toml")
-    error = caught.value
-    assert error.where == where
-    assert words in error.message
-    assert str(error).endswith(f" in sheet.toml:{where}")
+def test_what_is_wrong_is_named(
+    refused: Callable[..., None], text: str, where: str, words: str
+) -> None:
+    refused(sheets.MANIFEST, text, where, words)
 
 
 def test_sheets_that_touch_or_are_in_other_sections_share_nothing() -> None:
@@ -255,11 +239,10 @@ def test_a_camera_by_hand() -> None:
         (CAMERA + "k = 1", "k", "unknown key"),
     ],
 )
-def test_what_is_wrong_with_a_camera_is_named(text: str, where: str, words: str) -> None:
-    with pytest.raises(ArtifactError) as caught:
-        loads_camera(text, file="camera.toml")
-    assert caught.value.where == where
-    assert words in caught.value.message
+def test_what_is_wrong_with_a_camera_is_named(
+    refused: Callable[..., None], text: str, where: str, words: str
+) -> None:
+    refused(sheets.CAMERA, text, where, words)
 
 
 @given(cameras())
@@ -271,11 +254,3 @@ def test_a_camera_that_is_read_sees_every_pixel_once(camera: Camera) -> None:
     back = read.distort(read.undistort(corners.astype(float)))
     # Near the limit the root is steep: a millionth of the frame is what is left of 16 digits.
     np.testing.assert_allclose(back, corners, atol=1e-3 * max(camera.size))
-
-
-@given(st.text(max_size=80))
-def test_any_text_is_a_manifest_or_an_error(text: str) -> None:
-    with pytest.raises(ArtifactError):
-        loads_manifest(HEAD + "x" + text)
-    with pytest.raises(ArtifactError):
-        loads_camera(CAMERA + "x" + text)
