@@ -162,3 +162,27 @@ def test_odometry_in_another_frame_is_the_same() -> None:
     moved = replace(own, position=own.position @ turn + [5, -3, 0], quaternion=turned)
     again = solver.solve(one.samples, FLOOR, odometry=[moved]).trajectories[0]
     np.testing.assert_allclose(again.position, told.position, atol=2e-5)
+
+
+def test_a_misfit_of_odometry_is_spread_over_the_way() -> None:
+    """Between two visits that are farther apart than odometry tells."""
+    one = session(3, clean=True)[0]
+    recording = solver.read(one.samples[0], one.odometry[0], FLOOR, SolveOptions())
+    pair = [item.visit for item in (recording.seen[1], recording.seen[5])]
+    off = np.array([0.003, -0.002])
+    stays = []
+    for number, visit in enumerate(pair):
+        pose = visit.origin + [*(number * off), 0.0]
+        width = visit.trace.correction.shape[2]
+        stays.append(StayPose(pose, np.zeros(width), np.eye(3 + width) * 1e-8))
+    told = route.poses("robot", pair, stays, recording.odometry, recording.priors)
+    shift = told.position[:, :2] - recording.odometry.position[:, :2]
+    between = (told.time_ns > pair[0].time_ns[-1]) & (told.time_ns < pair[1].time_ns[0])
+    assert between.sum() > 20
+    before = told.time_ns <= pair[0].time_ns[-1]
+    np.testing.assert_allclose(shift[before][-1], 0, atol=2e-4)
+    np.testing.assert_allclose(shift[told.time_ns >= pair[1].time_ns[0]][0], off, atol=2e-4)
+    share = shift[between] @ off / (off @ off)
+    assert share[0] < 0.2
+    assert share[-1] > 0.8
+    assert np.abs(np.diff(share)).max() < 0.2

@@ -106,6 +106,15 @@ def test_a_random_walk_grows_as_a_walk_does() -> None:
     np.testing.assert_allclose(sparse[-1] @ sparse[-1].T, spread[-1], rtol=1e-9)
 
 
+@pytest.mark.parametrize("length", [0.04, 0.2, 0.77])
+def test_a_walk_is_no_longer_for_being_cut(length: float) -> None:
+    """A way that is no whole number of units has its own share of them."""
+    way = np.zeros((101, 3))
+    way[:, 0] = np.linspace(0, length, 101)
+    last = corrections(way, 0, Drift(0, 0, 0, 1e-3, 0.0))[-1]
+    assert (last @ last.T)[0, 0] == pytest.approx(1e-6 * length / 0.15)
+
+
 def test_a_walk_of_heading_swings_the_way() -> None:
     way = np.zeros((601, 3))
     way[:, 0] = np.linspace(0, 1.5, 601)
