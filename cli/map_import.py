@@ -74,12 +74,13 @@ def command(
     import numpy as np
 
     from locatk.core.units import metres
+    from locatk.formats.files import read_text
     from locatk.formats.maps import dumps_map, loads_map, read_map, write_map
 
     format_name = format_of(source, format_name, FORMATS)
     inputs = [source] if like is None else [source, like]
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
-    text = _text(source)
+    text = read_text(source)
     pitch = None if pitch_mm is None else metres(pitch_mm)
     if format_name == "csv":
         from locatk.formats.map_csv import loads_csv as loads
@@ -125,14 +126,3 @@ def command(
                 "largest_offset_m": worst,
             }
         )
-
-
-def _text(path: Path) -> str:
-    from locatk.core.errors import FormatError, InputError
-
-    try:
-        return path.read_bytes().decode("utf-8")
-    except UnicodeDecodeError:
-        raise FormatError("not UTF-8 text", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None

@@ -273,7 +273,9 @@ def _waypoints(file: Path) -> tuple[tuple[float, float], ...]:
     """Places of a CSV with the columns ``x_mm,y_mm``, in metres."""
     import csv
 
-    rows = csv.reader(file.read_text(encoding="utf-8-sig").splitlines())
+    from locatk.formats.files import read_text
+
+    rows = csv.reader(read_text(file).removeprefix("\ufeff").splitlines())
     head = [name.strip() for name in next(rows, [])]
     if not {"x_mm", "y_mm"} <= set(head):
         raise FormatError(

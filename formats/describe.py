@@ -3,6 +3,7 @@ values."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -157,23 +158,34 @@ def polaris(session: Session) -> dict[str, Any]:
 
     A solution has tags and no samples.
     """
+    return _described(
+        session, tag_files.attached_tags, tags, "arrays", arrays, lambda each: array(each.array)
+    )
+
+
+def _described(
+    session: Session,
+    attached: Callable[[Session], Any],
+    told: Callable[[Any], dict[str, Any]],
+    name: str,
+    samples: Any,
+    sensors: Callable[[Any], dict[str, Any]],
+) -> dict[str, Any]:
+    """What is ``attached``, as it is ``told``, and the samples that the module ``samples``
+    reads, under ``name``, with the ``sensors`` that took them."""
     described: dict[str, Any] = {}
     try:
-        known = tag_files.attached_tags(session)
+        known = attached(session)
         if known is not None:
-            described |= tags(known)
-        if session.topics(arrays.TOPIC, arrays.SCHEMA):
-            found = arrays.read_samples(session)
-            described["arrays"] = [_samples(each) for each in found]
+            described |= told(known)
+        if session.topics(samples.TOPIC, samples.SCHEMA):
+            found = samples.read_samples(session)
+            described[name] = [{**_recorded(each), **sensors(each)} for each in found]
             described["devices"] = [each.device for each in found]
             described["samples"] = sum(map(len, found))
     except LocatkError as error:
         described["damage"] = session.damage or error.message
     return described
-
-
-def _samples(found: Samples) -> dict[str, Any]:
-    return {**_recorded(found), **array(found.array)}
 
 
 def _recorded(found: Samples | HallSamples) -> dict[str, Any]:
@@ -251,18 +263,6 @@ def landmarks(session: Session) -> dict[str, Any]:
 
     A solution has a map and no samples.
     """
-    described: dict[str, Any] = {}
-    try:
-        known = maps.attached_map(session)
-        if known is not None:
-            described |= floor(known)
-        if session.topics(halls.TOPIC, halls.SCHEMA):
-            found = halls.read_samples(session)
-            described["halls"] = [
-                {**_recorded(each), **hall_sensors(each.sensors)} for each in found
-            ]
-            described["devices"] = [each.device for each in found]
-            described["samples"] = sum(map(len, found))
-    except LocatkError as error:
-        described["damage"] = session.damage or error.message
-    return described
+    return _described(
+        session, maps.attached_map, floor, "halls", halls, lambda each: hall_sensors(each.sensors)
+    )

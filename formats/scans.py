@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import InputError, MissingDataError
+from locatk.core.errors import InputError
 from locatk.formats import images
+from locatk.formats.files import read_bytes
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,7 @@ def read_scan(path: str | os.PathLike[str]) -> Scan:
     InputError
         It is no picture, or a damaged one; see :func:`locatk.formats.images.decode`.
     """
-    try:
-        with open(path, "rb") as stream:
-            data = stream.read()
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingDataError("no such file", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
+    data = read_bytes(path)
     try:
         image = images.grey(images.decode(data).pixels)
     except InputError as error:

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import ArtifactError, InputError, MissingDataError
+from locatk.core.errors import ArtifactError
+from locatk.formats.files import read_bytes
 
 _REQUIRED: Any = object()
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
@@ -41,14 +42,7 @@ def read(path: str | os.PathLike[str]) -> Table:
     ArtifactError
         It is not TOML; see :func:`loads`.
     """
-    try:
-        with open(path, "rb") as stream:
-            data = stream.read()
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingDataError("no such file", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
-    return loads(data, path)
+    return loads(read_bytes(path), path)
 
 
 def check_format(table: Table, name: str, version: int) -> None:

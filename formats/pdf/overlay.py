@@ -18,7 +18,8 @@ import pikepdf
 from pikepdf import Array, Dictionary, Name, Pdf, Stream
 
 from locatk.core.dots.sheet import MM_PER_INCH
-from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.errors import FormatError, InputError
+from locatk.formats.files import read_bytes
 from locatk.formats.pdf.strip import BROKEN, Stripper
 
 MM_PER_POINT = MM_PER_INCH / 72
@@ -261,14 +262,7 @@ def _plain(value: float) -> float | int:
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
     """A document that can be read whole; what goes wrong with it later is damage, too."""
-    try:
-        with open(path, "rb") as stream:
-            head = stream.read(1024)
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingDataError("no such file", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
-    if b"%PDF-" not in head:
+    if b"%PDF-" not in read_bytes(path, 1024):
         raise FormatError("not a PDF", file=path)
     try:
         # Without repairing, which may lose pages and not say so.

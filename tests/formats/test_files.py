@@ -1,0 +1,30 @@
+"""Files that are read whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.formats.files import read_bytes, read_text
+
+
+def test_what_is_there_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes("\ufeffgrün\r\n".encode())
+    assert read_bytes(path) == path.read_bytes()
+    assert read_bytes(path, 4) == path.read_bytes()[:4]
+    assert read_text(path) == "\ufeffgrün\r\n"
+
+
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(FormatError, match=r"not UTF-8 text in .*a\.txt"):
+        read_text(path)
+    for missing in (tmp_path / "b.txt", path / "b.txt"):
+        with pytest.raises(MissingDataError, match=r"no such file in .*b\.txt"):
+            read_bytes(missing)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_text(tmp_path)
