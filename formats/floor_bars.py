@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.floor import Cell, FloorMap
-from locatk.core.landmarks.landmark import signs
+from locatk.core.landmarks.floor import Cell, FloorMap, laid_mark
 
 Array = NDArray[np.float64]
 
@@ -45,11 +44,7 @@ def bars_on_floor(floor: FloorMap, cell: Cell) -> tuple[Array, Array, Array]:
         Their middles in the map's frame, in metres; the directions in which they are
         magnetised; their strengths, positive where N, 0 where missing.
     """
-    place, heading = np.array(floor.place(cell)), 0.0
-    strength = signs(floor.codes[cell])
-    built = floor.built.get(cell)
-    if built is not None:
-        place, heading, strength = place + [built.x_m, built.y_m], built.heading_rad, built.strength
-    at = heading + np.arange(4) * np.pi / 2
-    middles = place + floor.geometry.radius_m * np.column_stack([np.cos(at), np.sin(at)])
-    return middles, at + np.where(strength < 0, -np.pi / 2, np.pi / 2), np.asarray(strength)
+    pose, strength = laid_mark(floor, cell)
+    at = pose[2] + np.arange(4) * np.pi / 2
+    middles = pose[:2] + floor.geometry.radius_m * np.column_stack([np.cos(at), np.sin(at)])
+    return middles, at + np.where(strength < 0, -np.pi / 2, np.pi / 2), strength

@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.bars import basis
-from locatk.core.landmarks.floor import HOLE, FloorMap
-from locatk.core.landmarks.gridfit import built_poses
-from locatk.core.landmarks.landmark import signs
+from locatk.core.landmarks.floor import HOLE, FloorMap, laid_mark
 
 RESOLUTION_M = 0.010
 
@@ -61,9 +59,8 @@ def draw(floor: FloorMap, resolution_m: float = RESOLUTION_M) -> Pixels:
     known = np.full((max(cell[0][-1] + 1, rows), max(cell[1][-1] + 1, columns)), False)
     known[:rows, :columns] = floor.codes != HOLE
     upward = np.where(known[np.ix_(*cell)], FREE, UNKNOWN).astype(np.uint8)
-    for at, (x, y, heading) in zip(floor.cells(), built_poses(floor).tolist(), strict=True):
-        built = floor.built.get(at)
-        strength = signs(floor.codes[at]) if built is None else built.strength
+    for at in floor.cells():
+        (x, y, heading), strength = laid_mark(floor, at)
         spans = []
         for middle, count in ((y - bottom, size[0]), (x - left, size[1])):
             first, last = ((middle + s * floor.pitch_m / 2) / resolution_m for s in (-1, 1))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.landmark import Geometry, signs
 
 Array = NDArray[np.float64]
 Cell = tuple[int, int]
@@ -133,3 +133,15 @@ class FloorMap:
             return False
         one, other = sorted([cell, (row, column)])
         return (one, other) not in self.walls
+
+
+def laid_mark(floor: FloorMap, cell: Cell) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pose (3,) in the map's frame and signed strengths (4,) of a landmark, as built as far as
+    that is known."""
+    pose = np.array([*floor.place(cell), 0.0])
+    strength = signs(floor.codes[cell])
+    built = floor.built.get(cell)
+    if built is not None:
+        pose = pose + [built.x_m, built.y_m, built.heading_rad]
+        strength = np.where(np.isfinite(built.strength), built.strength, strength)
+    return pose, strength
