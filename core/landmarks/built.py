@@ -34,14 +34,3 @@ def laid_code(floor: FloorMap, cell: Cell) -> int:
     there = np.abs(built.strength) >= GONE  # False where it is nan
     north = np.where(there, built.strength, signs(floor.codes[cell])) > 0
     return int(north @ (1 << np.arange(4)))
-
-
-def laid_mark(floor: FloorMap, cell: Cell) -> tuple[Array, Array]:
-    """Pose (3,) in the map's frame and signed strengths (4,) of a landmark as far as known."""
-    pose = np.array([*floor.place(cell), 0.0])
-    strength = signs(floor.codes[cell])
-    built = floor.built.get(cell)
-    if built is not None:
-        pose = pose + [built.x_m, built.y_m, built.heading_rad]
-        strength = np.where(np.isfinite(built.strength), built.strength, strength)
-    return pose, strength

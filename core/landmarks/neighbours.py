@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks import bars
-from locatk.core.landmarks.built import laid_mark
-from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.floor import HOLE, Cell, FloorMap, laid_mark
 from locatk.core.landmarks.trace import Trace, compose, sensor_places
 
 Array = NDArray[np.float64]

@@ -43,7 +43,7 @@ class SolveOptions:
     """
 
     method: str = "field"
-    misread: float = 0.01
+    misread: float = 0.02
     priors: Priors = field(default_factory=Priors)
 
     def __post_init__(self) -> None:

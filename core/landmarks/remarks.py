@@ -11,7 +11,7 @@ from locatk.core.landmarks.detections import detection
 from locatk.core.landmarks.floor import Cell, FloorMap
 from locatk.core.landmarks.recording import Recording, Seen
 
-CERTAIN = 0.9999
+CERTAIN = 0.99999
 """Probability from which on a place on the map needs no remark."""
 
 FEWEST_MARKS = 3

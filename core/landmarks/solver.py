@@ -142,7 +142,7 @@ def placed(
     remarks = []
     if sure < CERTAIN:
         remarks.append(
-            f"{device}: its place on the map has a probability of {sure:.4f}"
+            f"{device}: its place on the map has a probability of {sure:.5f}"
             + ("; one more landmark would settle it" if first is None else " at one landmark")
         )
     marks = expected(usable, floor)

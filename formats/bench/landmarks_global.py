@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks import globalize
 from locatk.core.landmarks.detections import LIKELY
-from locatk.core.landmarks.floor import STEPS, Cell, FloorMap
+from locatk.core.landmarks.floor import STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.landmark import CODES, PATTERNS, code_of, rotated
 from locatk.core.landmarks.recording import SolveOptions
 from locatk.core.landmarks.remarks import CERTAIN
@@ -141,15 +141,11 @@ def random_walk(floor: FloorMap, start: Cell, heading: int, rng: np.random.Gener
         open_ = [h for h in ((heading + t) % 4 for t in (0, 1, 3)) if floor.open(cells[-1], h)] or [
             (heading + 2) % 4
         ]
-        fresh = [h for h in open_ if _next(cells[-1], h) not in cells] or open_
+        fresh = [h for h in open_ if neighbour(cells[-1], h) not in cells] or open_
         heading = int(rng.choice(fresh))
-        cells.append(_next(cells[-1], heading))
+        cells.append(neighbour(cells[-1], heading))
         quarters.append(heading)
     return Walk(tuple(cells), tuple(quarters))
-
-
-def _next(cell: Cell, heading: int) -> Cell:
-    return cell[0] + STEPS[heading][0], cell[1] + STEPS[heading][1]
 
 
 def sightings(

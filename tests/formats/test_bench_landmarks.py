@@ -278,7 +278,7 @@ def test_windows_and_walks_go_from_cell_to_cell(floor: FloorMap) -> None:
         assert len(walk.cells) in (3, landmarks_global.LONGEST)
         for n, (here, there) in enumerate(zip(walk.cells, walk.cells[1:], strict=False)):
             # It looks along the way on which it came.
-            assert landmarks_global._next(here, walk.quarters[n + 1]) == there
+            assert neighbour(here, walk.quarters[n + 1]) == there
             assert 0 <= min(there) <= max(there) < 24
     left = landmarks_global.windows_of(floor)[0]
     assert [(q - left.quarters[0]) % 4 for q in left.quarters] == [0, 0, 1]

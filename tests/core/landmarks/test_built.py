@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from locatk.core.landmarks import globalize, neighbours
-from locatk.core.landmarks.built import laid_codes, laid_mark
-from locatk.core.landmarks.floor import HOLE, AsBuilt, FloorMap
+from locatk.core.landmarks.built import laid_codes
+from locatk.core.landmarks.floor import HOLE, AsBuilt, FloorMap, laid_mark
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import code_of, rotated, signs
 from locatk.core.landmarks.sighting import Hypothesis, Sighting
