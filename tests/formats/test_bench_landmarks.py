@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from locatk.core.landmarks import windows
-from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.floor import FloorMap, neighbour
 from locatk.core.landmarks.landmark import CODES, rotated
 from locatk.core.landmarks.simulate import Simulated, simulate
 from locatk.core.landmarks.simulate_options import NONE, SimulationOptions
