@@ -37,7 +37,7 @@ MOST = 8
 SAME = 3e-3
 """Difference of place (m) and heading (rad) up to which two ends are one."""
 
-HALF_PI = np.pi / 2
+HALF_PI = math.pi / 2
 
 FAULTY = 0.5
 """Standard deviation of a bar's strength that may be weak or missing."""
@@ -116,7 +116,7 @@ def explain(
     best = _best(found)
     off = np.abs(best.strength - signs(best.code)) / priors.strength
     if off.max() > SUSPICIOUS or best.residual_sigma > WHITE:
-        found += _faulty(trace, geometry, priors)
+        found += _faulty(trace, geometry, priors, float(best.parameters[2]))
     return _shares(found)
 
 
@@ -130,8 +130,12 @@ def _explained(
     priors: fit.Priors,
     laid: Array,
     grid: scan.Grid = scan.COARSE,
+    toward: float | None = None,
 ) -> list[Explanation]:
-    """Explanations by ``laid`` (L, 4), the bars that may be there."""
+    """Explanations by ``laid`` (L, 4), the bars that may be there.
+
+    Their frames are those nearest to the heading ``toward``; of None, to that of the best.
+    """
     coarse = trace.thinned(COARSE)
     starts = STARTS if grid == scan.COARSE else 3 * STARTS
     pose, which = scan.candidates(coarse, geometry, laid, starts, grid)
@@ -149,7 +153,9 @@ def _explained(
     strength = np.concatenate([problem.strength, again.strength])
     parameters = np.concatenate([first.parameters, second.parameters])
     keep = np.flatnonzero(odds > odds.max() - MARGIN)
-    strength, start = _in_one_frame(strength[keep], parameters[keep], odds[keep])
+    if toward is None:
+        toward = math.remainder(float(parameters[np.argmax(odds), 2]), HALF_PI)
+    strength, start = _in_one_frame(strength[keep], parameters[keep], toward)
     strength, start = _unlike(strength, start, odds[keep])
     problem = _problem(trace.thinned(FINE), geometry, priors, strength)
     return _explanations(problem, fit.descend(problem, start))
@@ -178,10 +184,12 @@ def _problem(trace: Trace, geometry: Geometry, priors: fit.Priors, strength: Arr
     return fit.Problem(trace, geometry, priors, strength, sigma)
 
 
-def _faulty(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explanation]:
+def _faulty(
+    trace: Trace, geometry: Geometry, priors: fit.Priors, toward: float
+) -> list[Explanation]:
     """Explanations by landmarks of which one bar is of any strength."""
     found = []
-    for one in _explained(trace, geometry, priors, scan.ONE_MISSING):
+    for one in _explained(trace, geometry, priors, scan.ONE_MISSING, toward=toward):
         bar = one.free
         odds = one.log_odds + math.log(priors.faulty)
         if abs(one.strength[bar]) > GONE:
@@ -192,11 +200,9 @@ def _faulty(trace: Trace, geometry: Geometry, priors: fit.Priors) -> list[Explan
     return found
 
 
-def _in_one_frame(strength: Array, parameters: Array, odds: Array) -> tuple[Array, Array]:
-    """The same landmarks in frames that differ by no quarter turn from that of the best."""
-    best = parameters[np.argmax(odds), 2]
-    best -= HALF_PI * np.round(best / HALF_PI)
-    turns = np.round((best - parameters[:, 2]) / HALF_PI).astype(np.int64)
+def _in_one_frame(strength: Array, parameters: Array, toward: float) -> tuple[Array, Array]:
+    """The same landmarks in frames that are no quarter turn off the heading ``toward``."""
+    turns = np.round((toward - parameters[:, 2]) / HALF_PI).astype(np.int64)
     turned = parameters.copy()
     turned[:, 2] += HALF_PI * turns
     bars = (np.arange(4) + turns[:, None]) % 4

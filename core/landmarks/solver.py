@@ -145,7 +145,7 @@ def placed(
             f"{device}: its place on the map has a probability of {sure:.5f}"
             + ("; one more landmark would settle it" if first is None else " at one landmark")
         )
-    marks = expected(usable, floor)
+    marks = expected(usable, floor, found.priors)
     alone = replace(found.priors, floor_t=ALONE_T)
     run = as_run(usable, found, floor)
     smoothed = smooth.smooth([run], marks, floor.geometry, alone)
@@ -171,7 +171,7 @@ def placed(
     return [path], remarks, told
 
 
-def expected(usable: Sequence[Seen], floor: FloorMap) -> dict[Cell, smooth.Mark]:
+def expected(usable: Sequence[Seen], floor: FloorMap, priors: Priors) -> dict[Cell, smooth.Mark]:
     """The landmarks of visits, as the map has them and as they were read."""
     marks: dict[Cell, smooth.Mark] = {}
     for one in usable:
@@ -179,7 +179,7 @@ def expected(usable: Sequence[Seen], floor: FloorMap) -> dict[Cell, smooth.Mark]
         cell, quarters = one.located.cell, one.located.quarters
         best = one.explanations[one.located.hypothesis]
         strength = signs(rotated(best.code, quarters))
-        sigma = np.full(4, Priors().strength)
+        sigma = np.full(4, priors.strength)
         pose = np.array([*floor.place(cell), 0.0])
         spread = np.array([LAID_M, LAID_M, LAID_RAD])
         built = floor.built.get(cell)

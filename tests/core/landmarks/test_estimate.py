@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_of
-from locatk.core.landmarks.estimate import Explanation, explain, robot, stand
+from locatk.core.landmarks.bars import basis
+from locatk.core.landmarks.estimate import Explanation, _in_one_frame, explain, robot, stand
 from locatk.core.landmarks.fit import Priors
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
 from locatk.core.landmarks.simulate_options import NONE
@@ -139,10 +140,29 @@ def test_a_missing_bar_is_named_and_both_codes_kept() -> None:
     assert told[whole.found[0].code] == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.parametrize("toward", [-0.8, -0.1, 0.0, 0.7, 0.79, 1.2])
+def test_a_landmark_is_the_same_in_the_frame_of_another_hypothesis(toward: float) -> None:
+    rng = np.random.default_rng(1)
+    parameters = rng.uniform(-3, 3, (20, 5))
+    strength = rng.choice([-1.0, 0.0, 1.0], (20, 4))
+    bars, turned = _in_one_frame(strength, parameters, toward)
+    assert np.abs(turned[:, 2] - toward).max() <= math.pi / 4 + 1e-12
+    assert (turned[:, [0, 1, 3, 4]] == parameters[:, [0, 1, 3, 4]]).all()
+    points = rng.uniform(-0.05, 0.05, (7, 2))
+    for k in range(20):
+        fields = [
+            basis(
+                GEOMETRY,
+                points @ np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]),
+            )
+            @ laid
+            for a, laid in ((parameters[k, 2], strength[k]), (turned[k, 2], bars[k]))
+        ]
+        assert fields[0] == pytest.approx(fields[1], abs=1e-12)
+
+
 def field_of_bar(one: Read, bar: int) -> Array:
     """What one bar adds to a trace, laid as it was read."""
-    from locatk.core.landmarks.bars import basis
-
     mark = one.found[0].parameters[:3]
     c, s = math.cos(mark[2]), math.sin(mark[2])
     away = one.trace.places() - mark[:2]
