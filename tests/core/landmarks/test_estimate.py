@@ -151,22 +151,22 @@ def test_a_landmark_is_the_same_in_the_frame_of_another_hypothesis(toward: float
     points = rng.uniform(-0.05, 0.05, (7, 2))
     for k in range(20):
         fields = [
-            basis(
-                GEOMETRY,
-                points @ np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]),
-            )
-            @ laid
-            for a, laid in ((parameters[k, 2], strength[k]), (turned[k, 2], bars[k]))
+            basis(GEOMETRY, seen_under(angle, points)) @ laid
+            for angle, laid in ((parameters[k, 2], strength[k]), (turned[k, 2], bars[k]))
         ]
         assert fields[0] == pytest.approx(fields[1], abs=1e-12)
+
+
+def seen_under(angle: float, points: Array) -> Array:
+    """Points (n, 2) in a frame that is turned by an angle."""
+    c, s = math.cos(angle), math.sin(angle)
+    return points @ np.array([[c, -s], [s, c]])
 
 
 def field_of_bar(one: Read, bar: int) -> Array:
     """What one bar adds to a trace, laid as it was read."""
     mark = one.found[0].parameters[:3]
-    c, s = math.cos(mark[2]), math.sin(mark[2])
-    away = one.trace.places() - mark[:2]
-    local = away @ np.array([[c, -s], [s, c]])
+    local = seen_under(mark[2], one.trace.places() - mark[:2])
     return np.asarray(one.found[0].strength[bar] * basis(GEOMETRY, local)[..., bar])
 
 
