@@ -61,7 +61,8 @@ PyObject *bar_fields(PyObject *self, PyObject *args)
     const double *at = b[AT].buf;
     double *field = b[FIELD].buf, *slope = b[SLOPE].buf;
     Py_BEGIN_ALLOW_THREADS
-    for (Py_ssize_t i = 0; i < count; i++, at += 3, field += 4) {
+    for (Py_ssize_t i = 0; i < count; i++, at += 3, field += 4)
+    {
         double cos = 1, sin = 0;
         for (int k = 0; k < 4; k++) {
             const double u = cos * at[0] + sin * at[1], v = cos * at[1] - sin * at[0];
@@ -82,21 +83,21 @@ PyObject *bar_fields(PyObject *self, PyObject *args)
     return done(b, BUFFERS, 1);
 }
 
-/* Bilinear value at (i, j) of a square table, 0 outside. */
-static inline float look_up(const float *table, int size, float i, float j)
+/* Bilinear values of the four bars at (i, j) of a square table, which is inside. */
+static inline void look_up(const float *table, int size, float i, float j, float *unit)
 {
-    const float last = (float)(size - 1);
-    if (!(i >= 0 && j >= 0 && i < last && j < last)) return 0;
     const int a = (int)i, b = (int)j;
     const float di = i - (float)a, dj = j - (float)b;
-    const float *at = table + (ptrdiff_t)a * size + b;
-    return (1 - di) * ((1 - dj) * at[0] + dj * at[1])
-           + di * ((1 - dj) * at[size] + dj * at[size + 1]);
+    const float low = (1 - di) * (1 - dj), right = (1 - di) * dj, up = di * (1 - dj),
+                high = di * dj;
+    const float *at = table + 4 * ((ptrdiff_t)a * size + b), *next = at + 4 * (ptrdiff_t)size;
+    for (int k = 0; k < 4; k++)
+        unit[k] = low * at[k] + right * at[k + 4] + up * next[k] + high * next[k + 4];
 }
 
 /* Costs of what may be laid from the normal matrix of the four bars. */
-static void costs(const double *normal, const double *right, double power, double least,
-                  double most, const double *laid, int kinds, double *out)
+static void costs(const float *normal, const float *right, double power, double least, double most,
+                  const double *laid, int kinds, double *out)
 {
     for (int kind = 0; kind < kinds; kind++, laid += 4) {
         double top = 0, square = 0;
@@ -109,48 +110,62 @@ static void costs(const double *normal, const double *right, double power, doubl
     }
 }
 
+/* What a search is given, as locatk.core.landmarks.scan.scan_numpy has it. */
+typedef struct {
+    const double *points, *values, *weights;
+    const float *table;
+    int count, size;
+    double step;
+} Search;
+
+/* Normal matrix and right side of the four bars at one node: sums over all samples. */
+HOT static void gather(const Search *search, const double *centre, double turn,
+                       float normal[restrict 16], float right[restrict 4])
+{
+    const double c = cos(turn) / search->step, s = sin(turn) / search->step;
+    const float middle = (float)(search->size - 1) / 2;
+    for (int k = 0; k < 16; k++) normal[k] = 0;
+    for (int k = 0; k < 4; k++) right[k] = 0;
+    for (int i = 0; i < search->count; i++) {
+        const double x = search->points[2 * i] - centre[0];
+        const double y = search->points[2 * i + 1] - centre[1];
+        const float u = (float)(c * x + s * y), v = (float)(c * y - s * x);
+        if (fabsf(u) >= middle || fabsf(v) >= middle) continue;
+        float unit[4], weighted[4];
+        look_up(search->table, search->size, u + middle, v + middle, unit);
+        const float weight = (float)search->weights[i], value = (float)search->values[i];
+        for (int k = 0; k < 4; k++) weighted[k] = weight * unit[k];
+        for (int k = 0; k < 4; k++) right[k] += weighted[k] * value;
+        for (int k = 0; k < 4; k++)
+            for (int l = 0; l < 4; l++) normal[4 * k + l] += weighted[k] * unit[l];
+    }
+}
+
 PyObject *scan_landmarks(PyObject *self, PyObject *args)
 {
     enum { POINTS, VALUES, WEIGHTS, CENTRES, TURNS, TABLE, LAID, COST, BUFFERS };
     Py_buffer b[BUFFERS];
-    int count, nodes, turns, size, kinds;
-    double step, least, most;
+    Search search;
+    int nodes, turns, kinds;
+    double least, most;
     if (!PyArg_ParseTuple(args, "y*y*y*iy*iy*iy*idddy*iw*", &b[POINTS], &b[VALUES], &b[WEIGHTS],
-                          &count, &b[CENTRES], &nodes, &b[TURNS], &turns, &b[TABLE], &size, &step,
-                          &least, &most, &b[LAID], &kinds, &b[COST]))
+                          &search.count, &b[CENTRES], &nodes, &b[TURNS], &turns, &b[TABLE],
+                          &search.size, &search.step, &least, &most, &b[LAID], &kinds, &b[COST]))
         return NULL;
-    const double *points = b[POINTS].buf, *values = b[VALUES].buf, *weights = b[WEIGHTS].buf;
-    const double *centres = b[CENTRES].buf, *angle = b[TURNS].buf;
-    const double *laid = b[LAID].buf;
-    const float *table = b[TABLE].buf;
+    search.points = b[POINTS].buf;
+    search.values = b[VALUES].buf;
+    search.weights = b[WEIGHTS].buf;
+    search.table = b[TABLE].buf;
+    const double *centres = b[CENTRES].buf, *angle = b[TURNS].buf, *laid = b[LAID].buf;
     double *out = b[COST].buf;
-    const float middle = (float)(size - 1) / 2;
     Py_BEGIN_ALLOW_THREADS
     double power = 0;
-    for (int i = 0; i < count; i++) power += weights[i] * values[i] * values[i];
+    for (int i = 0; i < search.count; i++)
+        power += search.weights[i] * search.values[i] * search.values[i];
     for (int t = 0; t < turns; t++) {
-        const double c = cos(angle[t]) / step, s = sin(angle[t]) / step;
         for (int m = 0; m < nodes; m++, out += kinds) {
-            double normal[16] = {0}, right[4] = {0};
-            for (int i = 0; i < count; i++) {
-                const double x = points[2 * i] - centres[2 * m];
-                const double y = points[2 * i + 1] - centres[2 * m + 1];
-                const float u = (float)(c * x + s * y), v = (float)(c * y - s * x);
-                if (fabsf(u) >= middle || fabsf(v) >= middle) continue;
-                const float unit[4] = {
-                    look_up(table, size, u + middle, v + middle),
-                    look_up(table, size, v + middle, -u + middle),
-                    look_up(table, size, -u + middle, -v + middle),
-                    look_up(table, size, -v + middle, u + middle),
-                };
-                for (int k = 0; k < 4; k++) {
-                    const double weighted = weights[i] * unit[k];
-                    right[k] += weighted * values[i];
-                    for (int l = 0; l <= k; l++) normal[4 * k + l] += weighted * unit[l];
-                }
-            }
-            for (int k = 0; k < 4; k++)
-                for (int l = k + 1; l < 4; l++) normal[4 * k + l] = normal[4 * l + k];
+            float normal[16], right[4];
+            gather(&search, centres + 2 * m, angle[t], normal, right);
             costs(normal, right, power, least, most, laid, kinds, out);
         }
     }

@@ -172,20 +172,17 @@ def scan_numpy(
         x, y = np.moveaxis(points - centres[:, None], -1, 0)
         c, s = math.cos(turn), math.sin(turn)
         u, v = (c * x + s * y) / TABLE_STEP_M, (c * y - s * x) / TABLE_STEP_M
-        unit = np.empty((4, *u.shape))
-        for k in range(4):
-            i, j = u + last / 2, v + last / 2
-            inside = (i >= 0) & (j >= 0) & (i < last) & (j < last)
-            i, j = np.where(inside, i, 0), np.where(inside, j, 0)
-            a, b = i.astype(int), j.astype(int)
-            di, dj = i - a, j - b
-            unit[k] = inside * (
-                (1 - di) * ((1 - dj) * table[a, b] + dj * table[a, b + 1])
-                + di * ((1 - dj) * table[a + 1, b] + dj * table[a + 1, b + 1])
-            )
-            u, v = v, -u
-        right = np.einsum("kmn,n->mk", unit, weight * values)
-        normal = np.einsum("kmn,lmn,n->mkl", unit, unit, weight, optimize=True)
+        i, j = u + last / 2, v + last / 2
+        inside = (i >= 0) & (j >= 0) & (i < last) & (j < last)
+        i, j = np.where(inside, i, 0), np.where(inside, j, 0)
+        a, b = i.astype(int), j.astype(int)
+        di, dj = (i - a)[..., None], (j - b)[..., None]
+        unit = inside[..., None] * (
+            (1 - di) * ((1 - dj) * table[a, b] + dj * table[a, b + 1])
+            + di * ((1 - dj) * table[a + 1, b] + dj * table[a + 1, b + 1])
+        )
+        right = np.einsum("mnk,n->mk", unit, weight * values)
+        normal = np.einsum("mnk,mnl,n->mkl", unit, unit, weight, optimize=True)
         top = right @ laid.T
         square = np.einsum("ck,mkl,cl->mc", laid, normal, laid)
         gain = np.clip(top / np.maximum(square, 1e-300), *GAINS)
@@ -238,8 +235,8 @@ def _distinct(
 
 @functools.lru_cache(maxsize=4)
 def _table(geometry: Geometry) -> NDArray[np.float32]:
-    """Field of bar 0 over the landmark's plane, [x, y] from -REACH_M up in even steps."""
+    """Fields of the bars over the landmark's plane, [x, y, bar] from -REACH_M up in even steps."""
     count = round(REACH_M / TABLE_STEP_M)
     line = np.arange(-count, count + 1) * TABLE_STEP_M
     plane = np.stack(np.meshgrid(line, line, indexing="ij"), -1)
-    return np.ascontiguousarray(bars.basis(geometry, plane)[..., 0], np.float32)
+    return np.ascontiguousarray(bars.basis(geometry, plane), np.float32)
