@@ -106,7 +106,7 @@ def test_what_lies_before_and_after_all_visits_is_told_less_sure() -> None:
     one = session(2)[0]
     recording = solver.read(one.samples[0], one.odometry[0], FLOOR, SolveOptions())
     usable = solver.on_map(recording, FLOOR)
-    marks = solver.expected(usable, FLOOR)
+    marks = solver.expected(usable, FLOOR, recording.priors)
     middle = usable[2:4]
     smoothed = solver.smooth.smooth(
         [solver.as_run(middle, recording, FLOOR)], marks, FLOOR.geometry, recording.priors
