@@ -122,7 +122,8 @@ def locate(
             pairwise(sightings), pairwise(kept), strict=True
         )
     ]
-    read = [_seen(hypotheses, floor, misread) for hypotheses in kept]
+    laid = laid_codes(floor)
+    read = [_seen(hypotheses, laid, misread) for hypotheses in kept]
     seen = list(read)
     every = [sum(one.probability for _, one in hypotheses) / CODES for hypotheses in kept]
     for number, code in _again(kept, steps).items():
@@ -212,11 +213,13 @@ def _followed(sighting: Sighting) -> list[tuple[int, Hypothesis]]:
     return [(n, h) for n, h in every if n == 0 or h.probability > FAINT][:MOST]
 
 
-def _seen(hypotheses: list[tuple[int, Hypothesis]], floor: FloorMap, misread: float) -> Array:
+def _seen(
+    hypotheses: list[tuple[int, Hypothesis]], laid: NDArray[np.int64], misread: float
+) -> Array:
     """Likelihood (H, 4, rows, columns) of each hypothesis in each state, the pad included."""
-    codes = np.pad(laid_codes(floor), PAD, constant_values=HOLE)
+    codes = np.pad(laid, PAD, constant_values=HOLE)
     turned = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
-    inside = np.pad(np.ones(floor.shape, bool), PAD)
+    inside = np.pad(np.ones(laid.shape, bool), PAD)
     untold = np.where(inside, UNTOLD, BEYOND) / CODES
     out = np.empty((len(hypotheses), 4, *codes.shape))
     for place, (_, one) in enumerate(hypotheses):
