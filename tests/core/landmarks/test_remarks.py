@@ -1,0 +1,57 @@
+"""Sensors, floors and maps that are not as said: simulated with the fault, and named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.simulate import Faults, Simulated, SimulationOptions, simulate
+from locatk.core.landmarks.solver import solve
+from locatk.core.solution import Solution
+
+CODES = np.random.default_rng(11).integers(0, 16, (12, 12))
+
+FLOOR = FloorMap(CODES)
+
+CELLS = ((2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3))
+
+
+def drive(**options: object) -> Simulated:
+    given = {"strategy": "path", "cells": ((2, 2), (2, 5), (4, 5), (4, 3)), "rate_hz": 30.0}
+    return simulate(FLOOR, SimulationOptions(**given | {"seed": 1} | options))  # type: ignore[arg-type]
+
+
+def solved(one: Simulated, floor: FloorMap = FLOOR) -> Solution:
+    return solve(one.samples, floor, odometry=one.odometry)
+
+
+@pytest.mark.parametrize("sensor", range(4))
+def test_a_sensor_of_the_other_sign_is_named(sensor: int) -> None:
+    one = drive(strategy="paper", cells=(), seed=3, landmarks=3)
+    samples = one.samples[0]
+    field = samples.field_t * np.where(np.arange(4) == sensor, -1.0, 1.0)
+    name = samples.sensors.names[sensor]
+    with pytest.raises(InputError, match=f"the {name} sensor of robot has the other sign"):
+        solved(replace(one, samples=(replace(samples, field_t=field),)))
+
+
+def test_a_landmark_off_its_place_is_named_and_does_not_pull_the_others() -> None:
+    one = drive(faults=Faults(displaced=(((3, 5), (0.012, 0.0)),)))
+    found = solved(one)
+    named = [note for note in found.notes if "off its place" in note]
+    assert len(named) == 1
+    assert "landmark at 3,5 lies" in named[0]
+
+
+@pytest.mark.parametrize(("wrong", "believed"), [(1, True), (3, False)])
+def test_a_map_that_is_often_wrong_is_not_believed(wrong: int, believed: bool) -> None:
+    codes = CODES.copy()
+    for cell in CELLS[1::2][:wrong]:
+        codes[cell] = (codes[cell] + 5) % 16
+    found = solved(drive(), FloorMap(codes))
+    assert bool(found.trajectories) == believed
+    assert any("are not those of the map" in note for note in found.notes) != believed
