@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17locatk/lighthouse.proto\x12\x06locatk\x1a\x1fgoogle/protobuf/timestamp.proto\"\xa9\x01\n\x11LighthouseCapture\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x0f\n\x07time_ns\x18\x03 \x03(\x06\x12\x0e\n\x06sensor\x18\x04 \x03(\x07\x12\x0c\n\x04\x62its\x18\x05 \x03(\x06\x12\x12\n\npolynomial\x18\x06 \x03(\x0f\x12\x12\n\nbit_offset\x18\x07 \x03(\x0f\"\xb4\x01\n\x0fLighthouseSweep\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x0f\n\x07time_ns\x18\x03 \x03(\x06\x12\x0e\n\x06sensor\x18\x04 \x03(\x07\x12\x0f\n\x07\x63hannel\x18\x05 \x03(\x07\x12\x12\n\npolynomial\x18\x06 \x03(\x0f\x12\r\n\x05sweep\x18\x07 \x03(\x0f\x12\r\n\x05\x63ount\x18\x08 \x03(\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17locatk/lighthouse.proto\x12\x06locatk\x1a\x1fgoogle/protobuf/timestamp.proto\"\xbf\x01\n\x11LighthouseCapture\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x0f\n\x07time_ns\x18\x03 \x03(\x06\x12\x0e\n\x06sensor\x18\x04 \x03(\x07\x12\x0c\n\x04\x62its\x18\x05 \x03(\x06\x12\x12\n\npolynomial\x18\x06 \x03(\x0f\x12\x12\n\nbit_offset\x18\x07 \x03(\x0f\x12\x14\n\x0c\x64\x65vice_ticks\x18\x08 \x03(\x06\"\xca\x01\n\x0fLighthouseSweep\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x0f\n\x07time_ns\x18\x03 \x03(\x06\x12\x0e\n\x06sensor\x18\x04 \x03(\x07\x12\x0f\n\x07\x63hannel\x18\x05 \x03(\x07\x12\x12\n\npolynomial\x18\x06 \x03(\x0f\x12\r\n\x05sweep\x18\x07 \x03(\x0f\x12\r\n\x05\x63ount\x18\x08 \x03(\x01\x12\x14\n\x0c\x64\x65vice_ticks\x18\t \x03(\x06\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,7 +33,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'locatk.lighthouse_pb2', _gl
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_LIGHTHOUSECAPTURE']._serialized_start=69
-  _globals['_LIGHTHOUSECAPTURE']._serialized_end=238
-  _globals['_LIGHTHOUSESWEEP']._serialized_start=241
-  _globals['_LIGHTHOUSESWEEP']._serialized_end=421
+  _globals['_LIGHTHOUSECAPTURE']._serialized_end=260
+  _globals['_LIGHTHOUSESWEEP']._serialized_start=263
+  _globals['_LIGHTHOUSESWEEP']._serialized_end=465
 # @@protoc_insertion_point(module_scope)

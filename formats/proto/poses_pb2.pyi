@@ -26,7 +26,7 @@ class PoseTrack(_message.Message):
     def __init__(self, timestamp: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., device: _Optional[str] = ..., frame_id: _Optional[str] = ..., time_ns: _Optional[_Iterable[int]] = ..., position_m: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., covariance_m_rad: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Odometry(_message.Message):
-    __slots__ = ("timestamp", "device", "frame_id", "time_ns", "x_m", "y_m", "heading_rad")
+    __slots__ = ("timestamp", "device", "frame_id", "time_ns", "x_m", "y_m", "heading_rad", "device_ticks")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
@@ -34,6 +34,7 @@ class Odometry(_message.Message):
     X_M_FIELD_NUMBER: _ClassVar[int]
     Y_M_FIELD_NUMBER: _ClassVar[int]
     HEADING_RAD_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TICKS_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     device: str
     frame_id: str
@@ -41,4 +42,5 @@ class Odometry(_message.Message):
     x_m: _containers.RepeatedScalarFieldContainer[float]
     y_m: _containers.RepeatedScalarFieldContainer[float]
     heading_rad: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, timestamp: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., device: _Optional[str] = ..., frame_id: _Optional[str] = ..., time_ns: _Optional[_Iterable[int]] = ..., x_m: _Optional[_Iterable[float]] = ..., y_m: _Optional[_Iterable[float]] = ..., heading_rad: _Optional[_Iterable[float]] = ...) -> None: ...
+    device_ticks: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, timestamp: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., device: _Optional[str] = ..., frame_id: _Optional[str] = ..., time_ns: _Optional[_Iterable[int]] = ..., x_m: _Optional[_Iterable[float]] = ..., y_m: _Optional[_Iterable[float]] = ..., heading_rad: _Optional[_Iterable[float]] = ..., device_ticks: _Optional[_Iterable[int]] = ...) -> None: ...

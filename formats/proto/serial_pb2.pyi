@@ -1,7 +1,8 @@
 from google.protobuf import timestamp_pb2 as _timestamp_pb2
+from google.protobuf.internal import containers as _containers
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from collections.abc import Mapping as _Mapping
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
@@ -17,3 +18,19 @@ class SerialChunk(_message.Message):
     byte_offset: int
     data: bytes
     def __init__(self, timestamp: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., port: _Optional[str] = ..., byte_offset: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
+
+class Readings(_message.Message):
+    __slots__ = ("timestamp", "device", "names", "time_ns", "device_ticks", "value")
+    TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    NAMES_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_TICKS_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    timestamp: _timestamp_pb2.Timestamp
+    device: str
+    names: _containers.RepeatedScalarFieldContainer[str]
+    time_ns: _containers.RepeatedScalarFieldContainer[int]
+    device_ticks: _containers.RepeatedScalarFieldContainer[int]
+    value: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, timestamp: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., device: _Optional[str] = ..., names: _Optional[_Iterable[str]] = ..., time_ns: _Optional[_Iterable[int]] = ..., device_ticks: _Optional[_Iterable[int]] = ..., value: _Optional[_Iterable[float]] = ...) -> None: ...
