@@ -30,7 +30,8 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats import images, sheets
 from locatk.formats.mcap_places import Place, Places
 from locatk.formats.messages import timestamp
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 from locatk.formats.tracks import (
     Timed,
     check_devices,

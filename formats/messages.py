@@ -15,9 +15,10 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
-from locatk.formats.proto.lighthouse_pb2 import LighthouseSweep
+from locatk.formats.proto.lighthouse_pb2 import LighthouseCapture, LighthouseSweep
 from locatk.formats.proto.magnetics_pb2 import HallArray, MagnetometerArray
 from locatk.formats.proto.poses_pb2 import Odometry, PoseTrack
+from locatk.formats.proto.serial_pb2 import Readings
 
 
 class BatchError(Exception):
@@ -32,7 +33,7 @@ class Column:
     dtype: str
     width: int = 1
     optional: bool = False
-    """May be absent; its entries are then ``nan``."""
+    """May be absent; its entries are then ``nan``, or 0 where they are whole numbers."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Layout:
         object.__setattr__(self, "_tags", tags)
         object.__setattr__(self, "_numbers", frozenset(tag >> 3 for tag in tags))
 
-    def pack(self, once: Mapping[str, str | int], columns: Mapping[str, NDArray[Any]]) -> Message:
+    def pack(self, once: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> Message:
         """One message of what is said ``once`` and of ``columns``, each (n,) or (n, width);
         see :class:`Column`."""
         values = {
@@ -115,7 +116,7 @@ class Layout:
                         raise BatchError(
                             f"a message with {entries} times has another number of {column.name}"
                         )
-                    data = np.full(entries * column.width, np.nan, column.dtype).tobytes()
+                    data = _absent(column, entries)
                 parts[place].append(data)
             for place, text in enumerate(texts):
                 text.append(str(values[1 + place], "utf-8", "replace"))
@@ -171,6 +172,17 @@ class Layout:
         return message.SerializeToString()
 
 
+def _absent(column: Column, entries: int) -> bytes:
+    dtype = np.dtype(column.dtype)
+    value = np.nan if dtype.kind == "f" else 0
+    return np.full(entries * column.width, value, dtype).tobytes()
+
+
+TICKS = Column("device_ticks", "<i8", optional=True)
+"""A device's own clock as received, beside the times that were made of it."""
+
+SEQUENCE = Column("sequence", "<u4", optional=True)
+
 SWEEPS = Layout(
     LighthouseSweep,
     ("device",),
@@ -181,10 +193,24 @@ SWEEPS = Layout(
         Column("polynomial", "<i4"),
         Column("sweep", "<i4"),
         Column("count", "<f8"),
+        TICKS,
     ),
 )
 """Times and numbers are unsigned on the wire; the reader refuses those that come out
 negative as the signed types of the arrays."""
+
+CAPTURES = Layout(
+    LighthouseCapture,
+    ("device",),
+    (
+        Column("time_ns", "<i8"),
+        Column("sensor", "<i4"),
+        Column("bits", "<u8"),
+        Column("polynomial", "<i4"),
+        Column("bit_offset", "<i4"),
+        TICKS,
+    ),
+)
 
 POSES = Layout(
     PoseTrack,
@@ -205,6 +231,7 @@ ODOMETRY = Layout(
         Column("x_m", "<f8"),
         Column("y_m", "<f8"),
         Column("heading_rad", "<f8"),
+        TICKS,
     ),
 )
 
@@ -214,7 +241,13 @@ def magnetometers(sensors: int) -> Layout:
     return Layout(
         MagnetometerArray,
         ("device", "frame_id"),
-        (Column("time_ns", "<i8"), Column("b_tesla", "<f4", 3 * sensors)),
+        (
+            Column("time_ns", "<i8"),
+            Column("b_tesla", "<f4", 3 * sensors),
+            TICKS,
+            SEQUENCE,
+            Column("temperature_celsius", "<f4", optional=True),
+        ),
     )
 
 
@@ -223,7 +256,14 @@ def halls(sensors: int) -> Layout:
     return Layout(
         HallArray,
         ("device", "frame_id"),
-        (Column("time_ns", "<i8"), Column("b_tesla", "<f4", sensors)),
+        (Column("time_ns", "<i8"), Column("b_tesla", "<f4", sensors), TICKS, SEQUENCE),
+    )
+
+
+def readings(values: int) -> Layout:
+    """Layout of samples of so many named values; their names are said once."""
+    return Layout(
+        Readings, ("device",), (Column("time_ns", "<i8"), Column("value", "<f8", values), TICKS)
     )
 
 

@@ -22,7 +22,8 @@ from locatk.formats.frames import read_frames
 from locatk.formats.halls import read_samples as read_halls
 from locatk.formats.maps import attached_map as read_map
 from locatk.formats.messages import SWEEPS, batch_edges
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 from locatk.formats.sheets import attached_camera as read_camera
 from locatk.formats.sheets import attached_manifest as read_manifest
 from locatk.formats.solutions import read_solution, read_trajectories, write_solution
@@ -119,7 +120,11 @@ def sweep_messages(sweeps: Sweeps, *, batch_ns: int = BATCH_NS) -> Iterator[Time
     """Batches of ``sweeps`` by device and time, ascending in the time of their first."""
     _check_ranges(sweeps, None)
     order = np.lexsort((sweeps.time_ns, sweeps.device))
-    columns = {column.name: getattr(sweeps, column.name)[order] for column in SWEEPS.columns}
+    columns = {
+        column.name: getattr(sweeps, column.name)[order]
+        for column in SWEEPS.columns
+        if not column.optional
+    }
     device = sweeps.device[order]
     edges = batch_edges(columns["time_ns"], device, batch_ns, LARGEST_BATCH)
     starts, stops = edges[:-1], edges[1:]

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
 from locatk.formats.messages import BatchError, Layout, batch_edges
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 from locatk.formats.tracks import (
     LARGEST_BATCH,
     Timed,

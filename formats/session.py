@@ -1,32 +1,26 @@
-"""Sessions: MCAP files with protobuf messages, written whole and read fast.
+"""Sessions: MCAP files with protobuf messages, read fast.
 
 What is in them is said in docs/formats.md; how sweeps and poses become messages, in
-:mod:`locatk.formats.messages`.
+:mod:`locatk.formats.messages`; :mod:`locatk.formats.session_writer` writes them.
 """
 
 from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
-from typing import IO, Any, TypeVar
+from typing import IO, TypeVar
 
 from google.protobuf.message import DecodeError, Message
 from mcap.opcode import Opcode
 from mcap.records import Attachment
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import build_file_descriptor_set
 
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.formats import mcap_records
 from locatk.formats.mcap_records import DamageError, Index, NotMcapError
-from locatk.formats.output import atomic_write, tool_version
 
-PROFILE = "locatk"
-FORMAT_VERSION = "1"
 RECORD = "locatk"
 """Name of the metadata record that every file of locatk carries."""
 
@@ -247,130 +241,3 @@ def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
             where=None if damage.offset is None else f"byte {damage.offset}",
             hint="Record or import it again; `locatk info` tells what is left in it",
         ) from None
-
-
-class SessionWriter:
-    """Writes a session; a context manager, on whose clean exit the file appears.
-
-    Messages should come in the order of their times: readers then need little memory.
-    Same calls, same bytes.
-
-    Parameters
-    ----------
-    path : path
-        The output; see :func:`locatk.formats.output.atomic_write`.
-    kind : str
-        ``"session"`` or ``"solution"``.
-    system : str
-        ``"lighthouse"``, ``"polaris"``, ``"dots"`` or ``"landmarks"``.
-    facts : mapping of str to str, optional
-        More entries for the metadata record ``locatk``.
-    overwrite : bool
-        Replace an existing file.
-
-    Raises
-    ------
-    OutputExistsError, MissingDataError
-        On entering, before anything is written.
-    """
-
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        kind: str = "session",
-        system: str,
-        facts: Mapping[str, str] | None = None,
-        overwrite: bool = False,
-    ) -> None:
-        self._output: AbstractContextManager[IO[Any]] = atomic_write(path, overwrite=overwrite)
-        self._record = {
-            "format_version": FORMAT_VERSION,
-            "tool_version": tool_version(),
-            "kind": kind,
-            "system": system,
-            **(facts or {}),
-        }
-        self._writer: Writer | None = None
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, tuple[int, type[Message]]] = {}
-        self._sequence: dict[int, int] = {}
-
-    def __enter__(self) -> SessionWriter:
-        stream = self._output.__enter__()
-        self._writer = Writer(stream, compression=CompressionType.ZSTD)
-        self._writer.start(profile=PROFILE, library=f"locatk {tool_version()}")
-        self.metadata(RECORD, self._record)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None:
-            try:
-                self._open_writer.finish()
-            except BaseException as failure:
-                # The output must be removed, as after any failure inside the block.
-                self._output.__exit__(type(failure), failure, failure.__traceback__)
-                raise
-        self._output.__exit__(kind, error, trace)
-
-    @property
-    def _open_writer(self) -> Writer:
-        if self._writer is None:
-            raise RuntimeError("SessionWriter is used outside its `with` block")
-        return self._writer
-
-    def write(self, topic: str, message: Message, time_ns: int) -> None:
-        """Write one message at ``time_ns`` (log and publish time, ns since the epoch).
-
-        Raises
-        ------
-        InputError
-            The time is before 1970, which MCAP cannot say.
-        """
-        writer = self._open_writer
-        known = self._channels.get(topic)
-        if known is None:
-            known = (self._register(topic, type(message)), type(message))
-            self._channels[topic] = known
-        channel, message_class = known
-        if type(message) is not message_class:
-            raise TypeError(f"topic {topic} holds {message_class.__name__}")
-        if not 0 <= time_ns < 1 << 64:
-            raise InputError(
-                f"time {time_ns} ns of {topic} is not in the range of MCAP",
-                hint="Give times as nanoseconds since 1970",
-            )
-        sequence = self._sequence.get(channel, 0)
-        self._sequence[channel] = (sequence + 1) & 0xFFFFFFFF
-        writer.add_message(channel, time_ns, message.SerializeToString(), time_ns, sequence)
-
-    def _register(self, topic: str, message_class: type[Message]) -> int:
-        name = message_class.DESCRIPTOR.full_name
-        if name not in self._schemas:
-            files = build_file_descriptor_set(message_class)
-            self._schemas[name] = self._open_writer.register_schema(
-                name, "protobuf", files.SerializeToString()
-            )
-        return self._open_writer.register_channel(topic, "protobuf", self._schemas[name])
-
-    def attach(self, name: str, data: bytes, media_type: str, time_ns: int = 0) -> None:
-        """Attach a file of a media type; artifacts with :meth:`attach_toml`."""
-        self._open_writer.add_attachment(time_ns, time_ns, name, media_type, data)
-
-    def metadata(self, name: str, record: Mapping[str, str]) -> None:
-        """Add a metadata record."""
-        self._open_writer.add_metadata(name, dict(record))
-
-    def attach_toml(self, name: str, text: str) -> None:
-        """Attach an artifact as ``name``, as in ``attach_toml("scene.toml", text)``."""
-        self.attach(name, text.encode(), "application/toml")
-
-    def facts(self, facts: Mapping[str, object] | None) -> None:
-        """Write what is known of a recording as texts to the metadata record ``facts``."""
-        if facts:
-            self.metadata("facts", {key: str(value) for key, value in facts.items()})

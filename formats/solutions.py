@@ -19,7 +19,8 @@ from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import artifacts, maps, sheets, tags, viewers
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 from locatk.formats.tracks import (
     Timed,
     check_devices,

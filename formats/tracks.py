@@ -23,7 +23,8 @@ from locatk.formats.messages import (
     symmetric,
     triangle,
 )
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 
 LARGEST_BATCH = 1024
 """Most samples in one message."""

@@ -250,7 +250,7 @@ def test_info_tells_artifacts(locatk, tmp_path: Path) -> None:
 
 
 def test_info_of_a_damaged_session(locatk, tmp_path: Path) -> None:
-    from locatk.formats.session import SessionWriter
+    from locatk.formats.session_writer import SessionWriter
 
     bad = tmp_path / "bad.mcap"
     with SessionWriter(bad, system="landmarks") as writer:

@@ -187,7 +187,7 @@ def test_info_of_a_session_with_damaged_samples(locatk, tmp_path: Path) -> None:
     session = Session.open(out)
     assert session.damage is None
     from locatk.formats.proto.magnetics_pb2 import MagnetometerArray
-    from locatk.formats.session import SessionWriter
+    from locatk.formats.session_writer import SessionWriter
 
     (samples,) = observations.read_samples(session)
     message = next(iter(session.decoded("/magnetometers/bar", MagnetometerArray)))[1]

@@ -17,7 +17,8 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats import arrays, observations, tags
 from locatk.formats.messages import timestamp
 from locatk.formats.proto.magnetics_pb2 import MagnetometerArray
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -225,7 +225,7 @@ def test_two_cameras_of_one_name_and_no_frames(tmp_path: Path) -> None:
 
 
 def test_a_session_without_frames_says_so(tmp_path: Path) -> None:
-    from locatk.formats.session import SessionWriter
+    from locatk.formats.session_writer import SessionWriter
 
     with SessionWriter(tmp_path / "run.mcap", system="dots"):
         pass
@@ -273,7 +273,7 @@ def test_a_damaged_chunk_costs_its_own_frames_only(tmp_path: Path) -> None:
 def test_a_frame_that_cannot_be_read_is_named(
     tmp_path: Path, message: RawImage | CompressedImage, words: str
 ) -> None:
-    from locatk.formats.session import SessionWriter
+    from locatk.formats.session_writer import SessionWriter
 
     path = tmp_path / "run.mcap"
     with SessionWriter(path, system="dots") as writer:
@@ -286,7 +286,7 @@ def test_a_frame_that_cannot_be_read_is_named(
 
 
 def test_names_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    from locatk.formats.session import SessionWriter
+    from locatk.formats.session_writer import SessionWriter
 
     raw = RawImage(width=1, height=1, step=1, encoding="mono8", data=b"a")
     for text, words in (

@@ -23,7 +23,8 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats import observations
 from locatk.formats.messages import SWEEPS, BatchError
 from locatk.formats.proto.lighthouse_pb2 import LighthouseSweep
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 
 FIELDS = ("time_ns", "sensor", "channel", "polynomial", "sweep", "count")
 START = 1_690_000_000_000_000_000

@@ -31,6 +31,7 @@ def test_names_of_the_messages() -> None:
         "locatk.MagnetometerArray",
         "locatk.Odometry",
         "locatk.PoseTrack",
+        "locatk.Readings",
         "locatk.SerialChunk",
     }
 

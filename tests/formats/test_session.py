@@ -20,7 +20,8 @@ from locatk.core.errors import (
 )
 from locatk.formats import mcap_records
 from locatk.formats.proto.serial_pb2 import SerialChunk
-from locatk.formats.session import PROFILE, AttachmentInfo, Channel, Session, SessionWriter
+from locatk.formats.session import AttachmentInfo, Channel, Session
+from locatk.formats.session_writer import PROFILE, SessionWriter
 
 CHUNKS = 3000
 

@@ -20,7 +20,8 @@ from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats import artifacts, maps, sheets, tags
 from locatk.formats.hall_sensors import HALLS
-from locatk.formats.session import Session, SessionWriter
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
 from locatk.formats.toml_files import Artifact
 
 NOTE = 'a "b" \\ \n c'
