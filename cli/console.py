@@ -54,6 +54,11 @@ def verbose() -> bool:
     return _state.verbosity > 0
 
 
+def talks() -> bool:
+    """Whether talk is wanted: ``-q`` was not given."""
+    return _state.verbosity >= 0
+
+
 def colour(text: str, name: str) -> str:
     """``text`` in a colour, unless ``NO_COLOR`` is set (https://no-color.org)."""
     return text if os.environ.get("NO_COLOR") else click.style(text, fg=name)

@@ -1,0 +1,68 @@
+"""Artifacts that go into a recording: checked now, so that nobody finds out at solving."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from locatk.core.errors import InputError
+from locatk.formats import artifacts, files, hall_sensors, maps, sheets, tags, toml
+from locatk.formats.session import Session
+
+KINDS: dict[str, tuple[str, Callable[[str], Any]]] = {
+    artifacts.SCENE_FORMAT: (artifacts.SCENE_FILE, artifacts.loads_scene),
+    sheets.MANIFEST_FORMAT: (sheets.SHEET_FILE, sheets.loads_manifest),
+    sheets.CAMERA_FORMAT: (sheets.CAMERA_FILE, sheets.loads_camera),
+    tags.TAG_FORMAT: (tags.TAG_FILE, tags.loads_tags),
+    tags.ARRAY_FORMAT: (tags.ARRAY_FILE, tags.loads_array),
+    maps.MAP_FORMAT: (maps.MAP_FILE, maps.loads_map),
+    hall_sensors.HALLS_FORMAT: (maps.HALLS_FILE, maps.loads_halls),
+}
+"""Format of an artifact to the name of its attachment and what reads it."""
+
+ATTACHED = frozenset(name for name, _ in KINDS.values())
+
+
+def attachments(paths: Iterable[Path]) -> dict[str, str]:
+    """Name of the attachment to its text, of artifacts (.toml) and of those that sessions hold.
+
+    Raises
+    ------
+    MissingDataError, FormatError, ArtifactError
+        A file is not there or is no valid artifact.
+    InputError
+        Two of one kind, or a session without any.
+    """
+    found: dict[str, str] = {}
+    for path in paths:
+        for name, text in _of(path).items():
+            if found.get(name, text) != text:
+                raise InputError(f"a second {name}", file=path, hint="Give one of each kind")
+            found[name] = text
+    return found
+
+
+def _of(path: Path) -> dict[str, str]:
+    if path.suffix.lower() == ".mcap":
+        return _of_session(path)
+    kind = toml.read(path).text("format", choices=tuple(KINDS))
+    name, loads = KINDS[kind]
+    text = files.read_text(path)
+    loads(text)
+    return {name: text}
+
+
+def _of_session(path: Path) -> dict[str, str]:
+    session = Session.open(path)
+    found = {}
+    for info in session.attachments():
+        own = info.name in ATTACHED or info.name.partition("-")[0] in ("array", "halls")
+        data = session.attachment(info.name) if own else None
+        if data is not None:
+            found[info.name] = data.decode("utf-8", "replace")
+    if not found:
+        raise InputError(
+            "no artifact is attached", file=path, hint="Give the artifacts themselves (.toml)"
+        )
+    return found

@@ -1,0 +1,304 @@
+"""What was read becomes messages: raw bytes as they are, and what a decoder makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from google.protobuf.message import Message
+
+from locatk.formats import frames, messages
+from locatk.formats.capture.arrivals import Arrivals
+from locatk.formats.capture.receiver import Arrived
+from locatk.formats.capture.streams import SYSTEMS, Stamped, Streams
+from locatk.formats.capture.totals import Totals
+from locatk.formats.proto.serial_pb2 import SerialChunk
+from locatk.formats.wire import Device, device
+from locatk.formats.wire.decoder import Batch, Decoder, Options, Stream
+from locatk.formats.wire.identify import LISTEN_S, Identifier, Verdict
+
+PAUSE_NS = 3_000_000
+"""A line that is silent for longer is between two frames: within a frame bytes follow each
+other, or wait for the next millisecond of USB."""
+
+AUTO = "auto"
+
+
+class Intake(Protocol):
+    """What becomes of what was read.
+
+    Attributes
+    ----------
+    declared : sequence of (str, type)
+        Topics that are sure to come, with their messages.
+    system : str
+        Whose session it is, ``""`` while that is not known.
+    """
+
+    declared: Sequence[tuple[str, type[Message]]]
+    system: str
+
+    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
+        """Messages of what was read."""
+
+    def turn(self, now_ns: int) -> Iterator[Stamped]:
+        """Time has gone on, whether or not something was read."""
+
+    def restart(self) -> Iterator[Stamped]:
+        """The line was lost and is there again."""
+
+    def finish(self) -> Iterator[Stamped]:
+        """Nothing more comes."""
+
+    def count(self, totals: Totals) -> None:
+        """Put what was counted into ``totals``."""
+
+    def remarks(self) -> list[str]:
+        """What must be known to use the records, and was not said yet."""
+
+    def clocks(self) -> dict[str, str]:
+        """What is known of the devices' clocks, as entries of the metadata record."""
+
+    def artifacts(self) -> dict[str, str]:
+        """Artifacts that are known without being told, name to text."""
+
+
+class SerialIntake:
+    """Bytes of a serial line.
+
+    Parameters
+    ----------
+    name : str
+        Of the device, in topics.
+    port : str
+        As the user named it.
+    device_name : str
+        Of :data:`locatk.formats.wire.DEVICES` or an entry point, or ``"auto"``.
+    options : Options
+        For the decoder.
+    baud : int, optional
+        Of the port; the device's own where it is left out.
+
+    Raises
+    ------
+    InputError
+        There is no such device.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        port: str,
+        device_name: str,
+        options: Options | None = None,
+        *,
+        baud: int | None = None,
+    ) -> None:
+        self.topic = f"/serial/{name}"
+        self.declared = [(self.topic, SerialChunk)]
+        self.system = ""
+        self.device: Device | None = None
+        self._port, self._options = port, options or Options()
+        self._baud = baud
+        self._offset = 0
+        self._last_ns: int | None = None
+        self._first_ns: int | None = None
+        self._streams = Streams(name)
+        self._arrivals = Arrivals()
+        self._known: dict[str, Stream] = {}
+        self._said: list[str] = []
+        self._decoder: Decoder | None = None
+        self._identifier: Identifier | None = None
+        self._held: list[tuple[bytes, bool]] = []
+        if device_name == AUTO:
+            self._identifier = Identifier()
+        else:
+            self._decide(device(device_name))
+
+    def _decide(self, found: Device) -> None:
+        self.device = found
+        self._decoder = found.decode(self._options)
+        self._arrivals.byte_ns = 10e9 / (self._baud or found.baud)
+
+    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
+        """Messages of what was read: all raw ones, then the records."""
+        pieces: list[tuple[bool, list[bytes]]] = []
+        for each in arrived:
+            chunk = SerialChunk(
+                timestamp=messages.timestamp(each.time_ns),
+                port=self._port,
+                byte_offset=self._offset,
+                data=each.data,
+            )
+            yield Stamped(self.topic, chunk, each.time_ns, each.time_ns)
+            self._offset += each.size
+            self._arrivals.add(self._offset, each.time_ns)
+            pause = self._last_ns is None or each.time_ns - self._last_ns >= PAUSE_NS
+            self._last_ns = each.time_ns
+            self._first_ns = self._first_ns or each.time_ns
+            if pause or not pieces:
+                pieces.append((pause, []))
+            pieces[-1][1].append(each.data)
+        for pause, data in pieces:
+            yield from self._told(self._feed(b"".join(data), pause))
+
+    def _feed(self, data: bytes, pause: bool) -> list[Batch]:
+        if self._decoder is not None:
+            try:
+                return self._decoder.feed(data, pause=pause)
+            except Exception as error:  # a decoder's fault must not cost the bytes
+                return self._failed(error)
+        assert self._identifier is not None
+        self._held.append((data, pause))
+        self._identifier.feed(data, pause=pause)
+        return self._identified(self._identifier.verdict())
+
+    def _failed(self, error: Exception) -> list[Batch]:
+        assert self._decoder is not None
+        self._said.append(
+            f"the decoder failed ({type(error).__name__}: {error}): from here on there are only "
+            "raw bytes. Please report it"
+        )
+        counts, self._decoder = self._decoder.counts, device("raw").decode(self._options)
+        self._decoder.counts = counts
+        return []
+
+    def turn(self, now_ns: int) -> Iterator[Stamped]:
+        """Settle what the device is, when it was listened to for long enough."""
+        if self._first_ns is not None and now_ns - self._first_ns > LISTEN_S * 1e9:
+            yield from self._settle()
+
+    def _settle(self) -> Iterator[Stamped]:
+        if self._identifier is not None:
+            yield from self._told(self._identified(self._identifier.settle()))
+
+    def _identified(self, verdict: Verdict | None) -> list[Batch]:
+        if verdict is None:
+            return []
+        self._said.append(f"the device is taken for {verdict.device}: {verdict.why}")
+        self._decide(device(verdict.device))
+        held, self._held, self._identifier = self._held, [], None
+        return [batch for data, pause in held for batch in self._feed(data, pause)]
+
+    def restart(self) -> Iterator[Stamped]:
+        """What is half received is dropped; the next byte counts on."""
+        self._last_ns = None
+        if self._decoder is not None:
+            yield from self._told(self._decoder.restart())
+
+    def finish(self) -> Iterator[Stamped]:
+        """What the decoder held back."""
+        yield from self._settle()
+        if self._decoder is not None:
+            yield from self._told(self._decoder.finish())
+
+    def _told(self, batches: Sequence[Batch]) -> Iterator[Stamped]:
+        for batch in batches:
+            name = self._streams.device(batch.stream)
+            if len(batch) and f"{batch.stream.kind} {name}" not in self._known:
+                self._known[f"{batch.stream.kind} {name}"] = batch.stream
+                self.system = self.system or SYSTEMS.get(batch.stream.kind, "")
+        return self._streams.messages(batches, self._arrivals)
+
+    def count(self, totals: Totals) -> None:
+        """What the decoder counted, and how many records there are of each topic."""
+        totals.bytes = self._offset
+        if self._decoder is not None:
+            counts = self._decoder.counts
+            totals.frames, totals.bad, totals.lost = counts.frames, counts.bad, counts.lost
+            totals.skipped, totals.unknown = counts.skipped, counts.unknown
+        totals.samples = dict(self._streams.samples)
+
+    def remarks(self) -> list[str]:
+        """Of the decoder and of the identification."""
+        said, self._said = self._said, []
+        if self._decoder is not None:
+            said += self._decoder.remarks
+            self._decoder.remarks.clear()
+        return said
+
+    def clocks(self) -> dict[str, str]:
+        """Offset, drift and jitter of each device's clock against the host's."""
+        return {
+            f"{key}:{device}": f"{value:.9g}"
+            for device, clock in self._streams.clocks.items()
+            for key, value in (
+                ("tick_offset_s", clock.offset_ns * 1e-9),
+                ("tick_drift_ppm", clock.drift_ppm),
+                ("tick_jitter_s", clock.jitter_ns * 1e-9),
+                ("tick_restarts", clock.restarts),
+            )
+        }
+
+    def artifacts(self) -> dict[str, str]:
+        """Sensors of devices that are what they are."""
+        if self.device is None:
+            return {}
+        found: dict[str, str] = {}
+        for stream in self._known.values():
+            found |= self.device.attached(stream)
+        return found
+
+
+class CameraIntake:
+    """Frames of a camera, already packed as image files.
+
+    Parameters
+    ----------
+    name : str
+        Of the camera, in topics.
+    format : str
+        ``"png"`` or ``"jpeg"``.
+    """
+
+    system = "dots"
+
+    def __init__(self, name: str, format: str) -> None:
+        self.topic = f"{frames.TOPIC}{name}"
+        self.declared = [(self.topic, CompressedImage)]
+        self._name, self._format = name, format
+        self._frames = self._bytes = 0
+
+    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
+        """One message a frame."""
+        for each in arrived:
+            for time_ns, image, *_ in each.data:
+                self._frames += 1
+                self._bytes += len(image)
+                message = CompressedImage(
+                    timestamp=messages.timestamp(time_ns),
+                    frame_id=self._name,
+                    data=image,
+                    format=self._format,
+                )
+                yield Stamped(self.topic, message, time_ns, time_ns)
+
+    def turn(self, now_ns: int) -> Iterator[Stamped]:
+        """Nothing."""
+        return iter(())
+
+    def restart(self) -> Iterator[Stamped]:
+        """Nothing: each frame stands alone."""
+        return iter(())
+
+    def finish(self) -> Iterator[Stamped]:
+        """Nothing."""
+        return iter(())
+
+    def count(self, totals: Totals) -> None:
+        """Frames and their bytes."""
+        totals.bytes, totals.frames = self._bytes, self._frames
+        totals.samples = {self.topic: self._frames}
+
+    def remarks(self) -> list[str]:
+        """None."""
+        return []
+
+    def clocks(self) -> dict[str, str]:
+        """None: a frame has the time at which it was taken from the driver."""
+        return {}
+
+    def artifacts(self) -> dict[str, str]:
+        """None."""
+        return {}

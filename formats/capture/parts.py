@@ -1,0 +1,179 @@
+"""The files of a recording: one, or one after the other, each whole in itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.message import Message
+
+from locatk.formats.capture.live_file import LiveFile
+from locatk.formats.capture.streams import Stamped
+from locatk.formats.capture.totals import RECORD
+from locatk.formats.messages import timestamp
+from locatk.formats.output import check_output
+from locatk.formats.session import RECORD as SESSION
+from locatk.formats.session_writer import SessionWriter
+
+CHUNK = 1 << 19
+"""A chunk is written when it has so many bytes, if not before. Half of what the MCAP writer
+takes before it writes one unasked."""
+
+PER_CHUNK = 512
+"""Bytes of the index at the end of a file by chunk, at most."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What every part begins with.
+
+    Attributes
+    ----------
+    facts : mapping of str to str
+        Entries of the metadata record ``capture`` that are known at the start.
+    artifacts : mapping of str to str
+        Attachments: name to text.
+    declared : sequence of (str, type)
+        Topics that are sure to come.
+    """
+
+    facts: Mapping[str, str] = field(default_factory=dict)
+    artifacts: Mapping[str, str] = field(default_factory=dict)
+    declared: Sequence[tuple[str, type[Message]]] = ()
+
+
+def part_path(path: Path, number: int) -> Path:
+    """Path of a part, numbered from 1: ``run.mcap`` becomes ``run-001.mcap``."""
+    return path.with_name(f"{path.stem}-{number:03d}{path.suffix}")
+
+
+class Parts:
+    """Writes a recording; :meth:`next_part` goes on in a new file.
+
+    Parameters
+    ----------
+    path : path
+        The file, or where ``numbered`` the name from which those of the parts are made.
+    content : Content
+    numbered : bool
+        There may be several parts.
+    overwrite : bool
+        Replace existing files.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError, LocatkError
+        See :class:`.live_file.LiveFile`.
+    """
+
+    def __init__(
+        self, path: Path, content: Content, *, numbered: bool = False, overwrite: bool = False
+    ) -> None:
+        self._path, self._content = path, content
+        self._numbered, self._overwrite = numbered, overwrite
+        self._artifacts = dict(content.artifacts)
+        self._system = ""
+        self._finished_bytes = 0
+        self._chunks = 0
+        self._pending = 0
+        self.paths: list[Path] = []
+        self._open()
+
+    def _open(self) -> None:
+        number = len(self.paths) + 1
+        path = part_path(self._path, number) if self._numbered else self._path
+        self.file = LiveFile(path, overwrite=self._overwrite)
+        self.paths.append(path)
+        self._chunks = 0
+        self._writer = SessionWriter(path, system=self._system, live=self.file)  # type: ignore[arg-type]
+        self._writer.__enter__()
+        facts = dict(self._content.facts)
+        if self._numbered:
+            facts["part"] = str(number)
+        self._writer.metadata(RECORD, facts)
+        for name, text in self._artifacts.items():
+            self._writer.attach_toml(name, text)
+        for topic, message_class in self._content.declared:
+            self._writer.declare(topic, message_class)
+        self._writer.declare("/log", Log)
+
+    @property
+    def artifacts(self) -> Mapping[str, str]:
+        """What is attached, name to text."""
+        return self._artifacts
+
+    @property
+    def bytes_written(self) -> int:
+        """By all parts together."""
+        return self._finished_bytes + self.file.tell()
+
+    @property
+    def part_bytes(self) -> int:
+        """By this part."""
+        return self.file.tell()
+
+    def system(self, name: str) -> None:
+        """Say whose session it is, once that is known."""
+        if name and name != self._system:
+            self._system = name
+            self._writer.metadata(SESSION, {"system": name})
+
+    def attach(self, artifacts: Mapping[str, str]) -> None:
+        """Attach what is not yet there, to this part and all that follow."""
+        for name, text in artifacts.items():
+            if name not in self._artifacts:
+                self._artifacts[name] = text
+                self._writer.attach_toml(name, text)
+
+    def write(self, stamped: Iterable[Stamped]) -> None:
+        """Write messages, in the order in which they come."""
+        for each in stamped:
+            self._writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
+            self._pending += each.message.ByteSize()
+            if self._pending >= CHUNK:  # before the writer does, who makes no room
+                self.flush()
+
+    def log(self, text: str, time_ns: int, *, level: int = Log.WARNING) -> None:
+        """A line for the log panel."""
+        line = Log(timestamp=timestamp(time_ns), level=level, message=text, name="locatk capture")  # type: ignore[arg-type]
+        self._writer.write("/log", line, time_ns)
+
+    def flush(self) -> None:
+        """Give all that is buffered to the system: what is killed from here on keeps it.
+
+        Raises
+        ------
+        DiskFullError
+            There is no room for it; the file can still be finished.
+        """
+        self._pending = 0
+        self._chunks += 1
+        self.file.make_room(4 * CHUNK + PER_CHUNK * self._chunks)
+        self._writer.flush()
+
+    def next_part(self, facts: Mapping[str, str]) -> None:
+        """Finish this file with ``facts`` and go on in the next one."""
+        self.finish(facts)
+        self._open()
+
+    def finish(self, facts: Mapping[str, str]) -> None:
+        """Write the end of the file; ``facts`` are added to the record ``capture``."""
+        try:
+            self._writer.metadata(RECORD, facts)
+            self._writer.__exit__(None, None, None)
+        finally:
+            self._finished_bytes += self.file.tell()
+            self.file.close()
+
+
+def check_outputs(path: Path, *, numbered: bool, overwrite: bool) -> None:
+    """Refuse outputs that are there, before a port is opened.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError
+        See :func:`locatk.formats.output.check_output`.
+    """
+    check_output(part_path(path, 1) if numbered else path, overwrite=overwrite)

@@ -1,0 +1,202 @@
+"""The thread that reads the port, and nothing else: bytes and what happens to the line, in
+the order in which they came."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from locatk.formats.capture.clock import HostClock
+from locatk.formats.capture.source import (
+    Link,
+    LinkEnded,
+    LinkLost,
+    Overruns,
+    Port,
+    SourceError,
+)
+
+WAIT_S = 0.1
+"""Longest wait for a byte: so long it takes to notice that the recording is over."""
+
+LEAST_S = 0.001
+"""Shortest time between reads. A stamp is late by no more, and a fast line is read in pieces
+of some kilobytes instead of byte by byte; the smallest buffers of a kernel (4096 bytes) take
+20 ms to overflow at 2 Mbaud."""
+
+BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
+"""Between attempts to open a port again; the last one is repeated."""
+
+COUNT_S = 0.5
+"""Between looks at the kernel's counters."""
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """What one read gave: bytes of a serial line, or frames of a camera."""
+
+    time_ns: int
+    data: Any
+    size: int
+
+
+@dataclass(frozen=True)
+class Lost:
+    """The connection broke."""
+
+    time_ns: int
+    why: str
+
+
+@dataclass(frozen=True)
+class Back:
+    """It is there again, perhaps elsewhere."""
+
+    time_ns: int
+    where: str
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Nothing more will come; ``error`` where that is not as it should be."""
+
+    time_ns: int
+    error: str | None = None
+
+
+Event = Arrived | Lost | Back | Ended
+
+
+class Receiver:
+    """Reads a port in a thread of its own and opens it again when it was lost.
+
+    Parameters
+    ----------
+    port : Port
+    link : Link
+        The port, opened.
+    clock : HostClock
+    most_bytes : int
+        When so many wait to be written, reading stops until there is room: the system's own
+        buffers then fill, and count what they lose.
+    """
+
+    def __init__(
+        self, port: Port, link: Link, clock: HostClock, *, most_bytes: int = 64 << 20
+    ) -> None:
+        self._port, self._link, self._clock = port, link, clock
+        self._most = most_bytes
+        self._events: deque[Event] = deque()
+        self._stop = threading.Event()
+        self._received = 0
+        self._taken = 0
+        self._before = Overruns()  # of links that are closed
+        self._now = Overruns()
+        self.high_water = 0
+        self.held_up = 0
+        """How often reading stopped because too much was waiting."""
+        self._thread = threading.Thread(target=self._run, name="locatk-receiver", daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Read what has arrived by now, close the port and end the thread."""
+        self._stop.set()
+        self._thread.join()
+
+    def take(self) -> Sequence[Event]:
+        """All that has happened since the last call."""
+        events = [self._events.popleft() for _ in range(len(self._events))]
+        self._taken += sum(event.size for event in events if isinstance(event, Arrived))
+        return events
+
+    @property
+    def overruns(self) -> Overruns:
+        """What the kernel counted, of all links."""
+        before, now = self._before, self._now
+        return Overruns(
+            before.overrun + now.overrun,
+            before.buffer + now.buffer,
+            before.frame + now.frame,
+            before.parity + now.parity,
+        )
+
+    def _run(self) -> None:
+        try:
+            self._receive()
+        except Exception as error:  # whatever a driver raises must not end in silence
+            self._events.append(Ended(self._clock.now(), f"{type(error).__name__}: {error}"))
+        finally:
+            self._count()
+            self._link.close()
+
+    def _receive(self) -> None:
+        counted = 0.0
+        while not self._stop.is_set():
+            begun = time.monotonic()
+            try:
+                self._read(WAIT_S)
+            except LinkEnded:
+                self._events.append(Ended(self._clock.now()))
+                return
+            except LinkLost as lost:
+                self._events.append(Lost(self._clock.now(), str(lost)))
+                self._count()
+                self._before, self._now = self.overruns, Overruns()
+                self._link.close()
+                if not self._port.comes_again:
+                    self._events.append(Ended(self._clock.now(), str(lost)))
+                    return
+                if not self._reopen():
+                    return
+                self._events.append(Back(self._clock.now(), self._port.name))
+                continue
+            while self._received - self._taken > self._most and not self._stop.is_set():
+                self.held_up += 1
+                self._stop.wait(0.05)
+            if begun - counted > COUNT_S:
+                counted = begun
+                self._count()
+            left = begun + LEAST_S - time.monotonic()
+            if left > 0:
+                time.sleep(left)
+        self._read_rest()
+
+    def _read(self, wait_s: float) -> int:
+        data = self._link.read(wait_s)
+        if not data:
+            return 0
+        size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
+        self._events.append(Arrived(self._clock.now(), data, size))
+        self._received += size
+        self.high_water = max(self.high_water, self._received - self._taken)
+        return size
+
+    def _read_rest(self) -> None:
+        """What the system still holds; from a device that never stops, not for long."""
+        until = time.monotonic() + WAIT_S
+        try:
+            while time.monotonic() < until and self._read(0.0):
+                pass
+        except (LinkEnded, LinkLost):
+            return
+
+    def _reopen(self) -> bool:
+        attempt = 0
+        while not self._stop.wait(BACKOFF_S[min(attempt, len(BACKOFF_S) - 1)]):
+            attempt += 1
+            try:
+                self._link = self._port.open()
+                return True
+            except SourceError:
+                continue
+        return False
+
+    def _count(self) -> None:
+        self._now = self._link.overruns() or self._now

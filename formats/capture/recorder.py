@@ -1,0 +1,369 @@
+"""The recording itself: from the receiver's events to files, until somebody ends it.
+
+Three threads: the receiver reads the port and nothing else; this one decodes and writes;
+a third forces the file to the disk, which may take longer than a port can wait.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from locatk.formats.capture.clock import HostClock
+from locatk.formats.capture.intake import Intake
+from locatk.formats.capture.live_file import DiskFullError
+from locatk.formats.capture.parts import Parts
+from locatk.formats.capture.receiver import Arrived, Back, Ended, Event, Lost, Receiver
+from locatk.formats.capture.totals import Totals
+
+TURN_S = 0.02
+"""Between looks at what was received: one message of each stream covers about so much."""
+
+AHEAD_S = 300.0
+"""A disk that will be full sooner than this is told of."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When what is done; None for never.
+
+    Attributes
+    ----------
+    duration_s, max_bytes
+        The recording ends.
+    rotate_s, rotate_bytes
+        A new part begins.
+    silence_s : float
+        Without a byte for so long there is a warning.
+    reserve_bytes : int
+        So much of the disk stays free.
+    flush_s : float
+        So often what was recorded is given to the system: the most that is lost when the
+        program is killed, with :data:`TURN_S`.
+    sync_s : float
+        So often it is forced to the disk: the most that is lost with the power.
+    """
+
+    duration_s: float | None = None
+    max_bytes: int | None = None
+    rotate_s: float | None = None
+    rotate_bytes: int | None = None
+    silence_s: float = 5.0
+    reserve_bytes: int = 64 << 20
+    flush_s: float = 0.2
+    sync_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class Status:
+    """How it goes, once a second."""
+
+    elapsed_s: float
+    bytes_per_s: float
+    frames_per_s: float
+    totals: Totals
+    file_bytes: int
+    free_bytes: int
+
+
+@dataclass
+class Recorded:
+    """What came of a recording.
+
+    Attributes
+    ----------
+    paths : list of path
+        The files, in their order.
+    ended : str
+        Why: ``"stopped"``, ``"duration"``, ``"max-size"``, ``"end of the source"``, or what
+        went wrong.
+    failed : bool
+        Whether it ended for something that went wrong.
+    """
+
+    totals: Totals
+    paths: list[Path]
+    file_bytes: int
+    device: str
+    started_ns: int
+    ended_ns: int
+    ended: str
+    failed: bool
+    system: str
+    artifacts: list[str]
+    clocks: dict[str, str] = field(default_factory=dict)
+
+
+class Recorder:
+    """Records one port.
+
+    Parameters
+    ----------
+    receiver : Receiver
+        Not yet started.
+    intake : Intake
+    parts : Parts
+    clock : HostClock
+    limits : Limits
+    tell : callable
+        Takes lines for people as they come: gaps, silence, a disk that fills.
+    show : callable
+        Takes a :class:`Status` once a second.
+    """
+
+    def __init__(
+        self,
+        receiver: Receiver,
+        intake: Intake,
+        parts: Parts,
+        clock: HostClock,
+        limits: Limits,
+        *,
+        tell: Callable[[str], None],
+        show: Callable[[Status], None],
+    ) -> None:
+        self._receiver, self._intake, self._parts = receiver, intake, parts
+        self._clock, self._limits = clock, limits
+        self._tell, self._show = tell, show
+        self._totals = Totals()
+        self._part_began = Totals()
+        self._lost_ns: int | None = None
+        self._step_s = 0.0
+        self._held_up = 0
+        self._disk_told = False
+
+    def run(self, stop: threading.Event) -> Recorded:
+        """Record until ``stop`` is set, a limit is reached, or nothing more can come.
+
+        The files are finished when this returns, whatever ended it.
+        """
+        self._start_ns = self._part_ns = self._heard_ns = self._clock.now()
+        self._silent = False
+        self._parts.flush()
+        self._receiver.start()
+        syncing = threading.Event()
+        syncer = threading.Thread(
+            target=self._sync, args=(syncing,), name="locatk-sync", daemon=True
+        )
+        syncer.start()
+        try:
+            ended, failed = self._turns(stop)
+            self._receiver.stop()
+            if not isinstance(ended, DiskFullError):
+                self._rest()
+        except DiskFullError as full:
+            ended, failed = full, True
+        except BaseException as error:
+            self._parts.finish(self._facts(f"{type(error).__name__}: {error}"))
+            raise
+        finally:
+            self._receiver.stop()
+            syncing.set()
+        recorded = Recorded(
+            self._count(),
+            self._parts.paths,
+            0,
+            getattr(getattr(self._intake, "device", None), "name", ""),
+            self._start_ns,
+            self._clock.now(),
+            str(ended),
+            failed,
+            self._intake.system,
+            sorted(self._parts.artifacts),
+            self._intake.clocks(),
+        )
+        self._parts.finish(self._facts(str(ended)))
+        recorded.file_bytes = self._parts.bytes_written
+        syncer.join()
+        return recorded
+
+    def _turns(self, stop: threading.Event) -> tuple[str | DiskFullError, bool]:
+        """Write what comes, turn after turn; returns why it ended and whether that is bad."""
+        flushed = shown = time.monotonic()
+        before = Totals()
+        while True:
+            over = self._over(stop)
+            ended = self._write(self._receiver.take())
+            now = time.monotonic()
+            if now - flushed >= self._limits.flush_s:
+                flushed = now
+                self._parts.flush()
+            if now - shown >= 1:
+                totals = self._count()
+                full = self._second(totals, before, now - shown)
+                before, shown = totals, now
+                if full:
+                    return full, True
+            if ended is not None:
+                return ended.error or "end of the source", ended.error is not None
+            if over:
+                return over, False
+            self._rotate()
+            stop.wait(TURN_S)
+
+    def _over(self, stop: threading.Event) -> str:
+        """Why it is time to end, ``""`` while it is not."""
+        limits = self._limits
+        if stop.is_set():
+            return "stopped"
+        if limits.duration_s is not None and self._elapsed_s() >= limits.duration_s:
+            return "duration"
+        if limits.max_bytes is not None and self._parts.bytes_written >= limits.max_bytes:
+            return "max-size"
+        return ""
+
+    def _elapsed_s(self) -> float:
+        return (self._clock.now() - self._start_ns) * 1e-9
+
+    def _write(self, events: Sequence[Event]) -> Ended | None:
+        """Write what the receiver tells, in its order; returns its end where there is one."""
+        arrived: list[Arrived] = []
+        ended = None
+        for event in events:
+            if isinstance(event, Arrived):
+                arrived.append(event)
+                self._heard_ns, self._silent = event.time_ns, False
+                continue
+            self._take(arrived)
+            arrived = []
+            if isinstance(event, Lost):
+                self._lost_ns = event.time_ns
+                self._totals.gaps += 1
+                self._say(f"connection lost: {event.why}", event.time_ns)
+            elif isinstance(event, Back):
+                self._close_gap(event)
+            else:
+                ended = event
+        self._take(arrived)
+        self._parts.write(self._intake.turn(self._clock.now()))
+        self._parts.system(self._intake.system)
+        self._parts.attach(self._intake.artifacts())
+        for remark in self._intake.remarks():
+            self._say(remark, self._clock.now())
+        return ended
+
+    def _take(self, arrived: Sequence[Arrived]) -> None:
+        if arrived:
+            self._parts.write(self._intake.take(arrived))
+
+    def _close_gap(self, event: Back) -> None:
+        assert self._lost_ns is not None
+        away_s = (event.time_ns - self._lost_ns) * 1e-9
+        self._totals.gap_s += away_s
+        self._lost_ns = None
+        self._heard_ns = event.time_ns
+        self._parts.write(self._intake.restart())
+        self._say(f"connected again to {event.where} after {away_s:.1f} s", event.time_ns)
+
+    def _rest(self) -> None:
+        """What was received between the last turn and the end."""
+        self._write(self._receiver.take())
+        if self._lost_ns is not None:
+            self._totals.gap_s += (self._clock.now() - self._lost_ns) * 1e-9
+        self._parts.write(self._intake.finish())
+        for remark in self._intake.remarks():
+            self._say(remark, self._clock.now())
+
+    def _second(self, totals: Totals, before: Totals, took_s: float) -> DiskFullError | None:
+        """What is looked at once a second; returns why to stop, if so."""
+        fresh = totals.since(before)
+        free = shutil.disk_usage(self._parts.file.path.parent).free
+        rate = fresh.bytes / took_s
+        self._show(
+            Status(
+                self._elapsed_s(),
+                rate,
+                fresh.frames / took_s,
+                totals,
+                self._parts.bytes_written,
+                free,
+            )
+        )
+        self._look_for_silence()
+        self._look_at_clock()
+        if self._receiver.held_up > self._held_up:
+            self._held_up = self._receiver.held_up
+            self._say("the disk is slower than the port: reading waits", self._clock.now())
+        return self._look_at_disk(free)
+
+    def _look_for_silence(self) -> None:
+        silent_s = (self._clock.now() - self._heard_ns) * 1e-9
+        if self._lost_ns is None and not self._silent and silent_s >= self._limits.silence_s:
+            self._silent = True
+            self._totals.silences += 1
+            self._say(f"nothing received for {silent_s:.0f} s", self._clock.now())
+
+    def _look_at_clock(self) -> None:
+        step_s = self._clock.stepped_ns() * 1e-9
+        if abs(step_s - self._step_s) > 0.1:
+            self._say(
+                f"the wall clock was set by {step_s - self._step_s:+.1f} s; times of this "
+                "recording go on as they were",
+                self._clock.now(),
+            )
+            self._step_s = step_s
+
+    def _look_at_disk(self, free: int) -> DiskFullError | None:
+        left = free - self._limits.reserve_bytes
+        if left <= 0:
+            return DiskFullError("the disk is full but for the reserve", file=self._parts.file.path)
+        per_s = self._parts.bytes_written / max(self._elapsed_s(), 1.0)
+        if per_s > 0 and left / per_s < AHEAD_S:
+            if not self._disk_told:
+                self._say(
+                    f"the disk is full in {left / per_s:.0f} s at this rate", self._clock.now()
+                )
+            self._disk_told = True
+        else:
+            self._disk_told = False
+        return None
+
+    def _rotate(self) -> None:
+        limits = self._limits
+        old = (
+            limits.rotate_s is not None
+            and (self._clock.now() - self._part_ns) * 1e-9 >= limits.rotate_s
+        )
+        big = limits.rotate_bytes is not None and self._parts.part_bytes >= limits.rotate_bytes
+        if old or big:
+            self._parts.next_part(self._facts("goes on in the next part"))
+            self._part_ns = self._clock.now()
+            self._part_began = self._count()
+            self._parts.flush()
+
+    def _say(self, text: str, time_ns: int) -> None:
+        """To people and into the session."""
+        self._parts.log(text, time_ns, level=Log.WARNING)
+        self._tell(text)
+
+    def _count(self) -> Totals:
+        """All that is counted, as of now."""
+        totals = self._totals
+        self._intake.count(totals)
+        overruns = self._receiver.overruns
+        totals.overruns, totals.line_errors = overruns.lost, overruns.frame + overruns.parity
+        totals.high_water_bytes = self._receiver.high_water
+        totals.clock_step_s = self._step_s
+        return Totals(**vars(totals))
+
+    def _facts(self, ended: str) -> dict[str, str]:
+        """What the part that ends now holds, for its metadata."""
+        device = getattr(self._intake, "device", None)
+        return {
+            **({"device": device.name} if device is not None else {}),
+            "ended_ns": str(self._clock.now()),
+            "ended": ended,
+            **self._count().since(self._part_began).texts(),
+            **self._intake.clocks(),
+        }
+
+    def _sync(self, done: threading.Event) -> None:
+        """Force the file to the disk again and again, away from the thread that writes."""
+        while not done.wait(self._limits.sync_s):
+            self._parts.file.sync()

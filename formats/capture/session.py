@@ -1,0 +1,182 @@
+"""One recording from what the user wants to the files: checks first, then the port, then the
+first byte on the disk."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from locatk.core.errors import InputError, LocatkError
+from locatk.formats.capture import artifacts, camera, ports
+from locatk.formats.capture.clock import HostClock
+from locatk.formats.capture.intake import AUTO, CameraIntake, Intake, SerialIntake
+from locatk.formats.capture.live_file import DiskFullError
+from locatk.formats.capture.parts import Content, Parts, check_outputs
+from locatk.formats.capture.receiver import Receiver
+from locatk.formats.capture.recorder import Limits, Recorded, Recorder, Status
+from locatk.formats.capture.source import Port
+from locatk.formats.wire import device as device_named
+from locatk.formats.wire.decoder import Options
+
+CAMERA = "camera:"
+NAME, CAMERA_NAME = "robot", "camera"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to record, and how; the options of ``locatk capture``."""
+
+    port: str
+    device: str
+    output: Path
+    artifacts: tuple[Path, ...] = ()
+    note: str | None = None
+    meta: Mapping[str, str] = field(default_factory=dict)
+    limits: Limits = field(default_factory=Limits)
+    name: str | None = None
+    baud: int | None = None
+    columns: tuple[str, ...] = ()
+    speed: float = 1.0
+    image: str = "jpeg"
+    overwrite: bool = False
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether frames are recorded, not bytes."""
+        return self.port.startswith(CAMERA)
+
+    @property
+    def device_name(self) -> str:
+        """Name of the device in the session."""
+        return self.name or (CAMERA_NAME if self.is_camera else NAME)
+
+    @property
+    def numbered(self) -> bool:
+        """Whether there may be several files."""
+        return self.limits.rotate_s is not None or self.limits.rotate_bytes is not None
+
+
+def record(
+    wanted: Wanted,
+    stop: threading.Event,
+    *,
+    tell: Callable[[str], None] = lambda text: None,
+    show: Callable[[Status], None] = lambda status: None,
+    ready: Callable[[str], None] = lambda port: None,
+) -> Recorded:
+    """Record until ``stop`` is set, a limit of ``wanted`` is reached or the source is at its
+    end.
+
+    Parameters
+    ----------
+    wanted : Wanted
+    stop : threading.Event
+    tell, show : callable
+        See :class:`.recorder.Recorder`.
+    ready : callable
+        Takes the name of the port once it is open.
+
+    Raises
+    ------
+    LocatkError
+        Something is wrong with what is wanted, an artifact, the output or the port; nothing
+        was written then.
+    """
+    _check_name(wanted.device_name)
+    content = artifacts.attachments(wanted.artifacts)
+    check_outputs(wanted.output, numbered=wanted.numbered, overwrite=wanted.overwrite)
+    _check_disk(wanted.output.parent, wanted.limits.reserve_bytes)
+    clock = HostClock()
+    intake = _intake(wanted)
+    port = _port(wanted, clock)
+    link = port.open()
+    try:
+        ready(port.name)
+        facts = _facts(wanted, port, clock)
+        parts = Parts(
+            wanted.output,
+            Content(facts, content, intake.declared),
+            numbered=wanted.numbered,
+            overwrite=wanted.overwrite,
+        )
+    except BaseException:
+        link.close()
+        raise
+    receiver = Receiver(port, link, clock)
+    recorder = Recorder(receiver, intake, parts, clock, wanted.limits, tell=tell, show=show)
+    return recorder.run(stop)
+
+
+def _check_name(name: str) -> None:
+    if not name or any(c.isspace() or c == "/" for c in name):
+        raise InputError(f"the name {name!r} cannot be in a topic", hint="Use letters and digits")
+
+
+def _check_disk(folder: Path, reserve: int) -> None:
+    """Refuse a folder that cannot be written, or a disk that is full already."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise LocatkError(
+            f"cannot write: {error.strerror or error}",
+            file=folder,
+            hint="Choose another -o",
+        ) from error
+    free = shutil.disk_usage(folder).free
+    if free <= reserve:
+        raise DiskFullError(
+            f"only {free / 1e6:.0f} MB are free on the disk",
+            file=folder,
+            hint=f"Free some space, or choose a --reserve below {reserve / 1e6:.0f} MB",
+        )
+
+
+def _intake(wanted: Wanted) -> Intake:
+    if wanted.is_camera:
+        if wanted.device != AUTO:
+            raise InputError(
+                f"a camera is no {wanted.device}", hint="Leave out --device for a camera"
+            )
+        return CameraIntake(wanted.device_name, wanted.image)
+    return SerialIntake(
+        wanted.device_name,
+        wanted.port,
+        wanted.device,
+        Options(columns=wanted.columns),
+        baud=wanted.baud,
+    )
+
+
+def _port(wanted: Wanted, clock: HostClock) -> Port:
+    if wanted.is_camera:
+        return camera.port_of(
+            wanted.port.removeprefix(CAMERA),
+            clock=clock.now,
+            speed=wanted.speed,
+            format=wanted.image,
+        )
+    known = None if wanted.device == AUTO else device_named(wanted.device)
+    baud = wanted.baud or (known.baud if known else 115_200)
+    return ports.port_of(wanted.port, baud=baud, speed=wanted.speed)
+
+
+def _facts(wanted: Wanted, port: Port, clock: HostClock) -> dict[str, str]:
+    """What is known at the start, for the metadata record ``capture``."""
+    known = {} if wanted.is_camera or wanted.device == AUTO else {"device": wanted.device}
+    return {
+        **port.describe(),
+        "port": wanted.port,
+        **known,
+        "name": wanted.device_name,
+        "started_ns": str(clock.now()),
+        "host": platform.node(),
+        "clock": "host, steady, set once from the wall clock",
+        **({"note": wanted.note} if wanted.note else {}),
+        **{f"meta:{key}": value for key, value in wanted.meta.items()},
+    }

@@ -1,0 +1,141 @@
+"""Records of a device become messages of a session, with times of the host's clock."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
+from locatk.core.ticks import TickClock
+from locatk.formats import messages
+from locatk.formats.capture.arrivals import Arrivals
+from locatk.formats.messages import Layout
+from locatk.formats.tracks import LARGEST_BATCH
+from locatk.formats.wire.decoder import Batch, Stream
+
+SYSTEMS = {
+    "magnetometers": "polaris",
+    "halls": "landmarks",
+    "lighthouse": "lighthouse",
+    "captures": "lighthouse",
+}
+"""Kind of records to the system that solves them."""
+
+
+@dataclass(frozen=True)
+class Stamped:
+    """A message on its way into a session: when it was complete, and measured."""
+
+    topic: str
+    message: Message
+    time_ns: int
+    publish_ns: int
+
+
+class Streams:
+    """Messages of the batches that a decoder gives.
+
+    Parameters
+    ----------
+    name : str
+        Of the device; those behind it, if several, are ``<name>-<node>``.
+
+    Attributes
+    ----------
+    samples : Counter
+        Records by topic, so far.
+    clocks : dict of str to TickClock
+        By device, for those that tell their ticks.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._last: dict[str, int] = {}
+        self.samples: Counter[str] = Counter()
+        self.clocks: dict[str, TickClock] = {}
+
+    def device(self, stream: Stream) -> str:
+        """Name of the device whose records these are."""
+        return f"{self._name}-{stream.node}" if stream.node else self._name
+
+    def messages(self, batches: Sequence[Batch], arrivals: Arrivals) -> Iterator[Stamped]:
+        """Messages of ``batches``; what was measured when, is told by the device's ticks
+        where it has any, else by the arrival of the last byte."""
+        for batch in batches:
+            if len(batch) == 0:
+                continue
+            read_ns = arrivals.read_ns(batch.end)
+            if batch.stream.kind == "log":
+                yield from self._log(batch, read_ns)
+            else:
+                yield from self._records(batch, self._times(batch, arrivals), read_ns)
+
+    def _records(
+        self, batch: Batch, time_ns: NDArray[np.int64], read_ns: NDArray[np.int64]
+    ) -> Iterator[Stamped]:
+        stream, device = batch.stream, self.device(batch.stream)
+        topic, layout, once = _form(stream, device)
+        time_ns = self._ascending(topic, time_ns)
+        self.samples[topic] += len(batch)
+        columns: dict[str, NDArray[Any]] = {"time_ns": time_ns, **batch.columns}
+        if batch.tick is not None:
+            columns["device_ticks"] = batch.tick
+        if batch.sequence is not None:
+            columns["sequence"] = batch.sequence
+        for start in range(0, len(batch), LARGEST_BATCH):
+            part = slice(start, start + LARGEST_BATCH)
+            message = layout.pack(once, {key: column[part] for key, column in columns.items()})
+            last = min(part.stop, len(batch)) - 1
+            yield Stamped(topic, message, int(read_ns[last]), int(time_ns[start]))
+
+    def _times(self, batch: Batch, arrivals: Arrivals) -> NDArray[np.int64]:
+        ticks = batch.stream.ticks
+        if batch.tick is None or ticks is None:
+            return arrivals.wire_ns(batch.end)
+        device = self.device(batch.stream)
+        clock = self.clocks.get(device)
+        if clock is None or (clock.hz, clock.bits) != (ticks.hz, ticks.bits):
+            clock = self.clocks[device] = TickClock(ticks.hz, ticks.bits)
+        return clock.times(batch.tick, arrivals.read_ns(batch.end))
+
+    def _ascending(self, topic: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The same times, each later than the one before it by a nanosecond at least."""
+        steps = np.arange(len(time_ns))
+        last = self._last.get(topic, -1)
+        rising = np.maximum.accumulate(np.maximum(time_ns - steps, last + 1)) + steps
+        self._last[topic] = int(rising[-1])
+        return rising
+
+    def _log(self, batch: Batch, read_ns: NDArray[np.int64]) -> Iterator[Stamped]:
+        name = self.device(batch.stream)
+        rows = zip(batch.columns["level"], batch.columns["text"], read_ns.tolist(), strict=True)
+        for level, text, time_ns in rows:
+            stamp = messages.timestamp(time_ns)
+            line = Log(timestamp=stamp, level=int(level), message=str(text), name=name)
+            yield Stamped("/log", line, time_ns, time_ns)
+
+
+def _form(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
+    """Topic, layout and what is said once of a stream of a device."""
+    field = {"device": device, "frame_id": device, "sensors": stream.sensors}
+    if stream.kind == "magnetometers":
+        return f"/magnetometers/{device}", messages.magnetometers(stream.sensors), field
+    if stream.kind == "halls":
+        return f"/halls/{device}", messages.halls(stream.sensors), field
+    if stream.kind == "lighthouse":
+        return f"/lighthouse/{device}", messages.SWEEPS, {"device": device}
+    if stream.kind == "captures":
+        return f"/captures/{device}", messages.CAPTURES, {"device": device}
+    if stream.kind == "odometry":
+        once = {"device": device, "frame_id": "odometry"}
+        return f"/odometry/{device}", messages.ODOMETRY, once
+    if stream.kind == "readings":
+        once = {"device": device, "names": stream.names}
+        return f"/readings/{device}", messages.readings(len(stream.names)), once
+    raise ValueError(f"no such kind of records: {stream.kind}")

@@ -1,0 +1,102 @@
+"""What a recording got, and what it lost: the numbers of the live line, of the metadata and
+of ``--json``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+RECORD = "capture"
+"""Name of the metadata record."""
+
+
+@dataclass
+class Totals:
+    """Counted since the start.
+
+    Attributes
+    ----------
+    bytes, frames, bad, lost, skipped, unknown : int
+        Of the decoder: :class:`locatk.formats.wire.decoder.Counts`; of a camera, ``frames``.
+    gaps : int
+        How often the connection was lost.
+    gap_s : float
+        For how long in all.
+    silences : int
+        How often nothing came for longer than was allowed.
+    overruns : int
+        Bytes that the kernel says a UART lost.
+    line_errors : int
+        Bytes without a stop bit or of wrong parity, by the kernel.
+    high_water_bytes : int
+        Most that waited between the port and the file.
+    clock_step_s : float
+        By how much the wall clock was set meanwhile; the times here did not follow.
+    samples : dict of str to int
+        Records by topic.
+    """
+
+    bytes: int = 0
+    frames: int = 0
+    bad: int = 0
+    lost: int = 0
+    skipped: int = 0
+    unknown: int = 0
+    gaps: int = 0
+    gap_s: float = 0.0
+    silences: int = 0
+    overruns: int = 0
+    line_errors: int = 0
+    high_water_bytes: int = 0
+    clock_step_s: float = 0.0
+    samples: dict[str, int] = field(default_factory=dict)
+
+    def since(self, before: Totals) -> Totals:
+        """What was counted since ``before``; the high water and the clock's step are not
+        counts and stay."""
+        kept = ("high_water_bytes", "clock_step_s", "samples")
+        counted = {
+            each.name: getattr(self, each.name) - getattr(before, each.name)
+            for each in fields(self)
+            if each.name not in kept
+        }
+        samples = {
+            topic: count - before.samples.get(topic, 0) for topic, count in self.samples.items()
+        }
+        return Totals(
+            **counted,
+            high_water_bytes=self.high_water_bytes,
+            clock_step_s=self.clock_step_s,
+            samples=samples,
+        )
+
+    def losses(self) -> list[str]:
+        """What was lost, one phrase each; empty where nothing was."""
+        return [
+            words
+            for count, words in (
+                (self.gaps, f"connection lost {_times(self.gaps)}, {self.gap_s:.1f} s in all"),
+                (self.overruns, f"{self.overruns} bytes overrun in the UART or the kernel"),
+                (self.line_errors, f"{self.line_errors} bytes with line errors"),
+                (self.bad, f"{self.bad} bad frames"),
+                (self.lost, f"{self.lost} frames missing by their sequence numbers"),
+            )
+            if count
+        ]
+
+    def texts(self) -> dict[str, str]:
+        """As entries of a metadata record."""
+        plain = asdict(self)
+        samples = plain.pop("samples")
+        return {
+            **{key: _text(value) for key, value in plain.items()},
+            **{f"samples:{topic}": str(count) for topic, count in samples.items()},
+        }
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6f}" if isinstance(value, float) else str(value)
