@@ -26,6 +26,7 @@ COMMANDS = {
     "emulate": ("locatk.cli.emulate", "Be a device on a pseudo-terminal, without hardware."),
     "import": ("locatk.cli.import_", "Turn recordings of other tools into a session."),
     "simulate": ("locatk.cli.simulate", "Make a session with known truth, without hardware."),
+    "decode": ("locatk.cli.decode", "Decode the raw bytes of a recording again."),
     "recover": ("locatk.cli.recover", "Salvage a damaged recording."),
     "info": ("locatk.cli.info", "Say what is in a session, a solution or an artifact."),
     "calibrate": ("locatk.cli.calibrate", "Make a better artifact from recordings."),

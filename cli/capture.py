@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import capture_text, console, failures, options
-from locatk.cli.capture_options import DURATION, PACE, SIZE
+from locatk.cli.capture_options import DURATION, PACE, SIZE, names_option
 
 if TYPE_CHECKING:
     from locatk.formats.capture.recorder import Limits, Recorded
@@ -26,13 +26,6 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
             raise click.BadParameter(f"{text!r} is not of the form KEY=VALUE.")
         pairs[key.strip()] = content.strip()
     return pairs
-
-
-def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in value.split(",")) if value else ()
-    if not all(names) or len(set(names)) < len(names):
-        raise click.BadParameter("expected names with commas between, each once.")
-    return names
 
 
 @click.command(short_help="Record a device from a port, or a camera, into a session.")
@@ -66,12 +59,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
     help="Of the device in the session.  [default: robot; of a camera: camera]",
 )
 @click.option("--baud", type=click.IntRange(min=1), help="[default: the device's own]")
-@click.option(
-    "--columns",
-    metavar="A,B,...",
-    callback=_names,
-    help="lines: names of the values of a line, in their order.",
-)
+@names_option
 @click.option("--duration", type=DURATION, metavar="TIME", help="End after so long: 90s, 5min, 2h.")
 @click.option("--max-size", type=SIZE, metavar="SIZE", help="End at so many bytes: 500MB, 2GB.")
 @click.option(

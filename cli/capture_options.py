@@ -56,3 +56,18 @@ class Pace(click.ParamType[tuple[str, float]]):
 
 
 PACE = Pace()
+
+
+def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in value.split(",")) if value else ()
+    if not all(names) or len(set(names)) < len(names):
+        raise click.BadParameter("expected names with commas between, each once.")
+    return names
+
+
+names_option = click.option(
+    "--columns",
+    metavar="A,B,...",
+    callback=_names,
+    help="lines: names of the values of a line, in their order.",
+)

@@ -96,12 +96,13 @@ class SerialIntake:
         baud: int | None = None,
     ) -> None:
         self.topic = f"/serial/{name}"
-        self.declared = [(self.topic, SerialChunk)]
+        self.declared: Sequence[tuple[str, type[Message]]] = [(self.topic, SerialChunk)]
         self.system = ""
         self.device: Device | None = None
         self._port, self._options = port, options or Options()
         self._baud = baud
         self._offset = 0
+        self._opened = True
         self._last_ns: int | None = None
         self._first_ns: int | None = None
         self._streams = Streams(name)
@@ -130,7 +131,9 @@ class SerialIntake:
                 port=self._port,
                 byte_offset=self._offset,
                 data=each.data,
+                opened=self._opened,
             )
+            self._opened = False
             yield Stamped(self.topic, chunk, each.time_ns, each.time_ns)
             self._offset += each.size
             self._arrivals.add(self._offset, each.time_ns)
@@ -182,8 +185,9 @@ class SerialIntake:
         return [batch for data, pause in held for batch in self._feed(data, pause)]
 
     def restart(self) -> Iterator[Stamped]:
-        """What is half received is dropped; the next byte counts on."""
-        self._last_ns = None
+        """What is half received is dropped; byte offsets go on."""
+        self._opened = True
+        self._streams.restart()
         if self._decoder is not None:
             yield from self._told(self._decoder.restart())
 
@@ -199,7 +203,7 @@ class SerialIntake:
             if len(batch) and f"{batch.stream.kind} {name}" not in self._known:
                 self._known[f"{batch.stream.kind} {name}"] = batch.stream
                 self.system = self.system or SYSTEMS.get(batch.stream.kind, "")
-        return self._streams.messages(batches, self._arrivals)
+        return self._streams.messages(batches, self._arrivals, self._last_ns or 0)
 
     def count(self, totals: Totals) -> None:
         """What the decoder counted, and how many records there are of each topic."""
@@ -219,17 +223,18 @@ class SerialIntake:
         return said
 
     def clocks(self) -> dict[str, str]:
-        """Offset, drift and jitter of each device's clock against the host's."""
-        return {
-            f"{key}:{device}": f"{value:.9g}"
-            for device, clock in self._streams.clocks.items()
-            for key, value in (
-                ("tick_offset_s", clock.offset_ns * 1e-9),
-                ("tick_drift_ppm", clock.drift_ppm),
-                ("tick_jitter_s", clock.jitter_ns * 1e-9),
-                ("tick_restarts", clock.restarts),
-            )
-        }
+        """Of each device's clock against the host's: offset, drift, and how late the latest
+        twentieth of what it sends arrives."""
+        found: dict[str, str] = {}
+        for device, clock in self._streams.clocks.items():
+            known = {
+                "tick_offset_s": _scaled(clock.offset_ns, 1e-9),
+                "tick_drift_ppm": clock.drift_ppm,
+                "tick_jitter_s": _scaled((clock.jitter_ns or (None, None))[1], 1e-9),
+                "tick_restarts": clock.restarts,
+            }
+            found |= {f"{k}:{device}": f"{v:.9g}" for k, v in known.items() if v is not None}
+        return found
 
     def artifacts(self) -> dict[str, str]:
         """Sensors of devices that are what they are."""
@@ -239,6 +244,10 @@ class SerialIntake:
         for stream in self._known.values():
             found |= self.device.attached(stream)
         return found
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
 
 
 class CameraIntake:
@@ -252,11 +261,10 @@ class CameraIntake:
         ``"png"`` or ``"jpeg"``.
     """
 
-    system = "dots"
-
     def __init__(self, name: str, format: str) -> None:
         self.topic = f"{frames.TOPIC}{name}"
-        self.declared = [(self.topic, CompressedImage)]
+        self.declared: Sequence[tuple[str, type[Message]]] = [(self.topic, CompressedImage)]
+        self.system = "dots"
         self._name, self._format = name, format
         self._frames = self._bytes = 0
 

@@ -21,6 +21,9 @@ CHUNK = 1 << 19
 """A chunk is written when it has so many bytes, if not before. Half of what the MCAP writer
 takes before it writes one unasked."""
 
+LOG_NAME = "locatk capture"
+"""Who says what the recorder writes to ``/log``."""
+
 PER_CHUNK = 512
 """Bytes of the index at the end of a file by chunk, at most."""
 
@@ -137,7 +140,7 @@ class Parts:
 
     def log(self, text: str, time_ns: int, *, level: int = Log.WARNING) -> None:
         """A line for the log panel."""
-        line = Log(timestamp=timestamp(time_ns), level=level, message=text, name="locatk capture")  # type: ignore[arg-type]
+        line = Log(timestamp=timestamp(time_ns), level=level, message=text, name=LOG_NAME)  # type: ignore[arg-type]
         self._writer.write("/log", line, time_ns)
 
     def flush(self) -> None:

@@ -17,7 +17,7 @@ from locatk.formats import messages
 from locatk.formats.capture.arrivals import Arrivals
 from locatk.formats.messages import Layout
 from locatk.formats.tracks import LARGEST_BATCH
-from locatk.formats.wire.decoder import Batch, Stream
+from locatk.formats.wire.decoder import Batch, Stream, Ticks
 
 SYSTEMS = {
     "magnetometers": "polaris",
@@ -26,6 +26,8 @@ SYSTEMS = {
     "captures": "lighthouse",
 }
 """Kind of records to the system that solves them."""
+
+LEVELS = (Log.UNKNOWN, Log.DEBUG, Log.INFO, Log.WARNING, Log.ERROR, Log.FATAL)
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ class Streams:
     def __init__(self, name: str) -> None:
         self._name = name
         self._last: dict[str, int] = {}
+        self._ticks: dict[str, Ticks] = {}
         self.samples: Counter[str] = Counter()
         self.clocks: dict[str, TickClock] = {}
 
@@ -64,21 +67,25 @@ class Streams:
         """Name of the device whose records these are."""
         return f"{self._name}-{stream.node}" if stream.node else self._name
 
-    def messages(self, batches: Sequence[Batch], arrivals: Arrivals) -> Iterator[Stamped]:
-        """Messages of ``batches``; what was measured when, is told by the device's ticks
-        where it has any, else by the arrival of the last byte."""
+    def restart(self) -> None:
+        """The devices were away: their clocks may have begun anew."""
+        for clock in self.clocks.values():
+            clock.restart()
+
+    def messages(
+        self, batches: Sequence[Batch], arrivals: Arrivals, now_ns: int
+    ) -> Iterator[Stamped]:
+        """Messages of ``batches``, all complete at ``now_ns``; what was measured when, is told
+        by the device's ticks where it has any, else by the arrival of the last byte."""
         for batch in batches:
             if len(batch) == 0:
                 continue
-            read_ns = arrivals.read_ns(batch.end)
             if batch.stream.kind == "log":
-                yield from self._log(batch, read_ns)
+                yield from self._log(batch, arrivals.read_ns(batch.end), now_ns)
             else:
-                yield from self._records(batch, self._times(batch, arrivals), read_ns)
+                yield from self._records(batch, self._times(batch, arrivals), now_ns)
 
-    def _records(
-        self, batch: Batch, time_ns: NDArray[np.int64], read_ns: NDArray[np.int64]
-    ) -> Iterator[Stamped]:
+    def _records(self, batch: Batch, time_ns: NDArray[np.int64], now_ns: int) -> Iterator[Stamped]:
         stream, device = batch.stream, self.device(batch.stream)
         topic, layout, once = _form(stream, device)
         time_ns = self._ascending(topic, time_ns)
@@ -91,18 +98,17 @@ class Streams:
         for start in range(0, len(batch), LARGEST_BATCH):
             part = slice(start, start + LARGEST_BATCH)
             message = layout.pack(once, {key: column[part] for key, column in columns.items()})
-            last = min(part.stop, len(batch)) - 1
-            yield Stamped(topic, message, int(read_ns[last]), int(time_ns[start]))
+            yield Stamped(topic, message, now_ns, int(time_ns[start]))
 
     def _times(self, batch: Batch, arrivals: Arrivals) -> NDArray[np.int64]:
         ticks = batch.stream.ticks
         if batch.tick is None or ticks is None:
             return arrivals.wire_ns(batch.end)
         device = self.device(batch.stream)
-        clock = self.clocks.get(device)
-        if clock is None or (clock.hz, clock.bits) != (ticks.hz, ticks.bits):
-            clock = self.clocks[device] = TickClock(ticks.hz, ticks.bits)
-        return clock.times(batch.tick, arrivals.read_ns(batch.end))
+        if self._ticks.get(device) != ticks:
+            self._ticks[device] = ticks
+            self.clocks[device] = TickClock(ticks.hz, ticks.bits)
+        return self.clocks[device].times(batch.tick, arrivals.read_ns(batch.end))
 
     def _ascending(self, topic: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The same times, each later than the one before it by a nanosecond at least."""
@@ -112,18 +118,18 @@ class Streams:
         self._last[topic] = int(rising[-1])
         return rising
 
-    def _log(self, batch: Batch, read_ns: NDArray[np.int64]) -> Iterator[Stamped]:
+    def _log(self, batch: Batch, read_ns: NDArray[np.int64], now_ns: int) -> Iterator[Stamped]:
         name = self.device(batch.stream)
         rows = zip(batch.columns["level"], batch.columns["text"], read_ns.tolist(), strict=True)
         for level, text, time_ns in rows:
             stamp = messages.timestamp(time_ns)
-            line = Log(timestamp=stamp, level=int(level), message=str(text), name=name)
-            yield Stamped("/log", line, time_ns, time_ns)
+            line = Log(timestamp=stamp, level=LEVELS[int(level)], message=str(text), name=name)
+            yield Stamped("/log", line, now_ns, time_ns)
 
 
 def _form(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
     """Topic, layout and what is said once of a stream of a device."""
-    field = {"device": device, "frame_id": device, "sensors": stream.sensors}
+    field: dict[str, Any] = {"device": device, "frame_id": device, "sensors": stream.sensors}
     if stream.kind == "magnetometers":
         return f"/magnetometers/{device}", messages.magnetometers(stream.sensors), field
     if stream.kind == "halls":
@@ -133,7 +139,7 @@ def _form(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
     if stream.kind == "captures":
         return f"/captures/{device}", messages.CAPTURES, {"device": device}
     if stream.kind == "odometry":
-        once = {"device": device, "frame_id": "odometry"}
+        once: dict[str, Any] = {"device": device, "frame_id": "odometry"}
         return f"/odometry/{device}", messages.ODOMETRY, once
     if stream.kind == "readings":
         once = {"device": device, "names": stream.names}

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x13locatk/serial.proto\x12\x06locatk\x1a\x1fgoogle/protobuf/timestamp.proto\"m\n\x0bSerialChunk\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0c\n\x04port\x18\x02 \x01(\t\x12\x13\n\x0b\x62yte_offset\x18\x03 \x01(\x04\x12\x0c\n\x04\x64\x61ta\x18\x04 \x01(\x0c\"\x8e\x01\n\x08Readings\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\r\n\x05names\x18\x03 \x03(\t\x12\x0f\n\x07time_ns\x18\x04 \x03(\x06\x12\x14\n\x0c\x64\x65vice_ticks\x18\x05 \x03(\x06\x12\r\n\x05value\x18\x06 \x03(\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x13locatk/serial.proto\x12\x06locatk\x1a\x1fgoogle/protobuf/timestamp.proto\"}\n\x0bSerialChunk\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0c\n\x04port\x18\x02 \x01(\t\x12\x13\n\x0b\x62yte_offset\x18\x03 \x01(\x04\x12\x0c\n\x04\x64\x61ta\x18\x04 \x01(\x0c\x12\x0e\n\x06opened\x18\x05 \x01(\x08\"\x8e\x01\n\x08Readings\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\r\n\x05names\x18\x03 \x03(\t\x12\x0f\n\x07time_ns\x18\x04 \x03(\x06\x12\x14\n\x0c\x64\x65vice_ticks\x18\x05 \x03(\x06\x12\r\n\x05value\x18\x06 \x03(\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,7 +33,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'locatk.serial_pb2', _global
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_SERIALCHUNK']._serialized_start=64
-  _globals['_SERIALCHUNK']._serialized_end=173
-  _globals['_READINGS']._serialized_start=176
-  _globals['_READINGS']._serialized_end=318
+  _globals['_SERIALCHUNK']._serialized_end=189
+  _globals['_READINGS']._serialized_start=192
+  _globals['_READINGS']._serialized_end=334
 # @@protoc_insertion_point(module_scope)
