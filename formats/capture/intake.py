@@ -226,14 +226,14 @@ class SerialIntake:
         """Of each device's clock against the host's: offset, drift, and how late the latest
         twentieth of what it sends arrives."""
         found: dict[str, str] = {}
-        for device, clock in self._streams.clocks.items():
+        for name, clock in self._streams.clocks.items():
             known = {
                 "tick_offset_s": _scaled(clock.offset_ns, 1e-9),
                 "tick_drift_ppm": clock.drift_ppm,
                 "tick_jitter_s": _scaled((clock.jitter_ns or (None, None))[1], 1e-9),
                 "tick_restarts": clock.restarts,
             }
-            found |= {f"{k}:{device}": f"{v:.9g}" for k, v in known.items() if v is not None}
+            found |= {f"{k}:{name}": f"{v:.9g}" for k, v in known.items() if v is not None}
         return found
 
     def artifacts(self) -> dict[str, str]:
