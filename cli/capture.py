@@ -178,9 +178,13 @@ def command(
 
 @contextlib.contextmanager
 def _stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that the first SIGINT or SIGTERM sets; the second one is as always."""
+    """An event that the first SIGINT, SIGTERM or SIGHUP (a terminal that is closed) sets; the
+    second one is as always."""
     stop = threading.Event()
-    kinds = (signal.SIGINT, signal.SIGTERM)
+    kinds = [signal.SIGINT, signal.SIGTERM]
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup
+        kinds.append(hangup)
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return

@@ -13,6 +13,12 @@ _BYTES |= {"kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}
 _NUMBER = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-zA-Z]*)")
 
 
+LARGEST = 1e18
+
+SHORTEST_S, SMALLEST = 1.0, 100_000
+"""Of a part of a recording."""
+
+
 class _Quantity(click.ParamType[float]):
     """A positive number and its unit."""
 
@@ -26,7 +32,7 @@ class _Quantity(click.ParamType[float]):
             return value
         found = _NUMBER.fullmatch(value.strip())
         factor = self._units.get(found[2].lower()) if found else None
-        if found is None or factor is None or float(found[1]) * factor <= 0:
+        if found is None or factor is None or not 0 < float(found[1]) * factor < LARGEST:
             self.fail(f"{value!r} is no {self.name}; write it as {self._example}", param, ctx)
         number: float = float(found[1]) * factor
         return number
@@ -50,9 +56,13 @@ class Pace(click.ParamType[tuple[str, float]]):
         if isinstance(value, tuple):
             return value
         unit = re.sub(r"[\d.\s]", "", value).lower()
-        if unit in _BYTES:
-            return "size", SIZE.convert(value, param, ctx)
-        return "time", DURATION.convert(value, param, ctx)
+        kind, quantity, least = (
+            ("size", SIZE, SMALLEST) if unit in _BYTES else ("time", DURATION, SHORTEST_S)
+        )
+        number = quantity.convert(value, param, ctx)
+        if number < least:
+            self.fail(f"{value!r} is too little; at least 1s or 100kB", param, ctx)
+        return kind, number
 
 
 PACE = Pace()

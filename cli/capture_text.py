@@ -31,20 +31,31 @@ class Live:
 
     def tell(self, text: str) -> None:
         """Something happened."""
-        self.wipe()
-        console.warn(text)
+        with self._unheard():
+            self.wipe()
+            console.warn(text)
 
     def show(self, status: Status) -> None:
         """How it goes."""
         if not self._shown:
             return
         text = status_line(status)
-        if not self._terminal:
-            click.echo(text, err=True)
-            return
-        text = text[: shutil.get_terminal_size().columns - 1]
-        click.echo("\r" + text.ljust(self._width), err=True, nl=False)
-        self._width = len(text)
+        with self._unheard():
+            if self._terminal:
+                text = text[: shutil.get_terminal_size().columns - 1]
+                click.echo("\r" + text.ljust(self._width), err=True, nl=False)
+                self._width = len(text)
+            else:
+                click.echo(text, err=True)
+
+    @contextlib.contextmanager
+    def _unheard(self) -> Iterator[None]:
+        """Whoever listened is gone: that must not end a recording."""
+        try:
+            yield
+        except OSError:
+            console.set_verbosity(-1)
+            self._shown, self._width = False, 0
 
     def wipe(self) -> None:
         """Take the line away."""
@@ -76,7 +87,7 @@ def status_line(status: Status) -> str:
         *([f"{totals.gaps} gaps"] if totals.gaps else []),
         f"buffer {size(totals.high_water_bytes)}",
         f"file {size(status.file_bytes)}",
-        f"disk {size(status.free_bytes)} left",
+        *([f"disk {size(status.free_bytes)} left"] if status.free_bytes is not None else []),
     ]
     return "  ".join(words)
 

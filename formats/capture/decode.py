@@ -11,14 +11,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import FormatError
 from locatk.formats.capture.intake import AUTO, SerialIntake
-from locatk.formats.capture.parts import LOG_NAME
 from locatk.formats.capture.receiver import Arrived
 from locatk.formats.capture.streams import Stamped
 from locatk.formats.capture.totals import RECORD, Totals
 from locatk.formats.proto.serial_pb2 import SerialChunk
 from locatk.formats.session import RECORD as SESSION
 from locatk.formats.session import Session
-from locatk.formats.session_writer import SessionWriter
+from locatk.formats.session_writer import CHANNELS, SessionWriter
 from locatk.formats.wire.decoder import Options
 
 TOPIC = "/serial/"
@@ -110,6 +109,13 @@ def decode(
             attached = {**intake.artifacts(), **attached}
         for key, text in attached.items():
             writer.attach_toml(key, text)
+        for info in session.attachments():
+            data = session.attachment(info.name)
+            if data is not None and info.name not in attached:
+                writer.attach(info.name, data, info.media_type, info.time_ns)
+        for key, record in session.metadata().items():
+            if key not in (SESSION, RECORD, CHANNELS):
+                writer.metadata(key, record)
         decoded = _decoded(intakes)
         writer.metadata(SESSION, {"system": decoded.system})
         writer.metadata(RECORD, _facts(said, intakes, decoded, Path(session.path).name))
@@ -149,22 +155,25 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
     """Raw bytes, records and the log of the recorder, in the order of the file."""
     waiting: dict[str, list[Arrived]] = {topic: [] for topic in intakes}
     begun = 0
-    heard: set[str] = set()
+    expected = dict.fromkeys(intakes, 0)
     for topic, time_ns, payload in session.messages([*intakes, "/log"]):
         if topic == "/log":
             line = Log.FromString(payload)
-            if line.name == LOG_NAME:
+            if line.name.startswith("locatk"):  # not of a device: those are decoded again
                 yield from _turn(intakes, waiting)
                 yield Stamped("/log", line, time_ns, time_ns)
             continue
         chunk = SerialChunk.FromString(payload)
-        again = chunk.opened and topic in heard
-        heard.add(topic)
+        hole = chunk.byte_offset != expected[topic]
+        again = chunk.byte_offset != 0 and (chunk.opened or hole)
         if again or time_ns - begun >= TURN_NS:
             yield from _turn(intakes, waiting)
             begun = time_ns
+        if hole:
+            intakes[topic].skip_to(chunk.byte_offset)
         if again:
-            yield from intakes[topic].restart()
+            yield from intakes[topic].restart(opened=chunk.opened)
+        expected[topic] = chunk.byte_offset + len(chunk.data)
         waiting[topic].append(Arrived(time_ns, chunk.data, len(chunk.data)))
     yield from _turn(intakes, waiting)
     for intake in intakes.values():

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Protocol
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from google.protobuf.message import Message
@@ -15,8 +16,10 @@ from locatk.formats.capture.streams import SYSTEMS, Stamped, Streams
 from locatk.formats.capture.totals import Totals
 from locatk.formats.proto.serial_pb2 import SerialChunk
 from locatk.formats.wire import Device, device
-from locatk.formats.wire.decoder import Batch, Decoder, Options, Stream
-from locatk.formats.wire.identify import LISTEN_S, Identifier, Verdict
+from locatk.formats.wire.decoder import Batch, Counts, Decoder, Options, Stream
+
+if TYPE_CHECKING:
+    from locatk.formats.wire.identify import Identifier, Verdict
 
 PAUSE_NS = 3_000_000
 """A line that is silent for longer is between two frames: within a frame bytes follow each
@@ -101,18 +104,22 @@ class SerialIntake:
         self.device: Device | None = None
         self._port, self._options = port, options or Options()
         self._baud = baud
-        self._offset = 0
+        self._offset = self._fed = 0
         self._opened = True
         self._last_ns: int | None = None
         self._first_ns: int | None = None
         self._streams = Streams(name)
         self._arrivals = Arrivals()
-        self._known: dict[str, Stream] = {}
+        self._known: dict[tuple[str, str], Stream] = {}
+        self._asked: set[Stream] = set()
+        self._counts = Counts()
         self._said: list[str] = []
         self._decoder: Decoder | None = None
         self._identifier: Identifier | None = None
-        self._held: list[tuple[bytes, bool]] = []
+        self._held: list[tuple[bytes, bool] | None] = []  # None: opened again
         if device_name == AUTO:
+            from locatk.formats.wire.identify import Identifier
+
             self._identifier = Identifier()
         else:
             self._decide(device(device_name))
@@ -134,84 +141,107 @@ class SerialIntake:
                 opened=self._opened,
             )
             self._opened = False
-            yield Stamped(self.topic, chunk, each.time_ns, each.time_ns)
             self._offset += each.size
-            self._arrivals.add(self._offset, each.time_ns)
+            self._fed += each.size
+            self._arrivals.add(self._fed, each.time_ns)
             pause = self._last_ns is None or each.time_ns - self._last_ns >= PAUSE_NS
             self._last_ns = each.time_ns
             self._first_ns = self._first_ns or each.time_ns
             if pause or not pieces:
                 pieces.append((pause, []))
             pieces[-1][1].append(each.data)
+            yield Stamped(self.topic, chunk, each.time_ns, each.time_ns)
         for pause, data in pieces:
-            yield from self._told(self._feed(b"".join(data), pause))
+            yield from self._records(partial(self._feed, b"".join(data), pause))
 
     def _feed(self, data: bytes, pause: bool) -> list[Batch]:
         if self._decoder is not None:
-            try:
-                return self._decoder.feed(data, pause=pause)
-            except Exception as error:  # a decoder's fault must not cost the bytes
-                return self._failed(error)
-        assert self._identifier is not None
+            return self._decoder.feed(data, pause=pause)
+        if self._identifier is None:
+            return []
         self._held.append((data, pause))
         self._identifier.feed(data, pause=pause)
         return self._identified(self._identifier.verdict())
 
-    def _failed(self, error: Exception) -> list[Batch]:
-        assert self._decoder is not None
-        self._said.append(
-            f"the decoder failed ({type(error).__name__}: {error}): from here on there are only "
-            "raw bytes. Please report it"
-        )
-        counts, self._decoder = self._decoder.counts, device("raw").decode(self._options)
-        self._decoder.counts = counts
-        return []
-
     def turn(self, now_ns: int) -> Iterator[Stamped]:
         """Settle what the device is, when it was listened to for long enough."""
-        if self._first_ns is not None and now_ns - self._first_ns > LISTEN_S * 1e9:
-            yield from self._settle()
+        if self._identifier is not None and self._first_ns is not None:
+            from locatk.formats.wire.identify import LISTEN_S
 
-    def _settle(self) -> Iterator[Stamped]:
-        if self._identifier is not None:
-            yield from self._told(self._identified(self._identifier.settle()))
+            if now_ns - self._first_ns > LISTEN_S * 1e9:
+                yield from self._records(self._settle)
+
+    def _settle(self) -> list[Batch]:
+        return [] if self._identifier is None else self._identified(self._identifier.settle())
 
     def _identified(self, verdict: Verdict | None) -> list[Batch]:
         if verdict is None:
             return []
         self._said.append(f"the device is taken for {verdict.device}: {verdict.why}")
+        self._identifier = None
         self._decide(device(verdict.device))
-        held, self._held, self._identifier = self._held, [], None
-        return [batch for data, pause in held for batch in self._feed(data, pause)]
+        held, self._held = self._held, []
+        batches = []
+        for piece in held:
+            batches += self._again() if piece is None else self._feed(*piece)
+        return batches
 
-    def restart(self) -> Iterator[Stamped]:
-        """What is half received is dropped; byte offsets go on."""
-        self._opened = True
+    def restart(self, *, opened: bool = True) -> Iterator[Stamped]:
+        """What is half received is dropped; byte offsets go on. Not ``opened`` where only
+        bytes are missing from a recording."""
+        self._opened = opened
         self._streams.restart()
+        yield from self._records(self._again)
+
+    def _again(self) -> list[Batch]:
         if self._decoder is not None:
-            yield from self._told(self._decoder.restart())
+            return self._decoder.restart()
+        self._held += [None] * (self._identifier is not None)
+        return []
+
+    def skip_to(self, offset: int) -> None:
+        """Of a recording that is not whole: the next byte is number ``offset``."""
+        if offset > self._offset > 0:
+            self._said.append(f"{offset - self._offset} bytes are missing at byte {self._offset}")
+        self._offset = offset
 
     def finish(self) -> Iterator[Stamped]:
         """What the decoder held back."""
-        yield from self._settle()
+        yield from self._records(self._settle)
         if self._decoder is not None:
-            yield from self._told(self._decoder.finish())
+            yield from self._records(self._decoder.finish)
 
-    def _told(self, batches: Sequence[Batch]) -> Iterator[Stamped]:
+    def _records(self, decode: Callable[[], list[Batch]]) -> list[Stamped]:
+        """Messages of what ``decode`` gives. Whatever it raises ends the decoding, and not
+        the recording: the bytes go on."""
+        try:
+            batches = decode()
+            made = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
+        except Exception as error:  # of a decoder that may be somebody else's
+            self._give_up(error)
+            return []
         for batch in batches:
-            name = self._streams.device(batch.stream)
-            if len(batch) and f"{batch.stream.kind} {name}" not in self._known:
-                self._known[f"{batch.stream.kind} {name}"] = batch.stream
+            if len(batch):
+                self._known[batch.stream.kind, self._streams.device(batch.stream)] = batch.stream
                 self.system = self.system or SYSTEMS.get(batch.stream.kind, "")
-        return self._streams.messages(batches, self._arrivals, self._last_ns or 0)
+        return made
+
+    def _give_up(self, error: Exception) -> None:
+        self._said.append(
+            f"the decoder failed ({type(error).__name__}: {error}): from here on there are only "
+            "raw bytes. Please report it"
+        )
+        self._decoder = self._identifier = None
+        self._held = []
 
     def count(self, totals: Totals) -> None:
         """What the decoder counted, and how many records there are of each topic."""
-        totals.bytes = self._offset
+        totals.bytes = self._fed
         if self._decoder is not None:
-            counts = self._decoder.counts
-            totals.frames, totals.bad, totals.lost = counts.frames, counts.bad, counts.lost
-            totals.skipped, totals.unknown = counts.skipped, counts.unknown
+            self._counts = self._decoder.counts
+        counts = self._counts
+        totals.frames, totals.bad, totals.lost = counts.frames, counts.bad, counts.lost
+        totals.skipped, totals.unknown = counts.skipped, counts.unknown
         totals.samples = dict(self._streams.samples)
 
     def remarks(self) -> list[str]:
@@ -242,7 +272,9 @@ class SerialIntake:
             return {}
         found: dict[str, str] = {}
         for stream in self._known.values():
-            found |= self.device.attached(stream)
+            if stream not in self._asked:
+                found |= self.device.attached(stream)
+                self._asked.add(stream)
         return found
 
 

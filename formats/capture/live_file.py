@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import errno
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -19,6 +20,9 @@ from locatk.formats.output import check_output
 AHEAD = 4 << 20
 """Bytes of the disk that are taken before they are needed, so that a recording whose disk is
 full can still be finished."""
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What the system says of a disk, a quota or a file system's largest file that is full."""
 
 _KEEP_SIZE = 1
 """FALLOC_FL_KEEP_SIZE: the file is not longer for it."""
@@ -77,8 +81,8 @@ class LiveFile:
             with contextlib.suppress(OSError):
                 self._file.truncate(self._size)
                 self._file.seek(self._size)
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise DiskFullError("no space left on the disk", file=self.path) from error
+            if error.errno in FULL:
+                raise DiskFullError(_words(error.errno), file=self.path) from error
             raise
         self._size += done
         return done
@@ -97,12 +101,23 @@ class LiveFile:
         if not self._takes_ahead or wanted + AHEAD // 2 <= self._taken:
             return
         number = _fallocate(self._file.fileno(), self._size, more + AHEAD)
-        if number in (errno.ENOSPC, errno.EDQUOT):
-            raise DiskFullError("no space left on the disk", file=self.path)
-        if number:
-            self._takes_ahead = False
-        else:
+        if number in FULL:
+            raise DiskFullError(_words(number), file=self.path)
+        if number == 0:
             self._taken = wanted + AHEAD
+        elif number != errno.EINTR:
+            self._takes_ahead = False
+
+    def free(self) -> int | None:
+        """Bytes that are free on the disk, None where the system does not tell."""
+        try:
+            found = os.fstatvfs(self._file.fileno())
+        except (AttributeError, OSError, ValueError):
+            try:
+                return shutil.disk_usage(self.path.parent).free
+            except OSError:
+                return None
+        return found.f_bavail * found.f_frsize
 
     def tell(self) -> int:
         """Bytes written."""
@@ -126,6 +141,10 @@ class LiveFile:
         with contextlib.suppress(OSError):
             os.fsync(self._file.fileno())
         self._file.close()
+
+
+def _words(number: int | None) -> str:
+    return "the file is as large as it can be" if number == errno.EFBIG else "no space left"
 
 
 def _fallocate(descriptor: int, offset: int, length: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
+from locatk.core.errors import OutputExistsError
 from locatk.formats.capture.live_file import LiveFile
 from locatk.formats.capture.streams import Stamped
 from locatk.formats.capture.totals import RECORD
@@ -82,12 +84,17 @@ class Parts:
         self._chunks = 0
         self._pending = 0
         self.paths: list[Path] = []
+        self._is_open = False
+        if numbered and overwrite:  # what stays of an older recording would look like ours
+            for old in parts_of(path):
+                old.unlink(missing_ok=True)
         self._open()
 
     def _open(self) -> None:
         number = len(self.paths) + 1
         path = part_path(self._path, number) if self._numbered else self._path
         self.file = LiveFile(path, overwrite=self._overwrite)
+        self._is_open = True
         self.paths.append(path)
         self._chunks = 0
         self._writer = SessionWriter(path, system=self._system, live=self.file)  # type: ignore[arg-type]
@@ -110,12 +117,12 @@ class Parts:
     @property
     def bytes_written(self) -> int:
         """By all parts together."""
-        return self._finished_bytes + self.file.tell()
+        return self._finished_bytes + self.part_bytes
 
     @property
     def part_bytes(self) -> int:
         """By this part."""
-        return self.file.tell()
+        return self.file.tell() if self._is_open else 0
 
     def system(self, name: str) -> None:
         """Say whose session it is, once that is known."""
@@ -151,8 +158,8 @@ class Parts:
         DiskFullError
             There is no room for it; the file can still be finished.
         """
+        self._chunks += self._pending > 0
         self._pending = 0
-        self._chunks += 1
         self.file.make_room(4 * CHUNK + PER_CHUNK * self._chunks)
         self._writer.flush()
 
@@ -162,7 +169,11 @@ class Parts:
         self._open()
 
     def finish(self, facts: Mapping[str, str]) -> None:
-        """Write the end of the file; ``facts`` are added to the record ``capture``."""
+        """Write the end of the file; ``facts`` are added to the record ``capture``. Nothing
+        where that is done."""
+        if not self._is_open:
+            return
+        self._is_open = False
         try:
             self._writer.metadata(RECORD, facts)
             self._writer.__exit__(None, None, None)
@@ -171,12 +182,28 @@ class Parts:
             self.file.close()
 
 
-def check_outputs(path: Path, *, numbered: bool, overwrite: bool) -> None:
-    """Refuse outputs that are there, before a port is opened.
+def parts_of(path: Path) -> list[Path]:
+    """The parts of ``path`` that are there."""
+    name = re.compile(re.escape(path.stem) + r"-\d{3,}" + re.escape(path.suffix))
+    if not path.parent.is_dir():
+        return []
+    return sorted(each for each in path.parent.iterdir() if name.fullmatch(each.name))
+
+
+def check_outputs(
+    path: Path, *, numbered: bool, overwrite: bool, inputs: Sequence[Path] = ()
+) -> None:
+    """Refuse outputs that are there, or are among ``inputs``, before a port is opened.
 
     Raises
     ------
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.check_output`.
     """
-    check_output(part_path(path, 1) if numbered else path, overwrite=overwrite)
+    outputs = [part_path(path, 1), *parts_of(path)] if numbered else [path]
+    for each in outputs:
+        if each.exists() and any(each.samefile(other) for other in inputs if other.exists()):
+            raise OutputExistsError(
+                "the output is one of the inputs", file=each, hint="Choose another -o"
+            )
+        check_output(each, overwrite=overwrite)

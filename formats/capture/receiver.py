@@ -31,6 +31,9 @@ of some kilobytes instead of byte by byte; the smallest buffers of a kernel (409
 BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 """Between attempts to open a port again; the last one is repeated."""
 
+HANGING_S = 3.0
+"""Longest wait for the thread at the end."""
+
 COUNT_S = 0.5
 """Between looks at the kernel's counters."""
 
@@ -88,11 +91,14 @@ class Receiver:
     def __init__(
         self, port: Port, link: Link, clock: HostClock, *, most_bytes: int = 64 << 20
     ) -> None:
-        self._port, self._link, self._clock = port, link, clock
+        self._port, self._clock = port, clock
+        self._link: Link | None = link
         self._most = most_bytes
         self._events: deque[Event] = deque()
         self._stop = threading.Event()
-        self._received = 0
+        self._attempts = 0
+        self.received = 0
+        """Bytes so far."""
         self._taken = 0
         self._before = Overruns()  # of links that are closed
         self._now = Overruns()
@@ -106,9 +112,10 @@ class Receiver:
         self._thread.start()
 
     def stop(self) -> None:
-        """Read what has arrived by now, close the port and end the thread."""
+        """Read what has arrived by now, close the port and end the thread; a thread that hangs
+        in a driver is left behind."""
         self._stop.set()
-        self._thread.join()
+        self._thread.join(HANGING_S)
 
     def take(self) -> Sequence[Event]:
         """All that has happened since the last call."""
@@ -133,8 +140,7 @@ class Receiver:
         except Exception as error:  # whatever a driver raises must not end in silence
             self._events.append(Ended(self._clock.now(), f"{type(error).__name__}: {error}"))
         finally:
-            self._count()
-            self._link.close()
+            self._close()
 
     def _receive(self) -> None:
         counted = 0.0
@@ -147,17 +153,16 @@ class Receiver:
                 return
             except LinkLost as lost:
                 self._events.append(Lost(self._clock.now(), str(lost)))
-                self._count()
-                self._before, self._now = self.overruns, Overruns()
-                self._link.close()
+                self._close()
                 if not self._port.comes_again:
                     self._events.append(Ended(self._clock.now(), str(lost)))
                     return
                 if not self._reopen():
                     return
-                self._events.append(Back(self._clock.now(), self._port.name))
+                where = self._port.describe().get("resolved", self._port.name)
+                self._events.append(Back(self._clock.now(), where))
                 continue
-            while self._received - self._taken > self._most and not self._stop.is_set():
+            while self.received - self._taken > self._most and not self._stop.is_set():
                 self.held_up += 1
                 self._stop.wait(0.05)
             if begun - counted > COUNT_S:
@@ -169,13 +174,15 @@ class Receiver:
         self._read_rest()
 
     def _read(self, wait_s: float) -> int:
+        assert self._link is not None
         data = self._link.read(wait_s)
         if not data:
             return 0
+        self._attempts = 0
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
         self._events.append(Arrived(self._clock.now(), data, size))
-        self._received += size
-        self.high_water = max(self.high_water, self._received - self._taken)
+        self.received += size
+        self.high_water = max(self.high_water, self.received - self._taken)
         return size
 
     def _read_rest(self) -> None:
@@ -188,9 +195,9 @@ class Receiver:
             return
 
     def _reopen(self) -> bool:
-        attempt = 0
-        while not self._stop.wait(BACKOFF_S[min(attempt, len(BACKOFF_S) - 1)]):
-            attempt += 1
+        # Counted on over links that break before they gave anything.
+        while not self._stop.wait(BACKOFF_S[min(self._attempts, len(BACKOFF_S) - 1)]):
+            self._attempts += 1
             try:
                 self._link = self._port.open()
                 return True
@@ -199,4 +206,12 @@ class Receiver:
         return False
 
     def _count(self) -> None:
-        self._now = self._link.overruns() or self._now
+        if self._link is not None:
+            self._now = self._link.overruns() or self._now
+
+    def _close(self) -> None:
+        if self._link is not None:
+            self._count()
+            self._before, self._now = self.overruns, Overruns()
+            self._link.close()
+            self._link = None

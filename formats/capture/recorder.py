@@ -6,18 +6,17 @@ a third forces the file to the disk, which may take longer than a port can wait.
 
 from __future__ import annotations
 
-import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
+from locatk.core.errors import LocatkError
 from locatk.formats.capture.clock import HostClock
 from locatk.formats.capture.intake import Intake
-from locatk.formats.capture.live_file import DiskFullError
 from locatk.formats.capture.parts import Parts
 from locatk.formats.capture.receiver import Arrived, Back, Ended, Event, Lost, Receiver
 from locatk.formats.capture.totals import Totals
@@ -69,7 +68,7 @@ class Status:
     frames_per_s: float
     totals: Totals
     file_bytes: int
-    free_bytes: int
+    free_bytes: int | None
 
 
 @dataclass
@@ -89,7 +88,6 @@ class Recorded:
 
     totals: Totals
     paths: list[Path]
-    file_bytes: int
     device: str
     started_ns: int
     ended_ns: int
@@ -97,7 +95,8 @@ class Recorded:
     failed: bool
     system: str
     artifacts: list[str]
-    clocks: dict[str, str] = field(default_factory=dict)
+    clocks: dict[str, str]
+    file_bytes: int = 0
 
 
 class Recorder:
@@ -155,10 +154,10 @@ class Recorder:
         try:
             ended, failed = self._turns(stop)
             self._receiver.stop()
-            if not isinstance(ended, DiskFullError):
-                self._rest()
-        except DiskFullError as full:
-            ended, failed = full, True
+            self._rest()
+        except (LocatkError, OSError) as error:  # of the disk: all else is of the receiver
+            self._receiver.stop()
+            ended, failed = self._unsaved(error), True
         except BaseException as error:
             self._parts.finish(self._facts(f"{type(error).__name__}: {error}"))
             raise
@@ -166,24 +165,32 @@ class Recorder:
             self._receiver.stop()
             syncing.set()
         recorded = Recorded(
-            self._count(),
-            self._parts.paths,
-            0,
-            getattr(getattr(self._intake, "device", None), "name", ""),
-            self._start_ns,
-            self._clock.now(),
-            str(ended),
-            failed,
-            self._intake.system,
-            sorted(self._parts.artifacts),
-            self._intake.clocks(),
+            totals=self._count(),
+            paths=self._parts.paths,
+            device=getattr(getattr(self._intake, "device", None), "name", ""),
+            started_ns=self._start_ns,
+            ended_ns=self._clock.now(),
+            ended=ended,
+            failed=failed,
+            system=self._intake.system,
+            artifacts=sorted(self._parts.artifacts),
+            clocks=self._intake.clocks(),
         )
-        self._parts.finish(self._facts(str(ended)))
+        try:
+            self._parts.finish(self._facts(ended))
+        except OSError as error:
+            recorded.failed = True
+            recorded.ended += f"; the end of the file is missing ({error}): `locatk recover` it"
         recorded.file_bytes = self._parts.bytes_written
-        syncer.join()
+        syncer.join(self._limits.sync_s)
         return recorded
 
-    def _turns(self, stop: threading.Event) -> tuple[str | DiskFullError, bool]:
+    def _unsaved(self, error: LocatkError | OSError) -> str:
+        """What went wrong with the disk, and what is not on it."""
+        left = self._receiver.received - self._count().bytes
+        return f"{error}" + (f"; {left} bytes that were received are not in it" if left else "")
+
+    def _turns(self, stop: threading.Event) -> tuple[str, bool]:
         """Write what comes, turn after turn; returns why it ended and whether that is bad."""
         flushed = shown = time.monotonic()
         before = Totals()
@@ -270,10 +277,10 @@ class Recorder:
         for remark in self._intake.remarks():
             self._say(remark, self._clock.now())
 
-    def _second(self, totals: Totals, before: Totals, took_s: float) -> DiskFullError | None:
-        """What is looked at once a second; returns why to stop, if so."""
+    def _second(self, totals: Totals, before: Totals, took_s: float) -> str:
+        """What is looked at once a second; returns why to stop, ``""`` for no reason."""
         fresh = totals.since(before)
-        free = shutil.disk_usage(self._parts.file.path.parent).free
+        free = self._parts.file.free()
         rate = fresh.bytes / took_s
         self._show(
             Status(
@@ -290,7 +297,7 @@ class Recorder:
         if self._receiver.held_up > self._held_up:
             self._held_up = self._receiver.held_up
             self._say("the disk is slower than the port: reading waits", self._clock.now())
-        return self._look_at_disk(free)
+        return "" if free is None else self._look_at_disk(free)
 
     def _look_for_silence(self) -> None:
         silent_s = (self._clock.now() - self._heard_ns) * 1e-9
@@ -309,10 +316,10 @@ class Recorder:
             )
             self._step_s = step_s
 
-    def _look_at_disk(self, free: int) -> DiskFullError | None:
+    def _look_at_disk(self, free: int) -> str:
         left = free - self._limits.reserve_bytes
         if left <= 0:
-            return DiskFullError("the disk is full but for the reserve", file=self._parts.file.path)
+            return "the disk is full but for the reserve"
         per_s = self._parts.bytes_written / max(self._elapsed_s(), 1.0)
         if per_s > 0 and left / per_s < AHEAD_S:
             if not self._disk_told:
@@ -322,7 +329,7 @@ class Recorder:
             self._disk_told = True
         else:
             self._disk_told = False
-        return None
+        return ""
 
     def _rotate(self) -> None:
         limits = self._limits

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from locatk.core.errors import InputError, LocatkError
-from locatk.formats.capture import artifacts, camera, ports
+from locatk.formats.capture import artifacts, camera, ports, replay
 from locatk.formats.capture.clock import HostClock
 from locatk.formats.capture.intake import AUTO, CameraIntake, Intake, SerialIntake
 from locatk.formats.capture.live_file import DiskFullError
@@ -89,7 +89,12 @@ def record(
     """
     _check_name(wanted.device_name)
     content = artifacts.attachments(wanted.artifacts)
-    check_outputs(wanted.output, numbered=wanted.numbered, overwrite=wanted.overwrite)
+    check_outputs(
+        wanted.output,
+        numbered=wanted.numbered,
+        overwrite=wanted.overwrite,
+        inputs=[*wanted.artifacts, *_played(wanted.port)],
+    )
     _check_disk(wanted.output.parent, wanted.limits.reserve_bytes)
     clock = HostClock()
     intake = _intake(wanted)
@@ -110,6 +115,14 @@ def record(
     receiver = Receiver(port, link, clock)
     recorder = Recorder(receiver, intake, parts, clock, wanted.limits, tell=tell, show=show)
     return recorder.run(stop)
+
+
+def _played(port: str) -> list[Path]:
+    """The file that is played, whatever topic of it."""
+    if not port.startswith(replay.PREFIX):
+        return []
+    place = port.removeprefix(replay.PREFIX).removeprefix("//")
+    return [Path(place), Path(place.rpartition("#")[0] or place)]
 
 
 def _check_name(name: str) -> None:
