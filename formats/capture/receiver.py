@@ -17,7 +17,6 @@ from locatk.formats.capture.source import (
     LinkLost,
     Overruns,
     Port,
-    SourceError,
 )
 
 WAIT_S = 0.1
@@ -201,7 +200,7 @@ class Receiver:
             try:
                 self._link = self._port.open()
                 return True
-            except SourceError:
+            except Exception:  # not there yet, or a driver that is not ready
                 continue
         return False
 

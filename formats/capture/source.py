@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from locatk.core.errors import LocatkError
 
@@ -42,8 +42,9 @@ class Overruns:
 class Link(Protocol):
     """An open connection."""
 
-    def read(self, wait_s: float) -> bytes:
-        """What has arrived, all of it; waits for the first byte, at most ``wait_s``.
+    def read(self, wait_s: float) -> Any:
+        """What has arrived, all of it: bytes of a line, or a list of a camera's frames; waits
+        for the first, at most ``wait_s``, and is empty then.
 
         Raises
         ------
