@@ -190,8 +190,8 @@ class SerialIntake:
         """What is half received is dropped; byte offsets go on. Not ``opened`` where only
         bytes are missing from a recording."""
         self._opened = opened
-        self._streams.restart()
         yield from self._records(self._again)
+        self._streams.restart()  # after what was held back, which is of the time before
 
     def _again(self) -> list[Batch]:
         if self._decoder is not None:
@@ -231,6 +231,9 @@ class SerialIntake:
             f"the decoder failed ({type(error).__name__}: {error}): from here on there are only "
             "raw bytes. Please report it"
         )
+        if self._decoder is not None:
+            self._counts = self._decoder.counts
+            self._said += self._decoder.remarks
         self._decoder = self._identifier = None
         self._held = []
 
@@ -273,8 +276,11 @@ class SerialIntake:
         found: dict[str, str] = {}
         for stream in self._known.values():
             if stream not in self._asked:
-                found |= self.device.attached(stream)
                 self._asked.add(stream)
+                try:
+                    found |= self.device.attached(stream)
+                except Exception as error:  # of a device that may be somebody else's
+                    self._said.append(f"no artifacts of {self.device.name}: {error}")
         return found
 
 

@@ -83,6 +83,7 @@ class Parts:
         self._finished_bytes = 0
         self._chunks = 0
         self._pending = 0
+        self._last_ns = 0
         self.paths: list[Path] = []
         self._is_open = False
         if numbered and overwrite:  # what stays of an older recording would look like ours
@@ -141,14 +142,18 @@ class Parts:
         """Write messages, in the order in which they come."""
         for each in stamped:
             self._writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
+            self._last_ns = max(self._last_ns, each.time_ns)
             self._pending += each.message.ByteSize()
             if self._pending >= CHUNK:  # before the writer does, who makes no room
                 self.flush()
 
     def log(self, text: str, time_ns: int, *, level: int = Log.WARNING) -> None:
-        """A line for the log panel."""
+        """A line for the log panel, not before what was written last."""
+        time_ns = max(time_ns, self._last_ns)
         line = Log(timestamp=timestamp(time_ns), level=level, message=text, name=LOG_NAME)  # type: ignore[arg-type]
         self._writer.write("/log", line, time_ns)
+        self._last_ns = time_ns
+        self._pending += line.ByteSize()
 
     def flush(self) -> None:
         """Give all that is buffered to the system: what is killed from here on keeps it.

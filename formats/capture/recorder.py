@@ -24,6 +24,9 @@ from locatk.formats.capture.totals import Totals
 TURN_S = 0.02
 """Between looks at what was received: one message of each stream covers about so much."""
 
+SHOW_S = 1.0
+"""Between looks at rates, disk, silence and clock."""
+
 AHEAD_S = 300.0
 """A disk that will be full sooner than this is told of."""
 
@@ -136,6 +139,7 @@ class Recorder:
         self._step_s = 0.0
         self._held_up = 0
         self._disk_told = False
+        self._flushed_bytes = 0
 
     def run(self, stop: threading.Event) -> Recorded:
         """Record until ``stop`` is set, a limit is reached, or nothing more can come.
@@ -180,10 +184,18 @@ class Recorder:
             self._parts.finish(self._facts(ended))
         except OSError as error:
             recorded.failed = True
-            recorded.ended += f"; the end of the file is missing ({error}): `locatk recover` it"
+            missing = self._receiver.received - self._flushed_bytes
+            recorded.ended = (
+                f"{error}; the end of the file is missing, with up to {missing} bytes that were "
+                "received: `locatk recover` it"
+            )
         recorded.file_bytes = self._parts.bytes_written
         syncer.join(self._limits.sync_s)
         return recorded
+
+    def _flush(self) -> None:
+        self._parts.flush()
+        self._flushed_bytes = self._count().bytes
 
     def _unsaved(self, error: LocatkError | OSError) -> str:
         """What went wrong with the disk, and what is not on it."""
@@ -200,8 +212,8 @@ class Recorder:
             now = time.monotonic()
             if now - flushed >= self._limits.flush_s:
                 flushed = now
-                self._parts.flush()
-            if now - shown >= 1:
+                self._flush()
+            if now - shown >= SHOW_S:
                 totals = self._count()
                 full = self._second(totals, before, now - shown)
                 before, shown = totals, now
@@ -252,7 +264,7 @@ class Recorder:
         self._parts.system(self._intake.system)
         self._parts.attach(self._intake.artifacts())
         for remark in self._intake.remarks():
-            self._say(remark, self._clock.now())
+            self._say(remark)
         return ended
 
     def _take(self, arrived: Sequence[Arrived]) -> None:
@@ -275,7 +287,7 @@ class Recorder:
             self._totals.gap_s += (self._clock.now() - self._lost_ns) * 1e-9
         self._parts.write(self._intake.finish())
         for remark in self._intake.remarks():
-            self._say(remark, self._clock.now())
+            self._say(remark)
 
     def _second(self, totals: Totals, before: Totals, took_s: float) -> str:
         """What is looked at once a second; returns why to stop, ``""`` for no reason."""
@@ -296,7 +308,7 @@ class Recorder:
         self._look_at_clock()
         if self._receiver.held_up > self._held_up:
             self._held_up = self._receiver.held_up
-            self._say("the disk is slower than the port: reading waits", self._clock.now())
+            self._say("the disk is slower than the port: reading waits")
         return "" if free is None else self._look_at_disk(free)
 
     def _look_for_silence(self) -> None:
@@ -304,15 +316,14 @@ class Recorder:
         if self._lost_ns is None and not self._silent and silent_s >= self._limits.silence_s:
             self._silent = True
             self._totals.silences += 1
-            self._say(f"nothing received for {silent_s:.0f} s", self._clock.now())
+            self._say(f"nothing received for {silent_s:.0f} s")
 
     def _look_at_clock(self) -> None:
         step_s = self._clock.stepped_ns() * 1e-9
         if abs(step_s - self._step_s) > 0.1:
             self._say(
                 f"the wall clock was set by {step_s - self._step_s:+.1f} s; times of this "
-                "recording go on as they were",
-                self._clock.now(),
+                "recording go on as they were"
             )
             self._step_s = step_s
 
@@ -323,9 +334,7 @@ class Recorder:
         per_s = self._parts.bytes_written / max(self._elapsed_s(), 1.0)
         if per_s > 0 and left / per_s < AHEAD_S:
             if not self._disk_told:
-                self._say(
-                    f"the disk is full in {left / per_s:.0f} s at this rate", self._clock.now()
-                )
+                self._say(f"the disk is full in {left / per_s:.0f} s at this rate")
             self._disk_told = True
         else:
             self._disk_told = False
@@ -344,9 +353,10 @@ class Recorder:
             self._part_began = self._count()
             self._parts.flush()
 
-    def _say(self, text: str, time_ns: int) -> None:
-        """To people and into the session."""
-        self._parts.log(text, time_ns, level=Log.WARNING)
+    def _say(self, text: str, time_ns: int | None = None) -> None:
+        """To people and into the session; without a time at that of what was written last, as
+        bytes that came before now may still wait."""
+        self._parts.log(text, time_ns or self._start_ns, level=Log.WARNING)
         self._tell(text)
 
     def _count(self) -> Totals:
