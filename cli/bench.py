@@ -14,8 +14,9 @@ BENCHES = {
     "dots": "locatk.formats.bench.dots:figures",
     "polaris": "locatk.formats.bench.polaris:figures",
     "landmarks": "locatk.formats.bench.landmarks:figures",
+    "capture": "locatk.formats.bench.capture:figures",
 }
-"""Name of a system to the function that measures its figures."""
+"""Name of a system, or of a part, to the function that measures its figures."""
 
 ELSEWHERE = Path("../shared/data")
 
@@ -40,6 +41,7 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
       locatk bench dots
       locatk bench polaris
       locatk bench landmarks
+      locatk bench capture
       locatk bench lighthouse --data ~/data --json
     """
     from locatk.formats.data import data_folder

@@ -60,6 +60,14 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
 )
 @click.option("--baud", type=click.IntRange(min=1), help="[default: the device's own]")
 @names_option
+@click.option(
+    "--wait",
+    "wait_s",
+    type=DURATION,
+    default=0.0,
+    metavar="TIME",
+    help="Wait so long for the port to be there.",
+)
 @click.option("--duration", type=DURATION, metavar="TIME", help="End after so long: 90s, 5min, 2h.")
 @click.option("--max-size", type=SIZE, metavar="SIZE", help="End at so many bytes: 500MB, 2GB.")
 @click.option(

@@ -7,6 +7,7 @@ import platform
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +18,9 @@ from locatk.formats.capture.clock import HostClock
 from locatk.formats.capture.intake import AUTO, CameraIntake, Intake, SerialIntake
 from locatk.formats.capture.live_file import DiskFullError
 from locatk.formats.capture.parts import Content, Parts, check_outputs
-from locatk.formats.capture.receiver import Receiver
+from locatk.formats.capture.receiver import BACKOFF_S, Receiver
 from locatk.formats.capture.recorder import Limits, Recorded, Recorder, Status
-from locatk.formats.capture.source import Port
+from locatk.formats.capture.source import Link, Port, SourceError
 from locatk.formats.wire import device as device_named
 from locatk.formats.wire.decoder import Options
 
@@ -43,6 +44,7 @@ class Wanted:
     columns: tuple[str, ...] = ()
     speed: float = 1.0
     image: str = "jpeg"
+    wait_s: float = 0.0
     overwrite: bool = False
 
     @property
@@ -99,7 +101,7 @@ def record(
     clock = HostClock()
     intake = _intake(wanted)
     port = _port(wanted, clock)
-    link = port.open()
+    link = _opened(port, wanted.wait_s, stop)
     try:
         ready(port.name)
         facts = _facts(wanted, port, clock)
@@ -115,6 +117,17 @@ def record(
     receiver = Receiver(port, link, clock)
     recorder = Recorder(receiver, intake, parts, clock, wanted.limits, tell=tell, show=show)
     return recorder.run(stop)
+
+
+def _opened(port: Port, wait_s: float, stop: threading.Event) -> Link:
+    """Open a port, which may not be there for another ``wait_s``."""
+    until = time.monotonic() + wait_s
+    while True:
+        try:
+            return port.open()
+        except SourceError:
+            if time.monotonic() >= until or stop.wait(BACKOFF_S[1]):
+                raise
 
 
 def _played(port: str) -> list[Path]:
