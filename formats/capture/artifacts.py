@@ -10,7 +10,7 @@ from locatk.core.errors import InputError
 from locatk.formats import artifacts, files, hall_sensors, maps, sheets, tags, toml
 from locatk.formats.session import Session
 
-KINDS: dict[str, tuple[str, Callable[[str], Any]]] = {
+KINDS: dict[str, tuple[str, Callable[..., Any]]] = {
     artifacts.SCENE_FORMAT: (artifacts.SCENE_FILE, artifacts.loads_scene),
     sheets.MANIFEST_FORMAT: (sheets.SHEET_FILE, sheets.loads_manifest),
     sheets.CAMERA_FORMAT: (sheets.CAMERA_FILE, sheets.loads_camera),
@@ -21,7 +21,11 @@ KINDS: dict[str, tuple[str, Callable[[str], Any]]] = {
 }
 """Format of an artifact to the name of its attachment and what reads it."""
 
-ATTACHED = frozenset(name for name, _ in KINDS.values())
+ATTACHED = dict(KINDS.values())
+"""Name of an attachment to what reads it."""
+
+BY_DEVICE = ("array", "halls")
+"""Kinds of which each device may have its own: ``array-<device>.toml``."""
 
 
 def attachments(paths: Iterable[Path]) -> dict[str, str]:
@@ -49,7 +53,7 @@ def _of(path: Path) -> dict[str, str]:
     kind = toml.read(path).text("format", choices=tuple(KINDS))
     name, loads = KINDS[kind]
     text = files.read_text(path)
-    loads(text)
+    loads(text, file=path)
     return {name: text}
 
 
@@ -57,10 +61,13 @@ def _of_session(path: Path) -> dict[str, str]:
     session = Session.open(path)
     found = {}
     for info in session.attachments():
-        own = info.name in ATTACHED or info.name.partition("-")[0] in ("array", "halls")
-        data = session.attachment(info.name) if own else None
-        if data is not None:
-            found[info.name] = data.decode("utf-8", "replace")
+        stem, dash, _ = info.name.partition("-")
+        loads = ATTACHED.get(f"{stem}.toml" if dash and stem in BY_DEVICE else info.name)
+        data = None if loads is None else session.attachment(info.name)
+        if loads is not None and data is not None:
+            text = data.decode("utf-8", "replace")
+            loads(text, file=f"{path}:{info.name}")
+            found[info.name] = text
     if not found:
         raise InputError(
             "no artifact is attached", file=path, hint="Give the artifacts themselves (.toml)"

@@ -138,7 +138,16 @@ def _facts(
     return {**stays, **fresh, "device": ", ".join(decoded.devices.values()), "decoded_from": source}
 
 
-LINE = ("gaps", "gap_s", "silences", "overruns", "line_errors", "high_water_bytes", "clock_step_s")
+LINE = (
+    "gaps",
+    "gap_s",
+    "silences",
+    "overruns",
+    "dropped",
+    "line_errors",
+    "high_water_bytes",
+    "clock_step_s",
+)
 """Entries of the metadata that the port has counted, not the decoder."""
 
 

@@ -101,6 +101,7 @@ class Receiver:
         self._taken = 0
         self._before = Overruns()  # of links that are closed
         self._now = Overruns()
+        self._dropped_before = self._dropped = 0
         self.high_water = 0
         self.held_up = 0
         """How often reading stopped because too much was waiting."""
@@ -132,6 +133,11 @@ class Receiver:
             before.frame + now.frame,
             before.parity + now.parity,
         )
+
+    @property
+    def dropped(self) -> int:
+        """Frames of a camera that came faster than they were taken."""
+        return self._dropped_before + self._dropped
 
     def _run(self) -> None:
         try:
@@ -168,7 +174,7 @@ class Receiver:
                 counted = begun
                 self._count()
             left = begun + LEAST_S - time.monotonic()
-            if left > 0:
+            if left > 0 and self._port.comes_again:  # what is played has its own pace
                 time.sleep(left)
         self._read_rest()
 
@@ -207,10 +213,12 @@ class Receiver:
     def _count(self) -> None:
         if self._link is not None:
             self._now = self._link.overruns() or self._now
+            self._dropped = getattr(self._link, "dropped", 0)
 
     def _close(self) -> None:
         if self._link is not None:
             self._count()
             self._before, self._now = self.overruns, Overruns()
+            self._dropped_before, self._dropped = self.dropped, 0
             self._link.close()
             self._link = None

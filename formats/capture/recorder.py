@@ -365,6 +365,7 @@ class Recorder:
         self._intake.count(totals)
         overruns = self._receiver.overruns
         totals.overruns, totals.line_errors = overruns.lost, overruns.frame + overruns.parity
+        totals.dropped = self._receiver.dropped
         totals.high_water_bytes = self._receiver.high_water
         totals.clock_step_s = self._step_s
         return Totals(**vars(totals))

@@ -26,6 +26,8 @@ class Totals:
         How often nothing came for longer than was allowed.
     overruns : int
         Bytes that the kernel says a UART lost.
+    dropped : int
+        Frames of a camera that came faster than they could be packed.
     line_errors : int
         Bytes without a stop bit or of wrong parity, by the kernel.
     high_water_bytes : int
@@ -46,6 +48,7 @@ class Totals:
     gap_s: float = 0.0
     silences: int = 0
     overruns: int = 0
+    dropped: int = 0
     line_errors: int = 0
     high_water_bytes: int = 0
     clock_step_s: float = 0.0
@@ -77,6 +80,7 @@ class Totals:
             for count, words in (
                 (self.gaps, f"connection lost {_times(self.gaps)}, {self.gap_s:.1f} s in all"),
                 (self.overruns, f"{self.overruns} bytes overrun in the UART or the kernel"),
+                (self.dropped, f"{self.dropped} frames of the camera dropped"),
                 (self.line_errors, f"{self.line_errors} bytes with line errors"),
                 (self.bad, f"{self.bad} bad frames"),
                 (self.lost, f"{self.lost} frames missing by their sequence numbers"),

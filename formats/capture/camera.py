@@ -1,0 +1,367 @@
+"""Cameras, network streams and video files as sources of frames, through OpenCV.
+
+A thread takes each frame as soon as the driver has it and gives it the time of that moment;
+packing it as an image file is left to the thread that reads. A video file is shown at its
+own pace, its frames at the times at which they are due; ``locatk import video`` is faster
+and keeps the times of the file.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from locatk.core.errors import LocatkError
+from locatk.formats.capture.holders import busy, forbidden, holders
+from locatk.formats.capture.source import LinkEnded, LinkLost, Overruns, SourceError
+from locatk.formats.importers.video import Video, is_cut
+
+FORMATS = ("jpeg", "png")
+
+JPEG_QUALITY = 95
+
+PATIENCE_S = 1.0
+"""A camera that gives no frame for so long is lost; single frames do fail."""
+
+TIMEOUT_MS = 5_000
+"""After which a network stream that says nothing is given up; V4L2 has 10 s of its own."""
+
+MOST_BYTES = 64 << 20
+"""Pixels that may wait to be read."""
+
+AT_ONCE = 8
+"""Frames of one read, which takes long enough to pack them."""
+
+
+class Frame(NamedTuple):
+    """A frame: when it came, in ns of the clock that was given, and its image file."""
+
+    time_ns: int
+    image: bytes
+    width: int
+    height: int
+
+
+class CameraPort:
+    """A camera, stream or video file; see :func:`port_of`."""
+
+    def __init__(
+        self, place: str, *, clock: Callable[[], int], speed: float, format: str, grey: bool
+    ) -> None:
+        self.name = f"camera:{place}"
+        self._place = place
+        self._clock = clock
+        self._speed = speed
+        self._format = format
+        self._grey = grey
+        self._found: dict[str, str] = {}
+        self.comes_again = not self._is_file()
+
+    def _is_file(self) -> bool:
+        """Whether it has an end: not a number, an address, or a device such as /dev/video0."""
+        if self._place.isdecimal() or "://" in self._place:
+            return False
+        try:
+            return not stat.S_ISCHR(os.stat(self._place).st_mode)
+        except OSError:
+            return not self._place.startswith("/dev/")
+
+    def open(self) -> CameraLink:
+        """Open it and wait for its first frame.
+
+        Raises
+        ------
+        SourceError
+            It cannot be opened, or gives no frame.
+        """
+        is_file = self._is_file()
+        if is_file:
+            _check_file(self._place)
+        capture = _opened(self._place, is_file)
+        if capture is None:
+            raise self._explained(is_file)
+        first = _grab(capture, self._clock)
+        if first is None:
+            capture.release()
+            raise SourceError(
+                f"{self.name} gives no frame",
+                hint="Is the video cut short?" if is_file else "Is another program using it?",
+            )
+        height, width = first[1].shape[:2]
+        self._found = {
+            "width": str(width),
+            "height": str(height),
+            "fps": f"{_rate(capture):g}",
+            "backend": capture.getBackendName(),
+        }
+        return CameraLink(
+            capture,
+            first,
+            clock=self._clock,
+            file=self._place if is_file else None,
+            speed=self._speed,
+            format=self._format,
+            grey=self._grey,
+        )
+
+    def describe(self) -> dict[str, str]:
+        """``port``, ``format``, ``grey``; once it was open, ``width``, ``height``, ``fps`` (0
+        where the driver does not tell) and ``backend``, that of OpenCV."""
+        grey = {"grey": "true"} if self._grey else {}
+        return {"port": self.name, "format": self._format, **grey, **self._found}
+
+    def _explained(self, is_file: bool) -> SourceError:
+        if is_file or "://" in self._place:
+            return SourceError(
+                f"no video from {self._place}", hint="Is the address right, and the camera on?"
+            )
+        path = f"/dev/video{self._place}" if self._place.isdecimal() else self._place
+        if os.path.exists(path):
+            if not os.access(path, os.R_OK | os.W_OK):
+                return forbidden(self.name, path)
+            if holders([path])[path]:
+                return busy(self.name, path)
+        there = sorted(str(each) for each in Path("/dev").glob("video*"))
+        return SourceError(
+            f"no camera {self._place}",
+            hint=f"There are {', '.join(there)}" if there else "Is it plugged in?",
+        )
+
+
+def port_of(
+    place: str,
+    *,
+    clock: Callable[[], int],
+    speed: float = 1.0,
+    format: str = "jpeg",
+    grey: bool = False,
+) -> CameraPort:
+    """The camera at a place, not yet opened.
+
+    Parameters
+    ----------
+    place : str
+        Number of a camera, an address (``rtsp://...``, ``http://...``), a device or a
+        video file.
+    clock : callable
+        Gives the time of a frame in ns; called by several threads.
+    speed : float
+        Of a video file, times its own; 0 is as fast as it is read.
+    format : str
+        ``"jpeg"`` (quality 95) or ``"png"``, which loses nothing.
+    grey : bool
+        Keep luminance alone.
+
+    Raises
+    ------
+    SourceError
+        It is none of them, or ``speed`` is no speed.
+    """
+    if not place:
+        raise SourceError("a camera without a name", hint="As in camera:0 or camera:video.mp4")
+    if not (math.isfinite(speed) and speed >= 0):
+        raise SourceError(f"{speed} is no speed", hint="Give 1, 10, or 0 for the fastest")
+    if format not in FORMATS:
+        raise ValueError(f"format {format!r} is none of {FORMATS}")
+    return CameraPort(place, clock=clock, speed=speed, format=format, grey=grey)
+
+
+class CameraLink:
+    """Frames of an opened camera.
+
+    Attributes
+    ----------
+    dropped : int
+        Frames for which there was no room, as nobody read; none of a file.
+    """
+
+    def __init__(
+        self,
+        capture: Any,
+        first: tuple[int, Any],
+        *,
+        clock: Callable[[], int],
+        file: str | None,
+        speed: float,
+        format: str,
+        grey: bool,
+    ) -> None:
+        self.dropped = 0
+        self._capture = capture
+        self._clock = clock
+        self._file = file
+        self._speed = speed
+        self._format = format
+        self._grey = grey
+        self._waiting = deque([first])
+        self._bytes = int(first[1].nbytes)
+        self._end: LinkEnded | LinkLost | None = None
+        self._closing = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="locatk-camera", daemon=True)
+        self._thread.start()
+
+    def read(self, wait_s: float) -> list[Frame]:
+        """The frames that have come, some of them if they are many; waits for the first one,
+        at most ``wait_s``.
+
+        Raises
+        ------
+        LinkLost
+            A camera gives no more frames, or a file is cut short.
+        LinkEnded
+            The file is at its end.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._end, max(0.0, wait_s))
+            if not self._waiting and self._end is not None:
+                raise self._end
+            taken = [self._waiting.popleft() for _ in range(min(AT_ONCE, len(self._waiting)))]
+            self._bytes -= sum(pixels.nbytes for _, pixels in taken)
+            self._changed.notify_all()
+        return [self._packed(time_ns, pixels) for time_ns, pixels in taken]
+
+    def _packed(self, time_ns: int, pixels: Any) -> Frame:
+        import cv2
+
+        if self._grey and pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if self._format == "jpeg" else []
+        suffix = ".jpg" if self._format == "jpeg" else ".png"
+        done, data = cv2.imencode(suffix, pixels, options)
+        if not done:
+            raise LinkLost(f"a frame cannot be packed as {self._format}")
+        return Frame(time_ns, data.tobytes(), pixels.shape[1], pixels.shape[0])
+
+    def overruns(self) -> Overruns | None:
+        """Nobody counts bytes; see :attr:`dropped`."""
+        return None
+
+    def close(self) -> None:
+        """See :class:`.source.Link`. A driver that hangs keeps the camera until it returns."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        try:
+            end = self._show() if self._file is not None else self._watch()
+        except Exception as error:  # whatever a driver raises must not end in silence
+            end = LinkLost(f"{type(error).__name__}: {error}")
+        finally:
+            self._capture.release()
+        with self._changed:
+            self._end = end
+            self._changed.notify_all()
+
+    def _watch(self) -> LinkEnded | LinkLost:
+        """Take the frames of a camera until there are no more."""
+        last = time.monotonic()
+        while not self._closing:
+            shot = _grab(self._capture, self._clock)
+            if shot is not None:
+                last = time.monotonic()
+                with self._changed:
+                    if self._waiting and self._bytes + shot[1].nbytes > MOST_BYTES:
+                        self.dropped += 1
+                    else:
+                        self._put(shot)
+            elif time.monotonic() - last > PATIENCE_S:
+                return LinkLost("no more frames: unplugged, or the stream has ended")
+            else:
+                time.sleep(0.01)
+        return LinkEnded("closed")
+
+    def _show(self) -> LinkEnded | LinkLost:
+        """Take the frames of a file, each when it is due."""
+        begun, count, position_s = time.monotonic(), 1, 0.0
+        origin_s = _position_s(self._capture)
+        step_s = 1 / (_rate(self._capture) or 30.0)
+        while True:
+            shot = _grab(self._capture, self._clock)
+            if shot is None:
+                break
+            # Some files tell no times, or wrong ones.
+            told_s = _position_s(self._capture) - origin_s
+            position_s = told_s if told_s > position_s else position_s + step_s
+            due = begun + position_s / self._speed if self._speed else begun
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing, max(0.0, due - time.monotonic()))
+                self._changed.wait_for(lambda: self._closing or self._bytes < MOST_BYTES)
+                if self._closing:
+                    return LinkEnded("closed")
+                self._put((self._clock(), shot[1]))
+            count += 1
+        if is_cut(Path(self._file or "")):
+            return LinkLost(f"the video is cut short after {count} frames")
+        return LinkEnded("the end of the video")
+
+    def _put(self, shot: tuple[int, Any]) -> None:
+        self._waiting.append(shot)
+        self._bytes += shot[1].nbytes
+        self._changed.notify_all()
+
+
+def _check_file(path: str) -> None:
+    if not os.path.exists(path):
+        raise SourceError("no such video", file=path, hint="A camera is camera:0, camera:1, ...")
+    try:
+        Video(Path(path))
+    except LocatkError as error:
+        raise SourceError(error.message, file=path, hint=error.hint) from None
+
+
+def _opened(place: str, is_file: bool) -> Any:
+    """An opened ``cv2.VideoCapture``, or None; OpenCV says nothing on its own from now on."""
+    # Read by the library when it opens its first video; -8 is silence.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    import cv2
+
+    # Where this is moved from OpenCV 4 to 5.
+    (cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging).setLogLevel(0)
+    capture = cv2.VideoCapture()
+    if is_file:
+        # As an absolute path no file name is taken for an address on the network.
+        there = capture.open(os.path.abspath(place), cv2.CAP_FFMPEG)
+        # Pixels stay where the sensor had them.
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    elif "://" in place:
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC]
+        options = [value for limit in limits for value in (limit, TIMEOUT_MS)]
+        there = capture.open(place, cv2.CAP_FFMPEG, options)
+    elif place.isdecimal():
+        there = capture.open(int(place), cv2.CAP_ANY)
+    else:
+        # Others would read from any device, and wait for it.
+        there = capture.open(place, cv2.CAP_V4L2)
+    return capture if there else None
+
+
+def _grab(capture: Any, clock: Callable[[], int]) -> tuple[int, Any] | None:
+    """(time in ns, pixels) of the next frame; None where there is none."""
+    there = capture.grab()
+    time_ns = clock()
+    if there:
+        there, pixels = capture.retrieve()
+    return (time_ns, pixels) if there else None
+
+
+def _rate(capture: Any) -> float:
+    import cv2
+
+    rate = float(capture.get(cv2.CAP_PROP_FPS))
+    return rate if math.isfinite(rate) and rate > 0 else 0.0
+
+
+def _position_s(capture: Any) -> float:
+    import cv2
+
+    return float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e3
