@@ -9,9 +9,9 @@
 #include "locatk_frame.h"
 
 const char NAME[] = "locatk_magnetometers 1.0";
-const uint32_t BAUD = 115200;         // 50 frames of 9 sensors take 60 % of it; USB ignores it
+const uint32_t BAUD = 115200;         // 50 frames of 9 sensors take 56 % of it; USB ignores it
 const uint32_t PERIOD_US = 20000;     // twice a conversion at least, which takes 8.4 ms here
-const uint8_t CHIP_SELECT[] = {2, 3, 4, 5, 7, 9, 10, 11, 15};  // chip select pins, in the bar's order
+const uint8_t CHIP_SELECT[] = {2, 3, 4, 5, 7, 9, 10, 11, 15};  // pins, in the bar's order
 const uint8_t SENSORS = sizeof CHIP_SELECT;
 
 Adafruit_MLX90393 sensors[SENSORS];
