@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +10,7 @@ import click
 
 from locatk.cli import capture_text, console, failures, options
 from locatk.cli.capture_options import DURATION, PACE, SIZE, names_option
+from locatk.cli.signals import asked_to_stop
 
 if TYPE_CHECKING:
     from locatk.formats.capture.recorder import Limits, Recorded
@@ -179,37 +177,10 @@ def command(
         overwrite=overwrite,
         **rest,
     )
-    with capture_text.live() as live, _stopped_by_signals() as stop:
+    stop = threading.Event()
+    with capture_text.live() as live, asked_to_stop(stop.set):
         recorded = session.record(wanted, stop, tell=live.tell, show=live.show, ready=live.ready)
     _report(recorded, limits, as_json)
-
-
-@contextlib.contextmanager
-def _stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that the first SIGINT, SIGTERM or SIGHUP (a terminal that is closed) sets; the
-    second one is as always."""
-    stop = threading.Event()
-    kinds = [signal.SIGINT, signal.SIGTERM]
-    hangup = getattr(signal, "SIGHUP", None)
-    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup
-        kinds.append(hangup)
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {kind: signal.getsignal(kind) for kind in kinds}
-
-    def ask(*_: object) -> None:
-        stop.set()
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
-
-    for kind in kinds:
-        signal.signal(kind, ask)
-    try:
-        yield stop
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
 
 
 def _list(as_json: bool) -> None:

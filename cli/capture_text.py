@@ -142,7 +142,7 @@ def as_json(recorded: Recorded) -> dict[str, Any]:
         "ended": recorded.ended,
         "file_bytes": recorded.file_bytes,
         **vars(recorded.totals),
-        "clocks": recorded.clocks,
+        "clocks": {key: float(text) for key, text in recorded.clocks.items()},
         "artifacts": recorded.artifacts,
     }
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from locatk.cli import console, options
+from locatk.cli.signals import asked_to_stop
 from locatk.core.errors import InputError, MissingDataError
 
 if TYPE_CHECKING:
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from locatk.formats.emulate.source import Source
 
 SYSTEMS = ("polaris", "landmarks", "lighthouse", "dots")
-
-SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 SHARE = click.FloatRange(0, 1)
 ABOVE_0 = click.FloatRange(0, min_open=True)
@@ -145,41 +142,12 @@ def command(
         console.say(f"{_what(source, found)}; Ctrl-C ends it")
         emulator = Emulator(port, *parts)
         try:
-            with _stopped_by_signals(emulator.stop):
+            with asked_to_stop(emulator.stop) as caught:
                 emulator.run()
         finally:
             if as_json:
                 console.emit_json({**known, **emulator.totals.as_dict()})
             console.say(_summary(emulator.totals))
-
-
-@contextmanager
-def _stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Let the first SIGINT, SIGTERM or SIGHUP call ``stop``, and end the command after the
-    block: in the middle of it bytes would be sent and not counted."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    kinds = [getattr(signal, name) for name in SIGNALS if hasattr(signal, name)]
-    before = {kind: signal.getsignal(kind) for kind in kinds}
-    before = {kind: usual for kind, usual in before.items() if usual != signal.SIG_IGN}
-    caught: list[int] = []
-
-    def restore() -> None:
-        for kind, usual in before.items():
-            signal.signal(kind, usual)
-
-    def note(number: int, _: object) -> None:
-        caught.append(number)
-        stop()
-        restore()
-
-    for kind in before:
-        signal.signal(kind, note)
-    try:
-        yield
-    finally:
-        restore()
     if caught == [signal.SIGINT]:
         raise click.Abort
     if caught:

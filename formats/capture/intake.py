@@ -260,13 +260,13 @@ class SerialIntake:
         twentieth of what it sends arrives."""
         found: dict[str, str] = {}
         for name, clock in self._streams.clocks.items():
-            known = {
-                "tick_offset_s": _scaled(clock.offset_ns, 1e-9),
-                "tick_drift_ppm": clock.drift_ppm,
-                "tick_jitter_s": _scaled((clock.jitter_ns or (None, None))[1], 1e-9),
-                "tick_restarts": clock.restarts,
-            }
-            found |= {f"{k}:{name}": f"{v:.9g}" for k, v in known.items() if v is not None}
+            if clock.offset_ns is not None:
+                found[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
+            if clock.drift_ppm is not None:
+                found[f"tick_drift_ppm:{name}"] = f"{clock.drift_ppm:.3f}"
+            if clock.jitter_ns is not None:
+                found[f"tick_jitter_s:{name}"] = f"{clock.jitter_ns[1] / 1e9:.6f}"
+            found[f"tick_restarts:{name}"] = str(clock.restarts)
         return found
 
     def artifacts(self) -> dict[str, str]:
@@ -282,10 +282,6 @@ class SerialIntake:
                 except Exception as error:  # of a device that may be somebody else's
                     self._said.append(f"no artifacts of {self.device.name}: {error}")
         return found
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
 
 
 class CameraIntake:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from locatk.core.errors import InputError, LocatkError
-from locatk.formats.capture import artifacts, camera, ports, replay
+from locatk.formats.capture import artifacts, ports, replay
 from locatk.formats.capture.clock import HostClock
 from locatk.formats.capture.intake import AUTO, CameraIntake, Intake, SerialIntake
 from locatk.formats.capture.live_file import DiskFullError
@@ -181,6 +181,8 @@ def _intake(wanted: Wanted) -> Intake:
 
 def _port(wanted: Wanted, clock: HostClock) -> Port:
     if wanted.is_camera:
+        from locatk.formats.capture import camera  # OpenCV, which bytes do not need
+
         return camera.port_of(
             wanted.port.removeprefix(CAMERA),
             clock=clock.now,
