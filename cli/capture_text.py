@@ -125,9 +125,23 @@ def summary(recorded: Recorded) -> str:
             for topic, count in sorted(totals.samples.items())
         ]
         lines += [console.table(("stream", "records", "Hz"), rows)]
+    lines += [_clock(recorded.clocks, device) for device in _ticking(recorded.clocks)]
     if recorded.artifacts:
         lines.append(f"artifacts: {', '.join(recorded.artifacts)}")
     return "\n".join(lines)
+
+
+def _ticking(clocks: dict[str, str]) -> list[str]:
+    """Devices whose clock is known."""
+    drift = "tick_drift_ppm:"
+    return [key.removeprefix(drift) for key in clocks if key.startswith(drift)]
+
+
+def _clock(clocks: dict[str, str], device: str) -> str:
+    drift = float(clocks[f"tick_drift_ppm:{device}"])
+    words = f"clock of {device}: {drift:+.1f} ppm to the host's"
+    late = clocks.get(f"tick_jitter_s:{device}")
+    return words if late is None else f"{words}; 95 % arrive within {1e3 * float(late):.1f} ms"
 
 
 def as_json(recorded: Recorded) -> dict[str, Any]:
