@@ -13,7 +13,7 @@ from locatk.cli.capture_options import DURATION, PACE, SIZE, names_option
 from locatk.cli.signals import asked_to_stop
 
 if TYPE_CHECKING:
-    from locatk.formats.capture.recorder import Limits, Recorded
+    from locatk.formats.capture.totals import Recorded
 
 
 def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> dict[str, str]:
@@ -67,7 +67,12 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
     help="Wait so long for the port to be there.",
 )
 @click.option("--duration", type=DURATION, metavar="TIME", help="End after so long: 90s, 5min, 2h.")
-@click.option("--max-size", type=SIZE, metavar="SIZE", help="End at so many bytes: 500MB, 2GB.")
+@click.option(
+    "--max-size",
+    type=SIZE,
+    metavar="SIZE",
+    help="End when the files have so many bytes (half a MB more at most): 500MB, 2GB.",
+)
 @click.option(
     "--rotate",
     type=PACE,
@@ -180,7 +185,7 @@ def command(
     stop = threading.Event()
     with capture_text.live() as live, asked_to_stop(stop.set):
         recorded = session.record(wanted, stop, tell=live.tell, show=live.show, ready=live.ready)
-    _report(recorded, limits, as_json)
+    _report(recorded, as_json)
 
 
 def _list(as_json: bool) -> None:
@@ -195,7 +200,7 @@ def _list(as_json: bool) -> None:
         console.say("No serial port found. `locatk emulate polaris` makes one to try.")
 
 
-def _report(recorded: Recorded, limits: Limits, as_json: bool) -> None:
+def _report(recorded: Recorded, as_json: bool) -> None:
     console.result(capture_text.summary(recorded))
     if as_json:
         console.emit_json(capture_text.as_json(recorded))

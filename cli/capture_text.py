@@ -13,7 +13,7 @@ import click
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.formats.capture.recorder import Recorded, Status
+    from locatk.formats.capture.totals import Recorded, Status
 
 
 class Live:

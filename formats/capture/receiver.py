@@ -111,11 +111,13 @@ class Receiver:
         """Begin to read."""
         self._thread.start()
 
-    def stop(self) -> None:
-        """Read what has arrived by now, close the port and end the thread; a thread that hangs
-        in a driver is left behind."""
-        self._stop.set()
-        self._thread.join(HANGING_S)
+    def stop(self) -> bool:
+        """Read what has arrived by now, close the port and end the thread; returns whether it
+        ended: one that hangs in a driver is left behind."""
+        if not self._stop.is_set():
+            self._stop.set()
+            self._thread.join(HANGING_S)
+        return not self._thread.is_alive()
 
     def take(self) -> Sequence[Event]:
         """All that has happened since the last call."""

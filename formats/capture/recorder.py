@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.clock import HostClock
 from locatk.formats.capture.intake import Intake
-from locatk.formats.capture.parts import Parts
+from locatk.formats.capture.parts import CHUNK, Parts
 from locatk.formats.capture.receiver import Arrived, Back, Ended, Event, Lost, Receiver
-from locatk.formats.capture.totals import Totals
+from locatk.formats.capture.totals import Recorded, Status, Totals
 
 TURN_S = 0.02
 """Between looks at what was received: one message of each stream covers about so much."""
@@ -62,44 +61,18 @@ class Limits:
     sync_s: float = 1.0
 
 
-@dataclass(frozen=True)
-class Status:
-    """How it goes, once a second."""
-
-    elapsed_s: float
-    bytes_per_s: float
-    frames_per_s: float
-    totals: Totals
-    file_bytes: int
-    free_bytes: int | None
-
-
-@dataclass
-class Recorded:
-    """What came of a recording.
-
-    Attributes
-    ----------
-    paths : list of path
-        The files, in their order.
-    ended : str
-        Why: ``"stopped"``, ``"duration"``, ``"max-size"``, ``"end of the source"``, or what
-        went wrong.
-    failed : bool
-        Whether it ended for something that went wrong.
-    """
-
-    totals: Totals
-    paths: list[Path]
-    device: str
-    started_ns: int
-    ended_ns: int
-    ended: str
-    failed: bool
-    system: str
-    artifacts: list[str]
-    clocks: dict[str, str]
-    file_bytes: int = 0
+def _pieces(events: Sequence[Event]) -> Iterator[list[Event]]:
+    """The events of a turn, and no more than a chunk of bytes at once: a file is looked at
+    after each. At least one piece, if an empty one."""
+    piece: list[Event] = []
+    size = 0
+    for event in events:
+        piece.append(event)
+        size += event.size if isinstance(event, Arrived) else 0
+        if size >= CHUNK:
+            yield piece
+            piece, size = [], 0
+    yield piece
 
 
 class Recorder:
@@ -157,7 +130,8 @@ class Recorder:
         syncer.start()
         try:
             ended, failed = self._turns(stop)
-            self._receiver.stop()
+            if not self._receiver.stop():
+                self._say("the port's driver hangs: what it still holds is not recorded")
             self._rest()
         except (LocatkError, OSError) as error:  # of the disk: all else is of the receiver
             self._receiver.stop()
@@ -208,7 +182,12 @@ class Recorder:
         before = Totals()
         while True:
             over = self._over(stop)
-            ended = self._write(self._receiver.take())
+            ended = None
+            for events in _pieces(self._receiver.take()):
+                ended = self._write(events) or ended
+                self._rotate()
+                if self._is_full():
+                    return "max-size", False
             now = time.monotonic()
             if now - flushed >= self._limits.flush_s:
                 flushed = now
@@ -223,7 +202,6 @@ class Recorder:
                 return ended.error or "end of the source", ended.error is not None
             if over:
                 return over, False
-            self._rotate()
             stop.wait(TURN_S)
 
     def _over(self, stop: threading.Event) -> str:
@@ -233,9 +211,11 @@ class Recorder:
             return "stopped"
         if limits.duration_s is not None and self._elapsed_s() >= limits.duration_s:
             return "duration"
-        if limits.max_bytes is not None and self._parts.bytes_written >= limits.max_bytes:
-            return "max-size"
         return ""
+
+    def _is_full(self) -> bool:
+        most = self._limits.max_bytes
+        return most is not None and self._parts.bytes_written >= most
 
     def _elapsed_s(self) -> float:
         return (self._clock.now() - self._start_ns) * 1e-9
@@ -282,7 +262,8 @@ class Recorder:
 
     def _rest(self) -> None:
         """What was received between the last turn and the end."""
-        self._write(self._receiver.take())
+        if not self._is_full():
+            self._write(self._receiver.take())
         if self._lost_ns is not None:
             self._totals.gap_s += (self._clock.now() - self._lost_ns) * 1e-9
         self._parts.write(self._intake.finish())

@@ -19,8 +19,9 @@ from locatk.formats.capture.intake import AUTO, CameraIntake, Intake, SerialInta
 from locatk.formats.capture.live_file import DiskFullError
 from locatk.formats.capture.parts import Content, Parts, check_outputs
 from locatk.formats.capture.receiver import BACKOFF_S, Receiver
-from locatk.formats.capture.recorder import Limits, Recorded, Recorder, Status
+from locatk.formats.capture.recorder import Limits, Recorder
 from locatk.formats.capture.source import Link, Port, SourceError
+from locatk.formats.capture.totals import Recorded, Status
 from locatk.formats.wire import device as device_named
 from locatk.formats.wire.decoder import Options
 

@@ -4,6 +4,7 @@ of ``--json``."""
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 RECORD = "capture"
@@ -75,18 +76,17 @@ class Totals:
 
     def losses(self) -> list[str]:
         """What was lost, one phrase each; empty where nothing was."""
-        return [
-            words
-            for count, words in (
-                (self.gaps, f"connection lost {_times(self.gaps)}, {self.gap_s:.1f} s in all"),
-                (self.overruns, f"{self.overruns} bytes overrun in the UART or the kernel"),
-                (self.dropped, f"{self.dropped} frames of the camera dropped"),
-                (self.line_errors, f"{self.line_errors} bytes with line errors"),
-                (self.bad, f"{self.bad} bad frames"),
-                (self.lost, f"{self.lost} frames missing by their sequence numbers"),
-            )
-            if count
-        ]
+        counted = (
+            (self.overruns, "byte overrun in the UART", "bytes overrun in the UART"),
+            (self.dropped, "frame of the camera dropped", "frames of the camera dropped"),
+            (self.line_errors, "byte with a line error", "bytes with line errors"),
+            (self.bad, "bad frame", "bad frames"),
+            (self.lost, "frame missing by its number", "frames missing by their numbers"),
+        )
+        lost = [f"{count} {one if count == 1 else more}" for count, one, more in counted if count]
+        if self.gaps:
+            lost.insert(0, f"connection lost {_times(self.gaps)}, {self.gap_s:.1f} s in all")
+        return lost
 
     def texts(self) -> dict[str, str]:
         """As entries of a metadata record."""
@@ -96,6 +96,46 @@ class Totals:
             **{key: _text(value) for key, value in plain.items()},
             **{f"samples:{topic}": str(count) for topic, count in samples.items()},
         }
+
+
+@dataclass(frozen=True)
+class Status:
+    """How it goes, once a second."""
+
+    elapsed_s: float
+    bytes_per_s: float
+    frames_per_s: float
+    totals: Totals
+    file_bytes: int
+    free_bytes: int | None
+
+
+@dataclass
+class Recorded:
+    """What came of a recording.
+
+    Attributes
+    ----------
+    paths : list of path
+        The files, in their order.
+    ended : str
+        Why: ``"stopped"``, ``"duration"``, ``"max-size"``, ``"end of the source"``, or what
+        went wrong.
+    failed : bool
+        Whether it ended for something that went wrong.
+    """
+
+    totals: Totals
+    paths: list[Path]
+    device: str
+    started_ns: int
+    ended_ns: int
+    ended: str
+    failed: bool
+    system: str
+    artifacts: list[str]
+    clocks: dict[str, str]
+    file_bytes: int = 0
 
 
 def _times(count: int) -> str:
