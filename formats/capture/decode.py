@@ -91,6 +91,7 @@ def decode(
         )
     said = session.metadata().get(RECORD, {})
     name = device or said.get("device") or AUTO
+    attached = {**_attached(session), **(artifacts or {})}
     intakes = {
         topic: SerialIntake(
             topic.removeprefix(TOPIC),
@@ -98,10 +99,10 @@ def decode(
             name,
             options,
             baud=int(said["baud"]) if said.get("baud", "").isdigit() else None,
+            artifacts=attached,
         )
         for topic in topics
     }
-    attached = {**_attached(session), **(artifacts or {})}
     with SessionWriter(output, system="", overwrite=overwrite) as writer:
         for stamped in _messages(session, intakes):
             writer.write(stamped.topic, stamped.message, stamped.time_ns, stamped.publish_ns)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from google.protobuf.message import Message
 
-from locatk.formats import frames, messages
+from locatk.formats import frames, hall_sensors, messages
 from locatk.formats.capture.arrivals import Arrivals
 from locatk.formats.capture.receiver import Arrived
 from locatk.formats.capture.streams import SYSTEMS, Stamped, Streams
@@ -82,6 +82,8 @@ class SerialIntake:
         For the decoder.
     baud : int, optional
         Of the port; the device's own where it is left out.
+    artifacts : mapping of str to str
+        What is attached to the session: name to text.
 
     Raises
     ------
@@ -97,6 +99,7 @@ class SerialIntake:
         options: Options | None = None,
         *,
         baud: int | None = None,
+        artifacts: Mapping[str, str] | None = None,
     ) -> None:
         self.topic = f"/serial/{name}"
         self.declared: Sequence[tuple[str, type[Message]]] = [(self.topic, SerialChunk)]
@@ -108,7 +111,9 @@ class SerialIntake:
         self._opened = True
         self._last_ns: int | None = None
         self._first_ns: int | None = None
-        self._streams = Streams(name)
+        text = (artifacts or {}).get(hall_sensors.HALLS_FILE)
+        halls = () if text is None else hall_sensors.loads_halls(text).names
+        self._streams = Streams(name, halls)
         self._arrivals = Arrivals()
         self._known: dict[tuple[str, str], Stream] = {}
         self._asked: set[Stream] = set()
@@ -120,7 +125,7 @@ class SerialIntake:
         if device_name == AUTO:
             from locatk.formats.wire.identify import Identifier
 
-            self._identifier = Identifier()
+            self._identifier = Identifier(self._options)
         else:
             self._decide(device(device_name))
 
@@ -249,7 +254,8 @@ class SerialIntake:
 
     def remarks(self) -> list[str]:
         """Of the decoder and of the identification."""
-        said, self._said = self._said, []
+        said, self._said = self._said + self._streams.remarks, []
+        self._streams.remarks = []
         if self._decoder is not None:
             said += self._decoder.remarks
             self._decoder.remarks.clear()

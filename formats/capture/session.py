@@ -100,7 +100,7 @@ def record(
     )
     _check_disk(wanted.output.parent, wanted.limits.reserve_bytes)
     clock = HostClock()
-    intake = _intake(wanted)
+    intake = _intake(wanted, content)
     port = _port(wanted, clock)
     link = _opened(port, wanted.wait_s, stop)
     try:
@@ -164,7 +164,7 @@ def _check_disk(folder: Path, reserve: int) -> None:
         )
 
 
-def _intake(wanted: Wanted) -> Intake:
+def _intake(wanted: Wanted, content: Mapping[str, str]) -> Intake:
     if wanted.is_camera:
         if wanted.device != AUTO:
             raise InputError(
@@ -177,6 +177,7 @@ def _intake(wanted: Wanted) -> Intake:
         wanted.device,
         Options(columns=wanted.columns),
         baud=wanted.baud,
+        artifacts=content,
     )
 
 

@@ -47,6 +47,9 @@ class Streams:
     ----------
     name : str
         Of the device; those behind it, if several, are ``<name>-<node>``.
+    halls : sequence of str
+        Names of the hall sensors in the order that ``halls.toml`` has them; empty where that
+        is not known.
 
     Attributes
     ----------
@@ -54,10 +57,15 @@ class Streams:
         Records by topic, so far.
     clocks : dict of str to TickClock
         By device, for those that tell their ticks.
+    remarks : list of str
+        What must be known to use the records.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, halls: Sequence[str] = ()) -> None:
         self._name = name
+        self._halls = tuple(halls)
+        self._doubted: set[tuple[str, ...]] = set()
+        self.remarks: list[str] = []
         self._last: dict[str, int] = {}
         self._ticks: dict[str, Ticks] = {}
         self.samples: Counter[str] = Counter()
@@ -91,6 +99,8 @@ class Streams:
         time_ns = self._ascending(topic, time_ns)
         self.samples[topic] += len(batch)
         columns: dict[str, NDArray[Any]] = {"time_ns": time_ns, **batch.columns}
+        if stream.kind == "halls":
+            columns["b_tesla"] = self._in_order(stream.names, columns["b_tesla"])
         if batch.tick is not None:
             columns["device_ticks"] = batch.tick
         if batch.sequence is not None:
@@ -99,6 +109,20 @@ class Streams:
             part = slice(start, start + LARGEST_BATCH)
             message = layout.pack(once, {key: column[part] for key, column in columns.items()})
             yield Stamped(topic, message, now_ns, int(time_ns[start]))
+
+    def _in_order(self, names: tuple[str, ...], field: NDArray[Any]) -> NDArray[Any]:
+        """Fields (n, N) of sensors that a device names, in the order of ``halls.toml``."""
+        if not names or not self._halls or names == self._halls:
+            return field
+        if sorted(names) == sorted(self._halls):
+            return field[:, [names.index(name) for name in self._halls]]
+        if names not in self._doubted:
+            self._doubted.add(names)
+            self.remarks.append(
+                f"hall sensors are named {', '.join(names)}, and in halls.toml "
+                f"{', '.join(self._halls)}: they are taken in their order"
+            )
+        return field
 
     def _times(self, batch: Batch, arrivals: Arrivals) -> NDArray[np.int64]:
         ticks = batch.stream.ticks

@@ -38,7 +38,8 @@ class Stream:
     sensors : int
         Of ``magnetometers`` and ``halls``: how many.
     names : tuple of str
-        Of ``readings``: names of the values.
+        Of ``readings``: names of the values; of ``halls``: names of the sensors, where the
+        device tells.
     ticks : Ticks or None
         The clock of :attr:`Batch.tick`.
     """
@@ -114,7 +115,7 @@ class Counts:
         Bytes that belong to no good frame; those before the first are not counted, as
         nobody starts to listen at the start of a frame.
     unknown : int
-        Frames that are right, and of a type that this version does not know.
+        Of the ``frames``: those of a type that this version does not know.
     """
 
     bytes: int = 0
