@@ -204,7 +204,7 @@ def _report(recorded: Recorded, as_json: bool) -> None:
     console.result(capture_text.summary(recorded))
     if as_json:
         console.emit_json(capture_text.as_json(recorded))
-    losses = recorded.totals.losses()
+    losses = recorded.totals.losses() + recorded.totals.doubts(recorded.device)
     if recorded.failed:
         losses.insert(0, recorded.ended)
     if losses:

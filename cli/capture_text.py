@@ -16,6 +16,14 @@ if TYPE_CHECKING:
     from locatk.formats.capture.totals import Recorded, Status
 
 
+ENDS = {
+    "duration": "ended after --duration",
+    "max-size": "ended at --max-size",
+    "stopped": "stopped",
+}
+"""Why a recording has ended, for people."""
+
+
 class Live:
     """Talk while recording: on a terminal one line that changes each second, with what
     happened above it; elsewhere a line a second."""
@@ -77,14 +85,15 @@ def live() -> Iterator[Live]:
 def status_line(status: Status) -> str:
     """One line: what comes, what is lost, how full things are."""
     totals = status.totals
+    away = status.away_s
     words = [
         clock(status.elapsed_s),
-        f"{size(status.bytes_per_s)}/s",
+        f"{size(status.bytes_per_s)}/s" if away is None else f"away for {away:.0f} s",
         f"{status.frames_per_s:.0f} frames/s",
         f"{totals.bad} bad",
         f"{totals.lost} missing",
         f"{totals.overruns} overrun",
-        *([f"{totals.gaps} gaps"] if totals.gaps else []),
+        *([f"{totals.gaps} gap{'' if totals.gaps == 1 else 's'}"] if totals.gaps else []),
         f"buffer {size(totals.high_water_bytes)}",
         f"file {size(status.file_bytes)}",
         *([f"disk {size(status.free_bytes)} left"] if status.free_bytes is not None else []),
@@ -103,8 +112,13 @@ def size(count: float) -> str:
     """Bytes with three digits and a unit."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
-            return f"{count / factor:.3g} {unit}"
+            return f"{number(count / factor)} {unit}"
     return f"{count:.0f} B"
+
+
+def number(value: float) -> str:
+    """Three digits, or all before the point."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def summary(recorded: Recorded) -> str:
@@ -117,11 +131,12 @@ def summary(recorded: Recorded) -> str:
     lines = [
         f"{files}: {clock(seconds)}, {size(totals.bytes)} received"
         + (f" from {recorded.device}" if recorded.device else "")
-        + f", {totals.frames} frames, {totals.bad} bad, {totals.lost} missing; {recorded.ended}",
+        + f", {totals.frames} frames, {totals.bad} bad, {totals.lost} missing; "
+        + ENDS.get(recorded.ended, recorded.ended),
     ]
     if totals.samples:
         rows = [
-            (topic, count, f"{count / seconds:.3g}" if seconds > 0 else "-")
+            (topic, count, number(recorded.rates[topic]) if topic in recorded.rates else "-")
             for topic, count in sorted(totals.samples.items())
         ]
         lines += [console.table(("stream", "records", "Hz"), rows)]
@@ -156,6 +171,7 @@ def as_json(recorded: Recorded) -> dict[str, Any]:
         "ended": recorded.ended,
         "file_bytes": recorded.file_bytes,
         **vars(recorded.totals),
+        "rates_hz": recorded.rates,
         "clocks": {key: float(text) for key, text in recorded.clocks.items()},
         "artifacts": recorded.artifacts,
     }

@@ -82,7 +82,7 @@ def command(
                 "output": output,
                 "system": decoded.system or None,
                 "devices": [
-                    {"name": name, "device": decoded.devices[name], **vars(totals)}
+                    {"name": name, "device": decoded.devices[name], **_counted(totals)}
                     for name, totals in decoded.totals.items()
                 ],
                 "remarks": decoded.remarks,
@@ -90,3 +90,10 @@ def command(
         )
     if lost := losses(decoded):
         raise failures.Incomplete("; ".join(lost))
+
+
+def _counted(totals: Any) -> dict[str, Any]:
+    """What the decoder counts; the rest is of the port."""
+    from locatk.formats.capture.decode import LINE
+
+    return {key: value for key, value in vars(totals).items() if key not in LINE}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,16 +140,12 @@ def command(
         console.say(f"{_what(source, found)}; Ctrl-C ends it")
         emulator = Emulator(port, *parts)
         try:
-            with asked_to_stop(emulator.stop) as caught:
+            with asked_to_stop(emulator.stop):
                 emulator.run()
         finally:
             if as_json:
                 console.emit_json({**known, **emulator.totals.as_dict()})
             console.say(_summary(emulator.totals))
-    if caught == [signal.SIGINT]:
-        raise click.Abort
-    if caught:
-        sys.exit(128 + caught[0])
 
 
 def _refuse_contradictions(source: str, save: Path | None, given: dict[str, Any]) -> None:

@@ -231,7 +231,8 @@ def _geometry(session: Session, kind: Kind[G], topic: str, sensors: int) -> G:
             f"no geometry of the {kind.geometry} {device!r}",
             file=session.path,
             where=kind.file,
-            hint="Record or import it again: where the sensors sit is not known",
+            hint=f"Where the sensors sit is not known: `locatk decode {session.path} --artifact "
+            f"{kind.file} -o whole.mcap` adds it to a recording, else import it again",
         )
     if len(geometry) != sensors:
         raise FormatError(

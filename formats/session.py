@@ -239,5 +239,5 @@ def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
             str(damage),
             file=path,
             where=None if damage.offset is None else f"byte {damage.offset}",
-            hint="Record or import it again; `locatk info` tells what is left in it",
+            hint=f"`locatk recover {os.fspath(path)} -o whole.mcap` saves what is left of it",
         ) from None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,7 +87,7 @@ def decode(
         raise FormatError(
             f"no raw bytes (topic {TOPIC}<device>)",
             file=session.path,
-            hint="Give a session made by `locatk capture`",
+            hint="Give a recording of `locatk capture`; `locatk emulate` sends what others hold",
         )
     said = session.metadata().get(RECORD, {})
     name = device or said.get("device") or AUTO
@@ -214,6 +214,10 @@ def _decoded(intakes: Mapping[str, SerialIntake]) -> Decoded:
     return Decoded(devices, totals, remarks, system)
 
 
-def losses(decoded: Decoded) -> Sequence[str]:
+def losses(decoded: Decoded) -> list[str]:
     """What the decoder could not use, one phrase each."""
-    return [phrase for totals in decoded.totals.values() for phrase in totals.losses()]
+    return [
+        phrase
+        for name, totals in decoded.totals.items()
+        for phrase in [*totals.losses(), *totals.doubts(decoded.devices[name])]
+    ]

@@ -20,6 +20,8 @@ PROC = Path("/proc")
 
 USUAL = "ModemManager, a serial monitor (Arduino IDE, screen, minicom), another locatk capture"
 
+MASTERS = ("/dev/ptmx", "/dev/pts/ptmx")
+
 _Pair = tuple[int, int]
 
 
@@ -31,7 +33,8 @@ class Holder:
     ----------
     pid : int
     name : str
-        Of its command, as ``ps`` shows it: 15 characters at most.
+        Of its command, as ``ps`` shows it: 15 characters at most; of an interpreter, with
+        what it runs.
     """
 
     pid: int
@@ -64,18 +67,14 @@ def holders(paths: Iterable[str]) -> dict[str, tuple[Holder, ...]]:
             if pair in nodes:
                 nodes[pair].add(pid)
     return {
-        path: tuple(
-            Holder(pid, name)
-            for pid in sorted(opened | locked)
-            if (name := _line(PROC / str(pid) / "comm"))
-        )
+        path: tuple(Holder(pid, name) for pid in sorted(opened | locked) if (name := _name(pid)))
         for path, (opened, locked) in wanted.items()
     }
 
 
 def busy(name: str, path: str) -> SourceError:
     """The error of a port that somebody has open already."""
-    seen = holders([path])[path]
+    seen = [holder for holder in holders([path])[path] if not _serves(holder.pid, path)]
     if not seen:
         return SourceError(
             f"{name} is in use by another program",
@@ -183,6 +182,27 @@ def _locks() -> Iterator[tuple[int, _Pair]]:
             yield pid, (os.makedev(int(major, 16), int(minor, 16)), int(inode))
         except ValueError:
             continue
+
+
+def _name(pid: int) -> str:
+    """Name of a process, ``""`` where it has ended."""
+    name = _line(PROC / str(pid) / "comm")
+    if not name.startswith("python"):
+        return name
+    words = _line(PROC / str(pid) / "cmdline").replace("\0", " ").split()[1:]
+    run = [Path(word).name for word in words if not word.startswith("-")]
+    return f"{name} {' '.join(run[:2])}".strip()
+
+
+def _serves(pid: int, path: str) -> bool:
+    """Whether a process is the other end of a pseudo-terminal, which keeps it open."""
+    if not is_pty(path):
+        return False
+    folder = PROC / str(pid) / "fd"
+    try:
+        return any(os.readlink(each) in MASTERS for each in folder.iterdir())
+    except OSError:
+        return False
 
 
 def _line(path: Path) -> str:

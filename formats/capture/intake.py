@@ -25,6 +25,9 @@ PAUSE_NS = 3_000_000
 """A line that is silent for longer is between two frames: within a frame bytes follow each
 other, or wait for the next millisecond of USB."""
 
+JOINED_NS = 5_000_000
+"""Reads within so much time become one message."""
+
 AUTO = "auto"
 
 
@@ -62,6 +65,9 @@ class Intake(Protocol):
 
     def clocks(self) -> dict[str, str]:
         """What is known of the devices' clocks, as entries of the metadata record."""
+
+    def rates(self) -> dict[str, float]:
+        """Records a second by topic, from the first to the last."""
 
     def artifacts(self) -> dict[str, str]:
         """Artifacts that are known without being told, name to text."""
@@ -137,7 +143,7 @@ class SerialIntake:
     def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
         """Messages of what was read: all raw ones, then the records."""
         pieces: list[tuple[bool, list[bytes]]] = []
-        for each in arrived:
+        for each in _joined(arrived):
             chunk = SerialChunk(
                 timestamp=messages.timestamp(each.time_ns),
                 port=self._port,
@@ -265,7 +271,7 @@ class SerialIntake:
         """Of each device's clock against the host's: offset, drift, and how late the latest
         twentieth of what it sends arrives."""
         found: dict[str, str] = {}
-        for name, clock in self._streams.clocks.items():
+        for name, clock in self._streams.clocks().items():
             if clock.offset_ns is not None:
                 found[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
             if clock.drift_ppm is not None:
@@ -274,6 +280,10 @@ class SerialIntake:
                 found[f"tick_jitter_s:{name}"] = f"{clock.jitter_ns[1] / 1e9:.6f}"
             found[f"tick_restarts:{name}"] = str(clock.restarts)
         return found
+
+    def rates(self) -> dict[str, float]:
+        """Of what was decoded."""
+        return self._streams.rates()
 
     def artifacts(self) -> dict[str, str]:
         """Sensors of devices that are what they are."""
@@ -288,6 +298,30 @@ class SerialIntake:
                 except Exception as error:  # of a device that may be somebody else's
                     self._said.append(f"no artifacts of {self.device.name}: {error}")
         return found
+
+
+def _joined(arrived: Sequence[Arrived]) -> Iterator[Arrived]:
+    """Reads of a line that goes on without a pause, joined: it is read once a millisecond.
+    The bytes have the time of the last one; how much earlier the first were, the wire tells.
+    """
+    group: list[Arrived] = []
+    for each in arrived:
+        if group and (
+            each.time_ns - group[-1].time_ns >= PAUSE_NS
+            or each.time_ns - group[0].time_ns >= JOINED_NS
+        ):
+            yield _one(group)
+            group = []
+        group.append(each)
+    if group:
+        yield _one(group)
+
+
+def _one(group: Sequence[Arrived]) -> Arrived:
+    if len(group) == 1:
+        return group[0]
+    data = b"".join(each.data for each in group)
+    return Arrived(group[-1].time_ns, data, len(data))
 
 
 class CameraIntake:
@@ -306,12 +340,14 @@ class CameraIntake:
         self.declared: Sequence[tuple[str, type[Message]]] = [(self.topic, CompressedImage)]
         self.system = "dots"
         self._name, self._format = name, format
-        self._frames = self._bytes = 0
+        self._frames = self._bytes = self._first_ns = self._last_ns = 0
 
     def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
         """One message a frame."""
         for each in arrived:
             for time_ns, image, *_ in each.data:
+                self._first_ns = self._first_ns or time_ns
+                self._last_ns = time_ns
                 self._frames += 1
                 self._bytes += len(image)
                 message = CompressedImage(
@@ -346,6 +382,11 @@ class CameraIntake:
     def clocks(self) -> dict[str, str]:
         """None: a frame has the time at which it was taken from the driver."""
         return {}
+
+    def rates(self) -> dict[str, float]:
+        """Of the frames."""
+        span_s = (self._last_ns - self._first_ns) * 1e-9
+        return {self.topic: (self._frames - 1) / span_s} if span_s > 0 else {}
 
     def artifacts(self) -> dict[str, str]:
         """None."""

@@ -14,7 +14,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from locatk.core.errors import LocatkError
+from locatk.core.errors import LocatkError, OutputExistsError
 from locatk.formats.output import check_output
 
 AHEAD = 4 << 20
@@ -53,9 +53,13 @@ class LiveFile:
         self.path = Path(path)
         try:
             if overwrite:
+                _check_idle(self.path)
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(path)
             self._file = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
+            _lock(self._file.fileno())
+        except LocatkError:
+            raise
         except OSError as error:
             raise LocatkError(f"cannot write: {error.strerror or error}", file=path) from error
         self._size = 0
@@ -77,11 +81,11 @@ class LiveFile:
         try:
             while done < len(view):
                 done += self._file.write(view[done:])
-        except OSError as error:
+        except BaseException as error:
             with contextlib.suppress(OSError):
                 self._file.truncate(self._size)
                 self._file.seek(self._size)
-            if error.errno in FULL:
+            if isinstance(error, OSError) and error.errno in FULL:
                 raise DiskFullError(_words(error.errno), file=self.path) from error
             raise
         self._size += done
@@ -119,6 +123,13 @@ class LiveFile:
                 return None
         return found.f_bavail * found.f_frsize
 
+    def is_there(self) -> bool:
+        """Whether the file still has its name: somebody may have removed or replaced it."""
+        try:
+            return os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno()))
+        except (OSError, ValueError):
+            return False
+
     def tell(self) -> int:
         """Bytes written."""
         return self._size
@@ -141,6 +152,35 @@ class LiveFile:
         with contextlib.suppress(OSError):
             os.fsync(self._file.fileno())
         self._file.close()
+
+
+def _check_idle(path: Path) -> None:
+    """Refuse a file that another capture is writing."""
+    try:
+        with open(path, "rb") as stream:
+            busy = not _lock(stream.fileno())
+    except FileNotFoundError:
+        return
+    if busy:
+        raise OutputExistsError(
+            f"output {str(path)!r} is being recorded by another program",
+            hint="End that one, or choose another name",
+        )
+
+
+def _lock(descriptor: int) -> bool:
+    """Take the lock of a file until it is closed; False where somebody else has it."""
+    try:
+        import fcntl
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True  # a file system without locks
+    return True
 
 
 def _words(number: int | None) -> str:

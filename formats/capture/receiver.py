@@ -159,11 +159,11 @@ class Receiver:
                 self._events.append(Ended(self._clock.now()))
                 return
             except LinkLost as lost:
-                self._events.append(Lost(self._clock.now(), str(lost)))
                 self._close()
                 if not self._port.comes_again:
                     self._events.append(Ended(self._clock.now(), str(lost)))
                     return
+                self._events.append(Lost(self._clock.now(), str(lost)))
                 if not self._reopen():
                     return
                 where = self._port.describe().get("resolved", self._port.name)

@@ -26,6 +26,9 @@ TURN_S = 0.02
 SHOW_S = 1.0
 """Between looks at rates, disk, silence and clock."""
 
+DOUBT_S = 5.0
+"""After so long bytes without a frame are told of."""
+
 AHEAD_S = 300.0
 """A disk that will be full sooner than this is told of."""
 
@@ -113,6 +116,7 @@ class Recorder:
         self._held_up = 0
         self._disk_told = False
         self._flushed_bytes = 0
+        self._doubted = False
 
     def run(self, stop: threading.Event) -> Recorded:
         """Record until ``stop`` is set, a limit is reached, or nothing more can come.
@@ -145,7 +149,7 @@ class Recorder:
         recorded = Recorded(
             totals=self._count(),
             paths=self._parts.paths,
-            device=getattr(getattr(self._intake, "device", None), "name", ""),
+            device=self._device(),
             started_ns=self._start_ns,
             ended_ns=self._clock.now(),
             ended=ended,
@@ -153,7 +157,11 @@ class Recorder:
             system=self._intake.system,
             artifacts=sorted(self._parts.artifacts),
             clocks=self._intake.clocks(),
+            rates=self._intake.rates(),
         )
+        if not self._parts.file.is_there():
+            recorded.failed = True
+            recorded.ended += f"; somebody has removed or replaced {self._parts.file.path}"
         try:
             self._parts.finish(self._facts(ended))
         except OSError as error:
@@ -278,6 +286,7 @@ class Recorder:
         self._show(
             Status(
                 self._elapsed_s(),
+                None if self._lost_ns is None else (self._clock.now() - self._lost_ns) * 1e-9,
                 rate,
                 fresh.frames / took_s,
                 totals,
@@ -287,6 +296,7 @@ class Recorder:
         )
         self._look_for_silence()
         self._look_at_clock()
+        self._look_for_frames(totals)
         if self._receiver.held_up > self._held_up:
             self._held_up = self._receiver.held_up
             self._say("the disk is slower than the port: reading waits")
@@ -297,7 +307,21 @@ class Recorder:
         if self._lost_ns is None and not self._silent and silent_s >= self._limits.silence_s:
             self._silent = True
             self._totals.silences += 1
-            self._say(f"nothing received for {silent_s:.0f} s")
+            self._say(
+                f"nothing received for {silent_s:.0f} s: is it on, does it send, is the baud right?"
+            )
+
+    def _look_for_frames(self, totals: Totals) -> None:
+        """Bytes and nothing in them: the most usual fault of all."""
+        device = self._device()
+        if not self._doubted and device and self._elapsed_s() >= DOUBT_S and totals.bytes:
+            self._doubted = True
+            for doubt in totals.doubts(device):
+                self._say(f"{doubt}: is it this device (--device auto), is its baud right?")
+
+    def _device(self) -> str:
+        """What is at the port, ``""`` while that is not known, and of a camera."""
+        return getattr(getattr(self._intake, "device", None), "name", "")
 
     def _look_at_clock(self) -> None:
         step_s = self._clock.stepped_ns() * 1e-9
@@ -353,9 +377,9 @@ class Recorder:
 
     def _facts(self, ended: str) -> dict[str, str]:
         """What the part that ends now holds, for its metadata."""
-        device = getattr(self._intake, "device", None)
+        device = self._device()
         return {
-            **({"device": device.name} if device is not None else {}),
+            **({"device": device} if device else {}),
             "ended_ns": str(self._clock.now()),
             "ended": ended,
             **self._count().since(self._part_began).texts(),

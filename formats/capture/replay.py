@@ -91,7 +91,7 @@ class ReplayPort:
         raise SourceError(
             "no raw bytes",
             file=self._file,
-            hint=f"It holds {held}; recordings of `locatk capture` hold raw bytes",
+            hint=f"It holds {held}: `locatk emulate {self._file}` sends that",
         )
 
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from locatk.core.ticks import TickClock
 from locatk.formats import messages
 from locatk.formats.capture.arrivals import Arrivals
+from locatk.formats.capture.device_time import DeviceTime
 from locatk.formats.messages import Layout
 from locatk.formats.tracks import LARGEST_BATCH
-from locatk.formats.wire.decoder import Batch, Stream, Ticks
+from locatk.formats.wire.decoder import Batch, Stream
 
 SYSTEMS = {
     "magnetometers": "polaris",
@@ -55,8 +56,6 @@ class Streams:
     ----------
     samples : Counter
         Records by topic, so far.
-    clocks : dict of str to TickClock
-        By device, for those that tell their ticks.
     remarks : list of str
         What must be known to use the records.
     """
@@ -66,19 +65,30 @@ class Streams:
         self._halls = tuple(halls)
         self._doubted: set[tuple[str, ...]] = set()
         self.remarks: list[str] = []
+        self._first: dict[str, int] = {}
         self._last: dict[str, int] = {}
-        self._ticks: dict[str, Ticks] = {}
+        self._times_of: dict[str, DeviceTime] = {}
         self.samples: Counter[str] = Counter()
-        self.clocks: dict[str, TickClock] = {}
 
     def device(self, stream: Stream) -> str:
         """Name of the device whose records these are."""
         return f"{self._name}-{stream.node}" if stream.node else self._name
 
+    def rates(self) -> dict[str, float]:
+        """Records a second by topic, from the first to the last."""
+        spans = {topic: (self._last[topic] - first) * 1e-9 for topic, first in self._first.items()}
+        return {
+            topic: (self.samples[topic] - 1) / span for topic, span in spans.items() if span > 0
+        }
+
+    def clocks(self) -> dict[str, TickClock]:
+        """By device, of those that tell their ticks and can be believed."""
+        return {name: known.clock for name, known in self._times_of.items() if known.rate is None}
+
     def restart(self) -> None:
         """The devices were away: their clocks may have begun anew."""
-        for clock in self.clocks.values():
-            clock.restart()
+        for known in self._times_of.values():
+            known.restart()
 
     def messages(
         self, batches: Sequence[Batch], arrivals: Arrivals, now_ns: int
@@ -97,6 +107,7 @@ class Streams:
         stream, device = batch.stream, self.device(batch.stream)
         topic, layout, once = _form(stream, device)
         time_ns = self._ascending(topic, time_ns)
+        self._first.setdefault(topic, int(time_ns[0]))
         self.samples[topic] += len(batch)
         columns: dict[str, NDArray[Any]] = {"time_ns": time_ns, **batch.columns}
         if stream.kind == "halls":
@@ -129,10 +140,17 @@ class Streams:
         if batch.tick is None or ticks is None:
             return arrivals.wire_ns(batch.end)
         device = self.device(batch.stream)
-        if self._ticks.get(device) != ticks:
-            self._ticks[device] = ticks
-            self.clocks[device] = TickClock(ticks.hz, ticks.bits)
-        return self.clocks[device].times(batch.tick, arrivals.read_ns(batch.end))
+        known = self._times_of.get(device)
+        if known is None or known.ticks != ticks:
+            known = self._times_of[device] = DeviceTime(ticks)
+        believed = known.rate is None
+        times = known.times(batch.stream.kind, batch.tick, arrivals.read_ns(batch.end))
+        if believed and known.rate is not None:
+            self.remarks.append(
+                f"the clock of {device} runs {known.rate:.2g} times as fast as it says: samples "
+                "have the times of their arrival"
+            )
+        return arrivals.wire_ns(batch.end) if times is None else times
 
     def _ascending(self, topic: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The same times, each later than the one before it by a nanosecond at least."""

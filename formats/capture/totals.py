@@ -88,6 +88,19 @@ class Totals:
             lost.insert(0, f"connection lost {_times(self.gaps)}, {self.gap_s:.1f} s in all")
         return lost
 
+    def doubts(self, device: str) -> list[str]:
+        """Why nothing, or little, could be made of what came from a device of this kind; ``""``
+        for a camera."""
+        if not self.bytes:
+            return ["nothing was received"]
+        if device == "raw":
+            return []
+        if not self.frames:
+            return [f"no frame of {device or 'a device that is known'} in {self.bytes} bytes"]
+        if 2 * self.skipped > self.bytes:
+            return [f"{self.skipped} of {self.bytes} bytes are in no frame of {device}"]
+        return []
+
     def texts(self) -> dict[str, str]:
         """As entries of a metadata record."""
         plain = asdict(self)
@@ -103,6 +116,8 @@ class Status:
     """How it goes, once a second."""
 
     elapsed_s: float
+    away_s: float | None
+    """For how long the connection has been lost; None while it is there."""
     bytes_per_s: float
     frames_per_s: float
     totals: Totals
@@ -121,6 +136,8 @@ class Recorded:
     ended : str
         Why: ``"stopped"``, ``"duration"``, ``"max-size"``, ``"end of the source"``, or what
         went wrong.
+    rates : dict of str to float
+        Records a second by topic, from the first to the last.
     failed : bool
         Whether it ended for something that went wrong.
     """
@@ -135,6 +152,7 @@ class Recorded:
     system: str
     artifacts: list[str]
     clocks: dict[str, str]
+    rates: dict[str, float]
     file_bytes: int = 0
 
 

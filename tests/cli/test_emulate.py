@@ -198,10 +198,8 @@ def test_errors_are_one_line(
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-@pytest.mark.parametrize(
-    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
-)
-def test_signals_end_it_cleanly(run: Path, number: signal.Signals, status: int) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_end_it_cleanly(run: Path, number: signal.Signals) -> None:
     """Also for a device that sends for ever; the totals are told nevertheless."""
     command = [sys.executable, "-m", "locatk.cli", "emulate", str(run), "--json", "--loop", "0"]
     with subprocess.Popen(
@@ -222,7 +220,7 @@ def test_signals_end_it_cleanly(run: Path, number: signal.Signals, status: int) 
                 break
             got += piece
         os.close(descriptor)
-        assert process.wait(timeout=20) == status
+        assert process.wait(timeout=20) == 0
         totals = json.loads(process.stdout.read())
     assert totals["sent"] == len(got) > 0
     assert not port.parent.exists()
