@@ -124,9 +124,9 @@ class LiveFile:
         return found.f_bavail * found.f_frsize
 
     def is_there(self) -> bool:
-        """Whether the file still has its name: somebody may have removed or replaced it."""
+        """Whether the file has a name: somebody may have removed or replaced it."""
         try:
-            return os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno()))
+            return os.fstat(self._file.fileno()).st_nlink > 0
         except (OSError, ValueError):
             return False
 
