@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.info_text import text
-from locatk.core.errors import LocatkError
+from locatk.core.errors import FormatError, LocatkError
 
 if TYPE_CHECKING:
     from locatk.core.lighthouse.scene import Scene
@@ -27,7 +28,8 @@ def command(file: Path, as_json: bool) -> None:
     of landmarks, hall sensors.
 
     A damaged or cut recording is described as far as it can be read; the exit status
-    is 3 then.
+    is 3 then, and `locatk recover` saves what is left. Of a recording that holds more than
+    16 MB of samples only the index is read.
 
     \b
     Examples:
@@ -45,7 +47,8 @@ def command(file: Path, as_json: bool) -> None:
     else:
         console.result(text(facts))
     if facts.get("damage"):
-        raise failures.Incomplete(f"{facts['damage']} in {file}")
+        hint = "; `locatk recover` saves what is left of it" if facts["recoverable"] else ""
+        raise failures.Incomplete(f"{facts['damage']} in {file}{hint}")
 
 
 def _artifact(file: Path) -> dict[str, Any]:
@@ -92,9 +95,9 @@ def _artifact(file: Path) -> dict[str, Any]:
 
 
 def _recording(file: Path) -> dict[str, Any]:
-    from locatk.formats.session import Session
+    from locatk.formats import captured
 
-    session = Session.open(file, damaged_ok=True)
+    session = _session(file)
     facts = session.facts
     described = {
         "kind": facts.get("kind"),
@@ -104,14 +107,17 @@ def _recording(file: Path) -> dict[str, Any]:
         "library": session.library,
         "start_ns": session.start_ns,
         "end_ns": session.end_ns,
-        "duration_s": _duration(session),
+        "duration_s": captured.duration_s(session),
         "streams": _streams(session),
+        "capture": captured.capture(session),
         "attachments": [
             {"name": item.name, "media_type": item.media_type, "bytes": item.size}
             for item in session.attachments()
         ],
         "metadata": session.metadata(),
+        "unread_bytes": None,
         "damage": session.damage,
+        "recoverable": session.damage is not None,
     }
     if facts.get("system") == "lighthouse":
         described |= _lighthouse(session)
@@ -122,22 +128,37 @@ def _recording(file: Path) -> dict[str, Any]:
     return described
 
 
-def _duration(session: Session) -> float | None:
-    if session.start_ns is None or session.end_ns is None:
-        return None
-    return (session.end_ns - session.start_ns) / 1e9
+def _session(file: Path) -> Session:
+    """The session in a file, or what is left of it."""
+    from locatk.formats.mcap_records import NotMcapError
+    from locatk.formats.session import Session
+
+    try:
+        return Session.open(file)
+    except FormatError as error:
+        from locatk.formats.recover import left_in
+
+        where = "" if error.where is None else f" ({error.where})"
+        headless = isinstance(error.__context__, NotMcapError)
+        what = "it does not begin as an MCAP file" if headless else error.message + where
+        with contextlib.suppress(FormatError):
+            return left_in(file, what)
+        raise
 
 
 def _streams(session: Session) -> list[dict[str, Any]]:
-    duration = _duration(session)
+    from locatk.formats import captured
+
+    samples = {each.topic: captured.samples(session, each.topic) for each in session.channels}
     return [
         {
             "topic": channel.topic,
             "schema": channel.schema,
             "encoding": channel.encoding,
             "messages": channel.count,
-            # n messages span n - 1 intervals
-            "rate_hz": (channel.count - 1) / duration if duration and channel.count > 1 else None,
+            "rate_hz": captured.rate_hz(session, channel.count),
+            "samples": samples[channel.topic],
+            "samples_hz": captured.rate_hz(session, samples[channel.topic]),
         }
         for channel in session.channels
     ]
@@ -148,20 +169,28 @@ def _lighthouse(session: Session) -> dict[str, Any]:
     import numpy as np
 
     from locatk.core.lighthouse.scene import Scene
-    from locatk.formats import observations
+    from locatk.formats import captured, describe, observations
 
     described: dict[str, Any] = {}
     counts: dict[int, int] = {}
     scene = None
+    topics = session.topics("/lighthouse/")
     try:
         scene = observations.read_scene(session)
-        if session.topics("/lighthouse/"):
+        if topics and not captured.is_small(session, topics):
+            known = [captured.samples(session, topic) for topic in topics]
+            described = {
+                "devices": [topic.removeprefix("/lighthouse/") for topic in topics],
+                "sweeps": None if None in known else sum(each or 0 for each in known),
+                "unread_bytes": captured.held_bytes(session, topics),
+            }
+        elif topics:
             sweeps = observations.read_sweeps(session)
             channels, numbers = np.unique(sweeps.channel, return_counts=True)
             counts = dict(zip(channels.tolist(), numbers.tolist(), strict=True))
             described = {"devices": list(sweeps.devices), "sweeps": len(sweeps)}
     except LocatkError as error:
-        described["damage"] = session.damage or error.message
+        described |= describe.damage(session, error)
     return described | _scene(scene or Scene(), counts)
 
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from locatk.cli import console
+from locatk.cli import console, info_capture
+from locatk.cli.info_capture import size
 
 MOST_TAGS = 20
 """So many tags of a family are listed for people; ``--json`` holds them all."""
@@ -23,9 +24,9 @@ def text(facts: dict[str, Any]) -> str:
     kind = facts.get("kind") or "recording of another tool"
     lines = [f"{facts['file']}: {kind}" + (f", {facts['system']}" if facts.get("system") else "")]
     for label, value in (
-        ("size", _size(facts["bytes"])),
+        ("size", size(facts["bytes"])),
         ("made by", facts.get("library")),
-        ("start", _when(facts.get("start_ns"))),
+        ("start", when(facts.get("start_ns"))),
         ("duration", _seconds(facts.get("duration_s"))),
         ("devices", ", ".join(facts.get("devices", ()))),
         ("sweeps", facts.get("sweeps")),
@@ -40,6 +41,8 @@ def text(facts: dict[str, Any]) -> str:
         ("map", _floor(facts)),
         ("bars", _bars(facts.get("bars"))),
         ("patterns", _patterns(facts.get("patterns"))),
+        *info_capture.lines(facts.get("capture") or {}),
+        ("not read", _not_read(facts.get("unread_bytes"))),
         ("damage", facts.get("damage")),
     ):
         if value not in (None, ""):
@@ -51,11 +54,16 @@ def text(facts: dict[str, Any]) -> str:
         if rows:
             lines.extend(["", console.table(header, rows)])
 
+    streams = facts.get("streams", ())
+    counted = any(s["samples"] is not None for s in streams)
     section(
-        ("stream", "schema", "messages", "Hz"),
+        ("stream", "schema", "messages", "Hz", *(("samples", "Hz") if counted else ())),
         [
-            (s["topic"], s["schema"], s["messages"], _rate(s["rate_hz"]))
-            for s in facts.get("streams", ())
+            (
+                *(s["topic"], s["schema"], s["messages"], _rate(s["rate_hz"])),
+                *((_known(s["samples"]), _rate(s["samples_hz"])) if counted else ()),
+            )
+            for s in streams
         ],
     )
     section(
@@ -101,7 +109,7 @@ def text(facts: dict[str, Any]) -> str:
                 a.get("device", "-"),
                 a["sensors"],
                 _rate(a.get("rate_hz")),
-                a.get("left_out", "-"),
+                _known(a.get("left_out")),
                 f"{max(p[1] for p in a['position_mm']) - min(p[1] for p in a['position_mm']):.6g}",
                 _axes(a["noise_ut"]),
                 _axes(a["range_ut"]),
@@ -134,7 +142,7 @@ def text(facts: dict[str, Any]) -> str:
                 h.get("device", "-"),
                 h["sensors"],
                 _rate(h.get("rate_hz")),
-                h.get("left_out", "-"),
+                _known(h.get("left_out")),
                 _axes([h["noise_ut"]]),
                 _axes([h["range_mt"]]),
                 h["sensor"] or "-",
@@ -174,10 +182,16 @@ def text(facts: dict[str, Any]) -> str:
             (name, key, value)
             for name, record in facts.get("metadata", {}).items()
             for key, value in record.items()
-            if (name, key) not in SHOWN_ABOVE
+            if (name, key) not in SHOWN_ABOVE and not info_capture.told(name, key)
         ],
     )
     return "\n".join(lines)
+
+
+def _not_read(unread: int | None) -> str | None:
+    if unread is None:
+        return None
+    return f"the samples, which {size(unread)} of the file hold; the rest is from its index"
 
 
 def _print(facts: dict[str, Any]) -> str | None:
@@ -288,7 +302,8 @@ def _by(pair: Sequence[float] | None) -> str:
     return "-" if pair is None else f"{pair[0]:.6g} x {pair[1]:.6g}"
 
 
-def _when(time_ns: int | None) -> str | None:
+def when(time_ns: int | None) -> str | None:
+    """A time of a recording for people, in UTC."""
     if time_ns is None:
         return None
     try:
@@ -301,12 +316,9 @@ def _seconds(value: float | None) -> str | None:
     return None if value is None else f"{value:.3f} s"
 
 
+def _known(value: object) -> object:
+    return "-" if value is None else value
+
+
 def _rate(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
-
-
-def _size(count: int) -> str:
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count} bytes"

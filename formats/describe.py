@@ -10,15 +10,17 @@ import numpy as np
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.sheet import Manifest
-from locatk.core.errors import InputError, LocatkError
+from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples, SensorArray
 from locatk.core.polaris.tag import Tags
-from locatk.formats import arrays, frames, halls, maps, sheets
+from locatk.formats import arrays, captured, frames, halls, maps, sheets
 from locatk.formats import tags as tag_files
+from locatk.formats.mcap_records import DamageError
+from locatk.formats.samples import Kind
 from locatk.formats.session import Session
 
 
@@ -64,6 +66,13 @@ def camera(found: Camera) -> dict[str, Any]:
     }
 
 
+def damage(session: Session, error: LocatkError) -> dict[str, Any]:
+    """What is wrong with a session of which something could not be read, and whether it is
+    the file, of which `locatk recover` saves the rest."""
+    broken = session.damage is not None or isinstance(error.__context__, DamageError)
+    return {"damage": session.damage or error.message, "recoverable": broken}
+
+
 def dots(session: Session) -> dict[str, Any]:
     """Frames, sheets and camera of a session; what is damaged is left out and said.
 
@@ -77,7 +86,10 @@ def dots(session: Session) -> dict[str, Any]:
         lens = sheets.attached_camera(session)
         if lens is not None:
             described["camera"] = camera(lens)
-        if any(session.topics(frames.TOPIC, schema) for schema in frames.SCHEMAS):
+        topics = [t for schema in frames.SCHEMAS for t in session.topics(frames.TOPIC, schema)]
+        if topics and not captured.is_few(session, topics):
+            described |= _counted_frames(session, topics)
+        elif topics:
             found = frames.read_frames(session)
             described["cameras"] = [
                 {"device": each.device, "frames": len(each), "size_px": _size(each.images)}
@@ -86,12 +98,32 @@ def dots(session: Session) -> dict[str, Any]:
             described["devices"] = [each.device for each in found]
             described["frames"] = sum(map(len, found))
     except LocatkError as error:
-        described["damage"] = session.damage or error.message
+        described |= damage(session, error)
     return described
 
 
+def _counted_frames(session: Session, topics: list[str]) -> dict[str, Any]:
+    """Frames of a large session, none of them looked at."""
+    cameras = [
+        {
+            "device": topic.removeprefix(frames.TOPIC),
+            "frames": captured.messages(session, topic),
+            "size_px": None,
+        }
+        for topic in sorted(topics)
+    ]
+    return {
+        "cameras": cameras,
+        "devices": [each["device"] for each in cameras],
+        "frames": sum(each["frames"] for each in cameras),
+        "unread_bytes": captured.held_bytes(session, topics),
+    }
+
+
 def _size(images: Any) -> list[int] | None:
-    """(width, height) of the first frame, None where it cannot be read."""
+    """(width, height) of the first frame, None where there is none or it cannot be read."""
+    if not len(images):
+        return None
     try:
         height, width = images[0].shape
     except InputError:
@@ -159,7 +191,7 @@ def polaris(session: Session) -> dict[str, Any]:
     A solution has tags and no samples.
     """
     return _described(
-        session, tag_files.attached_tags, tags, "arrays", arrays, lambda each: array(each.array)
+        session, tag_files.attached_tags, tags, "arrays", arrays, lambda each: each.array, array
     )
 
 
@@ -169,23 +201,51 @@ def _described(
     told: Callable[[Any], dict[str, Any]],
     name: str,
     samples: Any,
+    geometry: Callable[[Any], Any],
     sensors: Callable[[Any], dict[str, Any]],
 ) -> dict[str, Any]:
     """What is ``attached``, as it is ``told``, and the samples that the module ``samples``
-    reads, under ``name``, with the ``sensors`` that took them."""
+    reads, under ``name``, with the ``sensors`` whose ``geometry`` they have. Of a large session
+    the samples are not read, nor where a device has none."""
     described: dict[str, Any] = {}
+    kind = samples.KIND
     try:
         known = attached(session)
         if known is not None:
             described |= told(known)
-        if session.topics(samples.TOPIC, samples.SCHEMA):
+        topics = session.topics(kind.topic, kind.schema)
+        small = captured.is_small(session, topics)
+        if topics and small and all(captured.messages(session, topic) for topic in topics):
             found = samples.read_samples(session)
-            described[name] = [{**_recorded(each), **sensors(each)} for each in found]
-            described["devices"] = [each.device for each in found]
+            described[name] = [{**_recorded(each), **sensors(geometry(each))} for each in found]
             described["samples"] = sum(map(len, found))
+        elif topics:
+            entries = [_unread(session, kind, topic) for topic in topics]
+            described[name] = [{**entry, **sensors(known)} for entry, known in entries]
+            counts = [entry["samples"] for entry, _ in entries]
+            described["samples"] = None if None in counts else sum(counts)
+            described["unread_bytes"] = None if small else captured.held_bytes(session, topics)
+        if topics:
+            described["devices"] = [each["device"] for each in described[name]]
     except LocatkError as error:
-        described["damage"] = session.damage or error.message
+        described |= damage(session, error)
     return described
+
+
+def _unread(session: Session, kind: Kind[Any], topic: str) -> tuple[dict[str, Any], Any]:
+    """What is known of a device's samples before reading them, and its geometry."""
+    device = topic.removeprefix(kind.topic)
+    geometry = kind.attached(session, device)
+    if geometry is None:
+        raise FormatError(f"no geometry of the {kind.geometry} {device!r}")
+    count = captured.samples(session, topic) if captured.messages(session, topic) else 0
+    entry = {
+        "device": device,
+        "samples": count,
+        "rate_hz": captured.rate_hz(session, count),
+        "left_out": None,
+    }
+    return entry, geometry
 
 
 def _recorded(found: Samples | HallSamples) -> dict[str, Any]:
@@ -264,5 +324,5 @@ def landmarks(session: Session) -> dict[str, Any]:
     A solution has a map and no samples.
     """
     return _described(
-        session, maps.attached_map, floor, "halls", halls, lambda each: hall_sensors(each.sensors)
+        session, maps.attached_map, floor, "halls", halls, lambda each: each.sensors, hall_sensors
     )

@@ -1,8 +1,16 @@
-"""A small recorded session, and a solver that needs no time."""
+"""A small recorded session, a solver that needs no time, and recordings in other processes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -126,3 +134,180 @@ def requests(monkeypatch: pytest.MonkeyPatch) -> list[systems.Request]:
 
     monkeypatch.setitem(systems.SYSTEMS, "lighthouse", solve)
     return asked
+
+
+class Line:
+    """A serial line: a pseudo-terminal behind a path that stays, where the test is the device."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._master = -1
+        self.plug()
+
+    def plug(self) -> None:
+        """Make it appear, as another terminal."""
+        import tty
+
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        self.path.symlink_to(os.ttyname(slave))
+        os.close(slave)
+        os.set_blocking(self._master, False)
+
+    def unplug(self) -> None:
+        """Make it vanish."""
+        if self._master >= 0:
+            self.path.unlink()
+            os.close(self._master)
+            self._master = -1
+
+    def send(self, data: bytes, over: threading.Event | None = None) -> int:
+        """Send all of it, or until it is ``over``; waits for the reader. How much was sent."""
+        done = 0
+        until = time.monotonic() + 20.0
+        while done < len(data) and not (over is not None and over.is_set()):
+            assert time.monotonic() < until, "nobody reads"
+            select.select([], [self._master], [], 0.1)
+            with contextlib.suppress(BlockingIOError):
+                done += os.write(self._master, data[done : done + 65_536])
+        return done
+
+
+class Process:
+    """A command in a process of its own, which may be talked to while it runs.
+
+    ``first`` is Python that runs in it before.
+    """
+
+    def __init__(self, *arguments: object, first: str = "") -> None:
+        code = f"{first}\nfrom locatk.cli.app import main; main()"
+        start = ["-c", code] if first else ["-m", "locatk.cli"]
+        command = [sys.executable, *start, *map(str, arguments)]
+        self.stdout = ""
+        self.lines: list[str] = []
+        self._news = threading.Condition()
+        self.child = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self._readers = [threading.Thread(target=read) for read in (self._talk, self._results)]
+        for reader in self._readers:
+            reader.start()
+
+    def _talk(self) -> None:
+        assert self.child.stderr is not None
+        for line in self.child.stderr:
+            with self._news:
+                self.lines.append(line.rstrip("\n"))
+                self._news.notify_all()
+        with self._news:
+            self.lines.append("")  # wakes those who wait for what never came
+            self._news.notify_all()
+
+    def _results(self) -> None:
+        assert self.child.stdout is not None
+        self.stdout = self.child.stdout.read()
+
+    @property
+    def stderr(self) -> str:
+        """What it has said."""
+        return "\n".join(self.lines)
+
+    def until(self, words: str, timeout_s: float = 30.0) -> None:
+        """Wait until it says this."""
+        with self._news:
+            self._news.wait_for(lambda: words in self.stderr or self.lines[-1:] == [""], timeout_s)
+        assert words in self.stderr
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        self.child.send_signal(number)
+
+    def end(self, timeout_s: float = 30.0) -> int:
+        """Wait for its end; gives the exit status."""
+        status = self.child.wait(timeout_s)
+        for reader in self._readers:
+            reader.join(timeout_s)
+        return status
+
+    def stop(self) -> int:
+        """As by Ctrl-C; gives the exit status."""
+        self.signal(signal.SIGINT)
+        return self.end()
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Callable[[str], Line]]:
+    """``line()`` is a serial line that is plugged in, ``line("name")`` one more."""
+    made: list[Line] = []
+
+    def plugged(name: str = "port") -> Line:
+        made.append(Line(tmp_path / name))
+        return made[-1]
+
+    yield plugged
+    for each in made:
+        each.unplug()
+
+
+@pytest.fixture
+def process() -> Iterator[Callable[..., Process]]:
+    """``process("capture", ...)`` begins a command; it is gone in the end, whatever happens."""
+    yield from _processes()
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Callable[..., Process]]:
+    """The same for all tests of a module."""
+    yield from _processes()
+
+
+def _processes() -> Iterator[Callable[..., Process]]:
+    made: list[Process] = []
+
+    def begin(*arguments: object, first: str = "") -> Process:
+        made.append(Process(*arguments, first=first))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        with contextlib.suppress(ProcessLookupError):
+            each.child.kill()
+        each.end()
+        for stream in (each.child.stdout, each.child.stderr):
+            assert stream is not None
+            stream.close()
+
+
+@pytest.fixture
+def raw_bytes() -> Callable[..., bytes]:
+    """``raw_bytes(path, ...)``: the bytes in recordings, whose offsets must follow on; of a
+    damaged one what is left."""
+    from locatk.formats.proto.serial_pb2 import SerialChunk
+
+    def join(*paths: Path, topic: str = "/serial/robot") -> bytes:
+        content = bytearray()
+        for path in paths:
+            for _, chunk in Session.open(path, damaged_ok=True).decoded(topic, SerialChunk):
+                assert chunk.byte_offset == len(content)
+                content += chunk.data
+        return bytes(content)
+
+    return join
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 9 MiB; the test is skipped where none can be mounted."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=9m", "locatk-test", str(folder)]
+    try:
+        made = subprocess.run(command, capture_output=True, text=True)
+    except OSError as error:
+        pytest.skip(f"no disk can be mounted: {error}")
+    if made.returncode:
+        pytest.skip(f"no disk can be mounted: {made.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)

@@ -1,0 +1,289 @@
+"""Records become messages: the right topic, every value, times that ascend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from locatk.core.polaris.array import SensorArray, bar
+from locatk.formats import arrays, messages, observations, tags, tracks
+from locatk.formats.capture.arrivals import Arrivals
+from locatk.formats.capture.streams import Stamped, Streams
+from locatk.formats.messages import Layout
+from locatk.formats.session import Session
+from locatk.formats.session_writer import SessionWriter
+from locatk.formats.tracks import LARGEST_BATCH
+from locatk.formats.wire.decoder import KINDS, Batch, Stream, Ticks
+
+START_NS = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+
+def arrivals_of(ends: Sequence[int], step_ns: int = 20 * MS) -> Arrivals:
+    arrivals = Arrivals()
+    for number, end in enumerate(ends):
+        arrivals.add(int(end), START_NS + number * step_ns)
+    return arrivals
+
+
+def values(kind: str, n: int, seed: int = 0) -> dict[str, Any]:
+    """Columns of ``n`` records of any kind but the log."""
+    rng = np.random.default_rng(seed)
+    whole = {"sensor": (0, 4), "channel": (1, 17), "polynomial": (-1, 32), "sweep": (-1, 2)}
+    numbers = {key: rng.integers(*span, n) for key, span in whole.items()}
+    if kind == "magnetometers":
+        return {
+            "b_tesla": rng.normal(size=(n, 9)).astype(np.float32),
+            "temperature_celsius": rng.normal(20, 1, n).astype(np.float32),
+        }
+    if kind == "halls":
+        return {"b_tesla": rng.normal(size=(n, 4)).astype(np.float32)}
+    if kind == "lighthouse":
+        return {**numbers, "count": rng.uniform(0, 2e5, n)}
+    if kind == "captures":
+        numbers.pop("channel"), numbers.pop("sweep")
+        bits = rng.integers(0, 2**64, n, dtype=np.uint64)
+        return {**numbers, "bits": bits, "bit_offset": rng.integers(0, 9, n)}
+    if kind == "odometry":
+        return {name: rng.normal(size=n) for name in ("x_m", "y_m", "heading_rad")}
+    return {"value": rng.normal(size=(n, 2))}
+
+
+STREAMS = {
+    "magnetometers": (Stream("magnetometers", sensors=3), messages.magnetometers(3)),
+    "halls": (Stream("halls", sensors=4), messages.halls(4)),
+    "lighthouse": (Stream("lighthouse"), messages.SWEEPS),
+    "captures": (Stream("captures"), messages.CAPTURES),
+    "odometry": (Stream("odometry"), messages.ODOMETRY),
+    "readings": (Stream("readings", names=("a", "b")), messages.readings(2)),
+}
+
+
+def unpacked(made: Sequence[Stamped], layout: Layout) -> messages.Batches:
+    return layout.unpack([each.message.SerializeToString() for each in made])
+
+
+def test_all_kinds_are_tried_here() -> None:
+    assert {*STREAMS, "log"} == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", STREAMS)
+@pytest.mark.parametrize("node", ["", "b7"])
+def test_every_value_comes_through(kind: str, node: str) -> None:
+    stream, layout = STREAMS[kind]
+    stream = Stream(stream.kind, node=node, sensors=stream.sensors, names=stream.names)
+    ends = np.arange(1, 8) * 10
+    columns = values(kind, 7)
+    tick, sequence = np.arange(7) * 1000 + 5, np.arange(7) + 65_530
+    made = list(
+        Streams("red").messages(
+            [Batch(stream, ends, columns, tick=tick, sequence=sequence)],
+            arrivals_of(ends),
+            START_NS + 999 * MS,
+        )
+    )
+    device = f"red-{node}" if node else "red"
+    (stamped,) = made
+    assert stamped.topic == f"/{kind}/{device}"
+    assert stamped.time_ns == START_NS + 999 * MS
+    assert stamped.publish_ns == START_NS  # no clock is told, so the ticks are only kept
+    batches = unpacked(made, layout)
+    assert batches.texts["device"] == [device]
+    np.testing.assert_array_equal(batches.columns["time_ns"], START_NS + np.arange(7) * 20 * MS)
+    np.testing.assert_array_equal(batches.columns["device_ticks"], tick)
+    for name, column in columns.items():
+        np.testing.assert_array_equal(batches.columns[name], column)
+    if "sequence" in batches.columns:
+        np.testing.assert_array_equal(batches.columns["sequence"], sequence)
+    message: Any = stamped.message
+    if kind == "readings":
+        assert list(message.names) == ["a", "b"]
+    if kind in ("magnetometers", "halls"):
+        assert message.sensors == stream.sensors
+        assert message.frame_id == device
+    assert message.timestamp.ToNanoseconds() == START_NS
+
+
+def test_long_batches_are_several_messages() -> None:
+    n = 2 * LARGEST_BATCH + 1
+    ends = np.arange(1, n + 1)
+    stream, layout = STREAMS["halls"]
+    columns = values("halls", n)
+    streams = Streams("red")
+    made = list(streams.messages([Batch(stream, ends, columns)], arrivals_of(ends), START_NS))
+    batches = unpacked(made, layout)
+    assert batches.counts.tolist() == [LARGEST_BATCH, LARGEST_BATCH, 1]
+    np.testing.assert_array_equal(batches.columns["b_tesla"], columns["b_tesla"])
+    assert [each.publish_ns for each in made] == [
+        START_NS + k * LARGEST_BATCH * 20 * MS for k in range(3)
+    ]
+    assert streams.samples == {"/halls/red": n}
+
+
+def test_empty_batches_are_nothing() -> None:
+    stream, _ = STREAMS["halls"]
+    batch = Batch(stream, np.zeros(0, np.int64), values("halls", 0))
+    streams = Streams("red")
+    assert list(streams.messages([batch], arrivals_of([1]), START_NS)) == []
+    assert not streams.samples
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    steps=st.lists(
+        st.lists(st.integers(0, 2).map(lambda k: k * 5), min_size=1, max_size=6),
+        min_size=1,
+        max_size=6,
+    )
+)
+def test_times_of_a_topic_ascend_strictly(steps: list[list[int]]) -> None:
+    """Readers refuse two samples of one time, and many records may end in one read."""
+    arrivals, streams = Arrivals(), Streams("red")
+    stream, layout = STREAMS["halls"]
+    end, time_ns, made, truth = 0, START_NS, [], []
+    for lengths in steps:
+        ends = end + 1 + np.cumsum(lengths)
+        end = int(ends[-1]) + 1
+        time_ns += 1000
+        arrivals.add(end, time_ns)
+        batch = Batch(stream, ends.astype(np.int64), values("halls", len(ends)))
+        made += list(streams.messages([batch], arrivals, time_ns))
+        truth += [time_ns] * len(ends)
+    times = unpacked(made, layout).columns["time_ns"]
+    assert (np.diff(times) > 0).all()
+    assert (times >= truth).all()
+    assert (times <= np.array(truth) + 100).all()  # nudged, not moved
+
+
+def test_topics_do_not_push_each_other() -> None:
+    streams, arrivals = Streams("red"), arrivals_of([10])
+    for kind in ("halls", "odometry"):
+        stream, layout = STREAMS[kind]
+        batch = Batch(stream, np.array([10]), values(kind, 1))
+        made = list(streams.messages([batch], arrivals, START_NS))
+        assert unpacked(made, layout).columns["time_ns"].tolist() == [START_NS]
+
+
+# ---- the device's clock
+
+
+def ticked(
+    streams: Streams, arrivals: Arrivals, ends: Any, tick: Any, ticks: Ticks, node: str = ""
+) -> Any:
+    stream = Stream("halls", node=node, sensors=4, ticks=ticks)
+    batch = Batch(stream, ends, values("halls", len(ends)), tick=tick)
+    made = list(streams.messages([batch], arrivals, START_NS))
+    return unpacked(made, messages.halls(4)).columns
+
+
+def test_samples_have_the_times_of_the_device() -> None:
+    """Samples every 10 ms, read in bursts of 100 ms: their ticks tell them apart."""
+    n = 300
+    ends = np.arange(1, n + 1)
+    arrivals = Arrivals()
+    for burst in range(n // 10):
+        arrivals.add(10 * (burst + 1), START_NS + (burst + 1) * 100 * MS)
+    streams = Streams("red")
+    tick = (np.arange(n) + 1) * 10_000 + 123_456
+    times = ticked(streams, arrivals, ends, tick, Ticks(1e6))["time_ns"]
+    np.testing.assert_allclose(np.diff(times)[20:] / MS, 10, atol=0.2)
+    (clock,) = streams.clocks().values()
+    assert clock.ticks_seen == n
+    assert clock.offset_ns == pytest.approx(START_NS - 123_456_000, abs=MS)
+
+
+def test_each_device_has_its_clock() -> None:
+    streams = Streams("red")
+    ends = np.arange(1, 6)
+    for node in ("a", "b"):
+        ticked(streams, arrivals_of(ends), ends, ends * 1000, Ticks(1e6, 32), node)
+    assert sorted(streams.clocks()) == ["red-a", "red-b"]
+
+
+def test_streams_of_one_device_share_its_clock() -> None:
+    streams = Streams("red")
+    ends = np.arange(1, 6)
+    ticked(streams, arrivals_of(ends), ends, ends * 1000, Ticks(1e6, 32))
+    first = streams.clocks()["red"]
+    stream = Stream("odometry", ticks=Ticks(1e6, 32))
+    batch = Batch(stream, ends, values("odometry", 5), tick=ends * 1000)
+    list(streams.messages([batch], arrivals_of(ends), START_NS))
+    assert streams.clocks()["red"] is first
+    assert first.ticks_seen == 10
+
+
+def test_after_a_restart_the_ticks_may_be_others() -> None:
+    """Unplugged for a second, the device counts from 0 again: no time is bent for it."""
+    streams = Streams("red")
+    ends = np.arange(1, 101)
+    arrivals = arrivals_of(ends)
+    ticked(streams, arrivals, ends, ends * 20_000 + 9_000_000, Ticks(1e6))
+    streams.restart()
+    more = ends + 100
+    for number, end in enumerate(more.tolist()):
+        arrivals.add(end, START_NS + (150 + number) * 20 * MS)
+    times = ticked(streams, arrivals, more, ends * 20_000, Ticks(1e6))["time_ns"]
+    np.testing.assert_allclose((times - START_NS) / MS, 20 * (150 + np.arange(100)), atol=1.0)
+
+
+# ---- lines of the device
+
+
+def test_what_the_device_says_goes_to_the_log() -> None:
+    batch = Batch(
+        Stream("log", node="3"),
+        np.array([10, 20]),
+        {"level": np.array([2, 4]), "text": np.array(["started", "hot"], object)},
+    )
+    made = list(Streams("red").messages([batch], arrivals_of([10, 20]), START_NS + 50 * MS))
+    lines: list[Any] = [each.message for each in made]
+    assert [each.topic for each in made] == ["/log", "/log"]
+    assert [line.message for line in lines] == ["started", "hot"]
+    assert [line.level for line in lines] == [Log.INFO, Log.ERROR]
+    assert {line.name for line in lines} == {"red-3"}
+    assert [each.time_ns for each in made] == [START_NS + 50 * MS] * 2
+    assert [line.timestamp.ToNanoseconds() for line in lines] == [START_NS, START_NS + 20 * MS]
+
+
+def test_a_kind_that_nobody_knows() -> None:
+    batch = Batch(Stream("smell"), np.array([1]), {})
+    with pytest.raises(ValueError, match="smell"):
+        list(Streams("red").messages([batch], arrivals_of([1]), START_NS))
+
+
+# ---- solvers can read them
+
+
+def test_what_was_recorded_reads_like_what_was_written(tmp_path: Path) -> None:
+    ends = np.arange(1, 51) * 10
+    arrivals, streams = arrivals_of(ends), Streams("red")
+    columns = {kind: values(kind, 50) for kind in STREAMS}
+    columns["magnetometers"].pop("temperature_celsius")
+    with SessionWriter(tmp_path / "run.mcap", system="polaris") as writer:
+        writer.attach_toml(tags.ARRAY_FILE, tags.dumps_array(SensorArray(bar(3, 0.02))))
+        for part in range(0, 50, 7):
+            span = slice(part, part + 7)
+            batches = [
+                Batch(stream, ends[span], {key: c[span] for key, c in columns[kind].items()})
+                for kind, (stream, _) in STREAMS.items()
+            ]
+            for each in streams.messages(batches, arrivals, START_NS):
+                writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
+    session = Session.open(tmp_path / "run.mcap")
+    (samples,) = arrays.read_samples(session)
+    assert samples.device == "red"
+    np.testing.assert_array_equal(
+        samples.field_t.reshape(50, -1), columns["magnetometers"]["b_tesla"]
+    )
+    sweeps = observations.read_sweeps(session)
+    np.testing.assert_array_equal(sweeps.count, columns["lighthouse"]["count"])
+    np.testing.assert_array_equal(sweeps.time_ns, samples.time_ns)
+    (odometry,) = tracks.read_odometry(session)
+    np.testing.assert_array_equal(odometry.position[:, 0], columns["odometry"]["x_m"])
