@@ -133,7 +133,8 @@ class Evidence:
             return length == 6 + inner and inner % 16 == 0
         if opcode in _LENGTHS:
             return length == _LENGTHS[opcode]
-        return exact(READERS[opcode], self.content(position, end)) is not None
+        self._stream.seek(position + FRAME.size)
+        return _filling(READERS[opcode], self._stream, length) is not None
 
     def chunk_head(self, position: int) -> ChunkHead | None:
         """Head of a chunk whose lengths agree, even where the file ends inside it."""
@@ -163,15 +164,17 @@ class Evidence:
     def attachment_head(self, position: int) -> AttachmentHead | None:
         """Head of an attachment whose lengths agree, even where the file ends inside it."""
         frame = self.at(position, FRAME.size)
-        opcode, length = FRAME.unpack(frame) if len(frame) == FRAME.size else (0, 0)
-        stream = _Strict(BytesIO(self.at(position + FRAME.size, LARGEST_HEAD)))
+        if len(frame) < FRAME.size or frame[0] != Opcode.ATTACHMENT:
+            return None
+        _, length = FRAME.unpack(frame)
+        stream = _Strict(self._stream, LARGEST_HEAD)  # which goes on behind the frame
         try:
             log_ns, create_ns = stream.read8(), stream.read8()
             name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
             size = stream.read8()
         except (McapError, struct.error, ValueError):
             return None
-        good = opcode == Opcode.ATTACHMENT and length == stream.count + size + 4
+        good = length == stream.count + size + 4
         return AttachmentHead(log_ns, create_ns, name, media_type, size) if good else None
 
     def attachment_is_right(self, position: int, end: int) -> bool:
@@ -182,7 +185,7 @@ class Evidence:
         last = self.at(end - 5, 5)
         crc = int.from_bytes(last[1:], "little")
         if crc == 0:
-            return last[0] != 0 and self.goes_on(end)
+            return last[:1] != b"\0" and self.goes_on(end)
         return self._crc(position + FRAME.size, end - 4) == crc
 
     def goes_on(self, position: int) -> bool:
@@ -269,9 +272,15 @@ class Evidence:
 
 
 class _Strict(ReadDataStream):
-    """Does not take fewer bytes than were asked for, as its parent does."""
+    """Gives as many bytes as asked for, as its parent may not, and no more than ``limit``."""
+
+    def __init__(self, stream: IO[bytes], limit: int) -> None:
+        super().__init__(stream)
+        self._limit = limit
 
     def read(self, length: int) -> bytes:
+        if length > self._limit - self.count:  # before memory is asked for
+            raise EndOfFile
         data = super().read(length)
         if len(data) != length:
             raise EndOfFile
@@ -286,12 +295,17 @@ class _Strict(ReadDataStream):
 
 def exact(reader: Callable[[ReadDataStream], Any], content: bytes) -> Any:
     """The record that fills ``content`` to its last byte, or None."""
-    stream = _Strict(BytesIO(content))
+    return _filling(reader, BytesIO(content), len(content))
+
+
+def _filling(reader: Callable[[ReadDataStream], Any], source: IO[bytes], length: int) -> Any:
+    """The record that fills the next ``length`` bytes, or None; read only as far as it is one."""
+    stream = _Strict(source, length)
     try:
         record = reader(stream)
     except (McapError, struct.error, ValueError, MemoryError, OverflowError):
         return None
-    return record if stream.count == len(content) else None
+    return record if stream.count == length else None
 
 
 def inside(data: bytes | memoryview) -> Inside | None:

@@ -74,7 +74,11 @@ def holders(paths: Iterable[str]) -> dict[str, tuple[Holder, ...]]:
 
 def busy(name: str, path: str) -> SourceError:
     """The error of a port that somebody has open already."""
-    seen = [holder for holder in holders([path])[path] if not _serves(holder.pid, path)]
+    seen = [
+        holder
+        for holder in holders([path])[path]
+        if holder.pid == os.getpid() or not _serves(holder.pid, path)
+    ]
     if not seen:
         return SourceError(
             f"{name} is in use by another program",

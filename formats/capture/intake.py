@@ -25,9 +25,6 @@ PAUSE_NS = 3_000_000
 """A line that is silent for longer is between two frames: within a frame bytes follow each
 other, or wait for the next millisecond of USB."""
 
-JOINED_NS = 5_000_000
-"""Reads within so much time become one message."""
-
 AUTO = "auto"
 
 
@@ -143,7 +140,7 @@ class SerialIntake:
     def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
         """Messages of what was read: all raw ones, then the records."""
         pieces: list[tuple[bool, list[bytes]]] = []
-        for each in _joined(arrived):
+        for each in arrived:
             chunk = SerialChunk(
                 timestamp=messages.timestamp(each.time_ns),
                 port=self._port,
@@ -298,30 +295,6 @@ class SerialIntake:
                 except Exception as error:  # of a device that may be somebody else's
                     self._said.append(f"no artifacts of {self.device.name}: {error}")
         return found
-
-
-def _joined(arrived: Sequence[Arrived]) -> Iterator[Arrived]:
-    """Reads of a line that goes on without a pause, joined: it is read once a millisecond.
-    The bytes have the time of the last one; how much earlier the first were, the wire tells.
-    """
-    group: list[Arrived] = []
-    for each in arrived:
-        if group and (
-            each.time_ns - group[-1].time_ns >= PAUSE_NS
-            or each.time_ns - group[0].time_ns >= JOINED_NS
-        ):
-            yield _one(group)
-            group = []
-        group.append(each)
-    if group:
-        yield _one(group)
-
-
-def _one(group: Sequence[Arrived]) -> Arrived:
-    if len(group) == 1:
-        return group[0]
-    data = b"".join(each.data for each in group)
-    return Arrived(group[-1].time_ns, data, len(data))
 
 
 class CameraIntake:

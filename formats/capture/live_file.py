@@ -53,7 +53,7 @@ class LiveFile:
         self.path = Path(path)
         try:
             if overwrite:
-                _check_idle(self.path)
+                check_idle(self.path)
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(path)
             self._file = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
@@ -154,8 +154,13 @@ class LiveFile:
         self._file.close()
 
 
-def _check_idle(path: Path) -> None:
-    """Refuse a file that another capture is writing."""
+def check_idle(path: Path) -> None:
+    """Refuse a file that another capture is writing.
+
+    Raises
+    ------
+    OutputExistsError
+    """
     try:
         with open(path, "rb") as stream:
             busy = not _lock(stream.fileno())

@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from locatk.core.errors import OutputExistsError
-from locatk.formats.capture.live_file import LiveFile
+from locatk.formats.capture.live_file import LiveFile, check_idle
 from locatk.formats.capture.streams import Stamped
 from locatk.formats.capture.totals import RECORD
 from locatk.formats.messages import timestamp
@@ -87,7 +87,10 @@ class Parts:
         self.paths: list[Path] = []
         self._is_open = False
         if numbered and overwrite:  # what stays of an older recording would look like ours
-            for old in parts_of(path):
+            olds = parts_of(path)
+            for old in olds:
+                check_idle(old)
+            for old in olds:
                 old.unlink(missing_ok=True)
         self._open()
 

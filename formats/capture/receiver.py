@@ -98,6 +98,8 @@ class Receiver:
         self._attempts = 0
         self.received = 0
         """Bytes so far."""
+        self.heard_ns = 0
+        """When the last of them were read."""
         self._taken = 0
         self._before = Overruns()  # of links that are closed
         self._now = Overruns()
@@ -189,6 +191,7 @@ class Receiver:
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
         self._events.append(Arrived(self._clock.now(), data, size))
         self.received += size
+        self.heard_ns = self._events[-1].time_ns
         self.high_water = max(self.high_water, self.received - self._taken)
         return size
 

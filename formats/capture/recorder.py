@@ -303,7 +303,8 @@ class Recorder:
         return "" if free is None else self._look_at_disk(free)
 
     def _look_for_silence(self) -> None:
-        silent_s = (self._clock.now() - self._heard_ns) * 1e-9
+        heard_ns = max(self._heard_ns, self._receiver.heard_ns)  # more may wait to be written
+        silent_s = (self._clock.now() - heard_ns) * 1e-9
         if self._lost_ns is None and not self._silent and silent_s >= self._limits.silence_s:
             self._silent = True
             self._totals.silences += 1

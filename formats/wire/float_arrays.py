@@ -63,8 +63,8 @@ def encode_magx(recording: Recording) -> Iterator[tuple[int, bytes]]:
 
 
 def polaris_artifacts(stream: Stream) -> dict[str, str]:
-    """The published bar of nine sensors 20 mm apart, or three 8 mm apart, as settings of
-    the published firmware have them (facts of the paper, section 7.1)."""
+    """``array.toml`` of the published bar: nine sensors 20 mm apart, or the three of the
+    miniature car 8 mm apart, which the published firmware sets to FILTER_5."""
     if stream.sensors == 9:
         array = mlx90393.published_bar(9, 0.020, mlx90393.Settings())
     elif stream.sensors == 3:
@@ -75,8 +75,8 @@ def polaris_artifacts(stream: Stream) -> dict[str, str]:
 
 
 def magx_artifacts(stream: Stream) -> dict[str, str]:
-    """None: MagX was published with six layouts of eight sensors, and the bytes do not tell
-    which it is (Codes/optimization/config.py of the release)."""
+    """None: MagX was published with seven layouts of eight sensors, and nothing tells which
+    one it is (Codes/optimization/config.py of the release)."""
     return {}
 
 

@@ -104,8 +104,10 @@ class Lock:
         return 3 if told and not self.layout.spare else 1
 
     def wild(self, values: Floats) -> Mask:
-        """Which of (..., P) floats no such sensor can have sent."""
+        """Which of (..., P) floats no such sensors can have sent; all, where all are zero, as
+        of a line that is broken."""
         wild = ~plausible(values)
+        wild |= ((values == 0) | self.blind).all(axis=-1, keepdims=True)
         counted = self.quantum > 0
         if counted.any():
             counts = values / np.where(counted, self.quantum, 1.0)
@@ -244,7 +246,7 @@ def choose(among: Phases, layout: Layout, lost: Bytes, pauses: NDArray[np.int64]
         return Choice(best, stays, leads=False, fits=False, clear=True)
     mean = float(used.mean()) / layout.floats
     lead = float(np.delete(total, best).min(initial=np.inf) - total[best])
-    leads = lead >= CLEAR and mean <= FAIR
+    leads = lead >= CLEAR and (mean <= FAIR or bool(pauses[best] >= LOOK - 1))
     return Choice(best, stays, leads, leads or mean <= GOOD, stays or lead >= STAY / 2)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import click
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.cli import capture_text
@@ -211,6 +212,13 @@ def test_bad_frames_are_told_by_the_status(capture: Any, old: Path, tmp_path: Pa
     assert Session.open(tmp_path / "run.mcap").damage is None
 
 
+def test_the_wrong_device_is_told_by_the_status(capture: Any, tmp_path: Path) -> None:
+    result = capture("--json", device="locatk")
+    assert result.exit_code == 3
+    assert f"no frame of locatk in {len(TEXT)} bytes" in result.stderr
+    assert json.loads(result.stdout)["frames"] == 0
+
+
 def test_parts(capture: Any, tmp_path: Path, old: Path, raw_bytes: Any) -> None:
     """At 100 kB, of bytes that do not compress, 500 kB of them a second."""
     noise = np.random.default_rng(6).bytes(400_000)
@@ -234,6 +242,38 @@ def test_the_size_is_a_limit(capture: Any, tmp_path: Path, old: Path, raw_bytes:
     kept = raw_bytes(tmp_path / "run.mcap")
     assert noise.startswith(kept)
     assert 190_000 < len(kept) < len(noise)
+
+
+# ---- cameras
+
+
+@pytest.mark.parametrize("packing", ["jpeg", "png"])
+def test_a_video_becomes_pictures(locatk: Any, tmp_path: Path, packing: str) -> None:
+    import cv2
+
+    video = tmp_path / "run.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    for number in range(12):
+        writer.write(np.full((48, 64, 3), 20 * number, np.uint8))
+    writer.release()
+    path = tmp_path / "run.mcap"
+    given = ("--speed", 0, "--image", packing, "-o", path, "--json")
+    result = locatk("capture", f"camera:{video}", *given)
+    assert result.exit_code == 0, result.stderr
+    report = json.loads(result.stdout)
+    (topic,) = report["samples"]
+    assert report["samples"][topic] == report["frames"] == 12
+    assert report["system"] == "dots"
+    session = Session.open(path)
+    pictures = [image for _, image in session.decoded(topic, CompressedImage)]
+    assert {image.format for image in pictures} == {packing}
+    middles = [
+        int(cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)[24, 32])
+        for image in pictures
+    ]
+    np.testing.assert_allclose(middles, 20 * np.arange(12), atol=4)
+    times = [time_ns for time_ns, _ in session.decoded(topic, CompressedImage)]
+    assert times == sorted(set(times))
 
 
 # ---- refused, before the port is opened
@@ -409,7 +449,7 @@ def test_what_is_neither(text: str) -> None:
 def test_the_live_line() -> None:
     totals = Totals(bad=2, lost=3, overruns=4, gaps=1, high_water_bytes=5_000)
     line = capture_text.status_line(
-        Status(3723.4, 2.5e6, 812.4, totals, None, 7_000_000, 80_000_000_000)
+        Status(3723.4, None, 2.5e6, 812.4, totals, 7_000_000, 80_000_000_000)
     )
     assert line.split("  ") == [
         "1:02:03",
@@ -423,11 +463,11 @@ def test_the_live_line() -> None:
         "file 7 MB",
         "disk 80 GB left",
     ]
-    quiet = capture_text.status_line(Status(5.0, 0.0, 0.0, Totals(), None, 0, None))
+    quiet = capture_text.status_line(Status(5.0, None, 0.0, 0.0, Totals(), 0, None))
     assert quiet.startswith("0:05  0 B/s")
     assert "gap" not in quiet
     assert "disk" not in quiet
-    away = capture_text.status_line(Status(9.0, 0.0, 0.0, Totals(gaps=2), 3.2, 0, None))
+    away = capture_text.status_line(Status(9.0, 3.2, 0.0, 0.0, Totals(gaps=2), 0, None))
     assert away.startswith("0:09  away for 3 s  ")
     assert "2 gaps" in away
 
@@ -445,7 +485,7 @@ def test_on_a_terminal_the_line_stays_one(
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "50")
-    status = Status(5.0, 1e6, 10.0, Totals(), None, 10**6, 10**9)
+    status = Status(5.0, None, 1e6, 10.0, Totals(), 10**6, 10**9)
     with capture_text.live() as live:
         live.show(status)
         live.show(status)
@@ -469,7 +509,7 @@ def test_who_listens_may_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(click, "echo", broken)
     live = capture_text.Live()
     live.tell("one")
-    live.show(Status(5.0, 1e6, 10.0, Totals(), None, 10**6, 10**9))
+    live.show(Status(5.0, None, 1e6, 10.0, Totals(), 10**6, 10**9))
     live.tell("two")
     live.wipe()
     assert len(heard) == 1

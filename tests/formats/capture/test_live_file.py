@@ -64,6 +64,32 @@ def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
     assert path.read_bytes() == b""
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no flock")
+def test_a_file_that_is_being_written_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    file = LiveFile(path)
+    file.write(b"one")
+    with pytest.raises(OutputExistsError, match="being recorded"):
+        LiveFile(path, overwrite=True)
+    file.write(b", two")
+    file.close()
+    assert path.read_bytes() == b"one, two"
+    LiveFile(path, overwrite=True).close()
+    assert path.read_bytes() == b""
+
+
+def test_a_file_that_was_removed_is_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    file = LiveFile(path)
+    assert file.is_there()
+    path.rename(tmp_path / "elsewhere.mcap")
+    assert file.is_there()
+    (tmp_path / "elsewhere.mcap").unlink()
+    assert not file.is_there()
+    file.close()
+    assert not file.is_there()
+
+
 def test_places_that_are_no_files(tmp_path: Path) -> None:
     with pytest.raises(MissingDataError):
         LiveFile(tmp_path / "no" / "run.mcap")

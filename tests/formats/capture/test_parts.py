@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -218,6 +219,18 @@ def test_parts_of_an_older_recording_do_not_stay_among_the_new(tmp_path: Path) -
     made.finish({})
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["run-001.mcap", "run-002.mcap", "run-x.mcap"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no flock")
+def test_parts_that_are_being_written_are_not_replaced(tmp_path: Path) -> None:
+    made = Parts(tmp_path / "run.mcap", CONTENT, numbered=True)
+    made.write([chunk(b"one")])
+    made.next_part({})
+    made.write([chunk(b"two", 3)])
+    with pytest.raises(OutputExistsError, match="being recorded"):
+        Parts(tmp_path / "run.mcap", CONTENT, numbered=True, overwrite=True)
+    made.finish({})
+    assert [contents(path) for path in made.paths] == [b"one", b"two"]
 
 
 def test_a_part_that_cannot_be_begun_leaves_the_one_before_whole(tmp_path: Path) -> None:

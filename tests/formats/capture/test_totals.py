@@ -58,6 +58,16 @@ def test_each_loss_is_said() -> None:
     assert Totals(gaps=1, gap_s=1.0).losses() == ["connection lost once, 1.0 s in all"]
 
 
+def test_doubts_whether_it_is_this_device() -> None:
+    assert Totals().doubts("lines") == ["nothing was received"]
+    assert Totals(bytes=9).doubts("raw") == []
+    assert Totals(bytes=9).doubts("lines") == ["no frame of lines in 9 bytes"]
+    assert Totals(bytes=9, frames=1, skipped=4).doubts("lines") == []
+    assert Totals(bytes=9, frames=1, skipped=5).doubts("lines") == [
+        "5 of 9 bytes are in no frame of lines"
+    ]
+
+
 def test_every_figure_goes_into_the_metadata_as_text() -> None:
     texts = Totals(bytes=5, gap_s=1.5, samples={"/halls/red": 7}).texts()
     names = {each.name for each in fields(Totals)} - {"samples"}
