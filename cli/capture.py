@@ -96,15 +96,12 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
 @click.option(
     "--speed",
     type=click.FloatRange(min=0),
-    default=1.0,
     help="replay:, camera:FILE: so many times as fast as recorded; 0 as fast as possible.",
 )
 @click.option(
     "--image",
     type=click.Choice(("jpeg", "png")),
-    default="jpeg",
-    show_default=True,
-    help="camera: how frames are packed; png loses nothing.",
+    help="camera: how frames are packed; png loses nothing.  [default: jpeg]",
 )
 @options.overwrite
 @options.as_json
@@ -162,6 +159,7 @@ def command(
     from locatk.formats.capture import session
     from locatk.formats.capture.recorder import Limits
 
+    _refuse_idle(port, device, rest)
     kind, amount = rotate or ("", 0.0)
     limits = Limits(
         duration_s=duration,
@@ -180,12 +178,36 @@ def command(
         meta=meta,
         limits=limits,
         overwrite=overwrite,
-        **rest,
+        **{name: value for name, value in rest.items() if value is not None},
     )
     stop = threading.Event()
     with capture_text.live() as live, asked_to_stop(stop.set):
         recorded = session.record(wanted, stop, tell=live.tell, show=live.show, ready=live.ready)
-    _report(recorded, as_json)
+    _report(recorded, device, as_json)
+
+
+def _refuse_idle(port: str, device: str, given: dict[str, Any]) -> None:
+    """Refuse options that would do nothing."""
+    camera, played = port.startswith("camera:"), port.startswith("replay:")
+    network = port.startswith(("socket:", "loop:"))
+    for name, idle, what in (
+        ("columns", device in DEVICES_WITHOUT_COLUMNS or camera, f"the device {device}"),
+        ("baud", camera or played or network, f"the port {port}"),
+        ("speed", not (camera or played), f"the port {port}"),
+        ("image", not camera, f"the port {port}"),
+    ):
+        if given[name] not in (None, ()) and idle:
+            raise click.UsageError(f"--{name} means nothing to {what}.")
+
+
+DEVICES_WITHOUT_COLUMNS = (
+    "locatk",
+    "polaris-array",
+    "magx-array",
+    "lighthouse-deck",
+    "dotbot-gateway",
+    "raw",
+)
 
 
 def _list(as_json: bool) -> None:
@@ -200,11 +222,12 @@ def _list(as_json: bool) -> None:
         console.say("No serial port found. `locatk emulate polaris` makes one to try.")
 
 
-def _report(recorded: Recorded, as_json: bool) -> None:
+def _report(recorded: Recorded, device: str, as_json: bool) -> None:
     console.result(capture_text.summary(recorded))
     if as_json:
         console.emit_json(capture_text.as_json(recorded))
-    losses = recorded.totals.losses() + recorded.totals.doubts(recorded.device)
+    found = "" if device == "auto" and recorded.device == "raw" else recorded.device
+    losses = recorded.totals.losses() + recorded.totals.doubts(found)
     if recorded.failed:
         losses.insert(0, recorded.ended)
     if losses:

@@ -156,7 +156,7 @@ def solve_session(path: Path, request: Request) -> Solved:
         raise FormatError(
             f"a {kind}, not a session" if kind else "not a session of locatk",
             file=path,
-            hint="Give a session made by `locatk import` or `locatk simulate`",
+            hint="Give a session made by `locatk capture`, `import` or `simulate`",
         )
     try:
         return _solver(session)(session, request)

@@ -232,7 +232,9 @@ def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         raise InputError(f"cannot be read ({error.strerror})", file=path) from error
     except NotMcapError as damage:
         raise FormatError(
-            str(damage), file=path, hint="Give a session made by `locatk import` or `simulate`"
+            str(damage),
+            file=path,
+            hint="Give a session made by `locatk capture`, `import` or `simulate`",
         ) from None
     except DamageError as damage:
         raise FormatError(

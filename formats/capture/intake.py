@@ -27,6 +27,9 @@ other, or wait for the next millisecond of USB."""
 
 AUTO = "auto"
 
+UNPACED = ("replay:", "socket:", "rfc2217:", "loop:")
+"""Ports whose bytes do not come one after the other at a baud."""
+
 
 class Intake(Protocol):
     """What becomes of what was read.
@@ -135,7 +138,8 @@ class SerialIntake:
     def _decide(self, found: Device) -> None:
         self.device = found
         self._decoder = found.decode(self._options)
-        self._arrivals.byte_ns = 10e9 / (self._baud or found.baud)
+        if not self._port.startswith(UNPACED):
+            self._arrivals.byte_ns = 10e9 / (self._baud or found.baud)
 
     def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
         """Messages of what was read: all raw ones, then the records."""
@@ -185,7 +189,8 @@ class SerialIntake:
     def _identified(self, verdict: Verdict | None) -> list[Batch]:
         if verdict is None:
             return []
-        self._said.append(f"the device is taken for {verdict.device}: {verdict.why}")
+        if self._fed:
+            self._said.append(f"the device is taken for {verdict.device}: {verdict.why}")
         self._identifier = None
         self._decide(device(verdict.device))
         held, self._held = self._held, []

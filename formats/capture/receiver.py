@@ -189,9 +189,9 @@ class Receiver:
             return 0
         self._attempts = 0
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
-        self._events.append(Arrived(self._clock.now(), data, size))
+        self.heard_ns = self._clock.now()
+        self._events.append(Arrived(self.heard_ns, data, size))
         self.received += size
-        self.heard_ns = self._events[-1].time_ns
         self.high_water = max(self.high_water, self.received - self._taken)
         return size
 

@@ -193,7 +193,6 @@ class Recorder:
             ended = None
             for events in _pieces(self._receiver.take()):
                 ended = self._write(events) or ended
-                self._rotate()
                 if self._is_full():
                     return "max-size", False
             now = time.monotonic()
@@ -257,6 +256,7 @@ class Recorder:
 
     def _take(self, arrived: Sequence[Arrived]) -> None:
         if arrived:
+            self._rotate()  # with the first byte of a part, so that none is empty
             self._parts.write(self._intake.take(arrived))
 
     def _close_gap(self, event: Back) -> None:

@@ -3,6 +3,7 @@ first byte on the disk."""
 
 from __future__ import annotations
 
+import contextlib
 import platform
 import shutil
 import tempfile
@@ -91,7 +92,7 @@ def record(
         was written then.
     """
     _check_name(wanted.device_name)
-    content = artifacts.attachments(wanted.artifacts)
+    content = _artifacts(wanted)
     check_outputs(
         wanted.output,
         numbered=wanted.numbered,
@@ -102,7 +103,7 @@ def record(
     clock = HostClock()
     intake = _intake(wanted, content)
     port = _port(wanted, clock)
-    link = _opened(port, wanted.wait_s, stop)
+    link = _opened(port, wanted.wait_s, stop, tell)
     try:
         ready(port.name)
         facts = _facts(wanted, port, clock)
@@ -120,14 +121,29 @@ def record(
     return recorder.run(stop)
 
 
-def _opened(port: Port, wait_s: float, stop: threading.Event) -> Link:
+def _artifacts(wanted: Wanted) -> dict[str, str]:
+    """What goes into the session: of what is played what that holds, and what is given."""
+    played: dict[str, str] = {}
+    for path in _played(wanted.port):
+        with contextlib.suppress(LocatkError):  # none, or no session: the port will say
+            played |= artifacts.attachments([path])
+    return {**played, **artifacts.attachments(wanted.artifacts)}
+
+
+def _opened(port: Port, wait_s: float, stop: threading.Event, tell: Callable[[str], None]) -> Link:
     """Open a port, which may not be there for another ``wait_s``."""
     until = time.monotonic() + wait_s
+    told = False
     while True:
         try:
             return port.open()
-        except SourceError:
-            if time.monotonic() >= until or stop.wait(BACKOFF_S[1]):
+        except SourceError as error:
+            if time.monotonic() >= until:
+                raise
+            if not told:
+                tell(f"{error}: waiting for it")
+            told = True
+            if stop.wait(BACKOFF_S[1]):
                 raise
 
 

@@ -28,6 +28,9 @@ SYSTEMS = {
 }
 """Kind of records to the system that solves them."""
 
+SHORTEST_S = 0.01
+"""Of less there is no rate."""
+
 LEVELS = (Log.UNKNOWN, Log.DEBUG, Log.INFO, Log.WARNING, Log.ERROR, Log.FATAL)
 
 
@@ -78,7 +81,9 @@ class Streams:
         """Records a second by topic, from the first to the last."""
         spans = {topic: (self._last[topic] - first) * 1e-9 for topic, first in self._first.items()}
         return {
-            topic: (self.samples[topic] - 1) / span for topic, span in spans.items() if span > 0
+            topic: (self.samples[topic] - 1) / span
+            for topic, span in spans.items()
+            if span > SHORTEST_S
         }
 
     def clocks(self) -> dict[str, TickClock]:

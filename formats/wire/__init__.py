@@ -144,7 +144,12 @@ def device(name: str) -> Device:
     from importlib.metadata import entry_points
 
     for entry in entry_points(group=GROUP, name=name):
-        found: Device = entry.load()
+        try:
+            found = entry.load()
+        except Exception as error:  # of another package
+            raise InputError(f"the device {name!r} cannot be loaded ({error})") from error
+        if not isinstance(found, Device):
+            raise InputError(f"the device {name!r} of {entry.value} is no Device")
         return found
     others = sorted(entry.name for entry in entry_points(group=GROUP))
     raise InputError(

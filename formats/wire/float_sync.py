@@ -22,6 +22,7 @@ import numpy as np
 from locatk.formats.wire.float_lock import (
     LAST_COUNT,
     OTHER_COUNT,
+    STAY,
     WRONG,
     Array,
     Floats,
@@ -285,18 +286,16 @@ def _from_first(
 ) -> tuple[int, str]:
     """The start that the first byte tells, or the one that is nearest to what it tells."""
     size = lock.layout.size
-    if first is None:
+    if first is None or len(window) < first + size:
         return starts[0], "guess"
-    if begin - first < size:
-        place = (first - begin) % size
-        nearest = min(starts, key=lambda s: min((4 * s - place) % size, (place - 4 * s) % size))
-        return nearest, "first" if 4 * nearest == place else "guess"
-    # Bytes were lost since: the first frame tells by its values.
+    # By the values of the first frame, as bytes may have been lost since.
     frame = np.frombuffer(window, "<f4", lock.layout.floats, first)
-    costs = []
-    for start in starts:
-        turned = lock.turned(start)
-        costs.append(float(turned.cost(turned.apart(frame), turned.hurt(frame)).sum()))
+    turned = [lock.turned(start) for start in starts]
+    costs = np.array([one.cost(one.apart(frame), one.hurt(frame)).sum() for one in turned])
     best = int(np.argmin(costs))
-    fits = costs[best] <= WRONG * lock.layout.floats
-    return starts[best], "first" if fits else "guess"
+    fits = bool(costs[best] <= WRONG * lock.layout.floats)
+    if fits and (np.delete(costs, best) >= costs[best] + STAY).all():
+        return starts[best], "first"
+    place = (first - begin) % size
+    nearest = min(starts, key=lambda s: min((4 * s - place) % size, (place - 4 * s) % size))
+    return nearest, "first" if fits and 4 * nearest == place else "guess"

@@ -39,6 +39,9 @@ MARKS = {"lighthouse-deck": b"\xff" * 12}
 VALUES = 8
 """So many different bytes say something."""
 
+ONE_VALUE = 0.7
+"""A larger share of one byte says nothing, whatever stands between."""
+
 TEXT = "lines"
 NOTHING = "raw"
 
@@ -179,7 +182,10 @@ class Identifier:
         found = []
         for entry in entry_points(group=GROUP):
             try:
-                found.append(entry.load())
+                device = entry.load()
+                if not isinstance(device, Device):
+                    raise TypeError("no Device")
+                found.append(device)
             except Exception as error:
                 self._leave(entry.name, error)
         return found
@@ -259,7 +265,8 @@ class Identifier:
             return False
         listener.again = 2 * len(self._data)
         data = np.frombuffer(bytes(self._data[listener.first :]), np.uint8)
-        if len(np.unique(data)) < VALUES:
+        share = np.bincount(data, minlength=256) / max(len(data), 1)
+        if np.count_nonzero(share) < VALUES or share.max() > ONE_VALUE:
             return False
         mixed = np.random.default_rng(0).permutation(data).tobytes()
         try:

@@ -184,7 +184,8 @@ def test_auto_of_noise_is_raw(locatk: Any, tmp_path: Path, raw_bytes: Any) -> No
     path = tmp_path / "run.mcap"
     result = locatk("capture", f"replay:{source}", "--speed", 0, "-o", path, "--json")
     assert json.loads(result.stdout)["device"] == "raw"
-    assert result.exit_code == 0
+    assert result.exit_code == 3
+    assert "no frame of a device that is known in 3000 bytes" in result.stderr
     assert raw_bytes(path) == noise
 
 

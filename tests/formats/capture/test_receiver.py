@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -86,6 +87,26 @@ def test_a_device_that_never_stops_is_left(port: Any, receive: Callable[..., Rec
     sending = False
     assert port.links[0].closed
     assert receiver.take()
+
+
+def test_whoever_takes_may_be_there_at_once(port: Any) -> None:
+    """Between the moment at which an event is there and the next step of the thread."""
+    receiver = Receiver(port, port.open(), HostClock())
+    taken: list[Event] = []
+
+    class Eager(deque[Event]):
+        def append(self, event: Event) -> None:
+            super().append(event)
+            taken.extend(receiver.take())
+
+    receiver._events = Eager()
+    receiver.start()
+    port.send(b"one", b"two")
+    port.lose()
+    port.send(b"three")
+    port.settle()
+    receiver.stop()
+    assert kinds(taken) == ["Arrived", "Arrived", "Lost", "Back", "Arrived"]
 
 
 def test_lost_and_back(port: Any, receive: Callable[..., Receiver]) -> None:
