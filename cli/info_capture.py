@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 COUNTED = (
@@ -11,9 +12,9 @@ COUNTED = (
     ("skipped", "bytes in no frame"),
     ("gaps", "gaps"),
     ("gap_s", "s without connection"),
-    ("unplugged", "times unplugged"),
     ("silences", "silences"),
     ("overruns", "bytes overrun"),
+    ("dropped", "frames of the camera dropped"),
     ("line_errors", "bytes with line errors"),
     ("clock_step_s", "s by which the wall clock was set"),
 )
@@ -49,7 +50,9 @@ def lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     said = [("capture", ", ".join(each for each in words if each))]
     if any(isinstance(found.get(key), int) for key in ("bytes", "frames")):
-        missed = [f"{found[key]:g} {text}" for key, text in COUNTED if _number(found, key)]
+        missed = [_counted(found[key], text) for key, text in COUNTED if _number(found, key)]
+        if not found.get("frames") and found.get("device") not in (None, "raw"):
+            missed.insert(0, f"no frame of {found['device']}")
         said += [("received", _received(found)), ("losses", ", ".join(missed) or "none")]
     said += [("clock", words) for words in _clocks(found)]
     meta = [
@@ -58,6 +61,13 @@ def lines(found: dict[str, Any]) -> list[tuple[str, str]]:
         if key.startswith("meta:")
     ]
     return [*said, ("note", str(found.get("note", ""))), ("meta", ", ".join(meta))]
+
+
+def _counted(count: float, words: str) -> str:
+    """``3 gaps``, ``1 gap``."""
+    if count == 1:
+        words = re.sub(r"\b(frame|byte|gap|silence)s\b", r"\1", words)
+    return f"{count:g} {words}"
 
 
 def _received(found: dict[str, Any]) -> str:
@@ -84,9 +94,8 @@ def _clocks(found: dict[str, Any]) -> list[str]:
         known = [
             f"{name} {found[key]} {unit}".rstrip()
             for prefix, name, unit in (
-                ("tick_offset_s", "offset", "s"),
                 ("tick_drift_ppm", "drift", "ppm"),
-                ("tick_jitter_s", "jitter", "s"),
+                ("tick_jitter_s", "95 % arrive within", "s"),
                 ("tick_restarts", "restarts", ""),
             )
             if (key := f"{prefix}:{node}") in found

@@ -321,4 +321,4 @@ def _known(value: object) -> object:
 
 
 def _rate(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+    return "-" if value is None else f"{value:.0f}" if value >= 1000 else f"{value:.3g}"

@@ -20,7 +20,7 @@ from locatk.core.polaris.tag import Tags
 from locatk.formats import arrays, captured, frames, halls, maps, sheets
 from locatk.formats import tags as tag_files
 from locatk.formats.mcap_records import DamageError
-from locatk.formats.samples import Kind
+from locatk.formats.samples import Kind, NoGeometryError
 from locatk.formats.session import Session
 
 
@@ -227,6 +227,8 @@ def _described(
             described["unread_bytes"] = None if small else captured.held_bytes(session, topics)
         if topics:
             described["devices"] = [each["device"] for each in described[name]]
+    except NoGeometryError as error:
+        described["notes"] = [f"{error.message}. {error.hint}"]
     except LocatkError as error:
         described |= damage(session, error)
     return described

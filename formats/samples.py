@@ -35,6 +35,10 @@ G = TypeVar("G")
 """The geometry of the sensors of one device."""
 
 
+class NoGeometryError(FormatError):
+    """Samples of sensors of which nobody knows where they sit: nothing is damaged."""
+
+
 @dataclass(frozen=True)
 class Kind(Generic[G]):
     """A kind of sensors, and how a session holds them.
@@ -202,6 +206,8 @@ def read(session: Session, kind: Kind[G]) -> list[Recorded[G]]:
 def _recorded(session: Session, kind: Kind[G], topic: str) -> Recorded[G]:
     device = topic.removeprefix(kind.topic)
     payloads = [payload for _, _, payload in session.messages([topic])]
+    if not payloads:
+        raise FormatError("no message at all", file=session.path, where=topic)
     try:
         first: Any = kind.layout(1).message.FromString(payloads[0])
         sensors = int(first.sensors)
@@ -227,7 +233,7 @@ def _geometry(session: Session, kind: Kind[G], topic: str, sensors: int) -> G:
     device = topic.removeprefix(kind.topic)
     geometry: Any = kind.attached(session, device)
     if geometry is None:
-        raise FormatError(
+        raise NoGeometryError(
             f"no geometry of the {kind.geometry} {device!r}",
             file=session.path,
             where=kind.file,

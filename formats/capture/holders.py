@@ -194,6 +194,8 @@ def _name(pid: int) -> str:
     if not name.startswith("python"):
         return name
     words = _line(PROC / str(pid) / "cmdline").replace("\0", " ").split()[1:]
+    if "-c" in words[:3]:
+        return name
     run = [Path(word).name for word in words if not word.startswith("-")]
     return f"{name} {' '.join(run[:2])}".strip()
 

@@ -106,6 +106,8 @@ class Parts:
         facts = dict(self._content.facts)
         if self._numbered:
             facts["part"] = str(number)
+        if number > 1:
+            facts["started_ns"] = str(self._last_ns)
         self._writer.metadata(RECORD, facts)
         for name, text in self._artifacts.items():
             self._writer.attach_toml(name, text)

@@ -94,6 +94,10 @@ def acquire(
     if run is None:
         return None
     begin, values = run
+    if len(values) >= (least + 2) * layouts[0].floats:
+        # Its ends may be damaged.
+        begin += layouts[0].size
+        values = values[layouts[0].floats : -layouts[0].floats]
     inside = [p - begin for p in pauses if begin <= p < begin + 4 * len(values)]
     layout, alike = _length(values, layouts, inside)
     width = layout.floats
