@@ -26,6 +26,9 @@ SOAK_S = 60.0
 KILLS = 50
 DAMAGES = 400
 
+FIRST = 4096
+"""Bytes by which the start of a recording is found in what was sent."""
+
 TOPIC = "/serial/robot"
 NAIVE = "one message a frame, facts 2.3"
 
@@ -56,7 +59,7 @@ def soak_figures(seconds: float = SOAK_S) -> list[Figure]:
         recording.returncode = os.waitstatus_to_exitcode(status)
         sent = int(line.sent()[-1, 1])
         rounds = sent // len(data) + 1
-        wrong = _wrong(received(output), (data * rounds)[:sent])
+        wrong = wrong_bytes(received(output), (data * rounds)[:sent])
         return [
             Figure("soak: bytes lost or wrong", wrong, "", f"{how}; {sent / 1e6:.0f} MB", 0.0),
             Figure("soak: bad or missing frames", answer["bad"] + answer["lost"], "", how, 0.0),
@@ -76,10 +79,10 @@ def soak_figures(seconds: float = SOAK_S) -> list[Figure]:
         ]
 
 
-def _wrong(found: bytes, sent: bytes) -> float:
+def wrong_bytes(found: bytes, sent: bytes) -> float:
     """Bytes of ``sent`` that are not in ``found`` at their place, from the first one that came
     after the port was opened on."""
-    start = sent.find(found[:4096])
+    start = sent.find(found[:FIRST])
     if start < 0:
         return float(len(sent))
     wanted = np.frombuffer(sent, np.uint8)[start:]
