@@ -191,7 +191,8 @@ def _refuse_idle(port: str, device: str, given: dict[str, Any]) -> None:
     camera, played = port.startswith("camera:"), port.startswith("replay:")
     network = port.startswith(("socket:", "loop:"))
     for name, idle, what in (
-        ("columns", device in DEVICES_WITHOUT_COLUMNS or camera, f"the device {device}"),
+        ("columns", camera, f"the port {port}"),
+        ("columns", device in DEVICES_WITHOUT_COLUMNS, f"the device {device}"),
         ("baud", camera or played or network, f"the port {port}"),
         ("speed", not (camera or played), f"the port {port}"),
         ("image", not camera, f"the port {port}"),
@@ -227,7 +228,10 @@ def _report(recorded: Recorded, device: str, as_json: bool) -> None:
     if as_json:
         console.emit_json(capture_text.as_json(recorded))
     found = "" if device == "auto" and recorded.device == "raw" else recorded.device
-    losses = recorded.totals.losses() + recorded.totals.doubts(found)
+    doubts = recorded.totals.doubts(found)
+    if doubts and recorded.totals.bytes:
+        doubts.append("is it this device (--device auto), is its baud right?")
+    losses = recorded.totals.losses() + doubts
     if recorded.failed:
         losses.insert(0, recorded.ended)
     if losses:

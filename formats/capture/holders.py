@@ -89,7 +89,7 @@ def busy(name: str, path: str) -> SourceError:
     )
     hint = "End it, or choose another port: `locatk capture --list`"
     if any(holder.name == "ModemManager" for holder in seen):
-        hint = "It lets go after half a minute; for good: sudo systemctl stop ModemManager"
+        hint = "It lets go after half a minute; for good: sudo systemctl disable --now ModemManager"
     return SourceError(f"{name} is in use by {names}", hint=hint)
 
 

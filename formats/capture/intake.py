@@ -274,6 +274,8 @@ class SerialIntake:
         twentieth of what it sends arrives."""
         found: dict[str, str] = {}
         for name, clock in self._streams.clocks().items():
+            if clock.jitter_ns is not None and clock.jitter_ns[1] < 0:
+                continue  # ticks ahead of their arrival are of no clock that runs with ours
             if clock.offset_ns is not None:
                 found[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
             if clock.drift_ppm is not None:

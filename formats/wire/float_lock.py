@@ -34,9 +34,9 @@ STAY, SILENT, CLEAR = 10.0, 12.0, 25.0
 starts after a pause; and how much better than any other a phase is that is believed though
 most values have changed. Of the frames published, each is better by 28 than turned."""
 
-SWING, LEAP = 4.0, 8.0
+SWING, LEAP, LEAP_UT = 4.0, 8.0, 20.0
 """Widths by which a value is away from the one before and the one after, which are close to
-one another, where it moves, and where it was damaged if it moves alone."""
+one another, where it moves, and where it was damaged if it moves alone; not by noise."""
 
 LOOK = 4
 """Frames on each phase that are looked at after damage: it may spoil two."""
@@ -186,6 +186,8 @@ class Choice:
         It is to be believed.
     clear : bool
         There is no other that is about as likely.
+    most : float
+        Cost of a frame on it, at most; others on it are from before the damage.
     """
 
     best: int
@@ -193,6 +195,7 @@ class Choice:
     leads: bool
     fits: bool
     clear: bool
+    most: float = 0.0
 
 
 def plausible(values: Floats) -> Mask:
@@ -247,7 +250,9 @@ def choose(among: Phases, layout: Layout, lost: Bytes, pauses: NDArray[np.int64]
     mean = float(used.mean()) / layout.floats
     lead = float(np.delete(total, best).min(initial=np.inf) - total[best])
     leads = lead >= CLEAR and (mean <= FAIR or bool(pauses[best] >= LOOK - 1))
-    return Choice(best, stays, leads, leads or mean <= GOOD, stays or lead >= STAY / 2)
+    clear = stays or lead >= STAY / 2
+    most = (1.5 * mean + 0.5) * layout.floats
+    return Choice(best, stays, leads, leads or mean <= GOOD, clear, most)
 
 
 def in_order(lock: Lock, frames: Floats, before: Array, cost: Array) -> Mask:
@@ -261,17 +266,18 @@ def in_order(lock: Lock, frames: Floats, before: Array, cost: Array) -> Mask:
     return fits
 
 
-def leaps(apart: Array, sensors: int) -> Mask:
+def leaps(lock: Lock, apart: Array) -> Mask:
     """Which values of all but the last of (n, P) frames are away, alone, from those before
     and after, and these close to one another, where the sensor's other axes stand still. No
     magnet does that, as its neighbours see it too; a flipped bit does."""
+    sensors = lock.layout.sensors
     back, on = np.abs(apart[:-1]), np.abs(apart[1:])
     swings = (np.abs(apart[:-1] + apart[1:]) < SWING) & (np.minimum(back, on) > SWING)
     moves = (np.maximum(back, on) > SWING)[:, : 3 * sensors].reshape(-1, sensors, 3)
     found = np.zeros(back.shape, bool)
     found[:, : 3 * sensors] = np.repeat(moves.sum(axis=2) == 1, 3, axis=1)
     found &= swings & (swings.sum(axis=1, keepdims=True) == 1)
-    return found & (np.minimum(back, on) > LEAP)
+    return found & (np.minimum(back, on) > np.maximum(LEAP, LEAP_UT / lock.width))
 
 
 def sound(cost: Array) -> Mask:

@@ -234,9 +234,7 @@ class FloatArrayDecoder:
         moved = self._vote(lock, good)
         if moved is not None:
             good = (moved - self._base - self._at) // size
-        lock = self._release(
-            lock, good - 1, wild[: good - 1] | leaps(apart[:good], lock.layout.sensors)
-        )
+        lock = self._release(lock, good - 1, wild[: good - 1] | leaps(lock, apart[:good]))
         if moved is not None:
             self._move(lock, moved)
             return True
@@ -305,7 +303,7 @@ class FloatArrayDecoder:
         best = choice.best
         starts = origin + among.offset[best] + lock.layout.size * np.arange(LOOK)
         self._grid = self._base + int(starts[0])
-        usable = np.isfinite(among.cost[:, best]) & among.sound[:, best]
+        usable = (among.cost[:, best] <= choice.most) & among.sound[:, best]
         usable &= among.few_hurt[:, best] & (starts >= earliest)
         if not usable.any():
             return False

@@ -100,7 +100,7 @@ def test_the_hint_knows_the_modem_manager(monkeypatch: pytest.MonkeyPatch) -> No
     seen(monkeypatch, Holder(9, "ModemManager"))
     error = busy("robot", "/dev/ttyACM0")
     assert str(error) == "robot is in use by ModemManager (pid 9)"
-    assert "systemctl stop ModemManager" in str(error.hint)
+    assert "systemctl disable --now ModemManager" in str(error.hint)
 
 
 def test_all_holders_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

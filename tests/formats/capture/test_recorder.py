@@ -193,7 +193,7 @@ def test_the_file_is_forced_to_the_disk_by_another_thread(
     assert set(names) == {"locatk-sync"}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_whatever_comes_together(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
