@@ -50,13 +50,14 @@ class LiveFile:
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         check_output(path, overwrite=overwrite)
-        self.path = Path(path)
+        # As atomic_write: what a link points to is replaced, not the link.
+        self.path = Path(os.path.realpath(path) if os.path.islink(path) else path)
         try:
             if overwrite:
                 check_idle(self.path)
                 with contextlib.suppress(FileNotFoundError):
-                    os.unlink(path)
-            self._file = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
+                    os.unlink(self.path)
+            self._file = open(self.path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
             _lock(self._file.fileno())
         except LocatkError:
             raise

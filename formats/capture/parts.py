@@ -130,6 +130,10 @@ class Parts:
         """By this part."""
         return self.file.tell() if self._is_open else 0
 
+    def is_gone(self) -> bool:
+        """Whether somebody has removed the file that is being written."""
+        return self._is_open and not self.file.is_there()
+
     def system(self, name: str) -> None:
         """Say whose session it is, once that is known."""
         if name and name != self._system:

@@ -159,7 +159,7 @@ class Recorder:
             clocks=self._intake.clocks(),
             rates=self._intake.rates(),
         )
-        if not self._parts.file.is_there():
+        if self._parts.is_gone():
             recorded.failed = True
             recorded.ended += f"; somebody has removed or replaced {self._parts.file.path}"
         try:

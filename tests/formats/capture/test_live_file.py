@@ -325,3 +325,14 @@ def test_forcing_and_closing_at_once(tmp_path: Path) -> None:
         file.close()
         thread.join()
         assert (tmp_path / f"{number}.mcap").read_bytes() == b"x"
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    target, link = tmp_path / "disk.mcap", tmp_path / "run.mcap"
+    target.write_bytes(b"old")
+    link.symlink_to(target)
+    file = LiveFile(link, overwrite=True)
+    file.write(b"new")
+    file.close()
+    assert link.is_symlink()
+    assert target.read_bytes() == b"new"
