@@ -5,7 +5,8 @@ else: no header, no length, no checksum. Polaris (github.com/wjk5117/Polaris) ha
 sensors, or three on the miniature car: 108 or 36 bytes. MagX (github.com/dychen24/magx) has
 eight, and one more float for the battery that the firmware never sets: 100 bytes.
 
-:mod:`.float_sync` finds where a frame starts, :mod:`.float_track` goes on from there.
+:mod:`.float_sync` finds where a frame starts, :mod:`.float_track` goes on from there, and
+:mod:`.float_lock` tells by the values whether floats are the next frame.
 """
 
 from __future__ import annotations

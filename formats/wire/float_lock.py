@@ -214,6 +214,7 @@ def rounding(counts: Array) -> Array:
     return most
 
 
+@np.errstate(all="ignore")  # Any bytes are floats; many are no numbers.
 def phases(lock: Lock, piece: bytes, offset: Bytes) -> Phases:
     """Frames that start at these bytes of a piece of up to LOOK + 1 frames."""
     size, there = lock.layout.size, len(piece)
@@ -259,7 +260,7 @@ def in_order(lock: Lock, frames: Floats, before: Array, cost: Array) -> Mask:
     """Whether (n, P) frames that are far from those before would clearly be still farther if
     they began at another sensor: then a magnet has moved."""
     fits = np.ones(len(frames), bool)
-    for floats in range(lock.step, lock.layout.floats, lock.step) if len(frames) else ():
+    for floats in range(lock.step, lock.layout.floats, lock.step):
         turned = np.roll(frames, floats, axis=1)
         turned_cost = lock.cost(lock.apart(turned, before), lock.hurt(turned))
         fits &= turned_cost.sum(axis=1) >= cost + CLEAR
@@ -272,6 +273,8 @@ def leaps(lock: Lock, apart: Array) -> Mask:
     magnet does that, as its neighbours see it too; a flipped bit does."""
     sensors = lock.layout.sensors
     back, on = np.abs(apart[:-1]), np.abs(apart[1:])
+    if not (back > LEAP).any():
+        return np.zeros(back.shape, bool)
     swings = (np.abs(apart[:-1] + apart[1:]) < SWING) & (np.minimum(back, on) > SWING)
     moves = (np.maximum(back, on) > SWING)[:, : 3 * sensors].reshape(-1, sensors, 3)
     found = np.zeros(back.shape, bool)

@@ -36,7 +36,7 @@ SMALLEST_COUNT_UT, CANDIDATES = 0.05, 6
 """Counts are larger (the MLX90393's smallest is 0.15), and so many of the smallest steps are
 tried to be one."""
 
-NEAR_UT = 15.0
+NEAR_UT = 20.0
 """How far the same value of two frames is apart, mostly, while nothing is known yet."""
 
 LEAST, HOLD = 6, 32

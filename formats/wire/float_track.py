@@ -226,8 +226,9 @@ class FloatArrayDecoder:
         apart = lock.apart(frames, before)
         cost = lock.cost(apart, hurt).sum(axis=1)
         doubt = cost > GOOD * lock.layout.floats
-        far = np.flatnonzero(doubt)
-        doubt[far] = ~in_order(lock, frames[far], before[far], cost[far])
+        if doubt.any():
+            far = np.flatnonzero(doubt)
+            doubt[far] = ~in_order(lock, frames[far], before[far], cost[far])
         doubt |= hurt.any(axis=1)
         doubt[0] = False
         good = int(np.argmax(doubt)) if doubt.any() else n
