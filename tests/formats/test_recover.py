@@ -568,7 +568,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     return contents
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     which=st.integers(0, len(SMALL) - 1),
     edits=st.lists(

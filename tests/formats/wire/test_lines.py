@@ -620,7 +620,7 @@ TEXT = st.lists(
 ).map(lambda lines: b"".join(line + end for line, end in lines))
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(
     data=TEXT,
     cuts=st.lists(st.integers(0, 600), max_size=20),
