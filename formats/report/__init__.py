@@ -1,0 +1,1 @@
+"""Reports: solutions as one HTML file that opens anywhere, offline."""
