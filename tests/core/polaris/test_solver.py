@@ -331,3 +331,14 @@ def test_devices_stay_apart(world: Any) -> None:
     }
     assert [t.device for t in solution.trajectories] == ["left", "right"]
     assert tag.cells == CELLS
+
+
+def test_a_height_is_as_sure_as_the_scale_of_its_way(world: Any) -> None:
+    """A speed that is told one percent too high lifts the array by as much."""
+    _, _, samples = passed(world, course=world.line(length=0.28, speed=0.1))
+    solution = solve([samples], TAGS, SolveOptions(speed_mps=0.101))
+    (trajectory,) = solution.trajectories
+    off, sigma = trajectory.position[:, 2] - 0.01, trajectory.sigma[:, 2]
+    assert np.all(np.abs(off) > 5e-5)
+    assert np.all(np.abs(off) < 2 * sigma)
+    assert np.all(sigma < 5e-4)
