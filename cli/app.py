@@ -32,6 +32,7 @@ COMMANDS = {
     "calibrate": ("locatk.cli.calibrate", "Make a better artifact from recordings."),
     "solve": ("locatk.cli.solve", "Solve recorded sessions into poses."),
     "eval": ("locatk.cli.eval", "Compare poses with the truth."),
+    "report": ("locatk.cli.report", "Show solutions on one page that opens anywhere."),
     "export": ("locatk.cli.export", "Write poses for other tools."),
     "demo": ("locatk.cli.demo", "Simulate, solve and evaluate, to see that all works."),
     "bench": ("locatk.cli.bench", "Measure what the project promises, on published data."),

@@ -15,6 +15,7 @@ BENCHES = {
     "polaris": "locatk.formats.bench.polaris:figures",
     "landmarks": "locatk.formats.bench.landmarks:figures",
     "capture": "locatk.formats.bench.capture:figures",
+    "look": "locatk.formats.bench.look:figures",
 }
 """Name of a system, or of a part, to the function that measures its figures."""
 
@@ -42,6 +43,7 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
       locatk bench polaris
       locatk bench landmarks
       locatk bench capture
+      locatk bench look
       locatk bench lighthouse --data ~/data --json
     """
     from locatk.formats.data import data_folder

@@ -2,270 +2,179 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shlex
+import time
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import click
 
 from locatk.cli import console, options
 
-if TYPE_CHECKING:
-    from locatk.core.trajectory import Trajectory
-
 SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
 
-SPEED_MPS = 0.1
-"""Of the robot over the tags; the published algorithm has to be told."""
+REPORT = "report.html"
 
 
 @click.command(short_help="Simulate, solve and evaluate, to see that all works.")
 @click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
-@options.output("Folder for sessions, solutions and plots. [default: a new one]", required=False)
+@options.output(
+    f"Report to write (.html).  [default: {REPORT}, in the folder of --keep if given]",
+    required=False,
+)
+@click.option(
+    "--keep",
+    type=options.PATH,
+    metavar="DIR",
+    help="Leave sessions, solutions, pictures and what to print in DIR.",
+)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @options.overwrite
 @options.as_json
 @options.verbosity
 def command(
-    systems: tuple[str, ...], output: Path | None, seed: int, overwrite: bool, as_json: bool
+    systems: tuple[str, ...],
+    output: Path | None,
+    keep: Path | None,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
 ) -> None:
-    """Simulate a session of each SYSTEM, solve it, and compare it with the truth.
+    """Simulate a session of each SYSTEM, solve it, compare it with the truth, and report.
 
     Two robots drive under two Lighthouse stations whose places are unknown; a camera
     drives over a printed A4 sheet of dots, of which some are missing and some are dust; a
     bar of magnetometers drives over three tags of magnets that were laid by hand, iron bits
     among them; a robot with four hall sensors finds where it is on a floor of landmarks, of
-    which one lacks a bar. Writes the session, the solution and a plot of each, and what to print.
+    which one lacks a bar. No hardware and no network are needed.
 
     \b
     Examples:
       locatk demo
-      locatk demo dots -o demo
+      locatk demo dots -o dots.html
+      locatk demo --keep demo
       locatk demo --seed 7 --json
     """
-    folder = _folder(output)
+    from locatk.formats.report.report import write_report
+
     chosen = [name for name in SYSTEMS if name in systems or not systems]
-    makers = {
-        "lighthouse": _lighthouse,
-        "dots": _dots,
-        "polaris": _polaris,
-        "landmarks": _landmarks,
-    }
-    for name in chosen:
-        for path in _files(folder, name):
+    report = output or (keep or Path()) / REPORT
+    if keep is not None:
+        options.make_folder(keep)
+        for path in (path for name in chosen for path, _ in kept(keep, name)):
             options.guard_output(path, overwrite=overwrite)
-    rows = [_whole_way(folder, name, makers[name], seed, overwrite) for name in chosen]
-    if as_json:
-        console.emit_json({"version": 1, "systems": rows})
-        return
-    console.result(
-        console.table(
-            ("system", "poses", "error [mm]", "published algorithm [mm]", "time [s]"),
-            [
-                (
-                    row["system"],
-                    row["poses"],
-                    f"{1e3 * row['mae_m']:.2g}",
-                    "-" if row["paper_mae_m"] is None else f"{1e3 * row['paper_mae_m']:.2g}",
-                    f"{row['solve_s']:.2f}",
-                )
-                for row in rows
-            ],
-        )
+    options.guard_output(report, overwrite=overwrite)
+
+    start = time.perf_counter()
+    folder: AbstractContextManager[str | Path] = (
+        TemporaryDirectory(prefix="locatk-demo-") if keep is None else nullcontext(keep)
     )
+    with folder as place:
+        ways = [whole_way(Path(place), name, seed, keep is not None, overwrite) for name in chosen]
+        with console.working("Reporting"):
+            write_report(report, [subject for _, subject in ways], overwrite=overwrite)
+    rows = [row for row, _ in ways]
+    took_s = time.perf_counter() - start
+
+    files = [] if keep is None else [item for name in chosen for item in kept(keep, name)]
+    if as_json:
+        console.emit_json(
+            {
+                "version": 1,
+                "systems": rows,
+                "report": report,
+                "files": [{"path": path, "next": words} for path, words in files],
+                "took_s": took_s,
+            }
+        )
+        return
+    console.result(table(rows))
     console.say(
         "error: mean distance from the truth, in the frame of the markers, the sheet, the site or "
         "the map"
     )
-    for row in rows:
-        for file in row["files"]:
-            console.say(f"Wrote {file}")
+    console.result(f"Wrote {report} in {took_s:.0f} s: open it in a browser")
+    if files:
+        width = max(len(str(path)) for path, _ in files)
+        for path, words in files:
+            console.result(f"{path!s:<{width}}  {words}")
 
 
-def _folder(output: Path | None) -> Path:
-    import tempfile
+def table(rows: list[dict[str, Any]]) -> str:
+    """One line a system."""
 
-    if output is None:
-        return Path(tempfile.mkdtemp(prefix="locatk-demo-"))
-    options.make_folder(output)
-    return output
+    def mm(metres: float | None) -> str:
+        return "-" if metres is None else f"{1e3 * metres:.2g}"
+
+    return console.table(
+        ("system", "poses", "error [mm]", "published algorithm [mm]", "time [s]"),
+        [
+            (
+                row["system"],
+                row["poses"],
+                mm(row["mae_m"]),
+                mm(row["paper_mae_m"]),
+                f"{row['solve_s']:.2f}",
+            )
+            for row in rows
+        ],
+    )
 
 
-def _files(folder: Path, system: str) -> list[Path]:
-    """Session, solution and plot, and what is to be printed."""
-    printed = {
-        "dots": ["-sheet.pdf"],
-        "polaris": ["-tags.pdf"],
-        "landmarks": ["-pack.pdf"],
-    }.get(system, [])
-    return [folder / f"{system}{end}" for end in (".mcap", "-solved.mcap", ".png", *printed)]
+def kept(folder: Path, system: str) -> list[tuple[Path, str]]:
+    """What ``--keep`` leaves of a system, and for each file what to try next."""
+    from locatk.cli.demo_sessions import PRINTED
+
+    session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
+    tries = [
+        (session, f"locatk info {_quoted(session)}"),
+        (solution, f"locatk eval {_quoted(solution)} --truth {_quoted(session)}"),
+        (folder / f"{system}.png", f"locatk report {_quoted(solution)} -o {system}.svg"),
+    ]
+    if system in PRINTED:
+        tries.append((folder / PRINTED[system], "print it at 100 %, without fitting to the page"))
+    return tries
 
 
-def _whole_way(
-    folder: Path,
-    system: str,
-    make: Callable[[list[Path], int, bool], tuple[Trajectory, ...]],
-    seed: int,
-    overwrite: bool,
-) -> dict[str, Any]:
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+def whole_way(
+    folder: Path, system: str, seed: int, pictured: bool, overwrite: bool
+) -> tuple[dict[str, Any], Any]:
+    """Simulate, solve and evaluate one system in ``folder``: its row of the table, and what
+    the report tells of it."""
+    from locatk.cli.demo_sessions import MAKERS, SPEED_MPS
     from locatk.cli.systems import Request, solve_session
     from locatk.core import metrics
+    from locatk.core.association import pair_devices
     from locatk.formats import solutions
     from locatk.formats.plot import plot_solution
+    from locatk.formats.report import subjects
 
-    files = _files(folder, system)
-    session, solution, picture = files[:3]
-    with console.working("Simulating"):
-        truths = make(files, seed, overwrite)
-    with console.working("Solving"):
+    session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
+    with console.working(f"Simulating {system}"):
+        truths = MAKERS[system](folder, seed, overwrite)
+    with console.working(f"Solving {system}"):
         solved = solve_session(session, Request())
         speed = SPEED_MPS if system == "polaris" else None
         paper = solve_session(session, Request(method="paper", speed=speed))
         solutions.write_solution(solution, solved.solution, source=session, overwrite=overwrite)
-
-    truth = {trajectory.device: trajectory for trajectory in truths}
-
-    def error(of: Any) -> float | None:
-        found = [mine for mine in of.solution.trajectories if len(mine)]
-        if not found:
-            return None
-        return metrics.evaluate_all([(mine, truth[mine.device]) for mine in found]).mae
-
-    with console.working("Drawing"):
-        plot_solution(picture, solved.solution, truth=truths, overwrite=overwrite)
-    return {
+    subject = subjects.load(solution, session=session)
+    if pictured:
+        with console.working(f"Drawing {system}"):
+            plot_solution(
+                folder / f"{system}.png", solved.solution, truth=truths, overwrite=overwrite
+            )
+    pairs, _ = pair_devices([t for t in paper.solution.trajectories if len(t)], truths)
+    row = {
         "system": system,
         "poses": solved.solution.poses,
-        "mae_m": error(solved),
-        "paper_mae_m": error(paper),
+        "mae_m": None if subject.evaluation is None else subject.evaluation.mae,
+        "paper_mae_m": metrics.evaluate_all(pairs).mae if pairs else None,
         "solve_s": solved.solve_s,
-        "files": [str(path) for path in files],
     }
-
-
-def _lighthouse(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    from locatk.core.lighthouse.simulate import SimulationOptions, simulate
-    from locatk.formats import observations
-
-    simulated = simulate(
-        SimulationOptions(robots=2, stations=2, planar=True, duration_s=60.0, seed=seed)
-    )
-    observations.write_session(
-        files[0],
-        system="lighthouse",
-        sweeps=simulated.sweeps,
-        scene=simulated.scene,
-        truth=simulated.truth,
-        overwrite=overwrite,
-    )
-    return simulated.truth
-
-
-def _dots(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    from math import radians
-
-    from locatk.core.dots import simulate
-    from locatk.formats import frames
-    from locatk.formats.output import atomic_write
-    from locatk.formats.pdf import pattern
-
-    wanted = simulate.SimulationOptions(
-        frames=200,
-        rate_hz=25.0,
-        speed_mps=0.25,
-        tilt_rad=radians(3),
-        missing=0.02,
-        dust=0.01,
-        jitter_m=10e-6,
-        noise=6.0,
-        vignette=0.3,
-        seed=seed,
-    )
-    simulated = simulate.simulate(None, wanted)
-    frames.write_session(
-        files[0],
-        [simulated.frames],
-        simulated.manifest,
-        camera=simulated.camera,
-        truth=(simulated.truth,),
-        overwrite=overwrite,
-    )
-    with atomic_write(files[3], overwrite=overwrite) as stream:
-        stream.write(pattern.render(simulated.manifest))
-    return (simulated.truth,)
-
-
-def _polaris(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    from math import radians
-
-    from locatk.core.polaris import cards, simulate
-    from locatk.core.polaris.codec import layout_of
-    from locatk.core.polaris.tag import Placed, Tags
-    from locatk.formats import arrays
-    from locatk.formats.output import atomic_write
-    from locatk.formats.pdf import tag
-
-    ids = (262_143, 77, 123_456)
-    tags = Tags(
-        codec="polaris-released",
-        site={
-            number: Placed(0.5 * k, 0.02 * k, radians(turn))
-            for k, (number, turn) in enumerate(zip(ids, (0.0, 90.0, 200.0), strict=True))
-        },
-    )
-    simulated = simulate.simulate(
-        tags,
-        simulate.SimulationOptions(
-            route=ids,
-            speed_mps=SPEED_MPS,
-            build_angle_rad=radians(3),
-            build_place_m=0.2e-3,
-            build_strength=0.03,
-            debris=3,
-            odometry=True,
-            seed=seed,
-        ),
-    )
-    arrays.write_session(
-        files[0],
-        [simulated.samples],
-        tags=tags,
-        truth=(simulated.truth,),
-        odometry=() if simulated.odometry is None else (simulated.odometry,),
-        overwrite=overwrite,
-    )
-    drawn = cards.draw(tags, [(number, layout_of(tags, number)) for number in ids], (210.0, 297.0))
-    with atomic_write(files[3], overwrite=overwrite) as stream:
-        stream.write(tag.render(drawn.pages, "locatk demo"))
-    return (simulated.truth,)
-
-
-def _landmarks(files: list[Path], seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    from locatk.core.landmarks import simulate
-    from locatk.core.landmarks.design import DesignOptions, design
-    from locatk.core.landmarks.pack import pack
-    from locatk.formats import halls
-    from locatk.formats.output import atomic_write
-    from locatk.formats.pdf import landmarks
-
-    floor = design(DesignOptions(rows=6, columns=8, seed=seed))
-    wanted = simulate.SimulationOptions(
-        start=(0.3, 0.3, 0.4),
-        landmarks=9,
-        spins=9,
-        faults=simulate.Faults(missing=(((2, 2), 1),)),
-        seed=seed,
-    )
-    simulated = simulate.simulate(floor, wanted)
-    halls.write_session(
-        files[0],
-        simulated.samples,
-        floor=floor,
-        truth=simulated.truth,
-        odometry=simulated.odometry,
-        overwrite=overwrite,
-    )
-    made = pack(floor, (210.0, 297.0), paper_name="A4")
-    with atomic_write(files[3], overwrite=overwrite) as stream:
-        stream.write(landmarks.render(made.pages, "locatk demo"))
-    return simulated.truth
+    return row, subject

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from locatk.cli import console, options
 from locatk.core.errors import InputError
 
-if TYPE_CHECKING:
-    from locatk.core.trajectory import Trajectory
-
-ALIGNMENTS = ("none", "se2", "se3", "sim2", "sim3")
-"""As in :mod:`locatk.core.association`, which imports numpy (a test holds the two equal)."""
+ALIGNMENTS = ("none", "se2", "se3", "sim2", "sim3", "yaw", "origin")
+"""As in :mod:`locatk.core.alignment`, which imports numpy (a test holds the two equal)."""
 
 
 class Offset(click.ParamType):
@@ -32,7 +29,7 @@ class Offset(click.ParamType):
             seconds = float(value)
         except ValueError:
             seconds = math.nan
-        if math.isfinite(seconds):
+        if abs(seconds) < 4e9:
             return seconds
         self.fail(f"{value!r} is neither a number of seconds nor `auto`.", param, ctx)
 
@@ -40,14 +37,19 @@ class Offset(click.ParamType):
 @click.command(short_help="Compare poses with the truth.")
 @options.input_argument("estimate")
 @options.input_option(
-    "--truth", required=True, metavar="FILE", help="Session with truth, or a TUM or CSV file."
+    "--truth",
+    required=True,
+    metavar="FILE",
+    help="Session with truth, another solution, or a TUM, KITTI or CSV file.",
 )
 @click.option(
     "--align",
     type=click.Choice(ALIGNMENTS),
     default="none",
     show_default=True,
-    help="Fitted from estimate to truth on the scored poses, for all devices together.",
+    help="Fitted from estimate to truth on the scored poses, for all devices together: in the "
+    "plane (se2), in space (se3), with scale (sim2, sim3), about z (yaw), or the first pose laid "
+    "on its truth (origin).",
 )
 @click.option(
     "--offset",
@@ -55,25 +57,77 @@ class Offset(click.ParamType):
     default=0.0,
     show_default=True,
     metavar="SECONDS|auto",
-    help="Added to the stamps of the estimate; `auto` estimates it on a part that is not scored.",
+    help="Added to the stamps of the estimate; `auto` estimates it on a part that is not scored, "
+    "from clocks that may be years apart.",
 )
+@click.option(
+    "--match",
+    type=click.Choice(("auto", "interpolate", "nearest")),
+    default="auto",
+    show_default=True,
+    help="Truth between its neighbours in time, or the nearest as evo takes it; `auto` is "
+    "`nearest` for two TUM or KITTI files.",
+)
+@click.option(
+    "--max-diff",
+    type=click.FloatRange(0, min_open=True),
+    default=0.01,
+    show_default=True,
+    metavar="SECONDS",
+    help="With `nearest`: how far apart in time.",
+)
+@click.option(
+    "--delta",
+    default="1f",
+    show_default=True,
+    metavar="N(f|m|deg|s)",
+    help="Distance of the poses of a relative error: poses, metres, degrees or seconds.",
+)
+@click.option("--all-pairs", is_flag=True, help="Relative errors from each pose on.")
 @options.as_json
 @options.verbosity
-def command(estimate: Path, truth: Path, align: str, offset: float | str, as_json: bool) -> None:
+def command(
+    estimate: Path,
+    truth: Path,
+    align: str,
+    offset: float | str,
+    match: str,
+    max_diff: float,
+    delta: str,
+    all_pairs: bool,
+    as_json: bool,
+) -> None:
     """Compare the poses of ESTIMATE with a reference, device by device.
 
-    ESTIMATE is a solution (.mcap), or a TUM or CSV file. Errors are distances: their
-    mean (MAE), root mean square (RMSE), standard deviation (SD) and so on.
+    ESTIMATE is a solution (.mcap), a TUM, KITTI or CSV file, or the truth of a session. The
+    absolute error (APE) is the distance of a pose from the truth, the relative one (RPE) what is
+    wrong in the motion from one pose to the next; both have a part in metres and one in degrees.
+    Consistency is whether the covariances of the estimate fit its errors.
 
     \b
     Examples:
       locatk eval solved.mcap --truth run.mcap
       locatk eval solved.mcap --truth grid.mcap --align sim3 --json
       locatk eval solved.mcap --truth camera.tum --offset auto
+      locatk eval slam.tum --truth mocap.tum --align se3 --delta 1m
     """
+    from locatk.cli import eval_text
     from locatk.core import metrics
+    from locatk.core.association import pair_devices
+    from locatk.core.relative import Delta
+    from locatk.formats import trajectory_files as files
 
-    pairs, alone = pair(read(estimate), read(truth, truth=True))
+    Delta.parse(delta)
+    mine = files.open_file(estimate)
+    true = files.open_file(truth, role="truth")
+    files.check_kinds(mine, true)
+    if not mine.solved:
+        if estimate.samefile(truth):
+            raise InputError(
+                "no solved poses", file=estimate, hint="Solve it first: `locatk solve`"
+            )
+        console.warn(f"{estimate} holds no solved poses: its truth is taken as the estimate")
+    pairs, alone = pair_devices(mine.trajectories, true.trajectories)
     if not pairs:
         raise InputError(
             f"no device of the estimate is in {truth}",
@@ -82,76 +136,24 @@ def command(estimate: Path, truth: Path, align: str, offset: float | str, as_jso
         )
     if alone:
         console.warn(f"no truth for {', '.join(alone)}")
-    facts = metrics.evaluate_all(pairs, align=align, offset_s=offset).as_dict()  # type: ignore[arg-type]
+    as_evo = mine.kind in files.EVO_KINDS and true.kind in files.EVO_KINDS
+    if match == "auto":
+        match = "nearest" if as_evo else "interpolate"
+    found = metrics.evaluate_all(
+        pairs,
+        align=align,
+        offset_s=offset,  # type: ignore[arg-type]
+        match=match,
+        max_diff_s=max_diff,
+        # Rows of KITTI are stamped by the second.
+        max_gap_s=1.0 if mine.kind == "kitti" else metrics.MAX_GAP_S,
+        delta=delta,
+        all_pairs=all_pairs,
+    )
+    if "first stamps" in found.offset_source:
+        console.warn("the motions are too unlike to set the clocks by: the first stamps were used")
     if as_json:
-        console.emit_json({"version": 1, "estimate": estimate, "truth": truth, **facts})
+        facts = {"version": 1, "estimate": estimate, "truth": truth, **found.as_dict()}
+        console.emit_json(facts)
     else:
-        console.result(text(facts))
-
-
-def read(path: Path, *, truth: bool = False) -> list[Trajectory]:
-    """Trajectories of a solution, of a session's truth, or of a TUM or CSV file.
-
-    As ``truth``, another solution serves too.
-    """
-    from locatk.formats import trajectories
-    from locatk.formats.session import Session
-    from locatk.formats.solutions import read_trajectories
-
-    kind = path.suffix.lower()
-    if kind == ".csv":
-        return trajectories.read_csv(path)
-    if kind in (".tum", ".txt"):
-        return [trajectories.read_tum(path)]
-    solved = not truth or Session.open(path).facts.get("kind") == "solution"
-    return read_trajectories(path, "solution" if solved else "truth")
-
-
-def pair(
-    estimates: list[Trajectory], truths: list[Trajectory]
-) -> tuple[list[tuple[Trajectory, Trajectory]], list[str]]:
-    """Estimate and truth of each device, and the devices that have no truth.
-
-    By name; where there is just one of each, their names need not agree.
-    """
-    if len(estimates) == len(truths) == 1:
-        return [(estimates[0], truths[0])], []
-    by_name = {trajectory.device: trajectory for trajectory in truths}
-    pairs = [(mine, by_name[mine.device]) for mine in estimates if mine.device in by_name]
-    return pairs, [mine.device for mine in estimates if mine.device not in by_name]
-
-
-STATISTICS = ("mae", "rmse", "sd", "median", "p95", "max")
-
-
-def text(facts: dict[str, Any]) -> str:
-    """The evaluation for people; lengths in mm."""
-    rows = [("all", facts)] if len(facts["devices"]) > 1 else []
-    rows += list(facts["devices"].items())
-    table = console.table(
-        ("device", "poses", *(f"{name.upper()} [mm]" for name in STATISTICS)),
-        [
-            (
-                name,
-                row["n"],
-                *(_millimetres(row[f"{s}_m"]) if row["n"] else "-" for s in STATISTICS),
-            )
-            for name, row in rows
-        ],
-    )
-    left_out = ", ".join(f"{count} {why}" for why, count in facts["unscored"].items() if count)
-    return "\n".join(
-        [
-            table,
-            f"alignment: {facts['align']}, fitted on {facts['align_fitted_on']}"
-            + (f" (scale {facts['scale']:.6f})" if facts["align"].startswith("sim") else ""),
-            f"time offset: {facts['offset_s']:.4f} s ({facts['offset_source']})",
-            f"not scored: {left_out or 'nothing'}",
-        ]
-    )
-
-
-def _millimetres(metres: float) -> str:
-    """Three decimals; three digits below a tenth of a millimetre."""
-    value = 1e3 * metres
-    return f"{value:.3f}" if value >= 0.1 or value == 0 else f"{value:.3g}"
+        console.result(eval_text.text(found))

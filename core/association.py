@@ -1,4 +1,4 @@
-"""Which truth belongs to which pose: matching in time, in space and between clocks.
+"""Which truth belongs to which pose: matching devices, and matching in time.
 
 A time offset is in seconds and is *added to the stamps of the estimate*: an estimate
 stamped t is compared with the truth at t + offset. (Shifting a camera's clock by
@@ -7,30 +7,32 @@ stamped t is compared with the truth at t + offset. (Shifting a camera's clock b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import DegenerateError, InputError
-from locatk.core.geometry import Similarity, umeyama
+from locatk.core.errors import InputError
+from locatk.core.orientation import slerp
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
 
-ALIGNMENTS = ("none", "se2", "se3", "sim2", "sim3")
-"""What may be fitted between estimate and truth. ``se2`` turns about z and shifts in x
-and y, ``se3`` is any rigid motion; ``sim2`` and ``sim3`` also scale. Least squares over
-the scored points, all equal (Umeyama), never a reflection. ``se2`` and ``sim2`` do not
-shift along z. ``se3`` and ``sim3`` can turn a planar estimate over, and so hide that it
-is mirrored."""
+Pairs = Sequence[tuple[Trajectory, Trajectory]]
+"""Estimate and truth, one pair a device."""
+
+MATCHES = ("interpolate", "nearest")
+"""How truth is found for a pose: ``interpolate`` takes it between its two neighbours in time.
+``nearest`` is what evo does by default: each pose of the shorter of the two with the nearest
+of the longer."""
 
 MAX_GAP_S = 0.5
 """Default for the longest gap in the truth that is bridged by interpolation."""
 
-MIN_POINTS = 10
-"""A time offset is not estimated from fewer points."""
+MAX_DIFF_S = 0.01
+"""Default for the largest difference in time of ``nearest``, as evo's."""
 
 
 @dataclass(frozen=True)
@@ -40,26 +42,42 @@ class Association:
     Attributes
     ----------
     index : (n,) int ndarray
-        Rows of the estimate.
+        Rows of the estimate; ascending, and with ``nearest`` perhaps repeated.
+    before, after : (n,) int ndarray
+        Rows of the truth between which each pose lies.
+    share : (n,) ndarray
+        How far it is on the way from the one to the other, 0 to 1.
     time_ns : (n,) int64 ndarray
-        Their stamps, as in the estimate.
+        The stamps of the poses, as in the estimate.
     estimate, truth : (n, 3) ndarray
         Positions in metres, each in its own frame.
+    estimate_turn, truth_turn : (n, 4) ndarray
+        Orientations as (x, y, z, w).
     """
 
-    index: NDArray[np.int64]
+    index: Rows
+    before: Rows
+    after: Rows
+    share: Array
     time_ns: NDArray[np.int64]
     estimate: Array
     truth: Array
+    estimate_turn: Array
+    truth_turn: Array
 
     def __len__(self) -> int:
         return len(self.index)
 
     def take(self, keep: NDArray[np.bool_]) -> Association:
         """Only the poses where ``keep`` (n,) is true."""
-        return Association(
-            self.index[keep], self.time_ns[keep], self.estimate[keep], self.truth[keep]
-        )
+        if keep.all():
+            return self
+        return Association(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+    def interpolated(self, of_truth: Array) -> Array:
+        """What the truth tells at its stamps (m, ...), linearly at those of the poses (n, ...)."""
+        share = self.share.reshape(-1, *(1,) * (of_truth.ndim - 1))
+        return np.asarray((1 - share) * of_truth[self.before] + share * of_truth[self.after])
 
 
 def associate(
@@ -67,152 +85,124 @@ def associate(
     truth: Trajectory,
     *,
     offset_s: float = 0.0,
+    match: str = "interpolate",
     max_gap_s: float = MAX_GAP_S,
+    max_diff_s: float = MAX_DIFF_S,
 ) -> Association:
     """Match each pose of an estimate with the truth at its time.
 
-    The truth is interpolated linearly between its two neighbours in time. It is never
-    extrapolated, and gaps longer than ``max_gap_s`` are not bridged: poses there are
-    left out.
-
-    Raises
-    ------
-    InputError
-        The stamps of the truth do not ascend.
-    """
-    if np.any(truth.time_ns[1:] <= truth.time_ns[:-1]):
-        raise InputError(
-            f"the stamps of the truth of device {truth.device!r} do not ascend",
-            hint="sort it and drop repeated stamps",
-        )
-    time = estimate.time_ns + round(offset_s * 1e9)
-    if len(truth) == 0:
-        empty = np.zeros(0, np.int64)
-        return Association(empty, empty, np.zeros((0, 3)), np.zeros((0, 3)))
-    after = np.searchsorted(truth.time_ns, time)  # first truth stamp at or after each pose
-    after_safe = np.minimum(after, len(truth) - 1)
-    before = np.maximum(after - 1, 0)
-    exact = truth.time_ns[after_safe] == time
-    # Differences of int64 nanoseconds: no digit of the epoch is lost.
-    gap = truth.time_ns[after_safe] - truth.time_ns[before]
-    inside = (after > 0) & (after < len(truth)) & (gap <= round(max_gap_s * 1e9))
-    index = np.flatnonzero(inside | exact)
-    before, after = np.where(exact, after_safe, before)[index], after_safe[index]
-    gap = np.maximum(truth.time_ns[after] - truth.time_ns[before], 1)
-    share = ((time[index] - truth.time_ns[before]) / gap)[:, None]
-    position = (1 - share) * truth.position[before] + share * truth.position[after]
-    return Association(index, estimate.time_ns[index], estimate.position[index], position)
-
-
-def fit_alignment(estimate: Array, truth: Array, align: str) -> Similarity:
-    """Transform named ``align`` that brings ``estimate`` (n, 3) closest to ``truth`` (n, 3).
-
-    Raises
-    ------
-    InputError
-        ``align`` is not one of :data:`ALIGNMENTS`.
-    DegenerateError
-        The points do not determine it (all in one place, on a line).
-    """
-    if align not in ALIGNMENTS:
-        raise InputError(f"unknown alignment {align!r}", hint=f"use one of {', '.join(ALIGNMENTS)}")
-    if align == "none":
-        return Similarity.identity()
-    if len(estimate) < 2:
-        raise DegenerateError(f"alignment {align!r} needs two poses or more, not {len(estimate)}")
-    with_scale = align.startswith("sim")
-    if align.endswith("3"):
-        return umeyama(estimate, truth, with_scale=with_scale)
-    flat = umeyama(estimate[:, :2], truth[:, :2], with_scale=with_scale)
-    rotation, translation = np.eye(3), np.zeros(3)
-    rotation[:2, :2], translation[:2] = flat.rotation, flat.translation
-    return Similarity(flat.scale, rotation, translation)
-
-
-Pairs = Sequence[tuple[Trajectory, Trajectory]]
-"""Estimate and truth, one pair a device."""
-
-
-def estimate_offset(
-    pairs: Pairs,
-    *,
-    align: str = "none",
-    span_s: float = 1.0,
-    max_gap_s: float = MAX_GAP_S,
-) -> float:
-    """Time offset that makes the mean error smallest, common to all pairs.
-
-    Do not score the poses that it was estimated from: give it other recordings, or let
-    :func:`evaluate` hold a part out.
-
     Parameters
     ----------
-    pairs : sequence of (Trajectory, Trajectory)
-        Estimate and truth of each device.
-    align : str
-        Fitted anew at each offset.
-    span_s : float
-        Offsets from ``-span_s`` to ``span_s`` are searched: every 20 ms, then finer
-        around the best.
-    max_gap_s : float
-        See :func:`associate`.
+    estimate, truth : Trajectory
+    offset_s : float
+        Added to the stamps of the estimate.
+    match : str
+        One of :data:`MATCHES`. ``interpolate``: positions linearly, orientations along the
+        great circle; never extrapolated, and gaps longer than ``max_gap_s`` are not
+        bridged. ``nearest``: pairs not more than ``max_diff_s`` apart, in float64 seconds,
+        so that ties fall as in evo 1.38 (``evo.core.sync``); of several poses with the same
+        truth all are kept.
+
+    Raises
+    ------
+    InputError
+        The stamps of the truth do not ascend; an unknown ``match``.
+    """
+    if match not in MATCHES:
+        raise InputError(f"unknown match {match!r}", hint=f"use one of {', '.join(MATCHES)}")
+    ascending(truth, "truth")
+    if len(truth) == 0 or len(estimate) == 0:
+        nothing = np.zeros(0, np.int64)
+        index, before, after, share = nothing, nothing, nothing, np.zeros(0)
+    elif match == "nearest":
+        ascending(estimate, "estimate")
+        index, before = nearest(estimate.time_ns, truth.time_ns, offset_s, max_diff_s)
+        after, share = before, np.zeros(len(index))
+    else:
+        time = estimate.time_ns + round(offset_s * 1e9)
+        index, before, after, share = between(time, truth.time_ns, max_gap_s)
+    positions, turns = truth.position[before], truth.quaternion[before]
+    if share.any():
+        column = share[:, None]
+        positions = (1 - column) * positions + column * truth.position[after]
+        turns = slerp(turns, truth.quaternion[after], share)
+    return Association(
+        index,
+        before,
+        after,
+        share,
+        estimate.time_ns[index],
+        estimate.position[index],
+        positions,
+        estimate.quaternion[index],
+        turns,
+    )
+
+
+def ascending(trajectory: Trajectory, what: str) -> None:
+    """Raise :class:`InputError` where stamps do not ascend."""
+    if np.any(trajectory.time_ns[1:] <= trajectory.time_ns[:-1]):
+        raise InputError(
+            f"the stamps of the {what} of device {trajectory.device!r} do not ascend",
+            hint="sort it and drop repeated stamps",
+        )
+
+
+def between(
+    time: NDArray[np.int64], known: NDArray[np.int64], max_gap_s: float
+) -> tuple[Rows, Rows, Rows, Array]:
+    """Neighbours of stamps ``time`` (n,) among ascending stamps ``known`` (m,), m > 0.
 
     Returns
     -------
-    float
-        Seconds to add to the stamps of the estimate.
-
-    Raises
-    ------
-    InputError
-        Too few poses have truth at all offsets searched, or the best offset lies at the
-        end of the span.
-    DegenerateError
-        The error hardly depends on the offset: the device stood still.
+    index : (k,) int ndarray
+        Rows of ``time`` that have neighbours, not more than ``max_gap_s`` apart.
+    before, after : (k,) int ndarray
+        Rows of ``known``; both the same where the stamp is met exactly.
+    share : (k,) ndarray
+        Of the way from ``before`` to ``after``.
     """
-    if not span_s > 0:
-        raise InputError(f"the span of time offsets must be positive, not {span_s}")
-    offsets = np.linspace(-span_s, span_s, 2 * max(5, round(span_s / 0.02)) + 1)
-    pairs = [(_where_always(e, t, offsets, max_gap_s), t) for e, t in pairs]
-    poses = sum(len(e) for e, _ in pairs)
-    if poses < MIN_POINTS:
-        raise InputError(
-            f"only {poses} poses have truth at all time offsets within {span_s:g} s",
-            hint="narrow the span, hold out a longer part, or give the offset",
-        )
-
-    def error(offset: float) -> float:
-        matched = [associate(e, t, offset_s=offset, max_gap_s=max_gap_s) for e, t in pairs]
-        estimate = np.concatenate([m.estimate for m in matched])
-        truth = np.concatenate([m.truth for m in matched])
-        moved = fit_alignment(estimate, truth, align).apply(estimate)
-        return float(np.mean(np.linalg.norm(moved - truth, axis=1)))
-
-    errors = np.array([error(o) for o in offsets])
-    best = int(np.argmin(errors))
-    if min(errors[0], errors[-1]) <= 1.05 * errors[best] + 1e-12:
-        if np.ptp(errors) <= 0.05 * errors[best] + 1e-12:
-            raise DegenerateError(
-                "the error does not depend on the time offset: the devices hardly moved",
-                hint="give the offset, or hold out a part with motion",
-            )
-        if best in (0, len(offsets) - 1):
-            raise InputError(
-                f"the best time offset lies at the end of the span of {span_s:g} s",
-                hint="widen the span, or check the clocks",
-            )
-    best = min(max(best, 1), len(offsets) - 2)
-    return _golden_section(error, float(offsets[best - 1]), float(offsets[best + 1]))
+    after = np.searchsorted(known, time)  # first known stamp at or after each
+    after_safe = np.minimum(after, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    exact = known[after_safe] == time
+    # Differences of int64 nanoseconds: no digit of the epoch is lost.
+    gap = known[after_safe] - known[before]
+    inside = (after > 0) & (after < len(known)) & (gap <= round(max_gap_s * 1e9))
+    index = np.flatnonzero(inside | exact)
+    after = after_safe[index]
+    before = np.where(exact[index], after, before[index])
+    gap = np.maximum(known[after] - known[before], 1)
+    return index, before, after, (time[index] - known[before]) / gap
 
 
-def _where_always(
-    estimate: Trajectory, truth: Trajectory, offsets: Array, max_gap_s: float
-) -> Trajectory:
-    """Poses with truth at every offset: the same poses are compared at each."""
-    seen = np.zeros(len(estimate), int)
-    for offset in offsets:
-        seen[associate(estimate, truth, offset_s=float(offset), max_gap_s=max_gap_s).index] += 1
-    return take(estimate, seen == len(offsets))
+def nearest(
+    estimate: NDArray[np.int64], truth: NDArray[np.int64], offset_s: float, max_diff_s: float
+) -> tuple[Rows, Rows]:
+    """Rows of estimate and truth whose stamps are nearest; see :func:`associate`."""
+    mine, true = _seconds(estimate), _seconds(truth)
+    if len(mine) > len(true):
+        rows_true, rows_mine = _nearest_of(true, mine + offset_s, max_diff_s)
+        return rows_mine, rows_true
+    return _nearest_of(mine, true - offset_s, max_diff_s)
+
+
+def _nearest_of(short: Array, long: Array, limit: float) -> tuple[Rows, Rows]:
+    """Rows of ``short`` and of the stamps of ``long`` nearest to them; the earlier of two."""
+    after = np.minimum(np.searchsorted(long, short, side="right"), len(long) - 1)
+    ahead = long[after] - short
+    behind = np.where(after > 0, short - long[after - 1], np.inf)
+    best = np.where(ahead < behind, after, after - 1)
+    within = np.minimum(ahead, behind) <= limit
+    within &= (short >= long[0] - limit) & (short <= long[-1] + limit)
+    rows = np.flatnonzero(within)
+    return rows, best[rows]
+
+
+def _seconds(time_ns: NDArray[np.int64]) -> Array:
+    """Epoch seconds, rounded once as by ``float("1690218696.0748")``."""
+    seconds, rest = np.divmod(time_ns, 1_000_000_000)
+    return np.asarray(seconds + rest / 1e9)
 
 
 def take(trajectory: Trajectory, keep: NDArray[np.bool_]) -> Trajectory:
@@ -227,20 +217,15 @@ def take(trajectory: Trajectory, keep: NDArray[np.bool_]) -> Trajectory:
     )
 
 
-def _golden_section(
-    function: Callable[[float], float], low: float, high: float, tolerance: float = 1e-4
-) -> float:
-    """Minimum of a function with one valley between ``low`` and ``high``."""
-    ratio = (np.sqrt(5) - 1) / 2
-    left, right = high - ratio * (high - low), low + ratio * (high - low)
-    at_left, at_right = function(left), function(right)
-    while high - low > tolerance:
-        if at_left < at_right:
-            high, right, at_right = right, left, at_left
-            left = high - ratio * (high - low)
-            at_left = function(left)
-        else:
-            low, left, at_left = left, right, at_right
-            right = low + ratio * (high - low)
-            at_right = function(right)
-    return (low + high) / 2
+def pair_devices(
+    estimates: Sequence[Trajectory], truths: Sequence[Trajectory]
+) -> tuple[list[tuple[Trajectory, Trajectory]], list[str]]:
+    """Estimate and truth of each device, and the devices that have no truth.
+
+    By name; where there is just one of each, their names need not agree.
+    """
+    if len(estimates) == len(truths) == 1:
+        return [(estimates[0], truths[0])], []
+    by_name = {trajectory.device: trajectory for trajectory in truths}
+    pairs = [(mine, by_name[mine.device]) for mine in estimates if mine.device in by_name]
+    return pairs, [mine.device for mine in estimates if mine.device not in by_name]

@@ -6,7 +6,6 @@ import os
 import textwrap
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib as mpl
@@ -17,16 +16,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from locatk.core import metrics
 from locatk.core.errors import InputError
-from locatk.core.geometry import Similarity
-from locatk.core.lighthouse.scene import Scene
 from locatk.core.metrics import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
+from locatk.formats import plot_series
 from locatk.formats.output import atomic_write, check_output
-from locatk.formats.plot_floor import floor_of
-from locatk.formats.plot_map import IN_LEGEND, draw_map, legend, plain, tags_of
+from locatk.formats.plot_ground import COLORS, IN_LEGEND, broken, compare, ground_of, has_no_scale
+from locatk.formats.plot_map import draw_map, legend, plain
+from locatk.formats.plot_series import Series
+
+__all__ = ["COLORS", "SUFFIXES", "draw", "plot_solution"]
 
 Array = NDArray[np.float64]
 
@@ -35,8 +35,8 @@ SUFFIXES = (".png", ".svg", ".pdf")
 SIZE_IN, DPI = (12.0, 6.0), 100
 """1200 x 600 pixels as PNG."""
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D")
-"""Okabe and Ito's, which the colour-blind can tell apart, without yellow."""
+MOST_BANDS = 3
+"""Of more devices, what their covariances expect is not drawn: it would cover all else."""
 
 
 def plot_solution(
@@ -91,28 +91,16 @@ def draw(
     solution: Solution, truth: Sequence[Trajectory] = (), evaluation: Evaluation | None = None
 ) -> Figure:
     """The figure of :func:`plot_solution`, not yet written."""
-    scene = solution.artifact if isinstance(solution.artifact, Scene) else Scene()
-    unscaled = solution.system == "lighthouse" and scene.scale == "unit"
-    if evaluation is None and not unscaled:
-        evaluation = _compare(solution, truth)
-    tags, floor = tags_of(solution), floor_of(solution)
-    if evaluation is not None:
-        paths, scene = _aligned(solution.trajectories, scene, evaluation.alignment)
-        tags = tuple(tag.moved(evaluation.alignment) for tag in tags)
-        floor = None if floor is None else floor.moved(evaluation.alignment)
-        unscaled = unscaled and evaluation.align != "sim3"
-    else:
-        paths = {t.device: t.position for t in solution.trajectories}
-    times = {t.device: t.time_ns for t in solution.trajectories}
-    colors = {name: COLORS[k % len(COLORS)] for k, name in enumerate(paths)}
+    if evaluation is None and not has_no_scale(solution):
+        evaluation = compare(solution, truth)
+    ground = ground_of(solution, truth, evaluation)
+    colors = {name: COLORS[k % len(COLORS)] for k, name in enumerate(ground.paths)}
 
     figure = Figure(figsize=SIZE_IN, layout="constrained")
     grid = figure.add_gridspec(1, 2)
     left, right = figure.add_subfigure(grid[0, 0]), figure.add_subfigure(grid[0, 1])
-    ground = left.subplots()
-    unit = "unit" if unscaled else "m"
-    draw_map(ground, paths, times, () if unscaled else truth, scene, tags, floor, colors, unit)
-    signs = legend(colors, scene, tags, floor, bool(truth) and not unscaled)
+    draw_map(left.subplots(), ground, colors)
+    signs = legend(ground, colors)
     widest = max((len(str(sign.get_label())) for sign in signs), default=0)
     left.legend(
         handles=signs,
@@ -121,10 +109,11 @@ def draw(
         frameon=False,
     )
     over_time, spread = right.subplots(2, 1, height_ratios=(3, 2))
-    series = _errors(evaluation) if evaluation else _sigmas(solution)
+    series = plot_series.errors(evaluation) if evaluation else plot_series.sigmas(solution)
     what = "error" if evaluation else "solver's sigma"
-    label = f"{what} [{'1/1000 unit' if unscaled else 'mm'}]"
-    _draw_series(over_time, spread, series, colors, label)
+    label = f"{what} [{'1/1000 unit' if ground.unit == 'unit' else 'mm'}]"
+    expected = plot_series.expected(solution, evaluation) if evaluation is not None else {}
+    _draw_series(over_time, spread, series, expected, colors, label)
     if evaluation is not None:
         spread.set_title(
             f"half below {_mm(evaluation.median)}, 95 % below {_mm(evaluation.p95)}, "
@@ -136,60 +125,6 @@ def draw(
     return figure
 
 
-# ---- what is drawn
-
-
-@dataclass(frozen=True)
-class Series:
-    """One number a pose: times (n,) in ns and values (n,), in thousandths of the unit."""
-
-    time_ns: NDArray[np.int64]
-    value: Array
-
-
-def _compare(solution: Solution, truth: Sequence[Trajectory]) -> Evaluation | None:
-    """The solution against the truth as it is; None where no pose has truth."""
-    true = {t.device: t for t in truth}
-    pairs = [(t, true[t.device]) for t in solution.trajectories if t.device in true and len(t)]
-    try:
-        return metrics.evaluate_all(pairs) if pairs else None
-    except InputError:
-        return None
-
-
-def _aligned(
-    trajectories: Sequence[Trajectory], scene: Scene, to: Similarity
-) -> tuple[dict[str, Array], Scene]:
-    """Paths and scene in the frame of the truth."""
-    stations = tuple(
-        replace(s, position=to.apply(s.position), rotation=to.rotation @ s.rotation)
-        for s in scene.stations
-    )
-    markers = tuple(replace(m, position=to.apply(m.position)) for m in scene.markers)
-    moved = replace(scene, stations=stations, markers=markers)
-    return {t.device: to.apply(t.position) for t in trajectories}, moved
-
-
-def _errors(evaluation: Evaluation) -> dict[str, Series]:
-    """Errors of each device."""
-    series = {}
-    for k, name in enumerate(evaluation.devices):
-        mine = evaluation.device == k
-        series[name] = Series(evaluation.time_ns[mine], 1e3 * evaluation.errors[mine])
-    return series
-
-
-def _sigmas(solution: Solution) -> dict[str, Series]:
-    """Standard deviations of positions, over the axes that are known; else left out."""
-    series = {}
-    for t in solution.trajectories:
-        variances = np.einsum("nii->ni", t.covariance[:, :3, :3])
-        known, variance = np.isfinite(variances).any(axis=1), np.nansum(variances, axis=1)
-        if np.any(known):
-            series[t.device] = Series(t.time_ns[known], 1e3 * np.sqrt(variance[known]))
-    return series
-
-
 # ---- numbers over time
 
 
@@ -197,10 +132,15 @@ def _draw_series(
     over_time: Axes,
     spread: Axes,
     series: dict[str, Series],
+    expected: dict[str, Series],
     colors: dict[str, str],
     label: str,
 ) -> None:
-    """Values over time, and how often they occur; wild ones are drawn at the upper edge."""
+    """Values over time, and how often they occur; wild ones are drawn at the upper edge.
+
+    All in thousandths; ``expected`` is drawn as a line, for each device that has one.
+    """
+    series, expected = _thousandths(series), _thousandths(expected)
     over_time.set_xlabel("time [s]")
     over_time.set_ylabel(label)
     spread.set_xlabel(label)
@@ -213,8 +153,7 @@ def _draw_series(
             axes.set_yticks([])
         return
     every = np.concatenate([s.value for s in filled.values()])
-    usual = 1.5 * float(np.percentile(every, 98))
-    top = 1.05 * min(float(every.max()), usual) or 1.0
+    top = plot_series.usual_top(every)
     start = min(int(s.time_ns.min()) for s in filled.values())
     for name, s in filled.items():
         seconds = (s.time_ns - start) * 1e-9
@@ -222,12 +161,20 @@ def _draw_series(
         over_time.plot(seconds[~wild], s.value[~wild], ".", color=colors[name], ms=3)
         edge = np.full(np.count_nonzero(wild), 0.98 * top)
         over_time.plot(seconds[wild], edge, "^", color=colors[name], ms=5)
+    said = []
+    bands = {name: s for name, s in expected.items() if np.isfinite(s.value).any()}
+    if 0 < len(bands) <= MOST_BANDS:
+        for name, s in bands.items():
+            band = broken(s.value[:, None], s.time_ns)[:, 0]
+            seconds = broken(1e-9 * (s.time_ns[:, None] - start).astype(float), s.time_ns)[:, 0]
+            over_time.fill_between(seconds, band, color=colors[name], alpha=0.15, lw=0)
+        said.append("shaded: where 95 % should lie by the covariance")
     over_time.set_ylim(0, top)
     over_time.grid(color="0.92")
     out = int(np.count_nonzero(every > top))
     if out:
-        beyond = f"{out} of {len(every)} beyond this scale (triangles)"
-        over_time.set_title(beyond, loc="left", fontsize=9)
+        said.append(f"{out} of {len(every)} beyond this scale (triangles)")
+    over_time.set_title("; ".join(said), loc="left", fontsize=9)
     # Many colours on top of each other tell nothing.
     parts = [s.value for s in filled.values()], [colors[name] for name in filled]
     if len(filled) > IN_LEGEND:
@@ -236,6 +183,10 @@ def _draw_series(
     spread.hist(values, bins=np.linspace(0, top, 41).tolist(), stacked=True, color=parts[1])
     spread.set_xlim(0, top)
     spread.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+
+
+def _thousandths(series: dict[str, Series]) -> dict[str, Series]:
+    return {name: Series(s.time_ns, 1e3 * s.value) for name, s in series.items()}
 
 
 # ---- words

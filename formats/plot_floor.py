@@ -1,4 +1,4 @@
-"""The floor of landmarks on the map of a picture: bars, walls, and where landmarks were seen."""
+"""The floor of landmarks under a solution: bars, walls, and where landmarks were seen."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
 from numpy.typing import NDArray
 
 from locatk.core.geometry import Similarity
@@ -19,7 +17,7 @@ from locatk.formats.floor_bars import WEAK, bars_on_floor, cells_near
 
 Array = NDArray[np.float64]
 
-NORTH_COLOR, SOUTH_COLOR, WALL_COLOR = "#C0392B", "#8FA8C8", "0.35"
+NORTH_COLOR, SOUTH_COLOR, WEAK_COLOR, WALL_COLOR = "#C0392B", "#8FA8C8", "#999999", "#595959"
 SEEN_COLOR, REFUSED_COLOR = "#009E73", "#7F3C8D"
 
 MOST_NAMED = 40
@@ -77,7 +75,7 @@ class Floor:
             self.met,
             there(self.seen),
             there(self.refused),
-            self.reach_m,
+            self.reach_m * to.scale,
         )
 
 
@@ -171,57 +169,3 @@ def solid(floor: Floor) -> list[Array]:
     """What of the floor the view must hold: the landmarks that were seen, else all."""
     shown = floor.centres[floor.met] if floor.met.any() else floor.centres
     return [shown - floor.reach_m, shown + floor.reach_m]
-
-
-def draw_floor(axes: Axes, floor: Floor) -> None:
-    """Bars with their north and south halves, walls, and marks where landmarks were seen."""
-    for rings, look in (
-        (floor.south, {"facecolor": SOUTH_COLOR}),
-        (floor.north, {"facecolor": NORTH_COLOR}),
-        (floor.weak, {"facecolor": "none", "edgecolor": "0.6", "linewidth": 0.6}),
-    ):
-        if len(rings):
-            axes.add_collection(PolyCollection(list(rings[:, :, :2]), zorder=1.5, **look))
-    if len(floor.walls):
-        ends = list(floor.walls[:, :, :2])
-        axes.add_collection(LineCollection(ends, colors=WALL_COLOR, linewidths=2, zorder=1.5))
-    axes.plot(*floor.seen[:, :2].T, "o", color=SEEN_COLOR, mfc="none", ms=7, mew=1.2, zorder=4)
-    axes.plot(*floor.refused[:, :2].T, "x", color=REFUSED_COLOR, ms=7, mew=1.5, zorder=4)
-
-
-def name_landmarks(axes: Axes, floor: Floor) -> None:
-    """Row and column beside each landmark in the view, where there is room for all."""
-    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    x, y = floor.centres[:, 0], floor.centres[:, 1]
-    inside = (left < x) & (x < right) & (low < y) & (y < high)
-    if np.count_nonzero(inside) > MOST_NAMED:
-        return
-    for k in np.flatnonzero(inside):
-        axes.annotate(
-            floor.names[k],
-            (x[k] + floor.reach_m, y[k] + floor.reach_m),
-            ha="left",
-            va="bottom",
-            fontsize=7,
-            color="0.35",
-            zorder=1.6,
-            clip_on=True,
-        )
-
-
-def signs(floor: Floor) -> list[dict[str, Any]]:
-    """Label and look of each sign, for the legend."""
-    square = {"marker": "s", "ms": 6}
-    found = [
-        {"label": "north pole", "color": NORTH_COLOR, **square},
-        {"label": "south pole", "color": SOUTH_COLOR, **square},
-    ]
-    if len(floor.weak):
-        found.append({"label": "weak or missing", "color": "0.6", "mfc": "none", **square})
-    if len(floor.walls):
-        found.append({"label": "wall", "color": WALL_COLOR, "ls": "-", "lw": 2})
-    if len(floor.seen):
-        found.append({"label": "landmark seen", "color": SEEN_COLOR, "marker": "o", "mfc": "none"})
-    if len(floor.refused):
-        found.append({"label": "refused", "color": REFUSED_COLOR, "marker": "x"})
-    return found

@@ -1,9 +1,8 @@
-"""Simulate, solve, evaluate, demo, bench: the real thing, from the command line."""
+"""Simulate, solve, evaluate, bench: the real thing, from the command line."""
 
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -53,35 +52,6 @@ def test_the_session_does_not_give_the_answer_away(locatk, simulated: Path) -> N
     answer = json.loads(locatk("info", simulated, "--json").stdout)
     assert answer["markers"] > 0
     assert [station["position_m"] for station in answer["stations"]] == [None, None]
-
-
-def test_demo(locatk, tmp_path: Path) -> None:
-    folder = tmp_path / "demo"
-    result = locatk("demo", "-o", folder, "--json")
-    assert result.exit_code == 0, result.stderr
-    rows = {row["system"]: row for row in json.loads(result.stdout)["systems"]}
-    limits = {"lighthouse": 0.005, "dots": 5e-6, "polaris": 2e-3, "landmarks": 3e-3}
-    assert set(rows) == set(limits)
-    for system, mae_m in limits.items():
-        row = rows[system]
-        assert row["poses"] > 100
-        assert row["mae_m"] < mae_m
-        # Where tags or landmarks were not read, the published algorithm has no poses.
-        assert row["paper_mae_m"] is not None or system in ("polaris", "landmarks")
-        assert row["mae_m"] < (row["paper_mae_m"] or math.inf)
-        assert (folder / f"{system}.png").read_bytes().startswith(b"\x89PNG")
-    for printed in ("dots-sheet.pdf", "polaris-tags.pdf", "landmarks-pack.pdf"):
-        assert (folder / printed).read_bytes().startswith(b"%PDF")
-    files = [path for row in rows.values() for path in row["files"]]
-    assert sorted(files) == sorted(str(path) for path in folder.iterdir())
-    assert locatk("demo", "-o", folder).exit_code == 1  # nothing is replaced unasked
-
-
-def test_demo_of_one_system(locatk, tmp_path: Path) -> None:
-    result = locatk("demo", "dots", "-o", tmp_path / "demo")
-    assert result.exit_code == 0, result.stderr
-    assert "lighthouse" not in result.stdout
-    assert locatk("demo", "magnets").exit_code == 2
 
 
 def test_published_grid_is_solved(locatk, data: Path, tmp_path: Path) -> None:

@@ -1,0 +1,114 @@
+"""What all figures of a report share: units, thinning, safe words, axes."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.formats.plot_ground import COLORS
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+MOST_POINTS = 3000
+"""So many poses a figure draws, at most, of all devices together."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit of length: its name, and how many of it a metre is."""
+
+    name: str
+    per_metre: float
+
+
+UNSCALED = Unit("1/1000 unit", 1e3)
+
+
+def unit_for(size_m: float, *, unscaled: bool = False) -> Unit:
+    """The unit in which a length of this size is said."""
+    if unscaled:
+        return UNSCALED
+    if not size_m > 0 or 1e-5 <= size_m < 1:
+        return Unit("mm", 1e3)
+    return Unit("\u00b5m", 1e6) if size_m < 1e-5 else Unit("m", 1.0)
+
+
+def length(metres: float, *, unscaled: bool = False) -> str:
+    """A length in the unit that suits it, to three digits."""
+    if unscaled:
+        return f"{digits(metres)} unit"
+    unit = unit_for(abs(metres))
+    return f"{digits(metres * unit.per_metre)} {unit.name}"
+
+
+def digits(value: float) -> str:
+    """A number to three digits, never with an exponent between 0.001 and a million."""
+    if not np.isfinite(value):
+        return "-"
+    if abs(value) >= 999.5:
+        return f"{value:.0f}" if abs(value) < 1e6 else f"{value:.3g}"
+    return f"{value:#.3g}".removesuffix(".") if abs(value) >= 1e-3 else f"{value:.3g}"
+
+
+def label(words: object) -> str:
+    """Text that plotly shows as it is: names of devices may look like HTML."""
+    return html.escape(str(words), quote=False)
+
+
+def colours(devices: list[str]) -> dict[str, str]:
+    """The colour of each device, the same in all figures."""
+    return {name: COLORS[k % len(COLORS)] for k, name in enumerate(devices)}
+
+
+def faint(colour: str, share: float) -> str:
+    """``"#rrggbb"`` that lets through what is beneath."""
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return f"rgba({red},{green},{blue},{share:g})"
+
+
+def thin(n: int, most: int, peaks: Array | None = None) -> Rows:
+    """Which of ``n`` points are drawn, at most ``most``, ascending.
+
+    Evenly, and where ``peaks`` (n,) are given, half of them those with the greatest value
+    around, so that nothing that stands out is lost.
+    """
+    if n <= most:
+        return np.arange(n)
+    if peaks is None:
+        return np.unique(np.linspace(0, n - 1, most).round().astype(np.int64))
+    buckets = max(1, (most - 1) // 2)
+    edges = np.linspace(0, n, buckets + 1).astype(np.int64)
+    bucket = np.searchsorted(edges, np.arange(n), side="right")
+    order = np.lexsort((np.nan_to_num(peaks, nan=-np.inf), bucket))
+    greatest = order[np.flatnonzero(np.diff(bucket[order], append=bucket.max() + 1))]
+    return np.unique(np.concatenate([edges[:-1], greatest, [n - 1]]))
+
+
+def share_of_points(counts: list[int], most: int = MOST_POINTS) -> list[int]:
+    """How many points each device may draw: all, or in proportion, and at least 20."""
+    total = sum(counts)
+    if total <= most:
+        return counts
+    return [max(20, most * count // total) for count in counts]
+
+
+def drawn(shown: int, total: int) -> str:
+    """A sentence that says that not all is drawn, where that is so."""
+    if shown >= total:
+        return ""
+    return f"Drawn are {shown} of {total} poses, the outliers among them."
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """An axis with a title."""
+    return {"title": {"text": title}, **more}
+
+
+def sentences(*parts: str) -> str:
+    """Those that say something, one after the other."""
+    return " ".join(part for part in parts if part)

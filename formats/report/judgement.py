@@ -1,0 +1,285 @@
+"""How good a solution is: in one sentence, in key figures, in tables and in figures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from locatk.core.consistency import EDGES
+from locatk.core.metrics import Evaluation
+from locatk.core.statistics import Statistics
+from locatk.formats import plot_series
+from locatk.formats.plot_ground import has_no_scale
+from locatk.formats.plot_series import NORMAL_95, Series
+from locatk.formats.report.figures import Unit, colours, digits, length, sentences, unit_for
+from locatk.formats.report.figures_time import Row, errors_figure, histogram_figure, rows_figure
+from locatk.formats.report.panel import Panel, Table
+from locatk.formats.report.subject import Subject
+
+
+def unscaled(subject: Subject) -> bool:
+    """Whether lengths of the subject are in units of its scene, not in metres."""
+    evaluation = subject.evaluation
+    fitted = evaluation is not None and evaluation.align.startswith("sim")
+    return has_no_scale(subject.solution) and not fitted
+
+
+def verdict(subject: Subject) -> str:
+    """How good it is, in a sentence or two."""
+    solution, evaluation = subject.solution, subject.evaluation
+    if not solution.poses:
+        return "Nothing was solved: there is no pose."
+    if evaluation is None:
+        spread = _sigma(subject)
+        if not len(spread):
+            return f"{_why_unjudged(subject)} The solver tells no covariance either."
+        middle = length(float(np.median(spread)), unscaled=unscaled(subject))
+        return (
+            f"{_why_unjudged(subject)} The solver itself expects a standard deviation of "
+            f"{middle} (median over all poses, all axes together)."
+        )
+    unit = unscaled(subject)
+    text = (
+        f"Half of the poses lie within {length(evaluation.median, unscaled=unit)} of the truth, "
+        f"95 % within {length(evaluation.p95, unscaled=unit)}."
+    )
+    fitted = (
+        "Nothing was fitted on the truth."
+        if evaluation.align == "none"
+        else f"The alignment {evaluation.align} was fitted on the truth, on these same poses."
+    )
+    if evaluation.offset_s:
+        fitted += f" Time offset: {evaluation.offset_s:.4f} s ({evaluation.offset_source})."
+    consistency = evaluation.consistency
+    judged = "" if consistency is None else f"{consistency.words().capitalize()}."
+    return sentences(text, fitted, judged)
+
+
+def _why_unjudged(subject: Subject) -> str:
+    """Why there are no errors."""
+    if subject.truth:
+        if has_no_scale(subject.solution):
+            return (
+                "The scene has no scale (its unit is the distance of the first two stations), so "
+                "that it is not compared with the truth in metres; --align sim3 compares them."
+            )
+        return "No pose has truth at its time for its device, so that there are no errors."
+    if subject.session is not None:
+        return "The session holds no truth, so that there are no errors; --truth FILE gives it."
+    return "No truth is at hand, so that there are no errors; --truth FILE gives it."
+
+
+def _sigma(subject: Subject) -> np.ndarray:
+    found = [s.value for s in plot_series.sigmas(subject.solution).values()]
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def key_figures(subject: Subject) -> list[tuple[str, str]]:
+    """Values and what they are, for the head."""
+    solution, evaluation = subject.solution, subject.evaluation
+    unit = unscaled(subject)
+    devices = len(solution.trajectories)
+    found = [(f"{solution.poses:,}".replace(",", "\u202f"), _of(devices))]
+    if evaluation is not None:
+        found += [
+            (length(evaluation.median, unscaled=unit), "median error"),
+            (length(evaluation.p95, unscaled=unit), "95 % of errors below"),
+            (length(evaluation.max, unscaled=unit), "largest error"),
+        ]
+        if evaluation.ape_rotation is not None:
+            found.append((f"{digits(evaluation.ape_rotation.median)}\u00b0", "median turn error"))
+        if evaluation.coverage.share is not None:
+            found.append((f"{100 * evaluation.coverage.share:.1f} %", "of the time solved"))
+    else:
+        spread = _sigma(subject)
+        if len(spread):
+            middle, high = np.percentile(spread, (50, 95)).tolist()
+            found.append((length(middle, unscaled=unit), "median sigma"))
+            found.append((length(high, unscaled=unit), "95 % of sigmas below"))
+    rejected = sum(solution.rejected.values())
+    found.append((f"{rejected:,}".replace(",", "\u202f"), "observations rejected"))
+    return found
+
+
+def _of(devices: int) -> str:
+    return f"poses of {devices} {'device' if devices == 1 else 'devices'}"
+
+
+def error_panels(subject: Subject) -> list[Panel]:
+    """Errors against time, how often they occur, by axis, in a table; none without truth."""
+    evaluation = subject.evaluation
+    if evaluation is None:
+        return []
+    colors = colours([t.device for t in subject.solution.trajectories])
+    for name in evaluation.devices:
+        colors.setdefault(name, "#5b6875")
+    series = plot_series.errors(evaluation)
+    expected = plot_series.expected(subject.solution, evaluation)
+    unit = unit_for(evaluation.p95, unscaled=unscaled(subject))
+    figure, note = errors_figure(
+        series,
+        expected,
+        colors,
+        unit,
+        "error",
+        "where 95 % of the errors should be below, by the solver's covariance",
+    )
+    known = np.concatenate([s.value for s in expected.values()])
+    below = evaluation.errors <= known
+    told = np.isfinite(known)
+    if told.any() and evaluation.consistency is None:
+        share = 100 * np.count_nonzero(below[told]) / np.count_nonzero(told)
+        note = sentences(note, f"{share:.0f} % of the errors are below what it expects of 95 %.")
+    panels = [Panel("Error against time", note, figure)]
+    lines = {"median": evaluation.median, "95 %": evaluation.p95}
+    shown = histogram_figure(series, colors, unit, "error", lines)
+    panels.append(Panel("How often errors occur", "", shown))
+    panels.append(_by_axis(subject, evaluation, colors, unit))
+    panels += _rotation(evaluation, colors)
+    panels += _nees(evaluation, colors)
+    panels.append(Panel("Statistics", _how(evaluation), table=_statistics(evaluation, unit)))
+    return panels
+
+
+def _by_axis(subject: Subject, evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Panel:
+    covariance = plot_series.scored_covariance(subject.solution, evaluation)
+    band = NORMAL_95 * np.sqrt(np.einsum("nii->ni", covariance)) * unit.per_metre
+    rows = []
+    for k, name in enumerate("xyz"):
+        value = evaluation.residuals[:, k] * unit.per_metre
+        if k == 2 and not np.abs(value).max() > 1e-9 * unit.per_metre:
+            continue  # all on the plane of the truth
+        values, bands = {}, {}
+        for i, device in enumerate(evaluation.devices):
+            mine = evaluation.device == i
+            if mine.any():
+                values[device] = Series(evaluation.time_ns[mine], value[mine])
+                if np.isfinite(band[mine, k]).any():
+                    bands[device] = Series(evaluation.time_ns[mine], band[mine, k])
+        rows.append(Row(f"{name} [{unit.name}]", values, bands))
+    figure, note = rows_figure(rows, colors, signed=True)
+    with_bands = any(0 < len(row.bands) <= 3 for row in rows)
+    shaded = "95 % should lie within the thin lines, by the solver's covariance."
+    return Panel(
+        "Error by axis", sentences("Solved minus true.", shaded if with_bands else "", note), figure
+    )
+
+
+def _rotation(evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
+    known = np.isfinite(evaluation.rotation_errors_deg)
+    if not known.any():
+        return []
+    series = {}
+    for k, name in enumerate(evaluation.devices):
+        mine = known & (evaluation.device == k)
+        series[name] = Series(evaluation.time_ns[mine], evaluation.rotation_errors_deg[mine])
+    figure, note = errors_figure(series, {}, colors, Unit("\u00b0", 1.0), "rotation error")
+    return [Panel("Rotation error against time", note, figure)]
+
+
+def _nees(evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
+    known = np.isfinite(evaluation.nees) & (evaluation.nees_dof > 0)
+    if evaluation.consistency is None or not known.any():
+        return []
+    ratio = evaluation.nees / np.array(EDGES)[evaluation.nees_dof]
+    series = {}
+    for k, name in enumerate(evaluation.devices):
+        mine = known & (evaluation.device == k)
+        series[name] = Series(evaluation.time_ns[mine], ratio[mine])
+    figure, note = errors_figure(
+        series, {}, colors, Unit("of its 95 % edge", 1.0), "NEES", reference=1.0
+    )
+    consistency = evaluation.consistency
+    said = (
+        "Normalised estimation error squared: the error measured by the covariance that comes "
+        "with it, here over the value below which 95 % should be. "
+        f"{100 * consistency.inside:.0f} % of {consistency.n} poses are below 1; the mean over "
+        f"its expectation is {digits(consistency.mean)} (1 where the covariances are right)."
+    )
+    return [Panel("Does the covariance fit the error?", sentences(said, note), figure)]
+
+
+STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "p95")
+ERRORS = (
+    ("ape_translation", "APE translation"),
+    ("ape_rotation", "APE rotation"),
+    ("rpe_translation", "RPE translation"),
+    ("rpe_rotation", "RPE rotation"),
+)
+_HEAD = ("RMSE", "mean", "median", "SD", "min", "max", "95 %")
+
+
+def _statistics(evaluation: Evaluation, unit: Unit) -> Table:
+    """APE and RPE; of several devices also each of them."""
+    rows: list[tuple[str, ...]] = []
+
+    def add(what: str, device: str, of: Statistics | None, unit: str, factor: float) -> None:
+        if of is not None:
+            values = (digits(factor * getattr(of, name)) for name in STATISTICS)
+            rows.append((what, device, unit, str(of.n), *values))
+
+    every = {name: getattr(evaluation, name) for name, _ in ERRORS}
+    of_each = {name: evaluation.of_device(k) for k, name in enumerate(evaluation.devices)}
+    if len(of_each) > 1:
+        of_each = {"all": every, **of_each}
+    for name, title in ERRORS:
+        of, factor = (unit.name, unit.per_metre) if "translation" in name else ("\u00b0", 1.0)
+        for k, (device, found) in enumerate(of_each.items()):
+            add(title if k == 0 else "", device, found[name], of, factor)
+    return Table(("", "device", "unit", "n", *_HEAD), rows)
+
+
+def _how(evaluation: Evaluation) -> str:
+    """What the statistics mean, and what was left out."""
+    out = ", ".join(f"{count} {why}" for why, count in evaluation.unscored.items() if count)
+    parts = [
+        "APE: each pose against the truth at its time. "
+        f"RPE: the motion from each pose to {_apart(evaluation.rpe_delta)}, against the true one.",
+        f"Alignment: {evaluation.align}; time offset: {evaluation.offset_s:g} s "
+        f"({evaluation.offset_source}).",
+        f"Not scored: {out}." if out else "All poses are scored.",
+    ]
+    if evaluation.path_m:
+        path = f"The true path is {length(evaluation.path_m)} long"
+        path += f", the solved one {length(evaluation.path_estimate_m)}"
+        if evaluation.drift_percent is not None:
+            path += f"; drift {digits(evaluation.drift_percent)} % of it"
+        parts.append(path + ".")
+    return " ".join(parts)
+
+
+def _apart(delta: str) -> str:
+    """How far apart the poses of a pair are, in words."""
+    frames = delta.removesuffix("f")
+    if frames != delta:
+        return "the next" if frames == "1" else f"the one {frames} poses on"
+    return f"the one {delta} on"
+
+
+def sigma_panels(subject: Subject) -> list[Panel]:
+    """Standard deviations as the solver tells them, against time; none where it tells none."""
+    solution = subject.solution
+    colors = colours([t.device for t in solution.trajectories])
+    moved = [t for t in solution.trajectories if len(t)]
+    spreads = [t.sigma[:, :3][np.isfinite(t.sigma[:, :3])] for t in moved]
+    every = np.concatenate(spreads) if spreads else np.zeros(0)
+    size = float(np.percentile(every, 90)) if len(every) else 0.0
+    unit = unit_for(size, unscaled=has_no_scale(solution))
+    rows = []
+    for column, name, factor, of in (
+        (0, "x", unit.per_metre, unit.name),
+        (1, "y", unit.per_metre, unit.name),
+        (2, "z", unit.per_metre, unit.name),
+        (5, "heading", 180 / np.pi, "\u00b0"),
+    ):
+        values = {}
+        for t in moved:
+            sigma = t.sigma[:, column] * factor
+            if np.isfinite(sigma).any() and np.nanmax(sigma) > 0:
+                values[t.device] = Series(t.time_ns, sigma)
+        if values:
+            rows.append(Row(f"\u03c3 {name} [{of}]", values, {}))
+    if not rows:
+        return []
+    figure, note = rows_figure(rows, colors, signed=False)
+    said = "Standard deviations as the solver tells them, in its own frame."
+    return [Panel("Covariance against time", sentences(said, note), figure)]

@@ -1,0 +1,239 @@
+"""Camera frames: what the camera saw, and how surely it was decoded over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.dots.camera import Camera
+from locatk.core.dots.codec import Codec
+from locatk.core.dots.frames import Frames
+from locatk.core.dots.sheet import Manifest
+from locatk.core.errors import InputError, LocatkError
+from locatk.core.solution import Solution
+from locatk.formats import captured, sheets
+from locatk.formats import frames as camera_frames
+from locatk.formats.plot_ground import COLORS
+from locatk.formats.report import signals_drawing as drawing
+from locatk.formats.report.figures import label
+from locatk.formats.report.panel import Panel, Picture
+from locatk.formats.report.signals_drawing import number, one_a_pixel, short, told
+from locatk.formats.seen_text import words
+from locatk.formats.session import Session
+
+PICTURES = 8
+"""Frames that are shown, of all cameras together."""
+
+REJECTED_SHOWN = 3
+"""Reasons of rejection of which a frame is shown."""
+
+WIDTH_PX = 376
+"""About the width of a picture: the paper's frames twice as large as they are."""
+
+RED, BLUE = (0, 94, 213), (178, 114, 0)
+"""As OpenCV has them: blue, green, red."""
+
+Outcome = Mapping[str, Any]
+
+
+def panels(session: Session, solution: Solution) -> list[Panel]:
+    """Some frames of each camera, and how all of them were decoded."""
+    topics = sorted(
+        topic
+        for schema in camera_frames.SCHEMAS
+        for topic in session.topics(camera_frames.TOPIC, schema)
+    )
+    if not topics:
+        return []
+    outcomes: list[Outcome] = list(solution.facts.get("frames") or ())
+    notes = drawing.strangers(
+        solution, [topic.removeprefix(camera_frames.TOPIC) for topic in topics]
+    )
+    found = []
+    if not captured.is_few(session, topics):
+        frames: list[Frames] = []
+        notes.append("The recording is too large to look for single frames in it.")
+    else:
+        try:
+            frames = camera_frames.read_frames(session)
+        except LocatkError as error:
+            frames = []
+            notes.append(f"No frame can be shown: {error.message}.")
+    for each, mine in zip(frames, _by_camera(frames, outcomes), strict=True):
+        most = max(2, PICTURES // len(frames))
+        found.append(_pictures(session, solution, each, mine, most))
+    found.append(_over_time(session, outcomes, notes))
+    return found
+
+
+def _by_camera(frames: Sequence[Frames], outcomes: Sequence[Outcome]) -> list[list[Outcome | None]]:
+    """What became of each frame of each camera, by its name and time."""
+    known: dict[tuple[str, int], list[Outcome]] = {}
+    for each in reversed(outcomes):
+        known.setdefault((str(each["frame"]), _ms(number(each["time_s"]))), []).append(each)
+    found: list[list[Outcome | None]] = []
+    for camera in frames:
+        mine: list[Outcome | None] = []
+        for name, time_ns in zip(camera.names, camera.time_ns.tolist(), strict=True):
+            alike = known.get((name, _ms(time_ns * 1e-9)))
+            mine.append(alike.pop() if alike else None)
+        found.append(mine)
+    return found
+
+
+def _ms(time_s: float) -> int:
+    return round(1e3 * time_s)
+
+
+# ---- pictures
+
+
+def _pictures(
+    session: Session,
+    solution: Solution,
+    frames: Frames,
+    outcomes: Sequence[Outcome | None],
+    most: int,
+) -> Panel:
+    name = f"Frames of {frames.device}"
+    if not len(frames):
+        return Panel(name, "There are none.")
+    manifest = solution.artifact
+    codec, camera = None, None
+    if isinstance(manifest, Manifest):
+        try:
+            codec, camera = _codec(manifest), sheets.attached_camera(session)
+        except LocatkError:
+            codec = None
+    shown, unreadable = [], []
+    for k in _chosen(outcomes, most):
+        try:
+            image = frames.images[k]
+        except LocatkError as error:
+            unreadable.append(f"{error.message}.")
+            continue
+        outcome = outcomes[k]
+        decoded = outcome is not None and not outcome.get("rejected")
+        png = _png(image, codec if decoded else None, camera)
+        seconds = (int(frames.time_ns[k]) - drawing.start_ns(session)) * 1e-9
+        caption = f"frame {frames.names[k]}, {seconds:.2f} s: {_caption(outcome, solution)}"
+        shown.append(Picture(png, caption))
+    said = [
+        f"{len(shown)} of {len(frames)} frames, spread over the recording, among them one of each "
+        "reason of rejection. Circled are the dots that were decoded; the cross is the place that "
+        "the pose tells."
+    ]
+    return Panel(name, " ".join([*said, *unreadable]), pictures=tuple(shown))
+
+
+def _codec(manifest: Manifest) -> Codec:
+    from locatk.core.dots.codec import codec
+
+    return codec(manifest.codec)
+
+
+def _chosen(outcomes: Sequence[Outcome | None], most: int) -> list[int]:
+    """Frames to show: one of each reason of rejection, then some that are spread over the rest."""
+    reasons = [None if each is None else each.get("rejected") for each in outcomes]
+    rejected = [k for k, why in enumerate(reasons) if why and why not in reasons[:k]]
+    if len(reasons) > 1 and len(rejected) > min(REJECTED_SHOWN, most - 1):
+        rejected = rejected[: min(REJECTED_SHOWN, most - 1)]
+    others = [k for k, why in enumerate(reasons) if not why]
+    others = others or [k for k in range(len(reasons)) if k not in rejected]
+    count = min(most - len(rejected), len(others))
+    spread = np.linspace(0, len(others) - 1, count).round().astype(int).tolist()
+    return sorted([*rejected, *(others[k] for k in dict.fromkeys(spread))])
+
+
+def _png(image: NDArray[np.uint8], codec: Codec | None, camera: Camera | None) -> bytes:
+    """A frame about :data:`WIDTH_PX` wide, with what was decoded in it where ``codec`` is given."""
+    import cv2
+
+    from locatk.core.dots.locate import sightings
+
+    height, width = image.shape
+    scale = max(1, round(WIDTH_PX / width)) if width < WIDTH_PX else WIDTH_PX / width
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    way = cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA
+    picture = cv2.cvtColor(cv2.resize(image, size, interpolation=way), cv2.COLOR_GRAY2BGR)
+    fits = camera is None or camera.size == (width, height)
+    if codec is not None and fits:
+        try:
+            seen = next(sightings(image[None], codec, camera), None)
+        except InputError:
+            seen = None
+        for x, y in () if seen is None else (seen.pixels + 0.5) * scale:
+            cv2.circle(picture, (round(x), round(y)), 5, BLUE, 1, cv2.LINE_AA)
+        middle = ((width - 1) / 2, (height - 1) / 2) if camera is None else camera.centre_px
+        at = (round((middle[0] + 0.5) * scale), round((middle[1] + 0.5) * scale))
+        cv2.drawMarker(picture, at, RED, cv2.MARKER_CROSS, 17, 2, cv2.LINE_AA)
+    return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1])
+
+
+def _caption(outcome: Outcome | None, solution: Solution) -> str:
+    if outcome is None:
+        return "not in the solution"
+    if outcome.get("rejected"):
+        return f"rejected, {words(outcome['rejected'])}; {outcome.get('dots', 0)} dots"
+    key = outcome["frame"], outcome["time_s"]
+    found = next((e for e in solution.detections if (e["frame"], e["time_s"]) == key), None)
+    place = (
+        ""
+        if found is None
+        else f"at {told(found, 'x_m', 1e3, '.2f')}, {told(found, 'y_m', 1e3, '.2f')} mm, "
+        f"{np.degrees(number(found['heading_rad'])):.1f} deg; "
+    )
+    return (
+        f"{place}{outcome.get('dots', 0)} dots, {outcome.get('corrected_bits', 0)} bits corrected"
+    )
+
+
+# ---- numbers
+
+
+def _over_time(session: Session, outcomes: Sequence[Outcome], notes: list[str]) -> Panel:
+    """Confidence, corrected bits and dots of all frames."""
+    from plotly.subplots import make_subplots
+
+    title = "Decoding over time"
+    if not outcomes:
+        return Panel(title, " ".join(["The solution does not tell of single frames.", *notes]))
+    start = drawing.start_ns(session)
+    time_s = np.array([number(each["time_s"]) for each in outcomes]) - start * 1e-9
+    reason = np.array([each.get("rejected") or "" for each in outcomes], object)
+    series = (
+        ("confidence", "confidence [%]", 100.0),
+        ("corrected_bits", "bits corrected", 1.0),
+        ("dots", "dots on the grid", 1.0),
+    )
+    reasons = sorted(set(reason), key=lambda why: (why != "", why))
+    figure = make_subplots(3, 1, shared_xaxes=True, vertical_spacing=0.05)
+    thinned = False
+    for row, (key, what, scale) in enumerate(series, 1):
+        value = scale * np.array([number(each.get(key)) for each in outcomes])
+        for k, why in enumerate(reasons):
+            mine = np.flatnonzero((reason == why) & np.isfinite(value))
+            if not len(mine):
+                continue
+            kept = mine[one_a_pixel(time_s[mine], value[mine])]
+            thinned |= len(kept) < len(mine)
+            name = label(words(why)) or "decoded"
+            color = COLORS[k % len(COLORS)] if why else drawing.USED
+            figure.add_scatter(
+                x=short(time_s[kept]), y=short(value[kept]), mode="markers",
+                marker={"color": color, "size": 4, "symbol": "x" if why else "circle"},
+                name=f"{name} ({np.count_nonzero(reason == why)})",
+                legendgroup=why, showlegend=row == 1,
+                hovertemplate=f"%{{x:.2f}} s: %{{y:.6g}}<extra>{name}</extra>",
+                row=row, col=1,
+            )  # fmt: skip
+        figure.update_yaxes(title=what, rangemode="tozero", row=row, col=1)
+    figure.update_xaxes(title="time [s]", row=3, col=1)
+    drawing.style(figure, 520)
+    said = [f"Each mark is a frame. Time 0 is {drawing.clock(start)}."]
+    if thinned:
+        said.append("Thinned: where marks would hide each other one is drawn.")
+    return Panel(title, " ".join([*said, *notes]), figure)

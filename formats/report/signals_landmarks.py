@@ -1,0 +1,188 @@
+"""Hall sensors: the field under the robot over time, and the landmarks that were read in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import LocatkError
+from locatk.core.solution import Solution
+from locatk.formats import seen_text
+from locatk.formats.halls import KIND
+from locatk.formats.report import signals_drawing as drawing
+from locatk.formats.report.figures import label
+from locatk.formats.report.panel import Panel
+from locatk.formats.report.signals_drawing import Event, envelope, number, short, told
+from locatk.formats.report.signals_reading import MOST_DEVICES, excerpt, fields
+from locatk.formats.session import Session
+
+Array = NDArray[np.float64]
+
+MOST_VISITS = 6
+ROW = 3
+"""Visits that are drawn sample by sample, and how many in a row."""
+
+BEFORE_S, AFTER_S = 3.0, 1.5
+"""How much is drawn around the time of a sighting, which is near the end of a visit."""
+
+MARK_S = 0.25
+"""Half the width of the mark of a sighting, of which only one time is known."""
+
+
+def panels(session: Session, solution: Solution) -> list[Panel]:
+    """The channels of each robot with the landmarks that were read, and some from near."""
+    topics = session.topics(KIND.topic, KIND.schema)
+    read = excerpt(session, topics[:MOST_DEVICES])
+    devices = [topic.removeprefix(KIND.topic) for topic in topics]
+    notes = [*read.notes, *drawing.strangers(solution, devices)]
+    if len(devices) > MOST_DEVICES:
+        notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
+    found: list[Panel] = []
+    start_ns = drawing.start_ns(session)
+    for topic, payloads in read.payloads.items():
+        device = topic.removeprefix(KIND.topic)
+        name = f"Hall sensors of {device}"
+        try:
+            samples = fields(session, KIND, topic, payloads)
+        except LocatkError as error:
+            found.append(Panel(name, f"Not drawn: {error.message}."))
+            continue
+        time_s = drawing.seconds(samples.time_ns, start_ns)
+        field_mt = 1e3 * samples.field_t
+        names = _names(session, device, field_mt.shape[1])
+        seen = [each for each in solution.detections if each.get("device") == device]
+        events = [_event(each, start_ns) for each in seen]
+        found.append(_whole(name, time_s, field_mt, names, events, start_ns, notes))
+        found += _near(device, time_s, field_mt, names, seen, events)
+        notes = []  # told once
+    return found
+
+
+def _names(session: Session, device: str, count: int) -> list[str]:
+    """Of the sensors; numbers where they are not told."""
+    try:
+        sensors = KIND.attached(session, device)
+    except LocatkError:
+        sensors = None
+    if sensors is None or len(sensors) != count:
+        return [f"sensor {k + 1}" for k in range(count)]
+    return [label(name) for name in sensors.names]
+
+
+def _event(found: Mapping[str, Any], start_ns: int) -> Event:
+    """The time at which a sighting stands, with what was read."""
+    at = number(found["time_s"]) - start_ns * 1e-9
+    refused = label(seen_text.words(found.get("refused")))
+    cell = seen_text.cell(found.get("cell"))
+    what = " ".join(filter(None, (cell, label(found.get("pattern") or ""))))
+    hover = "<br>".join(
+        [
+            f"landmark {what}" if what else "nothing read",
+            f"{seen_text.sure(found.get('probability'))} % sure",
+            f"residual {told(found, 'residual_sigma', 1, '.2g')} sigma",
+            *([f"refused: {refused}"] if refused else []),
+        ]
+    )
+    name = "<br>".join(filter(None, (refused, cell, label(found.get("pattern") or ""))))
+    return Event(at - MARK_S, at + MARK_S, name, hover, refused)
+
+
+def _whole(
+    name: str,
+    time_s: Array,
+    field_mt: NDArray[Any],
+    names: list[str],
+    events: list[Event],
+    start_ns: int,
+    notes: list[str],
+) -> Panel:
+    """The whole recording of one robot."""
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(2, 1, shared_xaxes=True, row_heights=[0.22, 0.78], vertical_spacing=0.02)
+    for k, sensor in enumerate(names):
+        x, y = envelope(time_s, field_mt[:, k])
+        figure.add_scatter(
+            x=short(x), y=short(y), mode="lines", name=sensor,
+            line={"color": drawing.OTHERS[k % len(drawing.OTHERS)], "width": 1},
+            hovertemplate="%{x:.2f} s, %{y:.2f} mT", row=2, col=1,
+        )  # fmt: skip
+    drawing.strip(figure, events, ("used", "refused"), row=1, rows=(2,))
+    figure.update_yaxes(title="upright field [mT]", row=2, col=1)
+    figure.update_xaxes(title="time [s]", row=2, col=1)
+    figure.update_xaxes(range=[float(time_s[0]), float(time_s[-1])])
+    drawing.style(figure, 420)
+    said = [
+        "Above: the landmarks that were seen, row and column on the map and pattern; those that "
+        f"were refused with the reason. Time 0 is {drawing.clock(start_ns)}."
+    ]
+    if not events:
+        said.append("No landmark was found in it.")
+    if len(events) > drawing.MOST_LABELS:
+        said.append("Hovering over a mark tells which landmark it was.")
+    if len(time_s) > 2 * drawing.COLUMNS:
+        said.append("Thinned: each column of the picture shows its largest and smallest value.")
+    return Panel(name, " ".join([*said, *notes]), figure)
+
+
+def _near(
+    device: str,
+    time_s: Array,
+    field_mt: NDArray[Any],
+    names: list[str],
+    seen: list[dict[str, Any]],
+    events: list[Event],
+) -> list[Panel]:
+    """Some visits, sample by sample."""
+    from plotly.subplots import make_subplots
+
+    middle = [(each.start_s + each.stop_s) / 2 for each in events]
+    edges = np.searchsorted(time_s, np.add.outer([-BEFORE_S, AFTER_S], middle))
+    there = np.flatnonzero(edges[1] - edges[0] > 1).tolist()  # samples of it were read
+    seen, events = [seen[k] for k in there], [events[k] for k in there]
+    chosen = drawing.telling(
+        [each.refused for each in events],
+        [number(each.get("probability")) for each in seen],
+        MOST_VISITS,
+    )
+    if not chosen:
+        return []
+    lines = [events[k].hover.split("<br>") for k in chosen]
+    titles = [", ".join(each[:2]) + "<br>" + ", ".join(each[2:]) for each in lines]
+    rows = math.ceil(len(chosen) / ROW)
+    figure = make_subplots(
+        rows, ROW, shared_yaxes=True, horizontal_spacing=0.03, vertical_spacing=0.3 / rows,
+        subplot_titles=titles,
+    )  # fmt: skip
+    for place, number_of in enumerate(chosen):
+        event, where = events[number_of], {"row": place // ROW + 1, "col": place % ROW + 1}
+        at = (event.start_s + event.stop_s) / 2
+        inside = (time_s >= at - BEFORE_S) & (time_s <= at + AFTER_S)
+        for k, sensor in enumerate(names):
+            x, y = envelope(time_s[inside], field_mt[inside, k])
+            figure.add_scatter(
+                x=short(x), y=short(y), mode="lines", name=sensor,
+                line={"color": drawing.OTHERS[k % len(drawing.OTHERS)], "width": 1.2},
+                legendgroup=sensor, showlegend=place == 0,
+                hovertemplate="%{x:.2f} s, %{y:.2f} mT", **where,
+            )  # fmt: skip
+        color = drawing.REFUSED if event.refused else drawing.USED
+        figure.add_vline(x=at, line={"color": color, "width": 1.5, "dash": "dot"}, **where)
+        figure.update_xaxes(title="time [s]" if place >= len(chosen) - ROW else None, **where)
+    for row in range(rows):
+        figure.update_yaxes(title="field [mT]", row=row + 1, col=1)
+    drawing.style(figure, 90 + 230 * rows, margin_t=60)
+    figure.update_annotations(font_size=11)
+    return [
+        Panel(
+            f"Landmarks of {device} from near",
+            f"Drawn are {len(chosen)} of {len(seen)} visits: one of each reason of refusal, the "
+            "least sure one of the others, and the surest. The dotted line is the time of the "
+            "sighting.",
+            figure,
+        )
+    ]

@@ -1,0 +1,118 @@
+"""Raw signals of a recording for the eye: as much as is quickly read, whatever is whole."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from locatk.core.errors import FormatError
+from locatk.formats import captured, mcap_records
+from locatk.formats.mcap_records import DamageError, Segment
+from locatk.formats.messages import BatchError
+from locatk.formats.samples import Kind
+from locatk.formats.session import Session, reading
+
+MOST_READ = 8 << 20
+"""Bytes of a recording that are read to be drawn; of a larger one, parts spread over it."""
+
+MOST_DEVICES = 4
+"""So many devices are drawn; the others are named."""
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """Messages of some topics, and what a reader must know of them.
+
+    Attributes
+    ----------
+    payloads : dict of str to list of bytes
+        By topic, in the order of the file.
+    notes : tuple of str
+        That parts were left out, or are damaged.
+    """
+
+    payloads: dict[str, list[bytes]]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Samples of field sensors: times (n,) in ns, ascending, and fields (n, N * axes) in T."""
+
+    time_ns: NDArray[np.int64]
+    field_t: NDArray[np.float32]
+
+
+def excerpt(session: Session, topics: Collection[str], *, most: int | None = None) -> Excerpt:
+    """Messages of ``topics`` from at most ``most`` bytes of the file (:data:`MOST_READ`).
+
+    A part that is damaged is left out and told.
+    """
+    most = MOST_READ if most is None else most
+    names = {
+        entry.id: entry.topic for entry in session.index.channels.values() if entry.topic in topics
+    }
+    segments = [
+        each
+        for each in session.index.segments
+        if each.channels is None or not each.channels.isdisjoint(names)
+    ]
+    chosen = _spread(segments, most)
+    found: dict[str, list[bytes]] = {topic: [] for topic in sorted(topics)}
+    damaged = 0
+    with reading(session.path) as stream:
+        for segment in chosen:
+            try:
+                for channel, _, payload in mcap_records.read_messages(stream, segment, names):
+                    found[names[channel]].append(payload)
+            except DamageError:
+                damaged += 1
+    notes = []
+    if len(chosen) < len(segments):
+        held = captured.held_bytes(session, topics)
+        notes.append(
+            f"The recording is large ({held / 1e6:.0f} MB): drawn are {len(chosen)} parts spread "
+            f"over it, of {len(segments)}."
+        )
+    if damaged:
+        notes.append(
+            f"{damaged} of {len(chosen)} parts of the recording are damaged and are missing here."
+        )
+    return Excerpt(found, tuple(notes))
+
+
+def _spread(segments: list[Segment], most: int) -> list[Segment]:
+    """As many as ``most`` bytes hold, one at least, evenly over the file."""
+    total = sum(segment.length for segment in segments)
+    if total <= most:
+        return segments
+    count = max(1, len(segments) * most // total)
+    at = np.linspace(0, len(segments) - 1, count).round().astype(int)
+    return [segments[k] for k in np.unique(at)]
+
+
+def fields(session: Session, kind: Kind[Any], topic: str, payloads: list[bytes]) -> Fields:
+    """Samples of one device; where its sensors sit need not be known.
+
+    Raises
+    ------
+    FormatError
+        There are none, or a message is damaged.
+    """
+    try:
+        first: Any = kind.layout(1).message.FromString(payloads[0]) if payloads else None
+        if first is None or not first.sensors:
+            raise FormatError("no samples", file=session.path, where=topic)
+        batches = kind.layout(int(first.sensors)).unpack(payloads)
+    except (DecodeError, BatchError):
+        raise FormatError("a message is damaged", file=session.path, where=topic) from None
+    time_ns = batches.columns["time_ns"]
+    if not len(time_ns):
+        raise FormatError("no samples", file=session.path, where=topic)
+    order = np.argsort(time_ns, kind="stable")
+    return Fields(time_ns[order], batches.columns["b_tesla"].reshape(len(time_ns), -1)[order])

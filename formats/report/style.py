@@ -1,0 +1,199 @@
+"""How a report looks: colours, letters, the frame of figures, and the script that draws them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
+
+INK, FAINT, RULE, GRID = "#1d2733", "#5b6875", "#d5dbe1", "#e9edf1"
+
+_AXIS: dict[str, Any] = {
+    "gridcolor": GRID,
+    "linecolor": "#9aa7b3",
+    "tickcolor": "#9aa7b3",
+    "ticks": "outside",
+    "ticklen": 4,
+    "zeroline": False,
+    "automargin": True,
+    "title": {"standoff": 8, "font": {"size": 13}},
+}
+
+TEMPLATE: dict[str, Any] = {
+    "layout": {
+        "font": {"family": FONT, "size": 13, "color": INK},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "#ffffff",
+        "margin": {"l": 56, "r": 12, "t": 12, "b": 44},
+        "xaxis": _AXIS,
+        "yaxis": _AXIS,
+        "hovermode": "closest",
+        "hoverlabel": {"font": {"family": FONT, "size": 13}, "align": "left"},
+        "legend": {
+            "orientation": "h",
+            "x": 0,
+            "xanchor": "left",
+            "y": 1.0,
+            "yanchor": "bottom",
+            "font": {"size": 12.5},
+            "bgcolor": "rgba(0,0,0,0)",
+        },
+        "modebar": {"bgcolor": "rgba(255,255,255,0.7)", "color": "#8896a3"},
+    }
+}
+"""Of all figures of a page, in it once."""
+
+CONFIG: dict[str, Any] = {
+    "responsive": True,
+    "displaylogo": False,
+    "showSendToCloud": False,
+    "showTips": False,
+    "scrollZoom": False,
+    "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"],
+}
+
+SCRIPT = """\
+"use strict";
+(function () {
+  const shared = JSON.parse(document.getElementById("shared").textContent);
+  const figures = Array.from(document.querySelectorAll(".figure"));
+  // A finger on a figure scrolls the page.
+  const touch = !window.matchMedia("(hover: hover)").matches;
+  shared.config.displayModeBar = touch ? false : "hover";
+  // One after the other, so that the page can be read while they are drawn.
+  function draw(k) {
+    if (k >= figures.length) {
+      document.documentElement.dataset.drawn = String(figures.length);
+      return;
+    }
+    const figure = figures[k];
+    const spec = JSON.parse(document.getElementById(figure.id + "-data").textContent);
+    spec.layout.template = shared.template;
+    if (touch) { spec.layout.dragmode = false; }
+    // As high as wide, where the axes are equal and the window is narrow.
+    if (spec.layout.yaxis && spec.layout.yaxis.scaleanchor) {
+      const height = Math.min(figure.clientHeight, Math.max(300, 1.15 * figure.clientWidth));
+      figure.style.height = height + "px";
+    }
+    Plotly.newPlot(figure, spec.data, spec.layout, shared.config)
+      .then(function () { setTimeout(draw, 0, k + 1); });
+  }
+  draw(0);
+
+  // Paper is narrower than most windows.
+  function fit(width) {
+    for (const figure of figures) {
+      if (!figure.layout) { continue; }
+      const square = figure.layout.yaxis && figure.layout.yaxis.scaleanchor;
+      const height = figure.dataset.height || figure.style.height;
+      figure.dataset.height = height;
+      const low = Math.min(parseFloat(height), 0.72 * width) + "px";
+      figure.style.height = width && square ? low : height;
+      Plotly.relayout(figure, {width: width, autosize: width === null});
+    }
+  }
+  window.addEventListener("beforeprint", function () { fit(690); });
+  window.addEventListener("afterprint", function () { fit(null); });
+
+  for (const button of document.querySelectorAll("button.copy")) {
+    button.hidden = false;
+    button.addEventListener("click", function () {
+      const text = document.getElementById(button.dataset.of);
+      window.getSelection().selectAllChildren(text);
+      document.execCommand("copy");
+      button.textContent = "Copied";
+    });
+  }
+})();
+"""
+
+STYLE = """\
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+html { -webkit-text-size-adjust: 100%; scroll-behavior: smooth; }
+body {
+  margin: 0; background: #f3f5f7; color: #1d2733; line-height: 1.5; font-size: 16px;
+  font-family: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
+}
+main, body > header, body > footer { max-width: 1080px; margin: 0 auto; padding: 0 20px; }
+body > header { padding-top: 28px; }
+body > header .brand {
+  font-size: 13px; letter-spacing: .06em; text-transform: uppercase; color: #5b6875; margin: 0;
+}
+h1 { font-size: 30px; line-height: 1.2; margin: 2px 0 10px; overflow-wrap: anywhere; }
+h2 { font-size: 25px; line-height: 1.25; margin: 44px 0 4px; overflow-wrap: anywhere; }
+h3 { font-size: 18px; line-height: 1.3; margin: 0 0 2px; }
+p { margin: 0 0 10px; }
+a { color: #0060a0; }
+.sub { color: #5b6875; margin: 0 0 14px; overflow-wrap: anywhere; }
+.verdict { font-size: 18px; margin: 0 0 14px; max-width: 60em; }
+.tiles {
+  display: grid; gap: 10px; margin: 0 0 16px;
+  grid-template-columns: repeat(auto-fit, minmax(126px, 1fr));
+}
+.tile { background: #fff; border: 1px solid #d5dbe1; border-radius: 8px; padding: 8px 11px 9px; }
+.tile b {
+  display: block; font-size: 19px; white-space: nowrap; line-height: 1.25; font-weight: 600;
+}
+.tile span { font-size: 13px; color: #5b6875; display: block; line-height: 1.35; }
+.notes {
+  background: #fff8e6; border: 1px solid #ecd9a0; border-radius: 8px;
+  padding: 10px 16px; margin: 0 0 16px;
+}
+.notes ul { margin: 2px 0 0; padding-left: 20px; }
+.notes li { overflow-wrap: anywhere; }
+.panel {
+  background: #fff; border: 1px solid #d5dbe1; border-radius: 8px;
+  padding: 14px 18px 12px; margin: 0 0 16px;
+}
+.panel > p { color: #5b6875; font-size: 14.5px; max-width: 68em; }
+.figure { width: 100%; margin-top: 4px; }
+.table { overflow-x: auto; margin: 6px 0 4px; }
+table { border-collapse: collapse; font-size: 14.5px; font-variant-numeric: tabular-nums; }
+th {
+  text-align: left; font-weight: 600; color: #5b6875; border-bottom: 1px solid #b9c3cc;
+  white-space: nowrap;
+}
+th, td { padding: 4px 18px 4px 0; vertical-align: top; }
+td { border-bottom: 1px solid #e9edf1; overflow-wrap: anywhere; min-width: 9em; }
+td.short { white-space: nowrap; min-width: 0; }
+tr:last-child td { border-bottom: 0; }
+th.number, td.number { text-align: right; white-space: nowrap; min-width: 0; }
+pre {
+  background: #f3f5f7; border: 1px solid #d5dbe1; border-radius: 6px; padding: 9px 12px;
+  margin: 6px 0 10px; font-size: 14px; white-space: pre-wrap; overflow-wrap: anywhere;
+  font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, monospace;
+}
+.command { display: flex; gap: 10px; align-items: flex-start; }
+.command pre { flex: 1; }
+button.copy {
+  margin-top: 8px; font: inherit; font-size: 14px; padding: 5px 12px; border-radius: 6px;
+  border: 1px solid #b9c3cc; background: #fff; color: #1d2733; cursor: pointer;
+}
+.pictures { display: flex; flex-wrap: wrap; gap: 14px; margin-top: 8px; }
+.pictures figure { margin: 0; flex: 1 1 220px; max-width: 480px; }
+.pictures img { width: 100%; height: auto; border: 1px solid #d5dbe1; display: block; }
+.pictures figcaption { font-size: 13.5px; color: #5b6875; }
+details summary { cursor: pointer; color: #0060a0; font-size: 14.5px; }
+body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bottom: 36px; }
+@media (max-width: 600px) {
+  main, body > header, body > footer { padding-left: 10px; padding-right: 10px; }
+  .panel { padding: 12px 10px 8px; }
+  .tiles { grid-template-columns: repeat(2, 1fr); }
+  .tile { padding: 8px 10px; }
+  h1 { font-size: 24px; } h2 { font-size: 21px; }
+}
+@media print {
+  @page { margin: 12mm; }
+  body { background: #fff; font-size: 11pt; }
+  main, body > header, body > footer { max-width: none; padding: 0; }
+  .panel, .tile, .notes { break-inside: avoid; }
+  .panel { border: 0; padding: 6px 0; }
+  h2 { break-after: avoid; }
+  .subject + .subject { break-before: page; }
+  .table { overflow: visible; }
+  table { font-size: 9pt; }
+  th, td { padding-right: 10px; }
+  button.copy, .modebar { display: none !important; }
+}
+"""

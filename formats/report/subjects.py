@@ -1,0 +1,123 @@
+"""Subjects of a report, from files: the solution, its session, and the truth."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal
+
+from locatk.core import metrics
+from locatk.core.association import pair_devices
+from locatk.core.errors import FormatError, InputError, LocatkError
+from locatk.core.metrics import Evaluation
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats import trajectory_files
+from locatk.formats.plot_ground import has_no_scale
+from locatk.formats.report.subject import Subject
+from locatk.formats.session import Session
+from locatk.formats.solutions import read_solution
+from locatk.formats.tracks import read_truth
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    session: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    align: str = "none",
+    offset_s: float | Literal["auto"] = 0.0,
+) -> Subject:
+    """Read a solution and all that is at hand to judge it.
+
+    Parameters
+    ----------
+    path : path
+        The solution.
+    session : path, optional
+        The recording that was solved; by default the one beside the solution that bears the
+        name which the solution says, where there is one.
+    truth : path, optional
+        Reference poses in any format that `locatk eval` reads; by default the session's.
+    align : str
+        One of :data:`locatk.core.metrics.ALIGNMENTS`.
+    offset_s : float or "auto"
+        Added to the stamps of the solution, see :func:`locatk.core.metrics.evaluate_all`.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        ``path`` is no solution, ``session`` no session, or ``truth`` holds none.
+    DegenerateError
+        The poses do not determine the alignment or the offset.
+    """
+    solution = read_solution(path)
+    facts = Session.open(path).facts
+    recording = _beside(Path(path), facts, solution)
+    if session is not None:
+        recording = Session.open(session, damaged_ok=True)
+        if recording.facts.get("kind") == "solution":
+            raise FormatError(
+                "a solution, not a session", file=session, hint="Give the recording it was made of"
+            )
+    if truth is not None:
+        known = tuple(trajectory_files.read(Path(truth), role="truth"))
+    else:
+        known = () if recording is None else _truth_of(recording)
+    evaluation = _evaluate(solution, known, align, offset_s)
+    return Subject(Path(path).name, solution, facts, recording, known, evaluation)
+
+
+def _beside(path: Path, facts: dict[str, str], solution: Solution) -> Session | None:
+    """The session that the solution names, in the same folder; None where there is no such.
+
+    A file of that name from another time is another recording.
+    """
+    source = facts.get("source", "")
+    if not source or Path(source).name != source:
+        return None
+    there = path.parent / source
+    try:
+        if not there.is_file() or there.samefile(path):
+            return None
+        session = Session.open(there, damaged_ok=True)
+    except (LocatkError, OSError):
+        return None
+    if session.facts.get("kind") == "solution":
+        return None
+    ends = [int(t.time_ns[k]) for t in solution.trajectories if len(t) for k in (0, -1)]
+    if ends and session.start_ns is not None and session.end_ns is not None:
+        # Poses may be stamped a little before or after the messages they are made of.
+        slack = 5_000_000_000
+        if max(ends) < session.start_ns - slack or min(ends) > session.end_ns + slack:
+            return None
+    return session
+
+
+def _truth_of(session: Session) -> tuple[Trajectory, ...]:
+    """The session's truth, none where it cannot be read: the report is of the solution."""
+    try:
+        return tuple(read_truth(session))
+    except LocatkError:
+        return ()
+
+
+def _evaluate(
+    solution: Solution,
+    truth: tuple[Trajectory, ...],
+    align: str,
+    offset_s: float | Literal["auto"],
+) -> Evaluation | None:
+    """None where no pose has truth, or lengths cannot be compared."""
+    solved = [t for t in solution.trajectories if len(t)]
+    if has_no_scale(solution) and not align.startswith("sim"):
+        return None
+    pairs, _ = pair_devices(solved, list(truth))
+    if not pairs:
+        return None
+    try:
+        return metrics.evaluate_all(pairs, align=align, offset_s=offset_s)
+    except InputError:
+        if align == "none" and offset_s == 0.0:
+            return None
+        raise

@@ -1,0 +1,133 @@
+"""Tables of what a system saw, as text: the same words on a terminal and in a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+DEGREES = math.degrees(1)
+
+POSE = ("x [mm]", "y [mm]", "heading [deg]")
+SIGMAS = ("sigma x", "sigma y [mm]", "sigma heading [deg]")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A table; ``more`` is how many rows were left out."""
+
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    more: int = 0
+
+
+def tags(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
+    """Tags as arrays saw them, in the array's frame.
+
+    Parameters
+    ----------
+    detections : sequence of dict
+        Of a solution of ``polaris``.
+    most : int, optional
+        Rows; all by default.
+    """
+    shown = detections[:most]
+    arrays = len({found.get("device") for found in detections}) > 1
+    refused = any(found.get("refused") for found in shown)
+    header = (
+        *(["array"] if arrays else []),
+        "tag",
+        "margin [steps]",
+        "magnets",
+        *POSE,
+        *SIGMAS,
+        *(["refused"] if refused else []),
+    )
+    rows = [
+        (
+            *([str(found.get("device"))] if arrays else []),
+            "-" if found["tag_id"] is None else str(found["tag_id"]),
+            number(found["margin"], 1, ".2f"),
+            str(len(found["magnets"])),
+            *_pose(found),
+            *([words(found.get("refused"))] if refused else []),
+        )
+        for found in shown
+    ]
+    return Seen(header, rows, len(detections) - len(shown))
+
+
+def landmarks(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
+    """Landmarks, and the robot in the frame of each; parameters as of :func:`tags`."""
+    shown = detections[:most]
+    robots = len({found["device"] for found in detections}) > 1
+    refused = any(found["refused"] for found in shown)
+    header = (
+        "time (UTC)",
+        *(["robot"] if robots else []),
+        "cell",
+        "pattern",
+        "sure [%]",
+        *POSE,
+        *SIGMAS,
+        *(["refused"] if refused else []),
+    )
+    rows = [
+        (
+            clock(found["time_s"]),
+            *([found["device"]] if robots else []),
+            cell(found["cell"]) or "-",
+            found["pattern"] or "-",
+            sure(found["probability"]),
+            *_pose(found),
+            *([words(found["refused"])] if refused else []),
+        )
+        for found in shown
+    ]
+    return Seen(header, rows, len(detections) - len(shown))
+
+
+def _pose(found: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        number(found["x_m"], 1e3, ".2f"),
+        number(found["y_m"], 1e3, ".2f"),
+        number(found["heading_rad"], DEGREES, ".2f"),
+        number(found["sigma_x_m"], 1e3, ".2g"),
+        number(found["sigma_y_m"], 1e3, ".2g"),
+        number(found["sigma_heading_rad"], DEGREES, ".2g"),
+    )
+
+
+def words(reason: str | None) -> str:
+    """A reason of refusal as people read it."""
+    return (reason or "").replace("_", " ")
+
+
+def cell(found: Sequence[int] | None) -> str:
+    """Row and column of a landmark, "" where they are not known."""
+    return "" if found is None else ",".join(map(str, found))
+
+
+def sure(probability: float | None) -> str:
+    """In percent; what is not wholly sure is not rounded to 100."""
+    if probability is None or not math.isfinite(probability):
+        return "-"
+    percent = 100 * probability
+    return f"{percent:.1f}" if percent < 99.95 else "100" if percent >= 99.9995 else ">99.9"
+
+
+def clock(time_s: float) -> str:
+    """Time of day, to the millisecond."""
+    try:
+        return datetime.fromtimestamp(time_s, UTC).strftime("%H:%M:%S.%f")[:-3]
+    except (OverflowError, ValueError, OSError):
+        return f"{time_s:g} s"
+
+
+def number(value: float | None, scale: float, form: str) -> str:
+    """``value`` times ``scale`` in a format, "-" where it is not known."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return format(value * scale, form)
