@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import click
@@ -12,45 +13,111 @@ from locatk.cli import console, options
 if TYPE_CHECKING:
     from locatk.core.trajectory import Trajectory
 
+FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
+
+STDOUT = Path("-")
+
 
 @click.command(short_help="Write poses for other tools.")
 @options.input_argument("solution")
-@click.option("--format", "format_name", type=click.Choice(["csv", "tum"]), required=True)
-@options.output("File to write; for `tum` with several devices, the folder for them.")
+@click.option("--format", "format_name", type=click.Choice(FORMATS), required=True)
+@options.output(
+    "File to write; for `tum` and `kitti` with several devices, the folder for them; `-` writes "
+    "`csv` or `tum` to stdout."
+)
+@click.option("--device", "devices", multiple=True, metavar="NAME", help="Only this; repeatable.")
+@click.option("--covariance", is_flag=True, help="In `ros2`, poses with covariance as well.")
 @options.overwrite
+@options.as_json
 @options.verbosity
-def command(solution: Path, format_name: str, output: Path, overwrite: bool) -> None:
+def command(
+    solution: Path,
+    format_name: str,
+    output: Path,
+    devices: tuple[str, ...],
+    covariance: bool,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     """Write the poses of SOLUTION in the format of other tools.
 
-    `csv` has one row a pose: time_s, device, x_m, y_m, z_m, qx, qy, qz, qw, sigma_x_m,
-    sigma_y_m, sigma_z_m, sigma_heading_rad; a sigma that is not known is empty. `tum`
-    (for evo and others) holds one device a file.
+    SOLUTION is what `locatk solve` has written, or a session, whose reference poses are
+    taken.
+
+    \b
+    tum      time and pose, one device a file, for evo and others
+    kitti    3 x 4 matrices, one device a file; times in a file beside it
+    csv      time_s, device, x_m, y_m, z_m, qx, qy, qz, qw, sigma_x_m, sigma_y_m,
+             sigma_z_m, sigma_heading_rad; a sigma that is not known is empty
+    parquet  the same, exact times, frames, full covariances; needs locatk[parquet]
+    ros2     PoseStamped and TFMessage in MCAP, for ros2 bag, RViz and evo
 
     \b
     Examples:
       locatk export solved.mcap --format csv -o poses.csv
       locatk export solved.mcap --format tum -o poses.tum
+      locatk export solved.mcap --format ros2 -o poses.mcap
+      locatk export solved.mcap --format csv -o - | head
     """
-    from locatk.formats import trajectories
+    from locatk.formats import exports
     from locatk.formats.solutions import read_trajectories
 
-    found = read_trajectories(solution)
-    if format_name == "csv":
-        options.guard_output(output, overwrite=overwrite, inputs=[solution])
-        trajectories.write_csv(output, found, overwrite=overwrite)
-        console.result(f"Wrote {output}: {sum(map(len, found))} poses")
+    if covariance and format_name != "ros2":
+        raise click.UsageError("--covariance is for --format ros2; csv and parquet always have it.")
+    if output == STDOUT and (as_json or format_name not in exports.TEXTS):
+        what = "--json" if as_json else f"--format {format_name}"
+        raise click.UsageError(f"{what} does not go with -o -, which is for csv and tum.")
+    found = chosen(read_trajectories(solution), devices, solution)
+    if output == STDOUT:
+        click.echo(text(found, format_name), nl=False)
         return
-    files = tum_files(found, output)
-    for path, _ in files:
+
+    planned = exports.parts(found, format_name, output)
+    if planned[0].path != output:
+        options.make_folder(output)
+    for path in (path for part in planned for path in part.files):
         options.guard_output(path, overwrite=overwrite, inputs=[solution])
-    for path, trajectory in files:
-        trajectories.write_tum(path, trajectory, overwrite=overwrite)
-        console.result(f"Wrote {path}: {len(trajectory)} poses")
+    facts = exports.facts_of(solution)
+    for part in planned:
+        exports.write(part, format_name, facts=facts, covariance=covariance, overwrite=overwrite)
+        console.result(f"Wrote {part.path}: {sum(map(len, part.trajectories))} poses")
+        if part.times is not None:
+            console.say(f"Its lines have no times: they are in {part.times}")
+    if format_name == "ros2" and output.suffix != ".mcap":
+        console.warn(f"{output} does not end in .mcap, by which ros2 bag and evo know it")
+    if as_json:
+        files = [
+            {"path": part.path, "device": each.device, "poses": len(each), "times": part.times}
+            for part in planned
+            for each in part.trajectories
+        ]
+        console.emit_json({"version": 1, "input": solution, "format": format_name, "files": files})
 
 
-def tum_files(found: list[Trajectory], output: Path) -> list[tuple[Path, Trajectory]]:
-    """Which file each device goes to: ``output``, or one of its name in that folder."""
-    if len(found) == 1 and not output.is_dir():
-        return [(output, found[0])]
-    options.make_folder(output)
-    return [(output / f"{t.device.replace('/', '_')}.tum", t) for t in found]
+def chosen(found: list[Trajectory], devices: tuple[str, ...], solution: Path) -> list[Trajectory]:
+    """Those of these devices, or all where none is named."""
+    from locatk.core.errors import InputError
+
+    names = [trajectory.device for trajectory in found]
+    for device in devices:
+        if device not in names:
+            raise InputError(
+                f"no device {device!r}", file=solution, hint=f"There are {', '.join(names)}"
+            )
+    return [each for each in found if not devices or each.device in devices]
+
+
+def text(found: list[Trajectory], format_name: str) -> bytes:
+    """The file as it would be written."""
+    from locatk.core.errors import InputError
+    from locatk.formats import exports
+
+    if format_name in exports.ENDINGS and len(found) > 1:
+        raise InputError(
+            f"{len(found)} devices, and {format_name} holds one",
+            hint="Name one with --device, or a folder with -o",
+        )
+    with TemporaryDirectory(prefix="locatk-export-") as folder:
+        path = Path(folder) / "poses"
+        exports.write(exports.Part(path, tuple(found)), format_name)
+        return path.read_bytes()

@@ -91,6 +91,11 @@ def command(
             subjects.load(path, session=session, truth=truth, align=align, offset_s=offset)  # type: ignore[arg-type]
             for path, session in zip(solutions, given, strict=True)
         ]
+    for subject in found:
+        if subject.truth and subject.evaluation is None:
+            from locatk.formats.report.judgement import why_unjudged
+
+            console.warn(f"{subject.name}: {why_unjudged(subject)}")
     written = []
     with console.working("Drawing"):
         if page is not None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections import Counter
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, failures, options, seen
-from locatk.core.errors import LocatkError
+from locatk.cli import console, options, seen
 
 if TYPE_CHECKING:
     from locatk.cli.systems import Solved
@@ -32,9 +31,22 @@ speed_option = click.option(
 )
 
 
+def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
+    """Callback: a number of processes; 0 for one a core."""
+    if value != "auto" and not value.isdecimal():
+        raise click.BadParameter("give a number, or auto for one a core")
+    return 0 if value == "auto" else int(value)
+
+
 @click.command(short_help="Solve recorded sessions into poses.")
-@options.sessions
-@options.output("Solution to write (.mcap); with several sessions, the folder for them.")
+@click.argument("sessions", nargs=-1, required=True)
+@click.option(
+    "-o",
+    "--output",
+    metavar="PATH",
+    help="Solution to write (.mcap), or the folder for those of several sessions; a URL, too. "
+    "[default: <session>-solved.mcap beside each session]",
+)
 @options.method
 @scene_option
 @options.artifact
@@ -50,22 +62,47 @@ speed_option = click.option(
     metavar="FILE",
     help="Lighthouse: write the solved scene as an artifact (.toml) too, for --artifact.",
 )
+@click.option(
+    "--jobs",
+    metavar="N",
+    default="1",
+    callback=_jobs,
+    help="Sessions to solve at a time; 0 or auto for one a core.  [default: 1]",
+)
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Solve on the Dask cluster of this scheduler, tcp://host:8786 (extra locatk[dask]).",
+)
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Leave out what is solved: from the same session with the same options and version. "
+    "Outdated solutions are replaced.",
+)
 @options.overwrite
 @options.as_json
 @options.verbosity
 def command(
-    sessions: tuple[Path, ...],
-    output: Path,
+    sessions: tuple[str, ...],
+    output: str | None,
     method: str | None,
     scene: str | None,
     artifact: Path | None,
     camera: Path | None,
     speed: float | None,
     save_scene: Path | None,
+    jobs: int,
+    scheduler: str | None,
+    resume: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Solve SESSIONS and write the poses to OUTPUT.
+
+    SESSIONS are files, folders (each *.mcap in them that is no solution), patterns in quotes,
+    and URLs such as s3://bucket/day/*.mcap (extra locatk[s3]). A session that fails does not
+    stop the others. With --json there is one line a session, in the order of the sessions.
 
     The exit status is 3 where a session could not be solved, a device in it has no pose, a
     tag was not read, or a robot does not know where on the map it is; the rest is written
@@ -77,81 +114,64 @@ def command(
       locatk solve run.mcap -o solved.mcap --method paper --json
       locatk solve first.mcap -o solved.mcap --save-scene scene.toml
       locatk solve day/*.mcap -o solved/ --artifact scene.toml
+      locatk solve day/ -o solved/ --jobs auto --resume --json
+      locatk solve "s3://bucket/day/*.mcap" -o s3://bucket/solved --scheduler tcp://host:8786
       locatk solve frames.mcap -o solved.mcap --camera camera.toml
       locatk solve pass.mcap -o solved.mcap --artifact tag.toml --speed 0.105
       locatk solve drive.mcap -o solved.mcap --artifact map.toml --method field
     """
-    from locatk.cli.systems import Request, solve_session, system_of
-    from locatk.formats import artifacts, solutions
+    from locatk.cli import solve_batch
+    from locatk.cli.solve_all import solve_all
+    from locatk.cli.systems import Request, check_given
+    from locatk.formats.batch.find import find_sessions
 
-    outputs = plan_outputs(sessions, output)
-    if save_scene is not None and len(sessions) > 1:
-        raise click.UsageError("--save-scene needs exactly one session.")
-    if save_scene is not None and (system := system_of(sessions[0])) in (
-        "dots",
-        "landmarks",
-        "polaris",
-    ):
-        raise click.UsageError(f"--save-scene is for lighthouse: {system} solves no scene.")
-    aside = [path for path in (artifact, camera) if path is not None]
-    for path in outputs:
-        options.guard_output(path, overwrite=overwrite, inputs=[*sessions, *aside])
+    if scheduler is not None and jobs != 1:
+        raise click.UsageError("--jobs is for this machine: leave it out with --scheduler.")
+    if save_scene is not None and resume:
+        raise click.UsageError("--save-scene does not go with --resume.")
+    found = find_sessions(sessions, solve_batch.beside if output is None else None)
+    for place in found.passed_over:
+        console.detail(f"Passed over {place}: a solution")
+    names = found.sessions
     if save_scene is not None:
-        options.guard_output(save_scene, overwrite=overwrite, inputs=sessions)
+        check_scene(names)
+    outputs = solve_batch.plan_outputs(names, output, many=found.many)
+    aside = [path for path in (artifact, camera) if path is not None]
+    solve_batch.guard_outputs(
+        outputs, [*names, *map(str, aside)], overwrite=overwrite, resume=resume
+    )
+    if save_scene is not None:
+        given = [Path(name) for name in names]
+        options.guard_output(save_scene, overwrite=overwrite, inputs=[*given, *aside])
 
     request = Request(method, scene, artifact, camera, speed)
-    entries: list[dict[str, Any]] = []
-    losses: list[str] = []
-    said: list[tuple[str, list[str]]] = []
-    wait = console.working("Solving") if len(sessions) == 1 else contextlib.nullcontext()
-    with wait, console.progress(sessions, "Solving") as bar:
-        for session, target in zip(bar, outputs, strict=True):
-            try:
-                solved = solve_session(session, request)
-                solutions.write_solution(
-                    target, solved.solution, source=session, overwrite=overwrite
-                )
-                if save_scene is not None:
-                    artifacts.write_scene(save_scene, solved.solution.artifact, overwrite=overwrite)
-            except LocatkError as error:
-                if len(sessions) == 1:
-                    raise
-                losses.append(failures.describe(error))
-                entries.append({"session": session, "error": error.message, "hint": error.hint})
-                continue
-            entries.append(entry(session, target, solved))
-            losses += [f"{session}: {loss}" for loss in seen.lost(solved.solution)]
-            said.append((text(session, target, solved), notes(session, solved)))
-
-    for results, remarks in said:  # not inside the loop: a progress bar is there
-        console.result(results)
-        for remark in remarks:
-            console.say(remark)
-    if as_json:
-        console.emit_json({"version": 1, "sessions": entries})
-    if losses:
-        for loss in losses[1:]:
-            console.warn(loss)
-        if all("error" in item for item in entries):
-            raise click.ClickException(losses[0])
-        raise failures.Incomplete(losses[0])
+    if len(names) > 1:
+        check_given(request)
+    work = solve_batch.plan(
+        names,
+        outputs,
+        request,
+        overwrite=overwrite,
+        resume=resume,
+        detections=as_json,
+        save_scene=save_scene,
+        travels=scheduler is not None,
+    )
+    solve_all(work, workers=jobs, scheduler=scheduler, as_json=as_json)
 
 
-def plan_outputs(sessions: tuple[Path, ...], output: Path) -> list[Path]:
-    """Where each session's solution goes: ``output``, or a file of the session's name in it.
+def check_scene(sessions: Sequence[str]) -> None:
+    """Refuse --save-scene for what solves no scene."""
+    from locatk.formats.batch import places
 
-    A folder for several sessions is made.
-    """
-    if len(sessions) == 1 and not output.is_dir():
-        return [output]
-    twins = [name for name, count in Counter(p.stem for p in sessions).items() if count > 1]
-    if twins:
-        raise click.UsageError(f"Several sessions have the name {twins[0]!r}.")
-    options.make_folder(output)
-    return [output / f"{session.stem}.mcap" for session in sessions]
+    if len(sessions) > 1:
+        raise click.UsageError("--save-scene needs exactly one session.")
+    system = places.facts_of(sessions[0]).get("system")
+    if system in ("dots", "landmarks", "polaris"):
+        raise click.UsageError(f"--save-scene is for lighthouse: {system} solves no scene.")
 
 
-def entry(session: Path, output: Path, solved: Solved) -> dict[str, Any]:
+def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, Any]:
     """One session of ``--json`` (ARCHITECTURE 4; docs/commands.md)."""
     solution = solved.solution
     return {
@@ -167,7 +187,7 @@ def entry(session: Path, output: Path, solved: Solved) -> dict[str, Any]:
     }
 
 
-def text(session: Path, output: Path, solved: Solved) -> str:
+def text(session: str | Path, output: str | Path, solved: Solved) -> str:
     """The same for people: a line, a table of devices, and what was rejected."""
     solution = solved.solution
     # A scene that nothing measured has no metres.
@@ -178,10 +198,11 @@ def text(session: Path, output: Path, solved: Solved) -> str:
         f"{count} {reason.replace('_', ' ')}" for reason, count in solution.rejected.items()
     )
     saw = seen.seen(solution)
+    took = "solved before" if math.isnan(solved.solve_s) else f"{solved.solve_s:.3g} s"
     return "\n".join(
         [
             f"{session} -> {output}: {solution.poses} poses, {solution.system} by "
-            f"{solution.method}, {solved.solve_s:.3g} s",
+            f"{solution.method}, {took}",
             *([saw] if saw else []),
             *([console.table(header, rows)] if rows else []),
             f"rejected: {rejected or 'nothing'}",
@@ -189,9 +210,9 @@ def text(session: Path, output: Path, solved: Solved) -> str:
     )
 
 
-def notes(session: Path, solved: Solved) -> list[str]:
+def notes(session: str | Path, solved: Solved) -> list[str]:
     """What must be known to use the poses; said with ``--json`` too, on stderr."""
-    return [f"{session.name}: {note}" for note in solved.solution.notes]
+    return [f"{Path(session).name}: {note}" for note in solved.solution.notes]
 
 
 def _spread(sigma: Any) -> list[str]:

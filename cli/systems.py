@@ -182,11 +182,31 @@ def _solver(session: Session) -> Solver:
     )
 
 
-def system_of(path: Path) -> str:
-    """Name of the system whose session is at ``path``, "" where it does not say."""
-    from locatk.formats.session import Session
+def check_given(request: Request) -> None:
+    """Read the artifact and the camera that were given, so that a broken one is found before
+    many sessions are solved with it.
 
-    return Session.open(path).facts.get("system", "")
+    Artifacts that are not of locatk are for the solvers that know them.
+
+    Raises
+    ------
+    ArtifactError
+    """
+    from locatk.formats import artifacts, maps, sheets, tags, toml
+
+    readers: dict[str, Callable[[Path], Any]] = {
+        artifacts.SCENE_FORMAT: artifacts.read_scene,
+        sheets.MANIFEST_FORMAT: sheets.read_manifest,
+        tags.TAG_FORMAT: tags.read_tags,
+        maps.MAP_FORMAT: maps.read_map,
+    }
+    given = request.artifact
+    if given is not None and given.suffix.lower() == ".toml":
+        reader = readers.get(toml.read(given).text("format", ""))
+        if reader is not None:
+            reader(given)
+    if request.camera is not None:
+        sheets.read_camera(request.camera)
 
 
 def _check(

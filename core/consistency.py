@@ -65,23 +65,21 @@ class Consistency:
 
     def words(self) -> str:
         """What it says of the covariances, in one clause."""
-        if self.mean > self.high:
-            text = f"covariances are {_times(self.mean)} times too small"
-            if self.median < self.mean / 2:
-                text += f", most of it by a few poses (by the median {self._by_median()})"
-            return text
-        if self.mean < self.low:
-            return f"covariances are {_times(1 / self.mean)} times too large"
-        return "covariances agree with the errors"
-
-    def _by_median(self) -> str:
-        if self.median >= 1:
-            return f"{_times(self.median)} times too small"
-        return f"{_times(1 / self.median)} times too large"
+        if self.low <= self.mean <= self.high:
+            return "covariances agree with the errors"
+        text = f"covariances are {_size(self.mean)}"
+        if self.mean > self.high and self.median < self.mean / 2:
+            text += f", most of it by a few poses (by the median {_size(self.median)})"
+        return text
 
 
-def _times(factor: float) -> str:
-    return f"{factor:.0f}" if factor >= 9.95 else f"{factor:.2g}"
+def _size(mean: float) -> str:
+    """Of covariances, by the mean of their NEES."""
+    if mean < 1e-3:
+        return "far too large"
+    factor = max(mean, 1 / mean)
+    times = f"{factor:.0f}" if factor >= 9.95 else f"{factor:.2g}"
+    return f"{times} times too {'small' if mean > 1 else 'large'}"
 
 
 def nees(

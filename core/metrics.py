@@ -166,8 +166,8 @@ def evaluate_all(
         matched.append(pair.take(~window[pair.index]))
     if not any(len(m) for m in matched):
         raise _nothing(pairs, offset)
-    # Repeated poses of ``nearest`` are one pose with truth.
-    scored = sum(len(np.unique(m.index)) for m in matched)
+    # Poses that ``nearest`` repeats are one pose with truth; rows ascend.
+    scored = sum(np.count_nonzero(np.diff(m.index)) + (len(m) > 0) for m in matched)
     total, kept_out = sum(len(e) for e, _ in pairs), int(sum(w.sum() for w in windows))
     names = tuple(dict.fromkeys(e.device for e, _ in pairs))
     return _score(

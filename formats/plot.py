@@ -35,9 +35,6 @@ SUFFIXES = (".png", ".svg", ".pdf")
 SIZE_IN, DPI = (12.0, 6.0), 100
 """1200 x 600 pixels as PNG."""
 
-MOST_BANDS = 3
-"""Of more devices, what their covariances expect is not drawn: it would cover all else."""
-
 
 def plot_solution(
     path: str | os.PathLike[str],
@@ -153,7 +150,11 @@ def _draw_series(
             axes.set_yticks([])
         return
     every = np.concatenate([s.value for s in filled.values()])
-    top = plot_series.usual_top(every)
+    bands = {name: s for name, s in expected.items() if np.isfinite(s.value).any()}
+    if len(bands) > plot_series.MOST_BANDS:
+        bands = {}
+    edges = [s.value for s in bands.values()]
+    top = plot_series.usual_top(every, np.concatenate(edges) if edges else None)
     start = min(int(s.time_ns.min()) for s in filled.values())
     for name, s in filled.items():
         seconds = (s.time_ns - start) * 1e-9
@@ -161,27 +162,27 @@ def _draw_series(
         over_time.plot(seconds[~wild], s.value[~wild], ".", color=colors[name], ms=3)
         edge = np.full(np.count_nonzero(wild), 0.98 * top)
         over_time.plot(seconds[wild], edge, "^", color=colors[name], ms=5)
-    said = []
-    bands = {name: s for name, s in expected.items() if np.isfinite(s.value).any()}
-    if 0 < len(bands) <= MOST_BANDS:
-        for name, s in bands.items():
-            band = broken(s.value[:, None], s.time_ns)[:, 0]
-            seconds = broken(1e-9 * (s.time_ns[:, None] - start).astype(float), s.time_ns)[:, 0]
-            over_time.fill_between(seconds, band, color=colors[name], alpha=0.15, lw=0)
-        said.append("shaded: where 95 % should lie by the covariance")
+    for name, s in bands.items():
+        edge = broken(s.value[:, None], s.time_ns)[:, 0]
+        seconds = broken(1e-9 * (s.time_ns[:, None] - start).astype(float), s.time_ns)[:, 0]
+        over_time.plot(seconds, edge, color=colors[name], lw=0.9, alpha=0.6)
+        if len(bands) == 1:  # several shades cover each other
+            over_time.fill_between(seconds, edge, color=colors[name], alpha=0.12, lw=0)
     over_time.set_ylim(0, top)
     over_time.grid(color="0.92")
+    said = ["line: 95 % expected by the covariance"] if bands else []
     out = int(np.count_nonzero(every > top))
     if out:
         said.append(f"{out} of {len(every)} beyond this scale (triangles)")
-    over_time.set_title("; ".join(said), loc="left", fontsize=9)
+    over_time.set_title("\n".join(said), loc="left", fontsize=9)
+    usual = plot_series.usual_top(every)
     # Many colours on top of each other tell nothing.
     parts = [s.value for s in filled.values()], [colors[name] for name in filled]
     if len(filled) > IN_LEGEND:
         parts = [every], ["0.5"]
-    values = [np.minimum(value, top) for value in parts[0]]
-    spread.hist(values, bins=np.linspace(0, top, 41).tolist(), stacked=True, color=parts[1])
-    spread.set_xlim(0, top)
+    values = [np.minimum(value, usual) for value in parts[0]]
+    spread.hist(values, bins=np.linspace(0, usual, 41).tolist(), stacked=True, color=parts[1])
+    spread.set_xlim(0, usual)
     spread.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
@@ -201,6 +202,8 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
     )
     if evaluation is not None:
         text += f", MAE {_mm(evaluation.mae)}, RMSE {_mm(evaluation.rmse)}"
+        share = evaluation.coverage.share
+        text += "" if share is None else f", {100 * share:.1f} % of the time solved"
         text += f" (alignment: {evaluation.align}, time offset: {evaluation.offset_source})"
     notes = textwrap.wrap("; ".join(solution.notes), 160, max_lines=2, placeholder=" ...")
     return plain("\n".join(textwrap.wrap(text, 160) + notes))

@@ -19,6 +19,13 @@ _QUANTILE_95 = 1.644854
 """Below it lie 95 % of a standard normal distribution."""
 
 
+MOST_ROOM = 3
+"""By how much a scale is widened, at most, to show where values were expected to be."""
+
+MOST_BANDS = 3
+"""Of more devices, what their covariances expect is not drawn: it would cover all else."""
+
+
 @dataclass(frozen=True)
 class Series:
     """One number a pose: times (n,) in ns and values (n,), in metres."""
@@ -106,10 +113,16 @@ def expected_error(covariance: Array) -> Array:
     return np.where(known, np.sqrt(squared), np.nan)
 
 
-def usual_top(values: Array) -> float:
-    """Upper end of a scale that shows all but wild values; these are named beside it."""
+def usual_top(values: Array, edges: Array | None = None) -> float:
+    """Upper end of a scale that shows all but wild values; these are named beside it.
+
+    Where the ``edges`` of what was expected are not too far above, they are shown too.
+    """
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 1.0
     usual = 1.5 * float(np.percentile(finite, 98))
-    return 1.05 * min(float(finite.max()), usual) or 1.0
+    top = 1.05 * min(float(finite.max()), usual) or 1.0
+    if edges is None or not np.isfinite(edges).any():
+        return top
+    return max(top, min(1.2 * float(np.nanmedian(edges)), MOST_ROOM * top))

@@ -23,7 +23,9 @@ class Seen:
     more: int = 0
 
 
-def tags(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
+def tags(
+    detections: Sequence[dict[str, Any]], most: int | None = None, *, compact: bool = False
+) -> Seen:
     """Tags as arrays saw them, in the array's frame.
 
     Parameters
@@ -32,6 +34,8 @@ def tags(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
         Of a solution of ``polaris``.
     most : int, optional
         Rows; all by default.
+    compact : bool
+        Standard deviations stand behind the values, not in columns of their own.
     """
     shown = detections[:most]
     arrays = len({found.get("device") for found in detections}) > 1
@@ -42,7 +46,7 @@ def tags(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
         "margin [steps]",
         "magnets",
         *POSE,
-        *SIGMAS,
+        *(() if compact else SIGMAS),
         *(["refused"] if refused else []),
     )
     rows = [
@@ -51,7 +55,7 @@ def tags(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
             "-" if found["tag_id"] is None else str(found["tag_id"]),
             number(found["margin"], 1, ".2f"),
             str(len(found["magnets"])),
-            *_pose(found),
+            *_pose(found, compact),
             *([words(found.get("refused"))] if refused else []),
         )
         for found in shown
@@ -59,7 +63,9 @@ def tags(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
     return Seen(header, rows, len(detections) - len(shown))
 
 
-def landmarks(detections: Sequence[dict[str, Any]], most: int | None = None) -> Seen:
+def landmarks(
+    detections: Sequence[dict[str, Any]], most: int | None = None, *, compact: bool = False
+) -> Seen:
     """Landmarks, and the robot in the frame of each; parameters as of :func:`tags`."""
     shown = detections[:most]
     robots = len({found["device"] for found in detections}) > 1
@@ -71,7 +77,7 @@ def landmarks(detections: Sequence[dict[str, Any]], most: int | None = None) -> 
         "pattern",
         "sure [%]",
         *POSE,
-        *SIGMAS,
+        *(() if compact else SIGMAS),
         *(["refused"] if refused else []),
     )
     rows = [
@@ -81,7 +87,7 @@ def landmarks(detections: Sequence[dict[str, Any]], most: int | None = None) -> 
             cell(found["cell"]) or "-",
             found["pattern"] or "-",
             sure(found["probability"]),
-            *_pose(found),
+            *_pose(found, compact),
             *([words(found["refused"])] if refused else []),
         )
         for found in shown
@@ -89,14 +95,15 @@ def landmarks(detections: Sequence[dict[str, Any]], most: int | None = None) -> 
     return Seen(header, rows, len(detections) - len(shown))
 
 
-def _pose(found: dict[str, Any]) -> tuple[str, ...]:
-    return (
-        number(found["x_m"], 1e3, ".2f"),
-        number(found["y_m"], 1e3, ".2f"),
-        number(found["heading_rad"], DEGREES, ".2f"),
-        number(found["sigma_x_m"], 1e3, ".2g"),
-        number(found["sigma_y_m"], 1e3, ".2g"),
-        number(found["sigma_heading_rad"], DEGREES, ".2g"),
+def _pose(found: dict[str, Any], compact: bool) -> tuple[str, ...]:
+    scales = {"x_m": 1e3, "y_m": 1e3, "heading_rad": DEGREES}
+    values = [number(found[key], scale, ".2f") for key, scale in scales.items()]
+    sigmas = [number(found[f"sigma_{key}"], scale, ".2g") for key, scale in scales.items()]
+    if not compact:
+        return (*values, *sigmas)
+    return tuple(
+        value if "-" in (value, sigma) else f"{value} \u00b1 {sigma}"
+        for value, sigma in zip(values, sigmas, strict=True)
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import artifacts, maps, sheets, tags, viewers
+from locatk.formats import artifacts, maps, sheets, tags, viewer_points, viewers
 from locatk.formats.session import Session
 from locatk.formats.session_writer import SessionWriter
 from locatk.formats.tracks import (
@@ -53,6 +53,7 @@ def write_solution(
     solution: Solution,
     *,
     source: str | os.PathLike[str],
+    facts: Mapping[str, str] | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a solution as MCAP; the topics are those of docs/formats.md.
@@ -65,6 +66,9 @@ def write_solution(
         What a solver answered; it may hold no poses at all.
     source : path
         The session that was solved; its name is kept.
+    facts : mapping of str to str, optional
+        What it was made from, for the metadata record ``locatk``: ``command``,
+        ``source_bytes`` and more (:mod:`locatk.formats.batch.made`).
     overwrite : bool
         Replace an existing file.
 
@@ -78,9 +82,9 @@ def write_solution(
     starts = [int(t.time_ns[0]) for t in solution.trajectories if len(t) > 0]
     start = min(starts, default=0)
     name = Path(source).name
-    facts = {"method": solution.method, "source": name}
+    record = {**(facts or {}), "method": solution.method, "source": name}
     with SessionWriter(
-        path, kind="solution", system=solution.system, facts=facts, overwrite=overwrite
+        path, kind="solution", system=solution.system, facts=record, overwrite=overwrite
     ) as writer:
         for kind, file, dumps in ARTIFACTS:
             if isinstance(artifact, kind):
@@ -128,9 +132,13 @@ def _once(solution: Solution, start: int) -> list[Timed]:
     """What is said once, at the start: the artifact, whole paths, the log."""
     scene = viewers.scene_update(solution.artifact, solution.trajectories, start)
     said: list[Timed] = [(start, "/scene", scene)]
-    for t in solution.trajectories:
+    for frame, cloud in viewer_points.artifact_points(scene, start).items():
+        said.append((start, f"/artifact_points/{frame}", cloud))
+    for number, t in enumerate(solution.trajectories):
         if len(t) > 0:
             said.append((start, f"/path/{t.device}", viewers.path(t, start)))
+            points = viewer_points.path_points(t, number, start)
+            said.append((start, f"/path_points/{t.device}", points))
     for note in solution.notes:
         said.append((start, "/log", viewers.log(note, start)))
     for reason, count in solution.rejected.items():

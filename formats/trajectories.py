@@ -1,4 +1,4 @@
-"""Trajectories in files that other programs read: CSV with uncertainty, and TUM.
+"""Trajectories in files that other programs read: CSV with uncertainty, TUM and KITTI.
 
 Stamps are written from and read into integer nanoseconds, digit by digit: as float64,
 epoch seconds resolve 240 ns only. What is written can be read back, but for a file without
@@ -7,18 +7,30 @@ poses; reading is strict, and every error names file and line.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import FormatError, InputError
+from locatk.core.errors import InputError
+from locatk.core.geometry import matrix_from_quaternion, quaternion_from_matrix
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.table import Table, read_table, read_text
+from locatk.formats.importers.table import Table, read_table
+from locatk.formats.number_lines import format_time, parse_time, parse_times, read_rows
 from locatk.formats.output import atomic_write
+
+__all__ = [
+    "COLUMNS",
+    "format_time",
+    "parse_time",
+    "read_csv",
+    "read_kitti",
+    "read_tum",
+    "write_csv",
+    "write_kitti",
+    "write_tum",
+]
 
 Array = NDArray[np.float64]
 
@@ -39,48 +51,14 @@ COLUMNS = (
 )
 """Header of the CSV form; it stays as it is (docs/architecture.md)."""
 
+KITTI_COLUMNS = tuple(f"number {k}" for k in range(1, 13))
+
 SIGMA_AXES = (0, 1, 2, 5)
 """Where the four sigmas stand in a pose's covariance."""
-
-SIMPLE_TIME = re.compile(r"(-?)(\d{1,10})(?:\.(\d{1,9}))?", re.ASCII)
 
 NORM_TOLERANCE = 1e-2
 """Quaternions further from unit length are an error; nearer ones were rounded by their
 writer and are normalised."""
-
-
-def format_time(time_ns: int) -> str:
-    """Epoch seconds with nine decimals, exactly."""
-    sign = "-" if time_ns < 0 else ""
-    seconds, rest = divmod(abs(int(time_ns)), 1_000_000_000)
-    return f"{sign}{seconds}.{rest:09d}"
-
-
-def parse_time(text: str) -> int:
-    """Nanoseconds since the epoch from decimal epoch seconds, exactly.
-
-    Digits beyond the ninth decimal are rounded; an exponent is allowed.
-
-    Raises
-    ------
-    ValueError
-        No finite number, or beyond the range of int64.
-    """
-    match = SIMPLE_TIME.fullmatch(text)
-    if match:
-        time_ns = int(match[2]) * 1_000_000_000 + int((match[3] or "").ljust(9, "0"))
-        time_ns = -time_ns if match[1] else time_ns
-    else:
-        try:
-            exact = Decimal(text.strip())
-            if not exact.is_finite() or exact.adjusted() > 12:
-                raise ValueError(f"{text!r} is no time")
-            time_ns = int(exact.scaleb(9).to_integral_value())
-        except InvalidOperation:
-            raise ValueError(f"{text!r} is no time") from None
-    if not -(2**63) <= time_ns < 2**63:
-        raise ValueError(f"{text!r} is beyond the range of time stamps")
-    return time_ns
 
 
 def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool = False) -> None:
@@ -225,32 +203,84 @@ def read_tum(path: Path, *, device: str | None = None, frame: str = "floor") -> 
     InputError
         A quaternion far from unit length, stamps that do not ascend.
     """
-    stamps, cells, lines = [], [], []
-    for number, line in enumerate(read_text(path).split("\n"), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) != 8:
-            raise FormatError(
-                f"{len(words)} words in a line of eight numbers",
-                file=path,
-                where=number,
-                hint="TUM lines are: time x y z qx qy qz qw",
-            )
-        stamps.append(words[0])
-        cells.append(words[1:])
-        lines.append(number)
-    if not lines:
-        raise FormatError("no poses", file=path, hint="TUM lines are: time x y z qx qy qz qw")
-    table = Table(
-        Path(path), dict(zip(COLUMNS[2:9], map(list, zip(*cells, strict=True)), strict=True)), lines
-    )
-    pose = np.stack([table.floats(name) for name in COLUMNS[2:9]], axis=1)
-    time = _times(stamps, path, lines)
-    _ascending(time, path, lines)
-    covariance = np.full((len(lines), 6, 6), np.nan)
+    rows = read_rows(path, ("time_s", *COLUMNS[2:9]), "TUM lines are: time x y z qx qy qz qw")
+    time = _times(rows.words, path, rows.lines)
+    _ascending(time, path, rows.lines)
+    pose = rows.values[:, 1:]
     name = Path(path).stem if device is None else device
-    return Trajectory(name, frame, time, pose[:, :3], _unit(pose[:, 3:], path, lines), covariance)
+    return Trajectory(
+        name,
+        frame,
+        time,
+        np.ascontiguousarray(pose[:, :3]),
+        _unit(pose[:, 3:], path, rows.lines),
+        _unknown(len(rows)),
+    )
+
+
+def write_kitti(path: Path, trajectory: Trajectory, *, overwrite: bool = False) -> None:
+    """Write one trajectory as KITTI: the upper three rows of each 4 x 4 pose, row by row.
+
+    KITTI knows no time: the rows are all that tells which pose is meant. Raises as
+    :func:`write_csv`.
+    """
+    _check(trajectory)
+    matrix = np.empty((len(trajectory), 3, 4))
+    matrix[:, :, :3] = matrix_from_quaternion(trajectory.quaternion)
+    matrix[:, :, 3] = trajectory.position
+    with atomic_write(path, overwrite=overwrite, mode="w") as stream:
+        stream.writelines(
+            " ".join(map(repr, row)) + "\n" for row in matrix.reshape(-1, 12).tolist()
+        )
+
+
+def read_kitti(path: Path, *, device: str | None = None, frame: str = "floor") -> Trajectory:
+    """Read a KITTI file; its rows are stamped 0, 1, 2 ... seconds.
+
+    Lines that start with ``#`` and blank lines are passed over.
+
+    Parameters
+    ----------
+    path : path
+    device : str, optional
+        Name of the device; the file's name without ending where None.
+    frame : str
+        Name of the frame, which the file does not tell.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        No such file; no text, no poses, lines without twelve numbers.
+    InputError
+        A matrix that is far from a rotation.
+    """
+    rows = read_rows(path, KITTI_COLUMNS, "KITTI lines are the rows of a 3 x 4 matrix")
+    matrix = rows.values.reshape(-1, 3, 4)
+    rotation = matrix[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = rotation @ rotation.transpose(0, 2, 1)
+        far = ~(np.abs(gram - np.eye(3)).max(axis=(1, 2)) <= 2 * NORM_TOLERANCE)
+        far |= ~(np.linalg.det(rotation) > 0)
+    if far.any():
+        raise InputError(
+            "a matrix that is no rotation",
+            file=path,
+            where=rows.lines[int(np.argmax(far))],
+            hint="KITTI lines are the rows of a 3 x 4 matrix: rotation, then position",
+        )
+    return Trajectory(
+        Path(path).stem if device is None else device,
+        frame,
+        1_000_000_000 * np.arange(len(rows), dtype=np.int64),
+        np.ascontiguousarray(matrix[:, :, 3]),
+        quaternion_from_matrix(rotation),
+        _unknown(len(rows)),
+    )
+
+
+def _unknown(n: int) -> Array:
+    """Covariances of n poses that tell none; one number in memory, which nobody writes to."""
+    return np.broadcast_to(np.nan, (n, 6, 6))
 
 
 def _check(trajectory: Trajectory) -> None:
@@ -264,22 +294,19 @@ def _check(trajectory: Trajectory) -> None:
         raise InputError(f"poses that are not numbers in the {name}", hint="leave them out")
 
 
-def _times(cells: list[str], path: Path, lines: list[int]) -> NDArray[np.int64]:
-    times = np.empty(len(cells), np.int64)
-    for i, cell in enumerate(cells):
-        try:
-            times[i] = parse_time(cell)
-        except ValueError:
-            raise InputError(
-                f"{cell[:40]!r} is no time in epoch seconds",
-                file=path,
-                where=lines[i],
-                hint="write it as 1690218696.074800000",
-            ) from None
-    return times
+def _times(cells: Sequence[str], path: Path, lines: Sequence[int]) -> NDArray[np.int64]:
+    def fail(row: int) -> InputError:
+        return InputError(
+            f"{cells[row][:40]!r} is no time in epoch seconds",
+            file=path,
+            where=lines[row],
+            hint="write it as 1690218696.074800000",
+        )
+
+    return parse_times(cells, fail)
 
 
-def _ascending(time: NDArray[np.int64], path: Path, lines: list[int]) -> None:
+def _ascending(time: NDArray[np.int64], path: Path, lines: Sequence[int]) -> None:
     late = time[1:] <= time[:-1]
     if late.any():
         raise InputError(
@@ -290,7 +317,7 @@ def _ascending(time: NDArray[np.int64], path: Path, lines: list[int]) -> None:
         )
 
 
-def _unit(quaternion: Array, path: Path, lines: list[int]) -> Array:
+def _unit(quaternion: Array, path: Path, lines: Sequence[int]) -> Array:
     length = np.linalg.norm(quaternion, axis=1)
     far = np.abs(length - 1) > NORM_TOLERANCE
     if far.any():

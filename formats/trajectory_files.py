@@ -103,10 +103,9 @@ def _kind_of_text(path: Path, head: bytes) -> Literal["tum", "kitti", "csv"]:
                 where=number,
                 hint=f"The header is {','.join(trajectories.COLUMNS[:9])},...",
             )
-        # A line of TUM that was cut is one of TUM, where the name says so.
-        if len(words) == 8 or path.suffix.lower() == ".tum":
+        if len(words) == 8:
             return "tum"
-        if len(words) == 12 or path.suffix.lower() == ".kitti":
+        if len(words) == 12:
             return "kitti"
         break
     else:

@@ -79,16 +79,21 @@ def transforms(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
         message = FrameTransform(
             timestamp=timestamp(time_ns),
             parent_frame_id=trajectory.frame,
-            child_frame_id=trajectory.device,
+            child_frame_id=child_frame(trajectory),
             translation=_vector(pose.position.x, pose.position.y, pose.position.z),
             rotation=pose.orientation,
         )
         yield time_ns, topic, message
 
 
+def child_frame(trajectory: Trajectory) -> str:
+    """Name of the device's own frame: the device's, unless the poses' frame has that name."""
+    return trajectory.device + ("_body" if trajectory.device == trajectory.frame else "")
+
+
 def path(trajectory: Trajectory, time_ns: int) -> PosesInFrame:
     """The whole path in one message, at most :data:`LONGEST_PATH` poses of it."""
-    keep = _thinned(len(trajectory))
+    keep = thinned(len(trajectory))
     return PosesInFrame(
         timestamp=timestamp(time_ns),
         frame_id=trajectory.frame,
@@ -195,7 +200,8 @@ def _vector(x: float, y: float, z: float) -> Vector3:
     return Vector3(x=x, y=y, z=z)
 
 
-def _thinned(n: int) -> NDArray[np.int64]:
+def thinned(n: int) -> NDArray[np.int64]:
+    """Which of n poses are drawn."""
     return np.unique(np.linspace(0, n - 1, min(n, LONGEST_PATH)).round().astype(np.int64))
 
 
@@ -359,7 +365,7 @@ def _loop(corners: NDArray[np.float64], color: Color, thickness: float) -> LineP
 
 
 def _line(trajectory: Trajectory, color: Color, time_ns: int) -> SceneEntity:
-    points = trajectory.position[_thinned(len(trajectory))].tolist()
+    points = trajectory.position[thinned(len(trajectory))].tolist()
     return SceneEntity(
         timestamp=timestamp(time_ns),
         frame_id=trajectory.frame,

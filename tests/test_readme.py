@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,11 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
     "README.md",
     # The page of commands is made from the commands and has a test of its own.
-    *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md")) if p.stem != "commands"),
+    *(
+        path.relative_to(ROOT).as_posix()
+        for path in sorted((ROOT / "docs").rglob("*.md"))
+        if path.stem != "commands"
+    ),
 ]
 
 
@@ -54,11 +59,13 @@ def command_of(words: list[str]) -> tuple[click.Command, list[str]]:
 def test_command_lines_are_valid_usage(
     root: Path, page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = (root / page).read_text(encoding="utf-8")
+    """Also of what is only shown: tests/test_guides.py runs the ```sh blocks."""
+    text = (root / page).read_text(encoding="utf-8").replace("\\\n", " ")
     monkeypatch.setattr(Path, "exists", lambda self, **_: True)
     for block in re.findall(r"^```(?:sh|console)\n(.*?)^```$", text, re.M | re.S):
-        for line in re.findall(r"^locatk (.*)$", block, re.M):
-            command, words = command_of(line.split("#")[0].split())
+        for line in re.findall(r"^(?:\$ )?locatk (.*)$", block, re.M):
+            words = shlex.split(re.split(r" (?:[|>&]|2>)", line)[0], comments=True)
+            command, words = command_of(words)
             command.make_context("example", words)
 
 

@@ -12,7 +12,7 @@ from plotly.graph_objects import Bar, Figure, Scatter
 from plotly.subplots import make_subplots
 
 from locatk.formats.plot_ground import IN_LEGEND, broken, short
-from locatk.formats.plot_series import Series, usual_top
+from locatk.formats.plot_series import MOST_BANDS, Series, usual_top
 from locatk.formats.report.figures import (
     MOST_POINTS,
     Array,
@@ -27,14 +27,8 @@ from locatk.formats.report.figures import (
 )
 from locatk.formats.report.style import INK
 
-MOST_BANDS = 3
-"""Of more devices, bands are not drawn: they would cover all else."""
-
 FEW = 800
 """Up to so many values of a diagram are marked by points on their line."""
-
-MOST_ROOM = 3
-"""By how much a scale is widened, at most, to show where values were expected to be."""
 
 BINS = 50
 
@@ -74,13 +68,12 @@ def errors_figure(
     filled = {name: s for name, s in series.items() if len(s.value)}
     figure = Figure()
     every = np.concatenate([s.value for s in filled.values()]) * unit.per_metre
-    top = usual_top(every)
     start = start_of([filled])
     counts = share_of_points([len(s.value) for s in filled.values()])
     bands = {name: s for name, s in expected.items() if np.isfinite(s.value).any()}
+    edge = _edges(bands)
+    top = usual_top(every, None if edge is None else edge * unit.per_metre)
     shaded = len(filled) == 1
-    if len(bands) <= MOST_BANDS:
-        top = _with_bands(top, bands, unit.per_metre)
     if reference is not None:
         top = max(top, 1.15 * reference)
         figure.add_hline(y=reference, line={"color": INK, "width": 1.2, "dash": "dash"})
@@ -128,12 +121,11 @@ def errors_figure(
     return figure, note
 
 
-def _with_bands(top: float, bands: dict[str, Series], factor: float) -> float:
-    """A scale that also shows where most of the bands end, where that is not too far away."""
-    if not bands:
-        return top
-    edge = np.concatenate([s.value for s in bands.values()]) * factor
-    return max(top, min(1.2 * float(np.nanmedian(edge)), MOST_ROOM * top))
+def _edges(bands: dict[str, Series]) -> Array | None:
+    """Where all bands end, in their unit; None where there are none, or too many to draw."""
+    if not 0 < len(bands) <= MOST_BANDS:
+        return None
+    return np.concatenate([s.value for s in bands.values()])
 
 
 def _look(name: str, color: str, k: int, devices: int) -> dict[str, Any]:
@@ -246,7 +238,7 @@ def rows_figure(rows: Sequence[Row], colors: dict[str, str], *, signed: bool) ->
         finite = {n: np.abs(s.value[np.isfinite(s.value)]) for n, s in row.values.items()}
         every = np.concatenate(list(finite.values()))
         bands = row.bands if len(row.bands) <= MOST_BANDS else {}
-        top = _with_bands(usual_top(every), bands, 1.0)
+        top = usual_top(every, _edges(bands))
         wild += int(np.count_nonzero(every > top))
         total += len(every)
         counts = share_of_points(

@@ -31,10 +31,10 @@ def verdict(subject: Subject) -> str:
     if evaluation is None:
         spread = _sigma(subject)
         if not len(spread):
-            return f"{_why_unjudged(subject)} The solver tells no covariance either."
+            return f"{why_unjudged(subject)} The solver tells no covariance either."
         middle = length(float(np.median(spread)), unscaled=unscaled(subject))
         return (
-            f"{_why_unjudged(subject)} The solver itself expects a standard deviation of "
+            f"{why_unjudged(subject)} The solver itself expects a standard deviation of "
             f"{middle} (median over all poses, all axes together)."
         )
     unit = unscaled(subject)
@@ -54,7 +54,7 @@ def verdict(subject: Subject) -> str:
     return sentences(text, fitted, judged)
 
 
-def _why_unjudged(subject: Subject) -> str:
+def why_unjudged(subject: Subject) -> str:
     """Why there are no errors."""
     if subject.truth:
         if has_no_scale(subject.solution):
@@ -157,7 +157,7 @@ def _by_axis(subject: Subject, evaluation: Evaluation, colors: dict[str, str], u
                     bands[device] = Series(evaluation.time_ns[mine], band[mine, k])
         rows.append(Row(f"{name} [{unit.name}]", values, bands))
     figure, note = rows_figure(rows, colors, signed=True)
-    with_bands = any(0 < len(row.bands) <= 3 for row in rows)
+    with_bands = any(0 < len(row.bands) <= plot_series.MOST_BANDS for row in rows)
     shaded = "95 % should lie within the thin lines, by the solver's covariance."
     return Panel(
         "Error by axis", sentences("Solved minus true.", shaded if with_bands else "", note), figure

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats.output import atomic_write, check_output, tool_version
 from locatk.formats.plot_ground import ground_of
@@ -14,6 +15,8 @@ from locatk.formats.report.figures import length
 from locatk.formats.report.figures_map import map_panels
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.subject import Subject
+
+GIVE_SESSION = "--session FILE gives it."
 
 
 def write_report(
@@ -87,14 +90,23 @@ def panels(subject: Subject) -> list[Panel]:
     found += judgement.error_panels(subject)
     found += judgement.sigma_panels(subject)
     found += seen.panels(subject.solution)
-    if subject.session is not None:
-        found += signals.panels(subject.session, subject.solution)
-    else:
-        source = subject.facts.get("source", "")
-        missing = f"The session {source} is not beside the solution" if source else "No session"
-        said = f"{missing}, so that its signals are not shown; --session FILE gives it."
-        found.append(Panel("Signals", said if source else said.replace(",", " is named,", 1)))
+    found += _signals(subject)
     return found + run_facts.run_panels(subject)
+
+
+def _signals(subject: Subject) -> list[Panel]:
+    """What was recorded, or why it is not shown."""
+    source = subject.facts.get("source", "")
+    if subject.session is None:
+        missing = f"The session {source} is not beside" if source else "No session is named in"
+        return [
+            Panel("Signals", f"{missing} the solution: its signals are not shown. {GIVE_SESSION}")
+        ]
+    try:
+        return signals.panels(subject.session, subject.solution)
+    except LocatkError as error:
+        # The report is of the solution, which is whole.
+        return [Panel("Signals", f"The session cannot be shown: {error}. {error.hint or ''}")]
 
 
 def _maps(subject: Subject) -> list[Panel]:

@@ -85,12 +85,12 @@ def _stations(solution: Solution) -> Panel:
 
 
 def _tags(solution: Solution) -> Panel:
-    table = seen_text.tags(solution.detections, MOST_ROWS)
+    table = seen_text.tags(solution.detections, MOST_ROWS, compact=True)
     margins = [number(each["margin"]) for each in solution.detections if not each.get("refused")]
     note = (
-        f"{len(margins)} of {counted(len(solution.detections), 'passes')} over magnets read as "
-        "tags. Tags are told in the frame of the bar; the margin is how much nearer the "
-        "id is than the next one, in steps of orientation."
+        f"{len(margins)} of {counted(len(solution.detections), 'passes')} over magnets were read "
+        "as tags. Tags are told in the frame of the bar, with the standard deviation; the margin "
+        "is how much nearer the id is than the next one, in steps of orientation."
     )
     figure = None
     if len(margins) > MOST_ROWS:
@@ -99,11 +99,11 @@ def _tags(solution: Solution) -> Panel:
 
 
 def _landmarks(solution: Solution) -> Panel:
-    table = seen_text.landmarks(solution.detections, MOST_ROWS)
+    table = seen_text.landmarks(solution.detections, MOST_ROWS, compact=True)
     refused = sum(bool(each["refused"]) for each in solution.detections)
     note = (
         f"{counted(len(solution.detections), 'visits')} to landmarks, {refused} refused. The robot "
-        "is told in the frame of the landmark."
+        "is told in the frame of the landmark, with the standard deviation."
     )
     figure = None
     if len(solution.detections) > MOST_ROWS:

@@ -83,7 +83,7 @@ def _dots() -> dict[str, Reason]:
 
 
 def _polaris() -> dict[str, Reason]:
-    from locatk.core.polaris import identify, reading
+    from locatk.core.polaris import reading
 
     return _of(
         "passes",
@@ -101,11 +101,10 @@ def _polaris() -> dict[str, Reason]:
             f"{reading.TIE_SIGMA:g} standard deviations.",
             "ambiguous": "The magnets can be read as different ids, or one id seems to lie in two "
             "places.",
-            "misfit": f"The magnets miss their cells, or the scale of the way is more than "
-            f"{100 * identify.SCALE_OFF:g} % off: tags of another spacing.",
-            "residual": f"The magnets explain the samples no better than "
-            f"{identify.USUAL_RESIDUAL:g} times the noise (median) or {identify.RESIDUAL:g} times "
-            "(rms), or the margin is small for what is left.",
+            "misfit": "The magnets miss their cells, or the scale of the way is far off: tags of "
+            "another spacing.",
+            "residual": "The magnets leave much more of the samples than noise, or the margin is "
+            "small for what they leave: debris, another way than was given, a drifting sensor.",
             "outside_grid": "A magnet lies outside of the tag's grid.",
             "cell_twice": "Two magnets lie in one cell.",
             "corner_occupied": "A magnet lies on the corner that tells the tag's orientation, "

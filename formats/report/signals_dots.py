@@ -20,7 +20,7 @@ from locatk.formats.plot_ground import COLORS
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel, Picture
-from locatk.formats.report.signals_drawing import number, one_a_pixel, short, told
+from locatk.formats.report.signals_drawing import number, one_a_pixel, told
 from locatk.formats.seen_text import words
 from locatk.formats.session import Session
 
@@ -211,7 +211,7 @@ def _over_time(session: Session, outcomes: Sequence[Outcome], notes: list[str]) 
     )
     reasons = sorted(set(reason), key=lambda why: (why != "", why))
     figure = make_subplots(3, 1, shared_xaxes=True, vertical_spacing=0.05)
-    thinned = False
+    thinned, traces = False, []
     for row, (key, what, scale) in enumerate(series, 1):
         value = scale * np.array([number(each.get(key)) for each in outcomes])
         for k, why in enumerate(reasons):
@@ -222,15 +222,16 @@ def _over_time(session: Session, outcomes: Sequence[Outcome], notes: list[str]) 
             thinned |= len(kept) < len(mine)
             name = label(words(why)) or "decoded"
             color = COLORS[k % len(COLORS)] if why else drawing.USED
-            figure.add_scatter(
-                x=short(time_s[kept]), y=short(value[kept]), mode="markers",
+            trace = drawing.scatter(
+                time_s[kept], value[kept], row, mode="markers",
                 marker={"color": color, "size": 4, "symbol": "x" if why else "circle"},
                 name=f"{name} ({np.count_nonzero(reason == why)})",
                 legendgroup=why, showlegend=row == 1,
                 hovertemplate=f"%{{x:.2f}} s: %{{y:.6g}}<extra>{name}</extra>",
-                row=row, col=1,
             )  # fmt: skip
+            traces.append(trace)
         figure.update_yaxes(title=what, rangemode="tozero", row=row, col=1)
+    figure.add_traces(traces)
     figure.update_xaxes(title="time [s]", row=3, col=1)
     drawing.style(figure, 520)
     said = [f"Each mark is a frame. Time 0 is {drawing.clock(start)}."]

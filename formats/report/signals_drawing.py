@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.formats.plot_ground import COLORS
-from locatk.formats.report.style import TEMPLATE
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -88,6 +87,20 @@ def short(value: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(value, np.float32)
 
 
+def scatter(
+    x: Any, y: Any, row: int, column: int = 1, columns: int = 1, **more: Any
+) -> dict[str, Any]:
+    """A trace for :meth:`Figure.add_traces`, which takes a tenth of the time of one at a time.
+
+    Values of an array are halved as :func:`short` does; ``row`` and ``column`` are those of a
+    figure of so many ``columns``.
+    """
+    number_of = (row - 1) * columns + column
+    axis = "" if number_of == 1 else str(number_of)
+    x, y = (short(each) if isinstance(each, np.ndarray) else each for each in (x, y))
+    return {"type": "scatter", "x": x, "y": y, "xaxis": f"x{axis}", "yaxis": f"y{axis}", **more}
+
+
 # ---- detections
 
 
@@ -125,13 +138,14 @@ def strip(
         drawn = [mine[k] for k in np.unique(np.linspace(0, len(mine) - 1, MOST_MARKS).astype(int))]
         x = [at for each in drawn for at in (each.start_s, each.stop_s, None)]
         y = [at for _ in drawn for at in (0.5, 0.5, None)]
-        figure.add_scatter(
-            x=x, y=y, mode="lines", line={"color": color, "width": 3 if many else 9},
-            hoverinfo="skip", showlegend=False, row=row, col=1,
+        bars = scatter(
+            x, y, row, mode="lines", line={"color": color, "width": 3 if many else 9},
+            hoverinfo="skip", showlegend=False,
         )  # fmt: skip
-        figure.add_scatter(
-            x=[(each.start_s + each.stop_s) / 2 for each in drawn],
-            y=[0.5] * len(drawn),
+        marks = scatter(
+            [(each.start_s + each.stop_s) / 2 for each in drawn],
+            [0.5] * len(drawn),
+            row,
             mode="markers+text" if len(events) <= MOST_LABELS else "markers",
             text=[each.label for each in drawn],
             textposition="top center",
@@ -146,18 +160,24 @@ def strip(
             },
             name=f"{name} ({len(mine)})",
             legendgroup=name,
-            row=row,
-            col=1,
         )
+        figure.add_traces([bars, marks])
     figure.update_yaxes(range=[0, 1.6], visible=False, fixedrange=True, row=row, col=1)
     if len(events) <= MOST_LABELS:
-        for each in events:
-            color = REFUSED if each.refused else USED
-            for below in rows:
-                figure.add_vrect(
-                    x0=each.start_s, x1=each.stop_s, fillcolor=color, opacity=0.1, line_width=0,
-                    layer="below", row=below, col=1,
-                )  # fmt: skip
+        spans = [
+            {
+                "type": "rect",
+                **{"xref": f"x{below}", "x0": each.start_s, "x1": each.stop_s},
+                **{"yref": f"y{below} domain", "y0": 0, "y1": 1},
+                "fillcolor": REFUSED if each.refused else USED,
+                "opacity": 0.1,
+                "line": {"width": 0},
+                "layer": "below",
+            }
+            for each in events
+            for below in rows  # from 2 on: plotly calls the axes of row 1 x and y
+        ]
+        figure.update_layout(shapes=spans)
 
 
 def telling(refused: Sequence[str], sure: Sequence[float], most: int) -> list[int]:
@@ -176,9 +196,8 @@ def telling(refused: Sequence[str], sure: Sequence[float], most: int) -> list[in
 
 
 def style(figure: Figure, height: int, **more: Any) -> None:
-    """The same look for every figure of signals."""
+    """The same look for every figure of signals; the page knows letters and colours."""
     figure.update_layout(
-        template=TEMPLATE,
         height=height,
         margin={"l": 64, "r": 12, "t": 24, "b": 44},
         legend={

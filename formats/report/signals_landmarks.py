@@ -16,7 +16,7 @@ from locatk.formats.halls import KIND
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
-from locatk.formats.report.signals_drawing import Event, envelope, number, short, told
+from locatk.formats.report.signals_drawing import Event, envelope, number, told
 from locatk.formats.report.signals_reading import MOST_DEVICES, excerpt, fields
 from locatk.formats.session import Session
 
@@ -104,13 +104,16 @@ def _whole(
     from plotly.subplots import make_subplots
 
     figure = make_subplots(2, 1, shared_xaxes=True, row_heights=[0.22, 0.78], vertical_spacing=0.02)
+    traces = []
     for k, sensor in enumerate(names):
         x, y = envelope(time_s, field_mt[:, k])
-        figure.add_scatter(
-            x=short(x), y=short(y), mode="lines", name=sensor,
+        trace = drawing.scatter(
+            x, y, 2, mode="lines", name=sensor,
             line={"color": drawing.OTHERS[k % len(drawing.OTHERS)], "width": 1},
-            hovertemplate="%{x:.2f} s, %{y:.2f} mT", row=2, col=1,
+            hovertemplate="%{x:.2f} s, %{y:.2f} mT",
         )  # fmt: skip
+        traces.append(trace)
+    figure.add_traces(traces)
     drawing.strip(figure, events, ("used", "refused"), row=1, rows=(2,))
     figure.update_yaxes(title="upright field [mT]", row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
@@ -158,21 +161,24 @@ def _near(
         rows, ROW, shared_yaxes=True, horizontal_spacing=0.03, vertical_spacing=0.3 / rows,
         subplot_titles=titles,
     )  # fmt: skip
+    traces = []
     for place, number_of in enumerate(chosen):
         event, where = events[number_of], {"row": place // ROW + 1, "col": place % ROW + 1}
         at = (event.start_s + event.stop_s) / 2
         inside = (time_s >= at - BEFORE_S) & (time_s <= at + AFTER_S)
         for k, sensor in enumerate(names):
             x, y = envelope(time_s[inside], field_mt[inside, k])
-            figure.add_scatter(
-                x=short(x), y=short(y), mode="lines", name=sensor,
+            trace = drawing.scatter(
+                x, y, place // ROW + 1, place % ROW + 1, ROW, mode="lines", name=sensor,
                 line={"color": drawing.OTHERS[k % len(drawing.OTHERS)], "width": 1.2},
                 legendgroup=sensor, showlegend=place == 0,
-                hovertemplate="%{x:.2f} s, %{y:.2f} mT", **where,
+                hovertemplate="%{x:.2f} s, %{y:.2f} mT",
             )  # fmt: skip
+            traces.append(trace)
         color = drawing.REFUSED if event.refused else drawing.USED
         figure.add_vline(x=at, line={"color": color, "width": 1.5, "dash": "dot"}, **where)
         figure.update_xaxes(title="time [s]" if place >= len(chosen) - ROW else None, **where)
+    figure.add_traces(traces)
     for row in range(rows):
         figure.update_yaxes(title="field [mT]", row=row + 1, col=1)
     drawing.style(figure, 90 + 230 * rows, margin_t=60)

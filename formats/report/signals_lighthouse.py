@@ -16,7 +16,7 @@ from locatk.formats.messages import SWEEPS, BatchError
 from locatk.formats.plot_ground import COLORS
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.panel import Panel
-from locatk.formats.report.signals_drawing import one_a_pixel, short
+from locatk.formats.report.signals_drawing import one_a_pixel
 from locatk.formats.report.signals_reading import MOST_DEVICES, excerpt
 from locatk.formats.session import Session
 
@@ -143,12 +143,13 @@ def _panel(
                     {"color": color, "size": 4, "symbol": symbol},
                 )  # fmt: skip
         count = np.histogram(time_s[here], edges)[0] / np.diff(edges)
-        figure.add_scatter(
-            x=short(edges), y=short(np.append(count, count[-1])), mode="lines",
+        rate = drawing.scatter(
+            edges, np.append(count, count[-1]), 2, mode="lines",
             line={"color": color, "width": 1.5, "shape": "hv"},
             name=f"channel {channel}", showlegend=False,
-            hovertemplate="%{x:.1f} s: %{y:.1f} sweeps a second", row=2, col=1,
+            hovertemplate="%{x:.1f} s: %{y:.1f} sweeps a second",
         )  # fmt: skip
+        figure.add_traces([rate])
     for left, words, color in (
         (held & ~posed, "no pose", drawing.REFUSED),
         (~held, "left out", LEFT_OUT),
@@ -182,10 +183,11 @@ _PLANES = ((0, "circle", ", plane 1"), (1, "circle-open", ", plane 2"), (-1, "ci
 def _marks(figure: Any, time_s: Array, degrees: Array, name: str, marker: dict[str, Any]) -> bool:
     """Draw sweeps; whether some of them were left out."""
     kept = one_a_pixel(time_s, degrees)
-    figure.add_scatter(
-        x=short(time_s[kept]), y=short(degrees[kept]), mode="markers", marker=marker,
-        name=name, hovertemplate="%{x:.3f} s: %{y:.2f} deg", row=1, col=1,
+    marks = drawing.scatter(
+        time_s[kept], degrees[kept], 1, mode="markers", marker=marker,
+        name=name, hovertemplate="%{x:.3f} s: %{y:.2f} deg",
     )  # fmt: skip
+    figure.add_traces([marks])
     return len(kept) < len(time_s)
 
 
@@ -205,8 +207,9 @@ def _poses(figure: Any, solution: Solution, device: str, start_ns: int, edges: A
     if not times:
         return
     count = np.histogram(np.concatenate(times), edges)[0] / np.diff(edges)
-    figure.add_scatter(
-        x=short(edges), y=short(np.append(count, count[-1])), mode="lines", name="poses",
+    rate = drawing.scatter(
+        edges, np.append(count, count[-1]), 2, mode="lines", name="poses",
         line={"color": "#222", "width": 2, "shape": "hv", "dash": "dot"},
-        hovertemplate="%{x:.1f} s: %{y:.1f} poses a second", row=2, col=1,
+        hovertemplate="%{x:.1f} s: %{y:.1f} poses a second",
     )  # fmt: skip
+    figure.add_traces([rate])

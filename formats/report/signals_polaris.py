@@ -151,12 +151,14 @@ def _whole(name: str, bar: _Bar, seen: list[dict[str, Any]], notes: list[str]) -
     strength = np.sqrt(np.sum(bar.field_ut**2, axis=2))
     thinned = _add_map(figure, bar, strength, seen)
     lines = [envelope(bar.time_s, strength[:, k]) for k in range(strength.shape[1])]
-    for k, color in enumerate(bar.colors()):
-        figure.add_scatter(
-            x=short(lines[k][0]), y=short(lines[k][1]), mode="lines",
-            line={"color": color, "width": 1}, name=bar.label(k),
-            hovertemplate="%{x:.2f} s, %{y:.1f} µT", row=3, col=1,
-        )  # fmt: skip
+    traces = [
+        drawing.scatter(
+            *lines[k], 3, mode="lines", line={"color": color, "width": 1}, name=bar.label(k),
+            hovertemplate="%{x:.2f} s, %{y:.1f} µT",
+        )
+        for k, color in enumerate(bar.colors())
+    ]  # fmt: skip
+    figure.add_traces(traces)
     drawing.strip(figure, events, ("read", "not read"), row=1, rows=(3,))
     figure.update_yaxes(title="across the bar [mm]" if bar.placed else "sensor", row=2, col=1)
     figure.update_yaxes(title="field [µT]", rangemode="tozero", row=3, col=1)
@@ -214,11 +216,12 @@ def _add_map(figure: Any, bar: _Bar, strength: NDArray[Any], seen: list[dict[str
         x, y = x[finite], y[finite]
         if len(x) and bar.placed:
             kept = drawing.one_a_pixel(x, y)
-            figure.add_scatter(
-                x=short(x[kept]), y=short(y[kept]), mode="markers", hoverinfo="skip",
+            circles = drawing.scatter(
+                x[kept], y[kept], 2, mode="markers", hoverinfo="skip",
                 marker={"symbol": "circle-open", "size": 9 if len(x) < MANY else 4, "color": color},
-                name="magnets, tag not read" if refused else "magnets of tags", row=2, col=1,
+                name="magnets, tag not read" if refused else "magnets of tags",
             )  # fmt: skip
+            figure.add_traces([circles])
     return run > 1
 
 
@@ -257,6 +260,7 @@ def _near(device: str, bar: _Bar, seen: list[dict[str, Any]]) -> list[Panel]:
         horizontal_spacing=0.03, vertical_spacing=0.04,
         subplot_titles=[each.hover.replace("<br>", ", ").split(", residual")[0] for each in events],
     )  # fmt: skip
+    traces = []
     for column, event in enumerate(events, 1):
         beside = BESIDE * max(event.stop_s - event.start_s, 0.1)
         inside = (bar.time_s >= event.start_s - beside) & (bar.time_s <= event.stop_s + beside)
@@ -264,13 +268,15 @@ def _near(device: str, bar: _Bar, seen: list[dict[str, Any]]) -> list[Panel]:
         for k, color in enumerate(bar.colors()):
             for axis in range(3):
                 x, y = envelope(time_s, field[:, k, axis])
-                figure.add_scatter(
-                    x=short(x), y=short(y), mode="lines",
+                trace = drawing.scatter(
+                    x, y, axis + 1, column, len(events), mode="lines",
                     line={"color": color, "width": 1}, name=bar.label(k), legendgroup=str(k),
                     showlegend=column == 1 and axis == 0,
-                    hovertemplate="%{x:.2f} s, %{y:.1f} µT", row=axis + 1, col=column,
+                    hovertemplate="%{x:.2f} s, %{y:.1f} µT",
                 )  # fmt: skip
+                traces.append(trace)
         figure.update_xaxes(title="time [s]", row=3, col=column)
+    figure.add_traces(traces)
     for axis, what in enumerate(AXES):
         figure.update_yaxes(title=f"{what} [µT]", row=axis + 1, col=1)
     drawing.style(figure, 560, legend_traceorder="reversed", margin_t=44)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from click.testing import Result
 
 from locatk.cli import systems
 from locatk.formats import artifacts
@@ -14,6 +16,14 @@ from locatk.formats.solutions import read_solution
 POSES = 20
 
 pytestmark = pytest.mark.usefixtures("requests")
+
+
+def lines(result: Result) -> list[dict[str, Any]]:
+    """The sessions of `--json`, one a line."""
+    answers = [json.loads(line) for line in result.stdout.splitlines()]
+    assert all(set(answer) == {"version", "sessions"} for answer in answers)
+    assert [answer["version"] for answer in answers] == [1] * len(answers)
+    return [entry for answer in answers for [entry] in [answer["sessions"]]]
 
 
 def test_json_is_the_contract(locatk, session: Path, tmp_path: Path) -> None:
@@ -98,7 +108,7 @@ def test_a_folder_takes_several_sessions(locatk, record, tmp_path: Path) -> None
     sessions = [record(tmp_path / f"{name}.mcap") for name in ("one", "two")]
     result = locatk("solve", *sessions, "-o", tmp_path / "out", "--json")
     assert result.exit_code == 0, result.stderr
-    outputs = [entry["output"] for entry in json.loads(result.stdout)["sessions"]]
+    outputs = [entry["output"] for entry in lines(result)]
     assert outputs == [str(tmp_path / "out" / f"{name}.mcap") for name in ("one", "two")]
     assert all(Path(output).exists() for output in outputs)
 
@@ -107,9 +117,9 @@ def test_one_bad_session_does_not_stop_the_others(locatk, record, tmp_path: Path
     sessions = [record(tmp_path / f"{name}.mcap") for name in ("one", "still", "two")]
     result = locatk("solve", *sessions, "-o", tmp_path / "out", "--json")
     assert result.exit_code == 3
-    entries = json.loads(result.stdout)["sessions"]
+    entries = lines(result)
     assert [entry.get("error") for entry in entries] == [None, "one robot standing still", None]
-    assert "\nIncomplete: " in result.stderr
+    assert "\nIncomplete: 1 of 3 sessions could not be solved.\n" in result.stderr
     assert "one robot standing still in " in result.stderr
     assert "still.mcap. Hint: Drive it around." in result.stderr
 
@@ -118,6 +128,8 @@ def test_all_bad_sessions_are_a_failure(locatk, record, tmp_path: Path) -> None:
     sessions = [record(tmp_path / f"still{n}.mcap") for n in range(2)]
     result = locatk("solve", *sessions, "-o", tmp_path / "out")
     assert result.exit_code == 1
+    assert result.stderr.endswith("Error: none of the 2 sessions could be solved.\n")
+    assert result.stderr.count("Warning: one robot standing still in ") == 2
     one = locatk("solve", sessions[0], "-o", tmp_path / "one.mcap")
     assert one.exit_code == 1
     assert one.stderr == (
@@ -142,6 +154,7 @@ def test_twins_and_files_for_folders_are_refused(locatk, record, tmp_path: Path)
     others = [twins[0], record(tmp_path / "other.mcap")]
     (tmp_path / "file").write_text("x")
     assert locatk("solve", *others, "-o", tmp_path / "file").exit_code == 1
+    assert locatk("solve", *others, "-o", tmp_path / "file.mcap").exit_code == 2
     scene = ("--save-scene", tmp_path / "scene.toml")
     assert locatk("solve", *others, "-o", tmp_path / "out", *scene).exit_code == 2
 
@@ -152,6 +165,8 @@ def test_what_is_no_session_is_refused(locatk, record, session: Path, tmp_path: 
     unknown = record(tmp_path / "unknown.mcap", system="sonar")
     empty = tmp_path / "empty.mcap"
     empty.touch()
+    hollow = tmp_path / "hollow"
+    hollow.mkdir()
     text = tmp_path / "text.mcap"
     text.write_text("hello, this is no recording at all")
     cut = tmp_path / "cut.mcap"
@@ -163,7 +178,8 @@ def test_what_is_no_session_is_refused(locatk, record, session: Path, tmp_path: 
         (text, "not an MCAP file"),
         (cut, "cut short"),
         (tmp_path / "missing.mcap", "No such file"),
-        (tmp_path, "folder"),
+        (tmp_path / "none*.mcap", "nothing matches"),
+        (hollow, "no *.mcap in the folder"),
     ):
         out = tmp_path / "out.mcap"
         result = locatk("solve", path, "-o", out)

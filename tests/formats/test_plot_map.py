@@ -17,7 +17,7 @@ from locatk.core.polaris.tag import AsBuilt, Placed, Tags, built_magnets
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plot import draw
-from locatk.formats.plot_map import tags_of
+from locatk.formats.plot_tags import tags_of
 
 ID = 4711
 BUILT = Tags(built={ID: AsBuilt(np.full((5, 2), 1e-3), np.full(5, 0.1), 3)})

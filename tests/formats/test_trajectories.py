@@ -1,4 +1,4 @@
-"""CSV and TUM files: exact round trips, and errors that name file and line."""
+"""CSV, TUM and KITTI files: exact round trips, and errors that name file and line."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError, OutputExistsError
-from locatk.core.geometry import rotation_exp
+from locatk.core.geometry import matrix_from_quaternion, rotation_exp
 from locatk.core.trajectory import Trajectory
+from locatk.formats import number_lines
 from locatk.formats import trajectories as t
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -89,6 +90,76 @@ def test_tum_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Traje
     np.testing.assert_array_equal(read.time_ns, written.time_ns)
     np.testing.assert_array_equal(read.position, written.position)
     np.testing.assert_array_equal(read.quaternion, written.quaternion)
+
+
+@given(poses())
+def test_kitti_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Trajectory) -> None:
+    file = tmp_path_factory.mktemp("kitti") / "poses.txt"
+    t.write_kitti(file, written)
+    read = t.read_kitti(file, device=written.device)
+    assert read.time_ns.tolist() == [10**9 * k for k in range(len(written))]
+    np.testing.assert_array_equal(read.position, written.position)
+    np.testing.assert_allclose(
+        matrix_from_quaternion(read.quaternion),
+        matrix_from_quaternion(written.quaternion),
+        atol=1e-12,
+    )
+
+
+def test_kitti_is_the_upper_three_rows(tmp_path: Path) -> None:
+    t.write_kitti(tmp_path / "a.txt", sample())
+    assert (tmp_path / "a.txt").read_text().splitlines()[1] == (
+        "1.0 0.0 0.0 0.75 0.0 1.0 0.0 1.0 0.0 0.0 1.0 0.125"
+    )
+    assert np.loadtxt(tmp_path / "a.txt").shape == (2, 12)
+
+
+WORDS = st.one_of(
+    st.sampled_from(["nan", "inf", "1_0", "0x1", "1e5", "-0.0", "1e400", "+1", ".5", "5.", "1d5"]),
+    st.floats(-2, 2).map(repr),
+    st.text("0123456789.eE+-_xn", max_size=6),
+)
+LINES = st.lists(WORDS, min_size=8, max_size=8).map(" ".join)
+STAMPS = st.one_of(st.integers(0, 9999999999).map(str), st.decimals(0, 3, places=9).map(str), WORDS)
+
+
+@given(
+    st.lists(st.tuples(STAMPS, st.one_of(st.just("0 0 0 0 0 0 1"), LINES)), max_size=4),
+    st.sampled_from(["\n", "\r\n", "\n\n", " \n", "\n# c\n"]),
+    st.sampled_from(["", "# head\n", "\ufeff", "\n"]),
+)
+def test_files_read_at_once_are_read_as_word_by_word(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[str, str]], end: str, head: str
+) -> None:
+    file = tmp_path_factory.mktemp("tum") / "poses.tum"
+    file.write_bytes((head + "".join(f"{a} {b}{end}" for a, b in rows)).encode())
+    quick = _outcome(file)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(number_lines, "_regular", lambda *_: None)
+        patch.setattr(number_lines, "_aligned_times", lambda _: None)
+        assert _outcome(file) == quick
+
+
+def _outcome(file: Path) -> object:
+    try:
+        read = t.read_tum(file)
+    except LocatkError as error:
+        return type(error), str(error), error.hint
+    return read.time_ns.tolist(), read.position.tolist(), read.quaternion.tolist()
+
+
+@given(
+    st.lists(st.integers(0, 2**63 - 1), min_size=1, max_size=5), st.integers(0, 12), st.booleans()
+)
+def test_stamps_at_once_are_those_one_by_one(stamps: list[int], places: int, cut: bool) -> None:
+    words = [t.format_time(each)[: len(t.format_time(each)) - 9 + places] for each in stamps]
+    words = [word.rstrip("0") for word in words] if cut else words
+
+    def fail(row: int) -> InputError:
+        return InputError(str(row))
+
+    expected = [t.parse_time(word) for word in words]
+    assert number_lines.parse_times(words, fail).tolist() == expected
 
 
 def sample(device: str = "robot") -> Trajectory:
@@ -223,7 +294,7 @@ def test_any_bytes_are_refused_in_one_line(
 ) -> None:
     file = tmp_path_factory.mktemp("junk") / "junk"
     file.write_bytes(content)
-    for read in (t.read_csv, t.read_tum):
+    for read in (t.read_csv, t.read_tum, t.read_kitti):
         with pytest.raises(LocatkError):
             read(file)
 

@@ -1,0 +1,266 @@
+"""``locatk eval`` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.core.geometry import quaternion_from_heading
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats import trajectories
+from locatk.formats.session_writer import SessionWriter
+from locatk.formats.solutions import write_solution
+from locatk.formats.tracks import truth_messages, write_streams
+
+START_NS = 1_700_000_000_000_000_000
+N = 600
+
+
+def drive(device: str = "red") -> Trajectory:
+    """A robot in the plane that turns on its way; its pose is known to 1 mm and 10 mrad."""
+    time = np.arange(N) * 0.05
+    heading = 0.4 * time + np.sin(0.9 * time)
+    step = 0.2 * 0.05
+    position = np.column_stack(
+        [np.cumsum(step * np.cos(heading)), np.cumsum(step * np.sin(heading)), 0 * time]
+    )
+    covariance = np.full((N, 6, 6), np.nan)
+    plane = np.array([0, 1, 5])
+    covariance[:, plane[:, None], plane] = np.diag([1e-6, 1e-6, 1e-4])
+    return Trajectory(
+        device,
+        "floor",
+        START_NS + np.round(time * 1e9).astype(np.int64),
+        position,
+        quaternion_from_heading(heading),
+        covariance,
+    )
+
+
+def solved(device: str = "red", factor: float = 1.0, late_ns: int = 0) -> Trajectory:
+    """With errors ``factor`` times as large as it says."""
+    true = drive(device)
+    rng = np.random.default_rng(7)
+    error = factor * rng.normal(0, [1e-3, 1e-3, 1e-2], (N, 3))
+    heading = 2 * np.arctan2(true.quaternion[:, 2], true.quaternion[:, 3]) + error[:, 2]
+    return replace(
+        true,
+        time_ns=true.time_ns + late_ns,
+        position=true.position + error[:, [0, 1, 2]] * [1, 1, 0],
+        quaternion=quaternion_from_heading(heading),
+    )
+
+
+def unknown(of: Trajectory) -> Trajectory:
+    return replace(of, covariance=np.full((len(of), 6, 6), np.nan))
+
+
+def session(path: Path, *truth: Trajectory) -> Path:
+    with SessionWriter(path, system="dots") as writer:
+        write_streams(writer, truth_messages(truth or [unknown(drive())]))
+    return path
+
+
+def solution(path: Path, *found: Trajectory) -> Path:
+    write_solution(path, Solution("dots", "lattice", found or (solved(),)), source="run.mcap")
+    return path
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return session(tmp_path / "run.mcap")
+
+
+@pytest.fixture
+def found(tmp_path: Path) -> Path:
+    return solution(tmp_path / "solved.mcap")
+
+
+def answer(locatk, *words: object) -> dict:
+    result = locatk("eval", *words, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.count("\n") == 1
+    return dict(json.loads(result.stdout))
+
+
+def test_json_says_all(locatk, run: Path, found: Path) -> None:
+    said = answer(locatk, found, "--truth", run)
+    assert said["version"] == 1
+    assert (said["n"], said["match"], said["align"]) == (N, "interpolate", "none")
+    assert said["ape"]["translation_m"]["rmse"] == said["rmse_m"] == pytest.approx(1.4e-3, rel=0.1)
+    assert said["ape"]["rotation_deg"]["rmse"] == pytest.approx(np.rad2deg(1e-2), rel=0.1)
+    assert said["rpe"]["delta"] == "1f"
+    assert said["rpe"]["translation_m"]["n"] == N - 1
+    assert said["rpe"]["rotation_deg"]["rmse"] == pytest.approx(np.rad2deg(1.4e-2), rel=0.1)
+    assert said["coverage"] == {"share": 1.0, "solved_s": 29.95, "truth_s": 29.95}
+    assert said["path_m"] == pytest.approx(0.01 * (N - 1), rel=1e-3)
+    assert said["path_estimate_m"] > said["path_m"]
+    assert 0 < said["drift"]["translation_percent"] < 1
+    assert said["nees"]["mean"] == pytest.approx(1, abs=0.12)
+    assert said["nees"]["dof"] == 3
+    assert set(said["devices"]) == {"red"}
+    assert said["devices"]["red"]["ape"] == said["ape"]
+
+
+def test_text_says_it_in_words(locatk, run: Path, found: Path, tmp_path: Path) -> None:
+    text = locatk("eval", found, "--truth", run, "--delta", "0.5m").stdout
+    for line in (
+        "RPE: of poses 0.5m apart",
+        "alignment: none, fitted on nothing",
+        "association: interpolate",
+        "time offset: 0.0000 s (none)",
+        "not scored: nothing",
+        "coverage: 100.0 % (29.9 of 29.9 s)",
+        "path: 5.9",
+        "drift: 0.",
+        "consistency: covariances agree with the errors (NEES ",
+    ):
+        assert line in text, line
+    assert "APE [mm]" in text
+    bold = solution(tmp_path / "bold.mcap", solved(factor=3.0))
+    said = locatk("eval", bold, "--truth", run).stdout
+    assert "covariances are 9" in said or "covariances are 8." in said
+    assert "times too small" in said
+
+
+def test_points_have_no_rotation(locatk, tmp_path: Path) -> None:
+    poses = drive()
+    point = Trajectory.from_positions(
+        "red", "floor", poses.time_ns, poses.position, np.full((N, 3, 3), 0.0) + np.eye(3) * 1e-6
+    )
+    run, found = session(tmp_path / "a.mcap", point), solution(tmp_path / "b.mcap", point)
+    assert answer(locatk, found, "--truth", run)["ape"]["rotation_deg"] is None
+    lines = locatk("eval", found, "--truth", run).stdout.splitlines()
+    assert "consistency: covariances are far too large" in lines[-1]
+    assert [line.split()[4] for line in lines if "[deg]" in line] == ["-", "-"]
+
+
+def test_any_file_on_either_side(locatk, run: Path, found: Path, tmp_path: Path) -> None:
+    trajectories.write_tum(tmp_path / "solved.txt", solved())
+    trajectories.write_csv(tmp_path / "solved.csv", [solved()])
+    trajectories.write_tum(tmp_path / "truth.txt", drive())
+    expected = answer(locatk, found, "--truth", run)["rmse_m"]
+    for mine in ("solved.mcap", "solved.csv", "solved.txt"):
+        for true in ("run.mcap", "truth.txt"):
+            said = answer(locatk, tmp_path / mine, "--truth", tmp_path / true)
+            assert said["rmse_m"] == pytest.approx(expected, rel=1e-12), (mine, true)
+            assert said["match"] == ("nearest" if {mine[-3:], true[-3:]} == {"txt"} else
+                                     "interpolate")  # fmt: skip
+    backward = locatk("eval", run, "--truth", found, "--json")
+    assert json.loads(backward.stdout)["rmse_m"] == pytest.approx(expected)
+    assert "holds no solved poses" in backward.stderr
+
+
+def test_kitti_is_compared_row_by_row(locatk, tmp_path: Path) -> None:
+    trajectories.write_kitti(tmp_path / "a.txt", solved())
+    trajectories.write_kitti(tmp_path / "b.txt", drive())
+    said = answer(locatk, tmp_path / "a.txt", "--truth", tmp_path / "b.txt")
+    assert (said["n"], said["match"], said["coverage"]["share"]) == (N, "nearest", 1.0)
+    assert said["rmse_m"] == pytest.approx(1.4e-3, rel=0.1)
+
+
+def test_several_devices_have_rows_of_their_own(locatk, tmp_path: Path) -> None:
+    run = session(tmp_path / "run.mcap", unknown(drive("blue")), unknown(drive("red")))
+    found = solution(tmp_path / "solved.mcap", solved("blue"), solved("red"), solved("green"))
+    result = locatk("eval", found, "--truth", run)
+    assert "no truth for green" in result.stderr
+    assert [line.split()[0] for line in result.stdout.splitlines()[1:13]] == (
+        ["all"] * 4 + ["blue"] * 4 + ["red"] * 4
+    )
+    said = answer(locatk, found, "--truth", run)
+    assert said["n"] == 2 * said["devices"]["red"]["n"] == 2 * N
+
+
+def test_clocks_months_apart(locatk, run: Path, tmp_path: Path) -> None:
+    later = 100 * 86_400 * 10**9 + 123_456_789
+    of = solved(late_ns=later)
+    keep = of.time_ns >= of.time_ns[0] + 10**9
+    cut = Trajectory(
+        "robot", "floor", of.time_ns[keep], of.position[keep], of.quaternion[keep],
+        of.covariance[keep],
+    )  # fmt: skip
+    found = solution(tmp_path / "later.mcap", cut)
+    lost = locatk("eval", found, "--truth", run)
+    assert lost.exit_code == 1
+    assert "--offset auto" in lost.stderr
+    said = answer(locatk, found, "--truth", run, "--offset", "auto")
+    assert said["offset_s"] == pytest.approx(-later / 1e9, abs=2e-3)
+    assert said["rmse_m"] < 2e-3
+    assert said["unscored"]["held out"] == pytest.approx(said["n"] / 3, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("--align", "best"), "best"),
+        (("--offset", "soon"), "soon"),
+        (("--offset", "nan"), "nan"),
+        (("--match", "any"), "any"),
+        (("--max-diff", "0"), "max-diff"),
+    ],
+)
+def test_wrong_usage(locatk, run: Path, found: Path, words: tuple[str, ...], what: str) -> None:
+    result = locatk("eval", found, "--truth", run, *words)
+    assert result.exit_code == 2
+    assert what in result.stderr
+
+
+TUM = "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n3 1 1 0 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("mine", "true", "words", "what"),
+    [
+        (TUM, TUM, ("--delta", "1km"), "no distance between poses"),
+        (TUM, "PK\x03\x04 zip", (), "first row"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", TUM, (), "does not ascend"),
+        (TUM, "1 0 nan 0 0 0 0 1\n", (), "finite"),
+        (TUM, "101 0 0 0 0 0 0 1\n102 1 0 0 0 0 0 1\n", (), "truth at its time"),
+        (TUM.splitlines()[0], TUM, ("--align", "se3"), "two poses or more"),
+        (TUM.splitlines()[0], TUM, ("--offset", "auto"), "only 0 poses"),
+        ("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n", TUM, ("--align", "se3"), "on a line"),
+        (TUM.replace("1 0 0 0", "0 0 0 0"), TUM, ("--align", "se2", "--offset", "9"), "time"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", TUM, (), "KITTI tells no times"),
+    ],
+)
+def test_bad_input_is_one_line_and_a_hint(
+    locatk, tmp_path: Path, mine: str, true: str, words: tuple[str, ...], what: str
+) -> None:
+    (tmp_path / "mine.txt").write_text(mine)
+    (tmp_path / "true.txt").write_text(true)
+    result = locatk("eval", tmp_path / "mine.txt", "--truth", tmp_path / "true.txt", *words)
+    assert result.exit_code == 1
+    assert what in result.stderr
+    assert "Hint: " in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+
+
+def test_one_pose_has_an_error_all_the_same(locatk, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("2 1 0.5 0 0 0 0 1\n")
+    (tmp_path / "b.txt").write_text(TUM)
+    said = answer(locatk, tmp_path / "a.txt", "--truth", tmp_path / "b.txt")
+    assert (said["n"], said["max_m"], said["rpe"]["translation_m"]) == (1, 0.5, None)
+    assert "drift: -" in locatk("eval", tmp_path / "a.txt", "--truth", tmp_path / "b.txt").stdout
+
+
+def test_tum_files_need_no_scipy_and_no_session(tmp_path: Path) -> None:
+    """They are heavy to import, and evaluating is to be quick."""
+    (tmp_path / "a.txt").write_text(TUM)
+    code = (
+        "import sys; from locatk.cli.app import app\n"
+        "try: app(['eval', 'a.txt', '--truth', 'a.txt', '--align', 'se3'])\n"
+        "except SystemExit as end: assert not end.code\n"
+        "print([m for m in ('scipy', 'mcap', 'google', 'cv2') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr

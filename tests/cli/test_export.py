@@ -1,0 +1,192 @@
+"""`locatk export` as a user runs it, in every format."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.cli import export
+from locatk.formats import exports, trajectories
+
+POSES = 20
+
+
+@pytest.fixture
+def solved(locatk, requests, session: Path, tmp_path: Path) -> Path:
+    out = tmp_path / "solved.mcap"
+    assert locatk("solve", session, "-o", out).exit_code == 0
+    return out
+
+
+@pytest.fixture
+def two(locatk, requests, record, tmp_path: Path) -> Path:
+    """Solved, of the devices `lab/blue` and `red`."""
+    out = tmp_path / "two-solved.mcap"
+    session = record(tmp_path / "two.mcap", ("red", "lab/blue"))
+    assert locatk("solve", session, "-o", out).exit_code == 0
+    return out
+
+
+def test_formats_are_those_of_the_writers() -> None:
+    assert export.FORMATS == exports.FORMATS
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "ros2"])
+def test_one_file_holds_all_devices(locatk, two: Path, tmp_path: Path, kind: str) -> None:
+    if kind == "parquet":
+        pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    out = tmp_path / f"poses.{'mcap' if kind == 'ros2' else kind}"
+    result = locatk("export", two, "--format", kind, "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr == ""
+    answer = json.loads(result.stdout)
+    assert answer == {
+        "version": 1,
+        "input": str(two),
+        "format": kind,
+        "files": [
+            {"path": str(out), "device": device, "poses": POSES, "times": None}
+            for device in ("lab/blue", "red")
+        ],
+    }
+    before = out.read_bytes()
+    again = locatk("export", two, "--format", kind, "-o", out)
+    assert again.exit_code == 1
+    assert again.stderr.count("\n") == 1
+    assert "--overwrite" in again.stderr
+    assert out.read_bytes() == before
+    assert locatk("export", two, "--format", kind, "-o", out, "--overwrite").exit_code == 0
+    assert out.read_bytes() == before
+
+
+def test_kitti_keeps_the_times_beside_the_matrices(locatk, solved: Path, tmp_path: Path) -> None:
+    out = tmp_path / "poses.txt"
+    result = locatk("export", solved, "--format", "kitti", "-o", out)
+    assert result.exit_code == 0, result.stderr
+    assert "times: they are in" in " ".join(result.stderr.split())
+    [wanted] = exports_of(solved)
+    matrices = np.loadtxt(out).reshape(-1, 3, 4)
+    assert np.array_equal(matrices[:, :, 3], wanted.position)
+    times = (tmp_path / "poses.times.txt").read_text().splitlines()
+    assert [trajectories.parse_time(time) for time in times] == wanted.time_ns.tolist()
+    # The times are guarded like the poses.
+    out.unlink()
+    assert locatk("export", solved, "--format", "kitti", "-o", out).exit_code == 1
+    assert not out.exists()
+
+
+def exports_of(path: Path) -> list[trajectories.Trajectory]:
+    from locatk.formats.solutions import read_trajectories
+
+    return read_trajectories(path)
+
+
+def test_a_folder_holds_a_file_a_device(locatk, two: Path, tmp_path: Path) -> None:
+    out = tmp_path / "poses"
+    result = locatk("export", two, "--format", "kitti", "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    files = json.loads(result.stdout)["files"]
+    assert [(each["device"], Path(each["path"]).name) for each in files] == [
+        ("lab/blue", "lab_blue.txt"),
+        ("red", "red.txt"),
+    ]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "lab_blue.times.txt",
+        "lab_blue.txt",
+        "red.times.txt",
+        "red.txt",
+    ]
+
+
+def test_two_devices_never_share_a_file(locatk, requests, record, tmp_path: Path) -> None:
+    session, out = record(tmp_path / "s.mcap", ("lab/blue", "lab_blue")), tmp_path / "solved.mcap"
+    assert locatk("solve", session, "-o", out).exit_code == 0
+    folder = tmp_path / "poses"
+    result = locatk("export", out, "--format", "tum", "-o", folder, "--overwrite")
+    assert result.exit_code == 1
+    assert "lab_blue.tum" in result.stderr
+    assert "--device" in result.stderr
+    assert not folder.exists()
+    one = tmp_path / "one.tum"
+    chosen = locatk("export", out, "--format", "tum", "--device", "lab/blue", "-o", one)
+    assert chosen.exit_code == 0
+    assert len(one.read_text().splitlines()) == POSES
+    bag = locatk("export", out, "--format", "ros2", "-o", tmp_path / "poses.mcap")
+    assert bag.exit_code == 1
+    assert "have the same name in ROS" in bag.stderr
+
+
+def test_a_session_gives_its_reference_poses(locatk, session: Path, tmp_path: Path) -> None:
+    out = tmp_path / "truth.tum"
+    assert locatk("export", session, "--format", "tum", "-o", out).exit_code == 0
+    [truth] = exports_of(session)
+    assert np.array_equal(trajectories.read_tum(out).position, truth.position)
+
+
+def test_stdout_gets_the_same_text_as_a_file(locatk, two: Path, tmp_path: Path) -> None:
+    out = tmp_path / "poses.csv"
+    assert locatk("export", two, "--format", "csv", "-o", out).exit_code == 0
+    piped = locatk("export", two, "--format", "csv", "-o", "-")
+    assert piped.exit_code == 0
+    assert piped.stdout_bytes == out.read_bytes()
+    assert piped.stderr == ""
+    several = locatk("export", two, "--format", "tum", "-o", "-")
+    assert several.exit_code == 1
+    assert several.stdout == ""
+    assert "2 devices" in several.stderr
+    one = locatk("export", two, "--format", "tum", "-o", "-", "--device", "red")
+    assert len(one.stdout.splitlines()) == POSES
+    for wrong in (["--format", "ros2"], ["--format", "kitti"], ["--format", "csv", "--json"]):
+        assert locatk("export", two, *wrong, "-o", "-").exit_code == 2
+    assert not Path("-").exists()
+
+
+def test_the_bag_knows_where_it_comes_from(locatk, solved: Path, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    out = tmp_path / "poses.mcap"
+    result = locatk("export", solved, "--format", "ros2", "--covariance", "-o", out)
+    assert result.exit_code == 0, result.stderr
+    with out.open("rb") as stream:
+        reader = make_reader(stream)
+        [record] = list(reader.iter_metadata())
+        summary = reader.get_summary()
+    assert record.metadata["method"] == "bundle"
+    assert record.metadata["source"] == "run.mcap"
+    assert "kind" not in record.metadata
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert topics == {"/pose/red", "/pose_with_covariance/red", "/tf"}
+    other = locatk("export", solved, "--format", "ros2", "-o", tmp_path / "poses.bag")
+    assert other.exit_code == 0
+    assert "does not end in .mcap" in other.stderr
+
+
+def test_what_does_not_go_is_said_in_one_line(locatk, solved: Path, tmp_path: Path) -> None:
+    out = tmp_path / "poses.csv"
+    unknown = locatk("export", solved, "--format", "csv", "--device", "blue", "-o", out)
+    assert unknown.exit_code == 1
+    assert unknown.stderr.count("\n") == 1
+    assert "There are red" in unknown.stderr
+    assert locatk("export", solved, "--format", "csv", "--covariance", "-o", out).exit_code == 2
+    assert locatk("export", solved, "--format", "csv", "-o", solved, "--overwrite").exit_code == 1
+    assert locatk("export", solved, "--format", "xlsx", "-o", out).exit_code == 2
+    assert locatk("export", solved, "--format", "csv").exit_code == 2
+    nowhere = locatk("export", solved, "--format", "ros2", "-o", tmp_path / "no" / "poses.mcap")
+    assert nowhere.exit_code == 1
+    assert nowhere.stderr.count("\n") == 1
+    assert not out.exists()
+
+
+def test_parquet_without_pyarrow(
+    locatk, solved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    result = locatk("export", solved, "--format", "parquet", "-o", tmp_path / "poses.parquet")
+    assert result.exit_code == 1
+    assert 'pip install "locatk[parquet]"' in result.stderr
+    assert result.stderr.count("\n") == 1

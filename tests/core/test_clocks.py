@@ -1,0 +1,119 @@
+"""Time offsets between clocks that are seconds or months apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core import clocks, metrics
+from locatk.core.errors import InputError
+from locatk.core.geometry import rotation_exp
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+EPOCH = 1_690_218_696_000_000_000
+MONTHS_NS = 123 * 86_400 * 10**9 + 456_789_012_345
+
+
+def way(t: Array) -> Array:
+    """At a constant speed, as robots drive: speeds alone would not tell the time."""
+    heading = np.cumsum(0.5 * np.sin(0.7 * t) + 0.3 * np.sin(0.31 * t)) * (t[1] - t[0])
+    step = 0.3 * (t[1] - t[0])
+    return np.stack(
+        [np.cumsum(step * np.cos(heading)), np.cumsum(step * np.sin(heading)), 0 * t], -1
+    )
+
+
+TIME = np.arange(0, 40, 0.01)
+WAY = way(TIME)
+
+
+def trajectory(time_s: Array, position: Array, shift_ns: int = 0) -> Trajectory:
+    stamps = EPOCH + shift_ns + np.round(np.asarray(time_s) * 1e9).astype(np.int64)
+    return Trajectory.from_positions("robot", "floor", stamps, position)
+
+
+TRUTH = trajectory(TIME, WAY)
+
+
+def later(cut_s: float = 0.0, loops: int = 1, noise_m: float = 2e-3) -> Trajectory:
+    """What was captured months later: the beginning lost, and the drive repeated."""
+    time = np.concatenate([TIME[::7] + 40.0 * k for k in range(loops)])
+    position = np.tile(WAY[::7], (loops, 1))
+    position = position + np.random.default_rng(3).normal(0, noise_m, position.shape)
+    return trajectory(time[time >= cut_s], position[time >= cut_s], MONTHS_NS)
+
+
+@pytest.mark.parametrize("align", ["none", "se2", "sim2", "se3", "sim3", "yaw", "origin"])
+@pytest.mark.parametrize("loops", [1, 3])
+def test_clocks_that_are_months_apart(align: str, loops: int) -> None:
+    estimate = later(cut_s=1.3, loops=loops)
+    if align != "none":
+        turn = rotation_exp(np.array([0, 0, 2.0]))
+        scale = 0.3 if align.startswith("sim") else 1.0
+        estimate = trajectory(
+            (estimate.time_ns - EPOCH - MONTHS_NS) / 1e9,
+            scale * estimate.position @ turn.T + [3, -1, 0],
+            MONTHS_NS,
+        )
+    found = metrics.evaluate(estimate, TRUTH, align=align, offset_s="auto")
+    # Any loop will do.
+    off = (found.offset_s + MONTHS_NS / 1e9 + 20.0) % 40.0 - 20.0
+    assert off == pytest.approx(0, abs=5e-3)
+    assert "by motion" in found.offset_source
+    if align != "origin":  # which rests on one pose and its noise
+        assert found.mae < 5e-3
+    assert found.n + sum(found.unscored.values()) == len(estimate)
+    if loops == 3:
+        assert found.unscored["no truth"] > len(estimate) / 2
+
+
+def test_clocks_that_agree_are_searched_as_ever() -> None:
+    part = trajectory(TIME[300:900], WAY[300:900])
+    assert clocks.clocks_agree([(part, TRUTH)])
+    assert not clocks.clocks_agree([(later(), TRUTH)])
+    found = metrics.evaluate(part, TRUTH, offset_s="auto")
+    assert "clocks" not in found.offset_source
+    assert found.offset_s == pytest.approx(0, abs=1e-3)
+
+
+def test_a_straight_way_is_placed_where_nothing_is_fitted() -> None:
+    """Its shape tells no time; where it is does."""
+    line = np.outer(TIME, [0.2, 0.1, 0.0])
+    estimate = trajectory(TIME[500:2500], line[500:2500], MONTHS_NS)
+    found = metrics.evaluate(estimate, trajectory(TIME, line), offset_s="auto")
+    assert found.offset_s == pytest.approx(-MONTHS_NS / 1e9, abs=1e-3)
+
+
+def test_motions_that_are_unlike_fall_back_to_the_first_stamps() -> None:
+    rng = np.random.default_rng(0)
+    noise = np.cumsum(rng.normal(0, 0.01, WAY.shape), axis=0)
+    coarse = clocks.coarse_offset([(trajectory(TIME, noise, MONTHS_NS), TRUTH)], align="none")
+    assert coarse.by == "first stamps"
+    assert coarse.offset_s == pytest.approx(-MONTHS_NS / 1e9)
+    with pytest.raises(InputError, match="no poses"):
+        clocks.coarse_offset([(trajectory(TIME[:0], WAY[:0]), TRUTH)])
+
+
+def test_a_quarter_without_motion_is_not_what_the_offset_is_taken_from() -> None:
+    """The robot stands still for the first third."""
+    position = np.concatenate([np.repeat(WAY[:1], 2000, axis=0), WAY])
+    time = np.arange(len(position)) * 0.01
+    truth = trajectory(time, position)
+    shifted = trajectory(time[100:-100:5], position[100:-100:5], 70_000_000)
+    found = metrics.evaluate(shifted, truth, offset_s="auto")
+    assert found.offset_s == pytest.approx(-0.07, abs=2e-3)
+    assert "held-out 25% to 50%" in found.offset_source
+    with pytest.raises(Exception, match="hardly moved"):
+        metrics.evaluate(shifted, truth, offset_s="auto", held_out=(0.0, 0.25))
+
+
+def test_long_recordings_are_searched_in_longer_steps() -> None:
+    time = np.arange(0, 9000, 0.5)
+    position = way(time)
+    truth = trajectory(time, position)
+    late = trajectory(time[5000:15000], position[5000:15000], MONTHS_NS)
+    coarse = clocks.coarse_offset([(late, truth)], align="se2")
+    assert coarse.offset_s == pytest.approx(-MONTHS_NS / 1e9, abs=coarse.span_s)

@@ -1,0 +1,340 @@
+"""Reports: one file, harmless whatever devices are called, small, and the same every time."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from locatk.core import metrics
+from locatk.core.dots.sheet import Manifest, Sheet
+from locatk.core.errors import MissingDataError, OutputExistsError
+from locatk.core.lighthouse.calibration import IDEAL
+from locatk.core.lighthouse.scene import Marker, Scene, Station
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats.report.figures import MOST_POINTS
+from locatk.formats.report.report import panels, render, write_report
+from locatk.formats.report.subject import Subject
+
+START_NS = 1_767_225_600_000_000_000
+EVIL = "</script><img src=x onerror=alert(1)>"
+SCENE = Scene(
+    stations=(Station(1, np.array([-2.0, 0.0, 2.0]), np.eye(3), IDEAL),),
+    markers=(Marker("corner", np.array([0.5, 0.5, 0.0])),),
+    planar=True,
+    scale="markers",
+)
+
+
+def track(
+    device: str, n: int = 60, off_m: float = 0.0, frame: str = "floor", rise_m: float = 0.0
+) -> Trajectory:
+    """A loop of ``n`` poses, a tenth of a second apart, known to 1 mm."""
+    turn = np.linspace(0, 6, n)
+    position = np.column_stack([np.cos(turn) + off_m, np.sin(turn), rise_m * turn])
+    time_ns = START_NS + 100_000_000 * np.arange(n)
+    covariance = np.broadcast_to(np.eye(3) * 1e-6, (n, 3, 3))
+    return Trajectory.from_positions(device, frame, time_ns, position, covariance)
+
+
+def solution(*names: str, n: int = 60, **more: Any) -> Solution:
+    tracks = tuple(track(name, n, off_m=1e-3 * (k + 1)) for k, name in enumerate(names))
+    given: dict[str, Any] = {"artifact": SCENE, "notes": ("a note",), **more}
+    return Solution("lighthouse", "bundle", tracks, **given)
+
+
+def judged(solved: Solution, **more: Any) -> Subject:
+    """A subject with truth."""
+    truth = tuple(track(t.device, len(t)) for t in solved.trajectories)
+    pairs = [(t, u) for t, u in zip(solved.trajectories, truth, strict=True) if len(t)]
+    evaluation = metrics.evaluate_all(pairs) if pairs else None
+    return Subject("run.mcap", solved, truth=truth, evaluation=evaluation, **more)
+
+
+def specs(page: str) -> dict[str, Any]:
+    """The figures of a page by id."""
+    found = re.findall(
+        r'<script type="application/json" id="([^"]+)-data">(.*?)</script>', page, re.S
+    )
+    return {ident: json.loads(data) for ident, data in found}
+
+
+def values(array: Any) -> np.ndarray:
+    """An array as plotly writes it."""
+    if isinstance(array, dict):
+        flat = np.frombuffer(base64.b64decode(array["bdata"]), np.dtype(array["dtype"]))
+        return flat.reshape([int(n) for n in str(array.get("shape", len(flat))).split(",")])
+    return np.array([np.nan if v is None else v for v in array], float)
+
+
+# ---- the file
+
+
+def test_one_copy_of_the_script_and_no_address(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    write_report(path, [judged(solution("red")), judged(solution("blue"))])
+    page = path.read_text(encoding="utf-8")
+    assert page.count("plotly.js v") == 1
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.S)
+    assert len(scripts) == 2
+    rest = page.replace(scripts[0], "")
+    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:|//)""", rest)
+    assert "http://" not in rest
+    assert "https://" not in rest
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', page)
+    assert policy.startswith("default-src 'none'; ")
+    allowed = re.findall(r"'sha256-([^']+)'", policy)
+    of = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    assert allowed == of
+    assert "unsafe-eval" not in policy
+    assert "'unsafe-inline'" not in policy.split("style-src")[0]
+
+
+def test_the_same_subjects_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.html", "b.html"):
+        write_report(tmp_path / name, [judged(solution("red"))])
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_what_exists_is_not_replaced_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "a.html"
+    path.write_text("mine")
+    with pytest.raises(OutputExistsError):
+        write_report(path, [judged(solution("red"))])
+    assert path.read_text() == "mine"
+    write_report(path, [judged(solution("red"))], overwrite=True)
+    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    with pytest.raises(MissingDataError):
+        write_report(tmp_path / "nowhere" / "a.html", [judged(solution("red"))])
+
+
+def test_neither_matplotlib_nor_scipy_is_imported() -> None:
+    """They would take longer than all else."""
+    code = (
+        "import sys, locatk.formats.report.report, locatk.formats.report.subjects; "
+        "print([m for m in ('matplotlib', 'scipy', 'magpylib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# ---- words of others
+
+
+def test_names_of_devices_do_no_harm() -> None:
+    facts = {"command": f"locatk solve {EVIL}", "source": EVIL, "other": EVIL}
+    notes = (EVIL,)
+    subject = replace(judged(solution(EVIL, notes=notes), facts=facts), name=EVIL)
+    page = render([subject, subject])
+    assert "<img" not in page
+    assert page.lower().count("</script>") == page.count("<script")
+    # In figures it is escaped once more: plotly takes text for HTML.
+    names = {t.get("name") for spec in specs(page).values() for t in spec["data"]}
+    assert not any(name and "<" in name for name in names)
+    assert any(name and "&lt;" in name for name in names)
+
+
+@pytest.mark.parametrize("name", ["Łódź 🤖", "%{x}", "$5^2$", "_x", "a\nb", "<b>bold</b>", " "])
+def test_odd_names_are_shown(name: str) -> None:
+    page = render([judged(solution(name, "other"))])
+    assert specs(page)
+
+
+def test_the_command_is_there_to_be_copied() -> None:
+    page = render([judged(solution("red"), facts={"command": "locatk solve 'a b.mcap' -o <x>"})])
+    assert "locatk solve &#x27;a b.mcap&#x27; -o &lt;x&gt;</pre>" in page
+    assert 'class="copy"' in page
+
+
+# ---- what it says
+
+
+def texts(subject: Subject) -> str:
+    return re.sub(r"<script.*?</script>|<style.*?</style>", "", render([subject]), flags=re.S)
+
+
+def test_the_verdict_is_that_of_the_evaluation() -> None:
+    said = texts(judged(solution("red")))
+    assert "Half of the poses lie within 1.00 mm of the truth, 95 % within 1.00 mm" in said
+    assert "Nothing was fitted on the truth" in said
+    assert "a note" in said
+
+
+def test_without_truth_it_says_so_and_shows_sigmas() -> None:
+    subject = Subject("run.mcap", solution("red"), facts={"source": "run.mcap"})
+    said = texts(subject)
+    assert "No truth is at hand" in said
+    assert "1.73 mm" in said  # of three axes of 1 mm
+    assert "The session run.mcap is not beside the solution: its signals are not shown" in said
+    titles = [panel.title for panel in panels(subject)]
+    assert "Covariance against time" in titles
+    assert not any("Error" in title for title in titles)
+
+
+def test_truth_of_another_time_is_no_error() -> None:
+    late = replace(track("red"), time_ns=track("red").time_ns + 10**12)
+    said = texts(Subject("run.mcap", solution("red"), truth=(late,)))
+    assert "No pose has truth at its time" in said
+
+
+def test_a_scene_without_scale_has_no_metres() -> None:
+    solved = solution("red", artifact=replace(SCENE, scale="unit"))
+    subject = Subject("run.mcap", solved, truth=(track("red"),))
+    said = texts(subject)
+    assert "The scene has no scale" in said
+    assert "--align sim3" in said
+    assert not re.search(r"\d mm\b", said)
+    page = render([subject])
+    layouts = [spec["layout"] for spec in specs(page).values()]
+    titles = [layout.get("xaxis", {}).get("title", {}).get("text") for layout in layouts]
+    assert "x [unit]" in titles
+
+
+@pytest.mark.parametrize(
+    "empty",
+    [
+        Solution("lighthouse", "bundle", ()),
+        Solution("lighthouse", "bundle", (), artifact=SCENE),
+        solution("red", n=0),
+        Solution("dots", "lattice", (track("red", 0),), rejected={"blurred": 7}),
+    ],
+)
+def test_nothing_solved_is_a_report_too(empty: Solution) -> None:
+    said = texts(Subject("run.mcap", empty))
+    assert "Nothing was solved" in said
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_poses_are_a_report(n: int) -> None:
+    assert specs(render([judged(solution("red", n=n))]))
+
+
+def test_poses_without_covariance_are_a_report() -> None:
+    t = track("red")
+    bare = Trajectory.from_positions(t.device, t.frame, t.time_ns, t.position)
+    subject = judged(replace(solution("red"), trajectories=(bare,)))
+    assert "Covariance against time" not in [panel.title for panel in panels(subject)]
+    assert "tells no covariance" in texts(replace(subject, evaluation=None, truth=()))
+
+
+# ---- figures
+
+
+def figure(subject: Subject, title: str) -> Any:
+    (panel,) = [panel for panel in panels(subject) if panel.title == title]
+    return panel
+
+
+def test_the_map_is_to_scale_and_shows_what_is_there() -> None:
+    panel = figure(judged(solution("red")), "Path")
+    assert panel.figure.layout.yaxis.scaleanchor == "x"
+    traces = {t.name: t for t in panel.figure.data}
+    assert {"truth", "red", "marker", "station"} <= set(traces)
+    np.testing.assert_allclose(traces["marker"].x, [0.5])
+    np.testing.assert_allclose(traces["station"].x, [-2.0])
+    low, high = panel.figure.layout.xaxis.range
+    assert low < -2
+    assert high > 1
+    # 1 mm cannot be seen on 3 m: ellipses are larger by a round number, which is said.
+    assert "drawn 10 times as large" in panel.note
+    assert traces["95 % ellipse, \u00d7 10"]
+
+
+def test_ellipses_have_the_size_they_say() -> None:
+    t = track("red")
+    covariance = np.zeros((len(t), 3, 3))
+    covariance[:, 0, 0], covariance[:, 1, 1] = 0.04, 0.01
+    wide = Trajectory.from_positions(t.device, t.frame, t.time_ns, t.position, covariance)
+    panel = figure(Subject("a", replace(solution("red"), trajectories=(wide,))), "Path")
+    (trace,) = [t for t in panel.figure.data if t.name == "95 % ellipse"]
+    first = np.array([trace.x[:25], trace.y[:25]], float)
+    np.testing.assert_allclose(np.ptp(first, axis=1), 2 * 2.4477 * np.array([0.2, 0.1]), rtol=1e-3)
+
+
+def test_a_path_that_rises_is_seen_from_the_side() -> None:
+    steep = replace(solution("red"), trajectories=(track("red", rise_m=0.1),))
+    titles = [panel.title for panel in panels(judged(steep))]
+    assert "Path from the side" in titles
+    assert "Path from the side" not in [p.title for p in panels(judged(solution("red")))]
+
+
+def test_poses_in_two_frames_share_no_map() -> None:
+    sheets = tuple(
+        Sheet(name, (1000 * k, 0), (100, 100), (0, 0), (60.0, 60.0), (5.0, 5.0))
+        for k, name in enumerate(("a", "b"))
+    )
+    tracks = tuple(track(f"camera-{name}", frame=name) for name in "ab")
+    solved = Solution("dots", "lattice", tracks, artifact=Manifest(sheets))
+    found = [p for p in panels(Subject("x", solved)) if p.title.startswith("Path")]
+    assert [p.title for p in found] == ["Path in a", "Path in b"]
+    for panel, name in zip(found, "ab", strict=True):
+        assert panel.figure is not None
+        names = [t.name for t in panel.figure.data]
+        assert names.count("paper") == 1
+        assert f"camera-{name}" in names
+
+
+def test_wild_errors_are_at_the_edge_and_counted() -> None:
+    solved = solution("red", n=100)
+    solved.trajectories[0].position[50, 0] += 40.0
+    panel = figure(judged(solved), "Error against time")
+    assert "1 of 100 lie beyond this scale (triangles)" in panel.note
+    (triangle,) = [t for t in panel.figure.data if t.yaxis == "y2"]
+    np.testing.assert_allclose(triangle.customdata, [40_001.0], rtol=1e-6)
+    assert panel.figure.layout.yaxis.range[1] < 10
+    (spread,) = figure(judged(solved), "How often errors occur").figure.data
+    assert sum(spread.y) == 100
+
+
+def test_errors_and_bands_are_those_of_the_solution() -> None:
+    subject = judged(solution("red"))
+    panel = figure(subject, "Error against time")
+    shown = {t.name: t for t in panel.figure.data}
+    np.testing.assert_allclose(shown["red"].y, 1.0, atol=1e-9)
+    # Of the length of three normal errors of 1 mm 95 % are below 2.795 mm (chi-squared).
+    np.testing.assert_allclose(shown["95 % expected"].y, 2.7955, rtol=4e-3)
+
+
+# ---- much
+
+
+def test_ten_thousand_poses_are_thinned_and_small() -> None:
+    names = [f"robot-{k}" for k in range(12)]
+    rng = np.random.default_rng(1)
+    solved = solution(*names, n=900)
+    for t in solved.trajectories:
+        t.position[:] += 1e-3 * rng.standard_normal(t.position.shape)
+    solved.trajectories[3].position[417] += 5.0  # must not be lost
+    page = render([judged(solved)])
+    assert len(page.encode()) < 12e6
+    assert f"of {solved.poses} poses" in page
+    for ident, spec in specs(page).items():
+        points = sum(len(values(t["x"])) for t in spec["data"] if "markers" in t.get("mode", ""))
+        assert points < 1.3 * MOST_POINTS, ident
+    paths = [t for t in specs(page)["s1-1-figure"]["data"] if t.get("name") == "robot-3"]
+    assert max(np.nanmax(values(t["x"])) for t in paths) > 4
+
+
+def test_few_devices_are_named_and_the_rest_counted() -> None:
+    solved = solution(*[f"robot-{k}" for k in range(20)], n=5)
+    panel = figure(judged(solved), "Path")
+    named = [t for t in panel.figure.data if t.showlegend and str(t.name).startswith("robot")]
+    assert len(named) == 7
+    assert "The legend names 7 of 20 devices" in panel.note
+
+
+def test_several_subjects_are_in_a_table_with_links() -> None:
+    page = render([judged(solution("red")), Subject("b.mcap", solution("blue"))])
+    assert '<a href="#s2">b.mcap</a>' in page
+    assert page.count('class="subject"') == 2
+    assert len(specs(page)) == len(set(specs(page)))

@@ -1,0 +1,419 @@
+"""Raw signals in reports: what is drawn, thinned, left out and told."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+pytest.importorskip("plotly")
+
+from locatk.core.dots import simulate as dots_simulate
+from locatk.core.dots import solver as dots_solver
+from locatk.core.landmarks.halls import HallSamples, HallSensors
+from locatk.core.lighthouse import simulate as lighthouse_simulate
+from locatk.core.lighthouse import solver as lighthouse_solver
+from locatk.core.polaris import simulate as polaris_simulate
+from locatk.core.polaris import solver as polaris_solver
+from locatk.core.polaris.array import Samples
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats import arrays, frames, halls, observations
+from locatk.formats.report import (
+    signals,
+    signals_drawing,
+    signals_lighthouse,
+    signals_reading,
+)
+from locatk.formats.report.panel import Panel
+from locatk.formats.session import Session
+
+START_NS = 1_767_225_600_000_000_000
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def traces(panel: Panel, kind: str | None = None) -> list[dict[str, Any]]:
+    """Traces of a panel, as Python numbers."""
+    assert panel.figure is not None
+    found = json.loads(panel.figure.to_json())["data"]
+    return [each for each in found if kind in (None, each["type"])]
+
+
+def values(trace: Any) -> Any:
+    """y of a trace of a figure, nan where nothing is."""
+    return np.asarray(trace.y, float)
+
+
+# ---- recordings
+
+
+@pytest.fixture(scope="module")
+def lighthouse(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Solution]:
+    options = lighthouse_simulate.SimulationOptions(
+        robots=2, duration_s=20.0, outliers=0.02, occlusion=0.05
+    )
+    made = lighthouse_simulate.simulate(options)
+    path = tmp_path_factory.mktemp("signals") / "run.mcap"
+    observations.write_session(path, system="lighthouse", sweeps=made.sweeps)
+    session = Session.open(path)
+    return session, lighthouse_solver.solve(observations.read_sweeps(session))
+
+
+@pytest.fixture(scope="module")
+def polaris(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Solution]:
+    made = polaris_simulate.simulate()
+    path = tmp_path_factory.mktemp("signals") / "run.mcap"
+    arrays.write_session(path, [made.samples], tags=made.tags)
+    return Session.open(path), polaris_solver.solve([made.samples], made.tags)
+
+
+def landmark(at_s: float, **more: Any) -> dict[str, Any]:
+    """A visit as the solver tells it."""
+    return {
+        "time_s": START_NS * 1e-9 + at_s,
+        "device": "robot",
+        "cell": [2, 3],
+        "pattern": "NNNS",
+        "code": 13,
+        "probability": 0.9,
+        "x_m": 0.0,
+        "y_m": 0.0,
+        "heading_rad": 0.0,
+        "sigma_x_m": 1e-4,
+        "sigma_y_m": 1e-4,
+        "sigma_heading_rad": None,
+        "residual_sigma": 1.0,
+        "refused": "",
+    } | more
+
+
+def hall_session(path: Path, n: int = 30_000, device: str = "robot") -> tuple[Session, np.ndarray]:
+    """A quiet field with a single peak, at 200 Hz."""
+    field = 1e-6 * np.sin(np.arange(n))[:, None] * np.ones(4)
+    field[n // 3, 1] = 0.031
+    time_ns = START_NS + np.arange(n) * 5_000_000
+    halls.write_session(path, [HallSamples(device, HallSensors(), time_ns, field)])
+    return Session.open(path), field
+
+
+def landmarks_solution(*detections: dict[str, Any], device: str = "robot") -> Solution:
+    nothing = Trajectory.from_positions(device, "map", np.array([START_NS]), np.zeros((1, 3)))
+    return Solution("landmarks", "field", (nothing,), detections=list(detections))
+
+
+# ---- thinning
+
+
+def test_peaks_of_a_long_signal_are_drawn() -> None:
+    rng = np.random.default_rng(1)
+    value = rng.normal(size=123_457)
+    value[[7, 60_001, 123_456]] = 50, -40, 30
+    value[1000:5000] = np.nan
+    time = np.arange(len(value)) * 0.01
+    x, y = signals_drawing.envelope(time, value)
+    assert len(x) <= 2.1 * signals_drawing.COLUMNS
+    assert {50.0, -40.0, 30.0} <= set(y.tolist())
+    assert np.all(np.diff(x) >= 0)
+    kept = np.isfinite(y)
+    assert_array_equal(value[np.round(x[kept] / 0.01).astype(int)], y[kept])
+    assert not np.any(kept & (x > 12) & (x < 48))  # nothing is drawn over what is missing
+
+
+def test_a_short_signal_stays_as_it_is_and_breaks_at_gaps() -> None:
+    time = np.r_[np.arange(10) * 0.1, 5 + np.arange(10) * 0.1]
+    x, y = signals_drawing.envelope(time, np.ones(20))
+    assert len(x) == 21
+    assert np.isnan(y[10])
+    assert_allclose(x[[9, 10, 11]], [0.9, 5, 5])
+    for n in range(3):
+        assert len(signals_drawing.envelope(np.arange(float(n)), np.arange(float(n)))[0]) == n
+
+
+def test_marks_that_hide_each_other_are_drawn_once() -> None:
+    time = np.linspace(0, 100, 50_000)
+    value = np.sin(time)
+    value[25_000] = 30.0
+    kept = signals_drawing.one_a_pixel(time, value)
+    assert len(kept) <= signals_drawing.MOST_MARKS
+    assert 25_000 in kept
+    assert_array_equal(signals_drawing.one_a_pixel(time[:10], value[:10]), np.arange(10))
+    noise = np.random.default_rng(0).normal(size=50_000)
+    assert 500 < len(signals_drawing.one_a_pixel(time, noise)) <= signals_drawing.MOST_MARKS
+    assert len(signals_drawing.one_a_pixel(np.zeros(9000), np.zeros(9000))) == 1
+
+
+def test_the_telling_detections_are_those_refused_the_least_sure_and_the_surest() -> None:
+    refused = ["", "", "a", "a", "b", "", ""]
+    sure = [0.9, 0.2, 0.0, 0.0, 0.0, 0.5, 0.99]
+    assert signals_drawing.telling(refused, sure, 4) == [1, 2, 4, 6]
+    assert signals_drawing.telling(refused, sure, 20) == [0, 1, 2, 4, 5, 6]
+    assert signals_drawing.telling([], [], 3) == []
+    assert signals_drawing.telling(["a", "b", "c", "d"], [0.0] * 4, 3) == [0]
+    assert signals_drawing.telling(["", ""], [np.nan, 1.0], 1) == [1]
+
+
+# ---- systems
+
+
+def test_every_panel_has_words_and_draws_without_webgl(
+    lighthouse: tuple[Session, Solution], polaris: tuple[Session, Solution], tmp_path: Path
+) -> None:
+    session, _ = hall_session(tmp_path / "halls.mcap")
+    robot = landmarks_solution(landmark(20), landmark(50, refused="misread"))
+    for recording, solution in (lighthouse, polaris, (session, robot)):
+        for panel in signals.panels(recording, solution):
+            assert panel.title
+            assert panel.note.endswith(".")
+            assert {each["type"] for each in traces(panel)} <= {"scatter", "heatmap"}
+            assert panel.figure is not None
+            assert len(panel.figure.to_json()) < 1_000_000
+            titles = json.dumps(json.loads(panel.figure.to_json())["layout"])
+            assert "[s]" in titles
+
+
+def test_sweeps_are_told_apart_as_the_solver_did(lighthouse: tuple[Session, Solution]) -> None:
+    session, solution = lighthouse
+    found = signals.panels(session, solution)
+    assert [panel.title for panel in found] == ["Sweeps of robot-1", "Sweeps of robot-2"]
+    left_out, no_pose = 0, 0
+    for panel in found:
+        names = [each["name"] for each in traces(panel)]
+        assert {"channel 1", "channel 2", "poses"} <= set(names)
+        for name in names:
+            if name.startswith("left out"):
+                left_out += int(name.split("(")[1][:-1])
+            if name.startswith("no pose"):
+                no_pose += int(name.split("(")[1][:-1])
+    by_themselves = ("plane_unknown", "spike", "repeated_in_rotation", "count_above_period")
+    assert left_out == sum(solution.rejected.get(why, 0) for why in by_themselves) > 0
+    assert no_pose == sum(each["rejected"] for each in solution.detections) > 0
+
+
+def test_sweeps_of_several_photodiodes_belong_to_their_own_moments(
+    lighthouse: tuple[Session, Solution], tmp_path: Path
+) -> None:
+    session, _ = lighthouse
+    sweeps = observations.read_sweeps(session)
+    one = replace(sweeps, devices=("deck",), sensor=sweeps.device, device=0 * sweeps.device)
+    observations.write_session(tmp_path / "deck.mcap", system="lighthouse", sweeps=one)
+    solution = lighthouse_solver.solve(one)
+    assert [each.device for each in solution.trajectories] == ["deck/0", "deck/1"]
+    deck = Session.open(tmp_path / "deck.mcap")
+    (panel,) = signals.panels(deck, solution)
+    assert "no signals" not in panel.note
+    held, posed = signals_lighthouse._used(one, solution)
+    assert np.count_nonzero(held & ~posed) == sum(each["rejected"] for each in solution.detections)
+
+
+def test_tags_are_marked_where_their_field_is(polaris: tuple[Session, Solution]) -> None:
+    session, solution = polaris
+    whole, near = signals.panels(session, solution)
+    assert whole.title == "Magnetic field along bar"
+    (image,) = (each for each in whole.figure.data if each.type == "heatmap")
+    assert image.z.shape[0] == 9
+    assert_allclose(image.y, np.arange(-80, 81, 20))
+    (magnets,) = (each for each in whole.figure.data if each.name == "magnets of tags")
+    assert len(magnets.x) == 5
+    for x, y in zip(magnets.x, magnets.y, strict=True):  # each on a dark spot
+        column = np.abs(image.x - x).argmin()
+        row = np.abs(image.y - y).argmin()
+        around = image.z[row, max(0, column - 6) : column + 7]
+        assert around.max() > 0.3 * np.nanmax(image.z)
+    (read,) = (each for each in whole.figure.data if each.name == "read (1)")
+    assert str(solution.detections[0]["tag_id"]) in read.text[0]
+    assert len(near.figure.data) == 3 * 9
+    assert "1 of 1" in near.note
+
+
+def test_a_bar_whose_sensors_are_nowhere_is_drawn_by_numbers(
+    polaris: tuple[Session, Solution], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, solution = polaris
+    monkeypatch.setattr(session, "attachment", lambda name: None)
+    whole, _ = signals.panels(session, solution)
+    assert "not known: they are numbered" in whole.note
+    assert any(each.get("name") == "sensor 9" for each in traces(whole))
+
+
+def test_a_dead_sensor_and_a_short_recording_are_drawn(tmp_path: Path) -> None:
+    made = polaris_simulate.simulate().samples
+    field = made.field_t[:30].copy()
+    field[:, 4] = np.nan
+    arrays.write_session(
+        tmp_path / "run.mcap", [Samples("bar", made.array, made.time_ns[:30], field)]
+    )
+    nothing = Solution("polaris", "joint", ())
+    (panel,) = signals.panels(Session.open(tmp_path / "run.mcap"), nothing)
+    assert "Nothing was found in it." in panel.note
+    (image,) = (each for each in panel.figure.data if each.type == "heatmap")
+    assert np.isnan(image.z[4]).all()
+    assert np.isfinite(np.delete(image.z, 4, axis=0)).all()
+
+
+def test_halls_are_drawn_with_their_peaks_and_sightings(tmp_path: Path) -> None:
+    session, field = hall_session(tmp_path / "run.mcap")
+    solution = landmarks_solution(
+        landmark(20), landmark(50, refused="misread"), landmark(90, cell=None, pattern=None)
+    )
+    whole, near = signals.panels(session, solution)
+    (left,) = (each for each in whole.figure.data if each.name == "left")
+    assert np.nanmax(values(left)) == pytest.approx(31.0)
+    assert len(left.x) <= 2.1 * signals_drawing.COLUMNS
+    assert "Thinned" in whole.note
+    (refused,) = (each for each in whole.figure.data if each.name == "refused (1)")
+    assert refused.x[0] == pytest.approx(50, abs=0.01)
+    assert refused.text[0] == "misread<br>2,3<br>NNNS"
+    assert "refused: misread" in refused.customdata[0]
+    assert "3 of 3" in near.note
+    assert len(field) == 30_000
+
+
+def test_names_of_sensors_are_no_html(tmp_path: Path) -> None:
+    sensors = HallSensors(names=("<b>x</b>", "b", "c", "d"))
+    time_ns = START_NS + np.arange(50) * 5_000_000
+    samples = HallSamples("robot", sensors, time_ns, np.zeros((50, 4)))
+    halls.write_session(tmp_path / "run.mcap", [samples])
+    bad = landmark(0.1, refused="<i>why</i>", pattern="<u>")
+    for panel in signals.panels(Session.open(tmp_path / "run.mcap"), landmarks_solution(bad)):
+        text = panel.figure.to_json()
+        assert "<b>" not in text
+        assert "<i>" not in text
+        assert "<u>" not in text
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_frames_are_shown_decoded_and_rejected(tmp_path: Path, camera: bool) -> None:
+    made = dots_simulate.simulate(
+        dots_simulate.sheet(), dots_simulate.SimulationOptions(frames=24, missing=0.1)
+    )
+    images = list(made.frames.images)
+    images[3] = np.full_like(images[3], 200)
+    spoiled = replace(made.frames, images=images)
+    lens = made.camera if camera else None
+    frames.write_session(tmp_path / "run.mcap", [spoiled], made.manifest, camera=lens)
+    options = dots_solver.SolveOptions(camera=lens)
+    solution = dots_solver.solve([spoiled], made.manifest, options)
+    shown, over_time = signals.panels(Session.open(tmp_path / "run.mcap"), solution)
+    assert len(shown.pictures) == 8
+    assert all(each.png.startswith(PNG) for each in shown.pictures)
+    captions = [each.caption for each in shown.pictures]
+    assert sum("rejected, too few dots" in each for each in captions) == 1
+    first = solution.detections[0]
+    assert f"at {1e3 * first['x_m']:.2f}, {1e3 * first['y_m']:.2f} mm" in captions[0]
+    by_kind = {"rejected" in each.caption: colours(each.png) for each in shown.pictures}
+    assert by_kind[False] > 500  # circles and a cross
+    assert by_kind[True] == 0
+    names = {each["name"] for each in traces(over_time)}
+    assert names == {"decoded (23)", "too few dots (1)"}
+
+
+def colours(png: bytes) -> int:
+    """How many pixels are not grey."""
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return int(np.count_nonzero(np.ptp(picture.astype(int), axis=2) > 20))
+
+
+# ---- what is missing, damaged or too much
+
+
+def test_a_large_recording_is_drawn_in_parts_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    n = 400_000
+    time_ns = START_NS + np.arange(n) * 5_000_000
+    field = 1e-3 * rng.normal(size=(n, 4))
+    halls.write_session(
+        tmp_path / "run.mcap", [HallSamples("robot", HallSensors(), time_ns, field)]
+    )
+    session = Session.open(tmp_path / "run.mcap")
+    monkeypatch.setattr(signals_reading, "MOST_READ", 2 << 20)
+    read = signals_reading.excerpt(session, session.topics("/halls/"))
+    size = sum(map(len, read.payloads["/halls/robot"]))
+    assert size < 6 << 20  # of 9.6 MB unpacked
+    solution = landmarks_solution(*(landmark(at) for at in np.arange(1.0, 1999.0)))
+    whole, near = signals.panels(session, solution)
+    assert "The recording is large" in whole.note
+    front = next(each for each in whole.figure.data if each.name == "front")
+    assert front.x[0] == pytest.approx(0, abs=1)
+    assert front.x[-1] == pytest.approx(n * 0.005, rel=0.01)  # spread over the whole
+    assert np.isnan(values(front)).any()  # no line over what was not read
+    drawn = [each for each in near.figure.data if each.name == "front"]
+    assert drawn
+    assert all(len(each.x) > 10 for each in drawn)  # only where samples were read
+
+
+def test_damaged_parts_are_left_out_and_told(tmp_path: Path) -> None:
+    session, _ = hall_session(tmp_path / "run.mcap", n=400_000)
+    segment = session.index.segments[1]
+    data = bytearray((tmp_path / "run.mcap").read_bytes())
+    middle = segment.offset + segment.length // 2
+    data[middle : middle + 8] = b"\xff" * 8
+    (tmp_path / "run.mcap").write_bytes(data)
+    whole, *_ = signals.panels(Session.open(tmp_path / "run.mcap"), landmarks_solution())
+    assert f"1 of {len(session.index.segments)} parts of the recording are damaged" in whole.note
+    assert "No landmark was found in it." in whole.note
+
+
+def test_a_recording_cut_short_shows_what_is_left(
+    tmp_path: Path, polaris: tuple[Session, Solution]
+) -> None:
+    session, solution = polaris
+    data = Path(session.path).read_bytes()
+    for share in (0.2, 0.5, 0.9):
+        (tmp_path / "cut.mcap").write_bytes(data[: int(share * len(data))])
+        cut = Session.open(tmp_path / "cut.mcap", damaged_ok=True)
+        found = signals.panels(cut, solution)
+        assert found
+        assert all(panel.note for panel in found)
+
+
+def test_other_recordings_say_what_they_lack(
+    tmp_path: Path, polaris: tuple[Session, Solution], lighthouse: tuple[Session, Solution]
+) -> None:
+    (panel,) = signals.panels(polaris[0], lighthouse[1])
+    assert panel.note == "No signals of lighthouse in the recording: it is one of polaris."
+    (panel,) = signals.panels(lighthouse[0], replace(lighthouse[1], system="sonar"))
+    assert "'sonar' cannot be drawn" in panel.note
+    for system in signals.MODULES:
+        other = polaris[0] if system != "polaris" else lighthouse[0]
+        (panel,) = signals.panels(other, Solution(system, "x", ()))
+        assert panel.figure is None
+        assert panel.note
+    session, _ = hall_session(tmp_path / "run.mcap", n=500)
+    whole, *_ = signals.panels(session, landmarks_solution(device="another"))
+    assert "The recording has no signals of another, of which the solution has poses." in whole.note
+
+
+def test_many_devices_are_named_where_they_are_not_drawn(tmp_path: Path) -> None:
+    time_ns = START_NS + np.arange(50) * 5_000_000
+    samples = [
+        HallSamples(f"robot-{k}", HallSensors(), time_ns, np.zeros((50, 4))) for k in range(6)
+    ]
+    halls.write_session(tmp_path / "run.mcap", samples)
+    found = signals.panels(Session.open(tmp_path / "run.mcap"), Solution("landmarks", "field", ()))
+    assert len(found) == signals_reading.MOST_DEVICES
+    assert "Not drawn: robot-4, robot-5." in found[0].note
+
+
+def test_a_recording_that_is_gone_or_detections_of_others_are_told(
+    tmp_path: Path, polaris: tuple[Session, Solution]
+) -> None:
+    session, solution = polaris
+    odd = replace(solution, detections=[{"device": "bar"}, {"device": "bar", "time_s": "noon"}])
+    (panel,) = signals.panels(session, odd)
+    assert "detections are damaged" in panel.note
+    data = Path(session.path).read_bytes()
+    (tmp_path / "gone.mcap").write_bytes(data)
+    gone = Session.open(tmp_path / "gone.mcap")
+    (tmp_path / "gone.mcap").unlink()
+    (panel,) = signals.panels(gone, solution)
+    assert "cannot be drawn: no such file" in panel.note

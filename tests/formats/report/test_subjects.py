@@ -1,0 +1,164 @@
+"""Subjects of reports: which session and which truth are taken, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.core.errors import FormatError, MissingDataError
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats import observations, trajectories
+from locatk.formats.report.subjects import load
+from locatk.formats.solutions import write_solution
+
+START_NS = 1_767_225_600_000_000_000
+
+
+def track(device: str = "red", off_m: float = 0.0, late_s: float = 0.0) -> Trajectory:
+    turn = np.linspace(0, 6, 60)
+    place = np.column_stack([np.cos(turn) + off_m, np.sin(turn), 0 * turn])
+    time_ns = START_NS + round(late_s * 1e9) + 100_000_000 * np.arange(60)
+    return Trajectory.from_positions(
+        device, "floor", time_ns, place, np.broadcast_to(np.eye(3) * 1e-6, (60, 3, 3))
+    )
+
+
+SOLUTION = Solution(
+    "lighthouse", "bundle", (track(off_m=2e-3),), artifact=Scene(scale="markers", planar=True)
+)
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    """A recording with truth."""
+    return record(tmp_path / "run.mcap")
+
+
+def record(path: Path, late_s: float = 0.0, truth: bool = True) -> Path:
+    known = [track(late_s=late_s)] if truth else []
+    observations.write_session(
+        path, system="lighthouse", scene=Scene(), truth=known, sweeps=_none()
+    )
+    return path
+
+
+def _none() -> observations.Sweeps:
+    empty = np.zeros(0, np.int32)
+    return observations.Sweeps(
+        ("red",), np.zeros(0, np.int64), empty, empty, empty, empty, empty, np.zeros(0)
+    )
+
+
+def solved(path: Path, solution: Solution = SOLUTION, source: str = "run.mcap") -> Path:
+    write_solution(path, solution, source=source)
+    return path
+
+
+def test_the_session_beside_it_gives_the_truth(session: Path, tmp_path: Path) -> None:
+    subject = load(solved(tmp_path / "solved.mcap"))
+    assert subject.name == "solved.mcap"
+    assert subject.session is not None
+    assert Path(subject.session.path) == session
+    assert subject.facts["source"] == "run.mcap"
+    assert subject.evaluation is not None
+    assert subject.evaluation.median == pytest.approx(2e-3)
+
+
+def test_without_it_there_is_no_truth(tmp_path: Path) -> None:
+    subject = load(solved(tmp_path / "solved.mcap"))
+    assert (subject.session, subject.truth, subject.evaluation) == (None, (), None)
+
+
+@pytest.mark.parametrize("source", ["../run.mcap", "/run.mcap", "", "solved.mcap", "."])
+def test_other_names_are_not_followed(session: Path, tmp_path: Path, source: str) -> None:
+    """Neither out of the folder nor to the solution itself."""
+    assert load(solved(tmp_path / "solved.mcap", source=source)).evaluation is None or (
+        source.endswith("run.mcap")  # of a path the name is kept
+    )
+
+
+def test_a_recording_of_another_time_is_another_recording(tmp_path: Path) -> None:
+    record(tmp_path / "run.mcap", late_s=3600.0)
+    assert load(solved(tmp_path / "solved.mcap")).session is None
+
+
+def test_a_session_elsewhere_can_be_named(tmp_path: Path) -> None:
+    (tmp_path / "far").mkdir()
+    far = record(tmp_path / "far" / "other.mcap")
+    subject = load(solved(tmp_path / "solved.mcap"), session=far)
+    assert subject.session is not None
+    assert subject.evaluation is not None
+
+
+def test_a_solution_is_no_session(tmp_path: Path) -> None:
+    path = solved(tmp_path / "solved.mcap")
+    twin = tmp_path / "twin.mcap"
+    shutil.copy(path, twin)
+    with pytest.raises(FormatError, match="a solution, not a session"):
+        load(path, session=twin)
+
+
+def test_a_damaged_session_does_not_stop_the_report(session: Path, tmp_path: Path) -> None:
+    data = session.read_bytes()
+    for broken in (data[: len(data) // 2], b"no mcap at all", b""):
+        session.write_bytes(broken)
+        path = tmp_path / "solved.mcap"
+        path.unlink(missing_ok=True)
+        assert load(solved(path)).solution.poses == 60
+
+
+def test_truth_from_a_file_goes_first(session: Path, tmp_path: Path) -> None:
+    trajectories.write_tum(tmp_path / "camera.tum", track(off_m=5e-3))
+    subject = load(solved(tmp_path / "solved.mcap"), truth=tmp_path / "camera.tum")
+    assert subject.evaluation is not None
+    assert subject.evaluation.median == pytest.approx(3e-3)
+
+
+def test_alignment_and_offset_are_those_asked_for(session: Path, tmp_path: Path) -> None:
+    subject = load(solved(tmp_path / "solved.mcap"), align="se2")
+    assert subject.evaluation is not None
+    assert subject.evaluation.align == "se2"
+    assert subject.evaluation.max < 1e-6
+    late = load(solved(tmp_path / "b.mcap"), offset_s=0.1).evaluation
+    assert late is not None
+    assert late.offset_source == "given"
+    assert late.median > 0.05
+
+
+def test_a_scene_without_scale_is_compared_only_when_asked(session: Path, tmp_path: Path) -> None:
+    unit = replace(SOLUTION, artifact=Scene(scale="unit"))
+    path = solved(tmp_path / "solved.mcap", unit)
+    subject = load(path)
+    assert subject.truth
+    assert subject.evaluation is None
+    assert load(path, align="sim3").evaluation is not None
+
+
+def test_truth_of_nothing_that_was_solved(session: Path, tmp_path: Path) -> None:
+    two = replace(SOLUTION, trajectories=(track("green"), track("blue")))
+    assert load(solved(tmp_path / "a.mcap", two)).evaluation is None
+    none = replace(SOLUTION, trajectories=())
+    assert load(solved(tmp_path / "b.mcap", none)).evaluation is None
+
+
+def test_a_session_is_no_solution(session: Path, tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no solution") as caught:
+        load(session)
+    assert "locatk solve" in str(caught.value.hint)
+    with pytest.raises(MissingDataError):
+        load(tmp_path / "nowhere.mcap")
+
+
+def test_a_damaged_solution_is_one_line(tmp_path: Path) -> None:
+    path = solved(tmp_path / "solved.mcap")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(FormatError) as caught:
+        load(path)
+    assert "\n" not in str(caught.value)

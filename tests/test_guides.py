@@ -1,0 +1,521 @@
+"""Every command that README and docs show is run, in order, as a reader would.
+
+The ```sh blocks of a page are run in one folder, page by page. Plain ``locatk`` lines run in
+this process, which saves a second each; lines with pipes, globs and the like, and those of
+other programs, by bash with a ``locatk`` on the PATH. Each must end with status 0.
+
+What a reader has and a test machine has not:
+
+- A serial port ``/dev/tty...`` is a pseudo-terminal, on which ``locatk emulate`` is the device
+  of the line's ``--device``; ``camera:0`` is a video of the sheet of the line's ``--artifact``.
+- A recording without ``--duration`` is ended by Ctrl-C; ``locatk emulate``, ``dask scheduler``
+  and ``dask worker`` are other terminals, which run to the page's end.
+- ``s3://`` is a server of moto on this machine; a bucket holds the sessions that are in the
+  page's folder when it is first named.
+- Files that do not come out of the page's own commands are in :data:`FILES`. Where published
+  data or an optional package is absent, the page is skipped from there on.
+
+Comments that readers do not see, on the lines before a block, tell what is not the rule::
+
+    <!-- status 3 -->                    of the ```sh block: one of its commands ends with 3
+    <!-- guide: device run.mcap -->      of the ```sh block: what its serial ports send
+    <!-- guide: file all.csv -->         the block (of any language) is that file
+    <!-- guide: file b.toml after a.toml -->   the same, with a.toml before it
+
+What no machine can run is a ```console block (its usage is checked in test_readme.py), or stands
+in :data:`EXCEPTIONS`.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import itertools
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from locatk.cli.app import app
+
+ROOT = Path(__file__).resolve().parent.parent
+
+EXCEPTIONS = {
+    "python3 -m venv": "`Run it` and `Test it` of the README: .ci/run runs them",
+    "locatk bench": "minutes; tests/formats/test_bench*.py run them with less",
+}
+"""How a command begins that is not run, and why."""
+
+DEVICES = {"polaris-array": "polaris", "dotbot-gateway": "lighthouse", "locatk": "landmarks"}
+"""``--device`` to what ``locatk emulate`` simulates for it, where the page does not say."""
+
+LIMIT_S = 120.0
+RECORD_S = 2.0
+"""Until Ctrl-C, from the first bytes of the file on."""
+
+SHELL = re.compile(r"[|&;<>$`*?~!]|(?<![\w{])\{")
+"""In a line that only a shell understands."""
+
+
+# ---- pages
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: its first line in the page, language, text and hints to this test."""
+
+    line: int
+    language: str
+    text: str
+    hints: tuple[tuple[str, str], ...]
+
+    def hint(self, name: str) -> str | None:
+        return dict(self.hints).get(name)
+
+    def commands(self) -> list[str]:
+        """Commands, which may go on over several lines: after a backslash, or in quotes."""
+        found, begun = [], ""
+        for line in self.text.replace("\\\n", " ").splitlines(keepends=True):
+            begun += line
+            try:
+                words = shlex.split(begun, comments=True)
+            except ValueError:  # an open quotation
+                continue
+            found += [begun.strip()] if words else []
+            begun = ""
+        assert not begun, begun
+        return found
+
+
+HINT = re.compile(r"<!--\s*(?:guide:\s*)?(status|device|file)\s+(.*?)\s*-->")
+
+
+def blocks(text: str) -> list[Block]:
+    """All fenced blocks of a page."""
+    found = []
+    hints: list[tuple[str, str]] = []
+    fence: tuple[int, str, str] | None = None
+    body: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if fence is None:
+            if opened := re.match(r"( *```+)(\w*)", line):
+                fence, body = (number, opened[1], opened[2]), []
+            elif hint := HINT.search(line):
+                hints.append((hint[1], hint[2]))
+            elif line.strip():
+                hints = []
+        elif line.rstrip() == fence[1]:
+            found.append(Block(fence[0], fence[2], "\n".join(body) + "\n", tuple(hints)))
+            fence, hints = None, []
+        else:
+            body.append(line)
+    assert fence is None, f"the block of line {fence and fence[0]} has no end"
+    return found
+
+
+def pages() -> list[str]:
+    """README and docs that show commands."""
+    every = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    return [
+        path.relative_to(ROOT).as_posix()
+        for path in every
+        if any(block.language == "sh" for block in blocks(path.read_text(encoding="utf-8")))
+    ]
+
+
+# ---- what a reader has
+
+
+def _toml_of_formats(name: str) -> str:
+    """The example of an artifact in docs/formats.md, by its heading."""
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    section = re.search(rf"^## {re.escape(name)}\n(.*?)(?=^## )", text, re.M | re.S)
+    assert section, name
+    return next(block.text for block in blocks(section[1]) if block.language == "toml")
+
+
+def _pictures(sheet: Path, frames: int = 20) -> Iterator[bytes]:
+    """PNG files of a camera over a printed sheet."""
+    from locatk.core.dots.simulate import SimulationOptions, simulate
+    from locatk.formats.images import encode_png
+    from locatk.formats.sheets import read_manifest
+
+    made = simulate(read_manifest(sheet), SimulationOptions(frames=frames))
+    yield from map(encode_png, made.frames.images)
+
+
+def _frames(folder: Path, words: list[str]) -> None:
+    (folder / "frames").mkdir()
+    for number, png in enumerate(_pictures(folder / words[words.index("--sheet") + 1])):
+        (folder / "frames" / f"{number:04d}.png").write_bytes(png)
+
+
+def _video(folder: Path, words: list[str]) -> str:
+    """A video in the place of a camera."""
+    import cv2
+    import numpy as np
+
+    path = folder / "camera.avi"
+    writer = None
+    for png in _pictures(folder / words[words.index("--artifact") + 1]):
+        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        if writer is None:
+            size = image.shape[1], image.shape[0]
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20, size)
+        writer.write(image)
+    assert writer is not None
+    writer.release()
+    return f"camera:{path.name}"
+
+
+def _drive_csv(folder: Path, words: list[str]) -> None:
+    """A table of hall sensors and odometry over the map of the line."""
+    import numpy as np
+
+    from locatk.core.geometry import heading_of
+    from locatk.core.landmarks.simulate import SimulationOptions, simulate
+    from locatk.formats.maps import read_map
+
+    made = simulate(read_map(folder / words[words.index("--map") + 1]), SimulationOptions())
+    (samples,), (odometry,) = made.samples, made.odometry
+    times = (samples.time_ns - samples.time_ns[0]) * 1e-9
+    known = (odometry.time_ns - samples.time_ns[0]) * 1e-9
+    heading = np.unwrap(heading_of(odometry.quaternion))
+    way = [1e3 * odometry.position[:, 0], 1e3 * odometry.position[:, 1], np.degrees(heading)]
+    columns = [times, *(np.interp(times, known, each) for each in way), *(1e3 * samples.field_t.T)]
+    header = "t_s,x_mm,y_mm,heading_deg,front,left,rear,right"
+    table = np.column_stack(columns)
+    np.savetxt(folder / "drive.csv", table, "%.4f", ",", header=header, comments="")
+
+
+def _published(place: str) -> Callable[[Path, list[str]], None]:
+    """A link to published data."""
+
+    def provide(folder: Path, words: list[str]) -> None:
+        from locatk.formats.data import data_folder
+
+        data = data_folder()
+        if data is None or not (data / place).exists():
+            pytest.skip(f"the published {place} is not there (see LOCATK_DATA)")
+        (folder / Path(place).name).symlink_to((data / place).resolve())
+
+    return provide
+
+
+FILES: Mapping[str, Callable[[Path, list[str]], None]] = {
+    "frames": _frames,
+    "drive.csv": _drive_csv,
+    "map.toml": lambda folder, _: _made(folder, "map", "design", "4x4", "-o", "map.toml"),
+    "tag.toml": lambda folder, _: _made(folder, "tag", "design", "-o", "tag.toml"),
+    "halls.toml": lambda folder, _: _write(folder / "halls.toml", _toml_of_formats("halls.toml")),
+    "twoLH-3D_scene": _published("lighthouse/twoLH-3D_scene"),
+    "twoLH-2D_scene": _published("lighthouse/twoLH-2D_scene"),
+    "oneLH-2D_scene": _published("lighthouse/oneLH-2D_scene"),
+    **{f"RawData_{k}.csv": _published(f"polaris/default/RawData_{k}.csv") for k in range(1, 11)},
+}
+"""What a reader has beside what the page makes: name to what puts it into the folder."""
+
+
+def _made(folder: Path, *words: str) -> None:
+    """What another page makes."""
+    result = CliRunner().invoke(app, words, prog_name="locatk")
+    assert result.exit_code == 0, result.output
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+# ---- running
+
+
+class Reader:
+    """Somebody who types what a page shows, in one folder."""
+
+    def __init__(self, folder: Path, links: ExitStack, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder / "here"
+        self.folder.mkdir()
+        self.links = links
+        self.monkeypatch = monkeypatch
+        self.buckets: set[str] = set()
+        shim = folder / "bin" / "locatk"
+        shim.parent.mkdir()
+        _write(shim, f'#!/bin/sh\nexec "{sys.executable}" -m locatk.cli "$@"\n')
+        shim.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{shim.parent}{os.pathsep}{os.environ['PATH']}")
+        monkeypatch.chdir(self.folder)
+
+    def file(self, name: str, text: str) -> None:
+        """What the hint ``file`` says."""
+        name, _, before = name.partition(" after ")
+        first = (self.folder / before).read_text(encoding="utf-8") + "\n" if before else ""
+        _write(self.folder / name, first + text)
+
+    def type(self, line: str, device: str | None) -> int:
+        """Run a line; its exit status.
+
+        Raises
+        ------
+        AssertionError
+            The status is neither 0 nor 3, with what the command said.
+        """
+        words = shlex.split(line, comments=True)
+        self.provide(words)
+        if words[0] == "cd":
+            self.folder /= words[1]
+            self.monkeypatch.chdir(self.folder)
+            return 0
+        if words[:2] == ["locatk", "emulate"]:
+            self.links.enter_context(emulated(words[2:], self.folder))
+            return 0
+        if words[0] == "dask":
+            pytest.importorskip("distributed", reason=f"{line} needs locatk[dask]")
+            self.links.enter_context(terminal([sys.executable, "-m", *words], self.folder))
+            return 0
+        for bucket in re.findall(r"s3://([\w-]+)", line):
+            self.store(bucket)
+        with ExitStack() as stack:
+            for at, word in enumerate(words):
+                if word.startswith("/dev/tty"):
+                    port = self.folder / Path(word).name
+                    source = device or DEVICES[words[words.index("--device") + 1]]
+                    played = [*shlex.split(source), "--link", str(port), "--loop", "0"]
+                    played += ["--device", words[words.index("--device") + 1]]
+                    stack.enter_context(emulated(played, self.folder))
+                    line = line.replace(word, str(port))
+                    words[at] = str(port)
+                elif word == "camera:0":
+                    words[at] = _video(self.folder, words)
+                    line = line.replace(word, words[at])
+            if words[:2] == ["locatk", "capture"] and not {"--duration", "--list"} & set(words):
+                status, said = self.interrupted(words)
+            elif words[0] == "locatk" and not SHELL.search(re.sub(r"'[^']*'|\s#.*", "", line)):
+                result = CliRunner().invoke(app, words[1:], prog_name="locatk")
+                status, said = result.exit_code, result.output
+            else:
+                done = subprocess.run(
+                    ["bash", "-euo", "pipefail", "-c", line],
+                    cwd=self.folder,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                    timeout=LIMIT_S,
+                )
+                status, said = done.returncode, done.stdout
+        if status and (missing := re.search(r'pip install "locatk\[\w+\]"', said)):
+            pytest.skip(f"{line} needs {missing[0]}")
+        assert status in (0, 3), f"{line}\nended with {status}:\n{said}"
+        return status
+
+    def provide(self, words: list[str]) -> None:
+        """Put into the folder what a reader has."""
+        for before, word in itertools.pairwise(["", *words]):
+            if before in ("-o", "--output") or not word or word.startswith(("/", "-")):
+                continue
+            pattern = re.sub(r"\$\{?\w+\}?", "*", Path(word).parts[0])
+            for name in fnmatch.filter(FILES, pattern) if pattern != "*" else ():
+                if not (self.folder / name).exists():
+                    FILES[name](self.folder, words)
+
+    def store(self, bucket: str) -> None:
+        """A bucket with the sessions of the folder, where the page names it first."""
+        from locatk.formats.batch.places import facts_of
+
+        if bucket in self.buckets:
+            return
+        moto = pytest.importorskip("moto.server", reason="s3:// needs moto[server]")
+        fsspec = pytest.importorskip("s3fs", reason="s3:// needs locatk[s3]")
+        if not self.buckets:
+            server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+            server.start()
+            self.links.callback(server.stop)
+            host, port = server.get_host_and_port()
+            for name, value in {
+                "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+                "AWS_ACCESS_KEY_ID": "reader",
+                "AWS_SECRET_ACCESS_KEY": "secret",
+                "AWS_DEFAULT_REGION": "us-east-1",
+            }.items():
+                self.monkeypatch.setenv(name, value)
+        self.buckets.add(bucket)
+        store = fsspec.S3FileSystem(skip_instance_cache=True)
+        store.mkdir(bucket)
+        for path in self.folder.rglob("*.mcap"):
+            if facts_of(str(path)).get("kind") == "solution":
+                continue
+            store.put_file(str(path), f"{bucket}/{path.relative_to(self.folder).as_posix()}")
+
+    def interrupted(self, words: list[str]) -> tuple[int, str]:
+        """A recording that is ended by Ctrl-C, where it does not end by itself."""
+        output = self.folder / words[words.index("-o") + 1]
+        with terminal(words, self.folder) as process:
+            wait_for(output.exists, process)
+            try:
+                said, _ = process.communicate(timeout=RECORD_S)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGINT)
+                said, _ = process.communicate(timeout=LIMIT_S)
+        return process.returncode, said
+
+
+@contextmanager
+def ending(process: subprocess.Popen[str]) -> Iterator[None]:
+    """Whatever happens, the process ends."""
+    try:
+        yield
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+@contextmanager
+def terminal(words: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another terminal, in which a program runs while the block does."""
+    process = subprocess.Popen(
+        words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    with ending(process):
+        yield process
+
+
+@contextmanager
+def emulated(words: list[str], folder: Path) -> Iterator[None]:
+    """``locatk emulate words...``, from when its port is there to the end."""
+    port = folder / words[words.index("--link") + 1]
+    with terminal(["locatk", "emulate", *words], folder) as process:
+        wait_for(port.exists, process)
+        yield
+
+
+def wait_for(come: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    """Until it has come; the process that shall bring it must not fail before."""
+    give_up = time.monotonic() + LIMIT_S
+    while not come() and process.poll() is None:
+        assert time.monotonic() < give_up, process.args
+        time.sleep(0.02)
+    if process.poll() not in (None, 0):
+        raise AssertionError(f"{process.args!r} failed:\n{process.communicate()[0]}")
+
+
+def read_page(page: str, text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Type all that a page shows.
+
+    Raises
+    ------
+    AssertionError
+        A command fails, or a block does not end with the status that it says.
+    """
+    with ExitStack() as links:
+        reader = Reader(folder, links, monkeypatch)
+        for block in blocks(text):
+            if name := block.hint("file"):
+                reader.file(name, block.text)
+            if block.language != "sh":
+                continue
+            statuses = [
+                reader.type(line, block.hint("device"))
+                for line in block.commands()
+                if not line.startswith(tuple(EXCEPTIONS))
+            ]
+            wanted = int(block.hint("status") or 0)
+            assert max(statuses, default=0) == wanted, f"{page}:{block.line}: {statuses}"
+
+
+needs_terminals = pytest.mark.skipif(
+    shutil.which("bash") is None or not hasattr(os, "openpty"), reason="no bash or no terminals"
+)
+
+
+@needs_terminals
+@pytest.mark.parametrize("page", pages())
+def test_commands_of_a_page_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read_page(page, (ROOT / page).read_text(encoding="utf-8"), tmp_path, monkeypatch)
+
+
+def test_commands_are_where_they_are_found() -> None:
+    """A block of another name would not be run."""
+    every = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    languages = {
+        block.language for path in every for block in blocks(path.read_text(encoding="utf-8"))
+    }
+    assert languages <= {"", "sh", "text", "console", "python", "toml", "json", "csv"}
+
+
+def test_exceptions_are_needed() -> None:
+    text = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in pages())
+    lines = [line for block in blocks(text) if block.language == "sh" for line in block.commands()]
+    assert all(any(line.startswith(one) for line in lines) for one in EXCEPTIONS)
+
+
+PAGE = """
+```text
+locatk nothing
+```
+
+<!-- guide: file b.txt -->
+```
+two
+```
+
+```sh
+# a comment
+echo one > a.txt       # it's here
+cat a.txt \\
+    b.txt | grep -c o > count.txt
+printf '%s\n' 'three
+four' > c.txt
+locatk --version && test -s c.txt
+```
+
+<!-- status 3 -->
+```sh
+bash -c 'exit 3'
+```
+"""
+
+
+@needs_terminals
+def test_a_page_is_read_as_by_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read_page("page", PAGE, tmp_path, monkeypatch)
+    folder = Path.cwd()
+    assert (folder / "count.txt").read_text() == "2\n"
+    assert (folder / "c.txt").read_text() == "three\nfour\n"
+
+
+@needs_terminals
+@pytest.mark.parametrize(
+    ("block", "said"),
+    [
+        ("```sh\nlocatk info nothing.mcap\n```", "ended with 1"),
+        ("```sh\nlocatk info nothing.mcap > said.txt\n```", "ended with 1"),
+        ("```sh\nfalse | cat\n```", "ended with 1"),
+        ("```sh\nbash -c 'exit 3'\n```", "page:1: .3."),
+        ("<!-- status 3 -->\n```sh\ntrue\n```", "page:2: .0."),
+        ("<!-- status 3 -->\n\nwords\n\n```sh\nbash -c 'exit 3'\n```", "page:5: .3."),
+        ("```sh\nlocatk capture port --device lines -o run.mcap\n```", "ended with 1|failed"),
+        ("```sh\nlocatk emulate nothing.mcap --link port\n```", "failed"),
+    ],
+)
+def test_what_fails_on_a_page_is_told(
+    block: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(AssertionError, match=said):
+        read_page("page", block, tmp_path, monkeypatch)
