@@ -14,7 +14,7 @@ PAGES = (".html", ".htm")
 PICTURES = (".png", ".pdf", ".svg")
 
 
-@click.command(short_help="Show solutions on one page to share.")
+@click.command(short_help="Show solutions on one page that opens anywhere.")
 @options.input_argument("solutions", many=True)
 @options.output("Page to write (.html), or just a picture (.png, .pdf, .svg).")
 @options.input_option(

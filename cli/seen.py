@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console
 
 if TYPE_CHECKING:
     from locatk.core.solution import Solution
-
-DEGREES = math.degrees(1)
 
 MOST_LANDMARKS = 40
 """So many sightings are listed for people; ``--json`` holds them all."""
@@ -31,7 +27,24 @@ def lost(solution: Solution) -> list[str]:
     elif solution.system == "landmarks":
         refused = [seen for seen in solution.detections if seen["refused"]]
         losses += _refused(refused, "sighting", "refused")
+    elif solution.poses:
+        losses += _most(solution)
     return losses
+
+
+def _most(solution: Solution) -> list[str]:
+    """Whether most frames, or most moments of sweeps, gave no pose; a few are no loss."""
+    reasons = {
+        reason: count
+        for reason, count in solution.rejected.items()
+        if solution.system == "dots" or reason.startswith("moment_")
+    }
+    without = sum(reasons.values())
+    if without <= solution.poses:
+        return []
+    what = "frames" if solution.system == "dots" else "moments"
+    why = max(reasons, key=reasons.__getitem__).removeprefix("moment_").replace("_", " ")
+    return [f"{without} of {without + solution.poses} {what} gave no pose (most: {why})"]
 
 
 def _not_localised(solution: Solution) -> list[str]:
@@ -63,86 +76,12 @@ def _refused(seen: list[dict[str, Any]], what: str, how: str) -> list[str]:
 
 def seen(solution: Solution) -> str | None:
     """A table of what the system saw; None where it saw nothing, or has no such table."""
-    tables = {"polaris": tags_seen, "landmarks": landmarks_seen}
-    table = tables.get(solution.system)
-    return table(solution.detections) if table and solution.detections else None
+    from locatk.formats import seen_text
 
-
-def tags_seen(detections: list[dict[str, Any]]) -> str:
-    """Tags as the array saw them, in its own frame."""
-    header = ("tag", "margin [steps]", "magnets", "x [mm]", "y [mm]", "heading [deg]")
-    sigmas = ("sigma x", "sigma y [mm]", "sigma heading [deg]")
-    rows = [
-        (
-            "-" if found["tag_id"] is None else found["tag_id"],
-            _number(found["margin"], 1, ".2f"),
-            len(found["magnets"]),
-            *_pose(found),
-        )
-        for found in detections
-    ]
-    return console.table((*header, *sigmas), rows)
-
-
-def landmarks_seen(detections: list[dict[str, Any]]) -> str:
-    """Landmarks, and the robot in the frame of each."""
-    shown = detections[:MOST_LANDMARKS]
-    robots = len({found["device"] for found in detections}) > 1
-    refused = any(found["refused"] for found in shown)
-    header = (
-        "time (UTC)",
-        *(["robot"] if robots else []),
-        "cell",
-        "pattern",
-        "sure [%]",
-        *("x [mm]", "y [mm]", "heading [deg]"),
-        *("sigma x", "sigma y [mm]", "sigma heading [deg]"),
-        *(["refused"] if refused else []),
-    )
-    rows = [
-        (
-            _clock(found["time_s"]),
-            *([found["device"]] if robots else []),
-            "-" if found["cell"] is None else ",".join(map(str, found["cell"])),
-            found["pattern"] or "-",
-            _sure(found["probability"]),
-            *_pose(found),
-            *([(found["refused"] or "").replace("_", " ")] if refused else []),
-        )
-        for found in shown
-    ]
-    more = len(detections) - len(shown)
-    table = console.table(header, rows)
-    return f"{table}\n... and {more} more: see --json" if more else table
-
-
-def _pose(found: dict[str, Any]) -> tuple[str, ...]:
-    return (
-        _number(found["x_m"], 1e3, ".2f"),
-        _number(found["y_m"], 1e3, ".2f"),
-        _number(found["heading_rad"], DEGREES, ".2f"),
-        _number(found["sigma_x_m"], 1e3, ".2g"),
-        _number(found["sigma_y_m"], 1e3, ".2g"),
-        _number(found["sigma_heading_rad"], DEGREES, ".2g"),
-    )
-
-
-def _sure(probability: float | None) -> str:
-    """In percent; what is not wholly sure is not rounded to 100."""
-    if probability is None or not math.isfinite(probability):
-        return "-"
-    percent = 100 * probability
-    return f"{percent:.1f}" if percent < 99.95 else "100" if percent >= 99.9995 else ">99.9"
-
-
-def _clock(time_s: float) -> str:
-    try:
-        return datetime.fromtimestamp(time_s, UTC).strftime("%H:%M:%S.%f")[:-3]
-    except (OverflowError, ValueError, OSError):
-        return f"{time_s:g} s"
-
-
-def _number(value: float | None, scale: float, form: str) -> str:
-    if value is None or not math.isfinite(value):
-        return "-"
-    return format(value * scale, form)
+    tables = {"polaris": seen_text.tags, "landmarks": seen_text.landmarks}
+    if solution.system not in tables or not solution.detections:
+        return None
+    most = MOST_LANDMARKS if solution.system == "landmarks" else None
+    found = tables[solution.system](solution.detections, most)
+    table = console.table(found.header, found.rows)
+    return f"{table}\n... and {found.more} more: see --json" if found.more else table

@@ -8,6 +8,7 @@ process on any machine, and again where a process died.
 from __future__ import annotations
 
 import contextlib
+import math
 import shlex
 import sys
 import tempfile
@@ -26,6 +27,7 @@ from locatk.core.errors import LocatkError, OutputExistsError
 
 if TYPE_CHECKING:
     from locatk.cli.systems import Request
+    from locatk.core.solution import Solution
 
 
 @dataclass(frozen=True)
@@ -114,27 +116,35 @@ def _solved(job: Job, stack: contextlib.ExitStack, names: dict[str, str]) -> dic
         request = replace(request, **changed)
 
     facts = {**made.source_facts(path), "options_sha256": job.options_sha256}
-    overwrite = job.overwrite
+
+    def there() -> tuple[Solution | None, bool]:
+        """What is at the target: the same solution, and whether it may be made again."""
+        with places.local(job.target, scratch) as old:
+            return made.same_solution(old, facts), made.is_ours(old, path.name)
+
+    overwrite, before = job.overwrite, None
     # Without --resume it is there only if an attempt whose worker was lost had written it.
     if places.exists(job.target) and (job.resume or not overwrite):
-        old = stack.enter_context(places.local(job.target, scratch))
-        before = made.same_solution(old, facts)
-        if before is not None:
-            return _told(job, Solved(before, float("nan")))
-        overwrite = overwrite or (job.resume and made.is_ours(old, path.name))
-        places.check(job.target, overwrite=overwrite)
-
-    solved = solve_session(path, request)
-    facts["command"] = command_line(path.name, job.request)
-    target = Path(job.target)
-    if places.is_url(job.target):
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="locatk-", dir=scratch))
-        target = Path(folder) / places.name_of(job.target)
-        names[str(target)] = job.output
-    solutions.write_solution(target, solved.solution, source=path, facts=facts, overwrite=overwrite)
-    if places.is_url(job.target):
-        places.put(target, job.target, overwrite=overwrite)
-    if job.save_scene is not None:
+        before, ours = there()
+        if before is None:
+            overwrite = overwrite or (job.resume and ours)
+            places.check(job.target, overwrite=overwrite)
+    if before is not None:
+        solved = Solved(before, math.nan)
+    else:
+        solved = solve_session(path, request)
+        facts["command"] = command_line(path.name, job.request)
+        try:
+            with places.writing(job.target, scratch, overwrite=overwrite) as target:
+                names[str(target)] = job.output
+                solutions.write_solution(
+                    target, solved.solution, source=path, facts=facts, overwrite=overwrite
+                )
+        except OutputExistsError:  # by a worker that was only thought to be lost?
+            before, _ = there()
+            if before is None:
+                raise
+    if job.save_scene is not None and (before is None or not Path(job.save_scene).exists()):
         artifacts.write_scene(job.save_scene, solved.solution.artifact, overwrite=job.overwrite)
     return _told(job, solved)
 
@@ -146,7 +156,7 @@ def _told(job: Job, solved: Any) -> dict[str, Any]:
     if not job.detections:
         del entry["detections"]
     if job.resume:
-        entry["resumed"] = solved.solve_s != solved.solve_s  # nan: nobody solved it now
+        entry["resumed"] = math.isnan(solved.solve_s)
     return {
         "entry": console.plain(entry),
         "text": solve.text(job.session, job.output, solved),

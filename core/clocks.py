@@ -269,7 +269,8 @@ def estimate_offset(
     if min(errors[0], errors[-1]) <= 1.05 * errors[best] + 1e-12:
         if np.ptp(errors) <= 0.05 * errors[best] + 1e-12:
             raise DegenerateError(
-                "the error does not depend on the time offset: the devices hardly moved",
+                "the error does not depend on the time offset: the devices hardly moved, "
+                "or straight on",
                 hint="give the offset",
             )
         if best in (0, len(offsets) - 1):

@@ -167,7 +167,7 @@ def evaluate_all(
     if not any(len(m) for m in matched):
         raise _nothing(pairs, offset)
     # Poses that ``nearest`` repeats are one pose with truth; rows ascend.
-    scored = sum(np.count_nonzero(np.diff(m.index)) + (len(m) > 0) for m in matched)
+    scored = sum(int(np.count_nonzero(np.diff(m.index))) + (len(m) > 0) for m in matched)
     total, kept_out = sum(len(e) for e, _ in pairs), int(sum(w.sum() for w in windows))
     names = tuple(dict.fromkeys(e.device for e, _ in pairs))
     return _score(
@@ -357,6 +357,11 @@ def _offset(
         part = f"held-out {start:.0%} to {end:.0%} of the recording, not scored"
         return offset, part + found, windows
     assert first is not None
+    if "first stamps" in found:
+        raise InputError(
+            "the motions of estimate and truth are too unlike to bring their clocks together",
+            hint="give the offset, or the alignment that brings their frames together",
+        )
     raise first
 
 

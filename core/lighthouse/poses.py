@@ -46,6 +46,10 @@ above what a generic calibration leaves unmodelled."""
 REACH_M = 20.0
 """Base stations are not received farther away, in metres."""
 
+CONTRADICTED = 0.2
+"""Share of moments that contradict the scene from which on it needs a word: occlusions,
+reflections and fast robots cost a few in a hundred."""
+
 CALIBRATION_SIGMA = 4e-4
 """What a generic calibration adds to an angle after the scene is fitted, in radians: over
 simulated scenes with other units' factory calibrations, with which the covariance is as
@@ -81,6 +85,12 @@ def answer(job: Job, scene: Scene) -> Solution:
     job.reject("moment_with_too_few_sweeps", np.count_nonzero(unsolved))
     job.reject("moment_inconsistent", np.count_nonzero(inconsistent))
     job.reject("moment_out_of_reach", np.count_nonzero(far))
+    share = np.count_nonzero(inconsistent) / max(1, np.count_nonzero(~unsolved))
+    if share > CONTRADICTED:
+        job.notes.append(
+            f"{share:.0%} of the moments contradict the scene: a station was moved since, the "
+            "scene is of another place, or robots were faster than the sweeps"
+        )
     good = ~(unsolved | inconsistent | far)
     jumps = _jumps(job.epochs, fixes, good)
     job.reject("moment_jumps", np.count_nonzero(jumps))

@@ -95,6 +95,24 @@ def local(place: str, scratch: str | None = None) -> Iterator[Path]:
         yield path
 
 
+@contextlib.contextmanager
+def writing(place: str, scratch: str | None = None, *, overwrite: bool = False) -> Iterator[Path]:
+    """``place`` as a local file to write: itself, or one that is brought to the URL afterwards.
+
+    Raises
+    ------
+    OutputExistsError, InputError
+        As :func:`put`.
+    """
+    if not is_url(place):
+        yield Path(place)
+        return
+    with tempfile.TemporaryDirectory(prefix="locatk-", dir=scratch) as folder:
+        path = Path(folder) / name_of(place)
+        yield path
+        put(path, place, overwrite=overwrite)
+
+
 def put(path: Path, place: str, *, overwrite: bool = False) -> None:
     """Bring a file to a URL, where it appears as a whole.
 

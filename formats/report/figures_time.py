@@ -244,14 +244,16 @@ def rows_figure(rows: Sequence[Row], colors: dict[str, str], *, signed: bool) ->
         counts = share_of_points(
             [len(s.value) for s in row.values.values()], MOST_POINTS // len(rows)
         )
-        few = sum(counts) <= FEW
+        mode = "lines+markers" if sum(counts) <= FEW else "lines"
+        if len(row.values) > MOST_BANDS:
+            mode = "markers"  # many lines are a thicket
         for k, ((name, s), most) in enumerate(zip(row.values.items(), counts, strict=True)):
             keep = thin(len(s.value), most, np.abs(s.value))
             shown += len(keep)
             if name in bands:
                 for trace in _band(bands[name], start, colors[name], len(bands) == 1):
                     figure.add_trace(trace, row=number, col=1)
-            trace = _line(s, keep, start, colors[name], few)
+            trace = _line(s, keep, start, colors[name], mode)
             look = _look(name, colors[name], k, len(row.values))
             trace.update(**{**look, "showlegend": look["showlegend"] and number == 1})
             figure.add_trace(trace, row=number, col=1)
@@ -267,7 +269,7 @@ def rows_figure(rows: Sequence[Row], colors: dict[str, str], *, signed: bool) ->
     return figure, note
 
 
-def _line(s: Series, keep: NDArray[np.int64], start: int, color: str, few: bool) -> Scatter:
+def _line(s: Series, keep: NDArray[np.int64], start: int, color: str, mode: str) -> Scatter:
     time_ns = s.time_ns[keep]
     both = np.column_stack([(time_ns - start) * 1e-9, s.value[keep]])
     silence = max(500_000_000, 3 * int(np.median(np.diff(time_ns)))) if len(keep) > 1 else 1
@@ -275,7 +277,7 @@ def _line(s: Series, keep: NDArray[np.int64], start: int, color: str, few: bool)
     return Scatter(
         x=x,
         y=y,
-        mode="lines+markers" if few else "lines",
+        mode=mode,
         line={"color": color, "width": 1.1},
         marker={"color": color, "size": 3.5},
         hovertemplate="%{x:.3f} s<br>%{y:.4g}",

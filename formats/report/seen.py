@@ -208,7 +208,10 @@ def _rejected(solution: Solution) -> Panel:
     if not counts:
         return Panel(REJECTED, "Nothing was rejected.")
     known = {why: meaning(solution.system, why) for why in counts}
-    totals = _totals(solution, known)
+    try:
+        totals = _totals(solution, known)
+    except MALFORMED:
+        totals = {}
     order = sorted(counts, key=lambda why: (_unit(known[why]), -counts[why]))
     rows = []
     for why in order:

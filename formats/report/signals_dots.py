@@ -113,7 +113,7 @@ def _pictures(
         try:
             image = frames.images[k]
         except LocatkError as error:
-            unreadable.append(f"{error.message}.")
+            unreadable.append(error.message)
             continue
         outcome = outcomes[k]
         decoded = outcome is not None and not outcome.get("rejected")
@@ -126,7 +126,9 @@ def _pictures(
         "reason of rejection. Circled are the dots that were decoded; the cross is the place that "
         "the pose tells."
     ]
-    return Panel(name, " ".join([*said, *unreadable]), pictures=tuple(shown))
+    if unreadable:
+        said.append(f"{len(unreadable)} more could not be read ({unreadable[0]}).")
+    return Panel(name, " ".join(said), pictures=tuple(shown))
 
 
 def _codec(manifest: Manifest) -> Codec:

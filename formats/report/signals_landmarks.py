@@ -41,7 +41,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     notes = [*read.notes, *drawing.strangers(solution, devices)]
     if len(devices) > MOST_DEVICES:
         notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
-    found: list[Panel] = []
+    found: list[Panel] = []  # the first of them tells the notes
     start_ns = drawing.start_ns(session)
     for topic, payloads in read.payloads.items():
         device = topic.removeprefix(KIND.topic)
@@ -49,7 +49,8 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
         try:
             samples = fields(session, KIND, topic, payloads)
         except LocatkError as error:
-            found.append(Panel(name, f"Not drawn: {error.message}."))
+            found.append(Panel(name, " ".join([f"Not drawn: {error.message}.", *notes])))
+            notes = []
             continue
         time_s = drawing.seconds(samples.time_ns, start_ns)
         field_mt = 1e3 * samples.field_t
@@ -58,7 +59,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
         events = [_event(each, start_ns) for each in seen]
         found.append(_whole(name, time_s, field_mt, names, events, start_ns, notes))
         found += _near(device, time_s, field_mt, names, seen, events)
-        notes = []  # told once
+        notes = []
     return found
 
 

@@ -42,17 +42,18 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     notes = [*read.notes, *drawing.strangers(solution, devices)]
     if len(devices) > MOST_DEVICES:
         notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
-    found = []
+    found: list[Panel] = []  # the first of them tells the notes
     for topic, payloads in read.payloads.items():
         device = topic.removeprefix(TOPIC)
         name = f"Sweeps of {device}"
         try:
             sweeps = _sweeps(session, topic, device, payloads)
         except FormatError as error:
-            found.append(Panel(name, f"Not drawn: {error.message}."))
+            found.append(Panel(name, " ".join([f"Not drawn: {error.message}.", *notes])))
+            notes = []
             continue
         found.append(_panel(name, session, solution, sweeps, notes))
-        notes = []  # told once
+        notes = []
     return found
 
 

@@ -45,19 +45,20 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     notes = [*read.notes, *drawing.strangers(solution, devices)]
     if len(devices) > MOST_DEVICES:
         notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
-    found: list[Panel] = []
+    found: list[Panel] = []  # the first of them tells the notes
     for topic, payloads in read.payloads.items():
         device = topic.removeprefix(KIND.topic)
         name = f"Magnetic field along {device}"
         try:
             samples = fields(session, KIND, topic, payloads)
         except LocatkError as error:
-            found.append(Panel(name, f"Not drawn: {error.message}."))
+            found.append(Panel(name, " ".join([f"Not drawn: {error.message}.", *notes])))
+            notes = []
             continue
         bar = _Bar(session, device, samples)
         seen = [each for each in solution.detections if each.get("device") == device]
         found += [_whole(name, bar, seen, notes), *_near(device, bar, seen)]
-        notes = []  # told once
+        notes = []
     return found
 
 
@@ -218,7 +219,10 @@ def _add_map(figure: Any, bar: _Bar, strength: NDArray[Any], seen: list[dict[str
             kept = drawing.one_a_pixel(x, y)
             circles = drawing.scatter(
                 x[kept], y[kept], 2, mode="markers", hoverinfo="skip",
-                marker={"symbol": "circle-open", "size": 9 if len(x) < MANY else 4, "color": color},
+                marker={
+                    "symbol": "circle-open", "color": color, "size": 9 if len(x) < MANY else 4,
+                    "line": {"width": 2 if len(x) < MANY else 1},
+                },
                 name="magnets, tag not read" if refused else "magnets of tags",
             )  # fmt: skip
             figure.add_traces([circles])

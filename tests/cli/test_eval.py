@@ -120,7 +120,7 @@ def test_text_says_it_in_words(locatk, run: Path, found: Path, tmp_path: Path) -
         "coverage: 100.0 % (29.9 of 29.9 s)",
         "path: 5.9",
         "drift: 0.",
-        "consistency: covariances agree with the errors (NEES ",
+        "consistency: covariances agree with the errors; NEES ",
     ):
         assert line in text, line
     assert "APE [mm]" in text

@@ -309,6 +309,34 @@ def test_resume_replaces_nothing_of_others(
     assert calls(sonar) == ["b", "a"]
 
 
+def test_an_attempt_thought_lost_does_no_harm(
+    locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that nobody hears from any more writes the output all the same, meanwhile."""
+    from locatk.cli import solve_batch, systems
+
+    [session] = day("a")
+    out = tmp_path / "a.mcap"
+    [job] = solve_batch.plan([str(session)], [str(out)], systems.Request(), travels=False)
+    solve = systems.solve_session
+
+    def twice(path: Path, request: systems.Request) -> systems.Solved:
+        monkeypatch.setattr(systems, "solve_session", solve)
+        assert "error" not in solve_batch.solve_file(job)
+        return solve(path, request)
+
+    monkeypatch.setattr(systems, "solve_session", twice)
+    answer = solve_batch.solve_file(job)
+    assert "error" not in answer
+    assert answer["entry"]["poses"] == 20
+    whole = out.read_bytes()
+    assert solve_batch.solve_file(job)["entry"]["solve_s"] is None  # once more, afterwards
+    assert out.read_bytes() == whole
+    out.write_text("precious")
+    assert "exists" in solve_batch.solve_file(job)["entry"]["error"]
+    assert out.read_text() == "precious"
+
+
 def test_a_broken_artifact_is_one_error(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, sonar: Path
 ) -> None:

@@ -93,6 +93,8 @@ def test_motions_that_are_unlike_fall_back_to_the_first_stamps() -> None:
     coarse = clocks.coarse_offset([(trajectory(TIME, noise, MONTHS_NS), TRUTH)], align="none")
     assert coarse.by == "first stamps"
     assert coarse.offset_s == pytest.approx(-MONTHS_NS / 1e9)
+    with pytest.raises(InputError, match="too unlike"):  # nor do these tell an offset
+        metrics.evaluate(trajectory(TIME, 1e-9 * noise, MONTHS_NS), TRUTH, offset_s="auto")
     with pytest.raises(InputError, match="no poses"):
         clocks.coarse_offset([(trajectory(TIME[:0], WAY[:0]), TRUTH)])
 

@@ -162,6 +162,14 @@ def test_stamps_at_once_are_those_one_by_one(stamps: list[int], places: int, cut
     assert number_lines.parse_times(words, fail).tolist() == expected
 
 
+def test_stamps_beyond_the_range_are_no_stamps(tmp_path: Path) -> None:
+    file = tmp_path / "a.tum"
+    file.write_text("8999999999.5 0 0 0 0 0 0 1\n9999999999.5 0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match=r"'9999999999\.5' is no time") as caught:
+        t.read_tum(file)
+    assert caught.value.where == 2
+
+
 def sample(device: str = "robot") -> Trajectory:
     covariance = np.full((2, 3, 3), 0.0)
     covariance[:] = np.diag([1e-6, 4e-6, 9e-6])

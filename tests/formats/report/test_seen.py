@@ -274,9 +274,10 @@ def test_a_refused_visit_of_the_solver_is_listed() -> None:
 
 def test_detections_of_other_tools_are_no_traceback() -> None:
     for system in seen_reasons.SYSTEMS:
-        saw, rejected = seen.panels(Solution(system, "x", (), {"z": 1}, [{"a": 1}]))
-        assert saw.note
-        assert rejected.note
+        for odd in ({"a": 1}, {"sweeps": "x", "rejected": []}):
+            saw, rejected = seen.panels(Solution(system, "x", (), {"spike": 1}, [odd]))
+            assert saw.note
+            assert rejected.note
 
 
 def test_words_of_tables() -> None:
