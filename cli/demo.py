@@ -148,10 +148,12 @@ def whole_way(
     """Simulate, solve and evaluate one system in ``folder``: its row of the table, and what
     the report tells of it."""
     from locatk.cli.demo_sessions import MAKERS, SPEED_MPS
+    from locatk.cli.solve_batch import command_line
     from locatk.cli.systems import Request, solve_session
     from locatk.core import metrics
     from locatk.core.association import pair_devices
     from locatk.formats import solutions
+    from locatk.formats.batch.made import source_facts
     from locatk.formats.plot import plot_solution
     from locatk.formats.report import subjects
 
@@ -162,7 +164,10 @@ def whole_way(
         solved = solve_session(session, Request())
         speed = SPEED_MPS if system == "polaris" else None
         paper = solve_session(session, Request(method="paper", speed=speed))
-        solutions.write_solution(solution, solved.solution, source=session, overwrite=overwrite)
+        facts = {**source_facts(session), "command": command_line(session.name, Request())}
+        solutions.write_solution(
+            solution, solved.solution, source=session, facts=facts, overwrite=overwrite
+        )
     subject = subjects.load(solution, session=session)
     if pictured:
         with console.working(f"Drawing {system}"):

@@ -44,7 +44,8 @@ def margins(locatk, sessions: list[Path], folder: Path, *args: object) -> list[f
     """Margins of the one tag in each session, which must be the default one."""
     result = locatk("solve", *sessions, "-o", folder, "--json", *args)
     assert result.exit_code == 0, result.stderr
-    found = [entry["detections"] for entry in json.loads(result.stdout)["sessions"]]
+    answers = [json.loads(line)["sessions"] for line in result.stdout.splitlines()]
+    found = [entry["detections"] for (entry,) in answers]
     assert [[seen["tag_id"] for seen in one] for one in found] == [[DEFAULT_ID]] * len(sessions)
     return [one[0]["margin"] for one in found]
 
