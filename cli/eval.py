@@ -83,6 +83,13 @@ class Offset(click.ParamType):
     metavar="N(f|m|deg|s)",
     help="Distance of the poses of a relative error: poses, metres, degrees or seconds.",
 )
+@click.option(
+    "--pair",
+    "names",
+    multiple=True,
+    metavar="NAME=NAME",
+    help="What a device of the estimate is called in the truth; may be given again.",
+)
 @click.option("--all-pairs", is_flag=True, help="Relative errors from each pose on.")
 @options.as_json
 @options.verbosity
@@ -94,6 +101,7 @@ def command(
     match: str,
     max_diff: float,
     delta: str,
+    names: tuple[str, ...],
     all_pairs: bool,
     as_json: bool,
 ) -> None:
@@ -110,6 +118,7 @@ def command(
       locatk eval solved.mcap --truth grid.mcap --align sim3 --json
       locatk eval solved.mcap --truth camera.tum --offset auto
       locatk eval slam.tum --truth mocap.tum --align se3 --delta 1m
+      locatk eval solved.mcap --truth mocap.csv --pair robot-785b=red --pair robot-dffa=blue
     """
     from locatk.cli import eval_text
     from locatk.core import metrics
@@ -127,12 +136,15 @@ def command(
                 "no solved poses", file=estimate, hint="Solve it first: `locatk solve`"
             )
         console.warn(f"{estimate} holds no solved poses: its truth is taken as the estimate")
-    pairs, alone = pair_devices(mine.trajectories, true.trajectories)
+    pairs, alone = pair_devices(mine.trajectories, true.trajectories, called(names))
     if not pairs:
+        here, there = (
+            ", ".join(each.device for each in side.trajectories) for side in (mine, true)
+        )
         raise InputError(
             f"no device of the estimate is in {truth}",
             file=estimate,
-            hint="Compare what `locatk info` says of both",
+            hint=f"Say by --pair NAME=NAME which of {here} is which of {there}",
         )
     if alone:
         console.warn(f"no truth for {', '.join(alone)}")
@@ -157,3 +169,12 @@ def command(
         console.emit_json(facts)
     else:
         console.result(eval_text.text(found))
+
+
+def called(names: tuple[str, ...]) -> dict[str, str]:
+    """Names in the estimate to names in the truth, from `NAME=NAME`."""
+    pairs = [name.partition("=") for name in names]
+    for name, (mine, _, true) in zip(names, pairs, strict=True):
+        if not mine or not true:
+            raise click.BadParameter(f"{name!r} is not NAME=NAME.", param_hint="--pair")
+    return {mine: true for mine, _, true in pairs}

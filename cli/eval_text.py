@@ -30,25 +30,25 @@ def text(found: Evaluation) -> str:
         every = {name: getattr(found, name) for name, _, _ in KINDS}
         scopes.append(("all", every))
     scopes += [(name, found.of_device(i)) for i, name in enumerate(found.devices)]
-    rows = []
-    for name, figures in scopes:
-        for kind, short, length in KINDS:
-            rows.append(_row(name, short, figures[kind], unit if length else "deg",
-                             factor if length else 1.0))  # fmt: skip
-    return "\n".join(
-        [
-            console.table(("device", "error", "n", *STATISTICS[:-1], "sse [unit²]"), rows),
-            *_lines(found),
-        ]
-    )
+    rows = [
+        _row(name, f"{short} [{unit}]", figures, factor)
+        if length
+        else _row(name, f"{short} [deg]", figures, 1.0)
+        for name, told in scopes
+        for kind, short, length in KINDS
+        if (figures := told[kind]) is not None
+    ]
+    header = ("device", "error", "n", *STATISTICS[:-1], "sse [unit²]")
+    return "\n".join([_verdict(found, unit, factor), console.table(header, rows), *_lines(found)])
 
 
-def _row(
-    device: str, short: str, figures: Statistics | None, unit: str, factor: float
-) -> tuple[object, ...]:
-    label = f"{short} [{unit}]"
-    if figures is None:
-        return (device, label, 0, *("-" for _ in STATISTICS))
+def _verdict(found: Evaluation, unit: str, factor: float) -> str:
+    """Whether it is good, in one line."""
+    middle, most = (f"{number(factor * value)} {unit}" for value in (found.median, found.p95))
+    return f"Half of {found.n} poses lie within {middle} of the truth, 95 % within {most}."
+
+
+def _row(device: str, label: str, figures: Statistics, factor: float) -> tuple[object, ...]:
     numbers = (
         number(getattr(figures, name) * (factor**2 if name == "sse" else factor))
         for name in STATISTICS
@@ -57,8 +57,10 @@ def _row(
 
 
 def number(value: float) -> str:
-    """Three decimals; three digits below a tenth."""
-    return f"{value:.3f}" if value >= 0.1 or value == 0 else f"{value:.3g}"
+    """Three decimals; three digits below a tenth, and nothing below rounding."""
+    if value < 1e-9:
+        return "0"
+    return f"{value:.3f}" if value >= 0.1 else f"{value:.3g}"
 
 
 def _lines(found: Evaluation) -> list[str]:
@@ -69,7 +71,9 @@ def _lines(found: Evaluation) -> list[str]:
         "nearest": "nearest in time",
     }[found.match]
     return [
-        f"RPE: of poses {found.rpe_delta} apart",
+        "RPE: from each pose to the next"
+        if found.rpe_delta == "1f"
+        else f"RPE: of poses {found.rpe_delta} apart",
         f"alignment: {found.align}, fitted on {facts['align_fitted_on']}"
         + (f" (scale {found.alignment.scale:.6f})" if found.align.startswith("sim") else ""),
         f"association: {found.match} ({how})",
@@ -102,7 +106,7 @@ def _consistency(found: Evaluation) -> str:
     if said is None:
         return "consistency: - (the estimate has no covariances)"
     return (
-        f"consistency: {said.words()}; NEES {said.mean:.2f} a degree of freedom "
+        f"consistency: {said.words()}; NEES {number(said.mean)} a degree of freedom "
         f"({said.low:.2f} to {said.high:.2f} expected of independent poses), "
         f"{100 * said.inside:.0f} % of the poses in their 95 % region"
     )

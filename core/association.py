@@ -7,7 +7,7 @@ stamped t is compared with the truth at t + offset. (Shifting a camera's clock b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -218,14 +218,32 @@ def take(trajectory: Trajectory, keep: NDArray[np.bool_]) -> Trajectory:
 
 
 def pair_devices(
-    estimates: Sequence[Trajectory], truths: Sequence[Trajectory]
+    estimates: Sequence[Trajectory],
+    truths: Sequence[Trajectory],
+    names: Mapping[str, str] | None = None,
 ) -> tuple[list[tuple[Trajectory, Trajectory]], list[str]]:
     """Estimate and truth of each device, and the devices that have no truth.
 
-    By name; where there is just one of each, their names need not agree.
+    By name; where there is just one of each, their names need not agree. ``names`` tells what
+    devices of the estimate are called in the truth; others then have their own name.
+
+    Raises
+    ------
+    InputError
+        ``names`` has a device that is not there.
     """
+    known = {trajectory.device: trajectory for trajectory in truths}
+    names = names or {}
+    for what, wanted, there in (
+        ("estimate", names.keys(), {mine.device for mine in estimates}),
+        ("truth", names.values(), known.keys()),
+    ):
+        for name in wanted:
+            if name not in there:
+                has = ", ".join(sorted(there))
+                raise InputError(f"no device {name!r} in the {what}", hint=f"It has {has}")
     if len(estimates) == len(truths) == 1:
         return [(estimates[0], truths[0])], []
-    by_name = {trajectory.device: trajectory for trajectory in truths}
-    pairs = [(mine, by_name[mine.device]) for mine in estimates if mine.device in by_name]
-    return pairs, [mine.device for mine in estimates if mine.device not in by_name]
+    called = [(mine, names.get(mine.device, mine.device)) for mine in estimates]
+    pairs = [(mine, known[name]) for mine, name in called if name in known]
+    return pairs, [mine.device for mine, name in called if name not in known]

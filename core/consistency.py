@@ -28,6 +28,10 @@ MEDIANS = (np.nan, 0.454936, 1.386294, 2.365974, 3.356694, 4.351460, 5.348121)
 """95 % and 50 % quantiles of chi-squared by degrees of freedom, 0 to 6. Written down: scipy,
 against which a test holds them, takes longer to import than all else here to compute."""
 
+FITTING = 1.5
+"""Errors that differ by no more from what covariances say are no reason to distrust them: the
+poses of one drive share errors, so that their mean strays further than that of draws."""
+
 NORMAL = 1.959964
 """Of 95 %, in both directions."""
 
@@ -63,23 +67,24 @@ class Consistency:
     inside: float
     dof: float
 
+    @property
+    def ratio(self) -> float:
+        """How many times as large the errors are as the covariances say."""
+        return float(np.sqrt(self.mean))
+
     def words(self) -> str:
         """What it says of the covariances, in one clause."""
-        if self.low <= self.mean <= self.high:
-            return "covariances agree with the errors"
-        text = f"covariances are {_size(self.mean)}"
+        ratio = self.ratio
+        errors = f"errors are {_times(ratio)} times as large as they say"
         if self.mean > self.high and self.median < self.mean / 2:
-            text += f", most of it by a few poses (by the median {_size(self.median)})"
-        return text
+            errors += f", most of it by a few poses (by the median {_times(np.sqrt(self.median))})"
+        if self.low <= self.mean <= self.high or 1 / FITTING < ratio < FITTING:
+            return f"covariances fit: {errors}"
+        return f"covariances are too {'small' if ratio > 1 else 'large'}: {errors}"
 
 
-def _size(mean: float) -> str:
-    """Of covariances, by the mean of their NEES."""
-    if mean < 1e-3:
-        return "far too large"
-    factor = max(mean, 1 / mean)
-    times = f"{factor:.0f}" if factor >= 9.95 else f"{factor:.2g}"
-    return f"{times} times too {'small' if mean > 1 else 'large'}"
+def _times(ratio: float) -> str:
+    return "less than 0.01" if ratio < 0.01 else f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.2g}"
 
 
 def nees(
