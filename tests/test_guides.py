@@ -321,7 +321,7 @@ class Reader:
     def provide(self, words: list[str]) -> None:
         """Put into the folder what a reader has."""
         for before, word in itertools.pairwise(["", *words]):
-            if before in ("-o", "--output") or not word or word.startswith(("/", "-")):
+            if before in ("-o", "--output") or word in ("", ".") or word.startswith(("/", "-")):
                 continue
             pattern = re.sub(r"\$\{?\w+\}?", "*", Path(word).parts[0])
             for name in fnmatch.filter(FILES, pattern) if pattern != "*" else ():
