@@ -106,12 +106,14 @@ def command(
         for subject, row in zip(found, pictures, strict=True):
             for path in row:
                 from locatk.formats.plot import plot_solution
+                from locatk.formats.plot_clock import origin_ns
 
                 plot_solution(
                     path,
                     subject.solution,
                     truth=subject.truth,
                     evaluation=subject.evaluation,
+                    start_ns=origin_ns(subject.session, subject.solution),
                     overwrite=overwrite,
                 )
                 written.append(path)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.core.errors import LocatkError, OutputExistsError
+from locatk.core.errors import InputError, LocatkError, OutputExistsError
 
 if TYPE_CHECKING:
     from locatk.cli.systems import Request
@@ -103,6 +103,9 @@ def _solved(job: Job, stack: contextlib.ExitStack, names: dict[str, str]) -> dic
     from locatk.formats import artifacts, solutions
     from locatk.formats.batch import made, places, pools
 
+    for place in (job.session, job.output):
+        if not places.is_text(place):
+            raise InputError("its name is not UTF-8", file=place, hint="Rename it")
     scratch = job.scratch or pools.worker_folder()
     path = stack.enter_context(places.local(job.source, scratch))
     names[str(path)] = job.session
@@ -219,7 +222,11 @@ def plan_outputs(sessions: Sequence[str], output: str | None, *, many: bool) -> 
     stems = [_stem(session) for session in sessions]
     twins = [name for name, count in Counter(stems).items() if count > 1]
     if twins:
-        raise click.UsageError(f"Several sessions have the name {twins[0]!r}.")
+        same = [session for session, stem in zip(sessions, stems, strict=True) if stem == twins[0]]
+        raise click.UsageError(
+            f"{same[0]} and {same[1]} would have the same output: leave out -o, or give them "
+            "names of their own."
+        )
     if not url:
         options.make_folder(Path(output))
     return [places.within(output, f"{stem}.mcap") for stem in stems]

@@ -201,8 +201,11 @@ def _nearest_of(short: Array, long: Array, limit: float) -> tuple[Rows, Rows]:
 
 def _seconds(time_ns: NDArray[np.int64]) -> Array:
     """Epoch seconds, rounded once as by ``float("1690218696.0748")``."""
+    # Below 2^53 ns the quotient is rounded once. Beyond, no nine decimals lie so near the middle
+    # of two floats that the rounding of the fraction could decide.
     seconds, rest = np.divmod(time_ns, 1_000_000_000)
-    return np.asarray(seconds + rest / 1e9)
+    small = np.abs(time_ns) < 2**53
+    return np.where(small, time_ns / 1e9, seconds + rest / 1e9)
 
 
 def take(trajectory: Trajectory, keep: NDArray[np.bool_]) -> Trajectory:

@@ -22,9 +22,11 @@ from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import plot_series
 from locatk.formats.output import atomic_write, check_output
+from locatk.formats.plot_clock import origin_ns
 from locatk.formats.plot_ground import COLORS, IN_LEGEND, broken, compare, ground_of, has_no_scale
 from locatk.formats.plot_map import draw_map, legend, plain
 from locatk.formats.plot_series import Series
+from locatk.formats.plot_units import Unit, length, thousands, unit_for
 
 __all__ = ["COLORS", "SUFFIXES", "draw", "plot_solution"]
 
@@ -42,6 +44,7 @@ def plot_solution(
     *,
     truth: Sequence[Trajectory] = (),
     evaluation: Evaluation | None = None,
+    start_ns: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Draw a solution: paths from above, and errors (else what the solver expects of them).
@@ -57,6 +60,8 @@ def plot_solution(
     evaluation : Evaluation, optional
         The errors, and the alignment with which the solution is laid over the truth. Without
         one a solution in metres is compared with ``truth`` as it is, without alignment.
+    start_ns : int, optional
+        Where the time axis begins; by default with the first pose.
     overwrite : bool
         Replace an existing file.
 
@@ -79,13 +84,16 @@ def plot_solution(
     salted = mpl.rc_context({"svg.hashsalt": "locatk", "font.size": 9})
     with style.context("default"), salted, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # drawn as a box
-        figure = draw(solution, truth, evaluation)
+        figure = draw(solution, truth, evaluation, start_ns)
         with atomic_write(path, overwrite=overwrite) as stream:
             figure.savefig(stream, format=suffix[1:], dpi=DPI, metadata=undated)
 
 
 def draw(
-    solution: Solution, truth: Sequence[Trajectory] = (), evaluation: Evaluation | None = None
+    solution: Solution,
+    truth: Sequence[Trajectory] = (),
+    evaluation: Evaluation | None = None,
+    start_ns: int | None = None,
 ) -> Figure:
     """The figure of :func:`plot_solution`, not yet written."""
     if evaluation is None and not has_no_scale(solution):
@@ -108,13 +116,24 @@ def draw(
     over_time, spread = right.subplots(2, 1, height_ratios=(3, 2))
     series = plot_series.errors(evaluation) if evaluation else plot_series.sigmas(solution)
     what = "error" if evaluation else "solver's sigma"
-    label = f"{what} [{'1/1000 unit' if ground.unit == 'unit' else 'mm'}]"
+    values = [s.value[np.isfinite(s.value)] for s in series.values()]
+    every = np.concatenate(values) if values else np.zeros(0)
+    size = float(np.percentile(every, 95)) if len(every) else 0.0
+    unscaled = ground.unit == "unit"
+    unit = unit_for(size, unscaled=unscaled)
+    label = f"{what} [{unit.name}]"
     expected = plot_series.expected(solution, evaluation) if evaluation is not None else {}
-    _draw_series(over_time, spread, series, expected, colors, label)
+    start = origin_ns(None, solution) if start_ns is None else start_ns
+    _draw_series(
+        over_time, spread, _scaled(series, unit), _scaled(expected, unit), colors, label, start
+    )
     if evaluation is not None:
         spread.set_title(
-            f"half below {_mm(evaluation.median)}, 95 % below {_mm(evaluation.p95)}, "
-            f"largest {_mm(evaluation.max)}",
+            "APE "
+            + ", ".join(
+                f"{name} {length(getattr(evaluation, name), unscaled=unscaled)}"
+                for name in ("median", "p95", "max")
+            ),
             loc="left",
             fontsize=9,
         )
@@ -132,12 +151,12 @@ def _draw_series(
     expected: dict[str, Series],
     colors: dict[str, str],
     label: str,
+    start: int,
 ) -> None:
     """Values over time, and how often they occur; wild ones are drawn at the upper edge.
 
-    All in thousandths; ``expected`` is drawn as a line, for each device that has one.
+    All in the unit of the label; ``expected`` is drawn as a line, for each device that has one.
     """
-    series, expected = _thousandths(series), _thousandths(expected)
     over_time.set_xlabel("time [s]")
     over_time.set_ylabel(label)
     spread.set_xlabel(label)
@@ -155,7 +174,6 @@ def _draw_series(
         bands = {}
     edges = [s.value for s in bands.values()]
     top = plot_series.usual_top(every, np.concatenate(edges) if edges else None)
-    start = min(int(s.time_ns.min()) for s in filled.values())
     for name, s in filled.items():
         seconds = (s.time_ns - start) * 1e-9
         wild = s.value > top
@@ -173,7 +191,8 @@ def _draw_series(
     said = ["line: 95 % expected by the covariance"] if bands else []
     out = int(np.count_nonzero(every > top))
     if out:
-        said.append(f"{out} of {len(every)} beyond this scale (triangles)")
+        count = f"{thousands(out)} of {thousands(len(every))}"
+        said.append(f"{count} beyond this scale (triangles)")
     over_time.set_title("\n".join(said), loc="left", fontsize=9)
     usual = plot_series.usual_top(every)
     # Many colours on top of each other tell nothing.
@@ -186,8 +205,8 @@ def _draw_series(
     spread.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
-def _thousandths(series: dict[str, Series]) -> dict[str, Series]:
-    return {name: Series(s.time_ns, 1e3 * s.value) for name, s in series.items()}
+def _scaled(series: dict[str, Series], unit: Unit) -> dict[str, Series]:
+    return {name: Series(s.time_ns, unit.per_metre * s.value) for name, s in series.items()}
 
 
 # ---- words
@@ -197,19 +216,15 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
     """What this is, how good it is, and what it stands on."""
     devices = len(solution.trajectories)
     text = (
-        f"{solution.system}, {solution.method}: {solution.poses} poses of {devices} "
+        f"{solution.system}, {solution.method}: {thousands(solution.poses)} poses of {devices} "
         f"{'device' if devices == 1 else 'devices'}"
     )
     if evaluation is not None:
-        text += f", MAE {_mm(evaluation.mae)}, RMSE {_mm(evaluation.rmse)}"
+        unit = has_no_scale(solution) and not evaluation.align.startswith("sim")
+        rmse, mean = (length(value, unscaled=unit) for value in (evaluation.rmse, evaluation.mae))
+        text += f", APE rmse {rmse}, mean {mean}"
         share = evaluation.coverage.share
         text += "" if share is None else f", {100 * share:.1f} % of the time solved"
         text += f" (alignment: {evaluation.align}, time offset: {evaluation.offset_source})"
     notes = textwrap.wrap("; ".join(solution.notes), 160, max_lines=2, placeholder=" ...")
     return plain("\n".join(textwrap.wrap(text, 160) + notes))
-
-
-def _mm(metres: float) -> str:
-    """A length in mm, to three digits."""
-    digits = np.clip(2 - np.floor(np.log10(max(1e3 * metres, 1e-5))), 0, 5)
-    return f"{1e3 * metres:.{int(digits)}f} mm"

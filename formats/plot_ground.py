@@ -101,10 +101,25 @@ class Ground:
         return points + ([] if self.floor is None else plot_floor.solid(self.floor))
 
 
+def known(t: Trajectory) -> Trajectory:
+    """The poses of a trajectory whose positions are numbers: the others cannot be judged."""
+    whole = np.isfinite(t.position).all(axis=1)
+    if whole.all():
+        return t
+    return replace(
+        t,
+        time_ns=t.time_ns[whole],
+        position=t.position[whole],
+        quaternion=t.quaternion[whole],
+        covariance=t.covariance[whole],
+    )
+
+
 def compare(solution: Solution, truth: Sequence[Trajectory]) -> Evaluation | None:
     """The solution against the truth as it is; None where no pose has truth."""
-    true = {t.device: t for t in truth}
-    pairs = [(t, true[t.device]) for t in solution.trajectories if t.device in true and len(t)]
+    true = {t.device: known(t) for t in truth}
+    solved = [known(t) for t in solution.trajectories]
+    pairs = [(t, true[t.device]) for t in solved if t.device in true and len(t)]
     try:
         return metrics.evaluate_all(pairs) if pairs else None
     except InputError:
@@ -217,12 +232,23 @@ class Pointer:
     label_at: Array
 
 
+def framed(
+    ground: Ground, *, widest: float = 1.0, plane: tuple[int, int] = (0, 1)
+) -> tuple[Ground, View, tuple[Pointer, ...]]:
+    """A map in the unit that suits its size (mm below a metre), with what :func:`view_of` says."""
+    view, pointers = view_of(ground, widest=widest, plane=plane)
+    if ground.unit != "m" or 2 * view.half.max() >= 1:
+        return ground, view, pointers
+    ground = ground.scaled(1e3, "mm")
+    return ground, *view_of(ground, widest=widest, plane=plane, least=10.0)
+
+
 def view_of(
     ground: Ground,
     *,
     widest: float = 1.0,
     plane: tuple[int, int] = (0, 1),
-    least: float = 0.1,
+    least: float = 0.01,
 ) -> tuple[View, tuple[Pointer, ...]]:
     """The rectangle that shows a map, at most ``widest`` times as wide as high, and never higher
     than wide; and the stations in it or at its margin.
@@ -275,9 +301,19 @@ def _rectangle(box: Array, widest: float, least: float) -> tuple[Array, Array]:
     return (low + high) / 2, np.array([wide, tall]) / 2
 
 
-def broken(position: Array, time_ns: NDArray[np.int64], silence_ns: int = BREAK_NS) -> Array:
-    """Columns (n, k) with a row of nan wherever the path is silent for longer than that."""
-    gaps = np.flatnonzero(np.diff(time_ns) > silence_ns) + 1
+def broken(
+    position: Array, time_ns: NDArray[np.int64], keep: NDArray[np.int64] | None = None
+) -> Array:
+    """Rows (n, k) with one of nan wherever the path is silent for longer than :data:`BREAK_NS`,
+    and longer than three of its usual intervals.
+
+    Of a thinned path the rows are those of ``keep``, while the times are of all: what is left
+    out is no silence.
+    """
+    interval = np.diff(time_ns)
+    silence = max(BREAK_NS, 3 * int(np.median(interval))) if len(interval) else BREAK_NS
+    silences = np.concatenate([[0], np.cumsum(interval > silence)])[: len(time_ns)]
+    gaps = np.flatnonzero(np.diff(silences if keep is None else silences[keep])) + 1
     return np.insert(position, gaps, np.nan, axis=0)
 
 

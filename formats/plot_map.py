@@ -22,16 +22,18 @@ from locatk.formats.plot_ground import (
     Paper,
     Pointer,
     broken,
+    framed,
     short,
-    view_of,
 )
 from locatk.formats.plot_tags import Tag
+from locatk.formats.plot_units import thousands
 
 Array = NDArray[np.float64]
 
 
 def draw_map(axes: Axes, ground: Ground, colors: dict[str, str]) -> None:
     """Draw all that lies on the ground, and fit a square view to it."""
+    ground, view, pointers = framed(ground)
     for t in ground.truth:
         line = broken(t.position[:, :2], t.time_ns).T
         axes.plot(*line, color=TRUTH_COLOR, lw=2.5, zorder=1)
@@ -46,7 +48,6 @@ def draw_map(axes: Axes, ground: Ground, colors: dict[str, str]) -> None:
         _draw_tag(axes, tag)
     if ground.floor is not None:
         _draw_floor(axes, ground.floor)
-    view, pointers = view_of(ground)
     for pointer in pointers:
         _draw_station(axes, pointer)
     axes.set_xlim(*view.limits[0])
@@ -60,7 +61,8 @@ def draw_map(axes: Axes, ground: Ground, colors: dict[str, str]) -> None:
     axes.set_ylabel(f"y [{ground.unit}]")
     out = sum(view.outside(path[:, :2]) for path in ground.paths.values())
     if out:
-        axes.set_title(f"{out} poses lie outside this view", loc="left", fontsize=9)
+        lie = "1 pose lies" if out == 1 else f"{thousands(out)} poses lie"
+        axes.set_title(f"{lie} outside this view", loc="left", fontsize=9)
 
 
 def _draw_paper(axes: Axes, paper: Paper) -> None:

@@ -7,6 +7,7 @@ What is in them is said in docs/formats.md; how sweeps and poses become messages
 from __future__ import annotations
 
 import os
+import stat
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -222,6 +223,9 @@ class Session:
 def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     """The open MCAP file; whatever is wrong with it becomes an error of one line."""
     try:
+        # A pipe would be waited for, for ever, and nothing of it can be read twice.
+        if not stat.S_ISREG(kind := os.stat(path).st_mode) and not stat.S_ISDIR(kind):
+            raise FormatError("not a regular file", file=path)
         with open(path, "rb") as stream:
             yield stream
     except (FileNotFoundError, NotADirectoryError):

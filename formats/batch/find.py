@@ -56,13 +56,13 @@ def find_sessions(names: Sequence[str], solved: Callable[[str], str] | None = No
         several = _expanded(name)
         many = many or several is not None
         for place in [name] if several is None else several:
-            key = places.absolute(place)
+            key = _identity(place)
             if key not in named:
                 named[key] = place
                 if several is not None:
                     doubtful[key] = place
     if solved is not None:
-        outputs = {places.absolute(solved(place)) for place in named.values()}
+        outputs = {_identity(solved(place)) for place in named.values()}
         doubtful |= {key: place for key, place in named.items() if key in outputs}
     with ThreadPoolExecutor(AT_ONCE) as threads:
         facts = dict(zip(doubtful, threads.map(places.facts_of, doubtful.values()), strict=True))
@@ -75,21 +75,48 @@ def find_sessions(names: Sequence[str], solved: Callable[[str], str] | None = No
     return Found(sessions, tuple(named[key] for key in named if key in passed), many)
 
 
+def _identity(place: str) -> str:
+    """Equal for one file behind two paths; a link that gives it another name is another."""
+    if places.is_url(place):
+        return place
+    folder, name = os.path.split(places.absolute(place))
+    return os.path.join(os.path.realpath(folder), name)
+
+
 def _expanded(name: str) -> list[str] | None:
     """What a folder or a pattern stands for; None where it names one file."""
     if places.is_url(name):
         return _expanded_url(name)
     if os.path.isdir(name):
-        found = glob.glob(os.path.join(glob.escape(name), "*.mcap"))
+        found = _files(os.path.join(glob.escape(name), "*.mcap"))
         return _something(sorted(found), name, f"no *.mcap in the folder {name}")
     if os.path.exists(name):
         return None
     if glob.has_magic(name):
-        found = [path for path in glob.glob(name, recursive=True) if not os.path.isdir(path)]
+        found = _files(name)
         return _something(sorted(found), name, f"nothing matches {name}")
     raise MissingDataError(
         "No such file or folder", file=name, hint="Check the spelling of the path"
     )
+
+
+def _files(pattern: str) -> list[str]:
+    """What a pattern matches, but for folders: one may be called `old.mcap`.
+
+    As in shells `**` follows no links to folders, of which two in a circle have no end.
+    """
+    parts = pattern.replace(os.sep, "/").split("/")
+    if "**" not in parts:
+        return [path for path in glob.glob(pattern) if not os.path.isdir(path)]
+    deep = parts.index("**")
+    below = "/".join(part for part in parts[deep + 1 :]) or "*"
+    found: list[str] = []
+    for top in glob.glob("/".join([*parts[:deep], ""])) if deep else [""]:
+        for folder, inner, _ in os.walk(top or os.curdir):
+            inner[:] = [name for name in inner if not name.startswith(".")]
+            start = os.path.relpath(folder) if not top else folder
+            found += _files(os.path.join("" if start == "." else glob.escape(start), below))
+    return found
 
 
 def _expanded_url(url: str) -> list[str] | None:

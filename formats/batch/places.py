@@ -40,6 +40,15 @@ def is_url(place: str) -> bool:
     return _URL.match(place) is not None
 
 
+def is_text(place: str) -> bool:
+    """Whether solutions and terminals can tell ``place``: names of files may hold any bytes."""
+    try:
+        place.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def absolute(place: str) -> str:
     """``place`` for processes that have another working folder."""
     return place if is_url(place) else os.path.abspath(place)

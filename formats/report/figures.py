@@ -1,58 +1,21 @@
-"""What all figures of a report share: units, thinning, safe words, axes."""
+"""What all figures of a report share: thinning, safe words, axes."""
 
 from __future__ import annotations
 
 import html
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.formats.plot_ground import COLORS
+from locatk.formats.plot_units import thousands
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 MOST_POINTS = 3000
 """So many poses a figure draws, at most, of all devices together."""
-
-
-@dataclass(frozen=True)
-class Unit:
-    """A unit of length: its name, and how many of it a metre is."""
-
-    name: str
-    per_metre: float
-
-
-UNSCALED = Unit("1/1000 unit", 1e3)
-
-
-def unit_for(size_m: float, *, unscaled: bool = False) -> Unit:
-    """The unit in which a length of this size is said."""
-    if unscaled:
-        return UNSCALED
-    if not size_m > 0 or 1e-5 <= size_m < 1:
-        return Unit("mm", 1e3)
-    return Unit("\u00b5m", 1e6) if size_m < 1e-5 else Unit("m", 1.0)
-
-
-def length(metres: float, *, unscaled: bool = False) -> str:
-    """A length in the unit that suits it, to three digits."""
-    if unscaled:
-        return f"{digits(metres)} unit"
-    unit = unit_for(abs(metres))
-    return f"{digits(metres * unit.per_metre)} {unit.name}"
-
-
-def digits(value: float) -> str:
-    """A number to three digits, never with an exponent between 0.001 and a million."""
-    if not np.isfinite(value):
-        return "-"
-    if abs(value) >= 999.5:
-        return f"{value:.0f}" if abs(value) < 1e6 else f"{value:.3g}"
-    return f"{value:#.3g}".removesuffix(".") if abs(value) >= 1e-3 else f"{value:.3g}"
 
 
 def label(words: object) -> str:
@@ -101,7 +64,7 @@ def drawn(shown: int, total: int) -> str:
     """A sentence that says that not all is drawn, where that is so."""
     if shown >= total:
         return ""
-    return f"Drawn are {shown} of {total} poses, the outliers among them."
+    return f"Drawn are {thousands(shown)} of {thousands(total)} poses, the outliers among them."
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:

@@ -19,15 +19,15 @@ from locatk.formats.plot_ground import (
     Pointer,
     View,
     broken,
+    framed,
     short,
-    view_of,
 )
+from locatk.formats.plot_units import digits, thousands
 from locatk.formats.report.artifact_marks import artifact_marks, landmark_names
 from locatk.formats.report.figures import (
     Array,
     axis,
     colours,
-    digits,
     drawn,
     faint,
     label,
@@ -49,24 +49,25 @@ STEEP = 0.05
 """A path is also seen from the side where it rises by more than this share of its width."""
 
 
-def map_panels(solution: Solution, ground: Ground, title: str = "Path") -> list[Panel]:
+def map_panels(
+    solution: Solution, ground: Ground, start_ns: int, title: str = "Path"
+) -> list[Panel]:
     """The map, and the side where the path leaves the plane."""
-    panels = [_panel(solution, ground, title, (0, 1))]
+    panels = [_panel(solution, ground, start_ns, title, (0, 1))]
     places = [p[np.isfinite(p).all(axis=1)] for p in ground.paths.values()]
     every = np.concatenate(places) if places else np.zeros((0, 3))
     if len(every) > 1:
         low, high = np.percentile(every, (1, 99), axis=0)
         wide, rise = float(np.max((high - low)[:2])), float(high[2] - low[2])
         if rise > STEEP * wide:
-            panels.append(_panel(solution, ground, f"{title} from the side", (0, 2)))
+            panels.append(_panel(solution, ground, start_ns, f"{title} from the side", (0, 2)))
     return panels
 
 
-def _panel(solution: Solution, ground: Ground, title: str, plane: tuple[int, int]) -> Panel:
-    view, pointers = view_of(ground, widest=WIDEST, plane=plane, least=0.01)
-    if ground.unit == "m" and 2 * view.half.max() < 1:
-        ground = ground.scaled(1e3, "mm")
-        view, pointers = view_of(ground, widest=WIDEST, plane=plane, least=10.0)
+def _panel(
+    solution: Solution, ground: Ground, start_ns: int, title: str, plane: tuple[int, int]
+) -> Panel:
+    ground, view, pointers = framed(ground, widest=WIDEST, plane=plane)
     figure = Figure()
     names = list(ground.paths)
     colors = colours(names)
@@ -79,13 +80,12 @@ def _panel(solution: Solution, ground: Ground, title: str, plane: tuple[int, int
         figure.add_trace(_truth(t, most, plane, first=k == 0))
     factor = _add_ellipses(figure, solution, ground, view, plane, colors)
     each = dict(zip(names, share_of_points([len(p) for p in ground.paths.values()]), strict=True))
-    start = _start(solution)
     shown = 0
     for k, t in enumerate(solution.trajectories):
         keep = thin(len(t), each[t.device], _jumps(ground.paths[t.device]))
         shown += len(keep)
         named = len(names) <= IN_LEGEND or k < IN_LEGEND - 1
-        for trace in _path(t, ground, keep, start, plane, colors[t.device], named):
+        for trace in _path(t, ground, keep, start_ns, plane, colors[t.device], named):
             figure.add_trace(trace)
     if ground.scene.markers:
         figure.add_trace(_markers(ground, plane))
@@ -111,11 +111,7 @@ def _panel(solution: Solution, ground: Ground, title: str, plane: tuple[int, int
 
 
 def _poses(count: int) -> str:
-    return "1 pose lies" if count == 1 else f"{count} poses lie"
-
-
-def _start(solution: Solution) -> int:
-    return min((int(t.time_ns[0]) for t in solution.trajectories if len(t)), default=0)
+    return "1 pose lies" if count == 1 else f"{thousands(count)} poses lie"
 
 
 def _jumps(path: Array) -> Array:
@@ -128,7 +124,7 @@ def _jumps(path: Array) -> Array:
 
 def _truth(t: Trajectory, most: int, plane: tuple[int, int], *, first: bool) -> Scatter:
     keep = thin(len(t), most, _jumps(t.position))
-    x, y = broken(t.position[keep][:, list(plane)], t.time_ns[keep], _silence(t.time_ns, keep)).T
+    x, y = broken(t.position[keep][:, list(plane)], t.time_ns, keep).T
     return Scatter(
         x=x,
         y=y,
@@ -139,15 +135,6 @@ def _truth(t: Trajectory, most: int, plane: tuple[int, int], *, first: bool) -> 
         line={"color": TRUTH_COLOR, "width": 4},
         hoverinfo="skip",
     )
-
-
-def _silence(time_ns: NDArray[np.int64], keep: NDArray[np.int64]) -> int:
-    """After how long a silence a thinned path is broken: points left out are no silence."""
-    from locatk.formats.plot_ground import BREAK_NS
-
-    if len(keep) == len(time_ns) or len(keep) < 2:
-        return BREAK_NS
-    return max(BREAK_NS, 3 * int(np.median(np.diff(time_ns[keep]))))
 
 
 def _path(
@@ -164,8 +151,7 @@ def _path(
         return []
     position = ground.paths[t.device][keep]
     said, template = _hover(t, ground, keep, start)
-    silence = _silence(t.time_ns, keep)
-    both = broken(np.column_stack([position[:, list(plane)], said]), t.time_ns[keep], silence)
+    both = broken(np.column_stack([position[:, list(plane)], said]), t.time_ns, keep)
     name = label(short(t.device))
     look: dict[str, Any] = {"legendgroup": t.device, "hovertemplate": template, "name": name}
     line = Scatter(

@@ -13,10 +13,10 @@ from plotly.subplots import make_subplots
 
 from locatk.formats.plot_ground import IN_LEGEND, broken, short
 from locatk.formats.plot_series import MOST_BANDS, Series, usual_top
+from locatk.formats.plot_units import Unit, thousands
 from locatk.formats.report.figures import (
     MOST_POINTS,
     Array,
-    Unit,
     axis,
     drawn,
     faint,
@@ -46,29 +46,23 @@ class Row:
     bands: dict[str, Series]
 
 
-def start_of(series: Sequence[dict[str, Series]]) -> int:
-    """The first time in any of them, in ns."""
-    times = [int(s.time_ns[0]) for row in series for s in row.values() if len(s.time_ns)]
-    return min(times, default=0)
-
-
 def errors_figure(
     series: dict[str, Series],
     expected: dict[str, Series],
     colors: dict[str, str],
     unit: Unit,
     what: str,
+    start_ns: int,
     edges: str = "",
     *,
     reference: float | None = None,
 ) -> tuple[Figure, str]:
-    """Values that are never negative against time, wild ones at the upper edge; and what must be
-    said of it. ``expected`` are the values below which 95 % should lie; ``edges`` says where they
-    are; ``reference`` is a value to be marked, and in view."""
+    """Values that are never negative against time since ``start_ns``, wild ones at the upper
+    edge; and what must be said of it. ``expected`` are the values below which 95 % should lie;
+    ``edges`` says where they are; ``reference`` is a value to be marked, and in view."""
     filled = {name: s for name, s in series.items() if len(s.value)}
     figure = Figure()
     every = np.concatenate([s.value for s in filled.values()]) * unit.per_metre
-    start = start_of([filled])
     counts = share_of_points([len(s.value) for s in filled.values()])
     bands = {name: s for name, s in expected.items() if np.isfinite(s.value).any()}
     edge = _edges(bands)
@@ -82,11 +76,11 @@ def errors_figure(
     for k, ((name, s), most) in enumerate(zip(filled.items(), counts, strict=True)):
         keep = thin(len(s.value), most, s.value)
         shown += len(keep)
-        seconds, value = (s.time_ns[keep] - start) * 1e-9, s.value[keep] * unit.per_metre
+        seconds, value = (s.time_ns[keep] - start_ns) * 1e-9, s.value[keep] * unit.per_metre
         look = _look(name, colors[name], k, len(filled))
         if name in bands and len(bands) <= MOST_BANDS:
             figure.add_trace(
-                _below(bands[name], start, unit, colors[name], shaded=shaded, first=k == 0)
+                _below(bands[name], start_ns, unit, colors[name], shaded=shaded, first=k == 0)
             )
         figure.add_trace(
             Scatter(
@@ -113,7 +107,8 @@ def errors_figure(
         ("The shade ends" if shaded else "The lines are") + f" {edges}."
         if 0 < len(bands) <= MOST_BANDS
         else "",
-        f"{wild} of {len(every)} lie beyond this scale (triangles): double-click to see them."
+        f"{thousands(wild)} of {thousands(len(every))} lie beyond this scale (triangles): "
+        "double-click to see them."
         if wild
         else "",
         drawn(shown, len(every)),
@@ -140,10 +135,10 @@ def _look(name: str, color: str, k: int, devices: int) -> dict[str, Any]:
 def _below(s: Series, start: int, unit: Unit, color: str, *, shaded: bool, first: bool) -> Scatter:
     """The area from zero to a band, or of several devices just its edge."""
     keep = thin(len(s.value), 600)
-    seconds = (s.time_ns[keep] - start) * 1e-9
+    x, y = _rows(s, keep, start).T
     return Scatter(
-        x=seconds,
-        y=s.value[keep] * unit.per_metre,
+        x=x,
+        y=y * unit.per_metre,
         mode="lines",
         name="95 % expected",
         legendgroup="expected",
@@ -229,10 +224,12 @@ def histogram_figure(
     return figure
 
 
-def rows_figure(rows: Sequence[Row], colors: dict[str, str], *, signed: bool) -> tuple[Figure, str]:
-    """Diagrams above each other that share the time; and what must be said of them."""
+def rows_figure(
+    rows: Sequence[Row], colors: dict[str, str], start_ns: int, *, signed: bool
+) -> tuple[Figure, str]:
+    """Diagrams above each other that share the time since ``start_ns``; and what must be said of
+    them."""
     figure = make_subplots(len(rows), 1, shared_xaxes=True, vertical_spacing=0.05)
-    start = start_of([row.values for row in rows])
     wild = total = shown = 0
     for number, row in enumerate(rows, start=1):
         finite = {n: np.abs(s.value[np.isfinite(s.value)]) for n, s in row.values.items()}
@@ -251,9 +248,9 @@ def rows_figure(rows: Sequence[Row], colors: dict[str, str], *, signed: bool) ->
             keep = thin(len(s.value), most, np.abs(s.value))
             shown += len(keep)
             if name in bands:
-                for trace in _band(bands[name], start, colors[name], len(bands) == 1):
+                for trace in _band(bands[name], start_ns, colors[name], len(bands) == 1):
                     figure.add_trace(trace, row=number, col=1)
-            trace = _line(s, keep, start, colors[name], mode)
+            trace = _line(s, keep, start_ns, colors[name], mode)
             look = _look(name, colors[name], k, len(row.values))
             trace.update(**{**look, "showlegend": look["showlegend"] and number == 1})
             figure.add_trace(trace, row=number, col=1)
@@ -261,7 +258,8 @@ def rows_figure(rows: Sequence[Row], colors: dict[str, str], *, signed: bool) ->
     figure.update_xaxes(axis("time [s]"), row=len(rows), col=1)
     figure.update_layout(height=ROW_PX * len(rows) + 60)
     note = sentences(
-        f"{wild} of {total} values lie beyond these scales: double-click to see them."
+        f"{thousands(wild)} of {thousands(total)} values lie beyond these scales: double-click "
+        "to see them."
         if wild
         else "",
         drawn(shown, total).replace("poses", "values"),
@@ -269,11 +267,14 @@ def rows_figure(rows: Sequence[Row], colors: dict[str, str], *, signed: bool) ->
     return figure, note
 
 
+def _rows(s: Series, keep: NDArray[np.int64], start: int) -> Array:
+    """Times and values, broken where there are none."""
+    both = np.column_stack([(s.time_ns[keep] - start) * 1e-9, s.value[keep]])
+    return broken(both, s.time_ns, keep)
+
+
 def _line(s: Series, keep: NDArray[np.int64], start: int, color: str, mode: str) -> Scatter:
-    time_ns = s.time_ns[keep]
-    both = np.column_stack([(time_ns - start) * 1e-9, s.value[keep]])
-    silence = max(500_000_000, 3 * int(np.median(np.diff(time_ns)))) if len(keep) > 1 else 1
-    x, y = broken(both, time_ns, silence).T
+    x, y = _rows(s, keep, start).T
     return Scatter(
         x=x,
         y=y,
@@ -288,7 +289,7 @@ def _band(s: Series, start: int, color: str, shaded: bool) -> list[Scatter]:
     """The area between minus and plus ``s``, or just its edges."""
     keep = thin(len(s.value), 600)
     keep = keep[np.isfinite(s.value[keep])]
-    seconds, value = (s.time_ns[keep] - start) * 1e-9, s.value[keep]
+    seconds, value = _rows(s, keep, start).T
     look: dict[str, Any] = {
         "mode": "lines",
         "line": {"color": faint(color, 0.5), "width": 1},

@@ -6,11 +6,14 @@ import numpy as np
 
 from locatk.core.consistency import EDGES
 from locatk.core.metrics import Evaluation
+from locatk.core.solution import Solution
 from locatk.core.statistics import Statistics
 from locatk.formats import plot_series
-from locatk.formats.plot_ground import has_no_scale
+from locatk.formats.plot_clock import origin_ns
+from locatk.formats.plot_ground import has_no_scale, known
 from locatk.formats.plot_series import NORMAL_95, Series
-from locatk.formats.report.figures import Unit, colours, digits, length, sentences, unit_for
+from locatk.formats.plot_units import Unit, digits, length, thousands, unit_for
+from locatk.formats.report.figures import colours, sentences
 from locatk.formats.report.figures_time import Row, errors_figure, histogram_figure, rows_figure
 from locatk.formats.report.panel import Panel, Table
 from locatk.formats.report.subject import Subject
@@ -31,11 +34,15 @@ def verdict(subject: Subject) -> str:
     if evaluation is None:
         spread = _sigma(subject)
         if not len(spread):
-            return f"{why_unjudged(subject)} The solver tells no covariance either."
+            return sentences(
+                why_unjudged(subject), "The solver tells no covariance either.", _left_out(solution)
+            )
         middle = length(float(np.median(spread)), unscaled=unscaled(subject))
-        return (
-            f"{why_unjudged(subject)} The solver itself expects a standard deviation of "
-            f"{middle} (median over all poses, all axes together)."
+        return sentences(
+            why_unjudged(subject),
+            f"The solver itself expects a standard deviation of {middle} (median over all poses, "
+            "all axes together).",
+            _left_out(solution),
         )
     unit = unscaled(subject)
     text = (
@@ -51,7 +58,16 @@ def verdict(subject: Subject) -> str:
         fitted += f" Time offset: {evaluation.offset_s:.4f} s ({evaluation.offset_source})."
     consistency = evaluation.consistency
     judged = "" if consistency is None else f"{consistency.words().capitalize()}."
-    return sentences(text, fitted, judged)
+    return sentences(text, fitted, judged, _left_out(solution))
+
+
+def _left_out(solution: Solution) -> str:
+    """A sentence on poses that are no numbers."""
+    count = solution.poses - sum(len(known(t)) for t in solution.trajectories)
+    if not count:
+        return ""
+    said = "1 pose is not a number: it is" if count == 1 else f"{thousands(count)} poses are not "
+    return f"{said}{'' if count == 1 else 'numbers: they are'} neither drawn nor scored."
 
 
 def why_unjudged(subject: Subject) -> str:
@@ -62,6 +78,8 @@ def why_unjudged(subject: Subject) -> str:
                 "The scene has no scale (its unit is the distance of the first two stations), so "
                 "that it is not compared with the truth in metres; --align sim3 compares them."
             )
+        if not any(len(known(t)) for t in subject.solution.trajectories):
+            return "No pose is a number, so that there are no errors."
         return "No pose has truth at its time for its device, so that there are no errors."
     if subject.session is not None:
         return "The session holds no truth, so that there are no errors; --truth FILE gives it."
@@ -78,15 +96,14 @@ def key_figures(subject: Subject) -> list[tuple[str, str]]:
     solution, evaluation = subject.solution, subject.evaluation
     unit = unscaled(subject)
     devices = len(solution.trajectories)
-    found = [(f"{solution.poses:,}".replace(",", "\u202f"), _of(devices))]
+    found = [(thousands(solution.poses), _of(devices))]
     if evaluation is not None:
         found += [
-            (length(evaluation.median, unscaled=unit), "median error"),
-            (length(evaluation.p95, unscaled=unit), "95 % of errors below"),
-            (length(evaluation.max, unscaled=unit), "largest error"),
+            (length(getattr(evaluation, name), unscaled=unit), f"APE {name}")
+            for name in ("median", "rmse", "p95", "max")
         ]
         if evaluation.ape_rotation is not None:
-            found.append((f"{digits(evaluation.ape_rotation.median)}\u00b0", "median turn error"))
+            found.append((f"{digits(evaluation.ape_rotation.median)}\u00b0", "APE rotation median"))
         if evaluation.coverage.share is not None:
             found.append((f"{100 * evaluation.coverage.share:.1f} %", "of the time solved"))
     else:
@@ -96,7 +113,7 @@ def key_figures(subject: Subject) -> list[tuple[str, str]]:
             found.append((length(middle, unscaled=unit), "median sigma"))
             found.append((length(high, unscaled=unit), "95 % of sigmas below"))
     rejected = sum(solution.rejected.values())
-    found.append((f"{rejected:,}".replace(",", "\u202f"), "observations rejected"))
+    found.append((thousands(rejected), "observations rejected"))
     return found
 
 
@@ -121,11 +138,12 @@ def error_panels(subject: Subject) -> list[Panel]:
         colors,
         unit,
         "error",
+        origin_ns(subject.session, subject.solution),
         "where 95 % of the errors should be below, by the solver's covariance",
     )
-    known = np.concatenate([s.value for s in expected.values()])
-    below = evaluation.errors <= known
-    told = np.isfinite(known)
+    edges = np.concatenate([s.value for s in expected.values()])
+    below = evaluation.errors <= edges
+    told = np.isfinite(edges)
     if told.any() and evaluation.consistency is None:
         share = 100 * np.count_nonzero(below[told]) / np.count_nonzero(told)
         note = sentences(note, f"{share:.0f} % of the errors are below what it expects of 95 %.")
@@ -134,8 +152,8 @@ def error_panels(subject: Subject) -> list[Panel]:
     shown = histogram_figure(series, colors, unit, "error", lines)
     panels.append(Panel("How often errors occur", "", shown))
     panels.append(_by_axis(subject, evaluation, colors, unit))
-    panels += _rotation(evaluation, colors)
-    panels += _nees(evaluation, colors)
+    panels += _rotation(subject, evaluation, colors)
+    panels += _nees(subject, evaluation, colors)
     panels.append(Panel("Statistics", _how(evaluation), table=_statistics(evaluation, unit)))
     return panels
 
@@ -156,44 +174,49 @@ def _by_axis(subject: Subject, evaluation: Evaluation, colors: dict[str, str], u
                 if np.isfinite(band[mine, k]).any():
                     bands[device] = Series(evaluation.time_ns[mine], band[mine, k])
         rows.append(Row(f"{name} [{unit.name}]", values, bands))
-    figure, note = rows_figure(rows, colors, signed=True)
-    with_bands = any(0 < len(row.bands) <= plot_series.MOST_BANDS for row in rows)
-    shaded = "95 % should lie within the thin lines, by the solver's covariance."
+    start = origin_ns(subject.session, subject.solution)
+    figure, note = rows_figure(rows, colors, start, signed=True)
+    drawn = [len(row.bands) for row in rows if 0 < len(row.bands) <= plot_series.MOST_BANDS]
+    within = "shade" if max(drawn, default=0) == 1 else "thin lines"
+    expected = f"95 % should lie within the {within}, by the solver's covariance."
     return Panel(
-        "Error by axis", sentences("Solved minus true.", shaded if with_bands else "", note), figure
+        "Error by axis", sentences("Solved minus true.", expected if drawn else "", note), figure
     )
 
 
-def _rotation(evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
-    known = np.isfinite(evaluation.rotation_errors_deg)
-    if not known.any():
+def _rotation(subject: Subject, evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
+    told = np.isfinite(evaluation.rotation_errors_deg)
+    if not told.any():
         return []
     series = {}
     for k, name in enumerate(evaluation.devices):
-        mine = known & (evaluation.device == k)
+        mine = told & (evaluation.device == k)
         series[name] = Series(evaluation.time_ns[mine], evaluation.rotation_errors_deg[mine])
-    figure, note = errors_figure(series, {}, colors, Unit("\u00b0", 1.0), "rotation error")
+    start = origin_ns(subject.session, subject.solution)
+    figure, note = errors_figure(series, {}, colors, Unit("\u00b0", 1.0), "rotation error", start)
     return [Panel("Rotation error against time", note, figure)]
 
 
-def _nees(evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
-    known = np.isfinite(evaluation.nees) & (evaluation.nees_dof > 0)
-    if evaluation.consistency is None or not known.any():
+def _nees(subject: Subject, evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
+    told = np.isfinite(evaluation.nees) & (evaluation.nees_dof > 0)
+    if evaluation.consistency is None or not told.any():
         return []
     ratio = evaluation.nees / np.array(EDGES)[evaluation.nees_dof]
     series = {}
     for k, name in enumerate(evaluation.devices):
-        mine = known & (evaluation.device == k)
+        mine = told & (evaluation.device == k)
         series[name] = Series(evaluation.time_ns[mine], ratio[mine])
+    start = origin_ns(subject.session, subject.solution)
     figure, note = errors_figure(
-        series, {}, colors, Unit("of its 95 % edge", 1.0), "NEES", reference=1.0
+        series, {}, colors, Unit("of its 95 % edge", 1.0), "NEES", start, reference=1.0
     )
     consistency = evaluation.consistency
     said = (
         "Normalised estimation error squared: the error measured by the covariance that comes "
         "with it, here over the value below which 95 % should be. "
-        f"{100 * consistency.inside:.0f} % of {consistency.n} poses are below 1; the mean over "
-        f"its expectation is {digits(consistency.mean)} (1 where the covariances are right)."
+        f"{100 * consistency.inside:.0f} % of {thousands(consistency.n)} poses are below 1; the "
+        f"mean over its expectation is {digits(consistency.mean)} (1 where the covariances are "
+        "right)."
     )
     return [Panel("Does the covariance fit the error?", sentences(said, note), figure)]
 
@@ -205,7 +228,6 @@ ERRORS = (
     ("rpe_translation", "RPE translation"),
     ("rpe_rotation", "RPE rotation"),
 )
-_HEAD = ("RMSE", "mean", "median", "SD", "min", "max", "95 %")
 
 
 def _statistics(evaluation: Evaluation, unit: Unit) -> Table:
@@ -225,7 +247,7 @@ def _statistics(evaluation: Evaluation, unit: Unit) -> Table:
         of, factor = (unit.name, unit.per_metre) if "translation" in name else ("\u00b0", 1.0)
         for k, (device, found) in enumerate(of_each.items()):
             add(title if k == 0 else "", device, found[name], of, factor)
-    return Table(("", "device", "unit", "n", *_HEAD), rows)
+    return Table(("", "device", "unit", "n", *STATISTICS), rows)
 
 
 def _how(evaluation: Evaluation) -> str:
@@ -280,6 +302,7 @@ def sigma_panels(subject: Subject) -> list[Panel]:
             rows.append(Row(f"\u03c3 {name} [{of}]", values, {}))
     if not rows:
         return []
-    figure, note = rows_figure(rows, colors, signed=False)
+    start = origin_ns(subject.session, solution)
+    figure, note = rows_figure(rows, colors, start, signed=False)
     said = "Standard deviations as the solver tells them, in its own frame."
     return [Panel("Covariance against time", sentences(said, note), figure)]

@@ -120,12 +120,15 @@ def figure(drawn: Figure, ident: str) -> str:
     spec = drawn.to_dict()
     layout = spec.setdefault("layout", {})
     layout.pop("template", None)  # the page has one for all
-    layout.pop("width", None)
-    # Of its place, not of the figure: a narrow window makes it lower.
+    # Of its place, not of the figure: it is as wide as its window, which scrolls it where that
+    # is narrower, and a map is lower in a narrow one.
+    least = layout.pop("width", None)
     height = int(layout.pop("height", None) or 380)
+    wide = f";min-width:{int(least)}px" if least else ""
     data = to_json_plotly({"data": spec.get("data", []), "layout": layout}, engine="json")
     return (
-        f'<div class="figure" id="{ident}" style="height:{height}px"></div>\n'
+        f'<div class="wide"><div class="figure" id="{ident}" style="height:{height}px{wide}">'
+        "</div></div>\n"
         f'<script type="application/json" id="{ident}-data">{_inert(data)}</script>'
     )
 

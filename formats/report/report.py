@@ -9,9 +9,10 @@ from dataclasses import replace
 from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats.output import atomic_write, check_output, tool_version
+from locatk.formats.plot_clock import of_one_time, origin_ns, span, when
 from locatk.formats.plot_ground import ground_of
+from locatk.formats.plot_units import length, thousands
 from locatk.formats.report import judgement, page, run_facts, seen, signals
-from locatk.formats.report.figures import length
 from locatk.formats.report.figures_map import map_panels
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.subject import Subject
@@ -102,6 +103,9 @@ def _signals(subject: Subject) -> list[Panel]:
         return [
             Panel("Signals", f"{missing} the solution: its signals are not shown. {GIVE_SESSION}")
         ]
+    if not of_one_time(subject.session, subject.solution):
+        other = "The session is of another time than the poses: its signals are not shown."
+        return [Panel("Signals", f"{other} It begins {when(subject.session.start_ns or 0)}.")]
     try:
         return signals.panels(subject.session, subject.solution)
     except LocatkError as error:
@@ -112,17 +116,18 @@ def _signals(subject: Subject) -> list[Panel]:
 def _maps(subject: Subject) -> list[Panel]:
     """A map for each frame in which there are poses: places in two frames share no map."""
     solution = subject.solution
+    start = origin_ns(subject.session, solution)
     frames = list(dict.fromkeys(t.frame for t in solution.trajectories))
     if len(frames) < 2:
         ground = ground_of(solution, subject.truth, subject.evaluation)
-        return map_panels(solution, ground)
+        return map_panels(solution, ground, start)
     found = []
     for frame in frames:
         part = _in_frame(solution, frame)
         names = {t.device for t in part.trajectories}
         truth = [t for t in subject.truth if t.device in names]
         ground = ground_of(part, truth, subject.evaluation)
-        found += map_panels(part, ground, f"Path in {frame}")
+        found += map_panels(part, ground, start, f"Path in {frame}")
     return found
 
 
@@ -139,9 +144,14 @@ def _what(subject: Subject) -> str:
     source = subject.facts.get("source")
     if source:
         parts[0] += f", from {source}"
-    times = run_facts.span(solution)
+    times = span(solution)
     if times is not None:
-        parts.append(f"{run_facts.when(times[0])}, {(times[1] - times[0]) * 1e-9:.1f} s")
+        parts.append(f"{(times[1] - times[0]) * 1e-9:.1f} s of poses")
+    start = origin_ns(subject.session, solution)
+    if start:
+        of_session = subject.session is not None and subject.session.start_ns == start
+        what = "the start of the recording" if of_session else "the first pose"
+        parts.append(f"time 0 is {what}, {when(start)}")
     return " \u00b7 ".join(parts)
 
 
@@ -149,7 +159,7 @@ def overview(subjects: Sequence[Subject]) -> str:
     """A table of all subjects, each a link to its part of the page."""
     head = "".join(f"<th>{name}</th>" for name in ("solution", "system", "method"))
     head += "".join(
-        f'<th class="number">{name}</th>' for name in ("poses", "median error", "95 %", "rejected")
+        f'<th class="number">{name}</th>' for name in ("poses", "APE median", "APE p95", "rejected")
     )
     rows = []
     for k, subject in enumerate(subjects, start=1):
@@ -162,7 +172,8 @@ def overview(subjects: Sequence[Subject]) -> str:
                 length(value, unscaled=unit) for value in (evaluation.median, evaluation.p95)
             )
         )
-        numbers = (str(solution.poses), *errors, str(sum(solution.rejected.values())))
+        rejected = sum(solution.rejected.values())
+        numbers = (thousands(solution.poses), *errors, thousands(rejected))
         rows.append(
             f'<tr><td><a href="#s{k}">{page.text(subject.name)}</a></td>'
             f"<td>{page.text(solution.system)}</td><td>{page.text(solution.method)}</td>"

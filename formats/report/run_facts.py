@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from locatk.core.dots.sheet import Manifest
@@ -12,7 +11,8 @@ from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution
 from locatk.formats import describe
-from locatk.formats.report.figures import digits
+from locatk.formats.plot_clock import span, when
+from locatk.formats.plot_units import digits
 from locatk.formats.report.panel import Panel, Table
 from locatk.formats.report.subject import Subject
 
@@ -23,6 +23,14 @@ LONGEST = 160
 """Characters of a fact that are shown."""
 
 _KNOWN = ("kind", "system", "method", "source", "tool_version", "format_version", "command")
+_FOR_PROGRAMS = ("options_sha256",)
+
+_UNITS = {
+    "m": "m", "mm": "mm", "um": "\u00b5m", "s": "s", "ms": "ms", "hz": "Hz", "mps": "m/s",
+    "rad": "rad", "mrad": "mrad", "deg": "\u00b0", "t": "T", "mt": "mT", "ut": "\u00b5T",
+    "am2": "A m\u00b2", "px": "px", "ppm": "ppm", "percent": "%",
+}  # fmt: skip
+"""By what follows the last underscore of a key."""
 
 
 def run_panels(subject: Subject) -> list[Panel]:
@@ -36,21 +44,6 @@ def run_panels(subject: Subject) -> list[Panel]:
         note = "On which the poses stand, as it was given or solved."
         panels.append(Panel("Artifact", note, table=_table(list(_flat(found)))))
     return panels
-
-
-def when(time_ns: int) -> str:
-    """A time for people, in UTC."""
-    try:
-        moment = datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
-    except (OverflowError, OSError, ValueError):
-        return f"{time_ns} ns"
-    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
-
-
-def span(solution: Solution) -> tuple[int, int] | None:
-    """Times of the first and the last pose in ns; None where there is no pose."""
-    ends = [(int(t.time_ns[0]), int(t.time_ns[-1])) for t in solution.trajectories if len(t)]
-    return (min(a for a, _ in ends), max(b for _, b in ends)) if ends else None
 
 
 def _run(subject: Subject) -> list[tuple[str, str]]:
@@ -71,7 +64,8 @@ def _run(subject: Subject) -> list[tuple[str, str]]:
     rows.append(("poses", names or "none"))
     if "tool_version" in facts:
         rows.append(("solved by", f"locatk {facts['tool_version']}"))
-    rows += [(_words(key), _cut(value)) for key, value in facts.items() if key not in _KNOWN]
+    left_out = _KNOWN + _FOR_PROGRAMS
+    rows += [(_words(key), _cut(value)) for key, value in facts.items() if key not in left_out]
     return rows
 
 
@@ -115,7 +109,7 @@ def _table(rows: list[tuple[str, str]]) -> Table:
 
 
 def _flat(facts: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Rows of nested facts; long lists are counted, what is unknown is left out."""
+    """Rows of nested facts; long lists and what is unknown are left out."""
     for key, value in facts.items():
         name = f"{before}{_words(str(key))}"
         if isinstance(value, Mapping):
@@ -135,8 +129,6 @@ def _listed(name: str, values: Sequence[Any]) -> Iterator[tuple[str, str]]:
     elif nested and len(values) <= 3:
         for k, value in enumerate(values):
             yield from _flat({f"{k + 1}": value}, f"{name} ")
-    else:
-        yield name, f"{len(values)} entries"
 
 
 def _value(value: Any) -> str:
@@ -148,6 +140,10 @@ def _value(value: Any) -> str:
 
 
 def _words(key: str) -> str:
+    """A key as a person reads it, its unit in brackets."""
+    name, _, unit = key.rpartition("_")
+    if name and unit in _UNITS:
+        return f"{name.replace('_', ' ')} [{_UNITS[unit]}]"
     return key.replace("_", " ")
 
 

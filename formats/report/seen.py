@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from locatk.core.solution import Solution
 from locatk.formats import seen_text
 from locatk.formats.plot_ground import COLORS
+from locatk.formats.plot_units import thousands
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel, Table
@@ -29,6 +30,9 @@ MOST_ROWS = 20
 SEEN, REJECTED = "What was seen", "What was rejected, and why"
 
 BINS = 40
+
+BAR_PX = 46
+"""Height of the bar of a reason with its name."""
 
 MALFORMED = (KeyError, TypeError, ValueError, AttributeError)
 """What detections raise that are not as docs/formats.md has them: other tools write files too."""
@@ -88,9 +92,10 @@ def _tags(solution: Solution) -> Panel:
     table = seen_text.tags(solution.detections, MOST_ROWS, compact=True)
     margins = [number(each["margin"]) for each in solution.detections if not each.get("refused")]
     note = (
-        f"{len(margins)} of {counted(len(solution.detections), 'passes')} over magnets were read "
-        "as tags. Tags are told in the frame of the bar, with the standard deviation; the margin "
-        "is how much nearer the id is than the next one, in steps of orientation."
+        f"{len(margins)} of {counted(len(solution.detections), 'passes')} over magnets "
+        f"{'was' if len(margins) == 1 else 'were'} read as a tag. Tags are told in the frame of "
+        "the bar, with the standard deviation; the margin is how much nearer the id is than the "
+        "next one, in steps of orientation."
     )
     figure = None
     if len(margins) > MOST_ROWS:
@@ -150,7 +155,8 @@ def _frames(solution: Solution) -> Panel:
     ]
     return Panel(
         SEEN,
-        f"{len(frames)} frames of the camera. Dots, corrected bits and confidence are medians.",
+        f"{counted(len(frames), 'frames')} of the camera. Dots, corrected bits and confidence are "
+        "medians.",
         _histogram(series, "frames"),
         Table(header, rows),
     )
@@ -232,14 +238,16 @@ def _rejected(solution: Solution) -> Panel:
     for unit in dict.fromkeys(_unit(known[why]) for why in order):
         count = sum(n for why, n in counts.items() if _unit(known[why]) == unit)
         said.append(
-            f"{count} of {counted(totals[unit], unit)}" if unit in totals else counted(count, unit)
+            f"{thousands(count)} of {counted(totals[unit], unit)}"
+            if unit in totals
+            else counted(count, unit)
         )
     return Panel(REJECTED, f"Rejected: {', '.join(said)}.", figure, Table(header, rows))
 
 
 def counted(count: int, unit: str) -> str:
     """``"1 pass"``, ``"2 passes"``."""
-    return f"{count} {unit if count != 1 else {'passes': 'pass'}.get(unit, unit[:-1])}"
+    return f"{thousands(count)} {unit if count != 1 else {'passes': 'pass'}.get(unit, unit[:-1])}"
 
 
 def _unit(reason: Reason | None) -> str:
@@ -267,25 +275,38 @@ def _totals(solution: Solution, known: Mapping[str, Reason | None]) -> dict[str,
     return {}
 
 
-def _bars(counts: Mapping[str, int], order: list[str], units: Mapping[str, str]) -> Figure:
-    """Reasons by how often they were given."""
+def _bars(counts: Mapping[str, int], order: list[str], units: Mapping[str, str]) -> Figure | None:
+    """Reasons by how often they were given, each with its name above its bar, where a narrow
+    window has room for it; of a single reason nothing that its table does not say."""
     from plotly.graph_objects import Figure
 
+    if len(order) < 2:
+        return None
     figure = Figure()
+    row = {why: k for k, why in enumerate(order)}
     for k, unit in enumerate(dict.fromkeys(units.values())):
         mine = [why for why in order if units[why] == unit]
         figure.add_bar(
-            x=[counts[why] for why in mine], y=[label(words(why)) for why in mine], orientation="h",
-            name=unit, marker_color=COLORS[(1, 5, 3)[k % 3]],
-            text=[str(counts[why]) for why in mine], textposition="outside", cliponaxis=False,
-            hovertemplate=f"%{{y}}: %{{x}} {unit}<extra></extra>",
+            x=[counts[why] for why in mine], y=[row[why] for why in mine], orientation="h",
+            name=unit, marker_color=COLORS[(1, 5, 3)[k % 3]], width=0.4,
+            text=[thousands(counts[why]) for why in mine], textposition="outside",
+            cliponaxis=False, customdata=[label(words(why)) for why in mine],
+            hovertemplate=f"%{{customdata}}: %{{x}} {unit}<extra></extra>",
         )  # fmt: skip
-    figure.update_xaxes(visible=False, rangemode="tozero")
-    figure.update_yaxes(
-        automargin=True,
-        categoryorder="array",
-        categoryarray=[label(words(why)) for why in order[::-1]],
-    )
+    names = [
+        {
+            "x": 0, "y": row[why], "text": label(words(why)), "showarrow": False,
+            "xanchor": "left", "yanchor": "bottom", "yshift": 0.2 * BAR_PX, "xshift": -3,
+        }
+        for why in order
+    ]  # fmt: skip
+    # Room for the number beside the longest bar.
+    figure.update_xaxes(visible=False, range=[0, 1.12 * max(counts[why] for why in order)])
+    figure.update_yaxes(visible=False, range=[len(order) - 0.5, -0.9])
     several = len(set(units.values())) > 1
-    drawing.style(figure, 60 + 28 * len(order), showlegend=several, margin_t=30, margin_b=8)
+    figure.update_layout(annotations=names, showlegend=several)
+    figure.update_layout(
+        height=BAR_PX * len(order) + (44 if several else 20),
+        margin={"l": 6, "r": 12, "t": 12, "b": 8},
+    )
     return figure

@@ -16,6 +16,7 @@ from locatk.core.errors import InputError, LocatkError
 from locatk.core.solution import Solution
 from locatk.formats import captured, sheets
 from locatk.formats import frames as camera_frames
+from locatk.formats.plot_clock import origin_ns
 from locatk.formats.plot_ground import COLORS
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
@@ -65,7 +66,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     for each, mine in zip(frames, _by_camera(frames, outcomes), strict=True):
         most = max(2, PICTURES // len(frames))
         found.append(_pictures(session, solution, each, mine, most))
-    found.append(_over_time(session, outcomes, notes))
+    found.append(_over_time(session, solution, outcomes, notes))
     return found
 
 
@@ -118,7 +119,7 @@ def _pictures(
         outcome = outcomes[k]
         decoded = outcome is not None and not outcome.get("rejected")
         png = _png(image, codec if decoded else None, camera)
-        seconds = (int(frames.time_ns[k]) - drawing.start_ns(session)) * 1e-9
+        seconds = (int(frames.time_ns[k]) - origin_ns(session, solution)) * 1e-9
         caption = f"frame {frames.names[k]}, {seconds:.2f} s: {_caption(outcome, solution)}"
         shown.append(Picture(png, caption))
     said = [
@@ -196,14 +197,16 @@ def _caption(outcome: Outcome | None, solution: Solution) -> str:
 # ---- numbers
 
 
-def _over_time(session: Session, outcomes: Sequence[Outcome], notes: list[str]) -> Panel:
+def _over_time(
+    session: Session, solution: Solution, outcomes: Sequence[Outcome], notes: list[str]
+) -> Panel:
     """Confidence, corrected bits and dots of all frames."""
     from plotly.subplots import make_subplots
 
     title = "Decoding over time"
     if not outcomes:
         return Panel(title, " ".join(["The solution does not tell of single frames.", *notes]))
-    start = drawing.start_ns(session)
+    start = origin_ns(session, solution)
     time_s = np.array([number(each["time_s"]) for each in outcomes]) - start * 1e-9
     reason = np.array([each.get("rejected") or "" for each in outcomes], object)
     series = (
@@ -236,7 +239,7 @@ def _over_time(session: Session, outcomes: Sequence[Outcome], notes: list[str]) 
     figure.add_traces(traces)
     figure.update_xaxes(title="time [s]", row=3, col=1)
     drawing.style(figure, 520)
-    said = [f"Each mark is a frame. Time 0 is {drawing.clock(start)}."]
+    said = ["Each mark is a frame."]
     if thinned:
         said.append("Thinned: where marks would hide each other one is drawn.")
     return Panel(title, " ".join([*said, *notes]), figure)

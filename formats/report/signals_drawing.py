@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
     from locatk.core.solution import Solution
-    from locatk.formats.session import Session
 
 Array = NDArray[np.float64]
 
@@ -31,6 +29,9 @@ COLUMNS = 1000
 
 MOST_MARKS = 2000
 """Marks of one kind in a figure: each is an element of the page."""
+
+COLUMN_PX = 260
+"""Least width of one of several diagrams side by side: a narrow window scrolls them."""
 
 MOST_LABELS = 30
 """Detections up to which each has its name written above it; hovering tells the others'."""
@@ -210,21 +211,8 @@ def style(figure: Figure, height: int, **more: Any) -> None:
         axes(exponentformat="none")
 
 
-def clock(time_ns: int | None) -> str:
-    """A time for people."""
-    try:
-        return datetime.fromtimestamp((time_ns or 0) * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    except (OverflowError, ValueError, OSError):
-        return f"{time_ns} ns"
-
-
-def start_ns(session: Session) -> int:
-    """Where the time axes of a recording begin."""
-    return session.start_ns or 0
-
-
 def seconds(time_ns: NDArray[Any], start_ns: int) -> Array:
-    """Times of samples on the axis."""
+    """Times of samples on the axis, which begins where all of a report do."""
     return np.asarray((time_ns - start_ns) * 1e-9, np.float64)
 
 
@@ -241,6 +229,13 @@ def strangers(solution: Solution, devices: Iterable[str]) -> list[str]:
     if not missing:
         return []
     return [f"The recording has no signals of {listed(missing)}, of which the solution has poses."]
+
+
+def choice(shown: int, total: int, what: str, which: str) -> str:
+    """A sentence that says which of all are drawn."""
+    if shown == total:
+        return f"All {what} are drawn." if total > 1 else f"There is one of these {what}."
+    return f"Drawn are {shown} of {total} {what}: {which}."
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

@@ -13,6 +13,7 @@ from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats import seen_text
 from locatk.formats.halls import KIND
+from locatk.formats.plot_clock import origin_ns
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
@@ -42,7 +43,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     if len(devices) > MOST_DEVICES:
         notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
     found: list[Panel] = []  # the first of them tells the notes
-    start_ns = drawing.start_ns(session)
+    start_ns = origin_ns(session, solution)
     for topic, payloads in read.payloads.items():
         device = topic.removeprefix(KIND.topic)
         name = f"Hall sensors of {device}"
@@ -122,7 +123,7 @@ def _whole(
     drawing.style(figure, 420)
     said = [
         "Above: the landmarks that were seen, row and column on the map and pattern; those that "
-        f"were refused with the reason. Time 0 is {drawing.clock(start_ns)}."
+        "were refused with the reason."
     ]
     if not events:
         said.append("No landmark was found in it.")
@@ -182,14 +183,18 @@ def _near(
     figure.add_traces(traces)
     for row in range(rows):
         figure.update_yaxes(title="field [mT]", row=row + 1, col=1)
-    drawing.style(figure, 90 + 230 * rows, margin_t=60)
+    drawing.style(figure, 90 + 230 * rows, margin_t=60, width=drawing.COLUMN_PX * ROW)
     figure.update_annotations(font_size=11)
     return [
         Panel(
             f"Landmarks of {device} from near",
-            f"Drawn are {len(chosen)} of {len(seen)} visits: one of each reason of refusal, the "
-            "least sure one of the others, and the surest. The dotted line is the time of the "
-            "sighting.",
+            drawing.choice(
+                len(chosen),
+                len(seen),
+                "visits",
+                "one of each reason of refusal, the least sure one of the others, and the surest",
+            )
+            + " The dotted line is the time of the sighting.",
             figure,
         )
     ]

@@ -13,6 +13,7 @@ from locatk.core.lighthouse.epochs import Epochs, group
 from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.formats.messages import SWEEPS, BatchError
+from locatk.formats.plot_clock import origin_ns
 from locatk.formats.plot_ground import COLORS
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.panel import Panel
@@ -30,6 +31,13 @@ STATIONS = tuple(color for color in COLORS if color not in (drawing.REFUSED, LEF
 
 ROUNDING_NS = 2
 
+MEANING = (
+    "Angle of the rotor at each sweep, and how many sweeps and poses there were in a second. "
+    "Crosses are sweeps that were left out by themselves (spikes, repeated or unpaired ones), "
+    "and those of moments that gave no pose."
+)
+"""Told once, of the first device."""
+
 FEWEST_BINS, MOST_BINS = 20, 300
 """In how many parts of the time sweeps are counted; of a second and more each."""
 
@@ -39,7 +47,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     topics = session.topics(TOPIC, SCHEMA)
     read = excerpt(session, topics[:MOST_DEVICES])
     devices = [topic.removeprefix(TOPIC) for topic in topics]
-    notes = [*read.notes, *drawing.strangers(solution, devices)]
+    notes = [MEANING, *read.notes, *drawing.strangers(solution, devices)]
     if len(devices) > MOST_DEVICES:
         notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
     found: list[Panel] = []  # the first of them tells the notes
@@ -124,7 +132,7 @@ def _panel(
 ) -> Panel:
     from plotly.subplots import make_subplots
 
-    start = drawing.start_ns(session)
+    start = origin_ns(session, solution)
     time_s = drawing.seconds(sweeps.time_ns, start)
     degrees = np.asarray(sweeps.count / period_counts(sweeps.channel) * 360, np.float64)
     inside = np.isfinite(degrees) & (degrees >= 0) & (degrees < 360)
@@ -166,16 +174,12 @@ def _panel(
     figure.update_yaxes(title="a second", rangemode="tozero", row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
     drawing.style(figure, 560)
-    said = [
-        "Angle of the rotor at each sweep, and how many sweeps and poses there were in a second. "
-        "Crosses are sweeps that were left out by themselves (spikes, repeated or unpaired ones), "
-        f"and those of moments that gave no pose. Time 0 is {drawing.clock(start)}."
-    ]
+    said = []
     if outside := int(np.count_nonzero(~inside)):
         said.append(f"Not drawn: {outside} sweeps with counts longer than a rotation.")
     if thinned:
         said.append("Thinned: where marks would hide each other one is drawn.")
-    return Panel(name, " ".join([*said, *notes]), figure)
+    return Panel(name, " ".join([*notes, *said]), figure)
 
 
 _PLANES = ((0, "circle", ", plane 1"), (1, "circle-open", ", plane 2"), (-1, "circle", ""))

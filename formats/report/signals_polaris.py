@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats.arrays import KIND
+from locatk.formats.plot_clock import origin_ns
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
@@ -55,7 +56,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
             found.append(Panel(name, " ".join([f"Not drawn: {error.message}.", *notes])))
             notes = []
             continue
-        bar = _Bar(session, device, samples)
+        bar = _Bar(session, device, samples, origin_ns(session, solution))
         seen = [each for each in solution.detections if each.get("device") == device]
         found += [_whole(name, bar, seen, notes), *_near(device, bar, seen)]
         notes = []
@@ -65,8 +66,8 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
 class _Bar:
     """Samples of one array as they are drawn: seconds, and uT less each sensor's median."""
 
-    def __init__(self, session: Session, device: str, samples: Fields) -> None:
-        self.start_ns = drawing.start_ns(session)
+    def __init__(self, session: Session, device: str, samples: Fields, start_ns: int) -> None:
+        self.start_ns = start_ns
         self.time_s = drawing.seconds(samples.time_ns, self.start_ns)
         field = samples.field_t.reshape(len(samples.time_ns), -1, 3)
         usual = np.zeros(field.shape[1:], np.float32)
@@ -167,10 +168,10 @@ def _whole(name: str, bar: _Bar, seen: list[dict[str, Any]], notes: list[str]) -
     figure.update_xaxes(range=[float(bar.time_s[0]), float(bar.time_s[-1])])
     drawing.style(figure, 620, legend_traceorder="reversed", legend_y=0.44)
     said = [
-        f"Size of the field at each sensor, less the sensor's median. Above: tags that were read, "
-        f"with their margin in steps of orientation, and passes that were not, with the reason. "
-        f"Circles are magnets as they were found, drawn where the mean speed of the pass puts "
-        f"them. Time 0 is {drawing.clock(bar.start_ns)}."
+        "Size of the field at each sensor, less the sensor's median. Above: tags that were read, "
+        "with their margin in steps of orientation, and passes that were not, with the reason. "
+        "Circles are magnets as they were found, drawn where the mean speed of the pass puts "
+        "them."
     ]
     if not seen:
         said.append("Nothing was found in it.")
@@ -283,15 +284,21 @@ def _near(device: str, bar: _Bar, seen: list[dict[str, Any]]) -> list[Panel]:
     figure.add_traces(traces)
     for axis, what in enumerate(AXES):
         figure.update_yaxes(title=f"{what} [µT]", row=axis + 1, col=1)
-    drawing.style(figure, 560, legend_traceorder="reversed", margin_t=44)
+    width = drawing.COLUMN_PX * len(events) if len(events) > 1 else None
+    drawing.style(figure, 560, legend_traceorder="reversed", margin_t=44, width=width)
     figure.update_annotations(font_size=11)
     return [
         Panel(
             f"Passes of {device} from near",
-            "The field's axes, less their medians, while a tag was passed. Drawn are "
-            f"{len(events)} of {len(seen)}: one of each reason why tags were not read, the least "
-            "sure one that was, and the surest. Sensors are named by where they sit across the "
-            "bar, left is positive.",
+            "The field's axes, less their medians, while a tag was passed. "
+            + drawing.choice(
+                len(events),
+                len(seen),
+                "passes",
+                "one of each reason why tags were not read, the least sure one that was, and the "
+                "surest",
+            )
+            + " Sensors are named by where they sit across the bar, left is positive.",
             figure,
         )
     ]

@@ -70,13 +70,30 @@ SCRIPT = """\
     const spec = JSON.parse(document.getElementById(figure.id + "-data").textContent);
     spec.layout.template = shared.template;
     if (touch) { spec.layout.dragmode = false; }
-    // As high as wide, where the axes are equal and the window is narrow.
-    if (spec.layout.yaxis && spec.layout.yaxis.scaleanchor) {
-      const height = Math.min(figure.clientHeight, Math.max(300, 1.15 * figure.clientWidth));
-      figure.style.height = height + "px";
-    }
+    if (figure.clientWidth < 600) { narrow(figure, spec); }
     Plotly.newPlot(figure, spec.data, spec.layout, shared.config)
       .then(function () { setTimeout(draw, 0, k + 1); });
+  }
+  // Legends go above, which takes room, and maps are as high as what they show.
+  function narrow(figure, spec) {
+    const legend = spec.layout.legend || {};
+    if (legend.orientation === "v") {
+      spec.layout.legend = {traceorder: legend.traceorder};
+    }
+    const named = spec.data.filter(function (trace) {
+      return trace.name && trace.showlegend !== false && spec.layout.showlegend !== false;
+    });
+    const longest = named.reduce((most, trace) => Math.max(most, trace.name.length), 0);
+    const width = figure.clientWidth - 70;
+    const columns = Math.max(1, Math.floor(width / (46 + 7 * longest)));
+    const rows = named.length > 1 ? Math.ceil(named.length / columns) : 0;
+    let height = figure.clientHeight + 19 * Math.max(0, rows - 1);
+    const x = spec.layout.xaxis, y = spec.layout.yaxis;
+    if (y && y.scaleanchor && x.range && y.range) {
+      const shape = (y.range[1] - y.range[0]) / (x.range[1] - x.range[0]);
+      height = Math.min(height, Math.max(140, width * shape) + 70 + 19 * rows);
+    }
+    figure.style.height = Math.round(height) + "px";
   }
   draw(0);
 
@@ -147,6 +164,7 @@ a { color: #0060a0; }
   padding: 14px 18px 12px; margin: 0 0 16px;
 }
 .panel > p { color: #5b6875; font-size: 14.5px; max-width: 68em; }
+.wide { overflow-x: auto; overflow-y: hidden; }
 .figure { width: 100%; margin-top: 4px; }
 .table { overflow-x: auto; margin: 6px 0 4px; }
 table { border-collapse: collapse; font-size: 14.5px; font-variant-numeric: tabular-nums; }
@@ -155,7 +173,7 @@ th {
   white-space: nowrap;
 }
 th, td { padding: 4px 18px 4px 0; vertical-align: top; }
-td { border-bottom: 1px solid #e9edf1; overflow-wrap: anywhere; min-width: 9em; }
+td { border-bottom: 1px solid #e9edf1; overflow-wrap: anywhere; min-width: 15em; }
 td.short { white-space: nowrap; min-width: 0; }
 tr:last-child td { border-bottom: 0; }
 th.number, td.number { text-align: right; white-space: nowrap; min-width: 0; }
@@ -181,6 +199,7 @@ body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bot
   .panel { padding: 12px 10px 8px; }
   .tiles { grid-template-columns: repeat(2, 1fr); }
   .tile { padding: 8px 10px; }
+  td { min-width: 13em; }
   h1 { font-size: 24px; } h2 { font-size: 21px; }
 }
 @media print {
@@ -191,7 +210,7 @@ body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bot
   .panel { border: 0; padding: 6px 0; }
   h2 { break-after: avoid; }
   .subject + .subject { break-before: page; }
-  .table { overflow: visible; }
+  .table, .wide { overflow: visible; }
   table { font-size: 9pt; }
   th, td { padding-right: 10px; }
   button.copy, .modebar { display: none !important; }

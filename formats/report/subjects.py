@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +15,8 @@ from locatk.core.metrics import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import trajectory_files
-from locatk.formats.plot_ground import has_no_scale
+from locatk.formats.plot_clock import of_one_time
+from locatk.formats.plot_ground import has_no_scale, known
 from locatk.formats.report.subject import Subject
 from locatk.formats.session import Session
 from locatk.formats.solutions import read_solution
@@ -51,7 +54,7 @@ def load(
     DegenerateError
         The poses do not determine the alignment or the offset.
     """
-    solution = read_solution(path)
+    solution = _by_name(read_solution(path))
     facts = Session.open(path).facts
     recording = _beside(Path(path), facts, solution)
     if session is not None:
@@ -61,11 +64,21 @@ def load(
                 "a solution, not a session", file=session, hint="Give the recording it was made of"
             )
     if truth is not None:
-        known = tuple(trajectory_files.read(Path(truth), role="truth"))
+        true = tuple(trajectory_files.read(Path(truth), role="truth"))
     else:
-        known = () if recording is None else _truth_of(recording)
-    evaluation = _evaluate(solution, known, align, offset_s)
-    return Subject(Path(path).name, solution, facts, recording, known, evaluation)
+        true = () if recording is None else _truth_of(recording)
+    evaluation = _evaluate(solution, true, align, offset_s)
+    return Subject(Path(path).name, solution, facts, recording, true, evaluation)
+
+
+def _by_name(solution: Solution) -> Solution:
+    """The same with its devices in the order of their names, ``robot-2`` before ``robot-10``."""
+
+    def parts(t: Trajectory) -> list[tuple[int, str]]:
+        found = re.findall(r"[0-9]+|[^0-9]+", t.device)
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in found]
+
+    return replace(solution, trajectories=tuple(sorted(solution.trajectories, key=parts)))
 
 
 def _beside(path: Path, facts: dict[str, str], solution: Solution) -> Session | None:
@@ -85,13 +98,7 @@ def _beside(path: Path, facts: dict[str, str], solution: Solution) -> Session | 
         return None
     if session.facts.get("kind") == "solution":
         return None
-    ends = [int(t.time_ns[k]) for t in solution.trajectories if len(t) for k in (0, -1)]
-    if ends and session.start_ns is not None and session.end_ns is not None:
-        # Poses may be stamped a little before or after the messages they are made of.
-        slack = 5_000_000_000
-        if max(ends) < session.start_ns - slack or min(ends) > session.end_ns + slack:
-            return None
-    return session
+    return session if of_one_time(session, solution) else None
 
 
 def _truth_of(session: Session) -> tuple[Trajectory, ...]:
@@ -109,10 +116,10 @@ def _evaluate(
     offset_s: float | Literal["auto"],
 ) -> Evaluation | None:
     """None where no pose has truth, or lengths cannot be compared."""
-    solved = [t for t in solution.trajectories if len(t)]
+    solved = [t for t in map(known, solution.trajectories) if len(t)]
     if has_no_scale(solution) and not align.startswith("sim"):
         return None
-    pairs, _ = pair_devices(solved, list(truth))
+    pairs, _ = pair_devices(solved, [t for t in map(known, truth) if len(t)])
     if not pairs:
         return None
     try:

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from locatk.formats.plot_series import expected_error, usual_top
-from locatk.formats.report.figures import digits, length, share_of_points, thin, unit_for
+from locatk.formats.plot_units import digits, length, unit_for
+from locatk.formats.report.figures import share_of_points, thin
 
 
 @given(n=st.integers(0, 3000), most=st.integers(20, 500), peak=st.integers(0, 2999))
