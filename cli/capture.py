@@ -182,7 +182,14 @@ def command(
     )
     stop = threading.Event()
     with capture_text.live() as live, asked_to_stop(stop.set):
-        recorded = session.record(wanted, stop, tell=live.tell, show=live.show, ready=live.ready)
+        recorded = session.record(
+            wanted,
+            stop,
+            tell=live.tell,
+            show=live.show,
+            ready=live.ready,
+            waiting=live.waiting,
+        )
     _report(recorded, device, as_json)
 
 

@@ -37,6 +37,12 @@ class Live:
         """The port is open."""
         console.say(f"Recording {port}; Ctrl-C ends it.")
 
+    def waiting(self, why: str) -> None:
+        """The port is not there yet, as the user expected, or cannot be opened."""
+        missing = "no such port "
+        told = f" for {why.removeprefix(missing)}" if why.startswith(missing) else f": {why}"
+        console.say(f"Waiting{told}; Ctrl-C ends it.")
+
     def tell(self, text: str) -> None:
         """Something happened."""
         with self._unheard():

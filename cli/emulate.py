@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import shlex
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,11 +11,12 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.signals import asked_to_stop
-from locatk.core.errors import InputError, MissingDataError
+from locatk.core.errors import InputError, LocatkError, MissingDataError
 
 if TYPE_CHECKING:
     from locatk.formats.emulate.emulator import Totals
     from locatk.formats.emulate.source import Source
+    from locatk.formats.session import Session
 
 SYSTEMS = ("polaris", "landmarks", "lighthouse", "dots")
 
@@ -87,7 +89,7 @@ ABOVE_0 = click.FloatRange(0, min_open=True)
     help="For how long it is gone then.  [default: 1]",
 )
 @options.number("--seed", default=0, type=click.IntRange(0), help="Of faults and simulation.")
-@options.as_json
+@options.json_flag("Two lines of JSON")
 @options.verbosity
 def command(
     source: str,
@@ -127,7 +129,7 @@ def command(
 
     _refuse_contradictions(source, save, given)
     with ExitStack() as stack:
-        found = _source(source, device, save, overwrite, given["seed"], stack)
+        found, session = _source(source, device, save, overwrite, given["seed"], stack)
         parts = _parts(found, given)
         if parts[0].next_s is None:
             raise InputError("nothing to send", file=source)
@@ -137,7 +139,10 @@ def command(
         if as_json:
             console.emit_json({**known, "source": source, "recorded": found.recorded})
         console.result(port.path)
-        console.say(f"{_what(source, found)}; Ctrl-C ends it")
+        console.say(f"{_what(source, found)}{_how_long(session, given)}; Ctrl-C ends it")
+        if not given["no_wait"]:
+            kept = None if source in SYSTEMS and save is None else session
+            console.say(f"Waiting for a reader, as: {_reader(port.path, found, kept)}")
         emulator = Emulator(port, *parts)
         try:
             with asked_to_stop(emulator.stop):
@@ -166,8 +171,9 @@ def _source(
     overwrite: bool,
     seed: int,
     stack: ExitStack,
-) -> Source:
-    """What is to be sent; a session that is not saved lives as long as ``stack``."""
+) -> tuple[Source, Session]:
+    """What is to be sent, and of which session; one that is not saved lives as long as
+    ``stack``."""
     import tempfile
 
     from locatk.formats.emulate.simulated import simulate_session
@@ -187,7 +193,8 @@ def _source(
             file=path,
             hint=f"Give a file, or a system: {', '.join(SYSTEMS[:-1])}",
         )
-    return source_of(Session.open(path), device)
+    session = Session.open(path)
+    return source_of(session, device), session
 
 
 def _parts(found: Source, given: dict[str, Any]) -> tuple[Any, Any, Any]:
@@ -216,6 +223,30 @@ def _parts(found: Source, given: dict[str, Any]) -> tuple[Any, Any, Any]:
 def _what(source: str, found: Source) -> str:
     how = "bytes as recorded" if found.recorded else "bytes made"
     return f"{found.device}, {how} of {source}"
+
+
+def _how_long(session: Session, given: dict[str, Any]) -> str:
+    """For how long it sends, where that is known before."""
+    if given["loop"] == 0:
+        return ", for ever"
+    if given["rate"] is not None or given["speed"] == 0:
+        return ""
+    if session.start_ns is None or session.end_ns is None:
+        return ""
+    seconds = given["loop"] * (session.end_ns - session.start_ns) * 1e-9 / given["speed"]
+    return f", {seconds:.1f} s, then it is unplugged"
+
+
+def _reader(port: str, found: Source, session: Session | None) -> str:
+    """What to type in another terminal; with what the session knows beside the bytes."""
+    from locatk.formats.capture import artifacts
+
+    words = ["locatk", "capture", port, "--device", found.device]
+    if session is not None:
+        with suppress(LocatkError):  # it holds none
+            if artifacts.attachments([Path(session.path)]):
+                words += ["--artifact", session.path]
+    return shlex.join([*words, "-o", "capture.mcap"])
 
 
 def _summary(totals: Totals) -> str:

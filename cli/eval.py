@@ -77,6 +77,15 @@ class Offset(click.ParamType):
     help="With `nearest`: how far apart in time.",
 )
 @click.option(
+    "--max-gap",
+    type=click.FloatRange(0, min_open=True),
+    default=0.5,
+    show_default=True,
+    metavar="SECONDS",
+    help="Longest gap in the truth that is interpolated over, and for which coverage counts a "
+    "time as known; KITTI has rows instead.",
+)
+@click.option(
     "--delta",
     default="1f",
     show_default=True,
@@ -100,6 +109,7 @@ def command(
     offset: float | str,
     match: str,
     max_diff: float,
+    max_gap: float,
     delta: str,
     names: tuple[str, ...],
     all_pairs: bool,
@@ -158,12 +168,14 @@ def command(
         match=match,
         max_diff_s=max_diff,
         # Rows of KITTI are stamped by the second.
-        max_gap_s=1.0 if mine.kind == "kitti" else metrics.MAX_GAP_S,
+        max_gap_s=max(1.0, max_gap) if mine.kind == "kitti" else max_gap,
         delta=delta,
         all_pairs=all_pairs,
     )
     if "first stamps" in found.offset_source:
         console.warn("the motions are too unlike to set the clocks by: the first stamps were used")
+    if "as well" in found.offset_source:
+        console.warn("the drive repeats itself, and the motion fits several offsets: give --offset")
     if as_json:
         facts = {"version": 1, "estimate": estimate, "truth": truth, **found.as_dict()}
         console.emit_json(facts)

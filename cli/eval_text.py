@@ -45,6 +45,8 @@ def text(found: Evaluation) -> str:
 def _verdict(found: Evaluation, unit: str, factor: float) -> str:
     """Whether it is good, in one line."""
     middle, most = (f"{number(factor * value)} {unit}" for value in (found.median, found.p95))
+    if found.n == 1:
+        return f"The one pose with truth lies {middle} from it."
     return f"Half of {found.n} poses lie within {middle} of the truth, 95 % within {most}."
 
 

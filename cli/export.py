@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
 
 if TYPE_CHECKING:
     from locatk.core.trajectory import Trajectory
@@ -57,8 +57,9 @@ def command(
       locatk export solved.mcap --format csv -o poses.csv
       locatk export solved.mcap --format tum -o poses.tum
       locatk export solved.mcap --format ros2 -o poses.mcap
-      locatk export solved.mcap --format csv -o - | head
+      locatk export solved.mcap --format csv -o -
     """
+    from locatk.core.errors import InputError
     from locatk.formats import exports
     from locatk.formats.solutions import read_trajectories
 
@@ -68,8 +69,15 @@ def command(
         what = "--json" if as_json else f"--format {format_name}"
         raise click.UsageError(f"{what} does not go with -o -, which is for csv and tum.")
     found = chosen(read_trajectories(solution), devices, solution)
+    poses = sum(map(len, found))
+    if format_name != "parquet":  # where they are null
+        found = [exports.numbers(each) for each in found]
+    lost = poses - sum(map(len, found))
+    if lost == poses:
+        raise InputError(f"none of the {poses} poses is a number", file=solution)
     if output == STDOUT:
         click.echo(text(found, format_name), nl=False)
+        tell(lost)
         return
 
     planned = exports.parts(found, format_name, output)
@@ -81,8 +89,9 @@ def command(
     for part in planned:
         exports.write(part, format_name, facts=facts, covariance=covariance, overwrite=overwrite)
         console.result(f"Wrote {part.path}: {sum(map(len, part.trajectories))} poses")
-        if part.times is not None:
-            console.say(f"Its lines have no times: they are in {part.times}")
+    if format_name == "kitti":
+        name = planned[0].times if len(planned) == 1 else f"{output}/*.times.txt"
+        console.say(f"Lines of kitti have no times: these are in {name}")
     if format_name == "ros2" and output.suffix != ".mcap":
         console.warn(f"{output} does not end in .mcap, by which ros2 bag and evo know it")
     if as_json:
@@ -92,6 +101,14 @@ def command(
             for each in part.trajectories
         ]
         console.emit_json({"version": 1, "input": solution, "format": format_name, "files": files})
+    tell(lost)
+
+
+def tell(lost: int) -> None:
+    """Say what was left out, by the exit status too."""
+    if lost:
+        poses = "1 pose that is not a number" if lost == 1 else f"{lost} poses that are not numbers"
+        raise failures.Incomplete(f"left out {poses}")
 
 
 def chosen(found: list[Trajectory], devices: tuple[str, ...], solution: Path) -> list[Trajectory]:

@@ -18,6 +18,9 @@ MOST_CELLS = 5_000
 
 SHOWN_ABOVE = {("locatk", key) for key in ("format_version", "tool_version", "kind", "system")}
 
+SIMULATED = "simulated_"
+"""Options of a simulation, and its truth: there are many, and some are long."""
+
 
 def text(facts: dict[str, Any]) -> str:
     """A block of facts and a table of each kind of thing; ``facts`` are what ``--json`` says."""
@@ -176,15 +179,16 @@ def text(facts: dict[str, Any]) -> str:
         ("attachment", "type", "bytes"),
         [(a["name"], a["media_type"], a["bytes"]) for a in facts.get("attachments", ())],
     )
-    section(
-        ("metadata", "key", "value"),
-        [
-            (name, key, value)
-            for name, record in facts.get("metadata", {}).items()
-            for key, value in record.items()
-            if (name, key) not in SHOWN_ABOVE and not info_capture.told(name, key)
-        ],
-    )
+    left = [
+        (name, key, value)
+        for name, record in facts.get("metadata", {}).items()
+        for key, value in record.items()
+        if (name, key) not in SHOWN_ABOVE and not info_capture.told(name, key)
+    ]
+    shown = [row for row in left if console.verbose() or not row[1].startswith(SIMULATED)]
+    section(("metadata", "key", "value"), shown)
+    if len(shown) < len(left):
+        lines.append(f"... and {len(left) - len(shown)} options of the simulation: see -v")
     return "\n".join(lines)
 
 

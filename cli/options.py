@@ -65,13 +65,13 @@ def _json(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
     return value
 
 
-as_json = click.option(
-    "--json",
-    "as_json",
-    is_flag=True,
-    help="One JSON object on stdout, and nothing else there.",
-    callback=_json,
-)
+def json_flag(what: str) -> Callable[[F], F]:
+    """`--json` of a command that says ``what`` on stdout."""
+    told = f"{what} on stdout, and nothing else there."
+    return click.option("--json", "as_json", is_flag=True, help=told, callback=_json)
+
+
+as_json = json_flag("One JSON object")
 
 method = click.option(
     "--method",

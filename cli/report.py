@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -91,6 +92,11 @@ def command(
             subjects.load(path, session=session, truth=truth, align=align, offset_s=offset)  # type: ignore[arg-type]
             for path, session in zip(solutions, given, strict=True)
         ]
+    count = Counter(subject.name for subject in found)
+    found = [
+        replace(subject, name=str(path)) if count[subject.name] > 1 else subject
+        for subject, path in zip(found, solutions, strict=True)
+    ]
     for subject in found:
         if subject.truth and subject.evaluation is None:
             from locatk.formats.report.judgement import why_unjudged

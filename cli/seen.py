@@ -25,8 +25,13 @@ def lost(solution: Solution) -> list[str]:
         unread = [seen for seen in solution.detections if seen["tag_id"] is None]
         losses += _refused(unread, "tag", "not read")
     elif solution.system == "landmarks":
-        refused = [seen for seen in solution.detections if seen["refused"]]
+        said = [seen for seen in solution.detections if seen["refused"]]
+        misread = [seen for seen in said if seen["refused"] == "misread"]
+        refused = [seen for seen in said if seen["refused"] != "misread"]
         losses += _refused(refused, "sighting", "refused")
+        if misread:
+            what = "landmark is not that" if len(misread) == 1 else "landmarks are not those"
+            losses.append(f"{len(misread)} {what} of the map (misread, or laid wrongly)")
     elif solution.poses:
         losses += _most(solution)
     return losses

@@ -81,7 +81,7 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     "Outdated solutions are replaced.",
 )
 @options.overwrite
-@options.as_json
+@options.json_flag("A JSON object a session, each on a line,")
 @options.verbosity
 def command(
     sessions: tuple[str, ...],
@@ -105,8 +105,9 @@ def command(
     stop the others. With --json there is one line a session, in the order of the sessions.
 
     The exit status is 3 where a session could not be solved, a device in it has no pose, a
-    tag was not read, or a robot does not know where on the map it is; the rest is written
-    all the same.
+    tag was not read, a robot does not know where on the map it is or met a landmark that is
+    not the map's, or more frames or moments of sweeps gave no pose than gave one; the rest is
+    written all the same.
 
     \b
     Examples:
@@ -192,7 +193,8 @@ def text(session: str | Path, output: str | Path, solved: Solved) -> str:
     solution = solved.solution
     # A scene that nothing measured has no metres.
     unit = "1e-3" if getattr(solution.artifact, "scale", None) == "unit" else "mm"
-    header = ("device", "poses", "sigma x", "sigma y", f"sigma z [{unit}]", "heading [deg]")
+    sigmas = [f"sigma {axis} [{unit}]" for axis in "xyz"]
+    header = ("device", "poses", *sigmas, "sigma heading [deg]")
     rows = [(t.device, len(t), *_spread(t.sigma)) for t in solution.trajectories]
     rejected = ", ".join(
         f"{count} {reason.replace('_', ' ')}" for reason, count in solution.rejected.items()

@@ -132,6 +132,8 @@ def _solved(job: Job, stack: contextlib.ExitStack, names: dict[str, str]) -> dic
         if before is None:
             overwrite = overwrite or (job.resume and ours)
             places.check(job.target, overwrite=overwrite)
+    elif not places.is_url(job.target):  # its folder may have gone since
+        places.check(job.target, overwrite=overwrite)
     if before is not None:
         solved = Solved(before, math.nan)
     else:
@@ -269,6 +271,9 @@ def guard_outputs(
     with ThreadPoolExecutor(16) as threads:
         for _ in threads.map(check, outputs):
             pass
+    stores = [output for output in outputs if places.is_url(output)]
+    for output in {places.beside(output, ""): output for output in stores}.values():
+        places.check_bucket(output)
 
 
 def _identity(place: str) -> tuple[int, int] | str:

@@ -59,11 +59,15 @@ def fit_alignment(
             hint="use `none` or `origin`",
         )
     try:
-        return _fitted(estimate, truth, align)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fitted = _fitted(estimate, truth, align)
+        if not 0 < fitted.scale < np.inf:  # of points so near each other that squares vanish
+            raise DegenerateError("the points are all in one place and do not determine a scale")
     except DegenerateError as error:
         raise DegenerateError(
             f"alignment {align!r}: {error.message}", hint="use `none` or `origin`"
         ) from None
+    return fitted
 
 
 def _fitted(estimate: Array, truth: Array, align: str) -> Similarity:

@@ -210,13 +210,18 @@ def _seconds(time_ns: NDArray[np.int64]) -> Array:
 
 def take(trajectory: Trajectory, keep: NDArray[np.bool_]) -> Trajectory:
     """Only the poses where ``keep`` (n,) is true."""
+    time_ns, covariance = trajectory.time_ns[keep], trajectory.covariance
+    if len(covariance) and covariance.strides[0] == 0:  # one unknown for all: stays one in memory
+        covariance = np.broadcast_to(covariance[0], (len(time_ns), 6, 6))
+    else:
+        covariance = covariance[keep]
     return Trajectory(
         trajectory.device,
         trajectory.frame,
-        trajectory.time_ns[keep],
+        time_ns,
         trajectory.position[keep],
         trajectory.quaternion[keep],
-        trajectory.covariance[keep],
+        covariance,
     )
 
 

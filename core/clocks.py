@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.alignment import fit_alignment
-from locatk.core.association import MAX_GAP_S, Pairs, associate, between, take
+from locatk.core.association import MAX_GAP_S, Pairs, Rows, ascending, between, take
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.trajectory import Trajectory
 
@@ -33,6 +33,10 @@ LEAST_SHARE = 0.5
 
 LEAST_FIT = 0.5
 """Part of the motion that must be the same in both, for a coarse offset to be believed."""
+
+ALIKE = (2.0, 3e-4)
+"""What is not common to both motions, as a multiple of what it is at the best offset and as a part
+of the motion: with no more than the sum of both, another offset fits as well."""
 
 
 def clocks_agree(pairs: Pairs) -> bool:
@@ -59,11 +63,15 @@ class Coarse:
         By how much that may be wrong, to either side.
     by : str
         What it was found by: ``"motion"`` or ``"first stamps"``.
+    alike : int
+        Other offsets at which the motions agree as well: of a drive that repeats itself, or of
+        one that was recorded several times, there are some.
     """
 
     offset_s: float
     span_s: float
     by: str
+    alike: int = 0
 
 
 def coarse_offset(
@@ -116,7 +124,8 @@ def coarse_offset(
     base = (true_start - start) / 1e9
     if fit[best] >= LEAST_FIT:
         step = step_ns / 1e9
-        return Coarse(base + int(lags[best]) * step, max(0.25, 3 * step), "motion")
+        offset_s = base + int(lags[best]) * step
+        return Coarse(offset_s, max(0.25, 3 * step), "motion", _peaks(fit) - 1)
     return Coarse(base, span_s, "first stamps")
 
 
@@ -131,14 +140,25 @@ def _sampled(
     """Positions (cells, 3), from ``middle``, at even stamps, zero where unknown; and where
     they are known (cells,), as 0 and 1."""
     time = start + step_ns * np.arange(longest // step_ns + 1)
-    index, before, after, share = between(time, trajectory.time_ns, max_gap_s)
     positions, known = np.zeros((len(time), 3)), np.zeros(len(time))
-    column = share[:, None]
-    positions[index] = (
-        (1 - column) * trajectory.position[before] + column * trajectory.position[after] - middle
-    )
+    index, there = _places(trajectory, time, max_gap_s)
+    positions[index] = there - middle
     known[index] = 1.0
     return positions, known
+
+
+def _places(
+    trajectory: Trajectory, time_ns: NDArray[np.int64], max_gap_s: float
+) -> tuple[Rows, Array]:
+    """Rows of the stamps (n,) at which a trajectory is known, and its positions (k, 3) there.
+
+    As :func:`locatk.core.association.associate` interpolates, without orientations.
+    """
+    if len(trajectory) == 0:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    index, before, after, share = between(time_ns, trajectory.time_ns, max_gap_s)
+    column = share[:, None]
+    return index, (1 - column) * trajectory.position[before] + column * trajectory.position[after]
 
 
 def _correlations(mine: Array, known: Array, true: Array, true_known: Array) -> list[Array]:
@@ -201,6 +221,24 @@ def _part(common: Array, size: Array, enough: NDArray[np.bool_]) -> Array:
     return np.where(enough & ~still, common / np.where(still, 1.0, size), -1.0)
 
 
+def _peaks(fit: Array) -> int:
+    """How many separate offsets fit as well as the best, from the fit at every lag.
+
+    A peak ends where twice as much is not common as may be at the top of one, so that noise
+    does not split it.
+    """
+    left, middle, right = fit[:-2], fit[1:-1], fit[2:]
+    # The top lies between samples: that of a parabola through three of them.
+    top = (middle >= left) & (middle > right) & (left > -1) & (right > -1)
+    curve = np.where(top, 2 * middle - left - right, 1.0)
+    tops = np.where(top, middle + (right - left) ** 2 / (8 * curve), middle)
+    apart = 1 - np.minimum(np.concatenate([fit[:1], tops, fit[-1:]]), 1.0)
+    limit = ALIKE[0] * apart.min() + ALIKE[1]
+    near = np.concatenate([[False], apart <= 2 * limit, [False]])
+    starts, ends = np.flatnonzero(~near[:-1] & near[1:]), np.flatnonzero(near[:-1] & ~near[1:])
+    return sum(bool(apart[a:b].min() <= limit) for a, b in zip(starts, ends, strict=True))
+
+
 def estimate_offset(
     pairs: Pairs,
     *,
@@ -246,6 +284,8 @@ def estimate_offset(
     # Whole nanoseconds: months in seconds, as a float, resolve 2 ns.
     middle_ns = round(around_s * 1e9)
     offsets = np.linspace(-span_s, span_s, 2 * max(5, round(span_s / 0.02)) + 1)
+    for _, truth in pairs:
+        ascending(truth, "truth")
     pairs = [(_later(e, middle_ns), t) for e, t in pairs]
     pairs = [(_where_always(e, t, offsets, max_gap_s), t) for e, t in pairs]
     poses = sum(len(e) for e, _ in pairs)
@@ -256,9 +296,11 @@ def estimate_offset(
         )
 
     def error(offset: float) -> float:
-        matched = [associate(e, t, offset_s=offset, max_gap_s=max_gap_s) for e, t in pairs]
-        estimate = np.concatenate([m.estimate for m in matched])
-        truth = np.concatenate([m.truth for m in matched])
+        placed = [_places(t, e.time_ns + round(offset * 1e9), max_gap_s) for e, t in pairs]
+        estimate = np.concatenate(
+            [e.position[index] for (e, _), (index, _) in zip(pairs, placed, strict=True)]
+        )
+        truth = np.concatenate([there for _, there in placed])
         moved = fit_alignment(estimate, truth, fitted).apply(estimate)
         return float(np.mean(np.linalg.norm(moved - truth, axis=1)))
 
@@ -270,8 +312,8 @@ def estimate_offset(
         if np.ptp(errors) <= 0.05 * errors[best] + 1e-12:
             raise DegenerateError(
                 "the error does not depend on the time offset: the devices hardly moved, "
-                "or straight on",
-                hint="give the offset",
+                "or evenly straight on or in a circle, or the frames differ",
+                hint="give the offset, or the alignment that brings the frames together",
             )
         if best in (0, len(offsets) - 1):
             raise InputError(
@@ -303,7 +345,8 @@ def _where_always(
     """Poses with truth at every offset: the same poses are compared at each."""
     seen = np.zeros(len(estimate), int)
     for offset in offsets:
-        seen[associate(estimate, truth, offset_s=float(offset), max_gap_s=max_gap_s).index] += 1
+        index, _ = _places(truth, estimate.time_ns + round(offset * 1e9), max_gap_s)
+        seen[index] += 1
     return take(estimate, seen == len(offsets))
 
 

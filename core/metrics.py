@@ -25,14 +25,14 @@ from locatk.core.association import (
     Association,
     Pairs,
     associate,
-    take,
 )
-from locatk.core.clocks import clocks_agree, coarse_offset, estimate_offset
+from locatk.core.clocks import estimate_offset
 from locatk.core.consistency import consistency, nees
 from locatk.core.coverage import Coverage, coverage
-from locatk.core.errors import DegenerateError, InputError, LocatkError
+from locatk.core.errors import InputError
 from locatk.core.evaluation import Evaluation
 from locatk.core.geometry import Similarity, quaternion_from_matrix
+from locatk.core.held_out import held_out_offset
 from locatk.core.orientation import angle, inverse, multiply, told
 from locatk.core.relative import (
     Delta,
@@ -49,7 +49,6 @@ from locatk.core.trajectory import Trajectory
 
 __all__ = [
     "ALIGNMENTS",
-    "HELD_OUT",
     "MATCHES",
     "MAX_GAP_S",
     "Association",
@@ -61,8 +60,8 @@ __all__ = [
     "fit_alignment",
 ]
 
-HELD_OUT = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75), (0.75, 1.0))
-"""Parts of the recording on which a time offset is estimated: the first of them that tells it."""
+FARTHEST_M = 1e100
+"""Beyond it, squares of distances run over."""
 
 
 def evaluate(
@@ -134,7 +133,7 @@ def evaluate_all(
     held_out : (float, float), optional
         The part for a time offset, as fractions of the poses with truth, in the order of time
         over all pairs: (0, 0.25) is the first quarter. Without it, the first of
-        :data:`HELD_OUT` in which there is motion enough.
+        :data:`locatk.core.held_out.HELD_OUT` in which devices are fast enough.
     span_s : float
         Largest offset searched, see :func:`estimate_offset`.
 
@@ -149,7 +148,7 @@ def evaluate_all(
     offset, source = 0.0, "none"
     windows: list[NDArray[np.bool_]] = [np.zeros(len(e), bool) for e, _ in pairs]
     if offset_s == "auto":
-        offset, source, windows = _offset(pairs, align, held_out, span_s, max_gap_s)
+        offset, source, windows = held_out_offset(pairs, align, held_out, span_s, max_gap_s)
     elif offset_s != 0.0:
         offset, source = float(offset_s), "given"
 
@@ -212,8 +211,11 @@ def _score(
     true_points = np.concatenate([m.truth for m in matched])
     turns = np.concatenate([m.estimate_turn for m in matched])
     true_turns = np.concatenate([m.truth_turn for m in matched])
-    if not np.all(np.isfinite(points - true_points)):
-        raise InputError("estimate or truth has positions that are not numbers")
+    if not np.all(np.abs(points - true_points) < FARTHEST_M):
+        raise InputError(
+            f"estimate or truth has positions that are not numbers, or beyond {FARTHEST_M:g} m",
+            hint="correct them, or leave them out",
+        )
     tells = np.concatenate(
         [
             told(e, at_its_word=at_its_word)[m.index] & told(t, at_its_word=at_its_word)[m.before]
@@ -323,69 +325,8 @@ def _nothing(pairs: Pairs, offset: float) -> InputError:
         return InputError("no pose of the estimate has truth at its time", hint="one has no poses")
     true, mine = ends[0]
     late = (int(mine[0]) - int(true[0])) / 1e9 + offset
-    apart = max(int(true[0]) - int(mine[1]), int(mine[0]) - int(true[1])) / 1e9
     hint = "check the time stamps, the time offset and the longest gap to bridge"
-    if apart > 0:
-        hint = f"the estimate starts {late:g} s after the truth: give --offset, or --offset auto"
+    if late > (int(true[1]) - int(true[0])) / 1e9 or late < (int(mine[0]) - int(mine[1])) / 1e9:
+        when = f"{abs(late):.3f} s {'after' if late > 0 else 'before'} the truth"
+        hint = f"the estimate starts {when}: give --offset, or --offset auto"
     return InputError("no pose of the estimate has truth at its time", hint=hint)
-
-
-def _offset(
-    pairs: Pairs,
-    align: str,
-    held_out: tuple[float, float] | None,
-    span_s: float,
-    max_gap_s: float,
-) -> tuple[float, str, list[NDArray[np.bool_]]]:
-    """Time offset, what it was estimated on, and which poses that were."""
-    around, found = 0.0, ""
-    if not clocks_agree(pairs):
-        coarse = coarse_offset(pairs, align=align, span_s=span_s, max_gap_s=max_gap_s)
-        around, span_s = coarse.offset_s, coarse.span_s
-        found = f"; clocks brought together by {coarse.by}"
-    first: LocatkError | None = None
-    for start, end in HELD_OUT if held_out is None else (held_out,):
-        windows = _held_out_poses(pairs, (start, end), max_gap_s, around)
-        training = [(take(e, w), t) for (e, t), w in zip(pairs, windows, strict=True)]
-        try:
-            offset = estimate_offset(
-                training, align=align, span_s=span_s, max_gap_s=max_gap_s, around_s=around
-            )
-        except (InputError, DegenerateError) as error:
-            first = first or error
-            continue
-        part = f"held-out {start:.0%} to {end:.0%} of the recording, not scored"
-        return offset, part + found, windows
-    assert first is not None
-    if "first stamps" in found:
-        raise InputError(
-            "the motions of estimate and truth are too unlike to bring their clocks together",
-            hint="give the offset, or the alignment that brings their frames together",
-        )
-    raise first
-
-
-def _held_out_poses(
-    pairs: Pairs, held_out: tuple[float, float], max_gap_s: float, around_s: float
-) -> list[NDArray[np.bool_]]:
-    """Which poses of each estimate lie in the part for estimating the offset."""
-    start, end = held_out
-    if not (0 <= start < end <= 1) or (start, end) == (0, 1):
-        raise InputError(
-            f"the held-out part {start:g} to {end:g} is no proper part of the recording",
-            hint="give two ascending fractions of 0 to 1 that leave something to score",
-        )
-    with_truth = np.sort(
-        np.concatenate(
-            [associate(e, t, offset_s=around_s, max_gap_s=max_gap_s).time_ns for e, t in pairs]
-        )
-    )
-    if len(with_truth) == 0:
-        raise InputError(
-            "no pose of the estimate has truth at its time", hint="check the time stamps"
-        )
-    # A window in time, not in rows: poses of other devices at that time are out as well.
-    low = with_truth[int(start * len(with_truth))]
-    stop = int(np.ceil(end * len(with_truth)))
-    high = with_truth[stop] if stop < len(with_truth) else with_truth[-1] + 1
-    return [(e.time_ns >= low) & (e.time_ns < high) for e, _ in pairs]

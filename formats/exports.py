@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.trajectory import Trajectory
@@ -140,6 +142,21 @@ def write_times(path: Path, trajectory: Trajectory, *, overwrite: bool = False) 
     with atomic_write(path, overwrite=overwrite, mode="w") as stream:
         times = map(trajectories.format_time, trajectory.time_ns.tolist())
         stream.writelines(f"{time}\n" for time in times)
+
+
+def numbers(trajectory: Trajectory) -> Trajectory:
+    """The poses that are numbers; the others can be written in no format but Parquet."""
+    pose = np.hstack([trajectory.position, trajectory.quaternion])
+    whole = np.isfinite(pose).all(axis=1)
+    if whole.all():
+        return trajectory
+    return replace(
+        trajectory,
+        time_ns=trajectory.time_ns[whole],
+        position=trajectory.position[whole],
+        quaternion=trajectory.quaternion[whole],
+        covariance=trajectory.covariance[whole],
+    )
 
 
 def facts_of(path: Path) -> dict[str, str]:

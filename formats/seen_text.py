@@ -11,7 +11,7 @@ from typing import Any
 DEGREES = math.degrees(1)
 
 POSE = ("x [mm]", "y [mm]", "heading [deg]")
-SIGMAS = ("sigma x", "sigma y [mm]", "sigma heading [deg]")
+SIGMAS = ("sigma x [mm]", "sigma y [mm]", "sigma heading [deg]")
 
 
 @dataclass(frozen=True)

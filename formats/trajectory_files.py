@@ -20,6 +20,8 @@ EVO_KINDS = ("tum", "kitti")
 
 MCAP_MAGIC = b"\x89MCAP"
 
+GZIP_MAGIC = b"\x1f\x8b"
+
 HEAD = 1 << 16
 """Bytes in which the first row of a text must be."""
 
@@ -89,6 +91,8 @@ def _kind_of_text(path: Path, head: bytes) -> Literal["tum", "kitti", "csv"]:
     """By the first row that is no comment."""
     if not head.strip():
         raise FormatError("an empty file", file=path, hint=HINT)
+    if head.startswith(GZIP_MAGIC):
+        raise FormatError("a compressed file", file=path, hint="Unpack it: `gunzip`")
     lines = head.decode("utf-8-sig", "replace").splitlines()
     for number, line in enumerate(lines, start=1):
         words = line.split()

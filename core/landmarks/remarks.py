@@ -14,6 +14,9 @@ from locatk.core.landmarks.recording import Recording, Seen
 CERTAIN = 0.99999
 """Probability from which on a place on the map needs no remark."""
 
+SURE = 0.999
+"""Probability from which on the remark asks for nothing more."""
+
 FEWEST_MARKS = 3
 """Landmarks from which on one of them can be known to be off its place."""
 

@@ -22,7 +22,14 @@ from locatk.core.landmarks.landmark import rotated, signs
 from locatk.core.landmarks.recording import METHODS as METHODS
 from locatk.core.landmarks.recording import Recording, Seen, on_map, read
 from locatk.core.landmarks.recording import SolveOptions as SolveOptions
-from locatk.core.landmarks.remarks import CERTAIN, contradicted, displaced, exchanged, why_not
+from locatk.core.landmarks.remarks import (
+    CERTAIN,
+    SURE,
+    contradicted,
+    displaced,
+    exchanged,
+    why_not,
+)
 from locatk.core.landmarks.trace import compose
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -97,7 +104,8 @@ def solve(
         facts["robots"][recording.device] = told
         for item in found.seen:
             detections.append(detection(item.sighting, item.located, floor))
-            if why := detections[-1]["refused"]:
+            why = detections[-1]["refused"]
+            if why and why != "misread":  # that one is used, as it was read
                 rejected[why] += 1
     return Solution(
         system="landmarks",
@@ -140,7 +148,9 @@ def placed(
     if not usable:
         return [], [*why_not(found, sure), *exchanged(found, floor, misread)], told
     remarks = []
-    if sure < CERTAIN:
+    if SURE <= sure < CERTAIN:
+        remarks.append(f"{device}: its place on the map is all but certain ({sure:.5f})")
+    elif sure < SURE:
         remarks.append(
             f"{device}: its place on the map has a probability of {sure:.5f}"
             + ("; one more landmark would settle it" if first is None else " at one landmark")

@@ -85,7 +85,7 @@ def answer(job: Job, scene: Scene) -> Solution:
     job.reject("moment_with_too_few_sweeps", np.count_nonzero(unsolved))
     job.reject("moment_inconsistent", np.count_nonzero(inconsistent))
     job.reject("moment_out_of_reach", np.count_nonzero(far))
-    share = np.count_nonzero(inconsistent) / max(1, np.count_nonzero(~unsolved))
+    share = np.count_nonzero(inconsistent) / max(1, int(np.count_nonzero(~unsolved)))
     if share > CONTRADICTED:
         job.notes.append(
             f"{share:.0%} of the moments contradict the scene: a station was moved since, the "

@@ -173,6 +173,28 @@ def check(place: str, *, overwrite: bool) -> None:
         )
 
 
+def check_bucket(place: str) -> None:
+    """Refuse an output in a bucket that is not there, before the work is done for nothing.
+
+    Raises
+    ------
+    MissingDataError
+        The server knows no such bucket.
+    """
+    if not place.lower().startswith(("s3://", "s3a://")):
+        return
+    with remote(place) as (store, key):
+        bucket = key.partition("/")[0]
+        try:
+            store.call_s3("head_bucket", Bucket=bucket)
+        except PermissionError:
+            pass  # one may be let write into it all the same
+        except FileNotFoundError:
+            raise MissingDataError(
+                f"no bucket {bucket!r} to write into", hint="Make it first, or check the spelling"
+            ) from None
+
+
 def facts_of(place: str) -> dict[str, str]:
     """The metadata record ``locatk`` of an MCAP file; empty where it cannot be read.
 
@@ -203,6 +225,9 @@ def remote(place: str) -> Iterator[tuple[Any, str]]:
         Nobody answers, access is refused, or the kind of URL is unknown.
     """
     kind = place.partition("://")[0]
+    hint = "Check the URL, and that its server is there"
+    if kind.lower() in STORES:
+        hint = "Check the credentials, and AWS_ENDPOINT_URL where it is not Amazon's"
     try:
         import fsspec
 
@@ -213,6 +238,10 @@ def remote(place: str) -> Iterator[tuple[Any, str]]:
         ) from None
     except ValueError as error:
         raise FormatError(_short(error), file=place) from None
+    except Exception as error:  # some connect at once
+        raise InputError(
+            f"cannot be read or written ({_short(error)})", file=place, hint=hint
+        ) from error
     try:
         yield store, key
     except (LocatkError, DamageError):
@@ -227,9 +256,7 @@ def remote(place: str) -> Iterator[tuple[Any, str]]:
         ) from None
     except Exception as error:  # each store has exceptions of its own
         raise InputError(
-            f"cannot be read or written ({_short(error)})",
-            file=place,
-            hint="Check the credentials, and AWS_ENDPOINT_URL where it is not Amazon's",
+            f"cannot be read or written ({_short(error)})", file=place, hint=hint
         ) from error
 
 

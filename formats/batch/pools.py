@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import multiprocessing
@@ -170,9 +171,11 @@ def _cluster(address: str) -> Iterator[Executor]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     hint = f"Start `dask scheduler`, and `dask worker {address}` where it is to run"
     try:
+        asyncio.run(_greet(address))
         client = distributed.Client(address, timeout=PATIENCE_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"no Dask scheduler at {address} ({_short(error)})", hint=hint) from None
+    except Exception as error:  # whatever the bytes of another server lead to
+        told = "it does not answer" if isinstance(error, TimeoutError) else _short(error)
+        raise InputError(f"no Dask scheduler at {address} ({told})", hint=hint) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=PATIENCE_S)
@@ -187,18 +190,39 @@ def _cluster(address: str) -> Iterator[Executor]:
             raise
 
 
+async def _greet(address: str) -> None:
+    """Connect as a client does, and no longer than :data:`PATIENCE_S`: a client waits for ever
+    where something else than Dask listens, and takes 40 s to be gone where it cannot begin."""
+    from distributed.comm import connect
+    from distributed.security import Security
+
+    async def asked() -> Any:
+        comm = await connect(address, PATIENCE_S, **Security().get_connection_args("client"))
+        try:
+            await comm.write({"op": "identity", "reply": True})
+            return await comm.read()
+        finally:
+            comm.abort()
+
+    kind = (await asyncio.wait_for(asked(), PATIENCE_S + 1)).get("type")
+    if kind != "Scheduler":
+        raise ValueError(f"it is a {kind}")
+
+
 def _check_versions(client: Any) -> None:
-    """Refuse workers that would solve otherwise than this machine."""
+    """Refuse workers that would solve otherwise than this machine, and a scheduler that cannot
+    read what is to be done."""
     hint = "Install the same locatk on all machines"
     try:
-        versions = client.run(tool_version)
+        who = "the scheduler"
+        versions = {who: client.run_on_scheduler(tool_version)}
+        who = "a worker"
+        versions |= {f"the worker {name}": v for name, v in client.run(tool_version).items()}
     except Exception as error:
-        raise InputError(f"a worker cannot run locatk ({_short(error)})", hint=hint) from None
-    for worker, version in versions.items():
+        raise InputError(f"{who} cannot run locatk ({_short(error)})", hint=hint) from None
+    for place, version in versions.items():
         if version != tool_version():
-            raise InputError(
-                f"locatk {version} at the worker {worker}, {tool_version()} here", hint=hint
-            )
+            raise InputError(f"locatk {version} at {place}, {tool_version()} here", hint=hint)
 
 
 def _short(error: BaseException) -> str:

@@ -180,7 +180,7 @@ def _commands(evo: Evo, folder: Path) -> list[Figure]:
     }
     two = theirs["ape", "trans_part"] + theirs["rpe", "trans_part"]
     four = sum(theirs.values())
-    how = f"{POSES:,} poses, TUM files of 16 MB, processor time"
+    how = f"{POSES:,} poses; start-up and reading two TUM files of 16 MB included; processor time"
     return [
         Figure(COMMAND, two / own, "ratio",
                f"{two:.1f} s by {own:.2f} s, which gives rotation and drift as well; {how}",

@@ -72,6 +72,7 @@ def record(
     tell: Callable[[str], None] = lambda text: None,
     show: Callable[[Status], None] = lambda status: None,
     ready: Callable[[str], None] = lambda port: None,
+    waiting: Callable[[str], None] = lambda port: None,
 ) -> Recorded:
     """Record until ``stop`` is set, a limit of ``wanted`` is reached or the source is at its
     end.
@@ -84,6 +85,8 @@ def record(
         See :class:`.recorder.Recorder`.
     ready : callable
         Takes the name of the port once it is open.
+    waiting : callable
+        Takes what is wrong with a port that is waited for.
 
     Raises
     ------
@@ -103,7 +106,7 @@ def record(
     clock = HostClock()
     intake = _intake(wanted, content)
     port = _port(wanted, clock)
-    link = _opened(port, wanted.wait_s, stop, tell)
+    link = _opened(port, wanted.wait_s, stop, waiting)
     try:
         ready(port.name)
         facts = _facts(wanted, port, clock)
@@ -130,7 +133,9 @@ def _artifacts(wanted: Wanted) -> dict[str, str]:
     return {**played, **artifacts.attachments(wanted.artifacts)}
 
 
-def _opened(port: Port, wait_s: float, stop: threading.Event, tell: Callable[[str], None]) -> Link:
+def _opened(
+    port: Port, wait_s: float, stop: threading.Event, waiting: Callable[[str], None]
+) -> Link:
     """Open a port, which may not be there for another ``wait_s``."""
     until = time.monotonic() + wait_s
     told = False
@@ -141,7 +146,7 @@ def _opened(port: Port, wait_s: float, stop: threading.Event, tell: Callable[[st
             if time.monotonic() >= until:
                 raise
             if not told:
-                tell(f"{error}: waiting for it")
+                waiting(str(error))
             told = True
             if stop.wait(BACKOFF_S[1]):
                 raise

@@ -14,6 +14,9 @@ from locatk.formats.plot_units import thousands
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
+FIRST = 100
+"""Rank of devices in a legend: before all that they stand on (plotly's is 1000)."""
+
 MOST_POINTS = 3000
 """So many poses a figure draws, at most, of all devices together."""
 

@@ -25,6 +25,7 @@ from locatk.formats.plot_ground import (
 from locatk.formats.plot_units import digits, thousands
 from locatk.formats.report.artifact_marks import artifact_marks, landmark_names
 from locatk.formats.report.figures import (
+    FIRST,
     Array,
     axis,
     colours,
@@ -154,6 +155,7 @@ def _path(
     both = broken(np.column_stack([position[:, list(plane)], said]), t.time_ns, keep)
     name = label(short(t.device))
     look: dict[str, Any] = {"legendgroup": t.device, "hovertemplate": template, "name": name}
+    look["legendrank"] = FIRST
     line = Scatter(
         x=both[:, 0],
         y=both[:, 1],

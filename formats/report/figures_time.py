@@ -15,6 +15,7 @@ from locatk.formats.plot_ground import IN_LEGEND, broken, short
 from locatk.formats.plot_series import MOST_BANDS, Series, usual_top
 from locatk.formats.plot_units import Unit, thousands
 from locatk.formats.report.figures import (
+    FIRST,
     MOST_POINTS,
     Array,
     axis,
@@ -128,6 +129,7 @@ def _look(name: str, color: str, k: int, devices: int) -> dict[str, Any]:
     return {
         "name": label(short(name)),
         "legendgroup": name,
+        "legendrank": FIRST,
         "showlegend": devices > 1 and (devices <= IN_LEGEND or k < IN_LEGEND - 1),
     }
 

@@ -16,6 +16,7 @@ from locatk.formats.plot_units import Unit, digits, length, thousands, unit_for
 from locatk.formats.report.figures import colours, sentences
 from locatk.formats.report.figures_time import Row, errors_figure, histogram_figure, rows_figure
 from locatk.formats.report.panel import Panel, Table
+from locatk.formats.report.signals_drawing import listed
 from locatk.formats.report.subject import Subject
 
 
@@ -154,7 +155,9 @@ def error_panels(subject: Subject) -> list[Panel]:
     panels.append(_by_axis(subject, evaluation, colors, unit))
     panels += _rotation(subject, evaluation, colors)
     panels += _nees(subject, evaluation, colors)
-    panels.append(Panel("Statistics", _how(evaluation), table=_statistics(evaluation, unit)))
+    panels.append(
+        Panel("Statistics", _how(subject.solution, evaluation), table=_statistics(evaluation, unit))
+    )
     return panels
 
 
@@ -250,15 +253,20 @@ def _statistics(evaluation: Evaluation, unit: Unit) -> Table:
     return Table(("", "device", "unit", "n", *STATISTICS), rows)
 
 
-def _how(evaluation: Evaluation) -> str:
+def _how(solution: Solution, evaluation: Evaluation) -> str:
     """What the statistics mean, and what was left out."""
-    out = ", ".join(f"{count} {why}" for why, count in evaluation.unscored.items() if count)
+    out = ", ".join(
+        f"{thousands(count)} {why}" for why, count in evaluation.unscored.items() if count
+    )
+    alone = [t.device for t in solution.trajectories if len(t)]
+    alone = [name for name in alone if name not in evaluation.devices]
     parts = [
         "APE: each pose against the truth at its time. "
         f"RPE: the motion from each pose to {_apart(evaluation.rpe_delta)}, against the true one.",
         f"Alignment: {evaluation.align}; time offset: {evaluation.offset_s:g} s "
         f"({evaluation.offset_source}).",
-        f"Not scored: {out}." if out else "All poses are scored.",
+        f"Not scored: {out}." if out else "" if alone else "All poses are scored.",
+        f"There is no truth for {listed(alone)}." if alone else "",
     ]
     if evaluation.path_m:
         path = f"The true path is {length(evaluation.path_m)} long"
@@ -266,7 +274,7 @@ def _how(evaluation: Evaluation) -> str:
         if evaluation.drift_percent is not None:
             path += f"; drift {digits(evaluation.drift_percent)} % of it"
         parts.append(path + ".")
-    return " ".join(parts)
+    return sentences(*parts)
 
 
 def _apart(delta: str) -> str:

@@ -61,7 +61,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
             notes = []
             continue
         found.append(_panel(name, session, solution, sweeps, notes))
-        notes = []
+        notes = ["Drawn as above."]
     return found
 
 

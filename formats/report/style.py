@@ -93,6 +93,14 @@ SCRIPT = """\
       const shape = (y.range[1] - y.range[0]) / (x.range[1] - x.range[0]);
       height = Math.min(height, Math.max(140, width * shape) + 70 + 19 * rows);
     }
+    // Names of diagrams stand between them and the legend.
+    const titled = (spec.layout.annotations || []).some(function (words) {
+      return words.yref === "paper" && words.y > 0.99 && words.yanchor === "bottom";
+    });
+    if (titled) {
+      spec.layout.legend = Object.assign({}, spec.layout.legend, {y: 1 + 22 / height});
+      height += 22;
+    }
     figure.style.height = Math.round(height) + "px";
   }
   draw(0);

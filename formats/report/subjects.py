@@ -74,9 +74,9 @@ def load(
 def _by_name(solution: Solution) -> Solution:
     """The same with its devices in the order of their names, ``robot-2`` before ``robot-10``."""
 
-    def parts(t: Trajectory) -> list[tuple[int, str]]:
-        found = re.findall(r"[0-9]+|[^0-9]+", t.device)
-        return [(int(part), "") if part.isdecimal() else (-1, part) for part in found]
+    def parts(t: Trajectory) -> list[tuple[bool, int, str]]:
+        found = re.findall(r"([0-9]+)|([^0-9]+)", t.device)
+        return [(not digits, int(digits or 0), words) for digits, words in found]
 
     return replace(solution, trajectories=tuple(sorted(solution.trajectories, key=parts)))
 

@@ -389,6 +389,16 @@ def test_a_port_that_is_not_there_keeps_the_old_file(locatk: Any, tmp_path: Path
     assert path.read_bytes() == b"old"
 
 
+def test_a_port_that_is_waited_for_is_no_warning(locatk: Any, tmp_path: Path) -> None:
+    port = tmp_path / "no-port"
+    args = ("--device", "raw", "-o", tmp_path / "run.mcap", "--wait", "0.3s")
+    result = locatk("capture", port, *args)
+    assert result.exit_code == 1
+    waiting, error = result.stderr.splitlines()
+    assert waiting == f"Waiting for {port}; Ctrl-C ends it."
+    assert error.startswith("Error: no such port")
+
+
 def test_what_is_played_is_not_overwritten(locatk: Any, old: Path) -> None:
     before = old.read_bytes()
     result = locatk("capture", f"replay:{old}", "-o", old, "--overwrite")

@@ -75,7 +75,8 @@ def test_the_path_is_all_that_is_printed(locatk: Callable, run: Path, tmp_path: 
         result = locatk("emulate", run, "--link", link)
     assert result.exit_code == 0, result.stderr
     assert result.stdout == f"{link}\n"
-    assert f"locatk, bytes as recorded of {run}" in result.stderr
+    assert f"locatk, bytes as recorded of {run}, " in result.stderr
+    assert f"as: locatk capture {link} --device locatk " in result.stderr
     assert result.stderr.endswith("Sent 5000 of 5000 bytes\n")
     assert b"".join(got) == DATA
     assert not os.path.lexists(link)

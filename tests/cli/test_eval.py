@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from locatk.core.association import take
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -284,3 +285,26 @@ def test_tum_files_need_no_scipy_and_no_session(tmp_path: Path) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
     )
     assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr
+
+
+def test_the_longest_gap_is_chosen(locatk, found: Path, tmp_path: Path) -> None:
+    """A truth of one pose a second."""
+    slow = tmp_path / "slow.csv"
+    part = unknown(drive())
+    rows = np.arange(0, N, 20)
+    trajectories.write_csv(slow, [take(part, np.isin(np.arange(N), rows))])
+    assert answer(locatk, found, "--truth", slow)["n"] == len(rows)
+    bridged = answer(locatk, found, "--truth", slow, "--max-gap", 1)
+    assert bridged["n"] == rows[-1] + 1
+    assert bridged["coverage"]["share"] == 1.0
+
+
+def test_a_single_pose_and_what_comes_late_are_said_in_words(
+    locatk, run: Path, tmp_path: Path
+) -> None:
+    one, late = tmp_path / "one.csv", tmp_path / "late.csv"
+    trajectories.write_csv(one, [take(solved(), np.arange(N) == 5)])
+    assert "The one pose with truth lies" in locatk("eval", one, "--truth", run).stdout
+    trajectories.write_csv(late, [solved(late_ns=-5_000_000_000_000)])
+    said = locatk("eval", late, "--truth", run).stderr
+    assert "starts 5000.000 s before the truth" in said

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 from locatk.cli import export
 from locatk.formats import exports, trajectories
+from locatk.formats.solutions import read_solution, write_solution
 
 POSES = 20
 
@@ -67,7 +70,7 @@ def test_kitti_keeps_the_times_beside_the_matrices(locatk, solved: Path, tmp_pat
     out = tmp_path / "poses.txt"
     result = locatk("export", solved, "--format", "kitti", "-o", out)
     assert result.exit_code == 0, result.stderr
-    assert "times: they are in" in " ".join(result.stderr.split())
+    assert "poses.times.txt" in result.stderr
     [wanted] = exports_of(solved)
     matrices = np.loadtxt(out).reshape(-1, 3, 4)
     assert np.array_equal(matrices[:, :, 3], wanted.position)
@@ -190,3 +193,43 @@ def test_parquet_without_pyarrow(
     assert result.exit_code == 1
     assert 'pip install "locatk[parquet]"' in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_poses_that_are_no_numbers_are_left_out_and_told(locatk, solved: Path) -> None:
+    some = solved.with_name("some.mcap")
+
+    def spoil(rows: slice) -> None:
+        whole = read_solution(solved)
+        (only,) = whole.trajectories
+        position = only.position.copy()
+        position[rows] = np.nan
+        spoilt = replace(whole, trajectories=(replace(only, position=position),))
+        write_solution(some, spoilt, source="run.mcap", overwrite=True)
+
+    spoil(slice(3, 5))
+    for kind in ("csv", "tum", "kitti", "ros2"):
+        out = solved.with_name(f"poses-{kind}.mcap")
+        done = locatk("export", some, "--format", kind, "-o", out)
+        assert done.exit_code == 3
+        assert "left out 2 poses that are not numbers" in done.stderr
+        assert f"{POSES - 2} poses" in done.stdout
+    done = locatk("export", some, "--format", "csv", "-o", "-")
+    assert (done.exit_code, done.stdout.count("\n")) == (3, POSES - 1)
+    spoil(slice(None))
+    done = locatk("export", some, "--format", "csv", "-o", solved.with_name("none.csv"))
+    assert done.exit_code == 1
+    assert "none of the 20 poses is a number" in done.stderr
+    assert not solved.with_name("none.csv").exists()
+
+
+def test_a_closed_pipe_is_no_error(locatk, solved: Path) -> None:
+    for kind in ("csv", "tum"):
+        done = subprocess.run(
+            ["sh", "-c", '"$0" -m locatk.cli export "$1" --format "$2" -o - | head -1']
+            + [sys.executable, str(solved), kind],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert done.stderr == ""
+        assert done.stdout.count("\n") == 1

@@ -383,7 +383,7 @@ def test_a_long_drive_is_not_listed_whole(locatk, solver: Solver, tmp_path: Path
         (told(False, landmarks_seen=0), [], 0, "robot is not localised: no landmark was seen"),
         (told(False, probability=None), [], 0, "robot is not localised."),
         ({}, [], 0, "no pose at all"),
-        (told(), [detection((0, 0), "misread")] * 2, 5, "2 sightings refused (misread)"),
+        (told(), [detection((0, 0), "misread")] * 2, 5, "2 landmarks are not those of the map"),
         (told(), [detection(None, "no_landmark")], 5, "1 sighting refused (no landmark)"),
     ],
 )

@@ -66,6 +66,18 @@ def test_several_solutions_share_a_page(solution: Path, locatk: Locatk, tmp_path
     assert "2 solutions" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
+def test_solutions_of_one_name_are_told_apart(
+    solution: Path, locatk: Locatk, tmp_path: Path
+) -> None:
+    (tmp_path / "again").mkdir()
+    other = tmp_path / "again" / solution.name
+    shutil.copy(solution, other)
+    assert locatk("report", solution, other, "-o", tmp_path / "r.html").exit_code == 0
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert f"<h2>{solution}</h2>" in page
+    assert f"<h2>{other}</h2>" in page
+
+
 def test_names_of_outputs() -> None:
     one, two = Path("a.mcap"), Path("b/a.mcap")
     assert plan((one,), Path("r.html"), []) == (Path("r.html"), [[]])

@@ -219,3 +219,13 @@ def test_nothing_is_overwritten_unasked(locatk, tmp_path: Path) -> None:
     artifacts.write_tags(tag, SITE)
     assert locatk("simulate", "polaris", tag, "-o", tag, "--overwrite").exit_code == 1
     assert artifacts.read_tags(tag) == SITE
+
+
+def test_options_of_a_simulation_are_told_if_asked(locatk, tmp_path: Path) -> None:
+    path = tmp_path / "sim.mcap"
+    assert locatk("simulate", "polaris", "-o", path).exit_code == 0
+    told = locatk("info", path).stdout
+    assert "simulated_" not in told
+    assert "options of the simulation: see -v" in told
+    assert "simulated_crossings" in locatk("info", path, "-v").stdout
+    assert "simulated_crossings" in locatk("info", path, "--json").stdout

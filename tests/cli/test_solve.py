@@ -10,7 +10,10 @@ import pytest
 from click.testing import Result
 
 from locatk.cli import systems
+from locatk.core.solution import Solution
 from locatk.formats import artifacts
+from locatk.formats.observations import read_truth
+from locatk.formats.session import Session
 from locatk.formats.solutions import read_solution
 
 POSES = 20
@@ -144,6 +147,42 @@ def test_an_unseen_device_is_status_3(locatk, record, tmp_path: Path) -> None:
     assert result.exit_code == 3
     assert "no pose for red" in result.stderr
     assert read_solution(out).poses == 0
+
+
+@pytest.mark.parametrize(
+    ("system", "rejected", "words"),
+    [
+        ("dots", {"motion_blur": POSES}, None),
+        ("dots", {"motion_blur": POSES, "glare": 1}, "21 of 41 frames gave no pose (most: motion"),
+        ("lighthouse", {"moment_inconsistent": POSES, "jump": 99}, None),
+        ("lighthouse", {"moment_inconsistent": POSES + 1}, "21 of 41 moments gave no pose (most: "),
+    ],
+)
+def test_more_without_a_pose_than_with_one_is_status_3(
+    locatk,
+    monkeypatch,
+    session: Path,
+    tmp_path: Path,
+    system: str,
+    rejected: Any,
+    words: str | None,
+) -> None:
+    def solve(*_: Any) -> systems.Solved:
+        poses = read_truth(Session.open(session))
+        return systems.Solved(Solution(system, "test", tuple(poses), rejected=rejected), 0.1)
+
+    monkeypatch.setitem(systems.SYSTEMS, "lighthouse", solve)
+    result = locatk("solve", session, "-o", tmp_path / "solved.mcap")
+    assert result.exit_code == (0 if words is None else 3), result.stderr
+    assert (words or "") in result.stderr
+    assert read_solution(tmp_path / "solved.mcap").poses == POSES
+
+
+def test_each_sigma_has_its_unit(locatk, session: Path, tmp_path: Path) -> None:
+    result = locatk("solve", session, "-o", tmp_path / "solved.mcap")
+    head = result.stdout.splitlines()[1]
+    assert all(f"sigma {axis} [mm]" in head for axis in "xyz")
+    assert "sigma heading [deg]" in head
 
 
 def test_twins_and_files_for_folders_are_refused(locatk, record, tmp_path: Path) -> None:

@@ -154,6 +154,36 @@ def test_folders_patterns_and_files(
     assert set(contents(tmp_path / "one")) == {"a.mcap"}
 
 
+def test_what_else_lies_in_a_folder(
+    locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pipes that nobody feeds, folders called like sessions, links in a circle, odd bytes."""
+    [session] = day("a")
+    folder = session.parent
+    os.mkfifo(folder / "pipe.mcap")
+    (folder / "old.mcap").mkdir()
+    (folder / "round").symlink_to(folder)
+    (folder / "around").symlink_to(tmp_path)
+    Path(os.fsdecode(os.fsencode(folder) + b"/z\xff.mcap")).write_bytes(session.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    for number, name in enumerate(("day", "**/*.mcap", "day/**", f"{tmp_path}/d*/**/*.mcap")):
+        result = locatk("solve", name, "-o", f"out{number}", "--json")
+        assert result.exit_code == 3, result.stderr
+        a, pipe, odd = entries(result.stdout)
+        assert a["poses"] > 0
+        assert pipe["error"] == "not a regular file"
+        assert odd["error"] == "its name is not UTF-8"
+        (tmp_path / f"out{number}" / "a.mcap").unlink()
+    twice = locatk("solve", "day/a.mcap", "day/round/a.mcap", "-o", "twice", "--json")
+    assert len(entries(twice.stdout)) == 1
+    (folder / "deep").mkdir()
+    session.rename(folder / "deep" / "a.mcap")
+    day("a")
+    named = locatk("solve", "day/a.mcap", "day/deep/a.mcap", "-o", "twins")
+    assert named.exit_code == 2
+    assert "day/a.mcap and day/deep/a.mcap would have the same output" in named.stderr
+
+
 def test_beside_the_sessions_by_default(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path
 ) -> None:
@@ -466,6 +496,17 @@ def test_who_does_not_answer_is_named(
     assert result.stderr.startswith(f"Error: no Dask scheduler at {address}")
     assert f"`dask worker {address}`" in result.stderr
     assert result.stderr.count("\n") == 1
+    with socket.create_server(("127.0.0.1", 0)) as deaf:  # takes connections, never answers
+        for address in (
+            f"tcp://127.0.0.1:{deaf.getsockname()[1]}",
+            "host",
+            "tls://host:1",
+            "x://y",
+        ):
+            result = locatk("solve", *sessions, "-o", tmp_path / "out", "--scheduler", address)
+            assert result.exit_code == 1
+            assert result.stderr.startswith(f"Error: no Dask scheduler at {address} (")
+            assert result.stderr.count("\n") == 1
 
 
 def test_missing_extras_are_one_line(
@@ -567,6 +608,10 @@ def test_s3_places(
     assert (tmp_path / "a.mcap").read_bytes() == bucket.cat_file("lab/day/a-solved.mcap")
     assert locatk("solve", session, "-o", "s3://lab/new.mcap").exit_code == 0
     assert bucket.exists("lab/new.mcap")
+    for output in ("s3://nobucket/new.mcap", "s3://nobucket/out/"):
+        refused = locatk("solve", session, "-o", output)
+        assert refused.exit_code == 1
+        assert refused.stderr.startswith("Error: no bucket 'nobucket' to write into. Hint: ")
     for place, words in (
         ("s3://lab/day/none.mcap", "No such object in s3://lab/day/none.mcap"),
         ("s3://lab/other/", "no *.mcap in s3://lab/other/"),

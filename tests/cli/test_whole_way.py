@@ -39,6 +39,26 @@ def test_simulated_poses_agree_with_the_truth(locatk, simulated: Path, tmp_path:
     assert score["mae_m"] < 0.005
 
 
+def test_a_scene_of_another_room_is_status_3(locatk, simulated: Path, tmp_path: Path) -> None:
+    other, scene = tmp_path / "other.mcap", tmp_path / "scene.toml"
+    args = ("--seed", 8, "--duration", 10)
+    assert locatk("simulate", "lighthouse", "-o", other, *args).exit_code == 0
+    assert locatk("calibrate", "scene", other, "-o", scene).exit_code == 0
+    out = tmp_path / "out.mcap"
+    result = locatk("solve", simulated, "-o", out, "--artifact", scene)
+    assert result.exit_code == 3, result.stderr
+    assert "of the moments contradict the scene: a station was moved since" in result.stderr
+
+
+def test_frames_blurred_by_motion_are_status_3(locatk, tmp_path: Path) -> None:
+    frames, out = tmp_path / "frames.mcap", tmp_path / "out.mcap"
+    args = ("--frames", 12, "--motion", 13)
+    assert locatk("simulate", "dots", "-o", frames, *args).exit_code == 0
+    result = locatk("solve", frames, "-o", out)
+    assert result.exit_code == 3, result.stderr
+    assert "of 12 frames gave no pose" in result.stderr or "no pose for" in result.stderr
+
+
 def test_same_seed_same_bytes(locatk, tmp_path: Path) -> None:
     files = [tmp_path / f"{n}.mcap" for n in range(3)]
     for path, seed in zip(files, (5, 5, 6), strict=True):

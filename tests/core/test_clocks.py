@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core import clocks, metrics
-from locatk.core.errors import InputError
+from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import rotation_exp
 from locatk.core.trajectory import Trajectory
 
@@ -119,3 +119,57 @@ def test_long_recordings_are_searched_in_longer_steps() -> None:
     late = trajectory(time[5000:15000], position[5000:15000], MONTHS_NS)
     coarse = clocks.coarse_offset([(late, truth)], align="se2")
     assert coarse.offset_s == pytest.approx(-MONTHS_NS / 1e9, abs=coarse.span_s)
+
+
+def laps(time_s: Array) -> Array:
+    """Round and round, 20 s a lap."""
+    angle = 2 * np.pi * time_s / 20
+    return np.stack(
+        [2 * np.cos(angle) + 0.3 * np.cos(3 * angle), np.sin(angle), 0 * angle], axis=-1
+    )
+
+
+@pytest.mark.parametrize(("apart_m", "alike"), [(0.0, 4), (0.3, 0)])
+def test_a_drive_that_repeats_itself_is_told(apart_m: float, alike: int) -> None:
+    time = np.arange(0, 100, 0.02)
+    rng = np.random.default_rng(0)
+    away = np.stack(
+        [np.interp(time, np.arange(0, 101, 4), rng.normal(0, apart_m, 26)) for _ in "xyz"], -1
+    )
+    truth = laps(time) + away
+    mine = (time >= 23) & (time < 71)
+    noise = rng.normal(0, 0.002, (int(mine.sum()), 3))
+    pairs = [
+        (
+            trajectory(time[mine][::5], (truth[mine] + noise)[::5], MONTHS_NS),
+            trajectory(time, truth),
+        )
+    ]
+    coarse = clocks.coarse_offset(pairs)
+    assert (coarse.by, coarse.alike) == ("motion", alike)
+    found = metrics.evaluate(*pairs[0], offset_s="auto")
+    assert ("fits 4 other offsets as well" in found.offset_source) == (alike > 0)
+    off = found.offset_s + MONTHS_NS / 1e9
+    assert (off + 10) % 20 - 10 == pytest.approx(0, abs=5e-3)
+    if not alike:
+        assert off == pytest.approx(0, abs=5e-3)
+
+
+def test_the_offset_is_taken_from_where_devices_move() -> None:
+    """A robot that is carried from place to place, stands there, and then drives."""
+    standing = np.repeat(5.0 * np.arange(4), 500)
+    position = np.concatenate([np.stack([standing, 0 * standing, 0 * standing], -1), WAY])
+    time = np.arange(len(position)) * 0.01
+    rng = np.random.default_rng(0)
+    rough = position[::10] + rng.normal(0, 2e-3, (len(time[::10]), 3))
+    found = metrics.evaluate(
+        trajectory(time[::10], rough, 50_000_000), trajectory(time, position), offset_s="auto"
+    )
+    assert "held-out 50% to 75%" in found.offset_source
+    assert found.offset_s == pytest.approx(-0.05, abs=2e-3)
+
+
+def test_frames_that_differ_are_named_where_nothing_tells_the_offset() -> None:
+    estimate = trajectory(TIME[::7], 0.01 * WAY[::7] + 1e3)
+    with pytest.raises(DegenerateError, match="frames differ"):
+        metrics.evaluate(estimate, TRUTH, offset_s="auto")

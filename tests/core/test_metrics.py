@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core import metrics
+from locatk.core import association, metrics
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.trajectory import Trajectory
@@ -211,3 +212,26 @@ def test_unusable_input_is_named() -> None:
     bad = trajectory(TRUE_TIME, np.where(TRUE_TIME[:, None] > 30, np.nan, TRUTH.position))
     with pytest.raises(InputError, match="not numbers"):
         metrics.evaluate(bad, TRUTH, align="se3")
+
+
+def test_stamps_become_the_seconds_that_a_reader_of_text_gets() -> None:
+    """Ties between two neighbours then fall as where stamps are read as float64."""
+    rng = np.random.default_rng(0)
+    for most in (10**9, 10**13, 2**53, 2**54, 9 * 10**18):
+        stamps = rng.integers(-most, most, 2000) // 10**5 * 10**5
+        words = [f"{'-' * (t < 0)}{abs(t) // 10**9}.{abs(t) % 10**9:09d}" for t in stamps.tolist()]
+        np.testing.assert_array_equal(association._seconds(stamps), list(map(float, words)))
+
+
+@pytest.mark.parametrize("factor", [1e200, 1e-200])
+def test_positions_whose_squares_run_over(factor: float) -> None:
+    strange = replace(TRUTH, position=factor * TRUTH.position)
+    with pytest.raises((InputError, DegenerateError), match=r"not numbers|in one place"):
+        metrics.evaluate(strange, TRUTH, align="sim3")
+
+
+def test_one_unknown_covariance_for_all_stays_one_in_memory() -> None:
+    unknown = replace(TRUTH, covariance=np.broadcast_to(np.nan, (len(TRUTH), 6, 6)))
+    part = association.take(unknown, np.arange(len(TRUTH)) % 2 == 0)
+    assert part.covariance.shape == (len(part), 6, 6)
+    assert part.covariance.strides[0] == 0

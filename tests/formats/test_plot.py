@@ -142,7 +142,7 @@ def test_errors_are_those_of_the_evaluation() -> None:
     figure = draw(solution(), TRUTH)
     said = "\n".join(texts(figure))
     assert "240 poses of 2 devices" in said
-    assert "MAE 3.00 mm, RMSE 3.16 mm" in said  # 2 mm and 4 mm
+    assert "APE rmse 3.16 mm, mean 3.00 mm" in said  # 2 mm and 4 mm
     assert "alignment: none" in said
     assert "the mean of other units" in said
     assert "error [mm]" in said
@@ -211,6 +211,18 @@ def test_stations_are_in_view_or_named_at_the_margin() -> None:
         assert bottom < y < top
 
 
+@pytest.mark.parametrize(
+    ("far_m", "said"), [(0.46, "ch 1\n460 mm"), (1.24, "ch 1\n1.2 m"), (87.3, "ch 1\n87 m")]
+)
+def test_a_small_map_tells_how_far_stations_are(far_m: float, said: str) -> None:
+    small = replace(track("red"), position=0.01 * track("red").position)
+    station = Station(1, np.array([0.0, far_m, 0.0]), np.eye(3), IDEAL)
+    scene = Scene(stations=(station,), scale="markers")
+    figure = draw(Solution("lighthouse", "bundle", (small,), artifact=scene))
+    assert figure.axes[0].get_xlabel() == "x [mm]"
+    assert said in texts(figure)
+
+
 def test_paths_break_where_nothing_was_seen() -> None:
     whole = track("red")
     keep = np.r_[0:40, 60:120]
@@ -227,7 +239,7 @@ def test_wild_poses_do_not_hide_the_others() -> None:
     figure = draw(Solution("lighthouse", "bundle", (wild,), artifact=SCENE), TRUTH)
     assert figure.axes[0].get_xlim()[1] < 10
     said = texts(figure)
-    assert "1 poses lie outside this view" in said
+    assert "1 pose lies outside this view" in said
     assert any("1 of 120 beyond this scale (triangles)" in text for text in said)
 
 

@@ -78,9 +78,10 @@ def test_the_map_shows_all_magnets() -> None:
     figure = draw(solution(BUILT, f"tag-{ID}"))
     ground = figure.axes[0]
     known, found = figure.findobj(Quiver)
-    place, _ = built_magnets(BUILT, ID, layout_of(BUILT, ID))
+    place = 1e3 * built_magnets(BUILT, ID, layout_of(BUILT, ID))[0]  # a small map is in mm
     np.testing.assert_allclose(known.XY, place)
     np.testing.assert_allclose(found.XY, place)
+    assert ground.get_xlabel() == "x [mm]"
     (left, right), (low, high) = ground.get_xlim(), ground.get_ylim()
     assert left < place[:, 0].min() < place[:, 0].max() < right
     assert low < place[:, 1].min() < place[:, 1].max() < high
@@ -93,5 +94,5 @@ def test_a_solution_without_poses_shows_the_site() -> None:
     assert tags_of(empty) == ()
     site = replace(empty, artifact=replace(BUILT, site={ID: Placed(3.0, 4.0, 0.0)}))
     ground = draw(site).axes[0]
-    assert ground.get_xlim()[0] < 3 < ground.get_xlim()[1]
-    assert ground.get_ylim()[0] < 4 < ground.get_ylim()[1]
+    assert ground.get_xlim()[0] < 3000 < ground.get_xlim()[1]  # mm
+    assert ground.get_ylim()[0] < 4000 < ground.get_ylim()[1]

@@ -330,3 +330,17 @@ def test_orientation_survives(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         matrix_from_quaternion(t.read_csv(tmp_path / "a.csv")[0].quaternion), turn, atol=1e-14
     )
+
+
+def test_rotations_of_kitti_are_the_nearest_to_rounded_matrices(tmp_path: Path) -> None:
+    """Files of KITTI have seven digits; rounded once or perturbed, no cell counts more."""
+    rng = np.random.default_rng(0)
+    exact = rotation_exp(rng.normal(size=(200, 3)))
+    rounded = exact + rng.normal(0, 1e-3, exact.shape)
+    rows = np.concatenate([rounded, np.zeros((200, 3, 1))], axis=2).reshape(-1, 12)
+    path = tmp_path / "rounded.kitti"
+    np.savetxt(path, rows)
+    u, _, vt = np.linalg.svd(rounded)
+    np.testing.assert_allclose(
+        matrix_from_quaternion(t.read_kitti(path).quaternion), u @ vt, atol=1e-12
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.errors import InputError, LocatkError
+from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import trajectories
@@ -127,3 +128,10 @@ def test_places_that_are_no_files(tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(LocatkError):
         files.read(tmp_path / "cut.mcap")
+
+
+def test_compressed_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "truth.tum.gz"
+    path.write_bytes(gzip.compress(b"0 0 0 0 0 0 0 1\n"))
+    with pytest.raises(FormatError, match="compressed"):
+        files.read(path)

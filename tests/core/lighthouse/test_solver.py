@@ -423,6 +423,18 @@ def test_a_lie_in_a_known_scene_is_outvoted(world: Any) -> None:
     assert errors(solution, drive).max() < 6e-3
 
 
+def test_a_scene_of_another_place_is_told(world: Any) -> None:
+    lamps = world.lamps(1, 2)
+    drive = world.drive(lamps, world.curve(200, flat=False))
+    scene = strict(drive.sweeps, marked(world, lamps)).artifact
+    right = strict(drive.sweeps, scene)
+    assert not any("contradict" in note for note in right.notes)
+    moved = replace(scene.stations[0], position=scene.stations[0].position + [0.5, 0.3, 0.0])
+    wrong = strict(drive.sweeps, replace(scene, stations=(moved, *scene.stations[1:])))
+    assert wrong.rejected["moment_inconsistent"] > 100
+    assert any("of the moments contradict the scene" in note for note in wrong.notes)
+
+
 @pytest.mark.parametrize("flat", [True, False])
 def test_two_stations_that_contradict_are_both_left_out(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2)

@@ -177,3 +177,27 @@ def test_it_can_be_looked_at(browser: str, tmp_path: Path) -> None:
     grey = np.abs(image - 0xBF).max(axis=1) < 6  # of the truth
     assert blue.sum() > 500
     assert grey.sum() > 20
+
+
+def test_a_narrow_window_shows_all(browser: str, tmp_path: Path) -> None:
+    """As on a phone: legends go above, maps get lower, and rows of diagrams can be scrolled."""
+    path = tmp_path / "report.html"
+    write_report(path, [subject()])
+    frame = tmp_path / "frame.html"
+    frame.write_text(f'<iframe src="{path.as_uri()}" style="width:390px;height:9000px"></iframe>')
+    script = (
+        "<script>const f = document.documentElement.clientWidth;"
+        "document.title = f + ' ' + document.documentElement.scrollWidth;</script>"
+    )
+    text = path.read_text(encoding="utf-8")
+    text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)
+    path.write_text(text.replace("</body>", f"{script}</body>"), encoding="utf-8")
+    picture = tmp_path / "page.png"
+    shown = opened(browser, frame, tmp_path / "profile", f"--screenshot={picture}")
+    assert shown.console == []
+    narrow = opened(browser, path, tmp_path / "other", "--window-size=500,3000").dom
+    heights = [int(h) for h in re.findall(r'class="figure[^>]*height: (\d+)px', narrow)]
+    assert heights[0] < 500  # the map, 640 in a wide window
+    (wide, all_of_it) = map(int, re.findall(r"<title>(\d+) (\d+)</title>", narrow)[0])
+    assert wide <= 600
+    assert all_of_it == wide  # nothing sticks out at the side

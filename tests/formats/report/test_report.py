@@ -10,7 +10,8 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -22,9 +23,12 @@ from locatk.core.lighthouse.calibration import IDEAL
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
+from locatk.formats.plot_ground import known
 from locatk.formats.report.figures import MOST_POINTS
+from locatk.formats.report.judgement import error_panels, sigma_panels
 from locatk.formats.report.report import panels, render, write_report
 from locatk.formats.report.subject import Subject
+from locatk.formats.session import Session
 
 START_NS = 1_767_225_600_000_000_000
 EVIL = "</script><img src=x onerror=alert(1)>"
@@ -227,7 +231,89 @@ def test_poses_without_covariance_are_a_report() -> None:
     assert "tells no covariance" in texts(replace(subject, evaluation=None, truth=()))
 
 
+def test_poses_that_are_no_numbers_are_left_out_and_counted() -> None:
+    solved = solution("red")
+    solved.trajectories[0].position[5:9] = np.nan
+    truth = (track("red"),)
+    pairs = [(known(t), u) for t, u in zip(solved.trajectories, truth, strict=True)]
+    subject = Subject("a", solved, truth=truth, evaluation=metrics.evaluate_all(pairs))
+    said = texts(subject)
+    assert "Half of the poses lie within 1.00 mm" in said
+    assert "4 poses are not numbers: they are neither drawn nor scored." in said
+    solved.trajectories[0].position[:] = np.nan
+    said = texts(Subject("a", solved, truth=truth))
+    assert "No pose is a number, so that there are no errors." in said
+    assert "60 poses are not numbers" in said
+
+
+def test_devices_without_truth_are_named() -> None:
+    subject = judged(solution("red", "blue"))
+    only = metrics.evaluate_all([(subject.solution.trajectories[0], subject.truth[0])])
+    said = figure(replace(subject, evaluation=only), "Statistics").note
+    assert "There is no truth for blue." in said
+    assert "All poses are scored" not in said
+    assert "All poses are scored." in figure(subject, "Statistics").note
+
+
+def test_facts_have_units_and_no_lists_for_programs() -> None:
+    facts = {"speed_mps": 0.5, "frames": [{"x": k} for k in range(200)], "robots": {"a": {"n": 1}}}
+    subject = Subject("a", solution("red", facts=facts), facts={"options_sha256": "00"})
+    assert dict(figure(subject, "What the solver tells").table.rows) == {
+        "speed [m/s]": "0.5",
+        "robots: a: n": "1",
+    }
+    assert "options" not in texts(subject)
+    only = Subject("a", solution("red", facts={"frames": [{}] * 200}))
+    assert "What the solver tells" not in [panel.title for panel in panels(only)]
+
+
 # ---- figures
+
+
+def times(panel: Any) -> list[float]:
+    """All times that a figure of numbers over time shows."""
+    found = [np.asarray(t.x, float) for t in panel.figure.data]
+    return np.concatenate([x[np.isfinite(x)] for x in found]).tolist()
+
+
+def test_all_time_axes_begin_with_the_recording() -> None:
+    recording = SimpleNamespace(
+        start_ns=START_NS - 3_000_000_000, end_ns=START_NS + 10**10, facts={}
+    )
+    subject = judged(solution("red"))
+    titles = ("Error against time", "Error by axis", "Covariance against time")
+    for title in titles:
+        assert min(times(figure(subject, title))) == pytest.approx(0.0)
+    from_session = replace(subject, session=cast("Session", recording))
+    shown = {p.title: p for p in (*error_panels(from_session), *sigma_panels(from_session))}
+    for title in titles:
+        assert min(times(shown[title])) == pytest.approx(3.0)
+    assert "time 0 is the first pose, 2026-01-01 00:00:00 UTC" in texts(subject)
+    late = replace(from_session, session=cast("Session", replace_start(recording)))
+    assert "of another time than the poses" in texts(late)
+
+
+def replace_start(recording: Any) -> Any:
+    """The same an hour later."""
+    hour = 3600 * 10**9
+    return SimpleNamespace(
+        start_ns=recording.start_ns + hour, end_ns=recording.end_ns + hour, facts={}
+    )
+
+
+def test_devices_come_first_in_legends() -> None:
+    traces = figure(judged(solution("red")), "Path").figure.data
+    ranks = {t.name: t.legendrank or 1000 for t in traces if t.showlegend is not False}
+    assert min(ranks, key=lambda name: ranks[name]) == "red"
+
+
+def test_a_thinned_path_breaks_where_nothing_was_seen_and_nowhere_else() -> None:
+    t = track("red", 6000)
+    t.time_ns[3000:] += 30_000_000_000
+    panel = figure(Subject("a", replace(solution("red"), trajectories=(t,))), "Path")
+    line = next(each for each in panel.figure.data if each.name == "red")
+    assert "Drawn are" in panel.note
+    assert np.count_nonzero(np.isnan(np.asarray(line.x, float))) == 1
 
 
 def figure(subject: Subject, title: str) -> Any:
@@ -317,7 +403,7 @@ def test_ten_thousand_poses_are_thinned_and_small() -> None:
     solved.trajectories[3].position[417] += 5.0  # must not be lost
     page = render([judged(solved)])
     assert len(page.encode()) < 12e6
-    assert f"of {solved.poses} poses" in page
+    assert "of 10\u202f800 poses" in page
     for ident, spec in specs(page).items():
         points = sum(len(values(t["x"])) for t in spec["data"] if "markers" in t.get("mode", ""))
         assert points < 1.3 * MOST_POINTS, ident

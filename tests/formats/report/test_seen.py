@@ -290,3 +290,22 @@ def test_words_of_tables() -> None:
     two = seen_text.tags([tag(), tag(device="other")], 1)
     assert two.header[0] == "array"
     assert two.more == 1
+
+
+def test_a_bar_has_its_reason_above_it_and_one_reason_no_figure() -> None:
+    counts = {"spike": 7, "moment_jumps": 1200, "plane_unknown": 3}
+    panel = seen.panels(Solution("lighthouse", "bundle", (), counts))[1]
+    assert panel.figure is not None
+    names = {each.text: each.y for each in panel.figure.layout.annotations}
+    assert set(names) == {"spike", "moment jumps", "plane unknown"}
+    bars = {y: x for bar in panel.figure.data for x, y in zip(bar.x, bar.y, strict=True)}
+    assert {name: bars[y] for name, y in names.items()} == {
+        "spike": 7,
+        "moment jumps": 1200,
+        "plane unknown": 3,
+    }
+    assert "1\u202f200" in panel.note
+    assert panel.figure.layout.xaxis.range[1] > 1200
+    (only,) = seen.panels(Solution("lighthouse", "bundle", (), {"spike": 7}))[1:]
+    assert only.figure is None
+    assert only.table.rows[0][:2] == ("spike", "7")

@@ -227,7 +227,7 @@ def test_tags_are_marked_where_their_field_is(polaris: tuple[Session, Solution])
     (read,) = (each for each in whole.figure.data if each.name == "read (1)")
     assert str(solution.detections[0]["tag_id"]) in read.text[0]
     assert len(near.figure.data) == 3 * 9
-    assert "1 of 1" in near.note
+    assert "There was one." in near.note
 
 
 def test_a_bar_whose_sensors_are_nowhere_is_drawn_by_numbers(
@@ -269,7 +269,7 @@ def test_halls_are_drawn_with_their_peaks_and_sightings(tmp_path: Path) -> None:
     assert refused.x[0] == pytest.approx(50, abs=0.01)
     assert refused.text[0] == "misread<br>2,3<br>NNNS"
     assert "refused: misread" in refused.customdata[0]
-    assert "3 of 3" in near.note
+    assert "All 3 visits are drawn." in near.note
     assert len(field) == 30_000
 
 

@@ -162,3 +162,23 @@ def test_a_damaged_solution_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(FormatError) as caught:
         load(path)
     assert "\n" not in str(caught.value)
+
+
+def test_devices_are_in_the_order_of_their_names(tmp_path: Path) -> None:
+    names = ("robot-10", "robot-9", "a/2", "robot", "7", "a/11")
+    many = replace(SOLUTION, trajectories=tuple(track(name) for name in names))
+    found = load(solved(tmp_path / "solved.mcap", many)).solution.trajectories
+    assert [t.device for t in found] == ["7", "a/2", "a/11", "robot", "robot-9", "robot-10"]
+
+
+def test_poses_that_are_no_numbers_do_not_cost_the_others_their_errors(
+    session: Path, tmp_path: Path
+) -> None:
+    some = replace(SOLUTION, trajectories=(track(off_m=2e-3),))
+    some.trajectories[0].position[3] = np.nan
+    subject = load(solved(tmp_path / "solved.mcap", some))
+    assert subject.evaluation is not None
+    assert subject.evaluation.n == 59
+    assert subject.solution.poses == 60
+    some.trajectories[0].position[:] = np.inf
+    assert load(solved(tmp_path / "none.mcap", some)).evaluation is None
