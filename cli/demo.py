@@ -155,6 +155,7 @@ def whole_way(
     from locatk.formats import solutions
     from locatk.formats.batch.made import source_facts
     from locatk.formats.plot import plot_solution
+    from locatk.formats.plot_clock import origin_ns
     from locatk.formats.report import subjects
 
     session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
@@ -172,7 +173,11 @@ def whole_way(
     if pictured:
         with console.working(f"Drawing {system}"):
             plot_solution(
-                folder / f"{system}.png", solved.solution, truth=truths, overwrite=overwrite
+                folder / f"{system}.png",
+                solved.solution,
+                truth=truths,
+                start_ns=origin_ns(subject.session, solved.solution),
+                overwrite=overwrite,
             )
     pairs, _ = pair_devices([t for t in paper.solution.trajectories if len(t)], truths)
     row = {

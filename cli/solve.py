@@ -81,7 +81,7 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     "Outdated solutions are replaced.",
 )
 @options.overwrite
-@options.json_flag("A JSON object a session, each on a line,")
+@options.json_flag("A JSON object a session, each on a line")
 @options.verbosity
 def command(
     sessions: tuple[str, ...],

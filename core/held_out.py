@@ -63,7 +63,7 @@ def held_out_offset(
         around, span_s = coarse.offset_s, coarse.span_s
         found = f"; clocks brought together by {coarse.by}"
         if coarse.alike:
-            found += f", which fits {coarse.alike} other offsets as well"
+            found += f", which fits other offsets as well ({coarse.alike})"
     parts = HELD_OUT if held_out is None else (held_out,)
     choices = [(part, _held_out_poses(pairs, part, max_gap_s, around)) for part in parts]
     speeds = [_speed(pairs, windows, max_gap_s, around) for _, windows in choices]
