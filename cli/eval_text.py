@@ -108,7 +108,7 @@ def _consistency(found: Evaluation) -> str:
     if said is None:
         return "consistency: - (the estimate has no covariances)"
     return (
-        f"consistency: {said.words()}; NEES {number(said.mean)} a degree of freedom "
+        f"consistency: {said.words()}; NEES {said.mean:.3g} a degree of freedom "
         f"({said.low:.2f} to {said.high:.2f} expected of independent poses), "
         f"{100 * said.inside:.0f} % of the poses in their 95 % region"
     )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from locatk.core.errors import MissingDataError
+from locatk.core.errors import InputError, MissingDataError
 from locatk.formats.batch import places
 
 AT_ONCE = 16
@@ -95,6 +95,8 @@ def _expanded(name: str) -> list[str] | None:
     if glob.has_magic(name):
         found = _files(name)
         return _something(sorted(found), name, f"nothing matches {name}")
+    if not name:
+        raise InputError("a name is empty", hint="A variable of the shell may hold nothing")
     raise MissingDataError(
         "No such file or folder", file=name, hint="Check the spelling of the path"
     )
