@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -26,6 +27,10 @@ RETRIES = 2
 
 PATIENCE_S = 20
 """How long a scheduler and the first worker may take to answer."""
+
+LONGEST_FOLDER = 70
+"""Bytes in the path of the temporary folder, in which the server of processes has a socket:
+the path of a socket has 107 at most, and 32 are its own."""
 
 ONE_THREAD = dict.fromkeys(
     (
@@ -103,7 +108,10 @@ class _Here(Executor):
 @contextlib.contextmanager
 def _processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
     # Never a plain fork: threads of libraries would leave their locks behind.
-    forkserver = "forkserver" in multiprocessing.get_all_start_methods()
+    forkserver = (
+        "forkserver" in multiprocessing.get_all_start_methods()
+        and len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
+    )
     context = multiprocessing.get_context("forkserver" if forkserver else "spawn")
     if forkserver:
         context.set_forkserver_preload(list(preload))

@@ -420,6 +420,21 @@ def test_an_interrupt_leaves_what_is_whole(
     assert [entry["resumed"] for entry in entries(done.stdout)] == resumed
 
 
+def test_a_long_temporary_folder(day: Callable[..., list[Path]], tmp_path: Path) -> None:
+    """The path of a socket is short."""
+    day("a", "b")
+    long = tmp_path / ("x" * 90)
+    long.mkdir()
+    done = subprocess.run(
+        command("solve", tmp_path / "day", "-o", tmp_path / "out", "--jobs", 2),
+        capture_output=True,
+        text=True,
+        env={**os.environ, "TMPDIR": str(long)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert set(contents(tmp_path / "out")) == {"a.mcap", "b.mcap"}
+
+
 def free_port() -> int:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
