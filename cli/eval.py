@@ -34,15 +34,7 @@ class Offset(click.ParamType):
         self.fail(f"{value!r} is neither a number of seconds nor `auto`.", param, ctx)
 
 
-@click.command(short_help="Compare poses with the truth.")
-@options.input_argument("estimate")
-@options.input_option(
-    "--truth",
-    required=True,
-    metavar="FILE",
-    help="Session with truth, another solution, or a TUM, KITTI or CSV file.",
-)
-@click.option(
+align_option = click.option(
     "--align",
     type=click.Choice(ALIGNMENTS),
     default="none",
@@ -51,7 +43,8 @@ class Offset(click.ParamType):
     "plane (se2), in space (se3), with scale (sim2, sim3), about z (yaw), or the first pose laid "
     "on its truth (origin).",
 )
-@click.option(
+
+offset_option = click.option(
     "--offset",
     type=Offset(),
     default=0.0,
@@ -60,6 +53,18 @@ class Offset(click.ParamType):
     help="Added to the stamps of the estimate; `auto` estimates it on a part that is not scored, "
     "from clocks that may be years apart.",
 )
+
+
+@click.command(short_help="Compare poses with the truth.")
+@options.input_argument("estimate")
+@options.input_option(
+    "--truth",
+    required=True,
+    metavar="FILE",
+    help="Session with truth, another solution, or a TUM, KITTI or CSV file.",
+)
+@align_option
+@offset_option
 @click.option(
     "--match",
     type=click.Choice(("auto", "interpolate", "nearest")),

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from locatk.cli import console, options
-from locatk.cli.eval import ALIGNMENTS, Offset
+from locatk.cli.eval import align_option, offset_option
 
 PAGES = (".html", ".htm")
 PICTURES = (".png", ".pdf", ".svg")
@@ -30,21 +30,8 @@ PICTURES = (".png", ".pdf", ".svg")
     metavar="FILE",
     help="Reference poses: a session, a solution, TUM, KITTI or CSV. [default: the session's]",
 )
-@click.option(
-    "--align",
-    type=click.Choice(ALIGNMENTS),
-    default="none",
-    show_default=True,
-    help="Fitted from solution to truth on the scored poses.",
-)
-@click.option(
-    "--offset",
-    type=Offset(),
-    default=0.0,
-    show_default=True,
-    metavar="SECONDS|auto",
-    help="Added to the stamps of the solution, as in `locatk eval`.",
-)
+@align_option
+@offset_option
 @click.option("--png", is_flag=True, help="Write pictures beside the page too: report.png.")
 @click.option("--pdf", is_flag=True, help="The same as PDF.")
 @click.option("--svg", is_flag=True, help="The same as SVG.")

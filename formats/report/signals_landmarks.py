@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_drawing import Event, envelope, number, told
-from locatk.formats.report.signals_reading import MOST_DEVICES, excerpt, fields
+from locatk.formats.report.signals_fields import Fields, each_device
 from locatk.formats.session import Session
 
 Array = NDArray[np.float64]
@@ -36,32 +36,18 @@ MARK_S = 0.25
 
 def panels(session: Session, solution: Solution) -> list[Panel]:
     """The channels of each robot with the landmarks that were read, and some from near."""
-    topics = session.topics(KIND.topic, KIND.schema)
-    read = excerpt(session, topics[:MOST_DEVICES])
-    devices = [topic.removeprefix(KIND.topic) for topic in topics]
-    notes = [*read.notes, *drawing.strangers(solution, devices)]
-    if len(devices) > MOST_DEVICES:
-        notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
-    found: list[Panel] = []  # the first of them tells the notes
     start_ns = origin_ns(session, solution)
-    for topic, payloads in read.payloads.items():
-        device = topic.removeprefix(KIND.topic)
-        name = f"Hall sensors of {device}"
-        try:
-            samples = fields(session, KIND, topic, payloads)
-        except LocatkError as error:
-            found.append(Panel(name, " ".join([f"Not drawn: {error.message}.", *notes])))
-            notes = []
-            continue
+
+    def drawn(device: str, name: str, samples: Fields, notes: Sequence[str]) -> list[Panel]:
         time_s = drawing.seconds(samples.time_ns, start_ns)
         field_mt = 1e3 * samples.field_t
         names = _names(session, device, field_mt.shape[1])
         seen = [each for each in solution.detections if each.get("device") == device]
         events = [_event(each, start_ns) for each in seen]
-        found.append(_whole(name, time_s, field_mt, names, events, start_ns, notes))
-        found += _near(device, time_s, field_mt, names, seen, events)
-        notes = []
-    return found
+        whole = _whole(name, time_s, field_mt, names, events, start_ns, notes)
+        return [whole, *_near(device, time_s, field_mt, names, seen, events)]
+
+    return each_device(session, solution, KIND, "Hall sensors of", drawn)
 
 
 def _names(session: Session, device: str, count: int) -> list[str]:
@@ -100,7 +86,7 @@ def _whole(
     names: list[str],
     events: list[Event],
     start_ns: int,
-    notes: list[str],
+    notes: Sequence[str],
 ) -> Panel:
     """The whole recording of one robot."""
     from plotly.subplots import make_subplots

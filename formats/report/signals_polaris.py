@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_drawing import Event, envelope, number, short, told
-from locatk.formats.report.signals_reading import MOST_DEVICES, Fields, excerpt, fields
+from locatk.formats.report.signals_fields import Fields, each_device
 from locatk.formats.seen_text import words
 from locatk.formats.session import Session
 
@@ -40,27 +40,13 @@ REACH_M = 0.02
 
 def panels(session: Session, solution: Solution) -> list[Panel]:
     """The field of each array with the tags that were read, and some passes from near."""
-    topics = session.topics(KIND.topic, KIND.schema)
-    read = excerpt(session, topics[:MOST_DEVICES])
-    devices = [topic.removeprefix(KIND.topic) for topic in topics]
-    notes = [*read.notes, *drawing.strangers(solution, devices)]
-    if len(devices) > MOST_DEVICES:
-        notes.append(f"Not drawn: {drawing.listed(devices[MOST_DEVICES:])}.")
-    found: list[Panel] = []  # the first of them tells the notes
-    for topic, payloads in read.payloads.items():
-        device = topic.removeprefix(KIND.topic)
-        name = f"Magnetic field along {device}"
-        try:
-            samples = fields(session, KIND, topic, payloads)
-        except LocatkError as error:
-            found.append(Panel(name, " ".join([f"Not drawn: {error.message}.", *notes])))
-            notes = []
-            continue
+
+    def drawn(device: str, name: str, samples: Fields, notes: Sequence[str]) -> list[Panel]:
         bar = _Bar(session, device, samples, origin_ns(session, solution))
         seen = [each for each in solution.detections if each.get("device") == device]
-        found += [_whole(name, bar, seen, notes), *_near(device, bar, seen)]
-        notes = []
-    return found
+        return [_whole(name, bar, seen, notes), *_near(device, bar, seen)]
+
+    return each_device(session, solution, KIND, "Magnetic field along", drawn)
 
 
 class _Bar:
@@ -142,7 +128,7 @@ def _passed_s(found: Mapping[str, Any], at: float) -> list[float]:
     return [at + number(each["x_m"]) / speed for each in found.get("magnets") or ()]
 
 
-def _whole(name: str, bar: _Bar, seen: list[dict[str, Any]], notes: list[str]) -> Panel:
+def _whole(name: str, bar: _Bar, seen: list[dict[str, Any]], notes: Sequence[str]) -> Panel:
     """The whole recording of one array: what was read, sensors over time, lines."""
     from plotly.subplots import make_subplots
 

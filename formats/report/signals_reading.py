@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
-from locatk.core.errors import FormatError
 from locatk.formats import captured, mcap_records
 from locatk.formats.mcap_records import DamageError, Segment
-from locatk.formats.messages import BatchError
-from locatk.formats.samples import Kind
 from locatk.formats.session import Session, reading
 
 MOST_READ = 8 << 20
@@ -38,14 +32,6 @@ class Excerpt:
 
     payloads: dict[str, list[bytes]]
     notes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Fields:
-    """Samples of field sensors: times (n,) in ns, ascending, and fields (n, N * axes) in T."""
-
-    time_ns: NDArray[np.int64]
-    field_t: NDArray[np.float32]
 
 
 def excerpt(session: Session, topics: Collection[str], *, most: int | None = None) -> Excerpt:
@@ -94,25 +80,3 @@ def _spread(segments: list[Segment], most: int) -> list[Segment]:
     count = max(1, len(segments) * most // total)
     at = np.linspace(0, len(segments) - 1, count).round().astype(int)
     return [segments[k] for k in np.unique(at)]
-
-
-def fields(session: Session, kind: Kind[Any], topic: str, payloads: list[bytes]) -> Fields:
-    """Samples of one device; where its sensors sit need not be known.
-
-    Raises
-    ------
-    FormatError
-        There are none, or a message is damaged.
-    """
-    try:
-        first: Any = kind.layout(1).message.FromString(payloads[0]) if payloads else None
-        if first is None or not first.sensors:
-            raise FormatError("no samples", file=session.path, where=topic)
-        batches = kind.layout(int(first.sensors)).unpack(payloads)
-    except (DecodeError, BatchError):
-        raise FormatError("a message is damaged", file=session.path, where=topic) from None
-    time_ns = batches.columns["time_ns"]
-    if not len(time_ns):
-        raise FormatError("no samples", file=session.path, where=topic)
-    order = np.argsort(time_ns, kind="stable")
-    return Fields(time_ns[order], batches.columns["b_tesla"].reshape(len(time_ns), -1)[order])
