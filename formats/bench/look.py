@@ -83,9 +83,9 @@ def _demo(place: Path) -> Figure:
 def _batch(place: Path) -> list[Figure]:
     """What several processes bring, and that they change nothing."""
     place.mkdir()
-    names = [f"run-{k:02}.mcap" for k in range(12)]
+    names = [f"run-{k}.mcap" for k in range(8)]
     for k, name in enumerate(names):
-        options = ("--robots", 2, "--duration", 60, "--seed", SEED + k)
+        options = ("--robots", 10, "--duration", 108, "--seed", SEED + k)
         _locatk(place, "simulate", "lighthouse", "-o", name, *options)
     _, alone_s = _locatk(place, "solve", *names, "-o", "alone", "--jobs", 1)
     _, shared_s = _locatk(place, "solve", *names, "-o", "shared", "--jobs", JOBS)
