@@ -151,7 +151,8 @@ def command(
                 "no solved poses", file=estimate, hint="Solve it first: `locatk solve`"
             )
         console.warn(f"{estimate} holds no solved poses: its truth is taken as the estimate")
-    pairs, alone = pair_devices(mine.trajectories, true.trajectories, called(names))
+    told = called(names)
+    pairs, alone = pair_devices(mine.trajectories, true.trajectories, told)
     if not pairs:
         here, there = (
             ", ".join(each.device for each in side.trajectories) for side in (mine, true)
@@ -161,6 +162,10 @@ def command(
             file=estimate,
             hint=f"Say by --pair NAME=NAME which of {here} is which of {there}",
         )
+    named = not {mine.kind, true.kind} & set(files.EVO_KINDS)  # these name no device
+    for ours, theirs in pairs:
+        if named and theirs.device != ours.device and ours.device not in told:
+            console.say(f"{ours.device} is compared with {theirs.device}, the only one there")
     if alone:
         console.warn(f"no truth for {', '.join(alone)}")
     as_evo = mine.kind in files.EVO_KINDS and true.kind in files.EVO_KINDS

@@ -29,6 +29,19 @@ MOST_WRONG = 1 / 3
 """Share of misread and unexplained landmarks from which on a map is not believed."""
 
 
+def doubt(sure: float, first: int | None) -> str | None:
+    """What to say of a place that has the probability ``sure``; None of a certain one.
+
+    ``first`` is the number of the landmark at which it was certain, None where at none.
+    """
+    if sure >= CERTAIN:
+        return None
+    if sure >= SURE:
+        return f"its place on the map is all but certain ({sure:.5f})"
+    end = "; one more landmark would settle it" if first is None else " at one landmark"
+    return f"its place on the map has a probability of {sure:.5f}{end}"
+
+
 def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict[Cell, float]:
     """Landmarks that were found far off where the map has them, and how far (m)."""
     if len(marks) < FEWEST_MARKS:

@@ -24,9 +24,9 @@ from locatk.core.landmarks.recording import Recording, Seen, on_map, read
 from locatk.core.landmarks.recording import SolveOptions as SolveOptions
 from locatk.core.landmarks.remarks import (
     CERTAIN,
-    SURE,
     contradicted,
     displaced,
+    doubt,
     exchanged,
     why_not,
 )
@@ -147,14 +147,8 @@ def placed(
         return [], [], told
     if not usable:
         return [], [*why_not(found, sure), *exchanged(found, floor, misread)], told
-    remarks = []
-    if SURE <= sure < CERTAIN:
-        remarks.append(f"{device}: its place on the map is all but certain ({sure:.5f})")
-    elif sure < SURE:
-        remarks.append(
-            f"{device}: its place on the map has a probability of {sure:.5f}"
-            + ("; one more landmark would settle it" if first is None else " at one landmark")
-        )
+    said = doubt(sure, first)
+    remarks = [] if said is None else [f"{device}: {said}"]
     marks = expected(usable, floor, found.priors)
     alone = replace(found.priors, floor_t=ALONE_T)
     run = as_run(usable, found, floor)

@@ -234,7 +234,8 @@ def remote(place: str) -> Iterator[tuple[Any, str]]:
         store, key = fsspec.core.url_to_fs(place)
     except ImportError as error:
         raise LocatkError(
-            f"{kind}:// cannot be read: {_short(error)}", hint='pip install "locatk[s3]"'
+            f"{kind}:// cannot be read: {_short(error)}",
+            hint='Install it: pip install "locatk[s3]"',
         ) from None
     except ValueError as error:
         raise FormatError(_short(error), file=place) from None

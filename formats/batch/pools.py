@@ -170,7 +170,8 @@ def _cluster(address: str) -> Iterator[Executor]:
         import distributed
     except ImportError:
         raise LocatkError(
-            "a scheduler needs dask, which is not installed", hint='pip install "locatk[dask]"'
+            "a scheduler needs dask, which is not installed",
+            hint='Install it: pip install "locatk[dask]"',
         ) from None
     # It logs with tracebacks what is told here in one line.
     for name in [

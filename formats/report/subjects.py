@@ -51,6 +51,8 @@ def load(
     ------
     MissingDataError, FormatError
         ``path`` is no solution, ``session`` no session, or ``truth`` holds none.
+    InputError
+        ``session`` is of another system.
     DegenerateError
         The poses do not determine the alignment or the offset.
     """
@@ -62,6 +64,13 @@ def load(
         if recording.facts.get("kind") == "solution":
             raise FormatError(
                 "a solution, not a session", file=session, hint="Give the recording it was made of"
+            )
+        system = recording.facts.get("system", solution.system)
+        if system != solution.system:
+            raise InputError(
+                f"a session of {system}, but the solution is of {solution.system}",
+                file=session,
+                hint="Give the recording that was solved",
             )
     if truth is not None:
         true = tuple(trajectory_files.read(Path(truth), role="truth"))

@@ -143,6 +143,15 @@ def test_points_have_no_rotation(locatk, tmp_path: Path) -> None:
     assert "[deg]" not in "\n".join(lines)
 
 
+def test_one_device_of_another_name_is_told(locatk, run: Path, found: Path, tmp_path: Path) -> None:
+    assert "compared" not in locatk("eval", found, "--truth", run).stderr
+    other = solution(tmp_path / "other.mcap", replace(solved(), device="robot"))
+    done = locatk("eval", other, "--truth", run)
+    assert done.exit_code == 0
+    assert "robot is compared with red, the only one there" in done.stderr
+    assert "compared" not in locatk("eval", other, "--truth", run, "--pair", "robot=red").stderr
+
+
 def test_devices_of_other_names(locatk, tmp_path: Path) -> None:
     red, blue = drive(), replace(drive(), device="blue")
     blue = replace(blue, position=blue.position + [1.0, 0.0, 0.0])

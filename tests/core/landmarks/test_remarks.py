@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
+from locatk.core.landmarks import remarks
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.simulate import Faults, Simulated, SimulationOptions, simulate
 from locatk.core.landmarks.solver import solve
@@ -55,3 +56,21 @@ def test_a_map_that_is_often_wrong_is_not_believed(wrong: int, believed: bool) -
     found = solved(drive(), FloorMap(codes))
     assert bool(found.trajectories) == believed
     assert any("are not those of the map" in note for note in found.notes) != believed
+
+
+@pytest.mark.parametrize(
+    ("sure", "first", "said"),
+    [
+        (0.999990, 3, None),
+        (1.0, None, None),
+        (0.99998, None, "its place on the map is all but certain (0.99998)"),
+        (0.99900, 2, "its place on the map is all but certain (0.99900)"),
+        (0.96, None, "its place on the map has a probability of 0.96000; one more landmark would "
+         "settle it"),
+        (0.96, 2, "its place on the map has a probability of 0.96000 at one landmark"),
+    ],
+)  # fmt: skip
+def test_what_is_not_certain_is_said_as_loud_as_it_deserves(
+    sure: float, first: int | None, said: str | None
+) -> None:
+    assert remarks.doubt(sure, first) == said

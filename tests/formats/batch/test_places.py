@@ -88,7 +88,7 @@ def test_urls_of_any_file_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(LocatkError, match="s3://") as missing:
         places.exists("s3://bucket/key")
-    assert missing.value.hint == 'pip install "locatk[s3]"'
+    assert missing.value.hint == 'Install it: pip install "locatk[s3]"'
 
 
 @given(st.text(max_size=30))

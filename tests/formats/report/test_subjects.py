@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.errors import FormatError, MissingDataError
+from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import observations, trajectories
-from locatk.formats.report.subjects import load
+from locatk.formats.report.subjects import _beside, load
 from locatk.formats.solutions import write_solution
 
 START_NS = 1_767_225_600_000_000_000
@@ -78,9 +78,18 @@ def test_without_it_there_is_no_truth(tmp_path: Path) -> None:
 @pytest.mark.parametrize("source", ["../run.mcap", "/run.mcap", "", "solved.mcap", "."])
 def test_other_names_are_not_followed(session: Path, tmp_path: Path, source: str) -> None:
     """Neither out of the folder nor to the solution itself."""
-    assert load(solved(tmp_path / "solved.mcap", source=source)).evaluation is None or (
-        source.endswith("run.mcap")  # of a path the name is kept
-    )
+    (tmp_path / "in").mkdir()
+    path = solved(tmp_path / "in" / "solved.mcap")
+    named = source if source != "/run.mcap" else str(session)
+    assert _beside(path, {"source": named}, SOLUTION) is None
+    there = solved(tmp_path / "solved.mcap")
+    assert _beside(there, {"source": "run.mcap"}, SOLUTION) is not None
+
+
+def test_a_session_of_another_system_is_refused(session: Path, tmp_path: Path) -> None:
+    path = solved(tmp_path / "solved.mcap", replace(SOLUTION, system="dots"))
+    with pytest.raises(InputError, match="of lighthouse, but the solution is of dots"):
+        load(path, session=session)
 
 
 def test_a_recording_of_another_time_is_another_recording(tmp_path: Path) -> None:
