@@ -120,18 +120,47 @@ def _processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
     quiet = "ignore:Protobuf gencode version:UserWarning"
     warned = ",".join(filter(None, (ours.get("PYTHONWARNINGS"), quiet)))
     with _environment({**ONE_THREAD, "PYTHONWARNINGS": warned}):
+        if forkserver:
+            _start_server()
         environment = {**ours, **ONE_THREAD}
         executor = ProcessPoolExecutor(
             width, mp_context=context, initializer=_begin, initargs=(environment,)
         )
         try:
             yield executor
-        except BaseException:
+        except BaseException as error:
             for worker in list((executor._processes or {}).values()):
                 worker.kill()
+            if forkserver and not isinstance(error, Exception):
+                _end_server()
             raise
         finally:
             executor.shutdown(cancel_futures=True)
+
+
+def _start_server() -> None:
+    """Start the process that forks workers, deaf to Ctrl-C: that goes to all of a terminal, and
+    would be answered with a traceback while it imports."""
+    from multiprocessing import forkserver
+
+    if threading.current_thread() is not threading.main_thread():
+        forkserver.ensure_running()
+        return
+    heard = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.signal(signal.SIGINT, heard)
+
+
+def _end_server() -> None:
+    """End it now: workers that it was asked for would not find what they share with us."""
+    from multiprocessing import forkserver
+
+    pid = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
+    if pid is not None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def _begin(environment: Mapping[str, str]) -> None:

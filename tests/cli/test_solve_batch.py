@@ -420,6 +420,30 @@ def test_an_interrupt_leaves_what_is_whole(
     assert [entry["resumed"] for entry in entries(done.stdout)] == resumed
 
 
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
+@pytest.mark.parametrize("after_s", [0.0, 0.3])
+def test_an_interrupt_while_processes_start(
+    day: Callable[..., list[Path]], tmp_path: Path, after_s: float
+) -> None:
+    """The terminal interrupts all of them; only the command answers."""
+    day("a", "b", "slow", "z")
+    out = tmp_path / "out"
+    batch = subprocess.Popen(
+        command("solve", tmp_path / "day", "-o", out, "--jobs", 2),
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    wait_for(out.exists)  # made before any process is started
+    time.sleep(after_s)
+    os.killpg(batch.pid, signal.SIGINT)
+    _, stderr = batch.communicate(timeout=20)
+    assert batch.returncode == 130
+    assert stderr.splitlines()[-1] == "Aborted"
+    assert "Traceback" not in stderr
+
+
 def test_a_long_temporary_folder(day: Callable[..., list[Path]], tmp_path: Path) -> None:
     """The path of a socket is short."""
     day("a", "b")
@@ -538,7 +562,7 @@ def test_missing_extras_are_one_line(
         result = locatk("solve", *args)
         assert result.exit_code == 1
         assert result.stderr.count("\n") == 1
-        assert f'Hint: Pip install "locatk[{extra}]"' in result.stderr
+        assert f'Hint: Install it: pip install "locatk[{extra}]".' in result.stderr
 
 
 @pytest.fixture
