@@ -103,6 +103,8 @@ class Scene:
         Assumptions made when it was solved.
     calibrations : dict of int to Calibration
         By channel, of stations that have yet to be solved; used as they are.
+    ids : dict of int to int
+        By channel, serial numbers of stations that have yet to be solved.
     """
 
     stations: tuple[Station, ...] = ()
@@ -114,6 +116,7 @@ class Scene:
     frame: str = "floor"
     notes: tuple[str, ...] = ()
     calibrations: dict[int, Calibration] = field(default_factory=dict)
+    ids: dict[int, int] = field(default_factory=dict)
 
     def station(self, channel: int) -> Station | None:
         """The station on ``channel``, or None."""

@@ -24,7 +24,8 @@ from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.bench import Figure
-from locatk.formats.importers.dotbot import ImportedSession, read_dotbot
+from locatk.formats.importers.dotbot import read_dotbot
+from locatk.formats.importers.sweeps import ImportedSession
 
 Array = NDArray[np.float64]
 Pair = tuple[Trajectory, Trajectory]

@@ -35,41 +35,16 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse.channels import POLYNOMIALS, channel_of
-from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers import dotbot_floor as floor
+from locatk.formats.importers.sweeps import ImportedSession
 from locatk.formats.importers.table import Table, read_table
 
 DEVICE = "robot"
 """Name of the device in files without a column ``source``."""
 
 TRUTH_COLUMNS = ("real_x_mm", "real_y_mm", "real_z_mm")
-
-
-@dataclass(frozen=True)
-class ImportedSession:
-    """A recording of others.
-
-    Attributes
-    ----------
-    sweeps : Sweeps
-        Ascending in time.
-    scene : Scene or None
-        Markers with their sightings, without stations; None where no marker is known.
-    truth : list of Trajectory
-        One a device, under the names of the sweeps' devices.
-    facts : dict of str to str
-        What was read and assumed, for people.
-    warnings : list of str
-        What was lost or is doubtful, one line each.
-    """
-
-    sweeps: Sweeps
-    scene: Scene | None
-    truth: list[Trajectory]
-    facts: dict[str, str]
-    warnings: list[str]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from locatk.core.lighthouse.angles import angles_to_counts, paper_image_points
 from locatk.core.lighthouse.calibration import IDEAL, predict_angles
 from locatk.core.metrics import evaluate_all
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.dotbot import ImportedSession, read_dotbot
+from locatk.formats.importers.dotbot import read_dotbot
+from locatk.formats.importers.sweeps import ImportedSession
 
 CORNERS = ("tl", "tr", "br", "bl")
 
