@@ -1,4 +1,4 @@
-"""``locatk export``: poses for other tools."""
+"""``locatk export``: poses, and stations, for other tools."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ import click
 from locatk.cli import console, failures, options
 
 if TYPE_CHECKING:
+    from locatk.core.lighthouse.scene import Scene
     from locatk.core.trajectory import Trajectory
 
 FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
+"""Of poses."""
+
+CONFIG = "crazyflie-config"
+"""The format of stations."""
 
 STDOUT = Path("-")
 
 
 @click.command(short_help="Write poses for other tools.")
 @options.input_argument("solution")
-@click.option("--format", "format_name", type=click.Choice(FORMATS), required=True)
+@click.option("--format", "format_name", type=click.Choice((*FORMATS, CONFIG)), required=True)
 @options.output(
     "File to write; for `tum` and `kitti` with several devices, the folder for them; `-` writes "
     "`csv` or `tum` to stdout."
@@ -39,10 +44,10 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write the poses of SOLUTION in the format of other tools.
+    """Write the poses of SOLUTION, or its Lighthouse stations, in the format of other tools.
 
     SOLUTION is what `locatk solve` has written, or a session, whose reference poses are
-    taken.
+    taken. Of crazyflie-config it may be a scene (scene.toml), too.
 
     \b
     tum      time and pose, one device a file, for evo and others
@@ -51,6 +56,9 @@ def command(
              sigma_z_m, sigma_heading_rad; a sigma that is not known is empty
     parquet  the same, exact times, frames, full covariances; needs locatk[parquet]
     ros2     PoseStamped and TFMessage in MCAP, for ros2 bag, RViz and evo
+    crazyflie-config
+             poses and calibrations of stations, in the YAML that Bitcraze's
+             client and library write into a Crazyflie
 
     \b
     Examples:
@@ -58,6 +66,8 @@ def command(
       locatk export solved.mcap --format tum -o poses.tum
       locatk export solved.mcap --format ros2 -o poses.mcap
       locatk export solved.mcap --format csv -o -
+      locatk export solved.mcap --format crazyflie-config -o lighthouse.yaml
+      locatk export scene.toml --format crazyflie-config -o lighthouse.yaml
     """
     from locatk.core.errors import InputError
     from locatk.formats import exports
@@ -68,6 +78,11 @@ def command(
     if output == STDOUT and (as_json or format_name not in exports.TEXTS):
         what = "--json" if as_json else f"--format {format_name}"
         raise click.UsageError(f"{what} does not go with -o -, which is for csv and tum.")
+    if format_name == CONFIG:
+        if devices:
+            raise click.UsageError(f"--device is for poses; {CONFIG} holds stations.")
+        stations(solution, output, overwrite=overwrite, as_json=as_json)
+        return
     found = chosen(read_trajectories(solution), devices, solution)
     poses = sum(map(len, found))
     if format_name != "parquet":  # where they are null
@@ -102,6 +117,41 @@ def command(
         ]
         console.emit_json({"version": 1, "input": solution, "format": format_name, "files": files})
     tell(lost)
+
+
+def stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> None:
+    """Write the stations of a scene, of a session or of a solution."""
+    from locatk.core.errors import about
+    from locatk.formats import crazyflie
+
+    options.guard_output(output, overwrite=overwrite, inputs=[source])
+    scene = scene_of(source)
+    with about(source):
+        crazyflie.write_config(output, scene, overwrite=overwrite)
+    channels = [station.channel for station in scene.stations]
+    count, s = ("1 station", "") if len(channels) == 1 else (f"{len(channels)} stations", "s")
+    console.result(f"Wrote {output}: {count}, channel{s} {', '.join(map(str, channels))}")
+    if as_json:
+        files = [{"path": output, "channels": channels}]
+        console.emit_json({"version": 1, "input": source, "format": CONFIG, "files": files})
+
+
+def scene_of(source: Path) -> Scene:
+    """The scene in a file of its own, or attached to a session or a solution."""
+    from locatk.core.errors import InputError
+    from locatk.formats import artifacts
+    from locatk.formats.session import Session
+
+    if source.suffix.lower() == ".toml":
+        return artifacts.read_scene(source)
+    scene = artifacts.attached_scene(Session.open(source))
+    if scene is None:
+        raise InputError(
+            "no lighthouse scene is attached",
+            file=source,
+            hint="Give a solution of `locatk solve`, or a scene (scene.toml)",
+        )
+    return scene
 
 
 def tell(lost: int) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli import import_lighthouse as lighthouse
 from locatk.cli.import_landmarks import OPTIONS, import_samples, landmark_options
 
 MOST_WARNINGS = 10
@@ -26,8 +27,16 @@ class Format:
 
 FORMATS = {
     "dotbot-lh2": Format(
-        "locatk.formats.importers.dotbot:read_dotbot", "lighthouse", ("truth", "calibration")
+        "locatk.formats.importers.dotbot:read_dotbot", "lighthouse", lighthouse.DOTBOT
     ),
+    "saleae": Format(
+        "locatk.formats.importers.saleae:read_saleae", "lighthouse", lighthouse.SALEAE
+    ),
+    "libsurvive": Format(
+        "locatk.formats.importers.libsurvive:read_libsurvive", "lighthouse", lighthouse.LIBSURVIVE
+    ),
+    "dotbot-log": Format("locatk.formats.importers.dotbot_log:read_dotbot_log", "lighthouse", ()),
+    "crazyflie-config": Format("locatk.formats.crazyflie:read_config", "scene", ()),
     "images": Format(
         "locatk.formats.importers.images:ImageFiles", "dots", ("sheet", "camera", "rate")
     ),
@@ -41,24 +50,14 @@ FORMATS = {
 }
 """Name of a foreign format to what is known of it."""
 
+ONE_PATH = ("saleae", "crazyflie-config", "video", "polaris-csv", "landmark-csv")
+
 
 @click.command("import", short_help="Turn recordings of other tools into a session.")
 @click.argument("format_name", metavar="FORMAT", type=click.Choice(list(FORMATS)))
 @click.argument("paths", type=options.PATH, nargs=-1, required=True)
-@options.output("Session to write (.mcap).")
-@options.input_option(
-    "--truth",
-    many=True,
-    metavar="PATH",
-    help="dotbot-lh2: reference to store beside the data: pixel tracks from Blender. "
-    "Repeatable. Grid columns in the data itself are taken unasked.",
-)
-@options.input_option(
-    "--calibration",
-    metavar="PATH",
-    help="dotbot-lh2: camera or marker calibration (calibration.json), where it is not beside "
-    "the truth.",
-)
+@options.output("Session to write (.mcap); of crazyflie-config the scene (.toml).")
+@lighthouse.lighthouse_options
 @options.input_option(
     "--sheet",
     metavar="MANIFEST",
@@ -93,8 +92,6 @@ def command(
     format_name: str,
     paths: tuple[Path, ...],
     output: Path,
-    truth: tuple[Path, ...],
-    calibration: Path | None,
     sheet: Path | None,
     camera: Path | None,
     rate: float | None,
@@ -102,13 +99,21 @@ def command(
     tag: Path | None,
     overwrite: bool,
     as_json: bool,
-    **landmarks: Any,
+    **more: Any,
 ) -> None:
     """Read PATHS, recorded by another tool in FORMAT, into one session.
 
     \b
     FORMAT is one of
       dotbot-lh2    LFSR counts of Lighthouse V2 as published by DotBots (CSV)
+      dotbot-log    the same, and raw bits, from log lines of a DotBot gateway
+      saleae        the infrared light itself: data lines of photodiodes on a logic
+                    analyser, as a capture of Logic 2 (.sal) or exported edges
+                    (.csv, .bin); finds sweeps, rotor periods and calibrations
+      libsurvive    recordings of libsurvive (.rec, .rec.gz), Lighthouse V2
+      crazyflie-config
+                    stations of a Crazyflie (YAML): poses and calibrations; the
+                    output is no session but a scene (scene.toml)
       images        camera frames of a dot sheet: files, folders or patterns, in
                     the order of the file names (frame2 before frame10)
       video         the same from one video file, whose times are kept
@@ -121,13 +126,19 @@ def command(
                     right; units are in their names (x_mm) or said with --units
 
     Files that are no image or are damaged, and samples that are no number or saturated, are
-    left out and named; the exit status is 3 then, and the rest is written all the same.
+    left out and named; the exit status is 3 then, and the rest is written all the same. So it
+    is with the end of a recording that is cut off, and with stations that cannot be told apart.
 
     \b
     Examples:
       locatk import dotbot-lh2 data_all.csv -o grid.mcap
       locatk import dotbot-lh2 1_lh2.csv --truth 1_blender.csv -o run.mcap
       locatk import dotbot-lh2 data.csv --truth 1_blender.csv --truth 2_blender.csv -o two.mcap
+      locatk import saleae capture.sal -o light.mcap
+      locatk import saleae take1.csv --channel 2 --device wand -o light.mcap
+      locatk import libsurvive run.rec.gz --stations -o run.mcap
+      locatk import dotbot-log pydotbot.log -o drive.mcap
+      locatk import crazyflie-config lighthouse.yaml -o scene.toml
       locatk import images frames/ --sheet sheet.toml --rate 46.6 -o run.mcap
       locatk import images 'run/*.png' --sheet sheet.toml --camera camera.toml -o run.mcap
       locatk import video run.mp4 --sheet sheet.toml -o run.mcap
@@ -139,26 +150,25 @@ def command(
     """
     chosen = FORMATS[format_name]
     given = {
-        "truth": truth,
-        "calibration": calibration,
         "sheet": sheet,
         "camera": camera,
         "rate": rate,
         "spacing": spacing,
         "tag": tag,
-        **landmarks,
+        **more,
     }
-    for name, value in given.items():
-        if value not in (None, ()) and name not in chosen.options:
+    given = {name: value for name, value in given.items() if value not in (None, ())}
+    for name in given:
+        if name not in chosen.options:
             raise click.UsageError(
                 f"--{name.replace('_', '-')} means nothing to the format {format_name}."
             )
-    if format_name in ("video", "polaris-csv", "landmark-csv") and len(paths) > 1:
+    if format_name in ONE_PATH and len(paths) > 1:
         raise click.UsageError(f"The format {format_name} takes one PATH.")
     if format_name != "images":  # whose patterns are not there by that name
         options.must_exist(paths)
-    named = (calibration, sheet, camera, tag, landmarks["halls"], landmarks["map"])
-    aside = [*truth, *(path for path in named if path is not None)]
+    named = [value for value in given.values() if isinstance(value, Path)]
+    aside = [*given.get("truth", ()), *named]
     options.guard_output(output, overwrite=overwrite, inputs=[*paths, *aside])
     read = options.load(chosen.reader)
     if chosen.system == "dots":
@@ -166,9 +176,11 @@ def command(
     elif chosen.system == "polaris":
         answer, lost = _samples(read, paths[0], output, rate, spacing, tag, overwrite)
     elif chosen.system == "landmarks":
-        answer, lost = import_samples(read, paths[0], output, landmarks, overwrite)
+        answer, lost = import_samples(read, paths[0], output, more, overwrite)
+    elif chosen.system == "scene":
+        answer, lost = lighthouse.import_scene(read, paths[0], output, overwrite)
     else:
-        answer, lost = _sweeps(read, paths, output, truth, calibration, overwrite), None
+        answer, lost = lighthouse.import_sweeps(read, paths, output, given, overwrite)
     for warning in answer["warnings"][:MOST_WARNINGS]:
         console.warn(warning)
     if len(answer["warnings"]) > MOST_WARNINGS:
@@ -179,44 +191,6 @@ def command(
         console.result(f"Wrote {output}")
     if lost is not None:
         raise failures.Incomplete(lost)
-
-
-def _sweeps(
-    read: Any,
-    paths: tuple[Path, ...],
-    output: Path,
-    truth: tuple[Path, ...],
-    calibration: Path | None,
-    overwrite: bool,
-) -> dict[str, Any]:
-    """Import sweeps; returns what ``--json`` says of them."""
-    from locatk.formats import observations
-
-    with console.working("Reading"):
-        # A recording named as its own reference means its own columns, which are read anyway.
-        references = [path for path in truth if not any(path.samefile(other) for other in paths)]
-        imported = read(list(paths), references, calibration=calibration)
-        observations.write_session(
-            output,
-            system="lighthouse",
-            sweeps=imported.sweeps,
-            scene=imported.scene,
-            truth=imported.truth,
-            facts=imported.facts,
-            overwrite=overwrite,
-        )
-    sweeps = imported.sweeps
-    truth_poses = sum(len(trajectory) for trajectory in imported.truth)
-    console.say(
-        f"{len(sweeps)} sweeps of {len(sweeps.devices)} device(s) "
-        f"({', '.join(sweeps.devices)}), {truth_poses} truth poses"
-    )
-    return {
-        "sweeps": len(sweeps),
-        "devices": list(sweeps.devices),
-        "truth_poses": truth_poses,
-        "warnings": imported.warnings,
-    }
 
 
 def _frames(

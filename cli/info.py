@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, failures, options
+from locatk.cli import console, failures, info_lighthouse, options
 from locatk.cli.info_text import text
-from locatk.core.errors import FormatError, LocatkError
+from locatk.core.errors import FormatError
 
 if TYPE_CHECKING:
-    from locatk.core.lighthouse.scene import Scene
     from locatk.formats.session import Session
 
 
@@ -24,8 +23,12 @@ if TYPE_CHECKING:
 @options.verbosity
 def command(file: Path, as_json: bool) -> None:
     """Say what is in FILE: a session or a solution (.mcap, of any tool), or an artifact
-    (.toml): a lighthouse scene, a manifest of dot sheets, a camera, tags, a sensor array, a map
-    of landmarks, hall sensors.
+    (.toml): a lighthouse scene, a receiver, a manifest of dot sheets, a camera, tags, a sensor
+    array, a map of landmarks, hall sensors.
+
+    Of Lighthouse it tells for each station its channel and serial number, how long a rotation
+    takes (in ticks of 48 MHz; with `ppm` from nominal where it was measured), sweeps, the
+    share of them that was decoded, and where its calibration is from.
 
     A damaged or cut recording is described as far as it can be read; the exit status
     is 3 then, and `locatk recover` saves what is left. Of a recording that holds more than
@@ -35,7 +38,9 @@ def command(file: Path, as_json: bool) -> None:
     Examples:
       locatk info run.mcap
       locatk info run.mcap --json
+      locatk info solved.mcap
       locatk info scene.toml
+      locatk info receiver.toml
       locatk info sheet.toml
       locatk info tag.toml
       locatk info map.toml
@@ -52,13 +57,22 @@ def command(file: Path, as_json: bool) -> None:
 
 
 def _artifact(file: Path) -> dict[str, Any]:
-    from locatk.formats import artifacts, describe, hall_sensors, maps, sheets, tags, toml
+    from locatk.formats import (
+        artifacts,
+        describe,
+        hall_sensors,
+        maps,
+        receivers,
+        sheets,
+        tags,
+        toml,
+    )
 
     kinds: dict[str, Callable[[], dict[str, Any]]] = {
         artifacts.SCENE_FORMAT: lambda: {
             "kind": "scene",
             "system": "lighthouse",
-            **_scene(artifacts.read_scene(file)),
+            **info_lighthouse.scene(artifacts.read_scene(file)),
         },
         sheets.MANIFEST_FORMAT: lambda: {
             "kind": "manifest",
@@ -90,6 +104,11 @@ def _artifact(file: Path) -> dict[str, Any]:
             "system": "landmarks",
             "halls": [describe.hall_sensors(maps.read_halls(file))],
         },
+        receivers.RECEIVER_FORMAT: lambda: {
+            "kind": "receiver",
+            "system": "lighthouse",
+            "receivers": [info_lighthouse.receiver(receivers.read_receiver(file))],
+        },
     }
     return kinds[toml.read(file).text("format", choices=tuple(kinds))]()
 
@@ -120,7 +139,7 @@ def _recording(file: Path) -> dict[str, Any]:
         "recoverable": session.damage is not None,
     }
     if facts.get("system") == "lighthouse":
-        described |= _lighthouse(session)
+        described |= info_lighthouse.recording(session)
     elif facts.get("system") in ("dots", "polaris", "landmarks"):
         from locatk.formats import describe
 
@@ -162,61 +181,3 @@ def _streams(session: Session) -> list[dict[str, Any]]:
         }
         for channel in session.channels
     ]
-
-
-def _lighthouse(session: Session) -> dict[str, Any]:
-    """Sweeps and stations; what is damaged is left out and said."""
-    import numpy as np
-
-    from locatk.core.lighthouse.scene import Scene
-    from locatk.formats import captured, describe, observations
-
-    described: dict[str, Any] = {}
-    counts: dict[int, int] = {}
-    scene = None
-    topics = session.topics("/lighthouse/")
-    try:
-        scene = observations.read_scene(session)
-        if topics and not captured.is_small(session, topics):
-            known = [captured.samples(session, topic) for topic in topics]
-            described = {
-                "devices": [topic.removeprefix("/lighthouse/") for topic in topics],
-                "sweeps": None if None in known else sum(each or 0 for each in known),
-                "unread_bytes": captured.held_bytes(session, topics),
-            }
-        elif topics:
-            sweeps = observations.read_sweeps(session)
-            channels, numbers = np.unique(sweeps.channel, return_counts=True)
-            counts = dict(zip(channels.tolist(), numbers.tolist(), strict=True))
-            described = {"devices": list(sweeps.devices), "sweeps": len(sweeps)}
-    except LocatkError as error:
-        described |= describe.damage(session, error)
-    return described | _scene(scene or Scene(), counts)
-
-
-def _scene(scene: Scene, sweeps: dict[int, int] | None = None) -> dict[str, Any]:
-    """Stations that are in the scene, or only seen in ``sweeps`` (channel to count)."""
-    from locatk.core.lighthouse.channels import period_ticks
-
-    channels = sorted({station.channel for station in scene.stations} | set(sweeps or {}))
-    stations = []
-    for channel in channels:
-        station = scene.station(channel)
-        stations.append(
-            {
-                "channel": channel,
-                "id": station.id if station else None,
-                "period_ticks": int(period_ticks(channel)),
-                "sweeps": (sweeps or {}).get(channel),
-                "calibration": station.calibration.source if station else None,
-                "position_m": station.position if station else None,
-            }
-        )
-    return {
-        "stations": stations,
-        "markers": len(scene.markers),
-        "scale": scene.scale if scene.stations else None,
-        "planar": scene.planar,
-        "frame": scene.frame,
-        "notes": list(scene.notes),
-    }

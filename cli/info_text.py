@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from locatk.cli import console, info_capture
+from locatk.cli import console, info_capture, info_lighthouse
 from locatk.cli.info_capture import size
 
 MOST_TAGS = 20
@@ -69,22 +69,8 @@ def text(facts: dict[str, Any]) -> str:
             for s in streams
         ],
     )
-    section(
-        ("channel", "id", "period", "sweeps", "calibration"),
-        [
-            tuple(
-                "-" if value is None else value
-                for value in (
-                    s["channel"],
-                    None if s["id"] is None else f"{s['id']:08x}",
-                    s["period_ticks"],
-                    s["sweeps"],
-                    s["calibration"],
-                )
-            )
-            for s in facts.get("stations", ())
-        ],
-    )
+    section(*info_lighthouse.station_table(facts.get("stations", ()), facts.get("scale")))
+    section(*info_lighthouse.receiver_table(facts.get("receivers", ())))
     section(
         ("camera", "frames", "px"),
         [(c["device"], c["frames"], _by(c["size_px"])) for c in facts.get("cameras", ())],
@@ -183,7 +169,9 @@ def text(facts: dict[str, Any]) -> str:
         (name, key, value)
         for name, record in facts.get("metadata", {}).items()
         for key, value in record.items()
-        if (name, key) not in SHOWN_ABOVE and not info_capture.told(name, key)
+        if (name, key) not in SHOWN_ABOVE
+        and not info_capture.told(name, key)
+        and not info_lighthouse.shown(name, key)
     ]
     shown = [row for row in left if console.verbose() or not row[1].startswith(SIMULATED)]
     section(("metadata", "key", "value"), shown)

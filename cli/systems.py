@@ -7,14 +7,16 @@ a function like :func:`lighthouse`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from locatk.core.errors import FormatError, InputError, LocatkError
 
 if TYPE_CHECKING:
+    from locatk.core.lighthouse.receiver import Receiver
+    from locatk.core.lighthouse.sweeps import Sweeps
     from locatk.core.solution import Solution
     from locatk.formats.session import Session
 
@@ -45,19 +47,33 @@ def lighthouse(session: Session, request: Request) -> Solved:
     """Solve a session of Lighthouse sweeps."""
     from locatk.core import lighthouse
     from locatk.core.lighthouse.scene import Scene
-    from locatk.formats import artifacts, observations
+    from locatk.formats import artifacts, heard, observations
 
     _check(request, "lighthouse", methods=("bundle", "paper"), refused=("camera", "speed"))
     sweeps = observations.read_sweeps(session)
-    if request.artifact is not None:
-        scene = artifacts.read_scene(request.artifact)
-    else:
-        scene = observations.read_scene(session) or Scene()
+    given = None if request.artifact is None else artifacts.read_scene(request.artifact)
+    # Whatever scene it is, the stations know best how they were made.
+    sent = observations.read_heard(session)
+    scene = heard.with_heard(given or observations.read_scene(session), sent) or Scene()
     odometry = observations.read_odometry(session)
+    rigid = _rigid(sweeps, observations.read_receivers(session))
+    more: dict[str, Any] = {"receivers": rigid} if rigid else {}
     options = _given(lighthouse.SolveOptions, {"method": request.method, "scene": request.scene})
     start = time.perf_counter()
-    solution = lighthouse.solve(sweeps, scene, options, odometry=odometry)
-    return Solved(solution, time.perf_counter() - start)
+    solution = lighthouse.solve(sweeps, scene, options, odometry=odometry, **more)
+    solve_s = time.perf_counter() - start
+    notes = (*heard.strangers(scene, sent), *solution.notes)
+    return Solved(replace(solution, notes=notes), solve_s)
+
+
+def _rigid(sweeps: Sweeps, receivers: Mapping[str, Receiver]) -> dict[str, Receiver]:
+    """Receivers of the devices of which several photodiodes have seen light; of the others
+    there is nothing but the place of the one that did."""
+    return {
+        name: receivers[name]
+        for number, name in enumerate(sweeps.devices)
+        if name in receivers and len(set(sweeps.sensor[sweeps.device == number].tolist())) > 1
+    }
 
 
 def dots(session: Session, request: Request) -> Solved:

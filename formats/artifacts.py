@@ -26,7 +26,7 @@ SCENE_FILE = "scene.toml"
 SCENE_FORMAT = "locatk-lighthouse-scene"
 SCENE_VERSION = 1
 
-SCALES = ("markers", "distance", "odometry", "unit")
+SCALES = ("markers", "distance", "odometry", "device", "unit")
 SOURCES = ("factory", "generic", "estimated", "none")
 
 ANGLES = ("phase", "tilt", "gibphase", "ogeephase")
@@ -72,8 +72,12 @@ def dumps_scene(scene: Scene) -> str:
         for distance in scene.distances
     ]
     table["calibrations"] = [
-        {"channel": int(channel), **_calibration_table(calibration)}
-        for channel, calibration in sorted(scene.calibrations.items())
+        {
+            "channel": int(channel),
+            "id": _hexadecimal(scene.ids.get(channel)),
+            **_calibration_table(scene.calibrations.get(channel)),
+        }
+        for channel in sorted(scene.calibrations.keys() | scene.ids.keys())
     ]
     return toml.dumps({key: value for key, value in table.items() if value != []})
 
@@ -90,7 +94,7 @@ def _station_table(station: Station, in_units: bool) -> dict[str, Any]:
     return {
         "#": f"looks to yaw {yaw:.1f} deg, {abs(pitch):.1f} deg {'up' if pitch > 0 else 'down'}",
         "channel": int(station.channel),
-        "id": None if station.id is None else f"{station.id:08x}",
+        "id": _hexadecimal(station.id),
         **position,
         "rotation": station.rotation,
         covariance: station.covariance,
@@ -99,7 +103,13 @@ def _station_table(station: Station, in_units: bool) -> dict[str, Any]:
     }
 
 
-def _calibration_table(calibration: Calibration) -> dict[str, Any]:
+def _hexadecimal(number: int | None) -> str | None:
+    return None if number is None else f"{number:08x}"
+
+
+def _calibration_table(calibration: Calibration | None) -> dict[str, Any]:
+    if calibration is None:
+        return {}
     return {
         "source": calibration.source,
         "model": calibration.model,
@@ -137,9 +147,7 @@ def _parse(table: Table) -> Scene:
         if in_units
         else table.number("floor_z_mm", 0.0, shift=_METRES)
     )
-    calibrations = table.tables("calibrations")
-    channels = [entry.integer("channel", 1, 16) for entry in calibrations]
-    _refuse_repeated(table, "calibrations", "channel", channels)
+    calibrations, ids = _calibrations(table)
     scene = Scene(
         stations=tuple(_station(station, in_units) for station in stations),
         markers=tuple(_marker(marker) for marker in table.tables("markers")),
@@ -149,10 +157,8 @@ def _parse(table: Table) -> Scene:
         scale=scale,
         frame=table.text("frame", "floor"),
         notes=table.texts("notes", ()),
-        calibrations={
-            channel: _calibration(entry)
-            for channel, entry in zip(channels, calibrations, strict=True)
-        },
+        calibrations=calibrations,
+        ids=ids,
     )
     table.end()
     _refuse_repeated(table, "stations", "channel", [s.channel for s in scene.stations])
@@ -168,9 +174,7 @@ def _refuse_repeated(table: Table, key: str, name: str, values: list[Any]) -> No
 
 def _station(table: Table, in_units: bool) -> Station:
     channel = table.integer("channel", 1, 16)
-    text = table.text("id", None)
-    if text is not None and not re.fullmatch("[0-9a-fA-F]{1,16}", text):
-        raise table.error("id", 'expected a hexadecimal number in quotes, as in "4cc60647"')
+    number = _id(table)
     if in_units:
         position = table.array("position_units", (3,))
     else:
@@ -187,8 +191,36 @@ def _station(table: Table, in_units: bool) -> Station:
         table.raw(name, None)  # known also where it is missing
     calibration = _calibration(table.table("calibration"))
     table.end()
-    number = None if text is None else int(text, 16)
     return Station(channel, position, rotation, calibration, number, covariance, floor_map)
+
+
+def _id(table: Table) -> int | None:
+    """A station's serial number."""
+    text = table.text("id", None)
+    if text is None:
+        return None
+    if not re.fullmatch("[0-9a-fA-F]{1,16}", text):
+        raise table.error("id", 'expected a hexadecimal number in quotes, as in "4cc60647"')
+    return int(text, 16)
+
+
+def _calibrations(table: Table) -> tuple[dict[int, Calibration], dict[int, int]]:
+    """What is known of stations that are yet to be solved: calibrations and serial numbers, by
+    channel."""
+    entries = table.tables("calibrations")
+    channels = [entry.integer("channel", 1, 16) for entry in entries]
+    _refuse_repeated(table, "calibrations", "channel", channels)
+    known: dict[int, Calibration] = {}
+    ids: dict[int, int] = {}
+    for channel, entry in zip(channels, entries, strict=True):
+        number = _id(entry)
+        if number is not None:
+            ids[channel] = number
+        if number is not None and set(entry) <= {"channel", "id"}:
+            entry.end()  # its serial number is all that is known of it
+        else:
+            known[channel] = _calibration(entry)
+    return known, ids
 
 
 def _calibration(table: Table) -> Calibration:

@@ -12,16 +12,22 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from locatk.core.errors import FormatError
+from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats import artifacts
+from locatk.formats import heard as heard_stations
+from locatk.formats import receivers as receiver_files
 from locatk.formats.arrays import read_samples
 from locatk.formats.artifacts import attached_scene as read_scene
 from locatk.formats.frames import read_frames
 from locatk.formats.halls import read_samples as read_halls
+from locatk.formats.heard import read_heard
 from locatk.formats.maps import attached_map as read_map
 from locatk.formats.messages import SWEEPS, batch_edges
+from locatk.formats.receivers import read_receivers
 from locatk.formats.session import Session
 from locatk.formats.session_writer import SessionWriter
 from locatk.formats.sheets import attached_camera as read_camera
@@ -42,9 +48,11 @@ __all__ = [
     "read_camera",
     "read_frames",
     "read_halls",
+    "read_heard",
     "read_manifest",
     "read_map",
     "read_odometry",
+    "read_receivers",
     "read_samples",
     "read_scene",
     "read_solution",
@@ -153,6 +161,8 @@ def write_session(
     odometry: Sequence[Trajectory] = (),
     scene: Scene | None = None,
     facts: Mapping[str, object] | None = None,
+    stations: Sequence[HeardStation] = (),
+    receivers: Mapping[str, Receiver] | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a session of sweeps with what is known beside them.
@@ -174,6 +184,13 @@ def write_session(
         Attached as ``scene.toml``.
     facts : mapping, optional
         Where the data comes from; written as texts to the metadata record ``facts``.
+    stations : sequence of HeardStation
+        What was measured of each station, in a metadata record ``station-<channel>`` each.
+        Calibrations and serial numbers that they sent go into the scene, where it has none of
+        its own for their channels.
+    receivers : mapping of str to Receiver, optional
+        By device; attached as ``receiver.toml``, or where the devices differ as
+        ``receiver-<device>.toml`` each.
     overwrite : bool
         Replace an existing file.
 
@@ -182,13 +199,22 @@ def write_session(
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.atomic_write`.
     InputError
-        A time is before 1970, or two trajectories have the same device.
+        A time is before 1970, two trajectories have the same device or two stations the same
+        channel, or a receiver cannot be.
     """
+    records = heard_stations.records_of(stations)
+    scene = heard_stations.with_heard(scene, stations)
+    devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
+    places = receiver_files.texts_of(receivers or {}, devices)
     streams = [sweep_messages(sweeps), *known_streams(truth, odometry)]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if scene is not None:
             writer.attach_toml(artifacts.SCENE_FILE, artifacts.dumps_scene(scene))
+        for name, text in places.items():
+            writer.attach_toml(name, text)
+        for name, record in records.items():
+            writer.metadata(name, record)
         write_streams(writer, streams)
 
 

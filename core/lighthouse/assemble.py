@@ -1,26 +1,27 @@
 """Stations and points from nothing but angles: up to scale, in a frame of its own.
 
-Two stations with the most common sight start; planar and spatial explanations compete;
-the others are resected one by one; a bundle adjustment ends it.
+The pair of stations that stands firmest starts; the others are added one by one; a bundle
+adjustment over all ends it. Every fifth place takes no part, so that the scene can be
+verified on it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.lighthouse import candidates, twoview
+from locatk.core.lighthouse import twoview
 from locatk.core.lighthouse.angles import rays as rays_of
 from locatk.core.lighthouse.bundle import Adjustment, Rig, adjust
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
-from locatk.core.lighthouse.locate import Fixes, locate
-from locatk.core.lighthouse.places import SAME_PLACE, require_places
-from locatk.core.lighthouse.resection import resect_in_space, resect_on_plane
+from locatk.core.lighthouse.join import Growth
+from locatk.core.lighthouse.pairs import Misfit, Pair, looks_flat, solve_pair
+from locatk.core.lighthouse.selection import evenly, hold_out
 
 Array = NDArray[np.float64]
 
@@ -28,22 +29,15 @@ BUNDLE_POINTS = 1500
 """Moments in the bundle adjustment, at most: more do not sharpen a scene whose error is
 its calibration, and cost time."""
 
-START_POINTS = 300
-"""Moments with which candidate rigs are compared."""
+STARTS = 3
+"""Pairs with which to start, at most, of which the firmest is taken."""
 
-MANY = 60
-CERTAIN = 1.5e-4
-"""With so many places, and a residual (rms, in radians) at the noise of a standing
-receiver, a start is taken without trying the others."""
+LOOKS, LEAST_LOOK = 12, 20
+"""Pairs whose places are looked at to tell a floor from space, at most, and how many places
+a pair must share to have a say."""
 
-LEAST_BASELINE = 0.02
-"""Distance of two stations, as a share of their distance from the plane of the robots."""
-
-FLAT = 3e-3
-"""Median miss of a homography, as a tangent, up to which a scene counts as planar."""
-
-
-Misfit = Callable[[Rig, tuple[int, int]], float]
+LEAST_JOINT = 4
+"""Places that two stations share, at least, to be of one group."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +50,16 @@ class Assembly:
         The bundle adjustment over ``chosen``; in a planar scene z = 0 is the plane of the
         photodiodes and z is up.
     stations : tuple of int
-        Columns of the stations that were solved, ascending; a station that shares too few
-        places with the others is left out.
+        Columns of the stations that were solved, ascending.
     chosen : (k,) int ndarray
-        Indices of the moments that took part.
+        Indices of the places that took part.
     planar : bool
     facts : dict
         What was decided, with the figures it was decided on.
+    held_out : (n,) int ndarray
+        Indices of places that agree as well and took no part; empty where all were needed.
+    left_out : dict of int to str
+        Columns of the other stations, with the reason.
     """
 
     adjustment: Adjustment
@@ -70,6 +67,8 @@ class Assembly:
     chosen: NDArray[np.int64]
     planar: bool
     facts: dict[str, object]
+    held_out: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    left_out: dict[int, str] = field(default_factory=dict)
 
 
 def assemble(
@@ -110,224 +109,61 @@ def assemble(
         axis=1,
     )
     seen = np.isfinite(rays[..., 0])
-    i, j = _best_pair(seen)
-    joint = np.flatnonzero(seen[:, i] & seen[:, j])
-    a, b = rays[joint, i], rays[joint, j]
-    require_places(a, b, 5 if planar is None else 4 if planar else 8)
+    joint = _joint(seen)
+    found: dict[tuple[int, int, bool | None], Pair | DegenerateError] = {}
 
-    facts: dict[str, object] = {}
-    flat, on_plane = twoview.agree_on_plane(a, b, seed)
-    planar, agreed = _decide(a, b, flat, on_plane, planar, seed, facts)
-    require_places(a[agreed], b[agreed], 4 if planar else 8)
-    if not planar:
-        miss = twoview.homography_residuals(
-            twoview.fit_homography(a[agreed], b[agreed]), a[agreed], b[agreed]
-        )
-        if np.sqrt(np.median(miss**2)) < SAME_PLACE / 2:
-            raise DegenerateError(
-                "all places lie on one plane, which does not determine a scene in space",
-                hint="move the photodiode up and down as well, or use --scene two-planar",
-            )
-    _require_baseline(a[agreed], b[agreed])
-    pair = (calibrations[i], calibrations[j])
-    starts = (
-        candidates.on_plane(a[agreed], b[agreed], pair)
-        if planar
-        else candidates.in_space(a[agreed], b[agreed], pair)
-    )
-    if not starts:
-        raise DegenerateError(
-            "no arrangement of two stations explains the angles",
-            hint="check that the channels of the stations are those of the recording",
-        )
-    inside = joint[agreed]
-    best = _choose(angles[inside][:, [i, j]], starts, planar, sigma, misfit, (i, j), facts)
-    return _extend(angles, rays, calibrations, best, (i, j), inside, planar, sigma, facts)
+    def pair_of(i: int, j: int, planar: bool | None) -> Pair | DegenerateError:
+        columns = (min(i, j), max(i, j))
+        key = (*columns, planar)
+        if key not in found:
+            try:
+                found[key] = solve_pair(
+                    angles,
+                    rays,
+                    calibrations,
+                    columns,
+                    sigma=sigma,
+                    planar=planar,
+                    misfit=misfit,
+                    seed=seed,
+                )
+            except DegenerateError as error:
+                found[key] = error
+        return found[key]
 
+    group = _largest_group(joint)
+    if planar is None and len(group) > 2 and _fills_space(rays, joint, group, seed):
+        planar = False
+    start = _start(joint, group, lambda i, j: pair_of(i, j, planar))
+    facts = dict(start.facts)
 
-def _best_pair(seen: NDArray[np.bool_]) -> tuple[int, int]:
-    joint = {
-        p: np.count_nonzero(seen[:, p[0]] & seen[:, p[1]])
-        for p in combinations(range(seen.shape[1]), 2)
-    }
-    pair = max(joint, key=lambda p: joint[p])
-    if joint[pair] == 0:
-        raise DegenerateError(
-            "no moment was seen by two stations at once",
-            hint="put the stations so that their views overlap",
-        )
-    return pair
+    def neighbours(i: int, j: int) -> Pair | None:
+        pair = pair_of(i, j, start.planar)
+        return pair if isinstance(pair, Pair) else None
+
+    growth = Growth(angles, rays, calibrations, start, sigma)
+    left_out = growth.add_all(neighbours)
+    for k in left_out:
+        if k not in group and np.any(joint[k] >= LEAST_JOINT):
+            left_out[k] = "is of a group that shares no place with the larger one"
+    return _adjusted(growth, calibrations, start, left_out, facts)
 
 
-def _require_baseline(a: Array, b: Array) -> None:
-    """Refuse two stations at one place: their views then differ by a turn alone."""
-    h = twoview.fit_homography(a, b)
-    if np.median(twoview.homography_residuals(h, a, b)) > FLAT:
-        return
-    stretch = np.linalg.svd(h, compute_uv=False)
-    if stretch[0] - stretch[2] < LEAST_BASELINE * stretch[1]:
-        raise DegenerateError(
-            "two stations stand at one place, which does not determine a scene",
-            hint="move them apart, best by as much as they are away from the robots",
-        )
-
-
-def _decide(
-    a: Array,
-    b: Array,
-    flat: Array,
-    on_plane: NDArray[np.bool_],
-    planar: bool | None,
-    seed: int,
-    facts: dict[str, object],
-) -> tuple[bool, NDArray[np.bool_]]:
-    """Whether the places lie on a plane, and which correspondences agree with that."""
-    share = float(np.mean(on_plane))
-    median = float(np.median(twoview.homography_residuals(flat, a, b)))
-    facts["plane_share"] = share
-    facts["plane_median_rad"] = median
-    if planar is None:
-        planar = median < FLAT
-        facts["planar_decided_by"] = "data"
-    else:
-        facts["planar_decided_by"] = "option"
-    if planar:
-        return True, on_plane
-    if len(a) < 8:
-        raise DegenerateError(
-            f"{len(a)} places off one plane do not determine a scene in space",
-            hint="record at least 8 places, better 20",
-        )
-    _, agreed = twoview.agree_in_space(a, b, seed)
-    return False, agreed
-
-
-def _choose(
-    angles: Array,
-    starts: list[Rig],
-    planar: bool,
-    sigma: float,
-    misfit: Misfit | None,
-    columns: tuple[int, int],
-    facts: dict[str, object],
-) -> Rig:
-    """The start that explains the angles best; of two that do, the one that fits the markers,
-    else the upright one.
-
-    A homography has two valid readings. Noise-free they predict the same angles, so that
-    only the world decides: what is known of it, or that stations stand or hang upright, with
-    little roll (the paper's conditions on the signs of n and t say as much).
-    """
-    some = np.unique(np.linspace(0, len(angles) - 1, START_POINTS).astype(int))
-    tried = []
-    for rig in starts:
-        small = Rig(rig.positions, rig.rotations, rig.calibrations, rig.points[some])
-        # All residuals count in full: a soft loss would let a bad start stay bad.
-        done = adjust(angles[some], small, sigma=sigma, planar=planar, soft=1.0, iterations=60)
-        tried.append((done.cost, _roll(done.rig.rotations) if planar else 0.0, done))
-        # In space only one arrangement fits; with many places a perfect fit is no accident.
-        perfect = np.sqrt(np.nanmean(done.residuals**2)) < CERTAIN
-        if not planar and len(some) >= MANY and perfect:
-            break
-    cheapest = min(cost for cost, _, _ in tried)
-    fitting = [t for t in tried if t[0] <= 2.0 * cheapest + 1e-9]
-    _, _, done = min(fitting, key=lambda t: (t[1], t[0]))
-    if planar and misfit is not None and len(fitting) > 1:
-        missed = [misfit(t[2].rig, columns) for t in fitting]
-        order = np.argsort(missed)
-        if missed[order[0]] < 0.5 * missed[order[1]]:
-            done = fitting[int(order[0])][2]
-            facts["reading_decided_by"] = "markers"
-    if planar:
-        facts["candidates"] = [
-            {
-                "cost": float(c),
-                "roll_deg": float(np.degrees(r)),
-                "fits": bool(c <= 2.0 * cheapest + 1e-9),
-                "chosen": candidate is done,
-            }
-            for c, r, candidate in tried
-        ]
-    return done.rig
-
-
-def _roll(rotations: Array) -> float:
-    """How far stations lean sideways, in radians: root of the sum of squares."""
-    return float(np.sqrt(np.sum(np.arcsin(np.clip(rotations[:, 2, 1], -1, 1)) ** 2)))
-
-
-def _extend(
-    angles: Array,
-    rays: Array,
+def _adjusted(
+    growth: Growth,
     calibrations: tuple[Calibration, ...],
-    rig: Rig,
-    pair: tuple[int, int],
-    inside: NDArray[np.int64],
-    planar: bool,
-    sigma: float,
+    start: Pair,
+    left_out: dict[int, str],
     facts: dict[str, object],
 ) -> Assembly:
-    """Resect the other stations on located points, then adjust all together."""
-    count = len(calibrations)
-    positions = np.full((count, 3), np.nan)
-    rotations = np.tile(np.eye(3), (count, 1, 1))
-    refined = list(calibrations)
-    for k, index in enumerate(pair):
-        positions[index], rotations[index] = rig.positions[k], rig.rotations[k]
-        refined[index] = rig.calibrations[k]
-    known = sorted(pair)
-    floor = 0.0 if planar else None
-
-    def fixes_of(stations: list[int]) -> Fixes:
-        return locate(
-            angles[:, stations],
-            positions[stations],
-            rotations[stations],
-            tuple(refined[k] for k in stations),
-            floor_z=floor,
-        )
-
-    apart: set[int] = set()
-    while len(known) + len(apart) < count:
-        fixes = fixes_of(known)
-        good = np.isfinite(fixes.position[:, 0]) & (fixes.worst < twoview.GATE)
-        shared = {
-            k: np.flatnonzero(good & np.isfinite(rays[:, k, 0]))
-            for k in range(count)
-            if k not in known and k not in apart
-        }
-        index = max(shared, key=lambda k: len(shared[k]))
-        rows = shared[index]
-        points = fixes.position[rows]
-        try:
-            poses = (
-                [resect_on_plane(points[:, :2], rays[rows, index])]
-                if planar
-                else resect_in_space(points, rays[rows, index])
-            )
-        except DegenerateError:
-            apart.add(index)
-            continue
-        tries = [
-            adjust(
-                angles[rows][:, [index]],
-                Rig(position[None], rotation[None], (refined[index],), points),
-                sigma=sigma,
-                fixed_points=True,
-            )
-            for position, rotation in poses
-        ]
-        best = min(tries, key=lambda t: t.cost)
-        positions[index], rotations[index] = best.rig.positions[0], best.rig.rotations[0]
-        refined[index] = best.rig.calibrations[0]
-        known = sorted([*known, index])
-
-    fixes = fixes_of(known)
+    """All known stations adjusted together, on all places that agree with them."""
+    planar, known = growth.planar, growth.known
+    fixes = growth.fixes()
     good = np.isfinite(fixes.position[:, 0]) & (fixes.freedom > 0) & (fixes.worst < twoview.GATE)
     if len(known) == 2:
         # What the two-view consensus refused stays out: two planes can meet by chance.
-        member = np.zeros(len(angles), bool)
-        member[inside] = True
+        member = np.zeros(len(good), bool)
+        member[start.inside] = True
         good &= member
     usable = np.flatnonzero(good)
     if len(usable) < (4 if planar else 8):
@@ -335,19 +171,94 @@ def _extend(
             f"{len(usable)} places agree with one arrangement of the stations",
             hint="the recording holds little but wrong sweeps; `locatk info` shows its channels",
         )
-    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, BUNDLE_POINTS).astype(int))]
+    seen = growth.seen[:, known]
+    taken, held_out = hold_out(seen, usable)
+    chosen = evenly(seen, taken, BUNDLE_POINTS)
     # From the calibrations that came in: the prior holds whatever an adjustment starts from.
     final = adjust(
-        angles[chosen][:, known],
+        growth.angles[chosen][:, known],
         Rig(
-            positions[known],
-            rotations[known],
+            growth.positions[known],
+            growth.rotations[known],
             tuple(calibrations[k] for k in known),
             fixes.position[chosen],
         ),
-        sigma=sigma,
+        sigma=growth.sigma,
         planar=planar,
     )
     facts["bundle_points"] = len(chosen)
     facts["bundle_iterations"] = final.iterations
-    return Assembly(final, tuple(known), chosen, planar, facts)
+    return Assembly(final, tuple(known), chosen, planar, facts, held_out, left_out)
+
+
+def _joint(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(s, s) number of places that two stations share; 0 on the diagonal."""
+    as_number = seen.astype(np.int64)
+    joint = as_number.T @ as_number
+    np.fill_diagonal(joint, 0)
+    return joint
+
+
+def _largest_group(joint: NDArray[np.int64]) -> tuple[int, ...]:
+    """Columns of the stations that common sight links: of several such groups the one with
+    the most stations, then with the most common places."""
+    if not np.any(joint):
+        raise DegenerateError(
+            "no moment was seen by two stations at once",
+            hint="put the stations so that their views overlap",
+        )
+    linked = joint >= min(LEAST_JOINT, int(joint.max()))
+    groups: list[tuple[int, ...]] = []
+    left = set(range(len(joint)))
+    while left:
+        group, frontier = set[int](), {min(left)}
+        while frontier:
+            group |= frontier
+            frontier = {int(k) for i in frontier for k in np.flatnonzero(linked[i])} - group
+        left -= group
+        groups.append(tuple(sorted(group)))
+    return max(groups, key=lambda g: (len(g), int(joint[np.ix_(g, g)].sum())))
+
+
+def _fills_space(rays: Array, joint: NDArray[np.int64], group: tuple[int, ...], seed: int) -> bool:
+    """Whether a quarter of the pairs of a group saw places that are on no plane.
+
+    One pair alone may see a stretch of the drive that happens to be flat.
+    """
+    ranked = sorted(combinations(group, 2), key=lambda p: -int(joint[p]))
+    views = []
+    for i, j in ranked[:LOOKS]:
+        if joint[i, j] < LEAST_LOOK:
+            break
+        both = np.isfinite(rays[:, [i, j], 0]).all(axis=1)
+        a, b = rays[both, i], rays[both, j]
+        flat, _ = twoview.agree_on_plane(a, b, seed)
+        median = float(np.median(twoview.homography_residuals(flat, a, b)))
+        views.append(looks_flat(a, b, median))
+    return bool(views) and 4 * views.count(False) >= len(views)
+
+
+def _start(
+    joint: NDArray[np.int64],
+    group: tuple[int, ...],
+    pair_of: Callable[[int, int], Pair | DegenerateError],
+) -> Pair:
+    """The pair that stands firmest among those of a group with the most common places."""
+    ranked = sorted(combinations(group, 2), key=lambda p: -int(joint[p]))
+    pairs: list[Pair] = []
+    refused: DegenerateError | None = None
+    for i, j in ranked:
+        weak = joint[i, j] < LEAST_JOINT or 4 * joint[i, j] < joint[ranked[0]]
+        if pairs and (weak or len(pairs) == STARTS):
+            break
+        pair = pair_of(i, j)
+        if isinstance(pair, Pair):
+            pairs.append(pair)
+        else:
+            refused = refused or pair
+    if not pairs:
+        assert refused is not None  # every pair was either solved or refused
+        raise refused
+    # A floor is a floor for all: of pairs that differ the kind of the first is right.
+    alike = [p for p in pairs if p.planar == pairs[0].planar]
+    return min(alike, key=lambda p: p.looseness)

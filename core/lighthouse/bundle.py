@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 STATION_UNKNOWNS = 10
 """Position, rotation vector, two tilts, two phases."""
 
+SLOW = 10
+"""Steps after which an adjustment counts as slow, and its points take a step of their own
+after each: that is twice the work, but gets it through the valleys of narrow fields."""
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -133,6 +137,10 @@ def adjust(
         steps += 1
         trial = _step(system, rig, damping, planar, dims)
         trial_system = _linearise(observed, seen, trial, sigma, loss_width, prior, dims)
+        if dims and steps > SLOW:
+            # Along a curved valley the points fall behind: let them find their own best place.
+            trial = replace(trial, points=_settled(trial_system, trial.points, dims))
+            trial_system = _linearise(observed, seen, trial, sigma, loss_width, prior, dims)
         if trial_system.cost < system.cost:
             gain = (system.cost - trial_system.cost) / max(system.cost, 1e-30)
             rig, system = trial, trial_system
@@ -314,6 +322,16 @@ def _gauge(rig: Rig, planar: bool) -> Array:
     growth[:, 0:3] = rig.positions
     motions.append(growth)
     return np.linalg.qr(np.stack([g.ravel() for g in motions], axis=1))[0]
+
+
+def _settled(system: _System, points: Array, dims: int) -> Array:
+    """Points after a step of their own, the stations held."""
+    blocks = system.points.copy()
+    diagonal = np.einsum("mii->mi", blocks)
+    diagonal += 1e-9 * np.max(diagonal, initial=0.0) + 1e-300
+    moved = points.copy()
+    moved[:, :dims] -= np.linalg.solve(blocks, system.points_rhs[..., None])[..., 0]
+    return moved
 
 
 def _step(system: _System, rig: Rig, damping: float, planar: bool, dims: int) -> Rig:

@@ -61,14 +61,14 @@ def indices(states: ArrayLike, polynomial: ArrayLike) -> NDArray[np.int64]:
     ndarray
         0 to 131070; :data:`NOWHERE` for state 0.
     """
-    index = _tables()[1][np.asarray(polynomial), np.asarray(states)]
+    index = tables()[1][np.asarray(polynomial), np.asarray(states)]
     return np.asarray(index, np.int64)
 
 
 def state_at(index: ArrayLike, polynomial: ArrayLike) -> NDArray[np.int64]:
     """The 17 bits that start at ``index`` (any integer, the sequence being cyclic);
     inverse of :func:`indices`."""
-    state = _tables()[0][np.asarray(polynomial), np.mod(index, LENGTH)]
+    state = tables()[0][np.asarray(polynomial), np.mod(index, LENGTH)]
     return np.asarray(state, np.int64)
 
 
@@ -88,8 +88,9 @@ def bits_at(index: ArrayLike, polynomial: ArrayLike, length: int = 64) -> NDArra
 
 
 @cache
-def _tables() -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """(32, 131071) states by index, and (32, 131072) indices by state.
+def tables() -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """(32, 131071) states by index, and (32, 131072) indices by state: made once a process, in
+    a fifth of a second.
 
     A step is linear over GF(2), and so is a jump of many. The states known so far, jumped
     ahead by their number, are the next ones: 17 doublings give them all.

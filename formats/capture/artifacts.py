@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.errors import InputError
-from locatk.formats import artifacts, files, hall_sensors, maps, sheets, tags, toml
+from locatk.formats import artifacts, files, hall_sensors, maps, receivers, sheets, tags, toml
 from locatk.formats.session import Session
 
 KINDS: dict[str, tuple[str, Callable[..., Any]]] = {
     artifacts.SCENE_FORMAT: (artifacts.SCENE_FILE, artifacts.loads_scene),
+    receivers.RECEIVER_FORMAT: (receivers.RECEIVER_FILE, receivers.loads_receiver),
     sheets.MANIFEST_FORMAT: (sheets.SHEET_FILE, sheets.loads_manifest),
     sheets.CAMERA_FORMAT: (sheets.CAMERA_FILE, sheets.loads_camera),
     tags.TAG_FORMAT: (tags.TAG_FILE, tags.loads_tags),
@@ -24,7 +25,7 @@ KINDS: dict[str, tuple[str, Callable[..., Any]]] = {
 ATTACHED = dict(KINDS.values())
 """Name of an attachment to what reads it."""
 
-BY_DEVICE = ("array", "halls")
+BY_DEVICE = ("array", "halls", "receiver")
 """Kinds of which each device may have its own: ``array-<device>.toml``."""
 
 

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from locatk.cli import export
-from locatk.formats import exports, trajectories
+from locatk.core.lighthouse.scene import Scene
+from locatk.formats import artifacts, exports, trajectories
+from locatk.formats.session_writer import SessionWriter
 from locatk.formats.solutions import read_solution, write_solution
 
 POSES = 20
@@ -233,3 +235,56 @@ def test_a_closed_pipe_is_no_error(locatk, solved: Path) -> None:
         )
         assert done.stderr == ""
         assert done.stdout.count("\n") == 1
+
+
+# ---- stations
+
+
+def test_stations_for_a_crazyflie(
+    locatk, solved: Path, session: Path, scene: Scene, tmp_path: Path
+) -> None:
+    file, first, second = (tmp_path / name for name in ("scene.toml", "a.yaml", "b.yaml"))
+    artifacts.write_scene(file, scene)
+    result = locatk("export", solved, "--format", "crazyflie-config", "-o", first)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout == f"Wrote {first}: 1 station, channel 3\n"
+    result = locatk("export", file, "--format", "crazyflie-config", "-o", second, "--json")
+    assert json.loads(result.stdout) == {
+        "version": 1,
+        "input": str(file),
+        "format": "crazyflie-config",
+        "files": [{"path": str(second), "channels": [3]}],
+    }
+    assert first.read_bytes() == second.read_bytes()
+    again = locatk("export", solved, "--format", "crazyflie-config", "-o", first)
+    assert again.exit_code == 1
+    assert "--overwrite" in again.stderr
+    back = tmp_path / "back.toml"
+    assert locatk("import", "crazyflie-config", first, "-o", back).exit_code == 0
+    [station] = artifacts.read_scene(back).stations
+    assert (station.channel, station.position.tolist()) == (3, [0, 1, 2])
+
+
+def test_what_a_crazyflie_cannot_have(
+    locatk, solved: Path, session: Path, scene: Scene, tmp_path: Path
+) -> None:
+    out, file = tmp_path / "a.yaml", tmp_path / "scene.toml"
+    artifacts.write_scene(file, replace(scene, scale="unit"))
+
+    def refused(source: Path, *more: object) -> tuple[int, str]:
+        result = locatk("export", source, "--format", "crazyflie-config", "-o", out, *more)
+        assert not out.exists()
+        return result.exit_code, result.stderr
+
+    status, words = refused(file)
+    assert status == 1
+    assert "scale" in words
+    assert str(file) in words
+    status, words = refused(session)  # markers only
+    assert status == 1
+    assert "stations" in words
+    assert refused(solved, "--device", "red")[0] == 2
+    assert refused(solved, "--covariance")[0] == 2
+    with SessionWriter(tmp_path / "dots.mcap", system="dots"):
+        pass
+    assert "no lighthouse scene" in refused(tmp_path / "dots.mcap")[1]

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from locatk.formats import observations
+from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.receiver import DECK
+from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.formats import artifacts, observations
+from locatk.formats.importers.sweeps import ImportedSession
 from locatk.formats.session import Session
 
 HEADER = "timestamp,source,LHA_count_1,LHA_count_2,LHB_count_1,LHB_count_2"
@@ -91,3 +98,203 @@ def test_published_tracks(locatk, data: Path, tmp_path: Path) -> None:
     result = locatk("import", "dotbot-lh2", source, "--truth", truth, "-o", out, "--json")
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["truth_poses"] == 1691
+
+
+# ---- Lighthouse from others, with a reader that needs no file
+
+
+def heard_stations() -> tuple[HeardStation, ...]:
+    calibration = Calibration(np.full((2, 7), 0.01), "factory")
+    return (
+        HeardStation(1, 0x4CC60647, 958985.25, 40, 2, calibration, 11, 1),
+        HeardStation(5, sweeps=3),
+    )
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> list[Any]:
+    """Put a reader in place of all; gives what it was asked. It loses what the test says."""
+    calls: list[Any] = []
+    count = 40
+    sweeps = Sweeps(
+        devices=("wand",),
+        time_ns=1_700_000_000_000_000_000 + 10_000_000 * np.arange(count),
+        device=np.zeros(count, np.int32),
+        sensor=np.arange(count, dtype=np.int32) % 4,
+        channel=np.ones(count, np.int32),
+        polynomial=np.full(count, -1, np.int32),
+        sweep=np.full(count, -1, np.int32),
+        count=40_000.0 + np.arange(count),
+    )
+
+    def read(paths: list[Path], **named: Any) -> ImportedSession:
+        calls.append((paths, named))
+        return ImportedSession(
+            sweeps,
+            scene=None,
+            truth=[],
+            facts={"format": "test"},
+            warnings=["the end is cut off"],
+            stations=heard_stations(),
+            receivers={"wand": DECK},
+            lost=getattr(request, "param", None),
+        )
+
+    monkeypatch.setattr("locatk.cli.options.load", lambda target: read)
+    return calls
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["saleae"], {}),
+        (
+            ["saleae", "--channel", "3", "--channel", "0", "--method", "paper", "--device", "w"],
+            {"channels": (3, 0), "method": "paper", "device": "w"},
+        ),
+        (["libsurvive"], {}),
+        (["libsurvive", "--stations"], {"stations": True}),
+        (["dotbot-log"], {}),
+    ],
+)
+def test_a_reader_gets_what_was_given(
+    locatk, tmp_path: Path, asked: list[Any], arguments: list[str], named: dict[str, Any]
+) -> None:
+    source = table(tmp_path / "source", "x")
+    result = locatk("import", arguments[0], source, *arguments[1:], "-o", tmp_path / "run.mcap")
+    assert result.exit_code == 0, result.stderr
+    assert asked == [([source], named)]
+
+
+def test_what_was_heard_goes_into_the_session(locatk, tmp_path: Path, asked: list[Any]) -> None:
+    source, out = table(tmp_path / "take.sal", "x"), tmp_path / "run.mcap"
+    result = locatk("import", "saleae", source, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout == f"Wrote {out}\n"
+    said = [" ".join(line.split()) for line in result.stderr.splitlines()]
+    assert said == [
+        "40 sweeps of 1 device(s) (wand), 0 truth poses",
+        "channel id period ppm sweeps decoded calibration OOTX frames damaged",
+        "1 4cc60647 958985.25 -15.38 40 95.2 % factory 11 1",
+        "5 - 947000 - 3 - - 0 0",
+        "Warning: the end is cut off",
+    ]
+    session = Session.open(out)
+    assert [(s.id, s.period_ticks) for s in observations.read_heard(session)] == [
+        (0x4CC60647, 958985.25),
+        (None, None),
+    ]
+    assert observations.read_receivers(session).keys() == {"wand"}
+    scene = observations.read_scene(session)
+    assert scene is not None
+    assert scene.calibrations[1].source == "factory"
+    assert scene.ids == {1: 0x4CC60647}
+
+
+def test_stations_in_json(locatk, tmp_path: Path, asked: list[Any]) -> None:
+    source = table(tmp_path / "take.sal", "x")
+    result = locatk("import", "saleae", source, "-o", tmp_path / "run.mcap", "--json")
+    answer = json.loads(result.stdout)
+    assert answer["warnings"] == ["the end is cut off"]
+    first, second = answer["stations"]
+    assert first.pop("ppm") == pytest.approx(-15.38, abs=0.01)
+    assert first == {
+        "channel": 1,
+        "id": "4cc60647",
+        "period_ticks": 958985.25,
+        "sweeps": 40,
+        "missed": 2,
+        "decode_rate": 40 / 42,
+        "calibration": "factory",
+        "frames": 11,
+        "damaged": 1,
+    }
+    assert (second["id"], second["period_ticks"], second["ppm"]) == (None, 947000, None)
+    assert (second["missed"], second["decode_rate"]) == (None, None)
+
+
+@pytest.mark.parametrize("asked", ["2 s at the end"], indirect=True)
+def test_what_is_lost_is_told_by_the_exit_status(locatk, tmp_path: Path, asked: list[Any]) -> None:
+    source, out = table(tmp_path / "take.sal", "x"), tmp_path / "run.mcap"
+    result = locatk("import", "libsurvive", source, "-o", out)
+    assert result.exit_code == 3
+    assert "2 s at the end" in result.stderr
+    assert len(observations.read_sweeps(Session.open(out))) == 40
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["saleae", "again"], "saleae takes one PATH"),
+        (["crazyflie-config", "again"], "crazyflie-config takes one PATH"),
+        (["saleae", "--stations"], "--stations means nothing to the format saleae"),
+        (["libsurvive", "--channel", "1"], "--channel means nothing to the format libsurvive"),
+        (["dotbot-log", "--device", "x"], "--device means nothing"),
+        (["libsurvive", "--method", "soft"], "--method means nothing"),
+        (["saleae", "--truth", "again"], "--truth means nothing"),
+        (["saleae", "--channel", "-1"], "-1"),
+        (["saleae", "--method", "bundle"], "bundle"),
+        (["crazyflie-config"], "ends in .toml"),
+    ],
+)
+def test_usage(locatk, tmp_path: Path, asked: list[Any], arguments: list[str], words: str) -> None:
+    more = [table(tmp_path / each, "x") if each == "again" else each for each in arguments[1:]]
+    source, out = table(tmp_path / "source", "x"), tmp_path / "run.mcap"
+    result = locatk("import", arguments[0], source, *more, "-o", out)
+    assert result.exit_code == 2
+    assert words in result.stderr
+    assert not asked
+    assert not out.exists()
+
+
+CONFIG = """
+type: lighthouse_system_configuration
+version: '1'
+systemType: 2
+geos:
+  0:
+    origin: [1.0, 2.0, 3.0]
+    rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+calibs: {}
+"""
+
+
+def test_a_crazyflie_config_becomes_a_scene(locatk, tmp_path: Path) -> None:
+    source, out = tmp_path / "lighthouse.yaml", tmp_path / "scene.toml"
+    source.write_text(CONFIG)
+    result = locatk("import", "crazyflie-config", source, "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    [station] = answer["stations"]
+    assert (station["channel"], station["id"], station["position_m"]) == (1, None, [1, 2, 3])
+    assert station["calibration"] == "generic"
+    assert answer["warnings"]
+    assert artifacts.read_scene(out).station(1) is not None
+    assert locatk("import", "crazyflie-config", source, "-o", out).exit_code == 1
+    empty = tmp_path / "empty.yaml"
+    empty.write_text(CONFIG[: CONFIG.index("geos")])
+    result = locatk("import", "crazyflie-config", empty, "-o", tmp_path / "empty.toml")
+    assert result.exit_code == 0
+    assert "holds no station" in result.stderr
+    damaged = tmp_path / "damaged.yaml"
+    damaged.write_text(CONFIG[:120])
+    result = locatk("import", "crazyflie-config", damaged, "-o", out, "--overwrite")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("Error: ")
+    assert artifacts.read_scene(out).station(1) is not None
+
+
+def test_published_recording_of_libsurvive(locatk, data: Path, tmp_path: Path) -> None:
+    source = data / "lighthouse" / "libsurvive" / "tracker-cal-attempt.rec.gz"
+    out = tmp_path / "run.mcap"
+    result = locatk("import", "libsurvive", source, "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert [station["calibration"] for station in answer["stations"]] == ["factory"] * 4
+    assert all(abs(station["ppm"]) < 10 for station in answer["stations"])
+    told = json.loads(locatk("info", out, "--json").stdout)
+    assert [station["id"] for station in told["stations"]] == [
+        int(station["id"], 16) for station in answer["stations"]
+    ]
+    [receiver] = told["receivers"]
+    assert (receiver["device"], receiver["sensors"]) == ("WM0", 22)

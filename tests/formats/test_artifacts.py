@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import ArtifactError
 from locatk.core.geometry import rotation_exp
-from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.calibration import MODELS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, Scene, Sighting, Station
 from locatk.formats import artifacts
 from locatk.formats.artifacts import dumps_scene, format_time, loads_scene, parse_time
@@ -21,6 +21,8 @@ from locatk.formats.artifacts import dumps_scene, format_time, loads_scene, pars
 
 finite = st.floats(-1e6, 1e6)
 times = st.integers(-(10**18), 4 * 10**18)
+numbers = st.integers(0, 2**32 - 1)
+channels = st.integers(1, 16)
 
 
 def vectors(n: int) -> st.SearchStrategy[np.ndarray]:
@@ -39,6 +41,13 @@ def sightings(draw: st.DrawFn) -> Sighting:
 
 
 @st.composite
+def calibrations(draw: st.DrawFn) -> Calibration:
+    source = draw(st.sampled_from(artifacts.SOURCES))
+    model = draw(st.sampled_from(MODELS))
+    return Calibration(draw(vectors(14)).reshape(2, 7), source, model)
+
+
+@st.composite
 def stations(draw: st.DrawFn, channel: int) -> Station:
     values = st.floats(allow_infinity=False) | st.just(0.0)
     covariance = st.lists(values, min_size=36, max_size=36).map(lambda v: np.array(v).reshape(6, 6))
@@ -46,8 +55,8 @@ def stations(draw: st.DrawFn, channel: int) -> Station:
         channel,
         draw(vectors(3)),
         rotation_exp(draw(vectors(3)) % 3),
-        Calibration(draw(vectors(14)).reshape(2, 7), draw(st.sampled_from(artifacts.SOURCES))),
-        draw(st.none() | st.integers(0, 2**32 - 1)),
+        draw(calibrations()),
+        draw(st.none() | numbers),
         draw(st.none() | covariance),
         draw(st.none() | vectors(9).map(lambda v: v.reshape(3, 3))),
     )
@@ -55,10 +64,10 @@ def stations(draw: st.DrawFn, channel: int) -> Station:
 
 @st.composite
 def scenes(draw: st.DrawFn) -> Scene:
-    channels = draw(st.lists(st.integers(1, 16), max_size=3, unique=True))
+    placed = draw(st.lists(channels, max_size=3, unique=True))
     names = draw(st.lists(st.text(max_size=5), max_size=3, unique=True))
     return Scene(
-        stations=tuple(draw(stations(channel)) for channel in channels),
+        stations=tuple(draw(stations(channel)) for channel in placed),
         markers=tuple(
             Marker(name, draw(vectors(3)), tuple(draw(st.lists(sightings(), max_size=2))))
             for name in names
@@ -72,6 +81,8 @@ def scenes(draw: st.DrawFn) -> Scene:
         scale=draw(st.sampled_from(artifacts.SCALES)),
         frame=draw(st.text(max_size=5)),
         notes=tuple(draw(st.lists(st.text(max_size=20), max_size=2))),
+        calibrations=draw(st.dictionaries(channels, calibrations(), max_size=3)),
+        ids=draw(st.dictionaries(channels, numbers, max_size=3)),
     )
 
 
@@ -81,6 +92,8 @@ def plain(value: object) -> object:
         return value.shape, [repr(item) for item in value.ravel().tolist()]
     if isinstance(value, tuple):
         return tuple(plain(item) for item in value)
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
     if hasattr(value, "__dataclass_fields__"):
         return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__}
     return value
@@ -194,6 +207,27 @@ def test_units_where_the_scale_is_not_known() -> None:
     assert "_units" not in text
 
 
+CALIBRATIONS = (
+    HEAD
+    + """
+[[calibrations]]
+channel = 3
+id = "4cc60647"
+source = "none"
+"""
+)
+
+
+def test_a_station_that_is_yet_to_be_solved_has_its_serial_number() -> None:
+    scene = loads_scene(CALIBRATIONS)
+    assert scene.ids == {3: 0x4CC60647}
+    assert scene.calibrations[3].source == "none"
+    # Its number may be all that is known.
+    scene = loads_scene(CALIBRATIONS.replace('source = "none"', ""))
+    assert (scene.ids, scene.calibrations) == ({3: 0x4CC60647}, {})
+    assert loads_scene(CALIBRATIONS.replace('id = "4cc60647"', "")).ids == {}
+
+
 METRIC = HEAD + 'scale = "markers"\n' + STATION
 
 
@@ -226,6 +260,11 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (METRIC.replace('"none"', '"factory"'), "stations[0].calibration.first", "missing"),
         (METRIC + STATION, "stations[1].channel", "twice"),
         (METRIC.replace("channel = 1", 'channel = 1\nid = "xyz"'), "stations[0].id", "hexa"),
+        (CALIBRATIONS.replace("4cc60647", "0x4c"), "calibrations[0].id", "hexa"),
+        (CALIBRATIONS.replace('"4cc60647"', "12"), "calibrations[0].id", "a string"),
+        (CALIBRATIONS.replace("source", "sorce"), "calibrations[0].source", "missing"),
+        (CALIBRATIONS.replace('source = "none"', 'model = "x"'), "calibrations[0].source", "miss"),
+        (HEAD + "[[calibrations]]\nchannel = 3", "calibrations[0].source", "missing"),
         (HEAD + MARKER + MARKER, "markers[1].name", "twice"),
         (HEAD + SIGHTING.replace("22.7", "25.7"), "markers[0].sightings[0].end", "before start"),
         (HEAD + SIGHTING.replace("963Z", "963"), "markers[0].sightings[0].start", "zone"),

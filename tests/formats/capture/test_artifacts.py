@@ -11,11 +11,12 @@ from locatk.core.dots.camera import Camera
 from locatk.core.errors import ArtifactError, FormatError, InputError, MissingDataError
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.halls import HallSensors
+from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats import artifacts as scenes
-from locatk.formats import hall_sensors, maps, sheets, tags
+from locatk.formats import hall_sensors, maps, receivers, sheets, tags
 from locatk.formats.capture.artifacts import ATTACHED, KINDS, attachments
 from locatk.formats.session_writer import SessionWriter
 
@@ -30,6 +31,7 @@ TEXTS = {
     "array.toml": ARRAY,
     "map.toml": MAP,
     "halls.toml": HALLS,
+    "receiver.toml": receivers.dumps_receiver(DECK),
 }
 
 
@@ -60,6 +62,7 @@ def test_all_kinds_that_solvers_read_are_known() -> None:
         tags.ARRAY_FORMAT,
         maps.MAP_FORMAT,
         hall_sensors.HALLS_FORMAT,
+        receivers.RECEIVER_FORMAT,
     }
     assert set(ATTACHED) == {*TEXTS, sheets.SHEET_FILE, sheets.CAMERA_FILE}
 

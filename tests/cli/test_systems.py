@@ -1,0 +1,93 @@
+"""What the solver of Lighthouse is given of a session."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from locatk.cli.systems import Request, solve_session
+from locatk.core import lighthouse
+from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.receiver import DECK
+from locatk.core.lighthouse.scene import Marker, Scene
+from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.solution import Solution
+from locatk.formats import artifacts, observations
+from locatk.formats.session import Session
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the last call of the solver was given."""
+    last: dict[str, Any] = {}
+
+    def solve(sweeps: Any, scene: Scene, options: Any, **more: Any) -> Solution:
+        last.update(more, scene=scene)
+        return Solution("lighthouse", "bundle", (), notes=("of the solver",))
+
+    monkeypatch.setattr(lighthouse, "solve", solve, raising=False)
+    return last
+
+
+def sweeps_of(session: Path, sensors: int) -> Sweeps:
+    """As in the session, but of so many photodiodes."""
+    sweeps = observations.read_sweeps(Session.open(session))
+    return replace(sweeps, sensor=np.arange(len(sweeps), dtype=np.int32) % sensors)
+
+
+def test_a_plain_session(session: Path, given: dict[str, Any]) -> None:
+    solution = solve_session(session, Request()).solution
+    assert [marker.name for marker in given["scene"].markers] == ["corner"]
+    assert "receivers" not in given
+    assert solution.notes == ("of the solver",)
+
+
+@pytest.mark.parametrize(("sensors", "rigid"), [(1, False), (2, True), (4, True)])
+def test_one_photodiode_is_no_rigid_device(
+    session: Path, tmp_path: Path, given: dict[str, Any], sensors: int, rigid: bool
+) -> None:
+    path, sweeps = tmp_path / "light.mcap", sweeps_of(session, sensors)
+    observations.write_session(path, system="lighthouse", sweeps=sweeps, receivers={"red": DECK})
+    solve_session(path, Request())
+    assert ("receivers" in given) == rigid
+
+
+def test_receivers_and_what_stations_sent(
+    session: Path, tmp_path: Path, given: dict[str, Any]
+) -> None:
+    """Another scene takes the place of the session's; of themselves the stations know best."""
+    sent = Calibration(np.full((2, 7), 0.01), "factory")
+    path, room = tmp_path / "light.mcap", tmp_path / "scene.toml"
+    observations.write_session(
+        path,
+        system="lighthouse",
+        sweeps=sweeps_of(session, sensors=4),
+        scene=Scene(markers=(Marker("old", np.zeros(3)),)),
+        stations=(HeardStation(1, 0xA, calibration=sent), HeardStation(2, 0xB, calibration=sent)),
+        receivers={"red": DECK},
+    )
+    artifacts.write_scene(
+        room,
+        Scene(
+            markers=(Marker("new", np.zeros(3)),),
+            calibrations={2: Calibration(np.zeros((2, 7)), "estimated")},
+            ids={2: 0xC},
+        ),
+    )
+    solution = solve_session(path, Request(artifact=room)).solution
+    scene = given["scene"]
+    assert [marker.name for marker in scene.markers] == ["new"]
+    assert {c: each.source for c, each in scene.calibrations.items()} == {
+        1: "factory",
+        2: "estimated",
+    }
+    assert scene.ids == {1: 0xA, 2: 0xC}
+    assert given["receivers"].keys() == {"red"}
+    first, second = solution.notes
+    assert first.startswith("on channel 2 the scene has the station 0000000c")
+    assert second == "of the solver"
