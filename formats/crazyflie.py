@@ -11,7 +11,7 @@ firmware, not of the numbers, so that they are read for the full model
 with the firmware's model, and is as good as that was. A scene that was read says so.
 
 Only factory calibrations are written. A Crazyflie that hears a station replaces others by
-the factory's within seconds, and a reader could not tell an estimate from it.
+the factory's within half a minute, and a reader could not tell an estimate from it.
 """
 
 from __future__ import annotations

@@ -132,10 +132,11 @@ def assemble(
         return found[key]
 
     group = _largest_group(joint)
-    if planar is None and len(group) > 2 and _fills_space(rays, joint, group, seed):
+    told = planar is not None
+    if not told and len(group) > 2 and _fills_space(rays, joint, group, seed):
         planar = False
     start = _start(joint, group, lambda i, j: pair_of(i, j, planar))
-    facts = dict(start.facts)
+    facts = {**start.facts, "planar_decided_by": "option" if told else "data"}
 
     def neighbours(i: int, j: int) -> Pair | None:
         pair = pair_of(i, j, start.planar)

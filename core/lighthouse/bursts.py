@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse.light import Edges
 
 GAP_S = 1.5e-6
@@ -119,15 +120,34 @@ def of_windows(windows: NDArray[np.uint8], rate_hz: float = 32e6) -> Bursts:
     windows = np.asarray(windows)
     if windows.ndim != 2 or windows.dtype != np.uint8:
         raise InputError("windows of light are rows of bytes")
+    tick, first, rises = _window_edges(np.ascontiguousarray(windows))
+    return Bursts(tick, first, rises, rate_hz)
+
+
+def _window_edges(
+    windows: NDArray[np.uint8],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    n, width = windows.shape
+    if kernels is None or width == 0:
+        return window_edges_numpy(windows)
+    tick = np.empty(n * 8 * width, np.int64)
+    first, rises = np.empty(n + 1, np.int64), np.empty(n, np.uint8)
+    kernels.window_edges(windows, width, tick, first, rises)
+    return tick[: first[-1]].copy(), first, rises.astype(bool)
+
+
+def window_edges_numpy(
+    windows: NDArray[np.uint8],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Ticks, first edges and first directions of :func:`of_windows`, in numpy."""
     level = np.unpackbits(windows, axis=1)
-    changed = level[:, 1:] != level[:, :-1]
-    row, column = np.nonzero(changed)
+    row, column = np.nonzero(level[:, 1:] != level[:, :-1])
     size = np.bincount(row, minlength=len(windows))
-    rises = np.zeros(len(windows), bool)
     first = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+    rises = np.zeros(len(windows), bool)
     some = size > 0
     rises[some] = level[some, 0] == 0
-    return Bursts(row * level.shape[1] + column + 1, first, rises, rate_hz)
+    return row * level.shape[1] + column + 1, first, rises
 
 
 def require_rate(rate_hz: float) -> None:

@@ -33,7 +33,7 @@ CERTAIN = 64
 """Of a soft bit: what a clean one reaches."""
 
 LONGEST_S = 500e-6
-"""Of a burst: more is no sweep, and its rest is left out. A sweep takes 10 to 60 us."""
+"""Of a burst: a longer one is no sweep, which takes 10 to 60 us, and has no bits."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def soft_bits(bursts: Bursts) -> SoftBits:
     Returns
     -------
     SoftBits
-        One row a burst; a burst of fewer than two edges has no bits.
+        One row a burst; a burst of fewer than two edges, or one that is too long, has no bits.
     """
     if kernels is None:
         return soft_bits_numpy(bursts)
@@ -82,15 +82,19 @@ def _compiled(bursts: Bursts) -> SoftBits:
     assert kernels is not None
     n = len(bursts)
     ticks_per_chip = bursts.rate_hz / CHIP_HZ
-    longest = int(LONGEST_S * CHIP_HZ)
-    room = _room(bursts, ticks_per_chip, longest)
+    readable = _readable(bursts)
+    # A burst has as many bits as it lasts, and one or two at its ends.
+    longest = int(LONGEST_S * CHIP_HZ) + 4
+    lasting = np.zeros(n)
+    lasting[readable] = bursts.take(readable).duration_s
     first = np.zeros(n + 1, np.int64)
-    value = np.empty(int(room.sum()), np.int8)
+    value = np.empty(int(np.sum(lasting * BIT_HZ + 4)), np.int8)
     tick = np.zeros(n)
     kernels.light_bits(
         np.ascontiguousarray(bursts.tick, np.int64),
         np.ascontiguousarray(bursts.first, np.int64),
         np.ascontiguousarray(bursts.rises, np.uint8),
+        readable.astype(np.uint8),
         ticks_per_chip,
         longest,
         value,
@@ -100,14 +104,12 @@ def _compiled(bursts: Bursts) -> SoftBits:
     return SoftBits(value[: first[-1]], first, tick, 2 * ticks_per_chip)
 
 
-def _room(bursts: Bursts, ticks_per_chip: float, longest: int) -> NDArray[np.int64]:
-    """Bits (n,) that each burst can have, at most."""
+def _readable(bursts: Bursts) -> NDArray[np.bool_]:
+    """Which bursts (n,) can hold bits."""
     some = np.diff(bursts.first) > 1
-    chips = np.zeros(len(bursts), np.int64)
     last = bursts.tick[np.maximum(bursts.first[1:] - 1, 0)[some]]
-    lasting = last - bursts.tick[bursts.first[:-1][some]]
-    chips[some] = np.minimum(lasting / ticks_per_chip, longest).astype(np.int64) + 6
-    return chips // 2 + 1
+    some[some] = last - bursts.tick[bursts.first[:-1][some]] <= LONGEST_S * bursts.rate_hz
+    return some
 
 
 def soft_bits_numpy(bursts: Bursts) -> SoftBits:
@@ -115,19 +117,21 @@ def soft_bits_numpy(bursts: Bursts) -> SoftBits:
     n = len(bursts)
     chip = bursts.rate_hz / CHIP_HZ
     size = np.diff(bursts.first)
-    some = np.flatnonzero(size > 1)
+    readable = _readable(bursts)
+    some = np.flatnonzero(readable)
     if not len(some):
         return SoftBits(np.zeros(0, np.int8), np.zeros(n + 1, np.int64), np.zeros(n), 2 * chip)
-    kept = bursts if len(some) == n else bursts.take(size > 1)
+    kept = bursts if len(some) == n else bursts.take(readable)
     burst = np.repeat(np.arange(len(some)), size[some])
     origin = kept.start
     rising = (np.arange(len(kept.tick)) - kept.first[burst]) % 2 == 0
     rising = np.where(kept.rises[burst], rising, ~rising)
     time, phase = _aligned((kept.tick - origin[burst]).astype(float), burst, rising, chip)
     # The grid of chips, from one before the first edge to one after the last.
-    begin = np.floor((time[kept.first[:-1]] - phase) / chip) - 1
-    count = np.ceil((time[kept.first[1:] - 1] - phase) / chip) + 1 - begin
-    count = np.minimum(count, int(LONGEST_S * CHIP_HZ)).astype(np.int64)
+    # Edges lie on it, so that rounding is safe where floor and ceil would toss a coin.
+    begin = np.rint((time[kept.first[:-1]] - phase) / chip) - 1
+    count = np.rint((time[kept.first[1:] - 1] - phase) / chip) + 1 - begin
+    count = count.astype(np.int64)
     offset = np.concatenate([[0], np.cumsum(count)])
     mean = _mean_levels(kept, time, rising, burst, phase + begin * chip, count, offset, chip)
     # Which chips pair to bits: borders of bits change always, their middles half of the time.
@@ -176,9 +180,7 @@ def _aligned(
     skew *= chip / (2 * np.pi)
     time = time + np.where(rising, -0.5, 0.5) * skew[burst]
     time = _ascending(time, burst)
-    angle = 2 * np.pi / chip * time
-    phase = np.arctan2(np.bincount(burst, np.sin(angle), n), np.bincount(burst, np.cos(angle), n))
-    return time, phase * chip / (2 * np.pi)
+    return time, turn[0] * chip / (2 * np.pi) - 0.5 * skew
 
 
 def _ascending(time: Array, burst: NDArray[np.int64]) -> Array:

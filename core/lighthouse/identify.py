@@ -1,12 +1,12 @@
 """Which station sent these bits, and at which turn of its rotor.
 
-Any 17 successive bits tell, for each of the 32 polynomials, where in its sequence they stand
-(:mod:`.lfsr`, one look-up), and so where the first bit of the burst stands. Under the right
-polynomial all undisturbed runs of 17 bits name one place; under a wrong one they scatter over
-131,071. The places that most runs name are then held against the whole burst, bit by bit:
-a match or a contradiction counts by how sure the bit is, in bits of evidence, and the stretch
-of the burst that agrees best is taken, so that noise at its ends does not matter (as local
-alignments are scored; Karlin and Altschul 1990).
+Under the right polynomial each bit follows from the 17 before it. So for each of the 32 the
+longest run of bits is sought that follow one from the other; where there is a long one, its
+first 17 bits tell, by one look-up, where they stand in the sequence (:mod:`.lfsr`), and so
+where the first bit of the burst stands. That place is then held against the whole burst, bit
+by bit: a match or a contradiction counts by how sure the bit is, in bits of evidence, and the
+stretch of the burst that agrees best is taken, so that noise at its ends does not matter (as
+local alignments are scored; Karlin and Altschul 1990).
 
 A place and a polynomial are one of 2^22, and a burst has many stretches, so that evidence of
 S bits is an accident with a probability of about 2^(27 - S) in a burst of noise
@@ -27,8 +27,12 @@ from locatk.core.lighthouse.channels import POLYNOMIALS
 from locatk.core.lighthouse.demodulate import CERTAIN, SoftBits
 
 UNKNOWN = 3
-"""A soft bit up to this size is unknown: it takes part in no run of 17, and is counted
-neither as right nor as wrong."""
+"""A soft bit up to this size is unknown: it ends a run, and is counted neither as right nor as
+wrong."""
+
+FOLLOW = 8
+"""So many successive bits must follow from the 17 before them for a polynomial to be
+considered: noise has as many under one in eight."""
 
 STEPS = 32
 """Steps in which a bit of evidence is counted, so that sums are exact."""
@@ -45,8 +49,8 @@ ALONE = 40.0
 ERROR_SHARE = 0.2
 """Contradictions allowed among the known bits of the stretch that agrees."""
 
-FASTEST = 60.0
-"""Evidence beyond which no other place is asked."""
+FASTEST = 45.0
+"""Evidence beyond which no other place is asked (by the compiled twin)."""
 
 CHUNK = 512
 
@@ -113,8 +117,8 @@ def identify(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
         return identify_numpy(bits, polynomials)
     assert kernels is not None
     states, index = lfsr.tables()
-    n = len(bits)
-    rows = np.zeros((n, 7), np.int32)
+    rows = np.zeros((len(bits), 7), np.int32)
+    rows[:, 0:2] = -1
     kernels.light_places(
         np.ascontiguousarray(bits.value, np.int8),
         np.ascontiguousarray(bits.first, np.int64),
@@ -125,6 +129,7 @@ def identify(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
         MATCH,
         MISS,
         UNKNOWN,
+        FOLLOW,
         int(FASTEST * STEPS),
         rows,
     )
@@ -196,43 +201,42 @@ def _padded(bits: SoftBits, chosen: NDArray[np.int64]) -> NDArray[np.int8]:
 
 def _best(value: NDArray[np.int8], size: NDArray[np.int64], polynomials: int) -> NDArray[np.int32]:
     """Rows of the best place under any polynomial; of equals the lower polynomial."""
+    best = np.zeros((len(value), 7), np.int32)
+    best[:, 0:2] = -1
+    runs = value.shape[1] - lfsr.BITS
+    if runs < FOLLOW:
+        return best
     hard = (value > 0).astype(np.int32)
     sure = np.abs(value.astype(np.int32)) > UNKNOWN
-    runs = value.shape[1] - lfsr.BITS + 1
     window = np.zeros((len(value), runs), np.int32)
-    whole = np.ones((len(value), runs), bool)
+    whole = sure[:, lfsr.BITS :].copy()
     for k in range(lfsr.BITS):
         window = window << 1 | hard[:, k : k + runs]
         whole &= sure[:, k : k + runs]
-    best = np.zeros((len(value), 7), np.int32)
-    best[:, 0:2] = -1
+    # State 0 follows from itself under all polynomials, and is none of a station's.
+    whole &= window != 0
     for polynomial in range(polynomials):
-        place, votes = _most_named(window, whole, polynomial)
-        some = np.flatnonzero(votes >= 1)
+        parity = np.bitwise_count(window & lfsr.TAPS[polynomial]) & 1
+        start, length = _longest_run(whole & (parity == hard[:, lfsr.BITS :]))
+        some = np.flatnonzero(length >= FOLLOW)
         if not len(some):
             continue
-        rows = _scored(value[some], size[some], polynomial, place[some])
+        state = window[some, start[some]]
+        place = np.mod(lfsr.indices(state, polynomial) - start[some], lfsr.LENGTH)
+        rows = _scored(value[some], size[some], polynomial, place)
         better = rows[:, 2] > best[some, 2]
         best[some[better]] = rows[better]
     return best
 
 
-def _most_named(
-    window: NDArray[np.int32], whole: NDArray[np.bool_], polynomial: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Place (n,) of the first bit that most runs name, and how many; of equals the lowest."""
-    found = lfsr.indices(window, polynomial)
-    start = np.mod(found - np.arange(window.shape[1]), lfsr.LENGTH)
-    start = np.sort(np.where(whole & (found >= 0), start, -1), axis=1)
-    n, runs = start.shape
-    fresh = np.ones((n, runs), bool)
-    fresh[:, 1:] = start[:, 1:] != start[:, :-1]
-    column = np.broadcast_to(np.arange(runs), start.shape)
-    head = np.maximum.accumulate(np.where(fresh, column, 0), axis=1)
-    length = np.where(start >= 0, column - head + 1, 0)
-    at = np.argmax(length, axis=1)
-    rows = np.arange(n)
-    return start[rows, at], length[rows, at]
+def _longest_run(true: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Start and length (n,) of the longest run in each row (n, k), the first of equals."""
+    column = np.arange(true.shape[1])
+    head = np.maximum.accumulate(np.where(true, -1, column), axis=1)
+    length = np.where(true, column - head, 0)
+    end = np.argmax(length, axis=1)
+    longest = length[np.arange(len(true)), end]
+    return end - longest + 1, longest
 
 
 def _scored(

@@ -80,7 +80,7 @@ class OotxFrame:
     right : bool
         Whether all bits are known and the checksum is right. Do not use it otherwise.
     missed : int
-        Bits of it, of 443, that were not received.
+        Bits of it, of 443, that were not received, or that other frames overruled.
     """
 
     start: int
@@ -106,7 +106,8 @@ class FactoryData:
     unlock_count : int
         How often its rotor fell out of step.
     acceleration : tuple of 3 int
-        Direction of gravity in its own axes (x, y, z), of no stated unit: 127 is about 1 g.
+        How it hangs: signed bytes in no stated unit, of which the second is 127 where it
+        stands upright.
     faults : int
         0 where all is well.
     nonce : int
@@ -148,6 +149,7 @@ def frames(bits: ArrayLike) -> list[OotxFrame]:
     -----
     Missing bits are those that every frame has, else what most of the neighbouring frames
     say; of what is missing then, up to 8 bits, all values are tried and one must be right.
+    Where no frame is right so, one is made of the bits that most of them have.
     """
     received = np.asarray(bits)
     if received.ndim != 1 or not np.all(np.isin(received, (UNKNOWN, 0, 1))):
@@ -183,6 +185,13 @@ def _read(bits: Bits, start: NDArray[np.int64]) -> list[OotxFrame]:
     missed = np.count_nonzero(window == UNKNOWN, axis=1)
     window[:, _FIXED] = _FIXED_BITS
     completed, right = _complete(window)
+    if not np.any(right):
+        agreed = _agreed(window)
+        solved, good = _complete(agreed)
+        overruled = np.count_nonzero((agreed != window) & (window != UNKNOWN), axis=1)
+        for k in np.flatnonzero(good)[np.argsort(overruled[good], kind="stable")][:1]:
+            completed[k], right[k] = solved[k], True
+            missed[k] += overruled[k]
     return [
         OotxFrame(int(at) + SYNC_BITS, _payload(frame), bool(good), int(gone))
         for at, frame, good, gone in zip(start, completed, right, missed, strict=True)
@@ -201,11 +210,7 @@ def _near(starts: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.boo
 
 def _complete(window: Bits) -> tuple[Bits, NDArray[np.bool_]]:
     """Frames (m, 443) with their missing bits found, and which have a right checksum."""
-    votes = np.where(window == UNKNOWN, 0, 2 * window.astype(np.int32) - 1)
-    total = np.concatenate([np.zeros((1, FRAME_BITS), np.int32), np.cumsum(votes, axis=0)])
-    each = np.arange(len(window))
-    votes = total[np.minimum(each + NEIGHBOURS + 1, len(window))]
-    votes -= total[np.maximum(each - NEIGHBOURS, 0)]
+    votes = _votes(window)
     voted = np.where((window == UNKNOWN) & (votes != 0), votes > 0, window).astype(np.int8)
     result, right = voted.copy(), np.zeros(len(window), bool)
     # A vote that is wrong can hide what the frame's own bits tell.
@@ -215,6 +220,22 @@ def _complete(window: Bits) -> tuple[Bits, NDArray[np.bool_]]:
             if solved is not None:
                 result[k], right[k] = solved, True
     return result, right
+
+
+def _agreed(window: Bits) -> Bits:
+    """Frames (m, 443) with the bits that most neighbours have; unknown where it is even."""
+    votes = _votes(window)
+    return np.where(votes == 0, UNKNOWN, votes > 0).astype(np.int8)
+
+
+def _votes(window: Bits) -> NDArray[np.int32]:
+    """How many more ones than zeros a frame and its neighbours have, for each bit."""
+    ballots = np.where(window == UNKNOWN, 0, 2 * window.astype(np.int32) - 1)
+    total = np.concatenate([np.zeros((1, FRAME_BITS), np.int32), np.cumsum(ballots, axis=0)])
+    each = np.arange(len(window))
+    votes = total[np.minimum(each + NEIGHBOURS + 1, len(window))]
+    votes -= total[np.maximum(each - NEIGHBOURS, 0)]
+    return np.asarray(votes, np.int32)
 
 
 def _solve(frame: Bits) -> Bits | None:

@@ -23,7 +23,7 @@ from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from locatk.core.lighthouse.solver import Job
+    from locatk.core.lighthouse.job import Job
 
 Array = NDArray[np.float64]
 Stations = tuple[Array, Array, tuple[Calibration, ...]]
@@ -102,6 +102,7 @@ def answer(job: Job, scene: Scene) -> Solution:
     if guessed and floor_map is None:
         job.facts["calibration_sigma_rad"] = CALIBRATION_SIGMA
         sigma = float(np.hypot(sigma, CALIBRATION_SIGMA))
+    checks = _verified(job, rig, floor, good) if floor_map is None else ()
     covariance = fixes.covariance(sigma, floor is not None)
     trajectories = []
     for k, name in enumerate(job.epochs.devices):
@@ -120,11 +121,25 @@ def answer(job: Job, scene: Scene) -> Solution:
         job.options.method,
         tuple(trajectories),
         job.rejected,
-        detections(job.epochs, {s.channel: s for s in stations}, fixes.residual, good),
+        detections(job.epochs, {s.channel: s for s in stations}, fixes.residual, good, checks),
         scene,
         tuple(dict.fromkeys(job.notes)),
         job.facts,
     )
+
+
+def _verified(
+    job: Job, rig: Stations, floor: float | None, good: NDArray[np.bool_]
+) -> tuple[StationCheck, ...]:
+    """Check each station on what took no part in solving the scene, and name a wrong one."""
+    if job.verified is None:
+        # What is rejected may be what tells of a wrong station: any moment is a witness.
+        seen = np.isfinite(job.angles).all(axis=2)
+        many = np.flatnonzero(np.count_nonzero(seen, axis=1) > (1 if floor is not None else 2))
+        rows = many if len(many) >= MOST else np.flatnonzero(good)
+    else:
+        job_angles = job.verified
+    return checks
 
 
 def _gate(fixes: Fixes) -> float:

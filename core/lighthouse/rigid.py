@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.channels import CHANNELS
+from locatk.core.lighthouse.poses import CALIBRATION_SIGMA
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.rigid_poses import Followed, follow
 from locatk.core.lighthouse.rigid_scene import solve_scene
@@ -20,6 +21,9 @@ from locatk.core.robust import robust_sigma
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+
+BEHIND = 0.3
+"""Share of sweeps from behind their photodiodes that calls for a word."""
 
 
 @dataclass
@@ -153,6 +157,8 @@ def _account(
         answer.unused[channel] = int(np.count_nonzero(mine & ~used))
     answer.facts["angle_sigma_rad"] = float(max(f.sigma for _, f in parts))
     answer.facts["lasting_angle_sigma_rad"] = float(max(f.lasting_sigma for _, f in parts))
+    if any(s.calibration.source in ("generic", "estimated") for s in answer.scene.stations):
+        answer.facts["calibration_sigma_rad"] = CALIBRATION_SIGMA
     answer.facts["station_residual_rad"] = {
         str(c): robust_sigma(r) for c, r in answer.residuals.items()
     }
@@ -167,6 +173,11 @@ def _remark(answer: RigidAnswer, parts: list[tuple[DeviceSweeps, Followed]]) -> 
                 "another place, or too few are seen at a time"
             )
             continue
+        if followed.from_behind > BEHIND:
+            answer.notes.append(
+                f"{name}: {followed.from_behind:.0%} of its sweeps come from behind their "
+                "photodiodes: places or normals of the receiver are mirrored or out of order"
+            )
         if followed.ambiguous:
             answer.notes.append(
                 f"{name}: flat and under one station, so that two orientations explain its "

@@ -25,6 +25,9 @@ NEAR_SHIFT = 0.15
 """Turn (rad) and shift (parts of the distance) by which two looks may differ on how two
 stations stand to each other: a deck of 30 mm at two metres errs by a few degrees."""
 
+RIVAL = 0.8
+"""Share of the agreeing moments from which on another answer is as good."""
+
 READINGS_KEPT = 2
 """A flat device has two readings under one station."""
 
@@ -124,13 +127,18 @@ def _best_readings(
 
 @dataclass(frozen=True)
 class Link:
-    """How a second station stands in the axes of a first, and how many moments agree."""
+    """How a second station stands in the axes of a first, and how many moments agree.
+
+    ``rivalled`` where quite another answer has about as many: a flat device that only stood
+    has two readings under each station, and nothing tells which are right.
+    """
 
     first: int
     second: int
     position: Array
     rotation: Array
     agreed: int
+    rivalled: bool = False
 
 
 def links_of(views: Views, number: int) -> list[Link]:
@@ -179,7 +187,10 @@ def _link(views: Views, i: int, j: int) -> Link | None:
         shift = np.median(position[near], axis=0)
         u, _, vt = np.linalg.svd(np.sum(rotation[near], axis=0))
         turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return Link(i, j, shift, turn, len(np.unique(moment[near])))
+    agreed = len(np.unique(moment[near]))
+    other = misfit(proposals, shift[None], turn[None])[0] >= 1.0
+    votes = np.count_nonzero(least[other] < 1.0, axis=1)
+    return Link(i, j, shift, turn, agreed, bool(np.any(votes >= RIVAL * agreed)))
 
 
 def join(

@@ -24,7 +24,15 @@ from locatk.core.lighthouse.poses import (
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.rigid_fit import Fit, Poses, Stations, fit
 from locatk.core.lighthouse.rigid_sweeps import DeviceSweeps, windows
-from locatk.core.lighthouse.rigid_waves import BLOCK, FAILED, SOLVED, Track, enough, locate_all
+from locatk.core.lighthouse.rigid_waves import (
+    BLOCK,
+    FAILED,
+    SOLVED,
+    Track,
+    enough,
+    from_behind,
+    locate_all,
+)
 from locatk.core.robust import robust_sigma
 from locatk.core.trajectory import Trajectory
 
@@ -59,6 +67,8 @@ class Followed:
     rejected : dict of str to int
     rate : (m, 6) ndarray
         Velocity in m/s and turning rate in rad/s of each pose, in the frame's axes.
+    from_behind : float
+        Share of the sweeps that came from behind their photodiodes.
     ambiguous : int
         Moments that were reached from an anchor with two readings of much the same cost.
     """
@@ -70,6 +80,7 @@ class Followed:
     lasting_sigma: float
     rejected: dict[str, int]
     rate: Array
+    from_behind: float
     ambiguous: int
 
 
@@ -146,11 +157,10 @@ def _finish(name: str, frame: str, track: Track) -> Followed:
     sigma, lasting = _noise(track.mine, residual, used, sweep)
 
     guessed = any(c.source in ("generic", "estimated") for c in track.stations[2])
-    if guessed:
-        lasting = float(np.hypot(lasting, CALIBRATION_SIGMA))
-        sigma = float(np.hypot(sigma, CALIBRATION_SIGMA))
-    covariance = np.linalg.inv(last.information)[:, :6, :6] / noise**2
-    covariance *= sigma**2 + (REPEATS - 1.0) * lasting**2
+    # What a photodiode's plane repeats in a window, it does not average.
+    variance = sigma**2 + (REPEATS - 1.0) * lasting**2
+    variance += REPEATS * CALIBRATION_SIGMA**2 if guessed else 0.0
+    covariance = np.linalg.inv(last.information)[:, :6, :6] * variance / noise**2
     bent = _unsteady(track.around.time_ns[solved], last.poses.rate, track.reach_ns)
     covariance += bent[:, :, None] * bent[:, None, :]
     loose = np.any(np.sqrt(np.einsum("mii->mi", covariance)) > LOOSEST, axis=1)
@@ -169,8 +179,18 @@ def _finish(name: str, frame: str, track: Track) -> Followed:
     )
     unsure = np.array(track.margin) < SURE
     ambiguous = int(np.count_nonzero(unsure[track.source[solved[good]]])) if len(unsure) else 0
+    some = solved[good][:: max(1, np.count_nonzero(good) // BLOCK)]
+    behind = from_behind(track, some, track.poses.take(some))
     return Followed(
-        trajectory, residual, used, sigma, lasting, track.rejected, poses.rate, ambiguous
+        trajectory,
+        residual,
+        used,
+        sigma,
+        lasting,
+        track.rejected,
+        poses.rate,
+        float(np.mean(behind)) if len(some) else 0.0,
+        ambiguous,
     )
 
 

@@ -199,6 +199,12 @@ def _adjusted(
         ],
     }
     answer.notes = _remarks(joined, channels, done.stations[2], len(size))
+    rivals = [f"{channels[k.first]} and {channels[k.second]}" for k in links if k.rivalled]
+    if rivals:
+        answer.notes.append(
+            f"how the stations on channels {', '.join(rivals)} stand to each other has two "
+            "answers of which neither is better: carry the device around, and turn it"
+        )
     solved = tuple(
         Station(
             int(channels[i]),

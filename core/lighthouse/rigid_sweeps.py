@@ -81,7 +81,8 @@ def sweeps_of(
 
     keep(np.isin(sweeps.channel[mine], CHANNELS), "channel_unknown")
     sensor = sweeps.sensor[mine]
-    keep((sensor >= 0) & (sensor < len(receiver)), "sensor_unknown")
+    placed = np.append(np.isfinite(receiver.position_m).all(axis=1), False)
+    keep(placed[np.where((sensor >= 0) & (sensor < len(receiver)), sensor, -1)], "sensor_unknown")
     keep(np.isin(sweeps.channel[mine], list(channels)), "station_not_in_scene")
     counts = sweeps.count[mine]
     with np.errstate(invalid="ignore"):
@@ -165,7 +166,9 @@ def windows(mine: DeviceSweeps, every_ns: int, reach_ns: int) -> Windows:
     if len(mine) == 0:
         return Windows(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
     since = mine.time_ns - mine.time_ns[0]
-    centre = np.unique(since // every_ns) * every_ns + every_ns // 2
+    stretch, start = np.unique(since // every_ns, return_index=True)
+    # The middle of a stretch, or near its first sweep where it is longer than the reach.
+    centre = np.minimum(stretch * every_ns + every_ns // 2, since[start] + reach_ns)
     first = np.searchsorted(since, centre - reach_ns)
     last = np.searchsorted(since, centre + reach_ns, side="right")
     number = last - first

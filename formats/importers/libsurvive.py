@@ -249,9 +249,14 @@ def _station(
     return Station(channel, pose[1:4], station_rotation(pose[4:]), calibration, number)
 
 
+def _in_imu(recording: Recording) -> bool:
+    """Whether poses are of the imu, not of the head."""
+    return recording.options.get("report-in-imu", "0") not in ("0", "")
+
+
 def _receivers(recording: Recording, warnings: list[str]) -> dict[str, Receiver]:
     """Photodiodes of the devices that tell of them."""
-    in_imu = recording.options.get("report-in-imu", "0") not in ("0", "")
+    in_imu = _in_imu(recording)
     found: dict[str, Receiver] = {}
     for name in recording.devices:
         config = recording.configs.get(name)
@@ -352,6 +357,7 @@ def _facts(
     }
     if truth:
         facts["truth"] = ", ".join(f"{len(t)} poses of {t.device} ({t.frame})" for t in truth)
+        facts["axes"] = f"of a device are those of its {'imu' if _in_imu(recording) else 'head'}"
     if skipped:
         facts["skipped"] = ", ".join(f"{n} {kind}" for kind, n in skipped.items())
     return facts

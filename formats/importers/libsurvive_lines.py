@@ -48,6 +48,9 @@ OPTIONS = 4096
 KINDS = 256
 """So many devices, options, unknown kinds and names of poses are kept at most."""
 
+STRANGE = 100_000
+"""After so many lines that are none of libsurvive's, none are looked for."""
+
 _TIME = rb"^(\d{1,9}(?:\.\d{1,9})?) "
 _NAME = rb"([^\s]{1,32}) "
 _END = rb"[ \t\r]*$"
@@ -167,6 +170,8 @@ def read_lines(path: Path, *, angles: bool = False) -> Recording:
     pieces = _Pieces(path)
     for block in pieces:
         collected.add(block)
+        if collected.recording.lines > STRANGE and not collected.known:
+            break
     collected.damaged += pieces.overlong
     recording = collected.finish(pieces.cut)
     if not (len(recording.syncs) or len(recording.sweeps) or recording.configs or recording.kinds):
@@ -247,6 +252,7 @@ class _Collected:
 
     def __init__(self, angles: bool) -> None:
         self.angles = angles
+        self.known = 0
         self.devices: dict[bytes, int] = {}
         self.parts: dict[str, list[Columns]] = {"Y": [], "W": [], "B": []}
         self.recording = Recording((), _columns([]), _columns([]), _columns([]))
@@ -274,6 +280,7 @@ class _Collected:
         for key, values in poses.items():
             if key in self.poses or len(self.poses) < KINDS:
                 self.poses.setdefault(key, []).append(np.array(values))
+        self.known += known + len(others)
         self.recording.lines += lines
         self.damaged += max(lines - known - len(others), 0)
 

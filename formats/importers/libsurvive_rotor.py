@@ -135,6 +135,8 @@ def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal: float) -> Rotor | No
     good &= _steady(x - number * length, good)
     kept = np.flatnonzero(good)
     kept, bit = _once(kept, number, bit)
+    later = np.diff(np.maximum.accumulate(x[kept]), prepend=-1.0) > 0
+    kept = kept[later]
     if len(kept) < LEAST:
         return None
     number = number[kept]

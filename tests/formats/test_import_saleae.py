@@ -247,6 +247,7 @@ def test_no_light(tmp_path: Path) -> None:
         ("Time [s],A\n0.1,0\n0.2,nan\n", "'nan' where a level", 3),
         ("Time [s],A\n0.1,0\n0.2,3.3\n", "'3.3' where a level", 3),
         ("Time [s],A\n0.1,0\n0.2,2\n", "'2' where a level", 3),
+        ("Time [s],A\n0.1,0\n0.2,01\n", "'01' where a level", 3),
         ("Time [s],A\n0.1,0\n0.2,\n", "'' where a level", 3),
         ("Time [s],A\n0.1,0\n0.2\n", "1 cell in a row of 2", 3),
         ("Time [s],A\n0.1,0\n0.2,1,1\n", "3 cells in a row of 2", 3),

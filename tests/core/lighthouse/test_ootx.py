@@ -164,6 +164,18 @@ def test_repetitions_tell_missing_bits() -> None:
         assert min(f.missed for f in found) > ootx.MOST_SOLVED
 
 
+@pytest.mark.parametrize("repeats", [2, 3, 6, 20])
+def test_where_no_frame_is_right_the_majority_is_asked(repeats: int) -> None:
+    """A wrong bit in each frame, none twice; of two that differ, both values are tried."""
+    place = 18 + 17 + 17 * np.arange(20) + np.random.default_rng(repeats).integers(0, 16, 20)
+    stream = np.tile(ootx.encode(STATION), (repeats, 1))
+    stream[np.arange(repeats), place[:repeats]] ^= 1
+    found = ootx.frames(stream.ravel())
+    assert len(found) == repeats
+    right = [(f.payload, f.missed) for f in found if f.right]
+    assert right == [(STATION, 1 if repeats > 2 else 2)]
+
+
 def test_a_frame_that_changes_is_not_mixed_with_the_old_one() -> None:
     other = bytearray(STATION)
     other[14] ^= 3  # it fell out of step
