@@ -74,12 +74,12 @@ static void make_wave(void)
 
 /* Mean levels of all chips of a burst; returns how many there are. time holds its edges in chips
  * from the first one, sign the first one's direction; begin answers where the grid starts. */
-static int chips_of(const double *time, int edges, float sign, int longest, double *begin,
+HOT static int chips_of(const double *time, int edges, float sign, int longest, double *begin,
                     float *mean)
 {
     double sums[2][2] = {{0, 0}, {0, 0}};
     for (int k = 0; k < edges; k++) {
-        const int at = (int)((time[k] - floor(time[k])) * TURN + 0.5) & (TURN - 1);
+        const int at = (int)((time[k] - (double)(int)time[k]) * TURN + 0.5) & (TURN - 1);
         sums[k & 1][0] += wave[at + TURN / 4];
         sums[k & 1][1] += wave[at];
     }
@@ -177,8 +177,9 @@ PyObject *light_bits(PyObject *self, PyObject *args)
         start[i] = 0;
         if (readable[i]) {
             const int64_t origin = tick[first[i]];
+            const double chips_per_tick = 1 / chip;
             for (int64_t k = 0; k < edges; k++)
-                time[k] = (double)(tick[first[i] + k] - origin) / chip;
+                time[k] = (double)(tick[first[i] + k] - origin) * chips_per_tick;
             double begin;
             int odd;
             const int chips = chips_of(time, (int)edges, rises[i] ? 1.0f : -1.0f, longest, &begin, mean);
@@ -196,100 +197,87 @@ PyObject *light_bits(PyObject *self, PyObject *args)
 
 #define REGISTER 17
 #define LENGTH 131071
+#define CERTAIN 64
 
 typedef struct {
     const int32_t *states, *index, *taps, *match, *miss;
-    int polynomials, unknown;
+    int polynomials, unknown, follow;
+    int32_t gain[2][2 * CERTAIN + 1]; /* evidence of a soft bit where a zero, a one is expected */
 } Tables;
 
-/* Row of one place: polynomial, place, score, begin, end, known, wrong. */
-static void score_place(const Tables *t, const int8_t *value, int bits, int polynomial, int place,
-                        int32_t *row)
-{
-    const int32_t *states = t->states + (size_t)polynomial * LENGTH;
-    int64_t total = 0, low = 0, best = 0;
-    int low_at = 0, begin = 0, end = 0, at = place, left = 0;
-    int32_t ahead = 0;
-    for (int k = 0; k < bits; k++) {
-        if (!left) {
-            ahead = states[at];
-            at += REGISTER;
-            if (at >= LENGTH) at -= LENGTH;
-            left = REGISTER;
-        }
-        const int expected = ahead >> --left & 1;
-        const int strength = value[k] < 0 ? -value[k] : value[k];
-        total += (value[k] > 0) == expected ? t->match[strength] : t->miss[strength];
-        if (total < low) {
-            low = total;
-            low_at = k + 1;
-        }
-        if (total - low > best) {
-            best = total - low;
-            begin = low_at;
-            end = k + 1;
-        }
-    }
-    int known = 0, wrong = 0;
-    for (int k = begin; k < end; k++) {
-        const int strength = value[k] < 0 ? -value[k] : value[k];
-        if (strength <= t->unknown) continue;
-        const int64_t here = ((int64_t)place + k) % LENGTH;
-        known++;
-        wrong += (value[k] > 0) != (states[here] >> (REGISTER - 1) & 1);
-    }
-    row[0] = polynomial;
-    row[1] = place;
-    row[2] = (int32_t)best;
-    row[3] = begin;
-    row[4] = end;
-    row[5] = known;
-    row[6] = wrong;
-}
-
-/* Bits of a burst as words, the first bit highest. */
+/* Bits of a burst as words, the first bit highest, with nothing before the first so that the last
+ * word is full; for each word also the words of bits that came one, two, ... seventeen before. */
 typedef struct {
-    uint64_t *hard, *open; /* open: bits that follow from nothing, as one of 18 is unknown */
-    int bits, words;
+    uint64_t (*before)[REGISTER + 1];
+    uint64_t *open; /* bits that follow from nothing, as one of the 18 is unknown */
+    uint8_t *expected;
+    int bits, words, empty; /* empty: places of the first word before the first bit */
 } Text;
 
 static void write_text(const Tables *t, const int8_t *value, int bits, Text *text)
 {
-    const int words = (bits + 63) / 64;
-    int sure = 0, ones = 0;
+    int sure = 0, ones = 0, next = 0;
+    uint64_t last = 0;
     text->bits = bits;
-    text->words = words;
-    for (int w = 0; w < words; w++) {
-        uint64_t hard = 0, open = 0;
-        for (int k = 64 * w; k < 64 * w + 64; k++) {
-            const int soft = k < bits ? value[k] : 0;
-            const int strength = soft < 0 ? -soft : soft;
-            sure = strength > t->unknown ? sure + 1 : 0;
-            hard = hard << 1 | (soft > 0);
+    text->words = (bits + 63) / 64;
+    text->empty = 64 * text->words - bits;
+    for (int w = 0; w < text->words; w++) {
+        const int to = 64 * (w + 1) - text->empty;
+        uint64_t hard = 0, open = ~0ull;
+        for (; next < to; next++) {
+            const int soft = value[next], one = soft > 0;
+            const int known = soft > t->unknown || soft < -t->unknown;
+            sure = known ? sure + 1 : 0;
+            hard = hard << 1 | (uint64_t)one;
             /* The 17 before must hold a one: state 0 follows from itself. */
-            open = open << 1 | (sure <= REGISTER || ones <= 0);
-            ones = soft > 0 ? REGISTER : ones - 1;
+            open = open << 1 | (uint64_t)((sure <= REGISTER) | (ones <= 0));
+            ones = one ? REGISTER : ones - 1;
         }
-        text->hard[w] = hard;
+        text->before[w][0] = hard;
+        for (int k = 1; k <= REGISTER; k++) text->before[w][k] = hard >> k | last << (64 - k);
         text->open[w] = open;
+        last = hard;
     }
 }
 
-static inline uint64_t word_before(const uint64_t *words, int w, int by)
+/* Bits of a word that do not follow from the 17 before each. */
+static inline uint64_t strangers(const Text *text, uint32_t taps, int w)
 {
-    return words[w] >> by | (w ? words[w - 1] << (64 - by) : 0);
+    uint64_t bad = text->before[w][0];
+    for (; taps; taps &= taps - 1) bad ^= text->before[w][1 + __builtin_ctz(taps)];
+    return bad | text->open[w];
+}
+
+/* The polynomial under which most bits of a word follow from those before, the first of equals. */
+HOT static int likeliest(const Tables *t, const Text *text, int w)
+{
+    int best = 0, fewest = 65;
+    for (int p = 0; p < t->polynomials; p++) {
+        const int number = __builtin_popcountll(strangers(text, (uint32_t)t->taps[p], w));
+        best = number < fewest ? p : best;
+        fewest = number < fewest ? number : fewest;
+    }
+    return best;
 }
 
 /* Where the longest run of bits begins that follow from the 17 before each, the first of equals,
- * among the words from first to last; answers its length. */
-static int longest_run(const Text *text, uint32_t taps, int first, int last, int *begin)
+ * among the words from first to last; answers its length, or 0 where none is long enough. */
+static int longest_run(const Tables *t, const Text *text, int polynomial, int first, int last,
+                       int *begin)
 {
+    const uint32_t taps = (uint32_t)t->taps[polynomial];
     int longest = 0, from = 64 * first;
+    uint64_t before = 0;
     for (int w = first; w < last; w++) {
-        uint64_t bad = text->hard[w];
-        for (uint32_t left = taps; left; left &= left - 1)
-            bad ^= word_before(text->hard, w, 1 + __builtin_ctz(left));
-        bad |= text->open[w];
+        uint64_t bad = strangers(text, taps, w);
+        /* Two words that hold no run of four need no look at each bit. */
+        uint64_t good = ~bad, run = good & (good >> 1 | before << 63);
+        run &= run >> 2 | (before & before << 1) << 62;
+        before = good;
+        if (!run && w + 1 < last) {
+            from = 64 * w + 64 - (good ? __builtin_ctzll(bad) : 0);
+            continue;
+        }
         while (bad) {
             const int place = __builtin_clzll(bad), at = 64 * w + place;
             if (at - from > longest) {
@@ -304,31 +292,71 @@ static int longest_run(const Text *text, uint32_t taps, int first, int last, int
         longest = 64 * last - from;
         *begin = from;
     }
-    return longest;
+    return longest < t->follow ? 0 : longest;
 }
 
-/* Place of the first bit, if the 17 bits before bit k stand in the sequence of a polynomial. */
+/* Place of the first bit, if the 17 bits before place k of the words stand in the sequence of a
+ * polynomial. */
 static int place_of(const Tables *t, const Text *text, int polynomial, int k)
 {
-    const int last = k - 1, w = last / 64, over = 63 - last % 64;
-    uint64_t state = text->hard[w] >> over;
-    if (w && over > 64 - REGISTER) state |= text->hard[w - 1] << (64 - over);
+    const uint64_t state =
+        k % 64 ? text->before[k / 64][0] >> (64 - k % 64) : text->before[k / 64 - 1][0];
+    const uint64_t more = k % 64 && k / 64 ? text->before[k / 64 - 1][0] << k % 64 : 0;
     const int32_t index =
-        t->index[(size_t)polynomial * (LENGTH + 1) + (state & ((1 << REGISTER) - 1))];
-    const int place = (index - (k - REGISTER)) % LENGTH;
+        t->index[(size_t)polynomial * (LENGTH + 1) + ((state | more) & LENGTH)];
+    const int place = (index - (k - text->empty - REGISTER)) % LENGTH;
     return place < 0 ? place + LENGTH : place;
 }
 
-/* light_places(value, first, states, index, taps, polynomials, match, miss, unknown, follow,
+/* Row of one place: polynomial, place, score, begin, end, known, wrong. */
+static void score_place(const Tables *t, const int8_t *value, Text *text, int polynomial,
+                        int place, int32_t *row)
+{
+    const int32_t *states = t->states + (size_t)polynomial * LENGTH;
+    uint8_t *expected = text->expected;
+    for (int k = 0, at = place; k < text->bits; k += REGISTER) {
+        const int32_t ahead = states[at];
+        for (int j = 0; j < REGISTER; j++) expected[k + j] = ahead >> (REGISTER - 1 - j) & 1;
+        at += REGISTER;
+        if (at >= LENGTH) at -= LENGTH;
+    }
+    int32_t total = 0, low = 0, best = 0;
+    int low_at = 0, begin = 0, end = 0;
+    for (int k = 0; k < text->bits; k++) {
+        total += t->gain[expected[k]][value[k] + CERTAIN];
+        low_at = total < low ? k + 1 : low_at;
+        low = total < low ? total : low;
+        const int higher = total - low > best;
+        best = higher ? total - low : best;
+        begin = higher ? low_at : begin;
+        end = higher ? k + 1 : end;
+    }
+    int known = 0, wrong = 0;
+    for (int k = begin; k < end; k++) {
+        const int sure = value[k] > t->unknown || value[k] < -t->unknown;
+        known += sure;
+        wrong += sure & ((value[k] > 0) ^ expected[k]);
+    }
+    row[0] = polynomial;
+    row[1] = place;
+    row[2] = best;
+    row[3] = begin;
+    row[4] = end;
+    row[5] = known;
+    row[6] = wrong;
+}
+
+/* light_places(value, first, states, index, taps, polynomials, match, miss, unknown, follow, steps,
  * fastest, rows) */
 PyObject *light_places(PyObject *self, PyObject *args)
 {
     (void)self;
     Py_buffer b[8];
     Tables t;
-    int follow, fastest;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iy*y*iiiw*", &b[0], &b[1], &b[2], &b[3], &b[4],
-                          &t.polynomials, &b[5], &b[6], &t.unknown, &follow, &fastest, &b[7]))
+    int steps, fastest;
+    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iy*y*iiiiw*", &b[0], &b[1], &b[2], &b[3], &b[4],
+                          &t.polynomials, &b[5], &b[6], &t.unknown, &t.follow, &steps, &fastest,
+                          &b[7]))
         return NULL;
     const int8_t *values = b[0].buf;
     const int64_t *first = b[1].buf;
@@ -337,45 +365,46 @@ PyObject *light_places(PyObject *self, PyObject *args)
     t.taps = b[4].buf;
     t.match = b[5].buf;
     t.miss = b[6].buf;
+    for (int v = -CERTAIN; v <= CERTAIN; v++) {
+        const int size = v < 0 ? -v : v;
+        t.gain[0][v + CERTAIN] = v > 0 ? t.miss[size] : t.match[size];
+        t.gain[1][v + CERTAIN] = v > 0 ? t.match[size] : t.miss[size];
+    }
     int32_t *rows = b[7].buf;
     const Py_ssize_t bursts = b[1].len / (Py_ssize_t)sizeof *first - 1;
     int64_t most = 1;
     for (Py_ssize_t i = 0; i < bursts; i++)
         if (first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
-    Text text = {malloc((size_t)(most / 64 + 1) * 8), malloc((size_t)(most / 64 + 1) * 8), 0, 0};
-    const int stored = text.hard && text.open;
+    const size_t words = (size_t)(most / 64 + 1);
+    Text text = {malloc(words * sizeof *text.before), malloc(words * sizeof *text.open),
+                 malloc((size_t)most + REGISTER), 0, 0, 0};
+    const int stored = text.before && text.open && text.expected;
     for (Py_ssize_t i = 0; stored && i < bursts; i++) {
         const int8_t *value = values + first[i];
         const int bits = (int)(first[i + 1] - first[i]);
         int32_t *row = rows + 7 * i;
-        if (bits < REGISTER + follow) continue;
+        if (bits < REGISTER + t.follow) continue;
         write_text(&t, value, bits, &text);
         /* The word in the middle tells of most bursts; of the others each word is asked. */
-        const int middle = text.words / 2;
-        int best = -1, longest = 0, begin = 0, at = 0;
-        for (int p = 0; p < t.polynomials; p++) {
-            const int run = longest_run(&text, (uint32_t)t.taps[p], middle, middle + 1, &at);
-            if (run > longest) {
-                longest = run;
-                best = p;
-                begin = at;
-            }
-        }
-        if (longest >= follow) {
-            score_place(&t, value, bits, best, place_of(&t, &text, best, begin), row);
-            if (row[2] >= fastest) continue;
+        const int middle = text.words / 2, likely = likeliest(&t, &text, middle);
+        int at = 0;
+        if (longest_run(&t, &text, likely, middle, middle + 1, &at)) {
+            score_place(&t, value, &text, likely, place_of(&t, &text, likely, at), row);
+            /* A bit outside of its stretch can be worth one bit of evidence for another. */
+            const int outside = bits - (row[4] - row[3]);
+            if (row[2] >= fastest && row[2] > outside * steps) continue;
         }
         row[0] = row[1] = -1;
         for (int k = 2; k < 7; k++) row[k] = 0;
         for (int p = 0; p < t.polynomials; p++) {
             int32_t trial[7];
-            const int run = longest_run(&text, (uint32_t)t.taps[p], 0, text.words, &at);
-            if (run < follow) continue;
-            score_place(&t, value, bits, p, place_of(&t, &text, p, at), trial);
+            if (!longest_run(&t, &text, p, 0, text.words, &at)) continue;
+            score_place(&t, value, &text, p, place_of(&t, &text, p, at), trial);
             if (trial[2] > row[2]) memcpy(row, trial, sizeof trial);
         }
     }
-    free(text.hard);
+    free(text.before);
     free(text.open);
+    free(text.expected);
     return done(b, 8, stored);
 }

@@ -133,7 +133,7 @@ def _window_edges(
     tick = np.empty(n * 8 * width, np.int64)
     first, rises = np.empty(n + 1, np.int64), np.empty(n, np.uint8)
     kernels.window_edges(windows, width, tick, first, rises)
-    return tick[: first[-1]].copy(), first, rises.astype(bool)
+    return tick[: first[-1]], first, rises.astype(bool)
 
 
 def window_edges_numpy(

@@ -50,7 +50,8 @@ ERROR_SHARE = 0.2
 """Contradictions allowed among the known bits of the stretch that agrees."""
 
 FASTEST = 45.0
-"""Evidence beyond which no other place is asked (by the compiled twin)."""
+"""Evidence beyond which the compiled twin asks no other place, if the rest of the burst is too
+short for one with more."""
 
 CHUNK = 512
 
@@ -130,6 +131,7 @@ def identify(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
         MISS,
         UNKNOWN,
         FOLLOW,
+        STEPS,
         int(FASTEST * STEPS),
         rows,
     )

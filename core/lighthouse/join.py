@@ -149,7 +149,7 @@ class Growth:
         ]
         best = min(tries, key=lambda t: t.cost)
         away = np.median(np.linalg.norm(points - best.rig.positions[0], axis=1))
-        spread = np.sqrt(np.trace(best.station_covariance[0, :3, :3]))
+        spread = np.sqrt(max(float(np.trace(best.station_covariance[0, :3, :3])), 0.0))
         agrees = np.nanmedian(np.abs(best.residuals)) < twoview.GATE
         return best.rig if agrees and spread < LOOSE * away else None
 

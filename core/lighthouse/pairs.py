@@ -76,7 +76,7 @@ class Pair:
         """Standard deviation of the stations' places, as a share of their distance."""
         spread = np.trace(self.adjustment.station_covariance[:, :3, :3], axis1=1, axis2=2)
         baseline = np.linalg.norm(self.rig.positions[1] - self.rig.positions[0])
-        return float(np.sqrt(np.sum(spread)) / baseline)
+        return float(np.sqrt(max(float(np.sum(spread)), 0.0)) / max(float(baseline), 1e-12))
 
 
 def solve_pair(

@@ -21,7 +21,7 @@ from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from locatk.core.lighthouse.solver import Job
+    from locatk.core.lighthouse.job import Job
 
 Array = NDArray[np.float64]
 

@@ -6,6 +6,7 @@ rejected where they do not; each is counted under its reason.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ from locatk.core.lighthouse.epochs import Epochs, angles_of
 from locatk.core.lighthouse.floor_map import locate_on_map
 from locatk.core.lighthouse.locate import Fixes, locate
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.selection import evenly
+from locatk.core.lighthouse.verification import MOST, StationCheck, verify, wrong_station
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -45,6 +48,9 @@ above what a generic calibration leaves unmodelled."""
 
 REACH_M = 20.0
 """Base stations are not received farther away, in metres."""
+
+FEW = 20_000
+"""Moments among which those to verify a known scene with are looked for, at most."""
 
 CONTRADICTED = 0.2
 """Share of moments that contradict the scene from which on it needs a word: occlusions,
@@ -102,7 +108,7 @@ def answer(job: Job, scene: Scene) -> Solution:
     if guessed and floor_map is None:
         job.facts["calibration_sigma_rad"] = CALIBRATION_SIGMA
         sigma = float(np.hypot(sigma, CALIBRATION_SIGMA))
-    checks = _verified(job, rig, floor, good) if floor_map is None else ()
+    checks = _verified(job, rig, floor) if floor_map is None else ()
     covariance = fixes.covariance(sigma, floor is not None)
     trajectories = []
     for k, name in enumerate(job.epochs.devices):
@@ -128,18 +134,37 @@ def answer(job: Job, scene: Scene) -> Solution:
     )
 
 
-def _verified(
-    job: Job, rig: Stations, floor: float | None, good: NDArray[np.bool_]
-) -> tuple[StationCheck, ...]:
+def _verified(job: Job, rig: Stations, floor: float | None) -> tuple[StationCheck, ...]:
     """Check each station on what took no part in solving the scene, and name a wrong one."""
-    if job.verified is None:
+    angles, held_out = job.verified, job.held_out
+    if angles is None:
         # What is rejected may be what tells of a wrong station: any moment is a witness.
-        seen = np.isfinite(job.angles).all(axis=2)
-        many = np.flatnonzero(np.count_nonzero(seen, axis=1) > (1 if floor is not None else 2))
-        rows = many if len(many) >= MOST else np.flatnonzero(good)
-    else:
-        job_angles = job.verified
+        seen = _sights(job.angles)
+        rows = np.flatnonzero(np.count_nonzero(seen, axis=1) > 1)
+        rows = rows[:: 1 + len(rows) // FEW]
+        angles, held_out = job.angles[evenly(seen, rows, MOST)], True
+    if angles.shape[1] < 2 or len(angles) == 0:
+        return ()
+    angles = angles[evenly(_sights(angles), np.arange(len(angles)), MOST)]
+    checks = verify(angles, job.epochs.channels.tolist(), *rig, floor_z=floor)
+    job.facts["verification"] = {
+        "held_out": held_out,
+        "moments": len(angles),
+        "stations": [check.as_facts() for check in checks],
+    }
+    wrong = wrong_station(checks)
+    if wrong is not None and wrong.residual_rad is not None:
+        job.notes.append(
+            f"station on channel {wrong.channel} is {1e3 * wrong.residual_rad:.1f} mrad from where "
+            "the others see the photodiodes, and they agree without it: it was moved since, or is "
+            "seen by reflection"
+        )
     return checks
+
+
+def _sights(angles: Array) -> NDArray[np.bool_]:
+    """(m, s) whether each station was seen."""
+    return np.asarray(np.isfinite(angles).any(axis=2))
 
 
 def _gate(fixes: Fixes) -> float:
@@ -264,6 +289,7 @@ def detections(
     stations: dict[int, Station],
     residual: Array | None = None,
     good: NDArray[np.bool_] | None = None,
+    checks: Sequence[StationCheck] = (),
 ) -> list[dict[str, object]]:
     """What was seen of each station, for ``--json`` (docs/formats.md)."""
     seen = np.isfinite(epochs.counts)
@@ -282,5 +308,8 @@ def detections(
         }
         if residual is not None and good is not None:
             row["residual_rad"] = robust_sigma(residual[good][:, i])
+        if checks:
+            row["verification_rad"] = checks[i].residual_rad
+            row["verification_m"] = checks[i].residual_m
         rows.append(row)
     return rows

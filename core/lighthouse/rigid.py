@@ -139,6 +139,7 @@ def solve_rigid(
     answer.trajectories = tuple(f.trajectory for _, f in parts)
     _account(answer, parts, channels)
     _remark(answer, parts)
+    _remark_stations(answer)
     return answer
 
 
@@ -162,6 +163,16 @@ def _account(
     answer.facts["station_residual_rad"] = {
         str(c): robust_sigma(r) for c, r in answer.residuals.items()
     }
+
+
+def _remark_stations(answer: RigidAnswer) -> None:
+    """Stations that most poses do without."""
+    wrong = [c for c, used in answer.used.items() if used < answer.unused[c]]
+    if wrong and len(wrong) < len(answer.used) and any(len(t) for t in answer.trajectories):
+        answer.notes.append(
+            f"most sweeps of the station on channel {', '.join(map(str, wrong))} contradict the "
+            "other stations: it was moved since the scene was solved, or it is seen by a mirror"
+        )
 
 
 def _remark(answer: RigidAnswer, parts: list[tuple[DeviceSweeps, Followed]]) -> None:

@@ -142,6 +142,7 @@ def fit(
     rates: bool = True,
     iterations: int = 30,
     settled: float = 1e-4,
+    lost: float = np.inf,
 ) -> Fit:
     """Poses at which the sweeps' angles fit best, from starting values.
 
@@ -160,6 +161,9 @@ def fit(
     settled : float
         Gain of a step, in parts of the cost, from which on a moment is done; the step after
         it would gain about the square of that.
+    lost : float
+        Residual in radians from which on a sweep does not count at all: a hundred of a moved
+        station pull, however little each. Starting values must be better than this.
 
     Returns
     -------
@@ -174,7 +178,9 @@ def fit(
     def evaluate(rows: NDArray[np.int64], trial: Poses) -> tuple[Array, Array, Array, Array]:
         chosen = looks if len(rows) == m else looks.take(rows)
         missed, gradient = linearise(chosen, stations, trial)
-        return _normal(chosen, trial, missed / sigma, gradient / sigma, width[rows], rates)
+        return _normal(
+            chosen, trial, missed / sigma, gradient / sigma, width[rows], rates, lost / sigma
+        )
 
     open_ = np.arange(m)
     residual[:], information[:], right[:], cost[:] = evaluate(open_, poses)
@@ -244,12 +250,19 @@ def _turned(vectors: Array, turns: Array) -> Array:
 
 
 def _normal(
-    looks: Looks, poses: Poses, missed: Array, gradient: Array, width: Array, rates: bool
+    looks: Looks,
+    poses: Poses,
+    missed: Array,
+    gradient: Array,
+    width: Array,
+    rates: bool,
+    gate: float,
 ) -> tuple[Array, Array, Array, Array]:
     """Residuals, normal matrices (m, 12, 12), right sides (m, 12) and costs (m,), in sigmas."""
     lost = looks.seen & ~np.isfinite(missed)
     missed = np.where(lost, UNSEEN, np.nan_to_num(missed))
-    ratio = (missed / width) ** 2
+    lost |= np.abs(missed) > gate
+    ratio = (np.minimum(np.abs(missed), gate) / width) ** 2
     weight = np.where(looks.seen & ~lost, 1.0 / (1.0 + ratio), 0.0)
     cost = 0.5 * width[:, 0] ** 2 * np.sum(np.log1p(ratio), axis=1, where=looks.seen)
     root = np.sqrt(weight)[..., None]

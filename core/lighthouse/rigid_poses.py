@@ -27,6 +27,7 @@ from locatk.core.lighthouse.rigid_sweeps import DeviceSweeps, windows
 from locatk.core.lighthouse.rigid_waves import (
     BLOCK,
     FAILED,
+    LOST,
     SOLVED,
     Track,
     enough,
@@ -211,6 +212,7 @@ def _refit(
             soft=soft,
             iterations=iterations,
             settled=1e-3,
+            lost=LOST,
         )
         residual = np.full((len(rows), wide), np.nan)
         residual[:, : looks.angle.shape[1]] = found.residual

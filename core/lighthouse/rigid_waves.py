@@ -8,13 +8,13 @@ less certain anchor is taken back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.pnp import SOFT, candidates, lit_from_behind
-from locatk.core.lighthouse.poses import COUNT_SIGMA, GATE
+from locatk.core.lighthouse.poses import COUNT_SIGMA, FINEST_GATE, GATE
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.rigid_fit import Looks, Poses, Stations, fit, places
 from locatk.core.lighthouse.rigid_sweeps import DeviceSweeps, Windows, looks_of
@@ -37,6 +37,9 @@ BLOCK = 256
 
 DISAGREE = 0.35
 """Turn in radians between two neighbours, beyond their rates, that no motion explains."""
+
+LOST = 2 * GATE
+"""An angle that misses by more (rad) says nothing of where a device is: 40 mm at two metres."""
 
 READINGS_TRIED = 4
 """Candidates of an anchor that are refined."""
@@ -123,26 +126,34 @@ def _drop_anchors(track: Track, moments: NDArray[np.int64], *, triples: bool) ->
 
 
 def _locate_block(track: Track, moments: NDArray[np.int64], triples: bool) -> None:
-    owner, shifts, turns = [], [], []
+    owner, origins, shifts, turns = [], [], [], []
     for i, moment in enumerate(moments):
-        for shift, turn in scene_candidates(track, int(moment), triples):
+        for origin, shift, turn in scene_candidates(track, int(moment), triples):
             owner.append(i)
+            origins.append(origin)
             shifts.append(shift)
             turns.append(turn)
     if not owner:
         return
     start = Poses.at_rest(np.stack(shifts), np.stack(turns))
     whose = np.array(owner)
-    # Rough costs leave the best few of each moment.
     looks = track.looks(moments)
-    rough = fit(looks.take(whose), track.stations, start, sigma=SOFT, soft=SOFT, iterations=0)
-    order = np.lexsort((rough.cost, whose))
+    # First under the station it comes from, with its motion; then all stations say which few
+    # are worth more.
+    alone = looks.take(whose)
+    alone = replace(alone, seen=alone.seen & (alone.station == np.array(origins)[:, None]))
+    start = fit(alone, track.stations, start, sigma=COUNT_SIGMA, soft=SOFT, settled=0.03).poses
+    rough = fit(
+        looks.take(whose), track.stations, start, sigma=COUNT_SIGMA, soft=SOFT, iterations=0
+    )
+    order = np.lexsort((_score(rough.residual, looks.seen[whose], GATE), whose))
     rank = np.arange(len(order)) - np.searchsorted(whose[order], whose[order])
     chosen = order[rank < READINGS_TRIED]
     whose = whose[chosen]
     found = fit(looks.take(whose), track.stations, start.take(chosen), sigma=COUNT_SIGMA, soft=SOFT)
     good = accepted(looks.take(whose), found.residual)
-    cost = found.cost + 1e6 * (from_behind(track, moments[whose], found.poses) > 0.3)
+    cost = _score(found.residual, looks.seen[whose], FINEST_GATE)
+    cost += 1e6 * (from_behind(track, moments[whose], found.poses) > 0.3)
     for i in np.unique(whose[good]):
         rows = np.flatnonzero(good & (whose == i))
         rows = rows[np.argsort(cost[rows])]
@@ -156,8 +167,18 @@ def _locate_block(track: Track, moments: NDArray[np.int64], triples: bool) -> No
         track.margin.append(margin)
 
 
-def scene_candidates(track: Track, moment: int, triples: bool) -> list[tuple[Array, Array]]:
-    """Rough poses of the device in the scene, from each station alone."""
+def _score(residual: Array, seen: NDArray[np.bool_], gate: float) -> Array:
+    """(m,) half sums of squares, in sigmas, cut off at ``gate``.
+
+    Where a station was moved, a pose that meets the others exactly is better than one that
+    misses all a little; a loss that grows without bound would not say so.
+    """
+    ratio = np.minimum(np.nan_to_num(np.abs(residual), nan=gate) / gate, 1.0)
+    return np.asarray(0.5 * (gate / COUNT_SIGMA) ** 2 * np.sum(ratio**2, axis=1, where=seen))
+
+
+def scene_candidates(track: Track, moment: int, triples: bool) -> list[tuple[int, Array, Array]]:
+    """Rough poses of the device in the scene, each with the station that it comes from."""
     sweep = track.around.sweep[moment]
     sweep = sweep[sweep >= 0]
     mine = track.mine.take(sweep)
@@ -166,7 +187,7 @@ def scene_candidates(track: Track, moment: int, triples: bool) -> list[tuple[Arr
     for i in np.unique(mine.station):
         angles = mean_angles(mine.take(mine.station == i), len(track.receiver))
         for shift, turn in candidates(angles, track.receiver, calibrations[i], triples=triples):
-            found.append((positions[i] + rotations[i] @ shift, rotations[i] @ turn))
+            found.append((int(i), positions[i] + rotations[i] @ shift, rotations[i] @ turn))
     return found
 
 
@@ -223,7 +244,13 @@ def _solve(track: Track, moments: NDArray[np.int64], start: Poses) -> NDArray[np
         rows = np.arange(k, min(k + BLOCK, len(moments)))
         looks = track.looks(moments[rows])
         found = fit(
-            looks, track.stations, start.take(rows), sigma=COUNT_SIGMA, soft=SOFT, settled=0.03
+            looks,
+            track.stations,
+            start.take(rows),
+            sigma=COUNT_SIGMA,
+            soft=SOFT,
+            settled=0.03,
+            lost=LOST,
         )
         good[rows] = accepted(looks, found.residual)
         fine = good[rows]

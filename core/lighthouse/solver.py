@@ -19,6 +19,7 @@ from locatk.core.trajectory import Trajectory
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 METHODS = ("bundle", "paper")
 
+
 @dataclass(frozen=True)
 class SolveOptions:
     """What the user may choose.

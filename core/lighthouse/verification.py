@@ -134,11 +134,14 @@ def verify(
 def wrong_station(checks: Sequence[StationCheck]) -> StationCheck | None:
     """The station that contradicts all others, which agree without it; None where there is
     none, or where fewer than three are there to tell."""
-    told = [c for c in checks if c.without_rad is not None and c.against == "others"]
+    told = sorted(
+        (c.without_rad, k)
+        for k, c in enumerate(checks)
+        if c.without_rad is not None and c.against == "others"
+    )
     if len(told) < 3:
         return None
-    told.sort(key=lambda c: c.without_rad or 0.0)
-    first, second = told[:2]
-    assert first.without_rad is not None and second.without_rad is not None
-    stands_out = first.without_rad < WRONG_SHARE * second.without_rad
-    return first if stands_out and (first.residual_rad or 0.0) > WRONG_RAD else None
+    (best, k), (second, _) = told[:2]
+    residual = checks[k].residual_rad
+    stands_out = best < WRONG_SHARE * second and residual is not None and residual > WRONG_RAD
+    return checks[k] if stands_out else None

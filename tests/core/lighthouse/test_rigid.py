@@ -283,6 +283,7 @@ def test_a_station_that_was_moved_shows() -> None:
     assert np.percentile(np.linalg.norm(off[:, :3], axis=1), 95) < 1e-3
     assert answer.used[8] < 0.2 * answer.unused[8]
     assert answer.unused[1] < 0.1 * answer.used[1]
+    assert any("channel 8 contradict" in note for note in answer.notes)
 
 
 def test_a_mirrored_receiver_is_told() -> None:
@@ -332,7 +333,7 @@ def test_a_pause_and_far_times_cost_nothing() -> None:
     later = sweeps.time_ns + np.where(sweeps.time_ns - START_NS > 250_000_000, 10**17, 0)
     answer = solve_rigid(replace(sweeps, time_ns=later), {"device": TRACKER}, Scene(ROOM))
     assert 20 <= len(answer.trajectories[0]) <= 30
-    assert np.abs(errors(answer, standing)[:, :3]).max() < 1e-3
+    assert normalised(answer, standing) < 1.5
 
 
 def test_the_recorded_tracker_stands_where_libsurvive_saw_it(data: Path) -> None:
@@ -344,7 +345,7 @@ def test_the_recorded_tracker_stands_where_libsurvive_saw_it(data: Path) -> None
     truth = session.truth[0]
     # Ten seconds after its first poses, when libsurvive had settled.
     since = session.sweeps.time_ns - truth.time_ns[0]
-    chosen = (since > 12_000_000_000) & (since < 18_000_000_000)
+    chosen = (since > 12_000_000_000) & (since < 15_000_000_000)
     sweeps = Sweeps(
         session.sweeps.devices,
         *(
@@ -356,7 +357,7 @@ def test_the_recorded_tracker_stands_where_libsurvive_saw_it(data: Path) -> None
     )  # fmt: skip
     answer = solve_rigid(sweeps, session.receivers, session.scene)
     (track,) = answer.trajectories
-    assert len(track) > 295
+    assert len(track) > 145
     at = np.searchsorted(truth.time_ns, track.time_ns)
     away = np.linalg.norm(track.position - truth.position[at], axis=1)
     turned = np.swapaxes(matrix_from_quaternion(truth.quaternion[at]), 1, 2)

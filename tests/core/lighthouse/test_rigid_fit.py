@@ -1,0 +1,160 @@
+"""Derivatives of the rigid model, numerically, and the fit from poor starts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.geometry import rotation_exp, rotation_log
+from locatk.core.lighthouse import rigid_bundle
+from locatk.core.lighthouse.calibration import predict_angles
+from locatk.core.lighthouse.generic import GENERIC
+from locatk.core.lighthouse.rigid_bundle import adjust_rigid
+from locatk.core.lighthouse.rigid_fit import Looks, Poses, Stations, fit, linearise, places
+
+Array = NDArray[np.float64]
+
+STATIONS: Stations = (
+    np.array([[-2.0, 0.0, 1.0], [0.3, -2.0, 1.2]]),
+    rotation_exp(np.array([[0.0, 0.3, 0.1], [0.1, 0.2, 1.5]])),
+    (GENERIC, GENERIC),
+)
+
+
+def world(moments: int, sweeps: int, *, seed: int = 0, noise: float = 0.0) -> tuple[Looks, Poses]:
+    """Sweeps of moving devices, and their true poses."""
+    rng = np.random.default_rng(seed)
+    poses = Poses(
+        rng.uniform(-0.3, 0.3, (moments, 3)) + [0.0, 0.0, 0.3],
+        rotation_exp(rng.normal(0, 1, (moments, 3))),
+        rng.normal(0, 1, (moments, 6)) * np.repeat([0.5, 2.0], 3),
+    )
+    shape = (moments, sweeps)
+    looks = Looks(
+        rng.uniform(-0.05, 0.05, (*shape, 3)),
+        rng.integers(0, 2, shape),
+        rng.integers(0, 2, shape),
+        np.zeros(shape),
+        rng.uniform(-0.02, 0.02, shape),
+        rng.random(shape) < 0.9,
+    )
+    angle = np.zeros(shape)
+    for m, n in np.ndindex(shape):
+        i, since = looks.station[m, n], looks.since_s[m, n]
+        rotation = rotation_exp(poses.rate[m, 3:] * since) @ poses.rotation[m]
+        place = poses.position[m] + poses.rate[m, :3] * since + rotation @ looks.place[m, n]
+        local = (place - STATIONS[0][i]) @ STATIONS[1][i]
+        angle[m, n] = predict_angles(local, STATIONS[2][i])[looks.plane[m, n]]
+    angle += rng.normal(0, noise, shape) if noise else 0.0
+    angle[~looks.seen] = 99.0
+    return Looks(looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen), poses
+
+
+def test_the_model_meets_its_own_world() -> None:
+    looks, poses = world(3, 20)
+    missed, _ = linearise(looks, STATIONS, poses)
+    assert np.abs(missed[looks.seen]).max() < 1e-12
+    assert np.all(np.isnan(missed[~looks.seen]))
+    lever, place = places(looks, poses)
+    assert np.linalg.norm(lever, axis=-1) == pytest.approx(np.linalg.norm(looks.place, axis=-1))
+
+
+def test_derivatives_are_those_of_small_steps() -> None:
+    looks, poses = world(3, 20)
+    # At rest, so that pose and sweep share their time; rates enter as steps times time.
+    poses = Poses.at_rest(poses.position, poses.rotation)
+    _, gradient = linearise(looks, STATIONS, poses)
+    for k in range(12):
+        step = np.zeros((3, 12))
+        step[:, k] = 1e-5
+        ahead, _ = linearise(looks, STATIONS, poses.stepped(step))
+        behind, _ = linearise(looks, STATIONS, poses.stepped(-step))
+        numeric = ((ahead - behind) / 2e-5)[looks.seen]
+        analytic = gradient[..., k % 6] * (looks.since_s if k >= 6 else 1.0)
+        assert numeric == pytest.approx(analytic[looks.seen], abs=1e-7)
+
+
+def test_the_fit_comes_back_from_a_poor_start() -> None:
+    looks, true = world(40, 40)
+    rng = np.random.default_rng(1)
+    start = Poses.at_rest(
+        true.position + rng.normal(0, 0.05, (40, 3)),
+        rotation_exp(rng.normal(0, 0.2, (40, 3))) @ true.rotation,
+    )
+    found = fit(looks, STATIONS, start, sigma=1e-4, soft=3e-3)
+    assert np.abs(found.poses.position - true.position).max() < 2e-5
+    turn = rotation_log(found.poses.rotation @ np.swapaxes(true.rotation, 1, 2))
+    assert np.abs(turn).max() < 1e-3
+    assert found.poses.rate == pytest.approx(true.rate, abs=0.1)
+    assert np.all(np.isnan(found.residual) == ~looks.seen)
+
+
+def test_lost_sweeps_pull_nothing() -> None:
+    looks, true = world(5, 60)
+    angle = looks.angle.copy()
+    angle[:, ::3] += 0.05
+    bent = Looks(looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen)
+    pulled = fit(bent, STATIONS, true, sigma=1e-4, soft=3e-3)
+    exact = fit(bent, STATIONS, true, sigma=1e-4, soft=3e-3, lost=0.02)
+    assert np.abs(exact.poses.position - true.position).max() < 2e-5
+    assert np.abs(pulled.poses.position - true.position).max() > 2e-5
+
+
+def test_the_gradient_of_the_joint_adjustment_is_that_of_its_cost() -> None:
+    looks, poses = world(4, 30, noise=1e-3)
+    share, free = np.array([1.0, 0.5, 0.25, 1.0]), np.array([True, True])
+    bent = tuple(rigid_bundle._bent(c, np.array([1e-3, -2e-3, 0.0, 1e-3])) for c in STATIONS[2])
+    stations = (STATIONS[0], STATIONS[1], bent)
+
+    def system(change: Array, by_pose: Array) -> rigid_bundle._System:
+        moved = (
+            stations[0] + change[:, :3],
+            rotation_exp(change[:, 3:6]) @ stations[1],
+            tuple(
+                rigid_bundle._bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)
+            ),
+        )
+        return rigid_bundle._linearise(
+            looks, moved, poses.stepped(by_pose), 1e-3, 3e-3, share, free
+        )
+
+    none, still = np.zeros((2, 10)), np.zeros((4, 12))
+    here = system(none, still)
+    for k in range(20):
+        if k % 10 == 8:
+            continue  # the first phase is the same in every unit and is not estimated
+        step = none.copy()
+        step.flat[k] = 1e-6
+        numeric = (system(step, still).cost - system(-step, still).cost) / 2e-6
+        assert numeric == pytest.approx(here.stations_rhs[k], rel=1e-4, abs=1e-2)
+    for k in range(6):  # by rates it is exact at rest only
+        step = still.copy()
+        step[2, k] = 1e-6
+        numeric = (system(none, step).cost - system(none, -step).cost) / 2e-6
+        assert numeric == pytest.approx(here.poses_rhs[2, k], rel=1e-4, abs=1e-2)
+
+
+def test_the_adjustment_finds_a_station_that_was_put_wrong() -> None:
+    looks, poses = world(30, 60, noise=1e-4)
+    wrong = STATIONS[0].copy()
+    wrong[1] += [0.05, -0.08, 0.03]
+    turned = STATIONS[1].copy()
+    turned[1] = rotation_exp([0.02, -0.03, 0.01]) @ turned[1]
+    done = adjust_rigid(
+        looks,
+        (wrong, turned, STATIONS[2]),
+        poses,
+        sigma=1e-4,
+        soft=3e-3,
+        share=np.ones(30),
+        calibrate=np.array([False, False]),
+    )
+    off = np.r_[
+        done.stations[0][1] - STATIONS[0][1],
+        rotation_log(done.stations[1][1] @ STATIONS[1][1].T),
+    ]
+    assert np.linalg.norm(off[:3]) < 5e-3
+    assert off @ np.linalg.solve(done.covariance[1], off) < 25
+    assert np.array_equal(done.stations[0][0], STATIONS[0][0])
+    assert not np.any(done.covariance[0])

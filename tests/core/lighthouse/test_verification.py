@@ -1,0 +1,132 @@
+"""Stations against each other, on moments that took no part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.solver import solve
+from locatk.core.lighthouse.verification import StationCheck, verify, wrong_station
+
+Array = NDArray[np.float64]
+NAMES = ("phase", "tilt", "curve", "gibmag", "gibpha", "ogeemag", "ogeephase")
+
+
+def exact(lamps: Any) -> tuple[Array, Array, tuple[Calibration, ...]]:
+    """Where the stations are, with their factory calibrations."""
+    return (
+        np.stack([lamp.position for lamp in lamps]),
+        np.stack([lamp.rotation for lamp in lamps]),
+        tuple(
+            Calibration(np.array([[getattr(p, n) for n in NAMES] for p in lamp.planes]), "factory")
+            for lamp in lamps
+        ),
+    )
+
+
+def seen_by(lamps: Any, points: Array, noise: float, seed: int = 1) -> Array:
+    rng = np.random.default_rng(seed)
+    true = np.stack([lamp.angles(points) for lamp in lamps], axis=1)
+    return true + rng.normal(0, noise, true.shape)
+
+
+def checked(world: Any, channels: tuple[int, ...], *, flat: bool, noise: float = 3e-4,
+            shift: tuple[int, Array] | None = None) -> tuple[StationCheck, ...]:  # fmt: skip
+    lamps = world.lamps(*channels)
+    angles = seen_by(lamps, world.curve(400, flat=flat), noise)
+    positions, rotations, calibrations = exact(lamps)
+    if shift is not None:
+        positions[shift[0]] += shift[1]
+    floor_z = 0.0 if flat else None
+    return verify(angles, channels, positions, rotations, calibrations, floor_z=floor_z)
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_in_a_right_scene_the_residual_is_the_noise(world: Any, flat: bool) -> None:
+    checks = checked(world, (1, 2, 5, 16), flat=flat)
+    assert [c.channel for c in checks] == [1, 2, 5, 16]
+    for check in checks:
+        assert check.against == "others"
+        assert check.moments == 400
+        # Its own noise, and that of where the other three see the place.
+        assert 3e-4 < check.residual_rad < 4.5e-4
+        assert check.residual_m == pytest.approx(3 * check.residual_rad, rel=0.25)  # at 3 m
+        assert 0 < check.jump_median_m < check.jump_95_m < 3e-3
+    assert wrong_station(checks) is None
+
+
+def test_two_stations_in_space_have_only_the_joint_fix(world: Any) -> None:
+    for check in checked(world, (1, 2), flat=False):
+        assert check.against == "joint"
+        assert 0 < check.residual_rad < 3e-4
+        assert check.jump_median_m is None
+        assert check.without_rad is None
+
+
+def test_two_stations_on_a_floor_check_each_other(world: Any) -> None:
+    for check in checked(world, (1, 2), flat=True):
+        assert check.against == "others"
+        assert check.jump_95_m is not None
+
+
+@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("moved", [0, 1, 2, 3])
+def test_a_moved_station_is_found(world: Any, moved: int, flat: bool) -> None:
+    channels = (1, 2, 5, 16)
+    checks = checked(world, channels, flat=flat, shift=(moved, np.array([0.03, -0.02, 0.01])))
+    wrong = wrong_station(checks)
+    assert wrong is not None
+    assert wrong.channel == channels[moved]
+
+
+def test_what_was_never_seen_tells_nothing(world: Any) -> None:
+    lamps = world.lamps(1, 2, 5)
+    angles = seen_by(lamps, world.curve(20, flat=False), 1e-4)
+    angles[:, 2] = np.nan
+    check = verify(angles, (1, 2, 5), *exact(lamps))[2]
+    assert check.moments == 0
+    assert check.residual_rad is None
+    assert check.jump_median_m is None
+
+
+# ---- in a solution
+
+
+def test_solutions_carry_it(world: Any) -> None:
+    lamps = world.lamps(1, 2, 5)
+    drive = world.drive(lamps, world.curve(400, flat=True))
+    solution = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square)))
+    found = solution.facts["verification"]
+    assert found["held_out"]
+    assert found["moments"] == 80  # every fifth
+    assert solution.facts["bundle_points"] == 320
+    assert [s["channel"] for s in found["stations"]] == [1, 2, 5]
+    for row, station in zip(solution.detections, found["stations"], strict=True):
+        assert row["verification_rad"] == station["residual_rad"] < 5e-4
+        assert row["verification_m"] == station["residual_m"] < 2e-3
+
+
+def test_few_places_are_all_needed_and_that_is_told(world: Any) -> None:
+    lamps = world.lamps(1, 2, 5)
+    drive = world.drive(lamps, world.curve(60, flat=True))
+    found = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square))).facts
+    assert not found["verification"]["held_out"]
+    assert found["bundle_points"] == found["verification"]["moments"] == 60
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_a_station_that_was_moved_since_is_named(world: Any, flat: bool) -> None:
+    lamps = world.lamps(1, 2, 5, 16)
+    drive = world.drive(lamps, world.curve(200, flat=flat))
+    scene = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square))).artifact
+    assert not any("moved since" in n for n in solve(drive.sweeps, scene).notes)
+    pushed = replace(lamps[2], position=lamps[2].position + [0.08, 0.0, 0.02])
+    later = world.drive((*lamps[:2], pushed, lamps[3]), world.curve(200, flat=flat), seed=9)
+    (note,) = [n for n in solve(later.sweeps, scene).notes if "agree without it" in n]
+    assert "channel 5 " in note
