@@ -30,7 +30,7 @@ FORMATS = {
         "locatk.formats.importers.dotbot:read_dotbot", "lighthouse", lighthouse.DOTBOT
     ),
     "saleae": Format(
-        "locatk.formats.importers.saleae:read_saleae", "lighthouse", lighthouse.SALEAE
+        "locatk.formats.importers.saleae_session:read_saleae", "lighthouse", lighthouse.SALEAE
     ),
     "libsurvive": Format(
         "locatk.formats.importers.libsurvive:read_libsurvive", "lighthouse", lighthouse.LIBSURVIVE

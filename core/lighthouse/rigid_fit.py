@@ -215,7 +215,11 @@ def fit(
 
 def linearise(looks: Looks, stations: Stations, poses: Poses) -> tuple[Array, Array]:
     """Angles missed (m, n) in radians, and their derivatives (m, n, 6) by shift and turn of
-    the device at the time of each sweep; ``nan`` where no plane meets the photodiode."""
+    the device at the time of each sweep; ``nan`` where no plane meets the photodiode.
+
+    The turn at the moment is taken for that at the sweep's time: within a rotation a device
+    turns little, and the steps only have to lead downhill.
+    """
     lever, place = places(looks, poses)
     missed = np.full(looks.angle.shape, np.nan)
     by_place = np.full((*looks.angle.shape, 3), np.nan)

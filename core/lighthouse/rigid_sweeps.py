@@ -79,7 +79,7 @@ def sweeps_of(
             rejected[reason] = int(np.count_nonzero(~good))
             mine = mine[good]
 
-    keep(np.isin(sweeps.channel[mine], CHANNELS), "channel_unknown")
+    keep(np.isin(sweeps.channel[mine], CHANNELS), "unknown_channel")
     sensor = sweeps.sensor[mine]
     placed = np.append(np.isfinite(receiver.position_m).all(axis=1), False)
     keep(placed[np.where((sensor >= 0) & (sensor < len(receiver)), sensor, -1)], "sensor_unknown")
@@ -87,7 +87,7 @@ def sweeps_of(
     counts = sweeps.count[mine]
     with np.errstate(invalid="ignore"):
         inside = (counts >= 0) & (counts < period_counts(sweeps.channel[mine]))
-    keep(inside, "count_out_of_range")
+    keep(inside, "count_above_period")
     mine = mine[np.argsort(sweeps.time_ns[mine], kind="stable")]
     plane = planes(sweeps.time_ns[mine], sweeps.channel[mine], sweeps.count[mine])
     plane = np.where(sweeps.sweep[mine] == UNKNOWN, plane, sweeps.sweep[mine])
@@ -168,7 +168,9 @@ def windows(mine: DeviceSweeps, every_ns: int, reach_ns: int) -> Windows:
     since = mine.time_ns - mine.time_ns[0]
     stretch, start = np.unique(since // every_ns, return_index=True)
     # The middle of a stretch, or near its first sweep where it is longer than the reach.
-    centre = np.minimum(stretch * every_ns + every_ns // 2, since[start] + reach_ns)
+    first_in = since[start]
+    middle = stretch * every_ns + every_ns // 2
+    centre = np.clip(middle, first_in - reach_ns, first_in + reach_ns)
     first = np.searchsorted(since, centre - reach_ns)
     last = np.searchsorted(since, centre + reach_ns, side="right")
     number = last - first

@@ -95,8 +95,8 @@ class Scene:
     floor_z : float
         Height of the photodiodes in a planar scene, in metres.
     scale : str
-        What fixed the scale: ``"markers"``, ``"distance"``, ``"odometry"`` or ``"unit"``
-        (the distance of the first two stations is 1).
+        What fixed the scale: ``"markers"``, ``"distance"``, ``"odometry"``, ``"device"`` (of
+        known size) or ``"unit"`` (the distance of the first two stations is 1).
     frame : str
         Name of the frame of positions.
     notes : tuple of str

@@ -108,6 +108,7 @@ DEVICES = {
             230_400,
             "locatk.formats.wire.lighthouse_deck:DeckDecoder",
             "locatk.formats.wire.lighthouse_deck:encode",
+            "locatk.formats.receivers:deck_artifacts",
         ),
         Device(
             "dotbot-gateway",

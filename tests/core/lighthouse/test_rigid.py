@@ -270,7 +270,7 @@ def test_reflections_and_junk_are_counted_and_left_out() -> None:
     assert len(off) >= 95
     assert np.percentile(np.linalg.norm(off[:, :3], axis=1), 95) < 0.5e-3
     left_out = sum(
-        answer.rejected.get(r, 0) for r in ("sweep_contradicts_pose", "count_out_of_range")
+        answer.rejected.get(r, 0) for r in ("sweep_contradicts_pose", "count_above_period")
     )
     assert 0.9 * np.count_nonzero(wrong) < left_out < 1.05 * np.count_nonzero(wrong)
 

@@ -1,0 +1,140 @@
+"""A capture of infrared light as a session: sweeps, stations, factory calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from locatk.core.errors import InputError
+from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.light import NANOSECOND
+from locatk.core.lighthouse.receive import Caught, Reception, receive
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.formats.importers.saleae import LightCapture, read_capture
+from locatk.formats.importers.sweeps import ImportedSession
+
+METHODS = ("soft", "paper")
+
+REASONS = {
+    "burst_off_rotor": "disagree with their rotor",
+    "burst_of_doubled_channel": "are of a channel on which two stations send",
+    "burst_not_read": "were not read",
+}
+"""Why a burst gave no sweep, for people."""
+
+
+def read_saleae(
+    paths: Sequence[Path],
+    *,
+    channels: Sequence[int] = (),
+    method: str = "soft",
+    device: str = "photodiode",
+) -> ImportedSession:
+    """Read a capture of photodiodes' data lines into sweeps.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        One capture: its lines are by one clock.
+    channels : sequence of int, optional
+        Of the analyser, in order of the photodiodes; else all that carry light.
+    method : str
+        ``"soft"``: whole bursts, judged by the rotors. ``"paper"``: the published way.
+    device : str
+        Name of the device in the session.
+
+    Raises
+    ------
+    MissingDataError, FormatError, InputError
+        See :func:`~locatk.formats.importers.saleae.read_capture`; and where no light of a base
+        station is in it.
+    """
+    if len(paths) != 1:
+        raise InputError("several captures have no common clock", hint="Import one by one")
+    if method not in METHODS:
+        raise InputError(f"unknown method {method!r}", hint=f"Choose {' or '.join(METHODS)}")
+    capture = read_capture(Path(paths[0]), channels)
+    try:
+        if method == "paper":
+            return _as_paper(capture, device)
+        return _session(capture, receive(capture.edges), device)
+    except InputError as error:
+        raise InputError(error.message, file=capture.file, hint=error.hint) from None
+
+
+def _session(capture: LightCapture, reception: Reception, device: str) -> ImportedSession:
+    facts = capture.facts()
+    bursts = sum(len(reading.bursts) for reading in reception.readings)
+    read = sum(int(np.count_nonzero(reading.read)) for reading in reception.readings)
+    rims = sum(int(np.count_nonzero(reading.beside >= 0)) for reading in reception.readings)
+    facts["bursts"] = f"{bursts:,}, of which {read:,} were read and {rims:,} are rims of those"
+    warnings = [*reception.notes]
+    for reason, words in REASONS.items():
+        number = sum(reading.rejected[reason] for reading in reception.readings)
+        if number:
+            facts[reason] = f"{number:,}"
+            warnings.append(f"{number:,} of {bursts:,} bursts {words}")
+    doubled = sum(reading.rejected["burst_of_doubled_channel"] for reading in reception.readings)
+    return ImportedSession(
+        _sweeps(capture, reception.sweeps, device),
+        _scene(reception.stations),
+        [],
+        facts,
+        warnings,
+        stations=reception.stations,
+        lost=f"{doubled:,} bursts {REASONS['burst_of_doubled_channel']}" if doubled else None,
+    )
+
+
+def _as_paper(capture: LightCapture, device: str) -> ImportedSession:
+    from locatk.core.lighthouse import paper_receive
+
+    caught, bursts = paper_receive.receive(capture.edges)
+    facts = capture.facts()
+    facts["method"] = "paper"
+    facts["bursts"] = f"{bursts:,}, of which {len(caught):,} were decoded"
+    channels, numbers = np.unique(caught.channel, return_counts=True)
+    return ImportedSession(
+        _sweeps(capture, caught, device),
+        None,
+        [],
+        facts,
+        [],
+        stations=tuple(
+            HeardStation(int(channel), sweeps=int(number))
+            for channel, number in zip(channels, numbers, strict=True)
+        ),
+    )
+
+
+def _sweeps(capture: LightCapture, caught: Caught, device: str) -> Sweeps:
+    """Sweeps by the recorder's clock; a capture without a date begins in 1970."""
+    rate, start_ns = capture.edges[0].rate_hz, capture.edges[0].start_ns
+    since_ns = np.rint(caught.tick * (NANOSECOND / rate)).astype(np.int64)
+    if not start_ns and len(since_ns):
+        # Times before a trigger are below zero, which no session holds.
+        start_ns = max(0, -int(since_ns.min()))
+    return Sweeps(
+        devices=(device,),
+        time_ns=start_ns + since_ns,
+        device=np.zeros(len(caught), np.int32),
+        sensor=caught.sensor,
+        channel=caught.channel,
+        polynomial=caught.polynomial,
+        sweep=caught.plane,
+        count=caught.count,
+    )
+
+
+def _scene(stations: Sequence[HeardStation]) -> Scene | None:
+    """What the stations told of themselves, for the solver."""
+    told = [station for station in stations if station.calibration is not None]
+    if not told:
+        return None
+    return Scene(
+        calibrations={s.channel: s.calibration for s in told if s.calibration is not None},
+        ids={s.channel: s.id for s in told if s.id is not None},
+    )
