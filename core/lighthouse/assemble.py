@@ -30,7 +30,8 @@ BUNDLE_POINTS = 1500
 its calibration, and cost time."""
 
 STARTS = 3
-"""Pairs with which to start, at most, of which the firmest is taken."""
+"""Pairs with which to start, at most: the firmest, and the others where that leads to less
+than half of the stations."""
 
 LOOKS, LEAST_LOOK = 12, 20
 """Pairs whose places are looked at to tell a floor from space, at most, and how many places
@@ -135,15 +136,22 @@ def assemble(
     told = planar is not None
     if not told and len(group) > 2 and _fills_space(rays, joint, group, seed):
         planar = False
-    start = _start(joint, group, lambda i, j: pair_of(i, j, planar))
-    facts = {**start.facts, "planar_decided_by": "option" if told else "data"}
+    starts = _starts(joint, group, lambda i, j: pair_of(i, j, planar))
 
     def neighbours(i: int, j: int) -> Pair | None:
-        pair = pair_of(i, j, start.planar)
+        pair = pair_of(i, j, starts[0].planar)
         return pair if isinstance(pair, Pair) else None
 
-    growth = Growth(angles, rays, calibrations, start, sigma)
-    left_out = growth.add_all(neighbours)
+    grown: list[tuple[Growth, Pair, dict[int, str]]] = []
+    for start in starts:
+        if any({*start.columns} <= {*growth.known} for growth, _, _ in grown):
+            continue
+        growth = Growth(angles, rays, calibrations, start, sigma)
+        grown.append((growth, start, growth.add_all(neighbours)))
+        if 2 * len(growth.known) > len(group):
+            break
+    growth, start, left_out = max(grown, key=lambda g: len(g[0].known))
+    facts = {**start.facts, "planar_decided_by": "option" if told else "data"}
     for k in left_out:
         if k not in group and np.any(joint[k] >= LEAST_JOINT):
             left_out[k] = "is of a group that shares no place with the larger one"
@@ -239,12 +247,12 @@ def _fills_space(rays: Array, joint: NDArray[np.int64], group: tuple[int, ...], 
     return bool(views) and 4 * views.count(False) >= len(views)
 
 
-def _start(
+def _starts(
     joint: NDArray[np.int64],
     group: tuple[int, ...],
     pair_of: Callable[[int, int], Pair | DegenerateError],
-) -> Pair:
-    """The pair that stands firmest among those of a group with the most common places."""
+) -> list[Pair]:
+    """The pairs of a group with the most common places, the one that stands firmest first."""
     ranked = sorted(combinations(group, 2), key=lambda p: -int(joint[p]))
     pairs: list[Pair] = []
     refused: DegenerateError | None = None
@@ -262,4 +270,4 @@ def _start(
         raise refused
     # A floor is a floor for all: of pairs that differ the kind of the first is right.
     alike = [p for p in pairs if p.planar == pairs[0].planar]
-    return min(alike, key=lambda p: p.looseness)
+    return sorted(alike, key=lambda p: p.looseness)

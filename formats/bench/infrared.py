@@ -1,0 +1,224 @@
+"""The figures of ``locatk bench infrared``: sweeps and factory data from the light itself.
+
+The captures are those that the paper's authors and Bitcraze published
+(``data/lighthouse/benchmarks`` and ``fpga``), and a recording of libsurvive. What is right is
+told by the rotors, which turn with a crystal's constancy, by checksums, and by calibrations
+that another program stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import LocatkError
+from locatk.core.lighthouse import bursts as light_bursts
+from locatk.core.lighthouse import paper_light, weak
+from locatk.core.lighthouse.bursts import Bursts, of_windows
+from locatk.core.lighthouse.identify import Matches, identify
+from locatk.core.lighthouse.judge import Reading, identified
+from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.receive import SHORTEST_S, Reception, receive
+from locatk.formats.bench import Figure
+from locatk.formats.bench.infrared_places import figures as place_figures
+from locatk.formats.bench.infrared_speed import figures as speed_figures
+from locatk.formats.bench.infrared_survive import figures as survive_figures
+from locatk.formats.importers.saleae import read_light
+
+DOTBOT = "DotBot C, its best window"
+RUN_LENGTH = "plain run lengths"
+
+POLYNOMIALS = (0, 1, 2, 3)
+"""Of the two stations of the published captures, on channels 1 and 2."""
+
+IDS = {1: 0x4CC60647, 2: 0x0FF22226}
+PPM = {1: -15.49, 2: -18.69}
+"""Of the capture that is scored: facts/lighthouse.md 1.4."""
+
+ROTOR_S = 1e-6
+
+WINDOW_START_S = 9e-6
+PHASE_TICKS = -1
+"""With which the peer's own program reads what it is said to: its samples come a tick later."""
+
+CAPTURES = ("demodulation_code/logic", "oneLH_2D/Logic", "twoLH_2D/Logic")
+
+FPGA = {"take1": (103, 103), "about_4m": (95, 31)}
+"""Recording to what is promised of its 103 bursts, and what plain run lengths read."""
+
+
+def figures(data: Path) -> list[Figure]:
+    """All figures; ``data`` is the folder of published recordings. About a minute."""
+    folder = data / "lighthouse"
+    found: list[Figure] = []
+    for measure, names in (
+        (_demodulation, {"bursts decoded of 11,136": "%", "false polynomials": "%"}),
+        (_windows, {"windows of 16 us read": "%"}),
+        (_others, {"bursts decoded, oneLH_2D": "%", "bursts decoded, twoLH_2D": "%"}),
+        (_fpga, {f"bursts read, {name}": "of 103" for name in FPGA}),
+    ):
+        found += _or_why(measure, folder, names)
+    return [*found, *place_figures(), *survive_figures(data), *speed_figures(data)]
+
+
+def _or_why(
+    measure: Callable[[Path], list[Figure]], folder: Path, names: dict[str, str]
+) -> list[Figure]:
+    """Figures, or their names and why there is none."""
+    try:
+        return measure(folder)
+    except (LocatkError, OSError) as error:
+        return [Figure(name, None, unit, f"not measured: {error}") for name, unit in names.items()]
+
+
+def capture(folder: Path, name: str) -> Edges:
+    """The light of a published capture."""
+    return read_light(folder / "benchmarks" / f"{name}_analyser_capture.sal")[0]
+
+
+# ---- the demodulation capture
+
+
+def _demodulation(folder: Path) -> list[Figure]:
+    reception = receive([capture(folder, CAPTURES[0])])
+    (reading,) = reception.readings
+    alone = reading.read & (np.abs(reading.off_s) <= ROTOR_S)
+    rims = reading.beside >= 0
+    rims[rims] = alone[reading.beside[rims]]
+    n = len(reading.bursts)
+    certain = reading.matches.certain()
+    strange = certain & ~np.isin(reading.matches.polynomial, POLYNOMIALS)
+    wrong = ~np.isin(reading.matches.polynomial[reading.read], POLYNOMIALS)
+    how = (
+        f"{n:,} bursts of more than 5 us on the data line of demodulation_code, 54 s; "
+        f"{np.count_nonzero(alone):,} were read and are within 1 us of their rotor"
+    )
+    return [
+        Figure("bursts decoded of 11,136", 100 * np.mean(alone | rims), "%",
+               f"{how}; {np.count_nonzero(rims)} more are rims of these: what is left of the "
+               "light there is the sequence of that sweep rather than other places of it", 98.5,
+               "higher", DOTBOT, 79.6),
+        Figure("bursts read by themselves", 100 * np.mean(alone), "%", how, None, "higher",
+               RUN_LENGTH, 95.4),
+        Figure("false polynomials", 100 * np.mean(wrong), "%",
+               f"of {len(wrong):,} bursts that were read, those of stations that are not there",
+               0.05, "lower", DOTBOT, 2.2),
+        Figure("false polynomials, without rotors", 100 * np.sum(strange) / np.sum(certain), "%",
+               "the same where each burst has to stand on its own evidence", 0.05, "lower",
+               DOTBOT, 2.2),
+        Figure("rims taken for a wrong place", 100 * _wrong_rims(reading), "%",
+               "bursts that are not read, held against another place of the same sequence", None),
+        *_stations(reception),
+        Figure("read of the bursts near a station's sweep", 100 * _decode_rate(reception), "%",
+               "decode rate as `locatk info` tells it, both stations", None, "higher"),
+    ]  # fmt: skip
+
+
+def _wrong_rims(reading: Reading) -> float:
+    """Share of unread bursts that are taken for light of a place where nothing was sent."""
+    m = reading.matches
+    elsewhere = Matches(
+        m.polynomial, (m.index + 20_000) % 131_071, m.evidence, m.begin, m.end, m.known, m.wrong
+    )
+    beside = weak.belongs(reading.bursts, reading.bits, elsewhere, reading.read)
+    return float(np.sum(beside >= 0) / max(1, np.sum(~reading.read)))
+
+
+def _decode_rate(reception: Reception) -> float:
+    sweeps = sum(station.sweeps for station in reception.stations)
+    return sweeps / (sweeps + sum(station.missed or 0 for station in reception.stations))
+
+
+def _stations(reception: Reception) -> list[Figure]:
+    """Factory data and periods of both stations."""
+    heard = {station.channel: station for station in reception.stations}
+    right = sum(channel in heard and heard[channel].id == IDS[channel] for channel in IDS)
+    frames = sum(station.frames for station in reception.stations)
+    damaged = sum(station.damaged for station in reception.stations)
+    rows = [
+        Figure("factory data of both stations", float(right), "of 2",
+               f"ids 4cc60647 and 0ff22226, each from frames with a right CRC-32; {frames} frames "
+               f"were right and {damaged} wrong, which were not used", 2.0, "higher",
+               "DotBot C", 0.0),
+    ]  # fmt: skip
+    for channel, known in PPM.items():
+        rotor = reception.rotors[channel]
+        ppm = rotor.ppm(reception.readings[0].bursts.rate_hz)
+        rows.append(
+            Figure(f"period of channel {channel}, off the fitted one", abs(ppm - known), "ppm",
+                   f"{ppm:.3f} ppm of nominal; a line through all zeros gives {known}", 0.05)
+        )  # fmt: skip
+    return rows
+
+
+# ---- the same light as the peer's receiver samples it
+
+
+def _windows(folder: Path) -> list[Figure]:
+    edges = capture(folder, CAPTURES[0])
+    bursts = light_bursts.split(edges)
+    bursts = bursts.take(bursts.duration_s > SHORTEST_S)
+    start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
+    windows = paper_light.windows_of(edges, start)
+    bits, matches = identified(of_windows(windows))
+    good = matches.certain()
+    strange = good & ~np.isin(matches.polynomial, POLYNOMIALS)
+    paper = paper_light.decode(windows)
+    read = paper.polynomial >= 0
+    false = read & ~np.isin(paper.polynomial, POLYNOMIALS)
+    how = "64 bytes at 32 MS/s, from 9 us after a burst's first edge: the peer's best window"
+    return [
+        Figure("windows of 16 us read", 100 * np.mean(good), "%",
+               f"{how}; each by its own evidence, of all 32 polynomials", None, "higher", DOTBOT,
+               79.6),
+        Figure("windows: false polynomials", 100 * np.sum(strange) / np.sum(good), "%",
+               "of those", None, "lower", DOTBOT, 2.2),
+        Figure("windows read by --method paper", 100 * np.mean(read), "%",
+               f"{how}; the published algorithm as we wrote it", None, "higher", DOTBOT, 79.6),
+        Figure("windows, --method paper: false polynomials", 100 * np.sum(false) / np.sum(read),
+               "%", "of those", None, "lower", DOTBOT, 2.2),
+    ]  # fmt: skip
+
+
+# ---- other captures
+
+
+def _others(folder: Path) -> list[Figure]:
+    rows = []
+    for name in CAPTURES[1:]:
+        reception = receive([capture(folder, name)])
+        (reading,) = reception.readings
+        share = np.mean(reading.read | (reading.beside >= 0))
+        rows.append(
+            Figure(f"bursts decoded, {name.split('/')[0]}", 100 * share, "%",
+                   f"of {len(reading.bursts):,}; nothing was chosen by what is scored here but "
+                   "the delay of weak light", None, "higher")
+        )  # fmt: skip
+    return rows
+
+
+def _fpga(folder: Path) -> list[Figure]:
+    rows = []
+    for name, (target, peer) in FPGA.items():
+        reception = receive(read_light(folder / "fpga" / f"{name}.csv"))
+        (reading,) = reception.readings
+        right = reading.read & np.isin(reading.matches.polynomial, (12, 13))
+        sigma = next(iter(reception.rotors.values())).sigma / reading.bursts.rate_hz
+        rows.append(
+            Figure(f"bursts read, {name}", float(np.sum(right)), "of 103",
+                   f"Bitcraze's recording, channel 7; within 2 us of the rotor, of which they "
+                   f"scatter by {1e6 * sigma:.2f} us", target, "higher", RUN_LENGTH, peer)
+        )  # fmt: skip
+    return rows
+
+
+def published_windows(data: Path) -> NDArray[np.uint8]:
+    """The peer's windows of the demodulation capture, (11136, 64)."""
+    edges = capture(data / "lighthouse", CAPTURES[0])
+    bursts: Bursts = light_bursts.split(edges)
+    bursts = bursts.take(bursts.duration_s > SHORTEST_S)
+    start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
+    return paper_light.windows_of(edges, start)
