@@ -16,6 +16,7 @@ BENCHES = {
     "landmarks": "locatk.formats.bench.landmarks:figures",
     "capture": "locatk.formats.bench.capture:figures",
     "look": "locatk.formats.bench.look:figures",
+    "infrared": "locatk.formats.bench.infrared:figures",
 }
 """Name of a system, or of a part, to the function that measures its figures."""
 
@@ -44,6 +45,7 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
       locatk bench landmarks
       locatk bench capture
       locatk bench look
+      locatk bench infrared
       locatk bench lighthouse --data ~/data --json
     """
     from locatk.formats.data import data_folder

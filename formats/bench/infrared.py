@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import bursts as light_bursts
 from locatk.core.lighthouse import paper_light, weak
-from locatk.core.lighthouse.bursts import Bursts, of_windows
-from locatk.core.lighthouse.identify import Matches, identify
+from locatk.core.lighthouse.bursts import of_windows
+from locatk.core.lighthouse.identify import Matches
 from locatk.core.lighthouse.judge import Reading, identified
 from locatk.core.lighthouse.light import Edges
 from locatk.core.lighthouse.receive import SHORTEST_S, Reception, receive
@@ -97,16 +97,16 @@ def _demodulation(folder: Path) -> list[Figure]:
         f"{np.count_nonzero(alone):,} were read and are within 1 us of their rotor"
     )
     return [
-        Figure("bursts decoded of 11,136", 100 * np.mean(alone | rims), "%",
+        Figure("bursts decoded of 11,136", _percent(alone | rims), "%",
                f"{how}; {np.count_nonzero(rims)} more are rims of these: what is left of the "
                "light there is the sequence of that sweep rather than other places of it", 98.5,
                "higher", DOTBOT, 79.6),
-        Figure("bursts read by themselves", 100 * np.mean(alone), "%", how, None, "higher",
+        Figure("bursts read by themselves", _percent(alone), "%", how, None, "higher",
                RUN_LENGTH, 95.4),
-        Figure("false polynomials", 100 * np.mean(wrong), "%",
+        Figure("false polynomials", _percent(wrong), "%",
                f"of {len(wrong):,} bursts that were read, those of stations that are not there",
                0.05, "lower", DOTBOT, 2.2),
-        Figure("false polynomials, without rotors", 100 * np.sum(strange) / np.sum(certain), "%",
+        Figure("false polynomials, without rotors", _percent(strange[certain]), "%",
                "the same where each burst has to stand on its own evidence", 0.05, "lower",
                DOTBOT, 2.2),
         Figure("rims taken for a wrong place", 100 * _wrong_rims(reading), "%",
@@ -115,6 +115,10 @@ def _demodulation(folder: Path) -> list[Figure]:
         Figure("read of the bursts near a station's sweep", 100 * _decode_rate(reception), "%",
                "decode rate as `locatk info` tells it, both stations", None, "higher"),
     ]  # fmt: skip
+
+
+def _percent(true: NDArray[np.bool_]) -> float:
+    return 100 * float(np.mean(true))
 
 
 def _wrong_rims(reading: Reading) -> float:
@@ -163,7 +167,7 @@ def _windows(folder: Path) -> list[Figure]:
     bursts = bursts.take(bursts.duration_s > SHORTEST_S)
     start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
     windows = paper_light.windows_of(edges, start)
-    bits, matches = identified(of_windows(windows))
+    _, matches = identified(of_windows(windows))
     good = matches.certain()
     strange = good & ~np.isin(matches.polynomial, POLYNOMIALS)
     paper = paper_light.decode(windows)
@@ -171,14 +175,14 @@ def _windows(folder: Path) -> list[Figure]:
     false = read & ~np.isin(paper.polynomial, POLYNOMIALS)
     how = "64 bytes at 32 MS/s, from 9 us after a burst's first edge: the peer's best window"
     return [
-        Figure("windows of 16 us read", 100 * np.mean(good), "%",
+        Figure("windows of 16 us read", _percent(good), "%",
                f"{how}; each by its own evidence, of all 32 polynomials", None, "higher", DOTBOT,
                79.6),
-        Figure("windows: false polynomials", 100 * np.sum(strange) / np.sum(good), "%",
+        Figure("windows: false polynomials", _percent(strange[good]), "%",
                "of those", None, "lower", DOTBOT, 2.2),
-        Figure("windows read by --method paper", 100 * np.mean(read), "%",
+        Figure("windows read by --method paper", _percent(read), "%",
                f"{how}; the published algorithm as we wrote it", None, "higher", DOTBOT, 79.6),
-        Figure("windows, --method paper: false polynomials", 100 * np.sum(false) / np.sum(read),
+        Figure("windows, --method paper: false polynomials", _percent(false[read]),
                "%", "of those", None, "lower", DOTBOT, 2.2),
     ]  # fmt: skip
 
@@ -191,9 +195,8 @@ def _others(folder: Path) -> list[Figure]:
     for name in CAPTURES[1:]:
         reception = receive([capture(folder, name)])
         (reading,) = reception.readings
-        share = np.mean(reading.read | (reading.beside >= 0))
         rows.append(
-            Figure(f"bursts decoded, {name.split('/')[0]}", 100 * share, "%",
+            Figure(f"bursts decoded, {name.split('/')[0]}", _percent(reading.read | (reading.beside >= 0)), "%",
                    f"of {len(reading.bursts):,}; nothing was chosen by what is scored here but "
                    "the delay of weak light", None, "higher")
         )  # fmt: skip
@@ -218,7 +221,7 @@ def _fpga(folder: Path) -> list[Figure]:
 def published_windows(data: Path) -> NDArray[np.uint8]:
     """The peer's windows of the demodulation capture, (11136, 64)."""
     edges = capture(data / "lighthouse", CAPTURES[0])
-    bursts: Bursts = light_bursts.split(edges)
+    bursts = light_bursts.split(edges)
     bursts = bursts.take(bursts.duration_s > SHORTEST_S)
     start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
     return paper_light.windows_of(edges, start)
