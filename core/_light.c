@@ -64,38 +64,60 @@ PyObject *window_edges(PyObject *self, PyObject *args)
 /* ---- Soft bits ----------------------------------------------------------------------------- */
 
 #define TURN 4096
-static float wave[TURN + TURN / 4]; /* sine, and a quarter turn later cosine */
+#define LONGEST_RUN 3.0
+#define EVEN 1e-3
+static int32_t wave[TURN + TURN / 4]; /* sine, and a quarter turn later cosine */
 
 static void make_wave(void)
 {
     if (wave[TURN / 4] != 0) return;
-    for (int k = 0; k < TURN + TURN / 4; k++) wave[k] = (float)sin(2 * M_PI * k / TURN);
+    for (int k = 0; k < TURN + TURN / 4; k++)
+        wave[k] = (int32_t)rint(sin(2 * M_PI / TURN * k) * 16384);
 }
 
-/* Mean levels of all chips of a burst; returns how many there are. time holds its edges in chips
- * from the first one, sign the first one's direction; begin answers where the grid starts. */
+/* The nearest whole number. Halves, which sampled times often are, go up for sure. */
+static inline double rounded(double value) { return floor(value + (0.5 + 1e-6)); }
+
+/* Where chips begin, one before the first edge, and by how much edges of the first edge's direction
+ * come later than the others. time holds the edges in chips from the first one. */
+static double grid_of(const double *time, int edges, double *skew)
+{
+    int64_t sine[2] = {0, 0}, cosine[2] = {0, 0};
+    for (int k = 0; k < edges; k++) {
+        const int at = (int)((time[k] - (double)(int)time[k]) * TURN + 0.5) & (TURN - 1);
+        sine[k & 1] += wave[at];
+        cosine[k & 1] += wave[at + TURN / 4];
+    }
+    double phase[2], run[2] = {0, 0};
+    for (int kind = 0; kind < 2; kind++)
+        phase[kind] = atan2((double)sine[kind], (double)cosine[kind]) / (2 * M_PI);
+    for (int k = 0; k + 1 < edges; k++) {
+        const double length = time[k + 1] - time[k];
+        run[k & 1] += length < LONGEST_RUN ? length : LONGEST_RUN;
+    }
+    /* Phases leave whole chips open, which the runs tell. */
+    double told = 0;
+    if (run[1] > 0) told = (run[1] / ((edges - 1) / 2) - run[0] / (edges / 2)) / 2;
+    told = told > 0.5 ? 0.5 : told < -0.5 ? -0.5 : told;
+    *skew = phase[0] - phase[1];
+    *skew -= rounded(*skew - told);
+    return phase[0] - 0.5 * *skew - 1;
+}
+
+/* Mean levels of all chips of a burst; returns how many there are. sign is the first edge's
+ * direction; begin answers where the first chip begins. */
 HOT static int chips_of(const double *time, int edges, float sign, int longest, double *begin,
                     float *mean)
 {
-    double sums[2][2] = {{0, 0}, {0, 0}};
-    for (int k = 0; k < edges; k++) {
-        const int at = (int)((time[k] - (double)(int)time[k]) * TURN + 0.5) & (TURN - 1);
-        sums[k & 1][0] += wave[at + TURN / 4];
-        sums[k & 1][1] += wave[at];
-    }
-    const double own = atan2(sums[0][1], sums[0][0]), other = atan2(sums[1][1], sums[1][0]);
-    double skew = (own - other) / (2 * M_PI);
-    skew -= rint(skew);
-    const double phase = own / (2 * M_PI) - skew / 2;
-    const double shift[2] = {-skew / 2, skew / 2};
-    /* Edges lie on the grid, so that rounding is safe where floor and ceil would toss a coin. */
-    *begin = rint(time[0] + shift[0] - phase) - 1 + phase;
+    double skew;
+    *begin = grid_of(time, edges, &skew);
+    const double shift[2] = {-0.5 * skew, 0.5 * skew};
     double last = time[0] + shift[0];
     for (int k = 1; k < edges; k++) {
         const double t = time[k] + shift[k & 1];
         last = t > last ? t : last;
     }
-    const double whole = rint(last - *begin) + 1;
+    const double whole = rounded(last - *begin) + 1;
     const int chips = whole < longest ? (int)whole : longest;
     /* Each edge changes the mean of its own chip by a part, and of all later ones whole. */
     memset(mean, 0, (size_t)(chips + 2) * sizeof *mean);
@@ -129,7 +151,7 @@ HOT static int bits_of(const float *restrict mean, int chips, int *odd, int8_t *
     float even_sum = 0, odd_sum = 0;
     for (int k = 0; k + 1 < chips; k += 2) even_sum += magnitude(mean[k + 1] - mean[k]);
     for (int k = 1; k + 1 < chips; k += 2) odd_sum += magnitude(mean[k + 1] - mean[k]);
-    *odd = even_sum > odd_sum;
+    *odd = even_sum > odd_sum + EVEN;
     const float *m = mean + *odd;
     const int bits = (chips - *odd) / 2;
     if (bits < 1) return 0;
@@ -159,9 +181,10 @@ PyObject *light_bits(PyObject *self, PyObject *args)
     int64_t *value_first = b[5].buf;
     double *start = b[6].buf;
     const Py_ssize_t bursts = b[2].len;
+    const int64_t room = b[4].len;
     int64_t most = 1;
     for (Py_ssize_t i = 0; i < bursts; i++)
-        if (first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
+        if (readable[i] && first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
     double *time = malloc((size_t)most * sizeof *time);
     float *mean = malloc((size_t)(longest + 8) * sizeof *mean);
     if (!time || !mean) {
@@ -182,7 +205,14 @@ PyObject *light_bits(PyObject *self, PyObject *args)
                 time[k] = (double)(tick[first[i] + k] - origin) * chips_per_tick;
             double begin;
             int odd;
-            const int chips = chips_of(time, (int)edges, rises[i] ? 1.0f : -1.0f, longest, &begin, mean);
+            const int chips =
+                chips_of(time, (int)edges, rises[i] ? 1.0f : -1.0f, longest, &begin, mean);
+            if (value_first[i] + chips / 2 > room) {
+                free(time);
+                free(mean);
+                PyErr_SetString(PyExc_ValueError, "no room for the bits of the bursts");
+                return release...;
+            }
             bits = bits_of(mean, chips, &odd, value + value_first[i]);
             start[i] = (double)origin + (begin + odd) * chip;
         }

@@ -30,7 +30,7 @@ html_show_search_summary = False
 
 MENU = {
     "First hour": ["first-hour-*"],
-    "Systems": ["lighthouse", "dots", "polaris", "landmarks"],
+    "Systems": ["lighthouse", "light", "dots", "polaris", "landmarks"],
     "From port to viewer": ["capture", "batch", "viewers"],
     "Reference": [
         "Commands <commands>",

@@ -222,6 +222,10 @@ FILES: Mapping[str, Callable[[Path, list[str]], None]] = {
     "twoLH-3D_scene": _published("lighthouse/twoLH-3D_scene"),
     "twoLH-2D_scene": _published("lighthouse/twoLH-2D_scene"),
     "oneLH-2D_scene": _published("lighthouse/oneLH-2D_scene"),
+    "logic_analyser_capture.sal": _published(
+        "lighthouse/benchmarks/demodulation_code/logic_analyser_capture.sal"
+    ),
+    "tracker-cal-attempt.rec.gz": _published("lighthouse/libsurvive/tracker-cal-attempt.rec.gz"),
     **{f"RawData_{k}.csv": _published(f"polaris/default/RawData_{k}.csv") for k in range(1, 11)},
 }
 """What a reader has beside what the page makes: name to what puts it into the folder."""

@@ -4,7 +4,7 @@ A station changes its light at the border of every bit, and once more in the mid
 (facts/lighthouse.md 2.3): two chips a bit, at 12 MHz. Its crystal is right to some parts in a
 million, so that within a burst the chips lie on a rigid grid of which only the phase is
 unknown. Rising and falling edges are delayed differently by the receiver; each kind tells its
-own phase, and their difference is taken out.
+own phase, and their difference is taken out, be it as long as a chip.
 
 What a chip holds is the mean level over it, which a late or missing edge blunts and does not
 turn over. A bit is a one where its chips differ. Borders change always, so that the chip
@@ -31,6 +31,15 @@ CHIP_HZ = 2 * BIT_HZ
 
 CERTAIN = 64
 """Of a soft bit: what a clean one reaches."""
+
+TURN = 4096
+"""Parts of a chip in which the phase of an edge is told, so that sums are exact."""
+
+LONGEST_RUN = 3.0
+"""In chips: a longer run counts as so long when both directions are compared."""
+
+EVEN = 1e-3
+"""Bits start at the second chip only where more than this speaks for it."""
 
 LONGEST_S = 500e-6
 """Of a burst: a longer one is no sweep, which takes 10 to 60 us, and has no bits."""
@@ -116,71 +125,80 @@ def soft_bits_numpy(bursts: Bursts) -> SoftBits:
     """The same in numpy; :func:`soft_bits` where nothing is compiled."""
     n = len(bursts)
     chip = bursts.rate_hz / CHIP_HZ
-    size = np.diff(bursts.first)
-    readable = _readable(bursts)
-    some = np.flatnonzero(readable)
+    some = np.flatnonzero(_readable(bursts))
     if not len(some):
         return SoftBits(np.zeros(0, np.int8), np.zeros(n + 1, np.int64), np.zeros(n), 2 * chip)
-    kept = bursts if len(some) == n else bursts.take(readable)
-    burst = np.repeat(np.arange(len(some)), size[some])
-    origin = kept.start
-    rising = (np.arange(len(kept.tick)) - kept.first[burst]) % 2 == 0
-    rising = np.where(kept.rises[burst], rising, ~rising)
-    time, phase = _aligned((kept.tick - origin[burst]).astype(float), burst, rising, chip)
-    # The grid of chips, from one before the first edge to one after the last.
-    # Edges lie on it, so that rounding is safe where floor and ceil would toss a coin.
-    begin = np.rint((time[kept.first[:-1]] - phase) / chip) - 1
-    count = np.rint((time[kept.first[1:] - 1] - phase) / chip) + 1 - begin
-    count = count.astype(np.int64)
-    offset = np.concatenate([[0], np.cumsum(count)])
-    mean = _mean_levels(kept, time, rising, burst, phase + begin * chip, count, offset, chip)
+    kept = bursts.take(_readable(bursts))
+    burst = np.repeat(np.arange(len(some)), np.diff(kept.first))
+    time = (kept.tick - kept.start[burst]) * (1 / chip)
+    first_kind = (np.arange(len(time)) - kept.first[burst]) % 2 == 0
+    begin, skew = _grid(time, burst, first_kind)
+    time = time + np.where(first_kind, -0.5, 0.5) * skew[burst]
+    time = _ascending(time, burst)
+    count = _rounded(time[kept.first[1:] - 1] - begin).astype(np.int64) + 1
+    rising = np.where(kept.rises[burst], first_kind, ~first_kind)
+    mean, offset = _mean_levels(time - begin[burst], rising, burst, kept.rises, count)
     # Which chips pair to bits: borders of bits change always, their middles half of the time.
     change = np.abs(np.diff(mean))
-    place = np.arange(len(change)) - np.repeat(offset[:-1], count)[: len(change)]
     inside = np.repeat(np.arange(len(count)), count)
+    place = np.arange(len(change)) - offset[inside[:-1]]
     within = inside[1:] == inside[:-1]
-    sums = [
+    of_middles, of_borders = (
         np.bincount(inside[:-1][m], change[m], len(count))
-        for m in (within & (place % 2 == 1), within & (place % 2 == 0))
-    ]
-    odd = (sums[1] > sums[0]).astype(np.int64)
+        for m in (within & (place % 2 == 0), within & (place % 2 == 1))
+    )
+    odd = (of_middles > of_borders + EVEN).astype(np.int64)
     bits = (count - odd) // 2
     first = np.concatenate([[0], np.cumsum(bits)])
     at = np.arange(first[-1]) - np.repeat(first[:-1], bits)
-    left = np.repeat(offset[:-1] + odd, bits) + 2 * at
+    left = np.repeat(offset + odd, bits) + 2 * at
     a, b = mean[left], mean[left + 1]
     head, tail = at == 0, at == np.repeat(bits, bits) - 1
     a, b = (
-        np.where(head, a, (a - np.where(head, 0.0, np.roll(b, 1))) / 2),
-        np.where(tail, b, (b - np.where(tail, 0.0, np.roll(a, -1))) / 2),
+        np.where(head, a, (a - np.roll(b, 1)) / 2),
+        np.where(tail, b, (b - np.roll(a, -1)) / 2),
     )
     value = np.rint(np.clip(-a * b, -1.0, 1.0) * CERTAIN).astype(np.int8)
     all_bits, tick = np.zeros(n, np.int64), np.zeros(n)
     all_bits[some] = bits
-    tick[some] = origin + phase + (begin + odd) * chip
+    tick[some] = kept.start + (begin + odd) * chip
     return SoftBits(value, np.concatenate([[0], np.cumsum(all_bits)]), tick, 2 * chip)
 
 
-def _aligned(
-    time: Array, burst: NDArray[np.int64], rising: NDArray[np.bool_], chip: float
-) -> tuple[Array, Array]:
-    """Edges with the difference of both directions taken out, and the phase of each burst."""
+def _grid(time: Array, burst: NDArray[np.int64], first_kind: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Where the chips of each burst begin, one before its first edge, and by how much edges of
+    the first edge's direction come later than the others; all in chips.
+
+    Phases leave whole chips open, which the runs tell: what one direction is late shortens the
+    runs that it begins and lengthens the others.
+    """
     n = int(burst[-1]) + 1
-    angle = 2 * np.pi / chip * time
-    wave = [(np.cos(angle), np.sin(angle), chosen) for chosen in (rising, ~rising)]
-    turn = [
+    place = np.floor((time - np.floor(time)) * TURN + 0.5).astype(np.int64) % TURN
+    wave = np.rint(np.sin(2 * np.pi / TURN * np.arange(TURN + TURN // 4)) * 2**14)
+    phase = [
         np.arctan2(
-            np.bincount(burst[m], s[m], n),
-            np.bincount(burst[m], c[m], n),
+            np.bincount(burst[m], wave[place[m]], n),
+            np.bincount(burst[m], wave[place[m] + TURN // 4], n),
         )
-        for c, s, m in wave
+        / (2 * np.pi)
+        for m in (first_kind, ~first_kind)
     ]
-    skew = turn[0] - turn[1]
-    skew -= 2 * np.pi * np.rint(skew / (2 * np.pi))
-    skew *= chip / (2 * np.pi)
-    time = time + np.where(rising, -0.5, 0.5) * skew[burst]
-    time = _ascending(time, burst)
-    return time, turn[0] * chip / (2 * np.pi) - 0.5 * skew
+    run = np.minimum(np.diff(time), LONGEST_RUN)
+    whole = burst[1:] == burst[:-1]
+    mean = []
+    for m in (whole & first_kind[:-1], whole & ~first_kind[:-1]):
+        number = np.bincount(burst[:-1][m], minlength=n)
+        mean.append(np.bincount(burst[:-1][m], run[m], n) / np.maximum(number, 1))
+    told = np.where(mean[1] > 0, np.clip((mean[1] - mean[0]) / 2, -0.5, 0.5), 0.0)
+    skew = phase[0] - phase[1]
+    skew -= _rounded(skew - told)
+    return phase[0] - 0.5 * skew - 1, skew
+
+
+def _rounded(value: Array) -> Array:
+    """The nearest whole number. Halves, which sampled times often are, go up for sure."""
+    whole: Array = np.floor(value + (0.5 + 1e-6))
+    return whole
 
 
 def _ascending(time: Array, burst: NDArray[np.int64]) -> Array:
@@ -191,36 +209,28 @@ def _ascending(time: Array, burst: NDArray[np.int64]) -> Array:
 
 
 def _mean_levels(
-    bursts: Bursts,
-    time: Array,
+    place: Array,
     rising: NDArray[np.bool_],
     burst: NDArray[np.int64],
-    begin: Array,
+    rises: NDArray[np.bool_],
     count: NDArray[np.int64],
-    offset: NDArray[np.int64],
-    chip: float,
-) -> Array:
-    """Mean level over each chip, -1 to 1, of all bursts one after the other.
+) -> tuple[Array, NDArray[np.int64]]:
+    """Mean level over each chip, -1 to 1, of all bursts one after the other, and the first chip
+    of each.
 
-    The integral of the level is linear between edges; its difference over a chip is the mean.
+    An edge changes the mean of its own chip by a part, and of all later ones whole.
     """
-    level = np.where(rising, 1.0, -1.0)
-    step = np.zeros(len(time))
-    same = burst[1:] == burst[:-1]
-    step[1:] = np.where(same, level[:-1] * np.diff(time), 0.0)
-    total = np.cumsum(step)
-    total -= total[bursts.first[burst]]
-    row = np.repeat(np.arange(len(count)), count + 1)
-    number = np.arange(len(row)) - (offset[:-1] + np.arange(len(count)))[row]
-    border = begin[row] + number * chip
-    # Edges of all bursts on one axis, far apart, for one search.
-    far = (
-        4 * chip + max(float(np.max(border)), float(np.max(time))) - min(0.0, float(np.min(border)))
-    )
-    before = np.searchsorted(time + burst * far, border + row * far, side="right") - 1
-    outside = before < bursts.first[row]
-    before = np.maximum(before, bursts.first[row])
-    held = np.where(outside, -level[before], level[before])
-    integral = total[before] + held * (border - time[before])
-    mean: Array = np.delete(np.diff(integral), (offset[1:] + np.arange(len(count)))[:-1]) / chip
-    return mean
+    offset = np.concatenate([[0], np.cumsum(count)])[:-1]
+    chip = place.astype(np.int64)
+    late = place - chip
+    # Each burst has a chip more here, which takes what its last edge leaves for later.
+    at = (offset + np.arange(len(count)))[burst] + chip
+    jump = np.where(rising, 2.0, -2.0)
+    total = len(count) + int(count.sum())
+    change = np.bincount(at, jump * (1 - late), total) + np.bincount(at + 1, jump * late, total)
+    spare = np.cumsum(count + 1) - 1
+    level = np.cumsum(change)
+    ends = np.concatenate([[0.0], level[spare[:-1]]])
+    base = np.where(rises, -1.0, 1.0) - ends
+    mean: Array = np.delete(level, spare) + np.repeat(base, count)
+    return mean, offset

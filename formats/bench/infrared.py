@@ -128,12 +128,13 @@ def _wrong_rims(reading: Reading) -> float:
         m.polynomial, (m.index + 20_000) % 131_071, m.evidence, m.begin, m.end, m.known, m.wrong
     )
     beside = weak.belongs(reading.bursts, reading.bits, elsewhere, reading.read)
-    return float(np.sum(beside >= 0) / max(1, np.sum(~reading.read)))
+    return float(np.mean(beside[~reading.read] >= 0))
 
 
 def _decode_rate(reception: Reception) -> float:
     sweeps = sum(station.sweeps for station in reception.stations)
-    return sweeps / (sweeps + sum(station.missed or 0 for station in reception.stations))
+    missed = sum(station.missed or 0 for station in reception.stations)
+    return sweeps / (sweeps + missed)
 
 
 def _stations(reception: Reception) -> list[Figure]:
@@ -195,8 +196,9 @@ def _others(folder: Path) -> list[Figure]:
     for name in CAPTURES[1:]:
         reception = receive([capture(folder, name)])
         (reading,) = reception.readings
+        decoded = _percent(reading.read | (reading.beside >= 0))
         rows.append(
-            Figure(f"bursts decoded, {name.split('/')[0]}", _percent(reading.read | (reading.beside >= 0)), "%",
+            Figure(f"bursts decoded, {name.split('/')[0]}", decoded, "%",
                    f"of {len(reading.bursts):,}; nothing was chosen by what is scored here but "
                    "the delay of weak light", None, "higher")
         )  # fmt: skip

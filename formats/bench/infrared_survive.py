@@ -72,8 +72,8 @@ def _poses(session: ImportedSession) -> list[Figure]:
     late = found.time_ns - start > SETTLED_S * 1e9
     how = (
         f"{found.n} full poses of a tracker with 22 photodiodes, which stands still, in the "
-        "recorded stations with their factory calibrations from the same recording, no alignment, against "
-        "the recorded reference (libsurvive's own estimate, to which nothing was fitted): mean"
+        "recorded stations with their factory calibrations from the same recording, no alignment, "
+        "against the recorded reference (libsurvive's own estimate; nothing was fitted to it): mean"
     )
     return [
         Figure("libsurvive: position", float(np.mean(where)), "mm", how, 5.0),

@@ -39,11 +39,16 @@ def _lighthouse() -> dict[str, Reason]:
         "station_not_in_scene": "The station is not in the scene that was given.",
         "station_not_solved": "The station shares too few places with the others to be located.",
         "other_station": "The method uses fewer stations, and this is none of them.",
+        "sensor_unknown": "The device has no photodiode of that number, or nobody told where it "
+        "sits.",
+        "sweep_contradicts_pose": "The sweep disagrees with the pose that the other photodiodes of "
+        "its device agree on (a reflection, an edge in the way).",
     }
     moments = {
         "station_contradicts_others": "One of three or more stations disagreed with the others "
         "(a reflection) and was left out; the moment has a pose all the same.",
         "moment_with_too_few_sweeps": "The sweeps of the moment do not determine a position.",
+        "pose_not_determined": "The photodiodes that were lit do not determine a full pose.",
         "moment_inconsistent": f"The planes of the moment miss their meeting point by more than "
         f"{poses.GATE_SIGMAS:g} times the noise of the recording (at most "
         f"{1e3 * poses.GATE:g} mrad).",

@@ -11,17 +11,12 @@ import io
 import json
 import os
 import re
-import resource
 import signal
 import struct
-import subprocess
-import sys
 import time
-import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -29,12 +24,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from locatk.cli import info_lighthouse
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import lfsr, ootx, paper_light, paper_receive
 from locatk.core.lighthouse.channels import period_counts
+from locatk.core.lighthouse.heard import HeardStation
 from locatk.core.lighthouse.light import Edges
 from locatk.core.lighthouse.receive import receive
-from locatk.formats import artifacts, crazyflie, observations, receivers
+from locatk.core.lighthouse.receiver import DECK
+from locatk.core.lighthouse.scene import Marker, Scene, Station
+from locatk.formats import artifacts, crazyflie, heard, observations, receivers
 from locatk.formats.importers.dotbot_log import read_dotbot_log
 from locatk.formats.importers.libsurvive import read_libsurvive
 from locatk.formats.importers.libsurvive_device import read_stored
@@ -182,7 +181,10 @@ def recording(seconds: float = 0.5) -> bytes:
             at = n * period + 0.001 * channel
             told = [(at, f"Y {channel} {{}} {bits[n % len(bits)]} 0")]
             told += [
-                (at + (0.33 * (plane + 1) + 0.001 * sensor) * period, f"W {channel} {sensor} {{}} 0")
+                (
+                    at + (0.33 * (plane + 1) + 0.001 * sensor) * period,
+                    f"W {channel} {sensor} {{}} 0",
+                )
                 for sensor in range(3)
                 for plane in (0, 1)
             ]
@@ -224,28 +226,323 @@ LOGS = [
     b"2023-07-24 17:11:36 [info] \x1b[1mlh2\x1b[0m x=0.58 \x1b[36mc0\x1b[0m=82189 c1=39797\n" * 4,
 ]
 
-SCENE = artifacts.dumps_scene(
-    replace(
-        crazyflie.loads_config(
-            crazyflie.dumps_config(
-                artifacts.Scene(
-                    (
-                        artifacts.Station(
-                            1,
-                            np.array([1.0, 2.0, 3.0]),
-                            np.eye(3),
-                            ootx.factory_data(payload()).calibration,
-                            0x4CC60647,
-                        ),
-                    ),
-                    calibrations={2: ootx.factory_data(payload()).calibration},
-                    ids={2: 0xFF22226},
-                    scale="markers",
-                )
-            )
-        ),
-        markers=(artifacts.Marker("a", np.zeros(3)),),
-        ids={3: 12, 2: 0xFF22226},
-    )
+
+FACTORY = ootx.factory_data(payload()).calibration
+SCENE = Scene(
+    stations=(Station(1, np.array([1.0, 2.0, 3.0]), np.eye(3), FACTORY, 0x4CC60647),),
+    markers=(Marker("a", np.zeros(3)),),
+    scale="markers",
+    calibrations={2: FACTORY},
+    ids={2: 0xFF22226, 3: 12},
 )
-CONFIG = crazyflie.dumps_config(artifacts.SCENE_FILE and artifacts_scene) if False else ""
+HEARD = (
+    HeardStation(1, 0x4CC60647, 958985.25, 40, 1, FACTORY, 11, 0),
+    HeardStation(4, None, None, 7, 3, None, 0, 2),
+)
+
+# ---- how it is damaged
+
+ODD_NUMBERS = [
+    *(b"0", b"-1", b"1", b"16", b"17", b"31", b"32", b"255", b"131070", b"131071", b"4294967295"),
+    *(b"4294967296", b"9223372036854775807", b"18446744073709551616", b"-9223372036854775809"),
+    *(b"1e308", b"1e309", b"-1e-320", b"nan", b"inf", b"-inf", b"0x10", b"1_0", b"9" * 400),
+    *(b"", b"1.5", b".", b"00000000000000000012", b"\xd9\xa3", b"true", b"null", b"[]", b"{}"),
+]
+"""Texts in the place of numbers."""
+
+ODD_BYTES = [
+    *(b"\0" * 8, b"\xff" * 8, b"\xff" * 7 + b"\x7f", b"\x01" + b"\0" * 7, b"\0\0\0\x80"),
+    *(struct.pack("<d", value) for value in (np.nan, np.inf, -1.0, 1e300, 24e6, 5e-324)),
+    *(struct.pack("<Q", 1 << power) for power in (16, 31, 32, 36, 48, 60)),
+]
+"""Bytes in the place of binary numbers."""
+
+NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+
+
+def damaged(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """``data`` with one to four faults; what is spliced in comes from ``others``."""
+    for _ in range(int(rng.integers(1, 5))):
+        if not data:
+            return data
+        at, size = int(rng.integers(len(data))), int(2 ** rng.uniform(0, 12))
+        kind = int(rng.integers(8))
+        if kind == 0:  # a bit
+            data = data[:at] + bytes([data[at] ^ 1 << int(rng.integers(8))]) + data[at + 1 :]
+        elif kind == 1:  # noise
+            data = data[:at] + rng.bytes(min(size, 64)) + data[at + size :]
+        elif kind == 2:  # the end is missing
+            data = data[:at]
+        elif kind == 3:  # a hole
+            data = data[:at] + data[at + size :]
+        elif kind == 4:  # a part again
+            data = data[:at] + data[at : at + size] * int(rng.integers(2, 5)) + data[at + size :]
+        elif kind == 5:  # a part of another
+            other = others[int(rng.integers(len(others)))]
+            start = int(rng.integers(len(other) + 1))
+            data = data[:at] + other[start : start + size] + data[at + size :]
+        elif kind == 6:  # a binary number, mostly in the head
+            at = at if rng.random() < 0.3 else int(rng.integers(min(len(data), 160)))
+            odd = ODD_BYTES[int(rng.integers(len(ODD_BYTES)))]
+            data = data[:at] + odd + data[at + len(odd) :]
+        else:  # a number of a text
+            found = list(NUMBER.finditer(data[:100_000]))
+            if found:
+                old = found[int(rng.integers(len(found)))]
+                new = ODD_NUMBERS[int(rng.integers(len(ODD_NUMBERS)))]
+                data = data[: old.start()] + new + data[old.end() :]
+    return data
+
+
+# ---- what reads it
+
+
+def imported(session: ImportedSession, folder: Path) -> None:
+    """What was imported is written without complaint, and is read again as it was."""
+    path = folder / "run.mcap"
+    observations.write_session(
+        path,
+        system="lighthouse",
+        sweeps=session.sweeps,
+        scene=session.scene,
+        truth=session.truth,
+        facts=session.facts,
+        stations=session.stations,
+        receivers=session.receivers,
+        overwrite=True,
+    )
+    for text in (*session.warnings, session.lost or "", *session.facts.values()):
+        assert "\n" not in text
+    written = Session.open(path)
+    sweeps = observations.read_sweeps(written)
+    assert sorted(sweeps.count.tolist()) == sorted(session.sweeps.count.tolist())
+    assert len(observations.read_heard(written)) == len(session.stations)
+    assert observations.read_receivers(written).keys() == session.receivers.keys()
+    observations.read_scene(written)
+    observations.read_truth(written)
+
+
+Attempt = Callable[[np.random.Generator, Path, bool], None]
+"""Damages something by the generator and reads it from the folder, perhaps on to a session."""
+
+
+def of_files(name: str, whole: Sequence[bytes], read: Callable[[Path, bool], Any]) -> Attempt:
+    """Files damaged as bytes."""
+
+    def attempt(rng: np.random.Generator, folder: Path, further: bool) -> None:
+        path = folder / name
+        path.write_bytes(damaged(whole[int(rng.integers(len(whole)))], whole, rng))
+        read(path, further)
+
+    return attempt
+
+
+def importer(read: Callable[[Path], ImportedSession]) -> Callable[[Path, bool], None]:
+    def run(path: Path, further: bool) -> None:
+        session = read(path)
+        if further:
+            imported(session, path.parent)
+
+    return run
+
+
+def saleae(path: Path, further: bool) -> None:
+    if further:
+        imported(read_saleae([path]), path.parent)
+    else:
+        capture = read_capture(path)
+        assert capture.facts()
+        for edges in capture.edges:
+            assert np.all(np.diff(edges.tick) > 0)
+
+
+def members(rng: np.random.Generator, folder: Path, further: bool) -> None:
+    """What is in a capture is damaged, its archive is whole."""
+    content = {"digital-4.bin": captured(SHORT), "meta.json": META}
+    name = ("digital-4.bin", "meta.json")[int(rng.random() < 0.3)]
+    content[name] = damaged(content[name], list(content.values()), rng)
+    (folder / "run.sal").write_bytes(archive(content, zipfile.ZIP_STORED))
+    saleae(folder / "run.sal", further)
+
+
+def packed_recording(rng: np.random.Generator, folder: Path, further: bool) -> None:
+    """A recording of which the packed bytes are damaged, or the text before it was packed."""
+    text = recording()
+    if rng.random() < 0.5:
+        text = gzip.compress(damaged(text, [STORED, *LOGS], rng), 1)
+    else:
+        text = damaged(gzip.compress(text, 1), [gzip.compress(STORED)], rng)
+    (folder / "run.rec.gz").write_bytes(text)
+    importer(lambda path: read_libsurvive([path], stations=True))(folder / "run.rec.gz", further)
+
+
+def records(rng: np.random.Generator, folder: Path, further: bool) -> None:
+    """Metadata and attachments of a session, damaged before it was written."""
+    texts = [artifacts.dumps_scene(SCENE).encode(), receivers.dumps_receiver(DECK).encode()]
+    scene, receiver = (damaged(text, texts, rng) if rng.random() < 0.3 else text for text in texts)
+    names = [f"station-{channel}" for channel in (1, 4)]
+    whole = [heard.record_of(station) for station in HEARD]
+    entries = [text.encode() for record in whole for text in record.values()]
+    path = folder / "run.mcap"
+    with SessionWriter(path, system="lighthouse", overwrite=True) as writer:
+        writer.attach("scene.toml", scene, "application/toml")
+        writer.attach("receiver.toml", receiver, "application/toml")
+        for name, record in zip(names, whole, strict=True):
+            for key, value in record.items():
+                if rng.random() < 0.3:
+                    record[key] = damaged(value.encode(), entries, rng).decode("utf-8", "replace")
+            if rng.random() < 0.2:
+                name = damaged(name.encode(), entries, rng).decode("utf-8", "replace")
+            writer.metadata(name, record)
+    if further:
+        path.write_bytes(damaged(path.read_bytes(), entries, rng))
+    session = Session.open(path, damaged_ok=True)
+    info_lighthouse.recording(session)
+    info_lighthouse.station_table(info_lighthouse.recording(session)["stations"])
+    observations.read_heard(session)
+    observations.read_receivers(session)
+
+
+def slow_bits(rng: np.random.Generator, folder: Path, further: bool) -> None:
+    """Slow bits of a station, and frames whose checksum is right."""
+    content = bytearray(payload())
+    if further:
+        for place in rng.integers(0, len(content), 3):
+            content[place] = int(rng.integers(256))
+    one = ootx.encode(bytes(content))
+    bits = np.tile(one, 3)[int(rng.integers(len(one))) :][: int(rng.integers(1400))]
+    wrong = rng.random(len(bits)) < 10 ** rng.uniform(-4, -1)
+    bits = np.where(wrong, rng.integers(-1, 2, len(bits)), bits).astype(np.int8)
+    if rng.random() < 0.3 and len(bits):
+        at = int(rng.integers(len(bits)))
+        bits = np.concatenate([bits[:at], bits[at : at + 40], bits[at:]])
+    for frame in ootx.frames(bits):
+        if frame.right:
+            # Of a frame with a right checksum nothing else may come than was sent.
+            assert frame.payload == content
+            ootx.factory_data(frame.payload)
+    ootx.factory_data(rng.bytes(int(rng.integers(40, 46))) if rng.random() < 0.1 else content)
+
+
+def windows(rng: np.random.Generator, folder: Path, further: bool) -> None:
+    """Windows of 64 bytes as the paper's receiver samples them."""
+    starts = np.array(LIGHT)[np.flatnonzero(np.diff(LIGHT, prepend=-99_999) > 2000)]
+    found = paper_light.windows_of(edges_of(np.array(LIGHT)), starts[:40])
+    data = damaged(found.tobytes(), [rng.bytes(64), bytes(64), b"\xff" * 64], rng)
+    data = data[: len(data) // 64 * 64]
+    decodes = paper_light.decode(np.frombuffer(data, np.uint8).reshape(-1, 64))
+    assert len(decodes.index) == len(data) // 64
+
+
+def edges_of(tick: np.ndarray, rate: float = RATE, first: bool = True) -> Edges:
+    end = int(tick[-1]) + 1 if len(tick) else 1
+    return Edges(tick.astype(np.int64), rate, rate, first, end)
+
+
+def edges(rng: np.random.Generator, folder: Path, further: bool) -> None:
+    """Edges that came, did not come, came twice, at another rate, moved, or of nothing."""
+    tick, rate = np.array(LIGHT), float(RATE)
+    for _ in range(int(rng.integers(1, 4))):
+        if len(tick) < 2:
+            break
+        at, size = int(rng.integers(len(tick))), int(2 ** rng.uniform(0, 12))
+        kind = int(rng.integers(8))
+        if kind == 0:
+            tick = np.delete(tick, np.flatnonzero(rng.random(len(tick)) < 10 ** rng.uniform(-4, 0)))
+        elif kind == 1:
+            more = rng.integers(tick[0], tick[-1] + 1, int(10 ** rng.uniform(0, 4)))
+            tick = np.concatenate([tick, more])
+        elif kind == 2:
+            tick = tick[at : at + size]
+        elif kind == 3:
+            tick = np.concatenate([tick[:at], tick[at:] + int(10 ** rng.uniform(0, 14))])
+        elif kind == 4:
+            tick = tick + rng.integers(-3, 4, len(tick))
+        elif kind == 5:
+            tick = tick[0] + np.round((tick - tick[0]) * rng.uniform(0.2, 3.0)).astype(np.int64)
+        elif kind == 6:
+            rate = float(rng.choice([1.0, 12e6, 24e6, 25e6, 1e9, 1e11]))
+        else:
+            tick = np.concatenate([tick, tick + int(rng.integers(1, 300_000))])
+        tick = np.unique(tick)
+    lines = [edges_of(tick, rate, bool(rng.random() < 0.5))]
+    if rng.random() < 0.3:
+        lines.append(edges_of(tick[: int(rng.integers(len(tick) + 1))], rate))
+    if further:
+        paper_receive.receive(lines)
+        return
+    sweeps = receive(lines).sweeps
+    assert np.all(np.isfinite(sweeps.tick))
+    assert np.all(np.isfinite(sweeps.count))
+    assert np.all(np.diff(sweeps.tick) >= 0)
+
+
+SHORT = light(0.1)
+PARSERS: dict[str, Attempt] = {
+    "capture": of_files("run.sal", [archive({"digital-4.bin": captured(SHORT), "meta.json": META},
+                                            method) for method in (0, 8)], saleae),
+    "members": members,
+    "csv": of_files("run.csv", tables(SHORT), saleae),
+    "export": of_files("digital_4.bin", [*exports(SHORT), captured(SHORT)], saleae),
+    "libsurvive": of_files(
+        "run.rec", [recording()], importer(lambda path: read_libsurvive([path], stations=True))
+    ),
+    "libsurvive-packed": packed_recording,
+    "libsurvive-stored": of_files("run.json", [STORED], lambda path, _: read_stored(path)),
+    "dotbot-log": of_files("pydotbot.log", LOGS, importer(lambda path: read_dotbot_log([path]))),
+    "crazyflie": of_files(
+        "config.yaml",
+        [crazyflie.dumps_config(SCENE).encode()],
+        lambda path, _: artifacts.loads_scene(artifacts.dumps_scene(crazyflie.read_config(path))),
+    ),
+    "scene": of_files(
+        "scene.toml",
+        [artifacts.dumps_scene(SCENE).encode()],
+        lambda path, _: artifacts.loads_scene(artifacts.dumps_scene(artifacts.read_scene(path))),
+    ),
+    "receiver": of_files(
+        "receiver.toml",
+        [receivers.dumps_receiver(DECK).encode()],
+        lambda path, _: receivers.loads_receiver(
+            receivers.dumps_receiver(receivers.read_receiver(path))
+        ),
+    ),
+    "records": records,
+    "slow bits": slow_bits,
+    "windows": windows,
+    "edges": edges,
+}  # fmt: skip
+
+
+class Hangs(Exception):
+    """Raised where an input takes far too long."""
+
+
+def stop(number: int, frame: FrameType | None) -> None:
+    raise Hangs(f"not read in {HANGS_S} s")
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_damaged_input_is_an_error_of_ours_or_is_read(name: str, tmp_path: Path) -> None:
+    attempt, number = PARSERS[name], FIRST
+    until = time.monotonic() + SECONDS / len(PARSERS)
+    refused = 0
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        while time.monotonic() < until or number < FIRST + 10:
+            rng = np.random.default_rng([SEED, zlib.crc32(name.encode()), number])
+            signal.alarm(HANGS_S)
+            try:
+                attempt(rng, tmp_path, number % WHOLE_WAY == 0)
+            except LocatkError as error:
+                refused += 1
+                assert "\n" not in str(error), f"LOCATK_FUZZ_START={SEED}:{number}"
+            except BaseException as error:
+                error.add_note(f"{name}: try it again with LOCATK_FUZZ_START={SEED}:{number}")
+                raise
+            number += 1
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    assert refused or name == "windows" or number < FIRST + 100
+    print(f"{name}: {number - FIRST} inputs, {refused} refused")

@@ -7,15 +7,18 @@ calibrations of real units, so that the solver's generic one is never exactly ri
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.generic import UNITS
+from locatk.core.lighthouse.light import Edges
 from locatk.core.lighthouse.scene import Marker, Sighting
 from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.trajectory import Trajectory
@@ -310,3 +313,193 @@ def world() -> type[World]:
 def recordings(data: Path) -> Path:
     """Folder of the published Lighthouse recordings."""
     return data / "lighthouse"
+
+
+# ---- the light itself
+
+
+@cache
+def sequence(polynomial: int) -> NDArray[np.int8]:
+    """All bits of a polynomial, twice over, by the register itself."""
+    state, mask = 1, int(lfsr.TAPS[polynomial])
+    bits = np.empty(131071, np.int8)
+    for k in range(len(bits)):
+        bits[k] = state >> 16
+        state = (state << 1 | (state & mask).bit_count() & 1) & 0x1FFFF
+    return np.tile(bits, 2)
+
+
+@dataclass(frozen=True)
+class Sender:
+    """A station that sends: its rotor and what it says. Times are true seconds."""
+
+    channel: int
+    zero_s: float = 0.004
+    ppm: float = 0.0
+    planes: tuple[Callable[[float], float], ...] = (
+        lambda time: 0.31 + 0.02 * np.sin(0.9 * time),
+        lambda time: 0.63 + 0.02 * np.cos(0.7 * time),
+    )
+    slow: tuple[int, ...] = (0, 1, 1, 0, 1)
+    wander: Callable[[float], float] = lambda time: 0.0
+    since_s: float = 0.0
+    until_s: float = np.inf
+
+
+@dataclass(frozen=True)
+class Receiving:
+    """What becomes of the light on its way to the recorder."""
+
+    rate_hz: float = 40e6
+    clock_ppm: float = 0.0
+    resolution_hz: float | None = None
+    delay_s: float = 0.0
+    """By which rising edges are late and falling ones early, together."""
+    jitter_s: float = 0.0
+    lost: float = 0.0
+    """Share of the short pulses."""
+    rim_s: float = 0.0
+    """Noise before and after the light."""
+    missing: float = 0.0
+    spoiled: float = 0.0
+    """Shares of the sweeps that do not arrive, and of those whose bits arrive as others."""
+    width_s: float = 25e-6
+
+
+@dataclass
+class Passed:
+    """Sweeps that passed photodiodes, ascending in time."""
+
+    time_s: Array
+    sensor: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    polynomial: NDArray[np.int64]
+    plane: NDArray[np.int64]
+    rotation: NDArray[np.int64]
+    count: Array
+    spoiled: NDArray[np.bool_]
+
+
+def biphase(bits: NDArray[np.int8]) -> Array:
+    """Times of the changes of bits, in bits: at each border, and in the middle of ones."""
+    return np.sort(np.concatenate([np.arange(len(bits) + 1), np.flatnonzero(bits) + 0.5]))
+
+
+def as_received(change_s: Array, path: Receiving, noise: np.random.Generator) -> Array:
+    """Edges that are left of changes of light, the first of them upward; as many fall."""
+    edge = change_s
+    if path.rim_s:
+        before, after = (np.cumsum(noise.uniform(5e-8, 4e-7, 40)) for _ in range(2))
+        before, after = (side[side < path.rim_s] for side in (before, after))
+        edge = np.concatenate([edge[0] - 1e-7 - before[::-1], edge, edge[-1] + 1e-7 + after])
+    if len(edge) % 2:
+        edge = np.append(edge, edge[-1] + 1.67e-7)
+    rising = np.arange(len(edge)) % 2 == 0
+    edge = edge + np.where(rising, 0.5, -0.5) * path.delay_s
+    edge = edge + noise.normal(0, path.jitter_s, len(edge)) if path.jitter_s else edge
+    short = np.flatnonzero(np.diff(edge) < 1.1e-7)
+    gone = short[noise.random(len(short)) < path.lost]
+    gone = np.concatenate([gone, np.flatnonzero(np.diff(edge) <= 0)])
+    keep = np.ones(len(edge), bool)
+    for k in np.sort(gone):
+        if keep[k] and keep[k + 1]:
+            keep[k] = keep[k + 1] = False
+    return np.sort(edge[keep])
+
+
+def light_of(
+    senders: Sequence[Sender],
+    seconds: float,
+    path: Receiving = Receiving(),  # noqa: B008
+    *,
+    sensors: int = 1,
+    others: Sequence[Array] = (),
+    seed: int = 1,
+) -> tuple[list[Edges], Passed]:
+    """What photodiodes receive, and what is true. ``others`` are edges of other light,
+    in seconds; photodiodes see a sweep 9 us one after the other."""
+    noise = np.random.default_rng(seed)
+    rows: list[tuple[float, ...]] = []
+    lines: list[list[Array]] = [[np.asarray(each) for each in others] for _ in range(sensors)]
+    for sender in senders:
+        nominal_s = ROTATION_TICKS[sender.channel] / 48e6
+        turn_s = nominal_s * (1 + sender.ppm * 1e-6)
+        bit_s = (1 + sender.ppm * 1e-6) / 6e6
+        for rotation in range(int((seconds - sender.zero_s) / turn_s) - 1):
+            zero = sender.zero_s + rotation * turn_s
+            if not sender.since_s <= zero < sender.until_s:
+                continue
+            zero += sender.wander(zero)
+            polynomial = 2 * (sender.channel - 1) + sender.slow[rotation % len(sender.slow)]
+            for plane, place in enumerate(sender.planes):
+                for sensor in range(sensors):
+                    if noise.random() < path.missing:
+                        continue
+                    middle = place(zero) * turn_s + 9e-6 * sensor
+                    first, last = np.rint((middle + path.width_s * np.array([-0.5, 0.5])) / bit_s)
+                    bits = sequence(polynomial)[int(first) : int(last)]
+                    spoiled = noise.random() < path.spoiled
+                    if spoiled:
+                        bits = noise.integers(0, 2, len(bits)).astype(np.int8)
+                    change = zero + (first + biphase(bits)) * bit_s
+                    lines[sensor].append(as_received(change, path, noise))
+                    count = (first + last) / 2
+                    rows.append(
+                        (zero + count * bit_s, sensor, sender.channel, polynomial, plane,
+                         rotation, count, spoiled)
+                    )  # fmt: skip
+    table = np.array(sorted(rows)).reshape(-1, 8)
+    passed = Passed(
+        table[:, 0],
+        *(table[:, k].astype(np.int64) for k in range(1, 6)),
+        table[:, 6],
+        table[:, 7] > 0,
+    )
+    return [edges_of(np.concatenate(line), seconds, path) for line in lines], passed
+
+
+def edges_of(edge_s: Array, seconds: float, path: Receiving = Receiving()) -> Edges:  # noqa: B008
+    """A recording of edges at true times, the first of them upward."""
+    resolution = path.resolution_hz or path.rate_hz
+    clock = 1 + path.clock_ppm * 1e-6
+    tick = np.floor(np.sort(edge_s) * clock * resolution) / resolution * path.rate_hz
+    tick = np.rint(tick).astype(np.int64)
+    # Two changes within a sample are none.
+    number, times = np.unique(tick, return_counts=True)
+    tick = number[times % 2 == 1]
+    end = int(max(seconds * path.rate_hz, tick[-1] if len(tick) else 0)) + 1
+    return Edges(tick, path.rate_hz, resolution, True, end)
+
+
+class Light:
+    """The functions above, for tests that cannot import a conftest."""
+
+    Sender, Receiving, Passed = Sender, Receiving, Passed
+    ticks = ROTATION_TICKS
+    sequence = staticmethod(sequence)
+    biphase = staticmethod(biphase)
+    as_received = staticmethod(as_received)
+    of = staticmethod(light_of)
+    edges = staticmethod(edges_of)
+
+
+@pytest.fixture(scope="session")
+def light() -> type[Light]:
+    """An independent drawing of the light of stations, edge by edge."""
+    return Light
+
+
+@pytest.fixture(scope="session")
+def published(recordings: Path) -> Callable[[str], Edges]:
+    """A published recording of light by its path, read once."""
+    from locatk.formats.importers.saleae import read_light
+
+    @cache
+    def read(name: str) -> Edges:
+        path = recordings / name
+        if not path.exists():
+            pytest.skip(f"{path} is absent")
+        (edges,) = read_light(path)
+        return edges
+
+    return read
