@@ -1270,6 +1270,8 @@ static PyMethodDef methods[] = {
      "Twin of locatk.core.lighthouse.demodulate.soft_bits_numpy."},
     {"light_places", light_places, METH_VARARGS,
      "Twin of locatk.core.lighthouse.identify.identify_numpy."},
+    {"light_expected", light_expected, METH_VARARGS,
+     "Twin of locatk.core.lighthouse.identify.expect_numpy."},
     {"search_map", search_map, METH_VARARGS,
      "Twin of locatk.core.landmarks.search.search_python."},
     {NULL, NULL, 0, NULL},

@@ -32,5 +32,6 @@ PyObject *search_map(PyObject *self, PyObject *args);
 PyObject *window_edges(PyObject *self, PyObject *args);
 PyObject *light_bits(PyObject *self, PyObject *args);
 PyObject *light_places(PyObject *self, PyObject *args);
+PyObject *light_expected(PyObject *self, PyObject *args);
 
 #endif

@@ -181,7 +181,6 @@ PyObject *light_bits(PyObject *self, PyObject *args)
     int64_t *value_first = b[5].buf;
     double *start = b[6].buf;
     const Py_ssize_t bursts = b[2].len;
-    const int64_t room = b[4].len;
     int64_t most = 1;
     for (Py_ssize_t i = 0; i < bursts; i++)
         if (readable[i] && first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
@@ -205,14 +204,9 @@ PyObject *light_bits(PyObject *self, PyObject *args)
                 time[k] = (double)(tick[first[i] + k] - origin) * chips_per_tick;
             double begin;
             int odd;
-            const int chips =
-                chips_of(time, (int)edges, rises[i] ? 1.0f : -1.0f, longest, &begin, mean);
-            if (value_first[i] + chips / 2 > room) {
-                free(time);
-                free(mean);
-                PyErr_SetString(PyExc_ValueError, "no room for the bits of the bursts");
-                return release...;
-            }
+            const int64_t room = 2 * (b[4].len - value_first[i]);
+            const int chips = chips_of(time, (int)edges, rises[i] ? 1.0f : -1.0f,
+                                       room < longest ? (int)room : longest, &begin, mean);
             bits = bits_of(mean, chips, &odd, value + value_first[i]);
             start[i] = (double)origin + (begin + odd) * chip;
         }
@@ -230,17 +224,33 @@ PyObject *light_bits(PyObject *self, PyObject *args)
 #define CERTAIN 64
 
 typedef struct {
-    const int32_t *states, *index, *taps, *match, *miss;
+    const int32_t *states, *index, *taps;
     int polynomials, unknown, follow;
     int32_t gain[2][2 * CERTAIN + 1]; /* evidence of a soft bit where a zero, a one is expected */
 } Tables;
+
+static void weigh(Tables *t, const int32_t *match, const int32_t *miss)
+{
+    for (int v = -CERTAIN; v <= CERTAIN; v++) {
+        const int size = v < 0 ? -v : v;
+        t->gain[0][v + CERTAIN] = v > 0 ? miss[size] : match[size];
+        t->gain[1][v + CERTAIN] = v > 0 ? match[size] : miss[size];
+    }
+}
+
+static int64_t most_of(const int64_t *first, Py_ssize_t bursts)
+{
+    int64_t most = 1;
+    for (Py_ssize_t i = 0; i < bursts; i++)
+        if (first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
+    return most;
+}
 
 /* Bits of a burst as words, the first bit highest, with nothing before the first so that the last
  * word is full; for each word also the words of bits that came one, two, ... seventeen before. */
 typedef struct {
     uint64_t (*before)[REGISTER + 1];
     uint64_t *open; /* bits that follow from nothing, as one of the 18 is unknown */
-    uint8_t *expected;
     int bits, words, empty; /* empty: places of the first word before the first bit */
 } Text;
 
@@ -338,13 +348,13 @@ static int place_of(const Tables *t, const Text *text, int polynomial, int k)
     return place < 0 ? place + LENGTH : place;
 }
 
-/* Row of one place: polynomial, place, score, begin, end, known, wrong. */
-static void score_place(const Tables *t, const int8_t *value, Text *text, int polynomial,
-                        int place, int32_t *row)
+/* Row of one place: polynomial, place, score, begin, end, known, wrong. expected has room for the
+ * bits of the burst and a register more. */
+static void score_place(const Tables *t, const int8_t *value, int bits, uint8_t *expected,
+                        int polynomial, int place, int32_t *row)
 {
     const int32_t *states = t->states + (size_t)polynomial * LENGTH;
-    uint8_t *expected = text->expected;
-    for (int k = 0, at = place; k < text->bits; k += REGISTER) {
+    for (int k = 0, at = place; k < bits; k += REGISTER) {
         const int32_t ahead = states[at];
         for (int j = 0; j < REGISTER; j++) expected[k + j] = ahead >> (REGISTER - 1 - j) & 1;
         at += REGISTER;
@@ -352,7 +362,7 @@ static void score_place(const Tables *t, const int8_t *value, Text *text, int po
     }
     int32_t total = 0, low = 0, best = 0;
     int low_at = 0, begin = 0, end = 0;
-    for (int k = 0; k < text->bits; k++) {
+    for (int k = 0; k < bits; k++) {
         total += t->gain[expected[k]][value[k] + CERTAIN];
         low_at = total < low ? k + 1 : low_at;
         low = total < low ? total : low;
@@ -393,22 +403,14 @@ PyObject *light_places(PyObject *self, PyObject *args)
     t.states = b[2].buf;
     t.index = b[3].buf;
     t.taps = b[4].buf;
-    t.match = b[5].buf;
-    t.miss = b[6].buf;
-    for (int v = -CERTAIN; v <= CERTAIN; v++) {
-        const int size = v < 0 ? -v : v;
-        t.gain[0][v + CERTAIN] = v > 0 ? t.miss[size] : t.match[size];
-        t.gain[1][v + CERTAIN] = v > 0 ? t.match[size] : t.miss[size];
-    }
+    weigh(&t, b[5].buf, b[6].buf);
     int32_t *rows = b[7].buf;
     const Py_ssize_t bursts = b[1].len / (Py_ssize_t)sizeof *first - 1;
-    int64_t most = 1;
-    for (Py_ssize_t i = 0; i < bursts; i++)
-        if (first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
+    const int64_t most = most_of(first, bursts);
     const size_t words = (size_t)(most / 64 + 1);
-    Text text = {malloc(words * sizeof *text.before), malloc(words * sizeof *text.open),
-                 malloc((size_t)most + REGISTER), 0, 0, 0};
-    const int stored = text.before && text.open && text.expected;
+    Text text = {malloc(words * sizeof *text.before), malloc(words * sizeof *text.open), 0, 0, 0};
+    uint8_t *expected = malloc((size_t)most + REGISTER);
+    const int stored = text.before && text.open && expected;
     for (Py_ssize_t i = 0; stored && i < bursts; i++) {
         const int8_t *value = values + first[i];
         const int bits = (int)(first[i + 1] - first[i]);
@@ -419,7 +421,7 @@ PyObject *light_places(PyObject *self, PyObject *args)
         const int middle = text.words / 2, likely = likeliest(&t, &text, middle);
         int at = 0;
         if (longest_run(&t, &text, likely, middle, middle + 1, &at)) {
-            score_place(&t, value, &text, likely, place_of(&t, &text, likely, at), row);
+            score_place(&t, value, bits, expected, likely, place_of(&t, &text, likely, at), row);
             /* A bit outside of its stretch can be worth one bit of evidence for another. */
             const int outside = bits - (row[4] - row[3]);
             if (row[2] >= fastest && row[2] > outside * steps) continue;
@@ -429,12 +431,45 @@ PyObject *light_places(PyObject *self, PyObject *args)
         for (int p = 0; p < t.polynomials; p++) {
             int32_t trial[7];
             if (!longest_run(&t, &text, p, 0, text.words, &at)) continue;
-            score_place(&t, value, &text, p, place_of(&t, &text, p, at), trial);
+            score_place(&t, value, bits, expected, p, place_of(&t, &text, p, at), trial);
             if (trial[2] > row[2]) memcpy(row, trial, sizeof trial);
         }
     }
     free(text.before);
     free(text.open);
-    free(text.expected);
+    free(expected);
     return done(b, 8, stored);
+}
+
+/* light_expected(value, first, states, polynomial, index, each, reach, match, miss, unknown, rows):
+ * the best of each burst's places, and of those up to reach bits beside them. */
+PyObject *light_expected(PyObject *self, PyObject *args)
+{
+    (void)self;
+    Py_buffer b[8];
+    Tables t;
+    int each, reach;
+    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iiy*y*iw*", &b[0], &b[1], &b[2], &b[3], &b[4], &each,
+                          &reach, &b[5], &b[6], &t.unknown, &b[7]))
+        return NULL;
+    const int8_t *values = b[0].buf;
+    const int64_t *first = b[1].buf, *index = b[4].buf;
+    const int32_t *polynomial = b[3].buf;
+    t.states = b[2].buf;
+    weigh(&t, b[5].buf, b[6].buf);
+    int32_t *rows = b[7].buf;
+    const Py_ssize_t bursts = b[1].len / (Py_ssize_t)sizeof *first - 1;
+    uint8_t *expected = malloc((size_t)most_of(first, bursts) + REGISTER);
+    for (Py_ssize_t i = 0; expected && i < bursts; i++)
+        for (int k = 0; k < each; k++)
+            for (int step = -reach; step <= reach; step++) {
+                int32_t trial[7];
+                const int64_t place = (index[i * each + k] + step) % LENGTH;
+                score_place(&t, values + first[i], (int)(first[i + 1] - first[i]), expected,
+                            polynomial[i * each + k], (int)(place < 0 ? place + LENGTH : place),
+                            trial);
+                if (trial[2] > rows[7 * i + 2]) memcpy(rows + 7 * i, trial, sizeof trial);
+            }
+    free(expected);
+    return done(b, 8, expected != NULL);
 }

@@ -16,6 +16,7 @@ grows with the number of known bits.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,7 +117,6 @@ def identify(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
     """
     if kernels is None:
         return identify_numpy(bits, polynomials)
-    assert kernels is not None
     states, index = lfsr.tables()
     rows = np.zeros((len(bits), 7), np.int32)
     rows[:, 0:2] = -1
@@ -151,17 +151,42 @@ def expect(
     reach : int
         Bits before and after, at which it may stand as well.
     """
+    if kernels is None:
+        return expect_numpy(bits, polynomial, index, reach)
     rows = np.zeros((len(bits), 7), np.int32)
     rows[:, 0:2] = -1
-    if len(bits) == 0:
-        return _matches(rows)
-    value, size = _padded(bits, np.arange(len(bits))), np.diff(bits.first)
-    for column in range(polynomial.shape[1]):
-        for step in range(-reach, reach + 1):
-            place = np.mod(index[:, column] + step, lfsr.LENGTH)
-            trial = _scored(value, size, polynomial[:, column], place)
-            better = trial[:, 2] > rows[:, 2]
-            rows[better] = trial[better]
+    kernels.light_expected(
+        np.ascontiguousarray(bits.value, np.int8),
+        np.ascontiguousarray(bits.first, np.int64),
+        lfsr.tables()[0],
+        np.ascontiguousarray(polynomial, np.int32),
+        np.ascontiguousarray(index, np.int64),
+        polynomial.shape[1],
+        reach,
+        MATCH,
+        MISS,
+        UNKNOWN,
+        rows,
+    )
+    return _matches(rows)
+
+
+def expect_numpy(
+    bits: SoftBits, polynomial: NDArray[np.int32], index: NDArray[np.int64], reach: int
+) -> Matches:
+    """The same in numpy; :func:`expect` where nothing is compiled."""
+    rows = np.zeros((len(bits), 7), np.int32)
+    rows[:, 0:2] = -1
+    for chosen in _alike(bits, 1):
+        value, size = _padded(bits, chosen), np.diff(bits.first)[chosen]
+        best = rows[chosen]
+        for column in range(polynomial.shape[1]):
+            for step in range(-reach, reach + 1):
+                place = np.mod(index[chosen, column] + step, lfsr.LENGTH)
+                trial = _scored(value, size, polynomial[chosen, column], place)
+                better = trial[:, 2] > best[:, 2]
+                best[better] = trial[better]
+        rows[chosen] = best
     return _matches(rows)
 
 
@@ -182,15 +207,19 @@ def identify_numpy(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
     """The same in numpy; :func:`identify` where nothing is compiled."""
     rows = np.zeros((len(bits), 7), np.int32)
     rows[:, 0:2] = -1
+    for chosen in _alike(bits, lfsr.BITS + FOLLOW):
+        value, size = _padded(bits, chosen), np.diff(bits.first)[chosen]
+        rows[chosen] = _best(value, size, polynomials)
+    return _matches(rows)
+
+
+def _alike(bits: SoftBits, least: int) -> Iterator[NDArray[np.int64]]:
+    """Bursts of at least so many bits, some at a time, those of a length together."""
     size = np.diff(bits.first)
     order = np.argsort(size, kind="stable")
+    order = order[size[order] >= least]
     for k in range(0, len(order), CHUNK):
-        chosen = order[k : k + CHUNK]
-        chosen = chosen[size[chosen] >= lfsr.BITS]
-        if len(chosen):
-            value = _padded(bits, chosen)
-            rows[chosen] = _best(value, size[chosen], polynomials)
-    return _matches(rows)
+        yield order[k : k + CHUNK]
 
 
 def _padded(bits: SoftBits, chosen: NDArray[np.int64]) -> NDArray[np.int8]:
@@ -206,8 +235,6 @@ def _best(value: NDArray[np.int8], size: NDArray[np.int64], polynomials: int) ->
     best = np.zeros((len(value), 7), np.int32)
     best[:, 0:2] = -1
     runs = value.shape[1] - lfsr.BITS
-    if runs < FOLLOW:
-        return best
     hard = (value > 0).astype(np.int32)
     sure = np.abs(value.astype(np.int32)) > UNKNOWN
     window = np.zeros((len(value), runs), np.int32)
