@@ -96,8 +96,8 @@ def import_sweeps(
     sweeps, stations = imported.sweeps, _stations(imported.stations)
     truth_poses = sum(map(len, imported.truth))
     console.say(
-        f"{len(sweeps)} sweeps of {len(sweeps.devices)} device(s) "
-        f"({', '.join(sweeps.devices)}), {truth_poses} truth poses"
+        f"{len(sweeps)} sweeps of {_some(sweeps.devices)}"
+        + (f", {truth_poses} truth poses" if truth_poses else "")
     )
     if stations:
         console.say(console.table(*info_lighthouse.station_table(stations)))
@@ -149,6 +149,12 @@ def _arguments(paths: tuple[Path, ...], given: dict[str, Any]) -> dict[str, Any]
             path for path in named["truth"] if not any(path.samefile(other) for other in paths)
         ]
     return named
+
+
+def _some(devices: Sequence[str], most: int = 8) -> str:
+    """Devices for people: how many, and the names of some."""
+    names = ", ".join([*devices[:most], "..."] if len(devices) > most else devices)
+    return f"{len(devices)} device{'s' * (len(devices) != 1)} ({names})"
 
 
 def _stations(heard: Sequence[HeardStation]) -> list[dict[str, Any]]:

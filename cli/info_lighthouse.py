@@ -124,7 +124,8 @@ def scene(
             entry["sweeps"] = counts.get(channel, 0)
         elif detection is not None:
             entry["sweeps"] = detection.get("sweeps")
-        entry["rejected"] = None if detection is None else detection.get("rejected")
+        for key in ("rejected", "verification_rad", "verification_m"):
+            entry[key] = None if detection is None else detection.get(key)
         entry["position_m"] = None if station is None else station.position
         stations.append(entry)
     return {
@@ -176,6 +177,11 @@ def receiver(found: Receiver, device: str | None = None) -> dict[str, Any]:
     }
 
 
+def _verified(station: Mapping[str, Any]) -> str:
+    off = station.get("verification_rad")
+    return "-" if off is None else f"{1e3 * off:.2f}"
+
+
 def station_table(stations: Sequence[Mapping[str, Any]], scale: str | None = None) -> Table:
     """Stations for people, in a scene of this scale; columns of which nothing is known are left
     out."""
@@ -190,6 +196,7 @@ def station_table(stations: Sequence[Mapping[str, Any]], scale: str | None = Non
         ("rejected", _any(stations, "rejected"), lambda s: _or_dash(s["rejected"])),
         ("decoded", _any(stations, "decode_rate"), lambda s: _percent(s["decode_rate"])),
         ("calibration", True, lambda s: s["calibration"] or "-"),
+        ("off others [mrad]", _any(stations, "verification_rad"), _verified),
         ("OOTX frames", _any(stations, "frames"), lambda s: _or_dash(s["frames"])),
         ("damaged", any(s["damaged"] for s in stations), lambda s: _or_dash(s["damaged"])),
         (f"position [{unit}]", _any(stations, "position_m"), lambda s: _place(s["position_m"])),

@@ -8,7 +8,8 @@ Calibrations are the factory's numbers, as the stations send them. Crazyflie fir
 curve and ogee out of its model and takes the gib wave elsewhere; that is a choice of the
 firmware, not of the numbers, so that they are read for the full model
 (:mod:`locatk.core.lighthouse.calibration`). A geometry is another matter: it was estimated
-with the firmware's model, and is as good as that was. A scene that was read says so.
+with the firmware's model, and is as good as that was. A scene that was read says so, unless
+the key ``solver`` tells that it is ours.
 
 Only factory calibrations are written. A Crazyflie that hears a station replaces others by
 the factory's within half a minute, and a reader could not tell an estimate from it.
@@ -56,9 +57,12 @@ ROTATION_TOLERANCE = 1e-3
 """How far rotation matrices may be off, as those that people typed with four digits."""
 
 MODEL_NOTE = (
-    "stations were estimated with the Crazyflie's calibration model, which leaves curve and ogee "
-    "out: solve again for millimetres"
+    "stations are taken as the Crazyflie estimates them, whose calibration model leaves curve and "
+    "ogee out: solve again for millimetres"
 )
+
+SOLVER, OURS = "solver", "locatk"
+"""A key that cfclient and cflib pass over: of stations that were solved with the full model."""
 
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
@@ -120,11 +124,11 @@ def loads_config(text: str | bytes, *, file: str | os.PathLike[str] = "<config>"
             calibrations[channel] = calibration
         if uid:
             ids[channel] = uid
-    unread += _unread(table, ("type", "version", "systemType", "geos", "calibs"))
+    unread += _unread(table, ("type", "version", "systemType", SOLVER, "geos", "calibs"))
     if unread:
         names = ", ".join(map(repr, unread[:5])) + (", ..." if len(unread) > 5 else "")
         notes.append(f"unknown keys of the Crazyflie's configuration were passed over: {names}")
-    if geometries:
+    if geometries and table.raw(SOLVER, None) != OURS:
         notes.append(MODEL_NOTE)
     unknown = sorted(set(geometries) - set(calibrations))
     if unknown:
@@ -197,6 +201,7 @@ def dumps_config(scene: Scene) -> str:
         "type": TYPE,
         "version": VERSION,
         "systemType": SYSTEM_V2,
+        **({} if MODEL_NOTE in scene.notes else {SOLVER: OURS}),
         "geos": dict(sorted(geos.items())),
         "calibs": calibs,
     }

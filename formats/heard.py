@@ -108,7 +108,8 @@ def read_heard(session: Session) -> tuple[HeardStation, ...]:
         try:
             found.append(_station(name, records[name], scene.calibrations))
         except ValueError as error:
-            raise FormatError(str(error), file=session.path, where=name) from None
+            place = name if len(name) < 20 and name.isprintable() else ascii(name[:20])
+            raise FormatError(str(error), file=session.path, where=place) from None
     return tuple(sorted(found, key=lambda each: each.channel))
 
 

@@ -92,12 +92,12 @@ def _compiled(bursts: Bursts) -> SoftBits:
     n = len(bursts)
     ticks_per_chip = bursts.rate_hz / CHIP_HZ
     readable = _readable(bursts)
-    # A burst has as many bits as it lasts, and one or two at its ends.
     longest = int(LONGEST_S * CHIP_HZ) + 4
-    lasting = np.zeros(n)
-    lasting[readable] = bursts.take(readable).duration_s
+    # A burst has as many bits as it lasts, and one or two at its ends.
+    begin, end = bursts.first[:-1][readable], bursts.first[1:][readable] - 1
+    lasting = np.sum(bursts.tick[end] - bursts.tick[begin]) / bursts.rate_hz
     first = np.zeros(n + 1, np.int64)
-    value = np.empty(int(np.sum(lasting * BIT_HZ + 4)), np.int8)
+    value = np.empty(int(lasting * BIT_HZ) + 4 * len(begin), np.int8)
     tick = np.zeros(n)
     kernels.light_bits(
         np.ascontiguousarray(bursts.tick, np.int64),
@@ -165,7 +165,9 @@ def soft_bits_numpy(bursts: Bursts) -> SoftBits:
     return SoftBits(value, np.concatenate([[0], np.cumsum(all_bits)]), tick, 2 * chip)
 
 
-def _grid(time: Array, burst: NDArray[np.int64], first_kind: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _grid(
+    time: Array, burst: NDArray[np.int64], first_kind: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """Where the chips of each burst begin, one before its first edge, and by how much edges of
     the first edge's direction come later than the others; all in chips.
 

@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from locatk.core.errors import DegenerateError
+from locatk.core.geometry import umeyama
 from locatk.core.lighthouse.channels import period_ticks
+from locatk.core.lighthouse.frame import turned
+from locatk.core.lighthouse.job import LARGEST_MISFIT_M
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.rigid import RigidAnswer, solve_rigid
-from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.rigid_verification import verify_rigid
+from locatk.core.lighthouse.scene import Scene, Sighting
 from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.verification import StationCheck
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from locatk.core.lighthouse.solver import SolveOptions
+
+Array = NDArray[np.float64]
+
+LEAST_MARKERS = 3
+
+COUNTED = ("sweeps", "rejected")
+"""Of a detection: numbers that add up over devices."""
 
 LEAST_PHOTODIODES = 3
 """Photodiodes of known place that fix an orientation."""
@@ -48,7 +64,20 @@ def solve_devices(
     from locatk.core.lighthouse.solver import solve
 
     answer = solve_rigid(sweeps, rigid, scene)
-    own = _solution(answer, options)
+    if not scene.stations and scene.markers:
+        answer = _on_markers(answer, sweeps, rigid, scene.frame)
+    if answer.scene.scale == "device" and not scene.stations:
+        answer.notes.append("the scale is that of the device's own photodiodes")
+        if scene.distances:
+            answer.notes.append("distances are not used")
+    checks = verify_rigid(sweeps, rigid, answer)
+    if checks:
+        answer.facts["verification"] = {
+            "held_out": bool(scene.stations),
+            "moments": sum(check.moments for check in checks),
+            "stations": [check.as_facts() for check in checks],
+        }
+    own = _solution(answer, options, checks)
     numbers = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
     left = np.flatnonzero(np.isin(sweeps.device, numbers))
     if len(left) == 0:
@@ -59,8 +88,74 @@ def solve_devices(
     return _together(own, others, tuple(rigid))
 
 
-def _solution(answer: RigidAnswer, options: SolveOptions) -> Solution:
+def _on_markers(
+    answer: RigidAnswer, sweeps: Sweeps, rigid: Mapping[str, Receiver], frame: str
+) -> RigidAnswer:
+    """The scene moved onto the markers on which devices stood, and the poses in it again.
+
+    Markers lie farther apart than photodiodes, so that they give the scale as well.
+    """
+    known, seen = [], []
+    for marker in answer.scene.markers:
+        for sighting in marker.sightings:
+            place = _stood(sighting, answer.trajectories)
+            if place is not None:
+                known.append(marker.position)
+                seen.append(place)
+    try:
+        if len(known) < LEAST_MARKERS:
+            raise DegenerateError(f"{len(known)} were seen")
+        to = umeyama(np.stack(seen), np.stack(known))
+    except DegenerateError:
+        answer.notes.append(
+            f"fewer than {LEAST_MARKERS} markers, not on one line, were stood on by a device: they "
+            "fix no frame"
+        )
+        return answer
+    misfit = float(np.sqrt(np.mean(np.sum((to.apply(seen) - known) ** 2, axis=1))))
+    notes = [*answer.notes]
+    if misfit > LARGEST_MISFIT_M:
+        notes.append(
+            f"the markers are {1e3 * misfit:.0f} mm (rms) from where the device stood: a marker is "
+            "measured wrong, or the scene is"
+        )
+    stations = tuple(
+        replace(
+            station,
+            position=to.apply(station.position),
+            rotation=to.rotation @ station.rotation,
+            covariance=None
+            if station.covariance is None
+            else turned(station.covariance, to.scale, to.rotation),
+        )
+        for station in answer.scene.stations
+    )
+    framed = replace(answer.scene, stations=stations, frame=frame, scale="markers")
+    again = solve_rigid(sweeps, rigid, framed)
+    again.facts.update({**answer.facts, **again.facts})
+    again.facts["marker_misfit_m"] = misfit
+    again.facts["marker_scale"] = to.scale
+    again.notes[:0] = notes
+    return again
+
+
+def _stood(sighting: Sighting, trajectories: tuple[Trajectory, ...]) -> Array | None:
+    """Median position (3,) of a device during a sighting; None where it has no pose."""
+    for trajectory in trajectories:
+        if trajectory.device == sighting.device:
+            start, end = sighting.start_ns or 0, sighting.end_ns or 0
+            inside = (trajectory.time_ns >= start) & (trajectory.time_ns <= end)
+            if np.any(inside):
+                place: Array = np.median(trajectory.position[inside], axis=0)
+                return place
+    return None
+
+
+def _solution(
+    answer: RigidAnswer, options: SolveOptions, checks: tuple[StationCheck, ...]
+) -> Solution:
     """What the rigid devices alone say."""
+    checked = {check.channel: check for check in checks}
     rows: list[dict[str, object]] = []
     for k, channel in enumerate(sorted(answer.used)):
         station = answer.scene.station(channel)
@@ -76,6 +171,9 @@ def _solution(answer: RigidAnswer, options: SolveOptions) -> Solution:
                 "residual_rad": robust_sigma(answer.residuals[channel]),
             }
         )
+        if channel in checked:
+            rows[-1]["verification_rad"] = checked[channel].residual_rad
+            rows[-1]["verification_m"] = checked[channel].residual_m
     return Solution(
         "lighthouse",
         options.method,
@@ -90,14 +188,11 @@ def _solution(answer: RigidAnswer, options: SolveOptions) -> Solution:
 
 def _together(rigid: Solution, others: Solution, names: tuple[str, ...]) -> Solution:
     """One solution of two over the same scene."""
-    rejected = dict(rigid.rejected)
-    for reason, number in others.rejected.items():
-        rejected[reason] = rejected.get(reason, 0) + number
+    rejected = dict(Counter(rigid.rejected) + Counter(others.rejected))
     rows = {row["channel"]: dict(row) for row in others.detections}
     for row in rigid.detections:
-        both = rows.setdefault(row["channel"], {**row, "sweeps": 0, "rejected": 0})
-        both["sweeps"] += row["sweeps"]
-        both["rejected"] += row["rejected"]
+        both = rows.setdefault(row["channel"], {**row, **dict.fromkeys(COUNTED, 0)})
+        both.update({name: both[name] + row[name] for name in COUNTED})
     points = [t for t in others.trajectories if t.device not in names]
     return replace(
         others,

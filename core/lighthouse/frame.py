@@ -227,3 +227,12 @@ def at_first_station(rig: Rig, planar: bool, scale: float) -> Similarity:
         )
         origin = origin * np.array([1.0, 1.0, 0.0])
     return Similarity(scale, rotation, -scale * rotation @ origin)
+
+
+def turned(covariance: Array, scale: float, rotation: Array) -> Array:
+    """Covariances (..., k, k) of stations after a similarity of their frame; their first six
+    unknowns are position and rotation vector."""
+    change = np.eye(covariance.shape[-1])
+    change[0:3, 0:3] = scale * rotation
+    change[3:6, 3:6] = rotation
+    return change @ covariance @ change.T

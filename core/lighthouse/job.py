@@ -14,7 +14,7 @@ from locatk.core.lighthouse import frame as frames
 from locatk.core.lighthouse import poses
 from locatk.core.lighthouse.angles import rays as rays_of
 from locatk.core.lighthouse.assemble import Assembly, assemble
-from locatk.core.lighthouse.bundle import STATION_UNKNOWNS, Rig, adjust
+from locatk.core.lighthouse.bundle import Rig, adjust
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.epochs import Epochs, angles_of
 from locatk.core.lighthouse.floor_map import fit_floor_map
@@ -227,7 +227,7 @@ class Job:
                     "them: a marker is measured wrong, or the scene is"
                 )
             rig = frames.moved(rig, to)
-            covariance = _turned(covariance, to.scale, to.rotation)
+            covariance = frames.turned(covariance, to.scale, to.rotation)
             floor_z = float(np.mean(known[:, 2])) if planar else 0.0
             if planar and np.mean(rig.positions[:, 2]) < floor_z:
                 self.notes.append(
@@ -243,7 +243,11 @@ class Job:
         to = frames.at_first_station(rig, planar, scale)
         frame = self.scene.frame if planar else f"station-{self.epochs.channels[0]}"
         scene = self._scene_of(
-            frames.moved(rig, to), planar, 0.0, source, _turned(covariance, scale, to.rotation)
+            frames.moved(rig, to),
+            planar,
+            0.0,
+            source,
+            frames.turned(covariance, scale, to.rotation),
         )
         return replace(scene, frame=frame)
 
@@ -316,11 +320,3 @@ class Job:
 def _candidates(facts: dict[str, object]) -> list[dict[str, object]]:
     found = facts.get("candidates")
     return found if isinstance(found, list) else []
-
-
-def _turned(covariance: Array, scale: float, rotation: Array) -> Array:
-    """Covariances (s, 10, 10) of stations after a similarity of their frame."""
-    change = np.eye(STATION_UNKNOWNS)
-    change[0:3, 0:3] = scale * rotation
-    change[3:6, 3:6] = rotation
-    return change @ covariance @ change.T

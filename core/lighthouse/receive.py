@@ -18,7 +18,7 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr, ootx
 from locatk.core.lighthouse.bursts import Bursts, of_mocap, split
 from locatk.core.lighthouse.channels import channel_of, period_counts, slow_bit_of
-from locatk.core.lighthouse.demodulate import SoftBits
+from locatk.core.lighthouse.demodulate import CERTAIN, SoftBits
 from locatk.core.lighthouse.heard import HeardStation
 from locatk.core.lighthouse.identify import ERROR_SHARE, Matches
 from locatk.core.lighthouse.judge import Reading, identified, judge
@@ -33,6 +33,9 @@ Int = NDArray[np.int32]
 
 SHORTEST_S = 5e-6
 """Of a burst that is looked at: 30 bits, of which 17 are one look-up."""
+
+LONGEST_SILENCE = 500
+"""Rotations without a sweep that are counted: more than a frame of factory data has."""
 
 TRACK_S = 0.25
 """Sweeps of a station this far before and after tell where its light is expected."""
@@ -102,12 +105,14 @@ def receive(lines: Sequence[Edges]) -> Reception:
     Raises
     ------
     InputError
-        No light of a base station, a rate too low, or nothing but a channel on which two
-        stations send.
+        No light of a base station, a rate too low, lines of different clocks, or nothing but a
+        channel on which two stations send.
     """
     if not lines:
         raise InputError("no line of light to read")
     rate_hz = lines[0].rate_hz
+    if any(edges.rate_hz != rate_hz for edges in lines):
+        raise InputError("lines of light that were recorded by different clocks")
     flashes, heard = 0, []
     for edges in lines:
         bursts = split(edges)
@@ -177,21 +182,19 @@ def _sweeps_of(
 ) -> tuple[Array, ...]:
     """Columns of the sweeps of one photodiode."""
     rows = np.flatnonzero(reading.read)
+    if not len(rows):
+        return (np.zeros(0),) * 6
     weight, middle = _middles(reading, rows)
     channel = channel_of(reading.matches.polynomial[rows])
     order = np.lexsort((middle, channel))
     rows, weight, middle, channel = rows[order], weight[order], middle[order], channel[order]
     fresh = np.r_[True, (np.diff(channel) != 0) | (np.diff(middle) > BESIDE_S * rate_hz)]
-    group = np.cumsum(fresh[: len(rows)]) - 1
-    total = np.bincount(group, weight)
-    tick = (
-        middle[fresh[: len(rows)]] if not len(rows) else np.bincount(group, weight * middle) / total
-    )
+    group = np.cumsum(fresh) - 1
+    tick = np.bincount(group, weight * middle) / np.bincount(group, weight)
     # Of the bursts of a sweep the one with the most evidence says its polynomial.
-    best = np.lexsort((-reading.matches.evidence[rows], group))
-    best = best[np.flatnonzero(np.r_[True, np.diff(group[best]) != 0])] if len(rows) else best
-    polynomial = reading.matches.polynomial[rows[best]]
-    channel = channel_of(polynomial)
+    best = np.lexsort((-reading.matches.evidence[rows], group))[np.flatnonzero(fresh)]
+    first = rows[best]
+    polynomial, channel = reading.matches.polynomial[first], channel[best]
     plane = np.full(len(tick), UNKNOWN)
     count = np.zeros(len(tick))
     for number in np.unique(channel):
@@ -201,28 +204,28 @@ def _sweeps_of(
             plane[mine] = planes_of(rotation, place)
             count[mine] = place * period_counts(number)
         else:
-            first = rows[best][mine]
-            bit = (tick[mine] - reading.bits.tick[first]) / reading.bits.ticks_per_bit
-            count[mine] = reading.matches.index[first] + bit
+            bit = (tick[mine] - reading.bits.tick[first[mine]]) / reading.bits.ticks_per_bit
+            count[mine] = reading.matches.index[first[mine]] + bit
     return tick, np.full(len(tick), sensor), channel, polynomial, plane, count
 
 
 def _middles(reading: Reading, rows: NDArray[np.int64]) -> tuple[Array, Array]:
     """How much of its sequence each burst shows, in bits, and the middle of that, in ticks.
 
-    Bits that agree count for, those that contradict against their place: noise at the ends
-    cancels out, and what is left is the beam. It scatters by a fifth of a microsecond, half as
-    much as the middle between the outer edges.
+    In the stretch that agrees, each bit counts by how sure it is, and one that contradicts
+    against its place. On recordings it scatters by a fifth of a microsecond, half as much as
+    the middle between the outer edges.
     """
     bits, matches = reading.bits, reading.matches
-    size = np.diff(bits.first)[rows]
+    begin = matches.begin[rows].astype(np.int64)
+    size = matches.end[rows] - begin
     burst = np.repeat(np.arange(len(rows)), size)
-    place = np.arange(len(burst)) - np.repeat(np.cumsum(size) - size, size)
-    value = bits.value[bits.first[rows][burst] + place] / 64.0
+    place = np.arange(len(burst)) - np.repeat(np.cumsum(size) - size - begin, size)
+    value = bits.value[bits.first[rows][burst] + place] / CERTAIN
     expected = lfsr.state_at(matches.index[rows][burst] + place, matches.polynomial[rows][burst])
     value = np.where(expected >> (lfsr.BITS - 1) > 0, value, -value)
     weight = np.bincount(burst, value, len(rows))
-    middle = np.bincount(burst, value * (place + 0.5), len(rows)) / np.maximum(weight, 1e-9)
+    middle = np.bincount(burst, value * (place + 0.5), len(rows)) / weight
     return weight, bits.tick[rows] + middle * bits.ticks_per_bit
 
 
@@ -241,6 +244,8 @@ def _station(
     mine = np.flatnonzero(sweeps.channel == number)
     if rotor is None:
         return HeardStation(number, sweeps=len(mine))
+    if rotor.restarts:
+        notes.append(f"the station on channel {number} started anew while recording")
     slow = slow_bits(sweeps.tick[mine], sweeps.polynomial[mine], rotor)
     frames = ootx.frames(slow)
     right = [frame for frame in frames if frame.right]
@@ -273,9 +278,10 @@ def _station(
 
 def slow_bits(tick: Array, polynomial: Int, rotor: Rotor) -> NDArray[np.int8]:
     """Slow bit of each rotation, from the first to the last that was heard; -1 where none was
-    heard, or its sweeps contradict each other."""
+    heard, or its sweeps contradict each other. Sweeps ascend in time."""
     rotation, _ = rotor.turn(tick)
-    rotation -= rotation.min()
+    # Over a longer silence no frame is put together.
+    rotation = np.cumsum(np.clip(np.diff(rotation, prepend=rotation[0]), 0, LONGEST_SILENCE))
     votes = np.bincount(rotation, np.where(slow_bit_of(polynomial) > 0, 1, -1))
     heard = np.bincount(rotation) > 0
     return np.where(heard & (votes != 0), votes > 0, -1).astype(np.int8)

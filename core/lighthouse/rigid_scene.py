@@ -282,7 +282,7 @@ def _spread_out(place: NDArray[np.int64], stations: NDArray[np.int64]) -> NDArra
 def _remarks(
     joined: list[int], channels: Sequence[int], calibrations: tuple[Calibration, ...], places: int
 ) -> list[str]:
-    notes = ["the scale is that of the device's own photodiodes"]
+    notes = []
     left = [str(c) for i, c in enumerate(channels) if i not in joined]
     if left:
         notes.append(

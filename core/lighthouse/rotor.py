@@ -3,19 +3,25 @@
 A decoded burst tells when the rotor was at its zero: its own time less the time that its
 index takes. A station's rotor turns with a crystal's constancy, wanders by a microsecond in a
 minute, and starts at another moment than any accident would name. So the bursts of a station
-must agree on one period and one phase; those that do not were decoded wrong.
+must agree on one period, and from one to the next on one phase; those that do not were decoded
+wrong.
 
-Two stations that send on one channel show as two phases. No light tells them apart for good,
-so that all that is said of such a channel is that it happens.
+Bursts of one phase, without a longer silence, are a stretch. A station that was out of sight
+for long, or was switched off and on, makes another one. Two stretches at the same time are two
+stations on one channel. No light tells them apart for good, so that all that is said of such a
+channel is that it happens.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from locatk.core.lighthouse.channels import CHANNELS, TICK_HZ, channel_of, period_ticks
 
@@ -26,7 +32,7 @@ SEED = 28.0
 together."""
 
 LEAST_BURSTS = 4
-"""That agree make a rotor."""
+"""That agree make a stretch of a rotor."""
 
 CLOCKS_PPM = 200.0
 """Clocks of station and recorder together are off by at most this."""
@@ -35,16 +41,21 @@ AGREE_S = 2e-6
 """From the followed phase: a burst farther away was decoded wrong. Single bursts scatter by
 0.13 us at 1 m and by 0.5 us at 4 m (Bitcraze's recordings)."""
 
-LINE_REACH_S = (20e-6, 10e-6)
-"""From a rotor of constant speed, in the steps in which it is found: its wander is heard."""
-
-CURVE_REACH_S = (8e-6, 3e-6)
-"""From the followed phase, in the steps in which it is found."""
-
 LINK_S = 3e-6
-"""Slack between two bursts of one rotor a few rotations apart."""
+LINK_PPM = 2.0
+"""Slack between two bursts of one rotor, and what it grows by with the time between them."""
 
 NEIGHBOURS = 8
+"""Bursts before and after to which one may link."""
+
+SILENCE = 50
+"""Rotations without a burst after which a stretch ends."""
+
+BASELINES = (4, SILENCE)
+"""Rotations over which the period is measured, in the steps in which it is found."""
+
+RESTART_S = 20e-6
+"""A rotor that comes back farther than this from where it should be started again."""
 
 KNOT_S = 0.5
 """Between the knots of the followed phase."""
@@ -71,9 +82,12 @@ class Rotor:
     knots : (k,) ndarray
         Times, in ticks of the recorder, at which ``wander`` is given.
     wander : (k,) ndarray
-        By how much the rotor's zero is later there than ``zero + k period``, in ticks.
+        By how much the rotor's zero is later there than ``zero + k period``, in ticks. Over
+        silences it goes straight to where the rotor comes back.
     bursts : int
         That agree.
+    restarts : int
+        How often it came back from a silence with another phase.
     sigma : float
         Standard deviation of one of them, in ticks.
     """
@@ -84,6 +98,7 @@ class Rotor:
     knots: Array
     wander: Array
     bursts: int
+    restarts: int
     sigma: float
 
     def turn(self, tick: Array) -> tuple[NDArray[np.int64], Array]:
@@ -150,15 +165,19 @@ def find_rotors(
         mine = np.flatnonzero(channel == number)
         if len(mine) < LEAST_BURSTS:
             continue
-        rotor, agree = _follow(number, tick[mine], index[mine], rate_hz)
-        if rotor is None:
+        period = _period(number, tick[mine], index[mine], rate_hz)
+        # Right ones ascend in time; wrong ones are anywhere.
+        start = zeros(tick[mine], index[mine], number, period)
+        order = np.argsort(start, kind="stable")
+        stretches, second = _apart(_stretches(start[order], period, rate_hz))
+        if not stretches:
             continue
-        rest = mine[~agree]
-        other, _ = _follow(number, tick[rest], index[rest], rate_hz)
-        if other is not None and other.bursts > SECOND_SHARE * rotor.bursts:
+        if second > SECOND_SHARE * sum(map(len, stretches)):
             doubled.append(number)
-        else:
-            rotors[number] = rotor
+            continue
+        mine = mine[order]
+        parts = [mine[rows] for rows in stretches]
+        rotors[number] = _followed(number, tick, index, parts, period, rate_hz)
     return Found(rotors, tuple(doubled))
 
 
@@ -171,98 +190,116 @@ def zeros(tick: Array, index: NDArray[np.int64], channel: int, period: float) ->
     return tick - index * (period * 8 / float(period_ticks(channel)))
 
 
-def _follow(
-    channel: int, tick: Array, index: NDArray[np.int64], rate_hz: float
-) -> tuple[Rotor | None, NDArray[np.bool_]]:
-    """The rotor that most bursts agree on, and which those are."""
-    none = np.zeros(len(tick), bool)
-    period = float(period_ticks(channel)) / TICK_HZ * rate_hz
-    linked = _linked(zeros(tick, index, channel, period), period, rate_hz)
-    if np.count_nonzero(linked) < LEAST_BURSTS:
-        return None, none
-    line = _line(channel, tick[linked], index[linked], period, rate_hz)
-    if line is None:
-        return None, none
-    period, zero = line
-    for reach_s in LINE_REACH_S:
-        start = zeros(tick, index, channel, period)
-        rotation, late = _late(start, period, zero)
-        near = np.abs(late) < reach_s * rate_hz
-        if np.count_nonzero(near) < LEAST_BURSTS:
-            return None, none
-        if np.ptp(rotation[near]) == 0:
-            return None, none
-        slope, shift = np.polyfit(rotation[near], late[near], 1)
-        period, zero = period + float(slope), zero + float(shift)
-    start = zeros(tick, index, channel, period)
-    _, late = _late(start, period, zero)
-    knots, wander = np.zeros(1), np.zeros(1)
-    for reach_s in CURVE_REACH_S:
-        near = np.abs(late - np.interp(start, knots, wander)) < reach_s * rate_hz
-        if np.count_nonzero(near) < LEAST_BURSTS:
-            return None, none
-        knots, wander = _smooth(start[near], late[near], rate_hz)
-    off = late - np.interp(start, knots, wander)
-    agree = np.abs(off) < AGREE_S * rate_hz
-    number = int(np.count_nonzero(agree))
-    if number < LEAST_BURSTS:
-        return None, none
-    sigma = float(np.sqrt(np.mean(off[agree] ** 2)))
-    return Rotor(channel, period, zero, knots, wander, number, sigma), agree
-
-
-def _late(start: Array, period: float, zero: float) -> tuple[Array, Array]:
-    """Rotation of each zero, and by how much it is later than a constant rotor says."""
-    rotation = np.rint((start - zero) / period)
-    return rotation, start - zero - rotation * period
-
-
-def _linked(start: Array, period: float, rate_hz: float) -> NDArray[np.bool_]:
-    """Which zeros (n,), ascending in time, are whole rotations away from some near neighbour."""
-    linked = np.zeros(len(start), bool)
-    for ahead in range(1, min(NEIGHBOURS, len(start) - 1) + 1):
-        step = start[ahead:] - start[:-ahead]
-        off = np.abs(step - np.rint(step / period) * period)
-        near = off < LINK_S * rate_hz + CLOCKS_PPM * 1e-6 * np.abs(step)
-        # Accidents link over long silences, where the slack is no test any more.
-        near &= np.abs(step) < 50 * period
-        linked[ahead:] |= near
-        linked[:-ahead] |= near
-    return linked
-
-
-def _line(
-    channel: int, tick: Array, index: NDArray[np.int64], period: float, rate_hz: float
-) -> tuple[float, float] | None:
-    """Period and zero of the line through most zeros, by ever longer baselines."""
-    nominal = period
-    for _ in range(3):
-        start = zeros(tick, index, channel, period)
-        # From each burst to the farthest one to which rotations can be counted without doubt.
-        reach = period / (8 * CLOCKS_PPM * 1e-6)
-        far = np.searchsorted(start, start + reach, side="right") - 1
-        far = np.clip(far, 0, len(start) - 1)
+def _period(channel: int, tick: Array, index: NDArray[np.int64], rate_hz: float) -> float:
+    """The period on which most pairs of bursts agree, by ever longer baselines."""
+    nominal = period = float(period_ticks(channel)) / TICK_HZ * rate_hz
+    for rotations in BASELINES:
+        start = np.sort(zeros(tick, index, channel, period))
+        far = np.searchsorted(start, start + (rotations + 0.5) * period) - 1
         step = start[far] - start
-        rotations = np.rint(step / period)
-        some = rotations > 0
-        if not np.any(some):
-            return None
-        slope = np.median((step[some] - rotations[some] * period) / rotations[some])
-        if abs(period + slope - nominal) > CLOCKS_PPM * 1e-6 * nominal:
-            return None
-        period += float(slope)
-    start = zeros(tick, index, channel, period)
-    phase = np.angle(np.exp(2j * np.pi * (start - start[0]) / period)) / (2 * np.pi) * period
-    middle = _densest(phase, LINE_REACH_S[0] * rate_hz)
-    return period, float(start[0] + middle)
+        turns = np.rint(step / period)
+        some = turns > 0
+        each = step[some] / turns[some]
+        each = each[np.abs(each - nominal) < CLOCKS_PPM * 1e-6 * nominal]
+        if len(each):
+            period = _densest(each, 2 * LINK_S * rate_hz / rotations)
+    return period
 
 
 def _densest(values: Array, width: float) -> float:
-    """Middle of the interval of a given width that holds most values."""
+    """Median in the interval of a given width that holds most values."""
     ordered = np.sort(values)
     number = np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered))
     at = int(np.argmax(number))
     return float(np.median(ordered[at : at + number[at]]))
+
+
+def _stretches(start: Array, period: float, rate_hz: float) -> list[NDArray[np.int64]]:
+    """Rows of zeros (n,), ascending in time, that link one to the next by whole rotations; each
+    ascending, those with most rows first."""
+    pairs = [np.zeros((2, 0), np.int64)]
+    for ahead in range(1, min(NEIGHBOURS, len(start) - 1) + 1):
+        step = start[ahead:] - start[:-ahead]
+        off = np.abs(step - np.rint(step / period) * period)
+        near = off < LINK_S * rate_hz + LINK_PPM * 1e-6 * step
+        row = np.flatnonzero(near & (step < (SILENCE + 0.5) * period))
+        pairs.append(np.stack([row, row + ahead]))
+    link = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(link.shape[1]), (link[0], link[1])), (len(start), len(start)))
+    _, of = connected_components(graph, directed=False)
+    order = np.argsort(of, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(of[order])) + 1)
+    return sorted((rows for rows in parts if len(rows) >= LEAST_BURSTS), key=len, reverse=True)
+
+
+def _apart(stretches: list[NDArray[np.int64]]) -> tuple[list[NDArray[np.int64]], int]:
+    """Stretches, ascending, of which no two are at the same time, the long ones first taken; and
+    the number of rows in the others."""
+    taken: list[NDArray[np.int64]] = []
+    others = 0
+    for rows in stretches:
+        at = bisect_left(taken, rows[0], key=lambda each: int(each[0]))
+        before = at == 0 or taken[at - 1][-1] < rows[0]
+        if before and (at == len(taken) or rows[-1] < taken[at][0]):
+            taken.insert(at, rows)
+        else:
+            others += len(rows)
+    return taken, others
+
+
+def _followed(
+    channel: int,
+    tick: Array,
+    index: NDArray[np.int64],
+    stretches: list[NDArray[np.int64]],
+    period: float,
+    rate_hz: float,
+) -> Rotor:
+    """The rotor whose bursts the rows of ``stretches`` are."""
+    # One slope for all: a stretch may begin at any phase.
+    for _ in range(2):
+        above = below = 0.0
+        for rows in stretches:
+            turns, late = _late(zeros(tick[rows], index[rows], channel, period), period)
+            turns -= turns.mean()
+            above, below = above + float(turns @ late), below + float(turns @ turns)
+        if below > 0:
+            period += above / below
+    zero = float(zeros(tick[stretches[0][:1]], index[stretches[0][:1]], channel, period)[0])
+    knots, wander, off = [], [], []
+    restarts = 0
+    for rows in stretches:
+        start = zeros(tick[rows], index[rows], channel, period)
+        shift = start[0] - zero
+        late = shift - np.rint(shift / period) * period + _late(start, period)[1]
+        times, curve = _smooth(start, late, rate_hz)
+        off.append(late - np.interp(start, times, curve))
+        if knots:
+            jump = curve[0] - wander[-1][-1]
+            jump -= np.rint(jump / period) * period
+            slack = RESTART_S * rate_hz + LINK_PPM * 1e-6 * (times[0] - knots[-1][-1])
+            restarts += int(abs(jump) > slack)
+        knots.append(times)
+        wander.append(curve)
+    far = np.concatenate(off)
+    near = far[np.abs(far) < AGREE_S * rate_hz]
+    return Rotor(
+        channel,
+        period,
+        zero,
+        np.concatenate(knots),
+        np.concatenate(wander),
+        bursts=len(near),
+        restarts=restarts,
+        sigma=float(np.sqrt(np.sum(near**2) / max(1, len(near)))),
+    )
+
+
+def _late(start: Array, period: float) -> tuple[Array, Array]:
+    """Rotation of each zero of a stretch from its first one, and by how much it is later than
+    a constant rotor says."""
+    turns = np.cumsum(np.rint(np.diff(start, prepend=start[0]) / period))
+    return turns, start - start[0] - turns * period
 
 
 def _smooth(tick: Array, late: Array, rate_hz: float) -> tuple[Array, Array]:
@@ -292,7 +329,10 @@ def _smooth(tick: Array, late: Array, rate_hz: float) -> tuple[Array, Array]:
         off = late - np.interp(tick, knots, wander)
         scale = 1.4826 * float(np.median(np.abs(off))) + 1e-3
         weight = np.minimum(1.0, 2 * scale / np.maximum(np.abs(off), 1e-12))
-    return knots, wander
+    # The last knot lies beyond the bursts, where something else may follow.
+    end = np.interp(last, knots, wander)
+    inside = knots < last
+    return np.append(knots[inside], last), np.append(wander[inside], end)
 
 
 def _bend_penalty(band: Array, stiffness: float) -> None:

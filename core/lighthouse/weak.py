@@ -56,19 +56,18 @@ def belongs(
         read themselves.
     """
     of = np.full(len(bursts), -1, np.int64)
-    known = np.flatnonzero(read)
-    if not len(known):
+    known, fragments = np.flatnonzero(read), np.flatnonzero(~read)
+    if not len(known) or not len(fragments):
         return of
-    for row in np.flatnonzero(~read):
-        start = float(bursts.start[row])
-        at = np.searchsorted(bits.tick[known], start)
-        beside = known[max(0, at - 1) : at + 1]
-        nearest = int(beside[np.argmin(np.abs(bits.tick[beside] - start))])
-        if abs(bits.tick[nearest] - start) > BESIDE_S * bursts.rate_hz:
-            continue
-        bit = (start - bits.tick[nearest]) / bits.ticks_per_bit + matches.index[nearest]
-        if chance(bursts, row, int(matches.polynomial[nearest]), bit) <= CHANCE:
-            of[row] = nearest
+    begin, start = bits.tick[known], bursts.start[fragments].astype(float)
+    at = np.searchsorted(begin, start)
+    sides = np.stack([np.maximum(at - 1, 0), np.minimum(at, len(known) - 1)])
+    nearest = sides[np.argmin(np.abs(begin[sides] - start), axis=0), np.arange(len(start))]
+    close = np.abs(begin[nearest] - start) <= BESIDE_S * bursts.rate_hz
+    for row, mate in zip(fragments[close], known[nearest[close]], strict=True):
+        bit = (bursts.start[row] - bits.tick[mate]) / bits.ticks_per_bit + matches.index[mate]
+        if chance(bursts, row, int(matches.polynomial[mate]), float(bit)) <= CHANCE:
+            of[row] = mate
     return of
 
 

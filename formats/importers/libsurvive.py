@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.errors import ArtifactError, FormatError, InputError, MissingDataError
 from locatk.core.lighthouse import ootx
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.channels import period_counts
@@ -43,6 +43,7 @@ from locatk.formats.importers.libsurvive_device import (
 from locatk.formats.importers.libsurvive_heard import HeardSweeps, hear
 from locatk.formats.importers.libsurvive_lines import Recording, read_lines
 from locatk.formats.importers.sweeps import ImportedSession
+from locatk.formats.receivers import dumps_receiver, loads_receiver
 
 FRAME = "libsurvive"
 EXTERNAL = "libsurvive-external"
@@ -84,8 +85,9 @@ def read_libsurvive(paths: Sequence[Path], *, stations: bool = False) -> Importe
         )
     path = Path(paths[0])
     recording = read_lines(path)
+    cut = "" if recording.cut is None else f" ({recording.cut})"
     if not len(recording.sweeps):
-        _refuse(recording, path)
+        _refuse(recording, path, cut)
     warnings: list[str] = []
     lost: list[str] = [] if recording.cut is None else [recording.cut]
     heard = [hear(recording, i) for i in range(len(recording.devices))]
@@ -96,19 +98,19 @@ def read_libsurvive(paths: Sequence[Path], *, stations: bool = False) -> Importe
     sweeps = _take(sweeps, ~strange)
     if not len(sweeps):
         raise InputError(
-            "no sweep of a station whose rotor is known",
+            f"no sweep of a station whose rotor is known{cut}",
             file=path,
             hint="a recording needs at least four syncs (lines Y) of a station",
         )
     told = _stations(heard, sweeps, warnings)
     truth = _truth(recording, warnings)
-    left = {
-        "damaged lines": recording.damaged,
-        "lines whose timecode does not fit their time": sum(h.unplaced for h in heard),
-        "sweeps without a sync near": sum(h.rotorless for h in heard),
-        "sweeps of photodiodes that the device's configuration does not have": int(strange.sum()),
-    }
-    lost += [f"{count} {what}" for what, count in left.items() if count]
+    left = [
+        (recording.damaged, "damaged line", ""),
+        (sum(h.unplaced for h in heard), "line", " with a timecode that does not fit its time"),
+        (sum(h.rotorless for h in heard), "sweep", " without a sync near"),
+        (int(strange.sum()), "sweep", " of photodiodes that the device's configuration lacks"),
+    ]
+    lost += [f"{n} {what}{'s' * (n > 1)}{which}" for n, what, which in left if n]
     facts = _facts(recording, path, heard, sweeps, truth)
     repaired = sum(h.repaired for h in heard)
     if repaired:
@@ -125,7 +127,7 @@ def read_libsurvive(paths: Sequence[Path], *, stations: bool = False) -> Importe
     )
 
 
-def _refuse(recording: Recording, path: Path) -> None:
+def _refuse(recording: Recording, path: Path, cut: str) -> None:
     first_generation = sum(recording.kinds[kind] for kind in ("C", "L", "R", "A", "S"))
     if first_generation:
         raise FormatError(
@@ -134,7 +136,7 @@ def _refuse(recording: Recording, path: Path) -> None:
             hint="only Lighthouse V2 is read",
         )
     raise FormatError(
-        "a recording without a sweep (lines W)",
+        f"a recording without a sweep (lines W){cut}",
         file=path,
         hint="record with --record-angle 1 and the stations running",
     )
@@ -264,9 +266,12 @@ def _receivers(recording: Recording, warnings: list[str]) -> dict[str, Receiver]
             warnings.append(f"the recording has no configuration of {name}")
             continue
         try:
-            found[name] = read_receiver(config, in_imu)
-        except FormatError as error:
-            warnings.append(f"{name}: {error.message}")
+            receiver = read_receiver(config, in_imu)
+            loads_receiver(dumps_receiver(receiver))
+        except (FormatError, ArtifactError) as error:
+            warnings.append(f"{name}: {error.message}: where its photodiodes sit is not taken")
+            continue
+        found[name] = receiver
     return found
 
 

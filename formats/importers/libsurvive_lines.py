@@ -36,8 +36,14 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, MissingDataError
 
-LIMIT = 1 << 30
-"""Decoded bytes that are read of one recording: an hour and a half of four stations."""
+LIMIT = 1 << 29
+LINES = 1 << 24
+"""Decoded bytes and lines that are read of one recording: forty minutes of a tracker under four
+stations."""
+
+DENSE = 40
+DENSE_FROM = 4 << 20
+"""By so much no recording packs, from so many packed-out bytes on: published ones do 4 : 1."""
 
 BLOCK = 8 << 20
 LONGEST = 1 << 20
@@ -172,6 +178,9 @@ def read_lines(path: Path, *, angles: bool = False) -> Recording:
         collected.add(block)
         if collected.recording.lines > STRANGE and not collected.known:
             break
+        if collected.recording.lines > LINES:
+            pieces.cut = f"only the first {collected.recording.lines:,} lines were read"
+            break
     collected.damaged += pieces.overlong
     recording = collected.finish(pieces.cut)
     if not (len(recording.syncs) or len(recording.sweeps) or recording.configs or recording.kinds):
@@ -232,6 +241,7 @@ class _Pieces:
 
     def _unpacked(self, packed: Iterator[bytes]) -> Iterator[bytes]:
         unpack = zlib.decompressobj(31)
+        taken = given = 0
         for raw in packed:
             while raw:
                 if unpack.eof:  # another member follows
@@ -242,7 +252,12 @@ class _Pieces:
                     self.cut = "the archive is damaged, what follows is lost"
                     return
                 yield piece
-                raw = unpack.unused_data if unpack.eof else unpack.unconsumed_tail
+                rest = unpack.unused_data if unpack.eof else unpack.unconsumed_tail
+                taken, given = taken + len(raw) - len(rest), given + len(piece)
+                if given > max(DENSE_FROM, DENSE * taken):
+                    self.cut = f"packed {given // taken} : 1 after {given >> 20} MB, as no recording is"
+                    return
+                raw = rest
         if not unpack.eof:
             self.cut = "the archive breaks off"
 

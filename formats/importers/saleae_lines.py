@@ -149,10 +149,12 @@ class Tally:
 
     @classmethod
     def of(cls, line: Line) -> Tally:
-        """Read a line without holding it."""
+        """Read a line without holding it; a fast clock no further than could be read at all."""
         tally = cls(line.rate_hz)
         for piece in line.pieces():
             tally.add(piece.tick)
+            if tally.edges > MOST_EDGES:
+                break
         return tally
 
     def add(self, tick: Ticks) -> None:

@@ -77,6 +77,8 @@ def test_stations_as_they_were_heard(locatk, write, tmp_path: Path) -> None:
         "frames": 11,
         "damaged": 0,
         "rejected": None,
+        "verification_rad": None,
+        "verification_m": None,
         "position_m": None,
     }
     assert (second["id"], second["calibration"], second["period_ticks"]) == (

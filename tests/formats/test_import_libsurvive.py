@@ -225,7 +225,7 @@ def test_a_tracker_that_starts_again_and_a_timecode_of_nowhere(tmp_path: Path) -
         room.lines[k] = (time, " ".join(words))
     session = read_libsurvive([room.write(tmp_path)])
     assert session.warnings == ["the counter of WM0 started again 1 times"]
-    assert session.lost == "2 lines whose timecode does not fit their time"
+    assert session.lost == "2 lines with a timecode that does not fit its time"
     assert np.abs(turn_errors(room, session.sweeps)).max() < 1.0
     assert np.ptp(session.sweeps.time_ns) < 3_100_000_000
 
@@ -430,13 +430,13 @@ def test_sweeps_of_no_photodiode_and_no_rotor_are_left_out(tmp_path: Path, room:
     ]
     session = read_libsurvive([room.write(tmp_path, *more)])
     assert session.lost == (
-        "1 sweeps without a sync near, "
-        "1 sweeps of photodiodes that the device's configuration does not have"
+        "1 sweep without a sync near, "
+        "1 sweep of photodiodes that the device's configuration lacks"
     )
     assert set(session.sweeps.channel.tolist()) == {4, 12}
     without = read_libsurvive([room.write(tmp_path, *more, config=False)])
     assert without.receivers == {}
-    assert without.lost == "1 sweeps without a sync near"
+    assert without.lost == "1 sweep without a sync near"
 
 
 @pytest.mark.parametrize("packed", [True, False])

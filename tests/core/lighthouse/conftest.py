@@ -410,7 +410,7 @@ def as_received(change_s: Array, path: Receiving, noise: np.random.Generator) ->
 def light_of(
     senders: Sequence[Sender],
     seconds: float,
-    path: Receiving = Receiving(),  # noqa: B008
+    path: Receiving = Receiving(),
     *,
     sensors: int = 1,
     others: Sequence[Array] = (),
@@ -458,7 +458,7 @@ def light_of(
     return [edges_of(np.concatenate(line), seconds, path) for line in lines], passed
 
 
-def edges_of(edge_s: Array, seconds: float, path: Receiving = Receiving()) -> Edges:  # noqa: B008
+def edges_of(edge_s: Array, seconds: float, path: Receiving = Receiving()) -> Edges:
     """A recording of edges at true times, the first of them upward."""
     resolution = path.resolution_hz or path.rate_hz
     clock = 1 + path.clock_ppm * 1e-6
