@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from locatk.cli import console, options, simulate_dots, simulate_landmarks, simulate_polaris
+
+if TYPE_CHECKING:
+    from locatk.core.lighthouse.receiver import Receiver
+
+
+DECK = "deck"
+
+REPORT_HZ = 10.0
+"""Of a DotBot."""
+
+EVERY_SWEEP_HZ = 120.0
+"""Reports faster than rotors turn hold each sweep once."""
 
 
 @click.group(short_help="Make a session with known truth, without hardware.")
@@ -68,6 +81,12 @@ command.add_command(simulate_landmarks.command, "landmarks")
     show_default=True,
     help="Share of sweeps that are wrong: jumps and reflections.",
 )
+@click.option(
+    "--receiver",
+    metavar="deck|FILE",
+    help="Photodiodes that each robot carries (receiver.toml, or Bitcraze's Lighthouse deck), of "
+    "which it reports every sweep; else it has one, and reports ten times a second.",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @options.overwrite
 @options.as_json
@@ -81,6 +100,7 @@ def lighthouse(
     noise_udeg: float,
     occlusion: float,
     outliers: float,
+    receiver: str | None,
     seed: int,
     overwrite: bool,
     as_json: bool,
@@ -95,13 +115,16 @@ def lighthouse(
       locatk simulate lighthouse -o run.mcap
       locatk simulate lighthouse -o swarm.mcap --robots 20 --stations 4 --duration 60
       locatk simulate lighthouse -o hard.mcap --3d --occlusion 0.2 --outliers 0.02 --seed 7
+      locatk simulate lighthouse -o deck.mcap --3d --receiver deck
     """
     import math
 
     from locatk.core.lighthouse import simulate
     from locatk.formats import observations
 
-    options.guard_output(output, overwrite=overwrite)
+    carried = None if receiver is None else _receiver(receiver)
+    aside = () if receiver in (None, DECK) else (Path(str(receiver)),)
+    options.guard_output(output, overwrite=overwrite, inputs=aside)
     with console.working("Simulating"):
         simulated = simulate.simulate(
             simulate.SimulationOptions(
@@ -113,6 +136,8 @@ def lighthouse(
                 occlusion=occlusion,
                 outliers=outliers,
                 seed=seed,
+                receiver=carried,
+                report_hz=REPORT_HZ if carried is None else EVERY_SWEEP_HZ,
             )
         )
         observations.write_session(
@@ -121,6 +146,7 @@ def lighthouse(
             sweeps=simulated.sweeps,
             scene=simulated.scene,
             truth=simulated.truth,
+            receivers={} if carried is None else dict.fromkeys(simulated.sweeps.devices, carried),
             overwrite=overwrite,
         )
     truth_poses = sum(len(trajectory) for trajectory in simulated.truth)
@@ -135,3 +161,11 @@ def lighthouse(
                 "truth_poses": truth_poses,
             }
         )
+
+
+def _receiver(name: str) -> Receiver:
+    """The deck, or what a file says."""
+    from locatk.core.lighthouse.receiver import DECK as DECKS_OWN
+    from locatk.formats.receivers import read_receiver
+
+    return DECKS_OWN if name == DECK else read_receiver(Path(name))

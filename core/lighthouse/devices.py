@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.geometry import umeyama
+from locatk.core.geometry import (
+    Similarity,
+    quaternion_from_matrix,
+    quaternion_multiply,
+    umeyama,
+)
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.frame import turned
 from locatk.core.lighthouse.job import LARGEST_MISFIT_M
@@ -65,7 +70,7 @@ def solve_devices(
 
     answer = solve_rigid(sweeps, rigid, scene)
     if not scene.stations and scene.markers:
-        answer = _on_markers(answer, sweeps, rigid, scene.frame)
+        answer = _on_markers(answer, scene.frame)
     if answer.scene.scale == "device" and not scene.stations:
         answer.notes.append("the scale is that of the device's own photodiodes")
         if scene.distances:
@@ -88,10 +93,8 @@ def solve_devices(
     return _together(own, others, tuple(rigid))
 
 
-def _on_markers(
-    answer: RigidAnswer, sweeps: Sweeps, rigid: Mapping[str, Receiver], frame: str
-) -> RigidAnswer:
-    """The scene moved onto the markers on which devices stood, and the poses in it again.
+def _on_markers(answer: RigidAnswer, frame: str) -> RigidAnswer:
+    """The scene and the poses moved onto the markers on which devices stood.
 
     Markers lie farther apart than photodiodes, so that they give the scale as well.
     """
@@ -131,12 +134,21 @@ def _on_markers(
         for station in answer.scene.stations
     )
     framed = replace(answer.scene, stations=stations, frame=frame, scale="markers")
-    again = solve_rigid(sweeps, rigid, framed)
-    again.facts.update({**answer.facts, **again.facts})
-    again.facts["marker_misfit_m"] = misfit
-    again.facts["marker_scale"] = to.scale
-    again.notes[:0] = notes
-    return again
+    facts = {**answer.facts, "marker_misfit_m": misfit, "marker_scale": to.scale}
+    tracks = tuple(_moved(track, to, frame) for track in answer.trajectories)
+    return replace(answer, scene=framed, trajectories=tracks, facts=facts, notes=notes)
+
+
+def _moved(track: Trajectory, to: Similarity, frame: str) -> Trajectory:
+    """Poses in another frame. Their photodiodes keep their distances: scale differs by less
+    than a part in a hundred, or a note has told that the markers do not fit."""
+    return replace(
+        track,
+        frame=frame,
+        position=to.apply(track.position),
+        quaternion=quaternion_multiply(quaternion_from_matrix(to.rotation), track.quaternion),
+        covariance=turned(track.covariance, to.scale, to.rotation),
+    )
 
 
 def _stood(sighting: Sighting, trajectories: tuple[Trajectory, ...]) -> Array | None:

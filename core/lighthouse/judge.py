@@ -70,9 +70,9 @@ def judge(bursts: Bursts, bits: SoftBits, matches: Matches, found: Found) -> Rea
     if found.rotors:
         off_s = _off_rotor(bits, matches, found.rotors, rate_hz)
         agrees = np.abs(off_s) <= AGREE_S
-        matches, helped = _expected(
-            bits, matches, ~(agrees & matches.certain(SEED)), found, rate_hz
-        )
+        # What stands on its own is not talked into something else.
+        weak = ~alone & ~(agrees & matches.certain(SEED))
+        matches, helped = _expected(bits, matches, weak, found)
         off_s = _off_rotor(bits, matches, found.rotors, rate_hz)
         agrees = np.abs(off_s) <= AGREE_S
         read = agrees & (matches.certain(SEED) | helped)
@@ -104,10 +104,10 @@ def _off_rotor(bits: SoftBits, matches: Matches, rotors: dict[int, Rotor], rate_
 
 
 def _expected(
-    bits: SoftBits, matches: Matches, open_: NDArray[np.bool_], found: Found, rate_hz: float
+    bits: SoftBits, matches: Matches, weak: NDArray[np.bool_], found: Found
 ) -> tuple[Matches, NDArray[np.bool_]]:
-    """Matches with the open ones looked for where the rotors say, and which were found so."""
-    rows = np.flatnonzero(open_ & (np.diff(bits.first) > 0))
+    """Matches with the weak ones looked for where the rotors say, and which were found so."""
+    rows = np.flatnonzero(weak & (np.diff(bits.first) > 0))
     helped = np.zeros(len(bits), bool)
     if not len(rows):
         return matches, helped

@@ -26,10 +26,10 @@ from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-STRETCHES = 60
-STRETCH_NS = 80_000_000
-"""Looked at are so many stretches, evenly over the recording, each of four rotations: a second
-of work a station, whatever the length of the recording."""
+STRETCHES = 30
+STRETCH_NS = 60_000_000
+"""Looked at are so many stretches, evenly over the recording, each of three rotations: some
+tenths of a second of work a station, whatever the length of the recording."""
 
 NEAR_NS = 10_000_000
 """A pose predicts sweeps this close to it: at half a metre a second 5 mm, on both sides alike."""

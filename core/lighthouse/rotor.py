@@ -272,7 +272,7 @@ def _followed(
         start = zeros(tick[rows], index[rows], channel, period)
         shift = start[0] - zero
         late = shift - np.rint(shift / period) * period + _late(start, period)[1]
-        times, curve = _smooth(start, late, rate_hz)
+        times, curve = _smooth(start, late, float(start[-1] + period), rate_hz)
         off.append(late - np.interp(start, times, curve))
         if knots:
             jump = curve[0] - wander[-1][-1]
@@ -287,7 +287,7 @@ def _followed(
         channel,
         period,
         zero,
-        np.concatenate(knots),
+        np.maximum.accumulate(np.concatenate(knots)),
         np.concatenate(wander),
         bursts=len(near),
         restarts=restarts,
@@ -302,13 +302,14 @@ def _late(start: Array, period: float) -> tuple[Array, Array]:
     return turns, start - start[0] - turns * period
 
 
-def _smooth(tick: Array, late: Array, rate_hz: float) -> tuple[Array, Array]:
-    """Knots of a smooth curve through ``late``: least squares with a penalty on bends.
+def _smooth(tick: Array, late: Array, last: float, rate_hz: float) -> tuple[Array, Array]:
+    """Knots of a smooth curve through ``late``, to the end of the last rotation: least squares
+    with a penalty on bends.
 
     Robust by Huber's weights, so that a wrong burst within reach does not pull.
     """
     span = KNOT_S * rate_hz
-    first, last = float(tick.min()), float(tick.max())
+    first = float(tick[0])
     count = int(np.ceil((last - first) / span)) + 2
     knots = first + span * np.arange(count)
     place = (tick - first) / span
@@ -329,7 +330,7 @@ def _smooth(tick: Array, late: Array, rate_hz: float) -> tuple[Array, Array]:
         off = late - np.interp(tick, knots, wander)
         scale = 1.4826 * float(np.median(np.abs(off))) + 1e-3
         weight = np.minimum(1.0, 2 * scale / np.maximum(np.abs(off), 1e-12))
-    # The last knot lies beyond the bursts, where something else may follow.
+    # Beyond, something else may follow.
     end = np.interp(last, knots, wander)
     inside = knots < last
     return np.append(knots[inside], last), np.append(wander[inside], end)

@@ -18,6 +18,7 @@ from locatk.core.geometry import quaternion_from_heading, rotation_exp
 from locatk.core.lighthouse.calibration import IDEAL, Calibration
 from locatk.core.lighthouse.channels import TICK_HZ, period_ticks
 from locatk.core.lighthouse.generic import GENERIC, UNITS
+from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.scene import Marker, Scene, Sighting, Station
 from locatk.core.lighthouse.simulate_courses import Course
 from locatk.core.lighthouse.simulate_faults import spoil
@@ -80,6 +81,8 @@ class SimulationOptions:
         ``"generic"``: all have their mean. ``"ideal"``: plain planes at 30 degrees.
     labelled : bool
         Whether polynomials are known.
+    receiver : Receiver, optional
+        Each robot carries these photodiodes; without it, one in its middle.
     seed : int
         At least 0.
 
@@ -99,6 +102,7 @@ class SimulationOptions:
     outliers: float = 0.0
     calibration: str = "units"
     labelled: bool = True
+    receiver: Receiver | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -174,9 +178,10 @@ def simulate(options: SimulationOptions | None = None) -> Simulated:
         reports_s = _report_times(timing, options)
         for light in lights:
             hidden = (course.carried_s, _blocks(hiding, options))
-            noise = jitter.normal(0.0, options.noise_rad, (len(reports_s), 2))
-            links.append(Link(robot, course, light))
-            parts.append(receive(links[-1], len(parts), reports_s, hidden, noise))
+            for link in _links(robot, course, light, options.receiver):
+                noise = jitter.normal(0.0, options.noise_rad, (len(reports_s), 2))
+                links.append(link)
+                parts.append(receive(link, len(parts), reports_s, hidden, noise))
     pairs = Pairs.joined(parts)
     spoil(pairs, links, options.outliers, options.noise_rad, faults)
 
@@ -245,6 +250,17 @@ def _calibration_of(unit: Array) -> Calibration:
 # ---- robots
 
 
+def _links(robot: int, course: Course, light: Light, receiver: Receiver | None) -> list[Link]:
+    """One a photodiode."""
+    if receiver is None:
+        return [Link(robot, course, light)]
+    normals = [None] * len(receiver) if receiver.normal is None else list(receiver.normal)
+    return [
+        Link(robot, course, light, k, offset, normal)
+        for k, (offset, normal) in enumerate(zip(receiver.position_m, normals, strict=True))
+    ]
+
+
 def _report_times(rng: np.random.Generator, options: SimulationOptions) -> Array:
     """Ascending times (n,) of a robot's reports in seconds, a little irregular."""
     step = 1.0 / options.report_hz
@@ -279,12 +295,14 @@ def _as_sweeps(
     order = np.argsort(time_ns, kind="stable")
     robot = np.array([link.robot for link in links], np.int32)[pairs.link]
     device = np.broadcast_to(robot[:, None], seen.shape)[seen][order]
+    number = np.array([link.sensor for link in links], np.int32)[pairs.link]
+    sensor = np.broadcast_to(number[:, None], seen.shape)[seen][order]
     unknown = np.full(len(order), UNKNOWN, np.int32)
     sweeps = Sweeps(
         devices=names,
         time_ns=time_ns[order],
         device=device,
-        sensor=np.zeros(len(order), np.int32),
+        sensor=sensor,
         channel=pairs.channel[seen][order].astype(np.int32),
         polynomial=pairs.polynomial[seen][order].astype(np.int32) if labelled else unknown,
         sweep=unknown,

@@ -96,7 +96,7 @@ def _mirrored(link: Link) -> Places:
     wall_m = np.copysign(WALL_M, forward[axis])
 
     def where(time_s: Array) -> Array:
-        place = link.course.position(time_s)
+        place = link.position(time_s)
         place[..., axis] = 2 * wall_m - place[..., axis]
         return place
 

@@ -78,11 +78,37 @@ class Light:
 
 @dataclass(frozen=True)
 class Link:
-    """A robot under a station."""
+    """A photodiode of a robot under a station.
+
+    ``offset`` (3,) is where it sits, from the robot's middle and in its axes, and ``normal``
+    (3,) where it looks; None where it looks everywhere.
+    """
 
     robot: int
     course: Course
     light: Light
+    sensor: int = 0
+    offset: Array | None = None
+    normal: Array | None = None
+
+    def position(self, time_s: Array) -> Array:
+        """Points (..., 3) in metres at ``time_s`` (...)."""
+        middle = self.course.position(time_s)
+        return middle if self.offset is None else middle + self._turned(self.offset, time_s)
+
+    def faces(self, time_s: Array) -> NDArray[np.bool_]:
+        """Whether it looks at the station's side at ``time_s`` (...)."""
+        if self.normal is None:
+            return np.ones(np.shape(time_s), bool)
+        towards = self.light.station.position - self.position(time_s)
+        return np.sum(towards * self._turned(self.normal, time_s), axis=-1) > 0
+
+    def _turned(self, vector: Array, time_s: Array) -> Array:
+        """A vector (3,) of the robot's axes (..., 3) as it stands at ``time_s``."""
+        heading = self.course.heading(time_s)
+        cos, sin = np.cos(heading), np.sin(heading)
+        x, y, z = vector
+        return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=-1)
 
 
 @dataclass
@@ -126,7 +152,7 @@ def receive(
     """
     light = link.light
     # The second plane passes last: of the rotation in which it had passed.
-    local = (link.course.position(reports_s) - light.station.position) @ light.station.rotation
+    local = (link.position(reports_s) - light.station.position) @ light.station.rotation
     turn = (predict_angles(local, light.station.calibration)[:, 1] - ROTOR_ZERO[1]) / (2 * np.pi)
     since = (reports_s - PROCESSING_S - light.zero_s) / light.period_s - turn
     rotation = np.floor(np.where(np.isfinite(since), since, -1.0)).astype(np.int64)
@@ -134,8 +160,8 @@ def receive(
     report, rotation = np.flatnonzero(fresh), rotation[fresh]
 
     start_s = light.zero_s + rotation * light.period_s
-    time_s, count = light.observe(start_s, link.course.position, noise[fresh])
-    lost = time_s < 0
+    time_s, count = light.observe(start_s, link.position, noise[fresh])
+    lost = (time_s < 0) | ~link.faces(time_s)
     for edges in hidden:
         lost |= np.searchsorted(edges, time_s) % 2 == 1
     count[lost] = np.nan

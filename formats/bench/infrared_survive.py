@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from locatk.core import metrics
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import solve
+from locatk.core.solution import Solution
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import cpu_seconds
 from locatk.formats.importers.libsurvive import read_libsurvive
@@ -83,7 +85,22 @@ def _poses(session: ImportedSession) -> list[Figure]:
                "the same"),
         Figure("libsurvive: position, largest after 10 s", float(np.max(where[late])), "mm",
                "the same, without the seconds in which the reference itself settles"),
+        _switches(solution),
     ]  # fmt: skip
+
+
+def _switches(solution: Solution) -> Figure:
+    """How far poses move when a station is hidden."""
+    checks = cast("dict[str, list[dict[str, float]]]", solution.facts["verification"])["stations"]
+    return Figure(
+        "libsurvive: jump when a station is hidden, 95 %",
+        1e3 * max(check["jump_95_m"] for check in checks),
+        "mm",
+        f"largest of {len(checks)} stations left out in turn; users of peers report 50 to 100 mm "
+        "(facts/lighthouse.md 4.3)",
+        peer="users of Crazyflies",
+        peer_value=50.0,
+    )
 
 
 def _times(session: ImportedSession, path: Path) -> list[Figure]:

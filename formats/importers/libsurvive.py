@@ -95,7 +95,8 @@ def read_libsurvive(paths: Sequence[Path], *, stations: bool = False) -> Importe
     receivers = _receivers(recording, warnings)
     sweeps = _sweeps(recording, heard)
     strange = _not_on_device(sweeps, receivers)
-    sweeps = _take(sweeps, ~strange)
+    before = ~strange & (sweeps.time_ns < 0)
+    sweeps = _take(sweeps, ~strange & ~before)
     if not len(sweeps):
         raise InputError(
             f"no sweep of a station whose rotor is known{cut}",
@@ -108,6 +109,7 @@ def read_libsurvive(paths: Sequence[Path], *, stations: bool = False) -> Importe
         (recording.damaged, "damaged line", ""),
         (sum(h.unplaced for h in heard), "line", " with a timecode that does not fit its time"),
         (sum(h.rotorless for h in heard), "sweep", " without a sync near"),
+        (int(before.sum()), "sweep", " before the recording began"),
         (int(strange.sum()), "sweep", " of photodiodes that the device's configuration lacks"),
     ]
     lost += [f"{n} {what}{'s' * (n > 1)}{which}" for n, what, which in left if n]

@@ -34,6 +34,9 @@ at times wrongly: for some milliseconds whenever the 32 bits start again."""
 ABOUT = 101
 """Lines about one that tell how late it may be."""
 
+EARLY_S = 0.2
+"""A line this much earlier than those about it was damaged."""
+
 RUN_LINES = 100
 RUNS = 16
 """A tracker that starts again counts anew. Fewer lines than these are no run, but damaged."""
@@ -104,8 +107,9 @@ def runs(host_s: Array, timecode: Ticks) -> list[Run]:
             break
         index = rest[inside]
         tick = expected[index] + centre + off[inside]
-        wrong = _upper_bits(tick, host_s[index])
-        found.append(_run(index, tick - wrong * SHORT_WRAP, host_s[index], wrong))
+        usual = _usual_delay(tick, host_s[index])
+        wrong = _upper_bits(tick, host_s[index], usual)
+        found.append(_run(index, tick - wrong * SHORT_WRAP, host_s[index], wrong, usual))
         rest = rest[~inside]
     return sorted(found, key=lambda run: float(host_s[run.index].min()))
 
@@ -121,33 +125,39 @@ def _most_common(values: Ticks) -> int:
     return (first + int(np.median(near[near < 2 * width]))) % WRAP
 
 
-def _upper_bits(tick: Ticks, host_s: Array) -> Ticks:
-    """By how many turns of 24 bits each tick is ahead of the lines about it."""
+def _usual_delay(tick: Ticks, host_s: Array) -> Array:
+    """By how much the lines about each were later than their ticks, in seconds."""
     order = np.argsort(host_s, kind="stable")
-    delay = host_s[order] - tick[order] / TICK_HZ
-    ahead = (median_filter(delay, ABOUT, mode="nearest") - delay) * (TICK_HZ / SHORT_WRAP)
+    usual = np.zeros(len(tick))
+    usual[order] = median_filter(host_s[order] - tick[order] / TICK_HZ, ABOUT, mode="nearest")
+    return usual
+
+
+def _upper_bits(tick: Ticks, host_s: Array, usual: Array) -> Ticks:
+    """By how many turns of 24 bits each tick is ahead of the lines about it."""
+    ahead = (usual - (host_s - tick / TICK_HZ)) * (TICK_HZ / SHORT_WRAP)
     turns = np.rint(ahead)
     # Of a host that stalled lines are late by anything.
     turns[np.abs(ahead - turns) > 1 / 8] = 0
-    wrong = np.zeros(len(tick), np.int64)
-    wrong[order] = turns
-    return wrong
+    return turns.astype(np.int64)
 
 
-def _run(index: NDArray[np.int64], tick: Ticks, host_s: Array, wrong: Ticks) -> Run:
+def _run(index: NDArray[np.int64], tick: Ticks, host_s: Array, wrong: Ticks, usual: Array) -> Run:
     """The line that touches the arrivals from below, over the middle of the run."""
+    # No line is written before its light: the time of one that comes so early is damaged.
+    sound = np.flatnonzero(host_s - tick / TICK_HZ > usual - EARLY_S)
     x = (tick - tick[0]) / TICK_HZ
     x0 = float(tick[0]) / TICK_HZ
     delay = host_s - x
     rate = 1.0
-    bins = np.floor((x - x.min()) / BIN_S).astype(np.int64)
-    order = np.lexsort((delay, bins))
-    first = order[np.r_[True, np.diff(bins[order]) > 0]]
+    bins = np.floor((x - x.min()) / BIN_S).astype(np.int64)[sound]
+    order = np.lexsort((delay[sound], bins))
+    first = sound[order[np.r_[True, np.diff(bins[order]) > 0]]]
     slope = _lower_edge(x[first], delay[first])
     if abs(slope) <= RATE_LIMIT:
         rate += slope
     late = host_s - rate * x
-    at = float(late.min())
+    at = float(late[sound].min())
     lag = float(np.median(late)) - at
     return Run(index, tick, at - rate * x0, rate, lag, int(np.count_nonzero(wrong)))
 

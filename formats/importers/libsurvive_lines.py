@@ -346,7 +346,7 @@ class _Collected:
                 values = tuple(map(float, (time, *rest.split()[:7])))
             except ValueError:
                 values = ()
-            if len(values) == 8 and all(abs(value) < 1e9 for value in values):
+            if len(values) == 8 and values[0] >= 0 and all(abs(value) < 1e9 for value in values):
                 poses.setdefault((kind, name), []).append(values)
             else:
                 self.damaged += 1

@@ -201,7 +201,7 @@ def tour(stops: Array, leg_s: float, stay_s: float) -> Places:
 
 def markers(path: Path, stops: Array, leg_s: float, stay_s: float, **more: object) -> Path:
     """A scene of places that the photodiode rested on."""
-    lines = ['format = "locatk-lighthouse-scene"', "version = 1"]
+    lines = ['format = "locatk-lighthouse-scene"', "format_version = 1"]
     lines += [f"{key} = {json.dumps(value)}" for key, value in more.items()]
     for number, place in enumerate(stops):
         middle = START_MS + 1e3 * (number + 0.5) * leg_s
@@ -227,7 +227,7 @@ def answer(result: Any, status: int = 0) -> dict[str, Any]:
 
 def errors(solution: Path, where: Places) -> Array:
     """Distances in metres of the poses from where the photodiode was."""
-    (track,) = read_trajectories(Session.open(solution))
+    (track,) = read_trajectories(solution)
     assert len(track) > 50
     return np.linalg.norm(track.position - where((track.time_ns - START_MS * 10**6) / 1e9), axis=1)
 
@@ -293,9 +293,9 @@ def test_a_table_without_factory_data_is_solved_up_to_scale(
     assert [station["id"] for station in told["stations"]] == [None, None]
     assert [station["frames"] for station in told["stations"]] == [0, 0]
     [entry] = answer(locatk("solve", run, "-o", solved, "--json"))["sessions"]
-    assert entry["poses"] > 80
+    assert entry["poses"] > 50
     assert any(note.startswith("unit scale") for note in entry["notes"])
-    (track,) = read_trajectories(Session.open(solved))
+    (track,) = read_trajectories(solved)
     # Distances between the four stops are in proportion: of real stations' planes only the
     # middle of all is known.
     places = np.array([
@@ -428,7 +428,7 @@ def test_damaged_and_other_files(locatk, second: tuple[Array, Places], tmp_path:
         refused(locatk("import", "saleae", tmp_path / name, "-o", run), run, words)
     refused(locatk("import", "saleae", tmp_path, "-o", run), run, "a folder")
     missing = tmp_path / "nowhere.sal"
-    refused(locatk("import", "saleae", missing, "-o", run), run, "nowhere.sal", status=2)
+    refused(locatk("import", "saleae", missing, "-o", run), run, "nowhere.sal")
     both = locatk("import", "saleae", source, source, "-o", run)
     refused(both, run, "takes one PATH", status=2)
     wrong = locatk("import", "saleae", source, "-o", run, "--channel", 9)
@@ -489,17 +489,13 @@ def test_published_light(
     assert len(read_sweeps(Session.open(run))) == told["sweeps"]
 
 
-def test_published_capture_of_one_photodiode_and_two_stations_is_solved(
-    locatk, data: Path, tmp_path: Path
-) -> None:
+def test_published_capture_of_a_photodiode_at_rest(locatk, data: Path, tmp_path: Path) -> None:
+    """It shows two stations from one place: the sweeps are there, a scene is not."""
     run, solved = tmp_path / "run.mcap", tmp_path / "solved.mcap"
     source = data / "lighthouse" / "benchmarks" / "oneLH_2D" / "Logic_analyser_capture.sal"
     told = answer(locatk("import", "saleae", source, "-o", run, "--json"))
-    result = locatk("solve", run, "-o", solved, "--json")
-    if len(told["stations"]) == 1:
-        refused(result, solved, "one station needs four sighted markers")
-    else:
-        assert answer(result)["sessions"][0]["poses"] > 0
+    assert len(told["stations"]) == 2
+    refused(locatk("solve", run, "-o", solved), solved, "stood still")
 
 
 def test_published_tracker_whole_and_cut(locatk, data: Path, tmp_path: Path) -> None:

@@ -302,7 +302,13 @@ def damaged(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> b
 
 def imported(session: ImportedSession, folder: Path) -> None:
     """What was imported is written without complaint, and is read again as it was."""
-    path = folder / "run.mcap"
+    try:
+        written(session, folder / "run.mcap")
+    except LocatkError as error:
+        raise AssertionError("what was imported cannot be written or read again") from error
+
+
+def written(session: ImportedSession, path: Path) -> None:
     observations.write_session(
         path,
         system="lighthouse",
@@ -316,13 +322,13 @@ def imported(session: ImportedSession, folder: Path) -> None:
     )
     for text in (*session.warnings, session.lost or "", *session.facts.values()):
         assert "\n" not in text
-    written = Session.open(path)
-    sweeps = observations.read_sweeps(written)
+    again = Session.open(path)
+    sweeps = observations.read_sweeps(again)
     assert sorted(sweeps.count.tolist()) == sorted(session.sweeps.count.tolist())
-    assert len(observations.read_heard(written)) == len(session.stations)
-    assert observations.read_receivers(written).keys() == session.receivers.keys()
-    observations.read_scene(written)
-    observations.read_truth(written)
+    assert len(observations.read_heard(again)) == len(session.stations)
+    assert observations.read_receivers(again).keys() == session.receivers.keys()
+    observations.read_scene(again)
+    assert len(observations.read_truth(again)) == len(session.truth)
 
 
 Attempt = Callable[[np.random.Generator, Path, bool], None]

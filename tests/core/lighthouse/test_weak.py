@@ -1,0 +1,87 @@
+"""Fragments at the rim of a beam: what continues a sequence, and what only lies beside it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from locatk.core.lighthouse.bursts import Bursts, split
+from locatk.core.lighthouse.demodulate import soft_bits
+from locatk.core.lighthouse.identify import identify
+from locatk.core.lighthouse.weak import BESIDE_S, CHANCE, DELAY_BITS, belongs
+
+
+def fragment(light: Any, index: int, start_s: float, length: int) -> np.ndarray:
+    """Edges of weak light: late, and only where a level lasts a bit."""
+    bits = light.sequence(6)[index : index + length]
+    change = light.biphase(bits)
+    long = np.diff(change, append=change[-1] + 1) > 0.75
+    level = np.arange(len(change)) % 2
+    kept = np.flatnonzero(long)
+    kept = kept[np.r_[True, np.diff(level[kept]) != 0]]
+    return start_s + (change[kept] + DELAY_BITS) / 6e6
+
+
+def scene(light: Any, shift: int, gap_bits: int = 20, seed: int = 0) -> tuple[Bursts, int]:
+    """Sweeps with a fragment after each; the row of the first fragment. Fragments are of bits
+    ``shift`` later than those that would follow."""
+    noise = np.random.default_rng(seed)
+    lines = []
+    for k in range(40):
+        index, start = int(noise.integers(1000, 100_000)), 1e-3 * (k + 1) + noise.uniform(0, 1e-7)
+        whole = start + light.biphase(light.sequence(6)[index : index + 100]) / 6e6
+        after = 100 + gap_bits
+        weak = fragment(light, index + after + shift, start + after / 6e6, 60)
+        lines += [whole[: len(whole) // 2 * 2], weak[: len(weak) // 2 * 2]]
+    return split(light.edges(np.concatenate(lines), 1.0)), 1
+
+
+def judged(bursts: Bursts) -> tuple[np.ndarray, np.ndarray]:
+    bits = soft_bits(bursts)
+    found = identify(bits)
+    read = np.arange(len(bursts)) % 2 == 0
+    assert found.certain()[read].all()
+    return belongs(bursts, bits, found, read), read
+
+
+def test_fragments_continue_their_sequence(light: Any) -> None:
+    bursts, _ = scene(light, 0)
+    assert len(bursts) == 80
+    of, read = judged(bursts)
+    assert np.all(of[read] == -1)
+    hit = of[~read] == np.flatnonzero(read)
+    assert hit.mean() > 0.9
+    assert np.all(hit | (of[~read] == -1))
+
+
+def test_other_places_do_not(light: Any) -> None:
+    for shift in (-30, 17, 400):
+        of, read = judged(scene(light, shift)[0])
+        assert np.mean(of[~read] >= 0) <= 0.05 + CHANCE
+
+
+def test_noise_does_not(light: Any) -> None:
+    noise = np.random.default_rng(7)
+    lines = []
+    for k in range(200):
+        start = 1e-3 * (k + 1)
+        bits = light.sequence(2)[500 * k : 500 * k + 80]
+        lines.append(start + light.biphase(bits)[:100] / 6e6)
+        lines.append(start + 25e-6 + np.cumsum(noise.uniform(8e-8, 6e-7, 40)))
+    of, read = judged(split(light.edges(np.concatenate(lines), 1.0)))
+    assert np.mean(of[~read] >= 0) <= 4 * CHANCE
+
+
+def test_far_ones_do_not(light: Any) -> None:
+    far = round(1.3 * BESIDE_S * 6e6)
+    of, _ = judged(scene(light, 0, gap_bits=far)[0])
+    assert np.all(of == -1)
+
+
+def test_nothing_read_or_nothing_left(light: Any) -> None:
+    bursts, _ = scene(light, 0)
+    bits = soft_bits(bursts)
+    found = identify(bits)
+    for read in (np.zeros(len(bursts), bool), np.ones(len(bursts), bool)):
+        assert np.all(belongs(bursts, bits, found, read) == -1)
