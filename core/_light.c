@@ -307,15 +307,12 @@ static int longest_run(const Tables *t, const Text *text, int polynomial, int fi
 {
     const uint32_t taps = (uint32_t)t->taps[polynomial];
     int longest = 0, from = 64 * first;
-    uint64_t before = 0;
     for (int w = first; w < last; w++) {
         uint64_t bad = strangers(text, taps, w);
-        /* Two words that hold no run of four need no look at each bit. */
-        uint64_t good = ~bad, run = good & (good >> 1 | before << 63);
-        run &= run >> 2 | (before & before << 1) << 62;
-        before = good;
-        if (!run && w + 1 < last) {
-            from = 64 * w + 64 - (good ? __builtin_ctzll(bad) : 0);
+        /* A word without a run of four, and with none to go on, needs no look at each bit. */
+        const uint64_t good = ~bad, two = good & good >> 1;
+        if (!(two & two >> 2) && 64 * w - from + 3 < t->follow) {
+            from = 64 * w + 64 - __builtin_ctzll(bad);
             continue;
         }
         while (bad) {

@@ -129,7 +129,9 @@ def _window_edges(
     windows: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     n, width = windows.shape
-    if kernels is None or width == 0:
+    if width == 0:
+        return np.zeros(0, np.int64), np.zeros(n + 1, np.int64), np.zeros(n, bool)
+    if kernels is None:
         return window_edges_numpy(windows)
     tick = np.empty(n * 8 * width, np.int64)
     first, rises = np.empty(n + 1, np.int64), np.empty(n, np.uint8)

@@ -26,10 +26,10 @@ from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-STRETCHES = 30
+STRETCHES = 60
 STRETCH_NS = 60_000_000
-"""Looked at are so many stretches, evenly over the recording, each of three rotations: some
-tenths of a second of work a station, whatever the length of the recording."""
+"""Looked at are so many stretches, evenly over the recording, each of three rotations, of which
+the poses in the middle count: half a second of work a station, however long the recording."""
 
 NEAR_NS = 10_000_000
 """A pose predicts sweeps this close to it: at half a metre a second 5 mm, on both sides alike."""
@@ -55,11 +55,16 @@ def verify_rigid(
     starts = np.linspace(first, max(first, last - STRETCH_NS), STRETCHES).astype(np.int64)
     at = np.searchsorted(starts, sweeps.time_ns, side="right") - 1
     some = _rows(sweeps, sweeps.time_ns - starts[at] < STRETCH_NS)
-    return tuple(_check(some, receivers, answer, channel) for channel in channels)
+    middles = starts + STRETCH_NS // 2
+    return tuple(_check(some, receivers, answer, channel, middles) for channel in channels)
 
 
 def _check(
-    sweeps: Sweeps, receivers: Mapping[str, Receiver], answer: RigidAnswer, channel: int
+    sweeps: Sweeps,
+    receivers: Mapping[str, Receiver],
+    answer: RigidAnswer,
+    channel: int,
+    middles: NDArray[np.int64],
 ) -> StationCheck:
     """One station against the others."""
     others = tuple(s for s in answer.scene.stations if s.channel != channel)
@@ -76,7 +81,8 @@ def _check(
     assert station is not None
     residual, away, jump = [], [], []
     full = {trajectory.device: trajectory for trajectory in answer.trajectories}
-    for trajectory in without.trajectories:
+    for whole in without.trajectories:
+        trajectory = _near(whole, middles)
         if len(trajectory) == 0:
             continue
         off, distance = _off(sweeps, receivers[trajectory.device], trajectory, station)
@@ -98,6 +104,21 @@ def _check(
         float(np.median(jumps)) if len(jumps) else None,
         float(np.percentile(jumps, 95)) if len(jumps) else None,
         robust_sigma(np.concatenate(list(without.residuals.values()))),
+    )
+
+
+def _near(trajectory: Trajectory, middles: NDArray[np.int64]) -> Trajectory:
+    """The poses that have sweeps on both sides of them."""
+    if len(trajectory) == 0:
+        return trajectory
+    at = _nearest(middles, trajectory.time_ns)
+    inner = np.abs(middles[at] - trajectory.time_ns) < NEAR_NS
+    return replace(
+        trajectory,
+        time_ns=trajectory.time_ns[inner],
+        position=trajectory.position[inner],
+        quaternion=trajectory.quaternion[inner],
+        covariance=trajectory.covariance[inner],
     )
 
 

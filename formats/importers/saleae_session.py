@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.errors import InputError
+from locatk.core.lighthouse.channels import channel_of
 from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.identify import false_rate
 from locatk.core.lighthouse.light import NANOSECOND
 from locatk.core.lighthouse.receive import Caught, Reception, receive
 from locatk.core.lighthouse.scene import Scene
@@ -71,6 +73,7 @@ def _session(capture: LightCapture, reception: Reception, device: str) -> Import
     read = sum(int(np.count_nonzero(reading.read)) for reading in reception.readings)
     rims = sum(int(np.count_nonzero(reading.beside >= 0)) for reading in reception.readings)
     facts["bursts"] = f"{bursts:,}, of which {read:,} were read and {rims:,} are rims of those"
+    facts["false polynomials"] = _false_polynomials(reception)
     warnings = [*reception.notes]
     for reason, words in REASONS.items():
         number = sum(reading.rejected[reason] for reading in reception.readings)
@@ -86,6 +89,21 @@ def _session(capture: LightCapture, reception: Reception, device: str) -> Import
         warnings,
         stations=reception.stations,
         lost=f"{doubled:,} bursts {REASONS['burst_of_doubled_channel']}" if doubled else None,
+    )
+
+
+def _false_polynomials(reception: Reception) -> str:
+    """How many bursts name a station that no rotor supports, and how many by chance would."""
+    strange, alone, chance = 0, 0, 0.0
+    for reading in reception.readings:
+        certain = reading.matches.certain()
+        channel = channel_of(reading.matches.polynomial[certain])
+        alone += len(channel)
+        strange += int(np.count_nonzero(~np.isin(channel, list(reception.rotors))))
+        chance += float(np.sum([false_rate(e) for e in reading.matches.evidence[certain]]))
+    return (
+        f"{strange:,} of {alone:,} bursts that stand on their own name a station without a rotor; "
+        f"{chance:.1g} by chance"
     )
 
 

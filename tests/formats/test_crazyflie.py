@@ -330,3 +330,16 @@ def test_damaged_files_give_an_error_or_a_scene(data: st.DataObject) -> None:
 def test_any_text(text: str) -> None:
     with contextlib.suppress(LocatkError):
         crazyflie.loads_config(text)
+
+
+def test_stations_that_were_solved_here_are_not_the_crazyflie_s() -> None:
+    """A key tells it, which other tools pass over; what is not ours is never said to be."""
+    ours = crazyflie.loads_config(crazyflie.dumps_config(scene()))
+    assert crazyflie.MODEL_NOTE not in ours.notes
+    theirs = crazyflie.loads_config(SAMPLE)
+    assert crazyflie.MODEL_NOTE in theirs.notes
+    again = crazyflie.loads_config(
+        crazyflie.dumps_config(dataclasses.replace(theirs, scale="markers"))
+    )
+    assert crazyflie.MODEL_NOTE in again.notes
+    assert crazyflie.MODEL_NOTE in crazyflie.loads_config(SAMPLE + "solver: other\n").notes

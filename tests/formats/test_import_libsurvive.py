@@ -422,6 +422,36 @@ def test_other_lines_are_counted_and_damaged_ones_told(tmp_path: Path, room: Roo
     assert np.abs(turn_errors(room, session.sweeps)).max() < 1.0
 
 
+def test_a_damaged_time_shifts_no_other(tmp_path: Path) -> None:
+    """The clock is told by the lines that are least late; one that came too early is none."""
+    room = Room(seconds=3.0).build()
+    whole = read_libsurvive([room.write(tmp_path)])
+    at = next(k for k, (time, line) in enumerate(room.lines) if time > 2 and " W " in line)
+    room.lines[at] = (room.lines[at][0] - 1.5, room.lines[at][1])
+    session = read_libsurvive([room.write(tmp_path)])
+    assert session.lost is None
+    assert np.abs(session.sweeps.time_ns - whole.sweeps.time_ns).max() < 1_000_000
+
+
+def test_sweeps_before_the_recording_are_left_out(tmp_path: Path) -> None:
+    room = Room().build()
+    room.lines = [(max(0.0, time - 0.3), line) for time, line in room.lines]
+    session = read_libsurvive([room.write(tmp_path)])
+    assert session.sweeps.time_ns.min() >= 0
+    assert "sweeps before the recording began" in str(session.lost)
+
+
+def test_photodiodes_at_one_place_do_not_keep_the_sweeps_out(tmp_path: Path) -> None:
+    config = json.loads(json.dumps(CONFIG))
+    config["lighthouse_config"]["modelPoints"][1] = config["lighthouse_config"]["modelPoints"][0]
+    room = Room().build()
+    room.lines.insert(0, (0.0, f"WM0 CONFIG {json.dumps(config)}"))
+    session = read_libsurvive([room.write(tmp_path, config=False)])
+    assert session.receivers == {}
+    assert "two photodiodes at the place of photodiode 0" in session.warnings[0]
+    assert len(session.sweeps) == sum(" W " in line for _, line in room.lines)
+
+
 def test_sweeps_of_no_photodiode_and_no_rotor_are_left_out(tmp_path: Path, room: Room) -> None:
     sweep = next(line for _, line in room.lines if " W 3 " in line).split()
     more = [
@@ -430,8 +460,7 @@ def test_sweeps_of_no_photodiode_and_no_rotor_are_left_out(tmp_path: Path, room:
     ]
     session = read_libsurvive([room.write(tmp_path, *more)])
     assert session.lost == (
-        "1 sweep without a sync near, "
-        "1 sweep of photodiodes that the device's configuration lacks"
+        "1 sweep without a sync near, 1 sweep of photodiodes that the device's configuration lacks"
     )
     assert set(session.sweeps.channel.tolist()) == {4, 12}
     without = read_libsurvive([room.write(tmp_path, *more, config=False)])
@@ -481,6 +510,14 @@ def test_bombs_are_read_to_a_limit(
     session = read_libsurvive([file])
     assert str(session.lost).startswith("only the first 2 MB were read")
     assert np.abs(turn_errors(room, session.sweeps)).max() < 1.0
+    # What packs as nothing that was measured does is not read on, nor are lines without end.
+    dense = b"1.1 WM0 POSE 0 0 0 1 0 0 0\r\n" * 40_000
+    file.write_bytes(gzip.compress(room.text() + dense))
+    monkeypatch.setattr(libsurvive_lines, "LINES", 20_000)
+    assert str(read_libsurvive([file]).lost).startswith("only the first 2")
+    monkeypatch.setattr(libsurvive_lines, "DENSE_FROM", 1 << 18)
+    monkeypatch.setattr(libsurvive_lines, "DENSE", 4)
+    assert "as no recording is" in str(read_libsurvive([file]).lost)
 
 
 def test_what_is_no_recording(tmp_path: Path, room: Room) -> None:

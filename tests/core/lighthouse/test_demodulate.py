@@ -30,7 +30,7 @@ def agree(bursts: Bursts) -> None:
 
 def read_back(light: Any, bits: np.ndarray, path: Any, start_s: float, seed: int = 0) -> int:
     """Errors among bits that were sent, but for two at each end."""
-    noise = np.random.default_rng(seed)
+    noise = np.random.default_rng(seed + 1000)
     change = start_s + light.biphase(bits) / 6e6
     line = light.edges(light.as_received(change, path, noise), 1.0, path)
     soft = soft_bits(split(line))
