@@ -292,7 +292,8 @@ def test_a_table_without_factory_data_is_solved_up_to_scale(
     assert told["devices"] == ["wand"]
     assert [station["id"] for station in told["stations"]] == [None, None]
     assert [station["frames"] for station in told["stations"]] == [0, 0]
-    result = locatk("solve", run, "-o", solved, "--json")
+    space = markers(tmp_path / "scene.toml", STOPS[:0], 0.5, 0.2, planar=False)
+    result = locatk("solve", run, "-o", solved, "--artifact", space, "--json")
     assert answer(result)["sessions"][0]["poses"] > 50
     assert "unit scale" in result.stderr
     (track,) = read_trajectories(solved)

@@ -14,6 +14,8 @@ import os
 import re
 import signal
 import struct
+import subprocess
+import sys
 import time
 import zipfile
 import zlib
@@ -564,3 +566,100 @@ def test_damaged_input_is_an_error_of_ours_or_is_read(name: str, tmp_path: Path)
         signal.signal(signal.SIGALRM, before)
     assert refused or name == "windows" or number < FIRST + 100
     print(f"{name}: {number - FIRST} inputs, {refused} refused")
+
+
+# ---- memory
+
+ROOM_BYTES = 600 << 20
+"""What a reader of a small hostile file may take beside the program itself."""
+
+GUARDED = """
+import resource, sys
+from pathlib import Path
+from locatk.core.errors import LocatkError
+from locatk.formats import artifacts, crazyflie, receivers
+from locatk.formats.importers.dotbot_log import read_dotbot_log
+from locatk.formats.importers.libsurvive import read_libsurvive
+from locatk.formats.importers.saleae_session import read_saleae
+pages = int(Path("/proc/self/statm").read_text().split()[0])
+limit = pages * resource.getpagesize() + {room}
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+path = Path(sys.argv[1])
+read = dict(
+    sal=lambda: read_saleae([path]), csv=lambda: read_saleae([path]),
+    bin=lambda: read_saleae([path]), gz=lambda: read_libsurvive([path]),
+    log=lambda: read_dotbot_log([path]), yaml=lambda: crazyflie.read_config(path),
+    scene=lambda: artifacts.read_scene(path), receiver=lambda: receivers.read_receiver(path),
+)[path.suffix[1:]]
+try:
+    read()
+except LocatkError as error:
+    print(error)
+else:
+    print("read")
+"""
+
+
+def squeezed(head: bytes, piece: bytes, mebibytes: int) -> bytes:
+    """gzip of a piece again and again."""
+    pack = zlib.compressobj(1, wbits=31)
+    block = piece * ((1 << 20) // len(piece))
+    return b"".join(
+        [pack.compress(head), *(pack.compress(block) for _ in range(mebibytes)), pack.flush()]
+    )
+
+
+def long_chunks(mebibytes: int) -> bytes:
+    """A channel of a capture that is nothing but edges."""
+    size = 1 << 20
+    head = struct.pack("<iiBdQdHQ", 1, 100, 1, RATE, 0, 0.0, 0, mebibytes)
+    chunks = (
+        struct.pack("<6Q", k * size, (k + 1) * size, size, RATE, 1, size) + bytes(size + 8)
+        for k in range(mebibytes)
+    )
+    return b"".join([b"<SALEAE>", head, *chunks])
+
+
+def bombs() -> dict[str, bytes]:
+    """Small files that tell of much, by their names."""
+    claims = struct.pack("<iiIddQ", 0, 0, 0, 0.0, 1.0, 1 << 60)
+    deep = b"[" * 200_000
+    return {
+        "edges.sal": archive({"digital-4.bin": long_chunks(128)}),
+        "claims.bin": b"<SALEAE>" + claims + bytes(800),
+        "wide.csv": b"Time [s]," + b"A," * 400_000 + b"A\n0.1,0\n",
+        "line.csv": b"Time [s],A\n" + b"0" * (32 << 20),
+        "sweeps.gz": squeezed(recording(), b"1.1 WM0 W 1 1 1 0\n", 256),
+        "names.gz": squeezed(b"", b"".join(b"1 n%d POSE 1 1 1 1 1 1 1\n" % k for k in range(9000)),
+                             64),
+        "line.gz": squeezed(b"0.1 OPTION v i 100\n", b"x", 256),
+        "line.log": LOGS[0] + b"poly=1 lfsr_index=" + b"9" * (32 << 20),
+        "deep.log": b'{"lfsr_index": ' + deep + b"\n",
+        "deep.yaml": b"geos: " + deep,
+        "twice.yaml": b"a: &a [x, x]\n" + b"".join(
+            b"b%d: &b%d [*%s, *%s]\n" % (k, k, name, name)
+            for k in range(60) for name in [b"b%d" % (k - 1) if k else b"a"]),
+        "deep.scene": b"format = " + deep,
+        "many.receiver": b"position_mm = [" + b"[0, 0, 0]," * 1_000_000 + b"]",
+    }  # fmt: skip
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="Linux tells its memory there")
+def test_small_files_take_little_memory(tmp_path: Path) -> None:
+    made = bombs()
+    for name, content in made.items():
+        (tmp_path / name).write_bytes(content)
+    running = {
+        name: subprocess.Popen(
+            [sys.executable, "-c", GUARDED.format(room=ROOM_BYTES), str(tmp_path / name)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for name in made
+    }
+    said = {name: child.communicate(timeout=HANGS_S)[0] for name, child in running.items()}
+    for name, child in running.items():
+        assert child.returncode == 0, f"{name}: {said[name]}"
+        assert len(said[name].splitlines()) == 1, f"{name}: {said[name]}"
+    print(said)
