@@ -24,6 +24,16 @@ NAMES = {"channel": "channels"}
 
 SCENE_KEYS = ("channel", "id", "period_ticks", "calibration", "position_m")
 
+LONGEST_NAME = 64
+
+
+def _device_name(ctx: click.Context, option: click.Parameter, name: str | None) -> str | None:
+    """A name that a topic can have and a terminal can show."""
+    if name is not None and not (0 < len(name.strip()) <= LONGEST_NAME and name.isprintable()):
+        raise click.BadParameter(f"expected a name of 1 to {LONGEST_NAME} printable characters")
+    return name
+
+
 lighthouse_options = options.together(
     options.input_option(
         "--truth",
@@ -55,6 +65,7 @@ lighthouse_options = options.together(
     click.option(
         "--device",
         metavar="NAME",
+        callback=_device_name,
         help="saleae: of the device in the session. [default: photodiode]",
     ),
     click.option(

@@ -64,6 +64,8 @@ MODEL_NOTE = (
 SOLVER, OURS = "solver", "locatk"
 """A key that cfclient and cflib pass over: of stations that were solved with the full model."""
 
+HINT = "give a configuration that cfclient or cflib has saved"
+
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _NO_NUMBER = re.compile(r"[-+]?\.(?:inf|nan)", re.IGNORECASE)
@@ -101,9 +103,7 @@ def loads_config(text: str | bytes, *, file: str | os.PathLike[str] = "<config>"
     """
     table = Table(_mapping(text, file), file, "")
     if table.raw("type", None) != TYPE:
-        raise table.error(
-            "type", f"expected {TYPE!r}", "give a configuration that cfclient or cflib has saved"
-        )
+        raise table.error("type", f"expected {TYPE!r}", HINT)
     if str(table.raw("version", None)) != VERSION:
         raise table.error("version", f"expected {VERSION!r}, the one version that is known")
     if table.raw("systemType", SYSTEM_V2) != SYSTEM_V2:
@@ -282,22 +282,29 @@ def _mapping(text: str | bytes, file: str | os.PathLike[str]) -> dict[str, Any]:
     """The mapping that the text is, with numbers as int and Decimal, the rest as strings."""
     if len(text) > LARGEST_FILE:
         raise ArtifactError(
-            f"larger than {LARGEST_FILE // 1000} kB: no Crazyflie configuration", file=file
+            f"larger than {LARGEST_FILE // 1000} kB: no Crazyflie configuration",
+            file=file,
+            hint=HINT,
         )
     try:
         decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text
     except UnicodeDecodeError:
-        raise ArtifactError("not UTF-8 text", file=file) from None
+        raise ArtifactError("not UTF-8 text", file=file, hint=HINT) from None
     try:
         root = _tree(decoded, file)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or "damaged text"
         raise ArtifactError(
-            f"not valid YAML ({problem})", file=file, where=mark.line + 1 if mark else None
+            f"not valid YAML ({problem})",
+            file=file,
+            where=mark.line + 1 if mark else None,
+            hint=HINT,
         ) from None
     if not isinstance(root, dict):
-        raise ArtifactError("no Crazyflie configuration: expected a YAML mapping", file=file)
+        raise ArtifactError(
+            "no Crazyflie configuration: expected a YAML mapping", file=file, hint=HINT
+        )
     return root
 
 
@@ -348,7 +355,7 @@ def _node(
 
 def _at(event: yaml.Event, file: str | os.PathLike[str], message: str) -> ArtifactError:
     line = event.start_mark.line + 1 if event.start_mark else None
-    return ArtifactError(message, file=file, where=line)
+    return ArtifactError(message, file=file, where=line, hint=HINT)
 
 
 def _scalar(event: yaml.ScalarEvent) -> Any:

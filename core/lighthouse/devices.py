@@ -87,9 +87,7 @@ def solve_devices(
     left = np.flatnonzero(np.isin(sweeps.device, numbers))
     if len(left) == 0:
         return own
-    columns = ("time_ns", "device", "sensor", "channel", "polynomial", "sweep", "count")
-    rest = replace(sweeps, **{name: getattr(sweeps, name)[left] for name in columns})
-    others = solve(rest, answer.scene, options)
+    others = solve(sweeps.take(left), answer.scene, options)
     return _together(own, others, tuple(rigid))
 
 

@@ -1,7 +1,8 @@
 """Each burst judged by what all of them say of the rotors.
 
-A burst is read if it stands on its own and no rotor contradicts it, or if it is weak and says
-just what a rotor leads one to expect.
+A burst is read if it says what the rotor of its station leads one to expect; the weaker it is,
+the nearer it is looked for. Where not one rotor is known, as of three sweeps, those bursts are read
+that stand on their own.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 
 EXPECTED = 20.0
 """Evidence in bits that is enough where a rotor says the same: it leaves a hundred places of
-2^22, and an accident in some thousand bursts of noise."""
+2^22, and for each station an accident in a thousand bursts of clear bits that are noise."""
 
 PLACES = 14
 """Bits before and after the place that a rotor tells, at which a weak burst is looked for: 2 us

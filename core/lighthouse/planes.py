@@ -51,8 +51,9 @@ def planes_of(rotation: NDArray[np.int64], place: Array) -> NDArray[np.int32]:
     plane[pair], plane[pair + 1] = 0, 1
     paired = np.zeros(n, bool)
     paired[pair] = paired[pair + 1] = True
-    for row in np.flatnonzero(~paired):
-        plane[row] = _by_neighbours(row, rotation, place, plane, pair)
+    if len(pair):
+        single = np.flatnonzero(~paired)
+        plane[single] = _by_neighbours(single, rotation, place, pair)
     # A plane passes once a rotation: of two that claim it neither is believed.
     both = np.r_[False, (np.diff(rotation) == 0) & (np.diff(plane) == 0) & (plane[1:] >= 0)]
     both[:-1] |= both[1:]
@@ -61,23 +62,15 @@ def planes_of(rotation: NDArray[np.int64], place: Array) -> NDArray[np.int32]:
 
 
 def _by_neighbours(
-    row: int,
-    rotation: NDArray[np.int64],
-    place: Array,
-    plane: NDArray[np.int32],
-    pair: NDArray[np.int64],
-) -> int:
-    """The plane whose nearest pairs were at the phase of a sweep."""
-    if not len(pair):
-        return UNKNOWN
-    at = np.searchsorted(pair, row)
-    distance = []
-    for number in (0, 1):
-        near = [
-            abs(place[pair[k] + number] - place[row])
-            for k in (at - 1, at)
-            if 0 <= k < len(pair) and abs(rotation[pair[k]] - rotation[row]) <= NEAR_ROTATIONS
-        ]
-        distance.append(min(near, default=1.0))
-    closest = int(np.argmin(distance))
-    return closest if distance[closest] < NEAR_TURN < distance[1 - closest] else UNKNOWN
+    rows: NDArray[np.int64], rotation: NDArray[np.int64], place: Array, pair: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The plane (n,) whose nearest pairs were at the phase of each of some sweeps (n,)."""
+    at = np.searchsorted(pair, rows)
+    distance = np.ones((2, len(rows)))
+    for beside in (pair[np.maximum(at - 1, 0)], pair[np.minimum(at, len(pair) - 1)]):
+        near = np.abs(rotation[beside] - rotation[rows]) <= NEAR_ROTATIONS
+        for number in (0, 1):
+            off = np.where(near, np.abs(place[beside + number] - place[rows]), 1.0)
+            distance[number] = np.minimum(distance[number], off)
+    closest, other = np.min(distance, axis=0), np.max(distance, axis=0)
+    return np.where((closest < NEAR_TURN) & (NEAR_TURN < other), np.argmin(distance, 0), UNKNOWN)

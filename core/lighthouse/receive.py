@@ -9,7 +9,7 @@ factory data (:mod:`.ootx`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,29 +161,18 @@ def _rotors(heard: list[tuple[Bursts, SoftBits, Matches]], rate_hz: float) -> Fo
 
 def _sweeps(readings: Sequence[Reading], rotors: dict[int, Rotor], rate_hz: float) -> Caught:
     """The bursts of each sweep put together."""
-    parts = [
-        _sweeps_of(sensor, reading, rotors, rate_hz) for sensor, reading in enumerate(readings)
-    ]
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    parts = [_sweeps_of(k, reading, rotors, rate_hz) for k, reading in enumerate(readings)]
+    columns = [np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Caught)]
     order = np.argsort(columns[0], kind="stable")
-    tick, sensor, channel, polynomial, plane, count = (column[order] for column in columns)
-    return Caught(
-        tick,
-        sensor.astype(np.int32),
-        channel.astype(np.int32),
-        polynomial.astype(np.int32),
-        plane.astype(np.int32),
-        count,
-    )
+    return Caught(*(column[order] for column in columns))
 
 
-def _sweeps_of(
-    sensor: int, reading: Reading, rotors: dict[int, Rotor], rate_hz: float
-) -> tuple[Array, ...]:
-    """Columns of the sweeps of one photodiode."""
+def _sweeps_of(sensor: int, reading: Reading, rotors: dict[int, Rotor], rate_hz: float) -> Caught:
+    """Sweeps of one photodiode, station by station."""
     rows = np.flatnonzero(reading.read)
     if not len(rows):
-        return (np.zeros(0),) * 6
+        none = np.zeros(0, np.int32)
+        return Caught(np.zeros(0), none, none, none, none, np.zeros(0))
     weight, middle = _middles(reading, rows)
     channel = channel_of(reading.matches.polynomial[rows])
     order = np.lexsort((middle, channel))
@@ -194,8 +183,8 @@ def _sweeps_of(
     # Of the bursts of a sweep the one with the most evidence says its polynomial.
     best = np.lexsort((-reading.matches.evidence[rows], group))[np.flatnonzero(fresh)]
     first = rows[best]
-    polynomial, channel = reading.matches.polynomial[first], channel[best]
-    plane = np.full(len(tick), UNKNOWN)
+    polynomial, channel = reading.matches.polynomial[first], channel[best].astype(np.int32)
+    plane = np.full(len(tick), UNKNOWN, np.int32)
     count = np.zeros(len(tick))
     for number in np.unique(channel):
         mine = np.flatnonzero(channel == number)
@@ -206,7 +195,7 @@ def _sweeps_of(
         else:
             bit = (tick[mine] - reading.bits.tick[first[mine]]) / reading.bits.ticks_per_bit
             count[mine] = reading.matches.index[first[mine]] + bit
-    return tick, np.full(len(tick), sensor), channel, polynomial, plane, count
+    return Caught(tick, np.full(len(tick), sensor, np.int32), channel, polynomial, plane, count)
 
 
 def _middles(reading: Reading, rows: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -224,8 +213,8 @@ def _middles(reading: Reading, rows: NDArray[np.int64]) -> tuple[Array, Array]:
     value = bits.value[bits.first[rows][burst] + place] / CERTAIN
     expected = lfsr.state_at(matches.index[rows][burst] + place, matches.polynomial[rows][burst])
     value = np.where(expected >> (lfsr.BITS - 1) > 0, value, -value)
-    weight = np.bincount(burst, value, len(rows))
-    middle = np.bincount(burst, value * (place + 0.5), len(rows)) / weight
+    weight: Array = np.bincount(burst, value, len(rows))
+    middle: Array = np.bincount(burst, value * (place + 0.5), len(rows)) / weight
     return weight, bits.tick[rows] + middle * bits.ticks_per_bit
 
 

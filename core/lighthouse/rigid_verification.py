@@ -54,7 +54,7 @@ def verify_rigid(
     first, last = int(sweeps.time_ns.min()), int(sweeps.time_ns.max())
     starts = np.linspace(first, max(first, last - STRETCH_NS), STRETCHES).astype(np.int64)
     at = np.searchsorted(starts, sweeps.time_ns, side="right") - 1
-    some = _rows(sweeps, sweeps.time_ns - starts[at] < STRETCH_NS)
+    some = sweeps.take(sweeps.time_ns - starts[at] < STRETCH_NS)
     middles = starts + STRETCH_NS // 2
     return tuple(_check(some, receivers, answer, channel, middles) for channel in channels)
 
@@ -71,7 +71,7 @@ def _check(
     none = StationCheck(channel, "others", 0, None, None, None, None, None)
     try:
         without = solve_rigid(
-            _rows(sweeps, sweeps.channel != channel),
+            sweeps.take(sweeps.channel != channel),
             receivers,
             replace(answer.scene, stations=others),
         )
@@ -156,8 +156,3 @@ def _nearest(time_ns: NDArray[np.int64], asked: NDArray[np.int64]) -> NDArray[np
     before = np.maximum(after - 1, 0)
     earlier = asked - time_ns[before] < time_ns[after] - asked
     return np.where(earlier, before, after)
-
-
-def _rows(sweeps: Sweeps, chosen: NDArray[np.bool_]) -> Sweeps:
-    columns = ("time_ns", "device", "sensor", "channel", "polynomial", "sweep", "count")
-    return replace(sweeps, **{name: getattr(sweeps, name)[chosen] for name in columns})

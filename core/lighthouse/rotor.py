@@ -266,7 +266,9 @@ def _followed(
         if below > 0:
             period += above / below
     zero = float(zeros(tick[stretches[0][:1]], index[stretches[0][:1]], channel, period)[0])
-    knots, wander, off = [], [], []
+    knots: list[Array] = []
+    wander: list[Array] = []
+    off: list[Array] = []
     restarts = 0
     for rows in stretches:
         start = zeros(tick[rows], index[rows], channel, period)

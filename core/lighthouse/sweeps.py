@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,3 +47,8 @@ class Sweeps:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Sweeps:
+        """The chosen sweeps, of the same devices."""
+        columns = (f.name for f in fields(self) if f.name != "devices")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in columns})

@@ -84,11 +84,12 @@ def chance(bursts: Bursts, row: int, polynomial: int, bit: float) -> float:
     bit : float
         Place in the sequence at the burst's first edge, if it were not late.
     """
-    edge = bursts.tick[bursts.first[row] : bursts.first[row + 1]].astype(float)
+    edge = bursts.tick[bursts.first[row] : bursts.first[row + 1]]
     ticks_per_sample = bursts.rate_hz / 6e6 / SAMPLES
-    time = np.arange(edge[0], edge[-1], ticks_per_sample)[: LONGEST_BITS * SAMPLES]
-    if len(time) < SAMPLES:
+    samples = min(LONGEST_BITS * SAMPLES, int(np.ceil((edge[-1] - edge[0]) / ticks_per_sample)))
+    if samples < SAMPLES:
         return 1.0
+    time = edge[0] + np.arange(samples) * ticks_per_sample
     rising = (np.searchsorted(edge, time, side="right") - 1) % 2 == (0 if bursts.rises[row] else 1)
     level = np.where(rising, 1.0, -1.0)
     level -= level.mean()

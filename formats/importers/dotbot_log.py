@@ -144,8 +144,9 @@ def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
             warnings.append(f"no record of light in {path}")
     rows = _rows(log, warnings)
     if not len(rows):
-        told = f"{log.records} records of light, {log.damaged} of them damaged"
-        raise FormatError(f"no sweep in the log ({told})", file=paths[0], hint=_HINT)
+        told = f" ({log.records} records of light, {log.damaged} of them damaged)"
+        told = told if log.records else ": none of its lines tells of light"
+        raise FormatError(f"no sweep in the log{told}", file=paths[0], hint=_HINT)
     warnings += log.faults
     rows = _once(_named_first(rows, warnings), warnings)
     clock = _date(rows, log.devices, warnings)

@@ -80,7 +80,6 @@ def read_libsurvive(paths: Sequence[Path], *, stations: bool = False) -> Importe
     if len(paths) > 1:
         raise InputError(
             "several recordings, which all start at 0 s",
-            file=paths[1],
             hint="import each into a session of its own",
         )
     path = Path(paths[0])

@@ -220,12 +220,9 @@ class _Pieces:
             else:
                 yield rest + piece[:end]
                 rest = piece[end:]
-        if rest:
-            # The last line of a file that breaks off may be cut within a number.
-            if self.cut is None:
-                yield rest + b"\n"
-            else:
-                self.overlong += 1
+        # The last line of a file that breaks off may be cut within a number.
+        if rest and self.cut is None:
+            yield rest + b"\n"
 
     def _decoded(self) -> Iterator[bytes]:
         try:
@@ -255,7 +252,9 @@ class _Pieces:
                 rest = unpack.unused_data if unpack.eof else unpack.unconsumed_tail
                 taken, given = taken + len(raw) - len(rest), given + len(piece)
                 if given > max(DENSE_FROM, DENSE * taken):
-                    self.cut = f"packed {given // taken} : 1 after {given >> 20} MB, as no recording is"
+                    self.cut = (
+                        f"packed {given // taken} : 1 after {given >> 20} MB, as no recording is"
+                    )
                     return
                 raw = rest
         if not unpack.eof:

@@ -115,12 +115,18 @@ def _as_paper(capture: LightCapture, device: str) -> ImportedSession:
     facts["method"] = "paper"
     facts["bursts"] = f"{bursts:,}, of which {len(caught):,} were decoded"
     channels, numbers = np.unique(caught.channel, return_counts=True)
+    warnings = []
+    if len(caught) < bursts / 2:
+        warnings.append(
+            f"only {len(caught):,} of {bursts:,} bursts were decoded, and these may be wrong: the "
+            "published way knows channels 1 to 4 only, and nothing checks it"
+        )
     return ImportedSession(
         _sweeps(capture, caught, device),
         None,
         [],
         facts,
-        [],
+        warnings,
         stations=tuple(
             HeardStation(int(channel), sweeps=int(number))
             for channel, number in zip(channels, numbers, strict=True)

@@ -322,6 +322,14 @@ def test_the_paper_s_way_on_the_same_light(
     assert 0.5 * len(channels[0]) < len(channels[1]) <= len(channels[0])
 
 
+def test_what_the_paper_s_way_cannot_know_is_said(locatk, data: Path, tmp_path: Path) -> None:
+    """The station of this recording is on channel 7."""
+    source, run = data / "lighthouse" / "fpga" / "take1.csv", tmp_path / "run.mcap"
+    told = answer(locatk("import", "saleae", source, "-o", run, "--method", "paper", "--json"))
+    assert told["sweeps"] < 20
+    assert "knows channels 1 to 4 only" in told["warnings"][0]
+
+
 def test_two_photodiodes_are_two_sensors(
     locatk, second: tuple[Array, Places], tmp_path: Path
 ) -> None:
@@ -434,6 +442,9 @@ def test_damaged_and_other_files(locatk, second: tuple[Array, Places], tmp_path:
     refused(both, run, "takes one PATH", status=2)
     wrong = locatk("import", "saleae", source, "-o", run, "--channel", 9)
     refused(wrong, run, "no line '9'", "'Channel 0'")
+    for name in ("", " ", "a\nb", "x" * 65):
+        result = locatk("import", "saleae", source, "-o", run, "--device", name)
+        refused(result, run, "printable", status=2)
     run.write_bytes(b"kept")
     result = locatk("import", "saleae", source, "-o", run)
     assert (result.exit_code, run.read_bytes()) == (1, b"kept")

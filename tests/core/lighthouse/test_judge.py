@@ -1,0 +1,97 @@
+"""Bursts judged by the rotors: wrong decodes refused, weak bursts taken, doubled channels out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from locatk.core.lighthouse.bursts import split
+from locatk.core.lighthouse.channels import channel_of
+from locatk.core.lighthouse.identify import ALONE
+from locatk.core.lighthouse.judge import Reading, identified, judge
+from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.rotor import Found, find_rotors
+
+
+def reading(line: Edges, found: Found | None = None) -> Reading:
+    """A photodiode's bursts, judged by what they say themselves or by ``found``."""
+    bursts = split(line)
+    bits, matches = identified(bursts)
+    if found is None:
+        found = find_rotors(
+            bits.tick, matches.polynomial, matches.index, matches.evidence, line.rate_hz
+        )
+    return judge(bursts, bits, matches, found)
+
+
+def test_clean_light_is_read(light: Any) -> None:
+    (line,), passed = light.of([light.Sender(1, ppm=9), light.Sender(12, zero_s=0.001)], 2.0)
+    read = reading(line)
+    assert read.read.sum() >= 0.98 * len(passed.time_s)
+    assert np.abs(read.off_s[read.read]).max() < 1e-7
+    assert sum(read.rejected.values()) == np.count_nonzero(~read.read & (read.beside < 0))
+
+
+def test_spoiled_sweeps_are_not(light: Any) -> None:
+    path = light.Receiving(spoiled=0.3)
+    (line,), passed = light.of([light.Sender(5, ppm=-20)], 10.0, path)
+    read = reading(line)
+    right = np.count_nonzero(~passed.spoiled)
+    assert right <= read.read.sum() <= right + 3
+    assert read.rejected["burst_not_read"] >= passed.spoiled.sum() - 3
+
+
+def test_bursts_off_the_rotor_are_refused(light: Any) -> None:
+    (line,), _ = light.of([light.Sender(5)], 2.0)
+    (other,), stray = light.of([light.Sender(5, zero_s=0.0111)], 0.09)
+    tick = np.union1d(line.tick, other.tick + round(1.0 * line.rate_hz))
+    both = Edges(tick, line.rate_hz, line.rate_hz, True, line.end_tick)
+    read = reading(both)
+    assert read.rejected["burst_off_rotor"] == len(stray.time_s)
+    assert np.all(read.matches.certain()[~read.read])
+
+
+def test_weak_bursts_are_taken_where_a_rotor_expects_them(light: Any) -> None:
+    # Ten microseconds of noisy light do not stand on their own; with the rotor they do.
+    strong = light.Receiving()
+    weak = light.Receiving(width_s=6.5e-6, jitter_s=5e-9)
+    sender = light.Sender(5)
+    (line,), _ = light.of([sender], 2.0, strong)
+    bursts = split(line)
+    bits, matches = identified(bursts)
+    found = find_rotors(
+        bits.tick, matches.polynomial, matches.index, matches.evidence, line.rate_hz
+    )
+    (thin,), passed = light.of([sender], 2.0, weak)
+    read = reading(thin, found)
+    assert np.mean(identified(split(thin))[1].certain()) < 0.2
+    assert read.read.sum() > 0.9 * len(passed.time_s)
+    right = read.matches.polynomial[read.read] == passed.polynomial[read.read]
+    assert right.all()
+    assert read.matches.evidence[read.read].min() < ALONE
+
+
+def test_what_stands_on_its_own_is_not_talked_into_something_else(light: Any) -> None:
+    senders = [light.Sender(3), light.Sender(3, zero_s=0.011), light.Sender(9, zero_s=0.002)]
+    (line,), _ = light.of(senders, 10.0, light.Receiving(rim_s=1e-6))
+    read = reading(line)
+    assert np.all(channel_of(read.matches.polynomial[read.read]) == 9)
+    sure = read.matches.certain() & (channel_of(read.matches.polynomial) == 3)
+    assert read.rejected["burst_of_doubled_channel"] == np.count_nonzero(sure & (read.beside < 0))
+    assert sure.sum() > 1900
+
+
+def test_without_a_rotor_only_what_stands_alone(light: Any) -> None:
+    (line,), passed = light.of([light.Sender(3, until_s=0.03)], 1.0, light.Receiving(missing=0.3))
+    read = reading(line)
+    assert 0 < len(passed.time_s) < 4
+    assert read.read.sum() == len(passed.time_s)
+    assert np.isnan(read.off_s).all()
+    assert not reading(line, Found({}, (3,))).read.any()
+
+
+def test_nothing() -> None:
+    read = reading(Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 1))
+    assert len(read.read) == 0
+    assert not any(read.rejected.values())

@@ -1,0 +1,219 @@
+"""Rotors from decoded bursts: period, phase over time, silences, restarts, two on a channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.lighthouse.rotor import AGREE_S, LEAST_BURSTS, Found, Rotor, find_rotors
+
+Array = NDArray[np.float64]
+RATE = 40e6
+TICKS = {1: 959000, 4: 949000, 16: 887000}
+
+
+@dataclass
+class Decoded:
+    """Bursts as the decoder would hand them over, sorted at the end."""
+
+    noise: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    rows: list[Array] = field(default_factory=list)
+
+    def station(
+        self,
+        channel: int,
+        since_s: float,
+        until_s: float,
+        *,
+        zero_s: float = 0.003,
+        ppm: float = 0.0,
+        wrong: float = 0.0,
+        scatter_s: float = 2e-7,
+        wander: Array | None = None,
+    ) -> None:
+        """Two sweeps a rotation; ``wander`` is amplitude and seconds of a slow sine."""
+        turn = TICKS[channel] / 48e6 * (1 + ppm * 1e-6)
+        k = np.repeat(np.arange(int((until_s - since_s) / turn)), 2)
+        zero = since_s + zero_s + k * turn
+        if wander is not None:
+            zero = zero + wander[0] * np.sin(2 * np.pi * zero / wander[1])
+        index = np.rint(np.tile([0.3, 0.62], len(k) // 2) * TICKS[channel] / 8)
+        time = zero + index / 6e6 * (1 + ppm * 1e-6)
+        time += self.noise.normal(0, scatter_s, len(time))
+        off = self.noise.random(len(time)) < wrong
+        index[off] = self.noise.integers(0, 131_071, off.sum())
+        polynomial = 2 * (channel - 1) + k % 2
+        self.rows.append(np.stack([time * RATE, polynomial, index, np.full(len(k), 60.0)]))
+
+    def accidents(self, number: int, until_s: float, polynomials: int = 32) -> None:
+        rows = [
+            self.noise.uniform(0, until_s * RATE, number),
+            self.noise.integers(0, polynomials, number),
+            self.noise.integers(0, 131_071, number),
+            np.full(number, 30.0),
+        ]
+        self.rows.append(np.stack(rows))
+
+    def found(self) -> Found:
+        table = np.concatenate(self.rows, axis=1)
+        tick, polynomial, index, evidence = table[:, np.argsort(table[0])]
+        return find_rotors(
+            tick, polynomial.astype(np.int32), index.astype(np.int64), evidence, RATE
+        )
+
+
+def lateness(rotor: Rotor, zero_s: Array) -> Array:
+    """Seconds by which a rotor's zeros are later than the true ones."""
+    _, place = rotor.turn(zero_s * RATE)
+    return -(place - np.rint(place)) * rotor.period / RATE
+
+
+def test_period_and_phase_through_wander_and_wrong_decodes() -> None:
+    drawn = Decoded()
+    wander = np.array([4e-7, 37.0])
+    drawn.station(1, 0, 60, ppm=-15.49, wrong=0.1, wander=wander)
+    drawn.station(16, 0, 60, ppm=23.4, wrong=0.1, zero_s=0.001)
+    found = drawn.found()
+    assert found.doubled == ()
+    assert sorted(found.rotors) == [1, 16]
+    assert found.rotors[1].ppm(RATE) == pytest.approx(-15.49, abs=0.02)
+    assert found.rotors[16].ppm(RATE) == pytest.approx(23.4, abs=0.01)
+    zero = 0.003 + np.arange(3000) * 959000 / 48e6 * (1 - 15.49e-6)
+    zero = zero + wander[0] * np.sin(2 * np.pi * zero / wander[1])
+    assert np.abs(lateness(found.rotors[1], zero)).max() < 1.5e-7
+    assert found.rotors[1].sigma / RATE == pytest.approx(2e-7, rel=0.1)
+    assert found.rotors[1].bursts == pytest.approx(0.9 * 6000, rel=0.02)
+
+
+def test_a_rotation_and_a_place_in_it() -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 10, ppm=5)
+    rotor = drawn.found().rotors[4]
+    turn = 949000 / 48e6 * (1 + 5e-6)
+    rotation, place = rotor.turn((0.003 + (np.array([0.2, 7.5, 300.9])) * turn) * RATE)
+    assert rotation.tolist() == [0, 7, 300]
+    assert place == pytest.approx([0.2, 0.5, 0.9], abs=1e-4)
+    assert rotor.period_ticks(RATE) == pytest.approx(949000 * (1 + 5e-6), rel=1e-8)
+
+
+@pytest.mark.parametrize("ppm", [-190.0, 190.0])
+def test_clocks_that_are_far_off(ppm: float) -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 5, ppm=ppm)
+    assert drawn.found().rotors[4].ppm(RATE) == pytest.approx(ppm, abs=0.1)
+
+
+def test_a_clock_that_drifts_by_far_more_than_a_sweep_scatters() -> None:
+    # 0.3 ppm in ten minutes: 45 us from any line.
+    drawn = Decoded()
+    drawn.station(4, 0, 600, wander=np.array([4.5e-5, 1200.0]), wrong=0.05)
+    rotor = drawn.found().rotors[4]
+    assert rotor.bursts > 0.94 * 60_000
+    assert rotor.restarts == 0
+
+
+def test_few_bursts() -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 0.03)
+    assert len(drawn.rows[0].T) == 2
+    assert drawn.found().rotors == {}
+    drawn.station(1, 0, 0.05)
+    assert len(drawn.rows[1].T) == LEAST_BURSTS
+    assert list(drawn.found().rotors) == [1]
+    none = np.zeros(0)
+    empty = find_rotors(none, none.astype(np.int32), none.astype(np.int64), none, RATE)
+    assert empty == Found({}, ())
+
+
+def test_one_second_is_enough() -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 1, ppm=11, wrong=0.2)
+    drawn.accidents(300, 1.0)
+    assert drawn.found().rotors[4].ppm(RATE) == pytest.approx(11, abs=0.3)
+
+
+def test_accidents_make_no_rotor() -> None:
+    for seed in range(20):
+        drawn = Decoded(np.random.default_rng(seed))
+        drawn.accidents(3000, 30.0)
+        assert drawn.found() == Found({}, ())
+
+
+def test_many_accidents_do_not_hide_a_rotor() -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 30, ppm=-8, wrong=0.1)
+    drawn.accidents(3000, 30.0, polynomials=8)
+    found = drawn.found()
+    assert list(found.rotors) == [4]
+    assert found.rotors[4].ppm(RATE) == pytest.approx(-8, abs=0.02)
+    # Those that lie right by accident, 4 us of 20 ms, count as well.
+    assert found.rotors[4].bursts == pytest.approx(0.9 * 3034, rel=0.02)
+
+
+@pytest.mark.parametrize("ppm", [0.0, 6.0, -40.0])
+def test_two_stations_on_a_channel(ppm: float) -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 20, wrong=0.1)
+    drawn.station(4, 0, 20, zero_s=0.0101, ppm=ppm, wrong=0.1)
+    drawn.station(1, 0, 20)
+    found = drawn.found()
+    assert found.doubled == (4,)
+    assert list(found.rotors) == [1]
+
+
+def test_two_stations_on_a_channel_for_a_part_of_the_time() -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 20)
+    drawn.station(4, 8, 14, zero_s=0.0101)
+    assert drawn.found().doubled == (4,)
+
+
+@pytest.mark.parametrize("ppm", [0.0, 1.0])
+def test_a_station_that_is_switched_off_and_on(ppm: float) -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 10, wrong=0.1)
+    drawn.station(4, 15, 25, zero_s=0.0101, ppm=ppm, wrong=0.1)
+    found = drawn.found()
+    assert found.doubled == ()
+    rotor = found.rotors[4]
+    assert rotor.restarts == 1
+    assert rotor.bursts == pytest.approx(0.9 * 2022, rel=0.02)
+    assert rotor.ppm(RATE) == pytest.approx(ppm / 2, abs=0.05)
+    turn = 949000 / 48e6
+    for since, zero, rate in ((0, 0.003, 0.0), (15, 0.0101, ppm)):
+        # Also in the last rotation before the silence, and the first after it.
+        times = since + zero + np.arange(505) * turn * (1 + rate * 1e-6)
+        assert np.abs(lateness(rotor, times)).max() < AGREE_S
+        assert np.abs(lateness(rotor, times + 0.9 * turn) - 0.1 * turn).max() < AGREE_S
+
+
+def test_out_of_sight_for_long() -> None:
+    # Nobody can count the rotations of two hours; what came before and after stands.
+    drawn = Decoded()
+    for since in (0.0, 7200.0, 7300.0):
+        drawn.station(4, since, since + 10, ppm=12, zero_s=0.003 + since * 3e-7)
+    rotor = drawn.found().rotors[4]
+    assert rotor.bursts > 0.99 * 3 * 1010
+    assert rotor.ppm(RATE) == pytest.approx(12, abs=0.02)
+    # Nothing is spent on the silence.
+    assert len(rotor.knots) < 100
+
+
+def test_sees_each_rotation_by_several_photodiodes() -> None:
+    drawn = Decoded()
+    for _ in range(24):
+        drawn.station(4, 0, 4, ppm=3)
+    found = drawn.found()
+    assert found.doubled == ()
+    assert found.rotors[4].bursts == sum(len(rows.T) for rows in drawn.rows)
+
+
+def test_absurd_times_end() -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 2)
+    drawn.station(4, 1e9, 1e9 + 2)
+    found = drawn.found()
+    assert len(found.rotors[4].knots) < 20
