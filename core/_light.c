@@ -80,20 +80,23 @@ static inline double rounded(double value) { return floor(value + (0.5 + 1e-6));
 
 /* Where chips begin, one before the first edge, and by how much edges of the first edge's direction
  * come later than the others. time holds the edges in chips from the first one. */
-static double grid_of(const double *time, int edges, double *skew)
+HOT static double grid_of(const double *time, int edges, double *skew)
 {
-    int64_t sine[2] = {0, 0}, cosine[2] = {0, 0};
-    for (int k = 0; k < edges; k++) {
-        const int at = (int)((time[k] - (double)(int)time[k]) * TURN + 0.5) & (TURN - 1);
-        sine[k & 1] += wave[at];
-        cosine[k & 1] += wave[at + TURN / 4];
-    }
-    double phase[2], run[2] = {0, 0};
-    for (int kind = 0; kind < 2; kind++)
-        phase[kind] = atan2((double)sine[kind], (double)cosine[kind]) / (2 * M_PI);
-    for (int k = 0; k + 1 < edges; k++) {
-        const double length = time[k + 1] - time[k];
-        run[k & 1] += length < LONGEST_RUN ? length : LONGEST_RUN;
+    double phase[2], run[2];
+    for (int kind = 0; kind < 2; kind++) {
+        int64_t sine = 0, cosine = 0;
+        for (int k = kind; k < edges; k += 2) {
+            const int at = (int)((time[k] - (double)(int)time[k]) * TURN + 0.5) & (TURN - 1);
+            sine += wave[at];
+            cosine += wave[at + TURN / 4];
+        }
+        phase[kind] = atan2((double)sine, (double)cosine) / (2 * M_PI);
+        double total = 0;
+        for (int k = kind; k + 1 < edges; k += 2) {
+            const double length = time[k + 1] - time[k];
+            total += length < LONGEST_RUN ? length : LONGEST_RUN;
+        }
+        run[kind] = total;
     }
     /* Phases leave whole chips open, which the runs tell. */
     double told = 0;

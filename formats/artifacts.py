@@ -180,9 +180,10 @@ def _station(table: Table, in_units: bool) -> Station:
     else:
         position = table.array("position_mm", (3,), shift=_METRES)
     rotation = table.array("rotation", (3, 3))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or (
-        np.linalg.det(rotation) < 0
-    ):
+    with np.errstate(over="ignore", invalid="ignore"):
+        turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        turns = turns and np.linalg.det(rotation) > 0
+    if not turns:
         raise table.error("rotation", "expected the rows of a rotation matrix")
     key = "covariance_units_rad" if in_units else "covariance_m_rad"
     covariance = table.array(key, (6, 6), nan=True) if key in table else None

@@ -130,7 +130,7 @@ def soft_bits_numpy(bursts: Bursts) -> SoftBits:
         return SoftBits(np.zeros(0, np.int8), np.zeros(n + 1, np.int64), np.zeros(n), 2 * chip)
     kept = bursts.take(_readable(bursts))
     burst = np.repeat(np.arange(len(some)), np.diff(kept.first))
-    time: Array = (kept.tick - kept.start[burst]) * (1 / chip)
+    time = (kept.tick - kept.start[burst]).astype(float) * (1 / chip)
     first_kind = (np.arange(len(time)) - kept.first[burst]) % 2 == 0
     begin, skew = _grid(time, burst, first_kind)
     time = time + np.where(first_kind, -0.5, 0.5) * skew[burst]

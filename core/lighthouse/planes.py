@@ -73,4 +73,4 @@ def _by_neighbours(
             off = np.where(near, np.abs(place[beside + number] - place[rows]), 1.0)
             distance[number] = np.minimum(distance[number], off)
     closest, other = np.min(distance, axis=0), np.max(distance, axis=0)
-    return np.where((closest < NEAR_TURN) & (NEAR_TURN < other), np.argmin(distance, 0), UNKNOWN)
+    return np.where((closest < NEAR_TURN) & (other > NEAR_TURN), np.argmin(distance, 0), UNKNOWN)

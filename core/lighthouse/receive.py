@@ -183,11 +183,12 @@ def _sweeps_of(sensor: int, reading: Reading, rotors: dict[int, Rotor], rate_hz:
     # Of the bursts of a sweep the one with the most evidence says its polynomial.
     best = np.lexsort((-reading.matches.evidence[rows], group))[np.flatnonzero(fresh)]
     first = rows[best]
-    polynomial, channel = reading.matches.polynomial[first], channel[best].astype(np.int32)
+    polynomial = reading.matches.polynomial[first]
+    station: Int = channel[best].astype(np.int32)
     plane = np.full(len(tick), UNKNOWN, np.int32)
     count = np.zeros(len(tick))
-    for number in np.unique(channel):
-        mine = np.flatnonzero(channel == number)
+    for number in np.unique(station).tolist():
+        mine = np.flatnonzero(station == number)
         if number in rotors:
             rotation, place = rotors[number].turn(tick[mine])
             plane[mine] = planes_of(rotation, place)
@@ -195,7 +196,7 @@ def _sweeps_of(sensor: int, reading: Reading, rotors: dict[int, Rotor], rate_hz:
         else:
             bit = (tick[mine] - reading.bits.tick[first[mine]]) / reading.bits.ticks_per_bit
             count[mine] = reading.matches.index[first[mine]] + bit
-    return Caught(tick, np.full(len(tick), sensor, np.int32), channel, polynomial, plane, count)
+    return Caught(tick, np.full(len(tick), sensor, np.int32), station, polynomial, plane, count)
 
 
 def _middles(reading: Reading, rows: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -213,7 +214,7 @@ def _middles(reading: Reading, rows: NDArray[np.int64]) -> tuple[Array, Array]:
     value = bits.value[bits.first[rows][burst] + place] / CERTAIN
     expected = lfsr.state_at(matches.index[rows][burst] + place, matches.polynomial[rows][burst])
     value = np.where(expected >> (lfsr.BITS - 1) > 0, value, -value)
-    weight: Array = np.bincount(burst, value, len(rows))
+    weight = np.bincount(burst, value, len(rows)).astype(float)
     middle: Array = np.bincount(burst, value * (place + 0.5), len(rows)) / weight
     return weight, bits.tick[rows] + middle * bits.ticks_per_bit
 

@@ -89,7 +89,8 @@ def chance(bursts: Bursts, row: int, polynomial: int, bit: float) -> float:
     samples = min(LONGEST_BITS * SAMPLES, int(np.ceil((edge[-1] - edge[0]) / ticks_per_sample)))
     if samples < SAMPLES:
         return 1.0
-    time = edge[0] + np.arange(samples) * ticks_per_sample
+    # Amid samples: a tick of 40 MHz often lies on their borders.
+    time = edge[0] + (np.arange(samples) + 0.5) * ticks_per_sample
     rising = (np.searchsorted(edge, time, side="right") - 1) % 2 == (0 if bursts.rises[row] else 1)
     level = np.where(rising, 1.0, -1.0)
     level -= level.mean()
@@ -99,7 +100,7 @@ def chance(bursts: Bursts, row: int, polynomial: int, bit: float) -> float:
     half = DECOYS // 2 + 10
     length = len(time) // SAMPLES + 2
     expected = _slow_level(polynomial, whole - half, 2 * half + length)
-    skip = round(part * SAMPLES)
+    skip = round(part * SAMPLES + 0.5)
     rows = np.lib.stride_tricks.sliding_window_view(expected[skip:], len(time))[::SAMPLES]
     likeness = np.abs(_correlation(rows, level))
     own = likeness[half]
