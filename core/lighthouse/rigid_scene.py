@@ -301,7 +301,7 @@ def _remarks(
         )
     if places < FEW_PLACES and len(joined) > 1:
         notes.append(
-            f"the devices were at {places} places only: carry one around, and turn it, so that "
-            "the stations' poses do not stand on the errors of a few looks"
+            f"the devices were at {places} place{'' if places == 1 else 's'} only: carry one "
+            "around, and turn it, so that the stations do not stand on the errors of a few looks"
         )
     return notes
