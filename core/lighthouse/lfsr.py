@@ -72,6 +72,30 @@ def state_at(index: ArrayLike, polynomial: ArrayLike) -> NDArray[np.int64]:
     return np.asarray(state, np.int64)
 
 
+def window_index(bits: ArrayLike, offset: ArrayLike, polynomial: ArrayLike) -> NDArray[np.int64]:
+    """Index of the first bit of windows of 64, of which the first bits are not trusted.
+
+    Parameters
+    ----------
+    bits : (n,) array_like of uint64
+        The first bit in the highest place, as in ``locatk.LighthouseCapture``.
+    offset : (n,) array_like of int
+        Bits that are passed over, 0 to 47: the 17 after them are looked up.
+    polynomial : (n,) array_like of int
+        0 to 31.
+
+    Returns
+    -------
+    (n,) ndarray
+        0 to 131070; :data:`NOWHERE` where the 17 bits are all zero.
+    """
+    passed = np.asarray(offset, np.int64)
+    shift = (64 - BITS - passed).astype(np.uint64)
+    state = np.asarray(bits, np.uint64) >> shift & np.uint64(LENGTH)
+    index = indices(state.astype(np.int64), polynomial)
+    return np.where(index == NOWHERE, NOWHERE, (index - passed) % LENGTH)
+
+
 def bits_at(index: ArrayLike, polynomial: ArrayLike, length: int = 64) -> NDArray[np.uint64]:
     """The ``length`` bits (1 to 64) that start at ``index``, the first in the highest place.
 

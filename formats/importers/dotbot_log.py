@@ -326,12 +326,10 @@ def _rows(log: _Log, warnings: list[str]) -> Rows:
     log.pack()
     rows = np.concatenate(log.packed)
     windows = rows["offset"] >= 0
-    offset, polynomial = rows["offset"][windows], rows["polynomial"][windows]
-    shift = (WINDOW_BITS - lfsr.BITS - offset).astype(np.uint64)
-    state = (rows["bits"][windows] >> shift & np.uint64(lfsr.LENGTH)).astype(np.int64)
-    # As the gateway's frames are read (formats/wire/dotbot_gateway.py).
-    rows["count"][windows] = (lfsr.indices(state, polynomial) - offset) % lfsr.LENGTH
-    dark = np.flatnonzero(windows)[state == 0]
+    known = rows[windows]
+    index = lfsr.window_index(known["bits"], known["offset"], known["polynomial"])
+    rows["count"][windows] = index
+    dark = np.flatnonzero(windows)[index == lfsr.NOWHERE]
     log.marks += len(dark)
     rows = np.delete(rows, dark)
     backwards = int(np.count_nonzero(np.diff(rows["time_ns"]) < 0))

@@ -217,12 +217,11 @@ def _raw(content: Frames, frame: Index) -> list[_Rows]:
         "polynomial": np.where(known, polynomial, UNKNOWN).astype(np.int32),
         "bit_offset": offset.astype(np.int32),
     }
-    room = 64 - lfsr.BITS
-    state = bits >> np.clip(room - offset, 0, room).astype(np.uint64) & np.uint64(lfsr.LENGTH)
-    good = known & (offset >= 0) & (offset <= room) & (state > 0)
-    polynomial, offset = polynomial[good], offset[good]
-    count = (lfsr.indices(state[good].astype(np.int64), polynomial) - offset) % lfsr.LENGTH
-    sweeps = _sweeps(channel_of(polynomial), polynomial, count)
+    good = known & (offset >= 0) & (offset <= 64 - lfsr.BITS)
+    count = np.full(len(bits), lfsr.NOWHERE)
+    count[good] = lfsr.window_index(bits[good], offset[good], polynomial[good])
+    good &= count != lfsr.NOWHERE
+    sweeps = _sweeps(channel_of(polynomial[good]), polynomial[good], count[good])
     return [_Rows(CAPTURES, frame, captures), _Rows(SWEEPS, frame[good], sweeps)]
 
 
