@@ -65,7 +65,8 @@ PyObject *window_edges(PyObject *self, PyObject *args)
 
 #define TURN 4096
 #define LONGEST_RUN 3.0
-#define EVEN 1e-3
+#define EVEN 1e-3f
+#define FULL (1 << 20) /* a level, as a whole number: its sums are exact */
 static int32_t wave[TURN + TURN / 4]; /* sine, and a quarter turn later cosine */
 
 static void make_wave(void)
@@ -109,22 +110,22 @@ HOT static double grid_of(const double *time, int edges, double *skew)
 
 /* Mean levels of all chips of a burst; returns how many there are. sign is the first edge's
  * direction; begin answers where the first chip begins. */
-HOT static int chips_of(const double *time, int edges, float sign, int longest, double *begin,
-                    float *mean)
+HOT static int chips_of(const double *time, int edges, int sign, int longest, double *begin,
+                    int32_t *mean)
 {
     double skew;
     *begin = grid_of(time, edges, &skew);
     const double shift[2] = {-0.5 * skew, 0.5 * skew};
-    double last = time[0] + shift[0];
-    for (int k = 1; k < edges; k++) {
-        const double t = time[k] + shift[k & 1];
-        last = t > last ? t : last;
-    }
+    /* Times ascend, so that with their shifts the latest is one of the last two. */
+    const int final = edges - 1;
+    double last = time[final] + shift[final & 1];
+    const double other = time[final - 1] + shift[(final - 1) & 1];
+    last = other > last ? other : last;
     const double whole = rounded(last - *begin) + 1;
     const int chips = whole < longest ? (int)whole : longest;
     /* Each edge changes the mean of its own chip by a part, and of all later ones whole. */
     memset(mean, 0, (size_t)(chips + 2) * sizeof *mean);
-    float jump = 2 * sign;
+    int32_t turn = sign < 0 ? -1 : 0; /* all ones: x ^ turn, less turn, is -x */
     last = time[0] + shift[0];
     for (int k = 0; k < edges; k++) {
         double t = time[k] + shift[k & 1];
@@ -133,12 +134,12 @@ HOT static int chips_of(const double *time, int edges, float sign, int longest, 
         const double place = t - *begin;
         const int chip = (int)place;
         if (chip >= chips) break;
-        const float late = (float)(place - chip);
-        mean[chip] += jump * (1 - late);
-        mean[chip + 1] += jump * late;
-        jump = -jump;
+        const int32_t late = (int32_t)((place - chip) * FULL);
+        mean[chip] += (2 * (FULL - late) ^ turn) - turn;
+        mean[chip + 1] += (2 * late ^ turn) - turn;
+        turn = ~turn;
     }
-    float level = -sign;
+    int32_t level = -sign * FULL;
     for (int k = 0; k < chips; k++) {
         level += mean[k];
         mean[k] = level;
@@ -146,24 +147,27 @@ HOT static int chips_of(const double *time, int edges, float sign, int longest, 
     return chips;
 }
 
-static inline float magnitude(float x) { return x < 0 ? -x : x; }
+static inline int32_t magnitude(int32_t x) { return (x < 0 ? -x : x) >> 6; }
 
-/* Bits of a burst from its chips; odd answers whether the first chip is the second half of one. */
-HOT static int bits_of(const float *restrict mean, int chips, int *odd, int8_t *restrict value)
+/* Bits of a burst from its chips; odd answers whether the first chip is the second half of one.
+ * change is room for as many numbers as there are chips. */
+HOT static int bits_of(const int32_t *restrict mean, int chips, int *odd,
+                       int32_t *restrict change, int8_t *restrict value)
 {
-    float even_sum = 0, odd_sum = 0;
-    for (int k = 0; k + 1 < chips; k += 2) even_sum += magnitude(mean[k + 1] - mean[k]);
-    for (int k = 1; k + 1 < chips; k += 2) odd_sum += magnitude(mean[k + 1] - mean[k]);
-    *odd = even_sum > odd_sum + EVEN;
-    const float *m = mean + *odd;
+    int32_t middles = 0, borders = 0;
+    for (int k = 0; k + 1 < chips; k += 2) middles += magnitude(mean[k + 1] - mean[k]);
+    for (int k = 1; k + 1 < chips; k += 2) borders += magnitude(mean[k + 1] - mean[k]);
+    *odd = middles > borders + (int32_t)(EVEN * FULL) / 64;
+    const int32_t *m = mean + *odd;
     const int bits = (chips - *odd) / 2;
     if (bits < 1) return 0;
+    change[0] = 2 * m[0];
+    for (int k = 1; k < bits; k++) change[k] = m[2 * k] - m[2 * k - 1];
+    change[bits] = -2 * m[2 * bits - 1];
     for (int k = 0; k < bits; k++) {
-        const float a = k ? (m[2 * k] - m[2 * k - 1]) / 2 : m[0];
-        const float b = k < bits - 1 ? (m[2 * k + 1] - m[2 * k + 2]) / 2 : m[2 * k + 1];
-        float soft = -a * b;
-        soft = soft > 1 ? 1 : soft < -1 ? -1 : soft;
-        value[k] = (int8_t)rintf(soft * 64);
+        float soft = (float)change[k] * (float)change[k + 1] * (16.0f / FULL / FULL);
+        soft = soft > 64 ? 64 : soft < -64 ? -64 : soft;
+        value[k] = (int8_t)(int32_t)rintf(soft);
     }
     return bits;
 }
@@ -188,7 +192,7 @@ PyObject *light_bits(PyObject *self, PyObject *args)
     for (Py_ssize_t i = 0; i < bursts; i++)
         if (readable[i] && first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
     double *time = malloc((size_t)most * sizeof *time);
-    float *mean = malloc((size_t)(longest + 8) * sizeof *mean);
+    int32_t *mean = malloc(2 * (size_t)(longest + 8) * sizeof *mean);
     if (!time || !mean) {
         free(time);
         free(mean);
@@ -208,9 +212,9 @@ PyObject *light_bits(PyObject *self, PyObject *args)
             double begin;
             int odd;
             const int64_t room = 2 * (b[4].len - value_first[i]);
-            const int chips = chips_of(time, (int)edges, rises[i] ? 1.0f : -1.0f,
+            const int chips = chips_of(time, (int)edges, rises[i] ? 1 : -1,
                                        room < longest ? (int)room : longest, &begin, mean);
-            bits = bits_of(mean, chips, &odd, value + value_first[i]);
+            bits = bits_of(mean, chips, &odd, mean + longest + 8, value + value_first[i]);
             start[i] = (double)origin + (begin + odd) * chip;
         }
         value_first[i + 1] = value_first[i] + bits;
@@ -249,18 +253,25 @@ static int64_t most_of(const int64_t *first, Py_ssize_t bursts)
     return most;
 }
 
+/* The 17 tap places of a polynomial in three parts: for each of them, all sums of the words of
+ * bits that came so many places before. A polynomial's sum is then three look-ups. */
+#define PARTS 3
+#define PART_BITS 6
+typedef uint64_t Sums[PARTS][1 << PART_BITS];
+
 /* Bits of a burst as words, the first bit highest, with nothing before the first so that the last
- * word is full; for each word also the words of bits that came one, two, ... seventeen before. */
+ * word is full. */
 typedef struct {
-    uint64_t (*before)[REGISTER + 1];
+    uint64_t *hard;
     uint64_t *open; /* bits that follow from nothing, as one of the 18 is unknown */
+    Sums *sums;
+    uint8_t *summed; /* words whose sums are there */
     int bits, words, empty; /* empty: places of the first word before the first bit */
 } Text;
 
 static void write_text(const Tables *t, const int8_t *value, int bits, Text *text)
 {
     int sure = 0, ones = 0, next = 0;
-    uint64_t last = 0;
     text->bits = bits;
     text->words = (bits + 63) / 64;
     text->empty = 64 * text->words - bits;
@@ -276,25 +287,42 @@ static void write_text(const Tables *t, const int8_t *value, int bits, Text *tex
             open = open << 1 | (uint64_t)((sure <= REGISTER) | (ones <= 0));
             ones = one ? REGISTER : ones - 1;
         }
-        text->before[w][0] = hard;
-        for (int k = 1; k <= REGISTER; k++) text->before[w][k] = hard >> k | last << (64 - k);
+        text->hard[w] = hard;
         text->open[w] = open;
-        last = hard;
+        text->summed[w] = 0;
     }
 }
 
-/* Bits of a word that do not follow from the 17 before each. */
+HOT static void sum_word(const Text *text, int w)
+{
+    const uint64_t hard = text->hard[w], last = w ? text->hard[w - 1] : 0;
+    for (int part = 0; part < PARTS; part++) {
+        uint64_t *sums = text->sums[w][part];
+        sums[0] = 0;
+        for (int bit = 0; bit < PART_BITS; bit++) {
+            const int by = 1 + part * PART_BITS + bit;
+            const uint64_t before = hard >> by | last << (64 - by);
+            for (int k = 0; k < 1 << bit; k++) sums[(1 << bit) + k] = sums[k] ^ before;
+        }
+    }
+    text->summed[w] = 1;
+}
+
+/* Bits of a word, whose sums are there, that do not follow from the 17 before each. */
 static inline uint64_t strangers(const Text *text, uint32_t taps, int w)
 {
-    uint64_t bad = text->before[w][0];
-    for (; taps; taps &= taps - 1) bad ^= text->before[w][1 + __builtin_ctz(taps)];
-    return bad | text->open[w];
+    const uint32_t part = (1 << PART_BITS) - 1;
+    const uint64_t sum = text->sums[w][0][taps & part] ^
+                         text->sums[w][1][taps >> PART_BITS & part] ^
+                         text->sums[w][2][taps >> 2 * PART_BITS];
+    return (text->hard[w] ^ sum) | text->open[w];
 }
 
 /* The polynomial under which most bits of a word follow from those before, the first of equals. */
 HOT static int likeliest(const Tables *t, const Text *text, int w)
 {
     int best = 0, fewest = 65;
+    sum_word(text, w);
     for (int p = 0; p < t->polynomials; p++) {
         const int number = __builtin_popcountll(strangers(text, (uint32_t)t->taps[p], w));
         best = number < fewest ? p : best;
@@ -311,10 +339,14 @@ static int longest_run(const Tables *t, const Text *text, int polynomial, int fi
     const uint32_t taps = (uint32_t)t->taps[polynomial];
     int longest = 0, from = 64 * first;
     for (int w = first; w < last; w++) {
+        if (!text->summed[w]) sum_word(text, w);
         uint64_t bad = strangers(text, taps, w);
-        /* A word without a run of four, and with none to go on, needs no look at each bit. */
-        const uint64_t good = ~bad, two = good & good >> 1;
-        if (!(two & two >> 2) && 64 * w - from + 3 < t->follow) {
+        if (!bad) continue;
+        /* A word without a long run, and that ends none, needs no look at each bit. */
+        uint64_t run = ~bad & ~bad >> 1;
+        run &= run >> 2;
+        if (t->follow >= 8) run &= run >> 4;
+        if (!run && t->follow >= 4 && 64 * w - from + __builtin_clzll(bad) < t->follow) {
             from = 64 * w + 64 - __builtin_ctzll(bad);
             continue;
         }
@@ -340,8 +372,8 @@ static int longest_run(const Tables *t, const Text *text, int polynomial, int fi
 static int place_of(const Tables *t, const Text *text, int polynomial, int k)
 {
     const uint64_t state =
-        k % 64 ? text->before[k / 64][0] >> (64 - k % 64) : text->before[k / 64 - 1][0];
-    const uint64_t more = k % 64 && k / 64 ? text->before[k / 64 - 1][0] << k % 64 : 0;
+        k % 64 ? text->hard[k / 64] >> (64 - k % 64) : text->hard[k / 64 - 1];
+    const uint64_t more = k % 64 && k / 64 ? text->hard[k / 64 - 1] << k % 64 : 0;
     const int32_t index =
         t->index[(size_t)polynomial * (LENGTH + 1) + ((state | more) & LENGTH)];
     const int place = (index - (k - text->empty - REGISTER)) % LENGTH;
@@ -350,7 +382,7 @@ static int place_of(const Tables *t, const Text *text, int polynomial, int k)
 
 /* Row of one place: polynomial, place, score, begin, end, known, wrong. expected has room for the
  * bits of the burst and a register more. */
-static void score_place(const Tables *t, const int8_t *value, int bits, uint8_t *expected,
+HOT static void score_place(const Tables *t, const int8_t *value, int bits, uint8_t *expected,
                         int polynomial, int place, int32_t *row)
 {
     const int32_t *states = t->states + (size_t)polynomial * LENGTH;
@@ -408,9 +440,12 @@ PyObject *light_places(PyObject *self, PyObject *args)
     const Py_ssize_t bursts = b[1].len / (Py_ssize_t)sizeof *first - 1;
     const int64_t most = most_of(first, bursts);
     const size_t words = (size_t)(most / 64 + 1);
-    Text text = {malloc(words * sizeof *text.before), malloc(words * sizeof *text.open), 0, 0, 0};
+    Text text = {.hard = malloc(words * sizeof *text.hard),
+                 .open = malloc(words * sizeof *text.open),
+                 .sums = malloc(words * sizeof *text.sums),
+                 .summed = malloc(words)};
     uint8_t *expected = malloc((size_t)most + REGISTER);
-    const int stored = text.before && text.open && expected;
+    const int stored = text.hard && text.open && text.sums && text.summed && expected;
     for (Py_ssize_t i = 0; stored && i < bursts; i++) {
         const int8_t *value = values + first[i];
         const int bits = (int)(first[i + 1] - first[i]);
@@ -435,8 +470,10 @@ PyObject *light_places(PyObject *self, PyObject *args)
             if (trial[2] > row[2]) memcpy(row, trial, sizeof trial);
         }
     }
-    free(text.before);
+    free(text.hard);
     free(text.open);
+    free(text.sums);
+    free(text.summed);
     free(expected);
     return done(b, 8, stored);
 }

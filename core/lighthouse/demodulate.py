@@ -7,11 +7,11 @@ unknown. Rising and falling edges are delayed differently by the receiver; each 
 own phase, and their difference is taken out, be it as long as a chip.
 
 What a chip holds is the mean level over it, which a late or missing edge blunts and does not
-turn over. A bit is a one where its chips differ. Borders change always, so that the chip
-before tells of the first and the chip after of the second once more: where they disagree, the
-bit is uncertain, and an uncertain bit counts little in what follows
-(:mod:`.identify`). A run-length decoder, which the paper and its peers use, has to decide at
-each run, and loses the rest of the burst with a run that it misread.
+turn over. The level changes at each border of bits, from one chip to the next; where it changes
+upward at both borders of a bit, or downward, it changed back between them: a one. The product
+of both changes tells the bit and how sure it is, and an uncertain bit counts little in what
+follows (:mod:`.identify`). A run-length decoder, which the paper and its peers use, has to
+decide at each run, and loses the rest of the burst with a run that it misread.
 """
 
 from __future__ import annotations
@@ -152,13 +152,11 @@ def soft_bits_numpy(bursts: Bursts) -> SoftBits:
     first = np.concatenate([[0], np.cumsum(bits)])
     at = np.arange(first[-1]) - np.repeat(first[:-1], bits)
     left = np.repeat(offset + odd, bits) + 2 * at
+    # The changes at both borders of a bit; at the ends of the burst twice its own chip.
     a, b = mean[left], mean[left + 1]
-    head, tail = at == 0, at == np.repeat(bits, bits) - 1
-    a, b = (
-        np.where(head, a, (a - np.roll(b, 1)) / 2),
-        np.where(tail, b, (b - np.roll(a, -1)) / 2),
-    )
-    value = np.rint(np.clip(-a * b, -1.0, 1.0) * CERTAIN).astype(np.int8)
+    before = np.where(at == 0, 2 * a, a - np.roll(b, 1))
+    after = np.where(at == np.repeat(bits, bits) - 1, -2 * b, np.roll(a, -1) - b)
+    value = np.rint(np.clip(before * after / 4, -1.0, 1.0) * CERTAIN).astype(np.int8)
     all_bits, tick = np.zeros(n, np.int64), np.zeros(n)
     all_bits[some] = bits
     tick[some] = kept.start + (begin + odd) * chip

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import bursts as light_bursts
 from locatk.core.lighthouse import paper_light, weak
-from locatk.core.lighthouse.bursts import of_windows
 from locatk.core.lighthouse.identify import Matches
-from locatk.core.lighthouse.judge import Reading, identified
+from locatk.core.lighthouse.judge import Reading
 from locatk.core.lighthouse.light import Edges
 from locatk.core.lighthouse.receive import SHORTEST_S, Reception, receive
+from locatk.core.lighthouse.windows import read_windows
 from locatk.formats.bench import Figure
 from locatk.formats.bench.infrared_places import figures as place_figures
 from locatk.formats.bench.infrared_speed import figures as speed_figures
@@ -168,7 +168,7 @@ def _windows(folder: Path) -> list[Figure]:
     bursts = bursts.take(bursts.duration_s > SHORTEST_S)
     start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
     windows = paper_light.windows_of(edges, start)
-    _, matches = identified(of_windows(windows))
+    matches = read_windows(windows).matches
     good = matches.certain()
     strange = good & ~np.isin(matches.polynomial, POLYNOMIALS)
     paper = paper_light.decode(windows)

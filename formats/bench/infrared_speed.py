@@ -12,10 +12,12 @@ from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.bursts import of_windows
 from locatk.core.lighthouse.demodulate import soft_bits
 from locatk.core.lighthouse.identify import identify
+from locatk.core.lighthouse.windows import read_windows
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import alone, cpu_seconds
 
-BATCH = 20
+BATCH = 4
+REPEATS = 40
 """Repetitions of the published windows in one batch."""
 
 ROWS = {
@@ -35,7 +37,8 @@ def figures(data: Path) -> list[Figure]:
     return [
         Figure("windows of 16 us to index", whole / 1e3, "k/s",
                f"64 bytes each to polynomial and index, batches of {11_136 * BATCH:,}, processor "
-               "time of one thread, best of 10; the peer's chain does the same for 8 polynomials",
+               f"time of one thread, best of {REPEATS}; the peer's chain does the same for 8 "
+               "polynomials",
                400.0, "higher", "DotBot C, -O3", 216.0),
         Figure("soft bits to index", index / 1e3, "k/s",
                "the same without demodulation, all 32 polynomials", None, "higher",
@@ -55,9 +58,9 @@ def measure(data: str) -> list[float]:
     lfsr.tables()
     tables = time.process_time() - start
     windows = np.concatenate([published_windows(Path(data))] * BATCH)
-    whole = cpu_seconds(lambda: identify(soft_bits(of_windows(windows))), 10)
+    whole = cpu_seconds(lambda: read_windows(windows), REPEATS)
     bits = soft_bits(of_windows(windows))
-    index = cpu_seconds(lambda: identify(bits), 10)
+    index = cpu_seconds(lambda: identify(bits), REPEATS)
     edges = capture(Path(data) / "lighthouse", CAPTURES[0])
     light = cpu_seconds(lambda: receive([edges]), 3)
     return [len(windows) / whole, len(windows) / index, tables, light]
