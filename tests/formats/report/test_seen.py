@@ -24,7 +24,15 @@ from locatk.formats.report import seen, seen_reasons
 
 ROOT = Path(__file__).resolve().parents[3]
 
-ARGUMENTS = {"reject": 0, "_note": 1, "keep_stations": 1, "_refusal": 2, "_answer": 2, "Seen": 3, "keep": 1}
+ARGUMENTS = {
+    "reject": 0,
+    "_note": 1,
+    "keep": 1,
+    "keep_stations": 1,
+    "_refusal": 2,
+    "_answer": 2,
+    "Seen": 3,
+}
 """Calls in core that give a reason, and which of their arguments it is."""
 
 NAMES = {"refused", "rejected", "reason", "why"}
