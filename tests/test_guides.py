@@ -460,7 +460,7 @@ def test_commands_are_where_they_are_found() -> None:
     languages = {
         block.language for path in every for block in blocks(path.read_text(encoding="utf-8"))
     }
-    assert languages <= {"", "sh", "text", "console", "python", "toml", "json", "csv"}
+    assert languages <= {"", "sh", "text", "console", "python", "toml", "json", "csv", "yaml"}
 
 
 def test_exceptions_are_needed() -> None:

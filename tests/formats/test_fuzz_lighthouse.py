@@ -46,7 +46,7 @@ from locatk.formats.importers.sweeps import ImportedSession
 from locatk.formats.session import Session
 from locatk.formats.session_writer import SessionWriter
 
-SECONDS = float(os.environ.get("LOCATK_FUZZ_SECONDS", "8"))
+SECONDS = float(os.environ.get("LOCATK_FUZZ_SECONDS", "5"))
 SEED, FIRST = (int(n) for n in os.environ.get("LOCATK_FUZZ_START", "8:0").split(":"))
 
 HANGS_S = 60

@@ -257,7 +257,7 @@ def test_a_deck_that_never_moved_does_not_fix_a_scene_and_the_answer_says_so() -
     known = {s.channel: s.calibration for s in stations}
     answer = solve_rigid(sweeps, {"device": DECK}, Scene(calibrations=known))
     assert any("two answers" in note for note in answer.notes)
-    assert any("places only" in note for note in answer.notes)
+    assert any("only: carry" in note for note in answer.notes)
 
 
 def test_reflections_and_junk_are_counted_and_left_out() -> None:
@@ -376,4 +376,4 @@ def test_the_recorded_tracker_stands_where_libsurvive_saw_it(data: Path) -> None
     found = np.stack([s.position for s in own.scene.stations])
     to = umeyama(found, true, with_scale=False)
     assert np.linalg.norm(to.apply(found) - true, axis=1).max() < 0.06
-    assert any("places only" in note for note in own.notes)
+    assert any("only: carry" in note for note in own.notes)

@@ -746,7 +746,8 @@ def test_garbage_is_refused_or_told_never_a_crash(
     world: Any, channels: tuple[int, ...], kind: str
 ) -> None:
     lamps = world.lamps(*channels)
-    for seed in range(6):
+    # Many stations have many arrangements to try: seconds a session of garbage.
+    for seed in range(6 if len(channels) < 3 else 3):
         rng = np.random.default_rng(seed)
         moments = int(rng.choice([6, 12, 20, 60]))
         drive = world.drive(lamps, world.curve(moments, flat=seed % 2 == 0), noise_rad=1e-3)
