@@ -83,22 +83,23 @@ static inline double rounded(double value) { return floor(value + (0.5 + 1e-6));
  * come later than the others. time holds the edges in chips from the first one. */
 HOT static double grid_of(const double *time, int edges, double *skew)
 {
-    double phase[2], run[2];
-    for (int kind = 0; kind < 2; kind++) {
-        int64_t sine = 0, cosine = 0;
-        for (int k = kind; k < edges; k += 2) {
-            const int at = (int)((time[k] - (double)(int)time[k]) * TURN + 0.5) & (TURN - 1);
-            sine += wave[at];
-            cosine += wave[at + TURN / 4];
+    int64_t sine[2] = {0, 0}, cosine[2] = {0, 0};
+    double phase[2], run[2] = {0, 0};
+    /* Both directions in one pass, so that neither sum waits for the other. */
+    for (int k = 0; k < edges; k += 2) {
+        for (int kind = 0; kind < 2 && k + kind < edges; kind++) {
+            const double here = time[k + kind];
+            const int at = (int)((here - (double)(int)here) * TURN + 0.5) & (TURN - 1);
+            sine[kind] += wave[at];
+            cosine[kind] += wave[at + TURN / 4];
+            if (k + kind + 1 < edges) {
+                const double length = time[k + kind + 1] - here;
+                run[kind] += length < LONGEST_RUN ? length : LONGEST_RUN;
+            }
         }
-        phase[kind] = atan2((double)sine, (double)cosine) / (2 * M_PI);
-        double total = 0;
-        for (int k = kind; k + 1 < edges; k += 2) {
-            const double length = time[k + 1] - time[k];
-            total += length < LONGEST_RUN ? length : LONGEST_RUN;
-        }
-        run[kind] = total;
     }
+    for (int kind = 0; kind < 2; kind++)
+        phase[kind] = atan2((double)sine[kind], (double)cosine[kind]) / (2 * M_PI);
     /* Phases leave whole chips open, which the runs tell. */
     double told = 0;
     if (run[1] > 0) told = (run[1] / ((edges - 1) / 2) - run[0] / (edges / 2)) / 2;
@@ -269,27 +270,39 @@ typedef struct {
     int bits, words, empty; /* empty: places of the first word before the first bit */
 } Text;
 
-static void write_text(const Tables *t, const int8_t *value, int bits, Text *text)
+/* Bits of which all of the last count, with their own, are one; more holds those of the word
+ * before, then the word's own. */
+static inline unsigned __int128 all_of_last(unsigned __int128 more, int count)
 {
-    int sure = 0, ones = 0, next = 0;
+    int reach = 1;
+    for (; 2 * reach <= count; reach *= 2) more &= more >> reach;
+    return more & more >> (count - reach);
+}
+
+HOT static void write_text(const Tables *t, const int8_t *value, int bits, Text *text)
+{
+    uint64_t sure_before = 0, zero_before = ~0ull;
     text->bits = bits;
     text->words = (bits + 63) / 64;
     text->empty = 64 * text->words - bits;
-    for (int w = 0; w < text->words; w++) {
+    for (int w = 0, next = 0; w < text->words; w++) {
         const int to = 64 * (w + 1) - text->empty;
-        uint64_t hard = 0, open = ~0ull;
+        uint64_t hard = 0, sure = 0;
         for (; next < to; next++) {
-            const int soft = value[next], one = soft > 0;
-            const int known = soft > t->unknown || soft < -t->unknown;
-            sure = known ? sure + 1 : 0;
-            hard = hard << 1 | (uint64_t)one;
-            /* The 17 before must hold a one: state 0 follows from itself. */
-            open = open << 1 | (uint64_t)((sure <= REGISTER) | (ones <= 0));
-            ones = one ? REGISTER : ones - 1;
+            const int soft = value[next];
+            hard = hard << 1 | (uint64_t)(soft > 0);
+            sure = sure << 1 | (uint64_t)(soft > t->unknown || soft < -t->unknown);
         }
+        /* Known are to be the bit and the 17 before it, which must hold a one: state 0 follows
+         * from itself. */
+        const unsigned __int128 known = (unsigned __int128)sure_before << 64 | sure;
+        const unsigned __int128 zeros = (unsigned __int128)zero_before << 64 | (uint64_t)~hard;
         text->hard[w] = hard;
-        text->open[w] = open;
+        text->open[w] = ~(uint64_t)all_of_last(known, REGISTER + 1) |
+                        (uint64_t)(all_of_last(zeros, REGISTER) >> 1);
         text->summed[w] = 0;
+        sure_before = sure;
+        zero_before = ~hard;
     }
 }
 
