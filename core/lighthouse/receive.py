@@ -53,7 +53,8 @@ class Caught:
         Photodiode from 0, station from 1, polynomial, and which of its two planes (-1 where
         nothing tells).
     count : float64 ndarray
-        Steps of 6 MHz since the rotor's zero, as its station's own clock counts.
+        Steps of 6 MHz since the rotor's zero, as its station's own clock counts: the index of
+        the bit that was sent when the middle passed.
     """
 
     tick: Array
@@ -186,16 +187,16 @@ def _sweeps_of(sensor: int, reading: Reading, rotors: dict[int, Rotor], rate_hz:
     polynomial = reading.matches.polynomial[first]
     station: Int = channel[best].astype(np.int32)
     plane = np.full(len(tick), UNKNOWN, np.int32)
-    count = np.zeros(len(tick))
+    ticks_per_bit = np.full(len(tick), reading.bits.ticks_per_bit)
     for number in np.unique(station).tolist():
-        mine = np.flatnonzero(station == number)
         if number in rotors:
-            rotation, place = rotors[number].turn(tick[mine])
-            plane[mine] = planes_of(rotation, place)
-            count[mine] = place * period_counts(number)
-        else:
-            bit = (tick[mine] - reading.bits.tick[first[mine]]) / reading.bits.ticks_per_bit
-            count[mine] = reading.matches.index[first[mine]] + bit
+            mine = np.flatnonzero(station == number)
+            plane[mine] = planes_of(*rotors[number].turn(tick[mine]))
+            ticks_per_bit[mine] = rotors[number].ticks_per_bit
+    # By the sweep's own bits: a rotor runs ahead and falls behind by a microsecond within
+    # seconds, and its station counts from where it is.
+    bit = (tick - reading.bits.tick[first]) / ticks_per_bit
+    count = np.maximum(reading.matches.index[first] + bit, 0.0)
     return Caught(tick, np.full(len(tick), sensor, np.int32), station, polynomial, plane, count)
 
 

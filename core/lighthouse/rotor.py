@@ -23,7 +23,13 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from locatk.core.lighthouse.channels import CHANNELS, TICK_HZ, channel_of, period_ticks
+from locatk.core.lighthouse.channels import (
+    CHANNELS,
+    TICK_HZ,
+    TICKS_PER_COUNT,
+    channel_of,
+    period_ticks,
+)
 
 Array = NDArray[np.float64]
 
@@ -100,6 +106,11 @@ class Rotor:
     bursts: int
     restarts: int
     sigma: float
+
+    @property
+    def ticks_per_bit(self) -> float:
+        """Length of a bit of its station, in ticks of the recorder."""
+        return self.period * TICKS_PER_COUNT / float(period_ticks(self.channel))
 
     def turn(self, tick: Array) -> tuple[NDArray[np.int64], Array]:
         """Rotation and place in it, 0 to below 1, of times in ticks of the recorder."""
@@ -187,7 +198,7 @@ def zeros(tick: Array, index: NDArray[np.int64], channel: int, period: float) ->
     The station counts bits and rotations by one clock: ``index`` lasts as much longer than
     nominal as the rotation does.
     """
-    return tick - index * (period * 8 / float(period_ticks(channel)))
+    return tick - index * (period * TICKS_PER_COUNT / float(period_ticks(channel)))
 
 
 def _period(channel: int, tick: Array, index: NDArray[np.int64], rate_hz: float) -> float:
