@@ -1,8 +1,8 @@
 """The rotor of each station: its period, and its phase followed over time.
 
 A decoded burst tells when the rotor was at its zero: its own time less the time that its
-index takes. A station's rotor turns with a crystal's constancy, wanders by a microsecond in a
-minute, and starts at another moment than any accident would name. So the bursts of a station
+index takes. A station's rotor turns with a crystal's constancy, wanders about it
+by some microseconds, and starts at another moment than any accident would name. So the bursts of a station
 must agree on one period, and from one to the next on one phase; those that do not were decoded
 wrong.
 
