@@ -1,10 +1,10 @@
 """The rotor of each station: its period, and its phase followed over time.
 
 A decoded burst tells when the rotor was at its zero: its own time less the time that its
-index takes. A station's rotor turns with a crystal's constancy, wanders about it
-by some microseconds, and starts at another moment than any accident would name. So the bursts of a station
-must agree on one period, and from one to the next on one phase; those that do not were decoded
-wrong.
+index takes. A station's rotor turns with a crystal's constancy, wanders about it by some
+microseconds, and starts at another moment than any accident would name. So the bursts of a
+station must agree on one period, and from one to the next on one phase; those that do not were
+decoded wrong.
 
 Bursts of one phase, without a longer silence, are a stretch. A station that was out of sight
 for long, or was switched off and on, makes another one. Two stretches at the same time are two
