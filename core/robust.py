@@ -1,14 +1,30 @@
-"""Estimating in the presence of outliers: random sampling and robust scale."""
+"""Estimating in the presence of outliers: random sampling, damped steps and robust scale."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+
+class Costed(Protocol):
+    """Normal equations at a state, with the robust cost there."""
+
+    @property
+    def cost(self) -> float: ...
+
+
+State = TypeVar("State")
+System = TypeVar("System", bound=Costed)
+
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6
+
+LEAST_GAIN = 1e-6
+"""Share of the cost: a step that gains less is the last."""
 
 POOL = 256
 """Correspondences from which samples are drawn, at most: enough to be fair, and it bounds
@@ -75,6 +91,53 @@ def consensus(
             break
         inliers = fresh
     return model, inliers
+
+
+def descend(
+    state: State,
+    system: System,
+    attempt: Callable[[State, System, float, int], tuple[State, System]],
+    *,
+    damping: float,
+    iterations: int,
+) -> tuple[State, System, int]:
+    """Follow damped steps down to the least cost (Levenberg 1944, Marquardt 1963).
+
+    Parameters
+    ----------
+    state
+        Where to start.
+    system
+        The normal equations there.
+    attempt : callable
+        From a state, its system, the damping and the number of the step (from 1) to the next
+        state and the system there.
+    damping : float
+        To begin with; a tenth after each step that gains, ten times as much after one that
+        does not.
+    iterations : int
+        Steps, at most.
+
+    Returns
+    -------
+    state, system, steps
+        Of the least cost that was found.
+    """
+    steps = 0
+    while steps < iterations:
+        steps += 1
+        trial, found = attempt(state, system, damping, steps)
+        if found.cost < system.cost:
+            gain = (system.cost - found.cost) / max(system.cost, 1e-30)
+            state, system = trial, found
+            damping = max(damping / 10, LEAST_DAMPING)
+            if gain < LEAST_GAIN:
+                break
+        else:
+            damping *= 10
+            if damping > MOST_DAMPING:
+                break
+    return state, system, steps
 
 
 def robust_sigma(residuals: Array) -> float:

@@ -22,6 +22,7 @@ from locatk.core.lighthouse.calibration import (
     predict_with_gradient,
 )
 from locatk.core.lighthouse.generic import GENERIC, PHASE_TILT_SIGMA
+from locatk.core.robust import descend
 
 Array = NDArray[np.float64]
 
@@ -130,27 +131,19 @@ def adjust(
     prior = _Prior.of(rig, free)
     dims = 0 if fixed_points else (2 if planar else 3)
 
-    damping = 1e-3
-    steps = 0
-    system = _linearise(observed, seen, rig, sigma, loss_width, prior, dims)
-    while steps < iterations:
-        steps += 1
+    def linearised(rig: Rig) -> _System:
+        return _linearise(observed, seen, rig, sigma, loss_width, prior, dims)
+
+    def attempt(rig: Rig, system: _System, damping: float, step: int) -> tuple[Rig, _System]:
         trial = _step(system, rig, damping, planar, dims)
-        trial_system = _linearise(observed, seen, trial, sigma, loss_width, prior, dims)
-        if dims and steps > SLOW:
+        found = linearised(trial)
+        if dims and step > SLOW:
             # Along a curved valley the points fall behind: let them find their own best place.
-            trial = replace(trial, points=_settled(trial_system, trial.points, dims))
-            trial_system = _linearise(observed, seen, trial, sigma, loss_width, prior, dims)
-        if trial_system.cost < system.cost:
-            gain = (system.cost - trial_system.cost) / max(system.cost, 1e-30)
-            rig, system = trial, trial_system
-            damping = max(damping / 10, 1e-9)
-            if gain < 1e-6:
-                break
-        else:
-            damping *= 10
-            if damping > 1e6:
-                break
+            trial = replace(trial, points=_settled(found, trial.points, dims))
+            found = linearised(trial)
+        return trial, found
+
+    rig, system, steps = descend(rig, linearised(rig), attempt, damping=1e-3, iterations=iterations)
     reduced, _, _ = _reduce(system, 0.0, dims)
     # Held directions and frozen calibrations carry no information of their own.
     loose = np.eye(len(reduced))
@@ -179,8 +172,8 @@ class _Prior:
 
     @classmethod
     def of(cls, rig: Rig, free: NDArray[np.bool_]) -> _Prior:
-        own = np.stack([_unknowns_of(c) for c in rig.calibrations])
-        mean = np.where(free[:, None], _unknowns_of(GENERIC), own)
+        own = np.stack([unknowns_of(c) for c in rig.calibrations])
+        mean = np.where(free[:, None], unknowns_of(GENERIC), own)
         spread = np.concatenate([PHASE_TILT_SIGMA[:, 1], PHASE_TILT_SIGMA[:, 0]])
         information = np.full(mean.shape, np.inf)
         # What is the same in every unit (the first phase is zero) is not estimated.
@@ -191,7 +184,8 @@ class _Prior:
         return cls(mean, information)
 
 
-def _unknowns_of(calibration: Calibration) -> Array:
+def unknowns_of(calibration: Calibration) -> Array:
+    """(4,) both tilts and both phases, which an adjustment may estimate, in radians."""
     return np.concatenate([calibration.sweeps[:, TILT], calibration.sweeps[:, PHASE]])
 
 
@@ -253,7 +247,7 @@ def _linearise(
         flat = jacobian.reshape(-1, n)
         stations[i] = flat.T @ flat
         stations_rhs[i] = flat.T @ pulled.ravel()
-        deviation = _unknowns_of(rig.calibrations[i]) - prior.mean[i]
+        deviation = unknowns_of(rig.calibrations[i]) - prior.mean[i]
         held = np.isinf(prior.information[i])
         information = np.where(held, 0.0, prior.information[i])
         stations[i][range(6, 10), range(6, 10)] += information
@@ -349,12 +343,13 @@ def _step(system: _System, rig: Rig, damping: float, planar: bool, dims: int) ->
     return Rig(
         rig.positions + change[:, 0:3],
         rotation_exp(change[:, 3:6]) @ rig.rotations,
-        tuple(_moved(c, d) for c, d in zip(rig.calibrations, change[:, 6:], strict=True)),
+        tuple(bent(c, d) for c, d in zip(rig.calibrations, change[:, 6:], strict=True)),
         points,
     )
 
 
-def _moved(calibration: Calibration, change: Array) -> Calibration:
+def bent(calibration: Calibration, change: Array) -> Calibration:
+    """A calibration with its :func:`unknowns_of` changed by so much."""
     if not np.any(change):
         return calibration
     sweeps = calibration.sweeps.copy()

@@ -91,10 +91,14 @@ class Matches:
     def __len__(self) -> int:
         return len(self.polynomial)
 
+    @property
+    def consistent(self) -> NDArray[np.bool_]:
+        """(n,) which have few enough contradictions for their known bits."""
+        return np.asarray((self.polynomial >= 0) & (self.wrong <= ERROR_SHARE * self.known))
+
     def certain(self, evidence: float = ALONE) -> NDArray[np.bool_]:
-        """(n,) which have at least so much evidence and few enough contradictions."""
-        few = self.wrong <= ERROR_SHARE * self.known
-        return np.asarray((self.polynomial >= 0) & (self.evidence >= evidence) & few)
+        """(n,) which are consistent and have at least so much evidence."""
+        return self.consistent & (self.evidence >= evidence)
 
 
 def false_rate(evidence: float) -> float:

@@ -20,7 +20,7 @@ from locatk.core.lighthouse.bursts import Bursts, of_mocap, split
 from locatk.core.lighthouse.channels import channel_of, period_counts, slow_bit_of
 from locatk.core.lighthouse.demodulate import CERTAIN, SoftBits
 from locatk.core.lighthouse.heard import HeardStation
-from locatk.core.lighthouse.identify import ERROR_SHARE, Matches
+from locatk.core.lighthouse.identify import Matches
 from locatk.core.lighthouse.judge import Reading, identified, judge
 from locatk.core.lighthouse.light import Edges
 from locatk.core.lighthouse.planes import planes_of
@@ -150,9 +150,7 @@ def _rotors(heard: list[tuple[Bursts, SoftBits, Matches]], rate_hz: float) -> Fo
     tick = np.concatenate([bits.tick for _, bits, _ in heard])
     polynomial = np.concatenate([m.polynomial for _, _, m in heard])
     index = np.concatenate([m.index for _, _, m in heard])
-    evidence = np.concatenate(
-        [np.where(m.wrong <= ERROR_SHARE * m.known, m.evidence, 0.0) for _, _, m in heard]
-    )
+    evidence = np.concatenate([np.where(m.consistent, m.evidence, 0.0) for _, _, m in heard])
     order = np.argsort(tick, kind="stable")
     return find_rotors(tick[order], polynomial[order], index[order], evidence[order], rate_hz)
 

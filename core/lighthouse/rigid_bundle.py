@@ -7,25 +7,21 @@ complement). The first station holds the frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
+from locatk.core.lighthouse.bundle import STATION_UNKNOWNS, bent, unknowns_of
 from locatk.core.lighthouse.calibration import (
-    PHASE,
-    TILT,
-    Calibration,
     predict_with_gradient,
 )
 from locatk.core.lighthouse.generic import GENERIC, PHASE_TILT_SIGMA
 from locatk.core.lighthouse.rigid_fit import SPEED_SIGMA, UNSEEN, Looks, Poses, Stations, places
+from locatk.core.robust import descend
 
 Array = NDArray[np.float64]
-
-UNKNOWNS = 10
-"""Of a station: position, rotation vector, two tilts, two phases."""
 
 
 @dataclass(frozen=True)
@@ -90,42 +86,33 @@ def adjust_rigid(
         Stations of which tilts and phases are estimated, about the mean of other units.
     iterations : int
     """
-    damping, steps = 1e-4, 0
-    system = _linearise(looks, stations, poses, sigma, soft, share, calibrate)
-    while steps < iterations:
-        steps += 1
-        trial = _step(system, stations, poses, damping, calibrate)
-        found = _linearise(looks, *trial, sigma, soft, share, calibrate)
-        if found.cost < system.cost:
-            gain = (system.cost - found.cost) / max(system.cost, 1e-30)
-            (stations, poses), system = trial, found
-            damping = max(damping / 10, 1e-9)
-            if gain < 1e-6:
-                break
-        else:
-            damping *= 10
-            if damping > 1e6:
-                break
+
+    def attempt(
+        state: tuple[Stations, Poses], system: _System, damping: float, _: int
+    ) -> tuple[tuple[Stations, Poses], _System]:
+        trial = _step(system, *state, damping, calibrate)
+        return trial, _linearise(looks, *trial, sigma, soft, share, calibrate)
+
+    begin = _linearise(looks, stations, poses, sigma, soft, share, calibrate)
+    (stations, poses), system, steps = descend(
+        (stations, poses), begin, attempt, damping=1e-4, iterations=iterations
+    )
     free = _free(calibrate)
     reduced = _reduce(system, 0.0)[0][np.ix_(free, free)]
     full = np.zeros((len(free), len(free)))
     full[np.ix_(free, free)] = np.linalg.pinv(reduced, hermitian=True)
-    blocks = full.reshape(len(calibrate), UNKNOWNS, len(calibrate), UNKNOWNS)
+    blocks = full.reshape(len(calibrate), STATION_UNKNOWNS, len(calibrate), STATION_UNKNOWNS)
     covariance = np.stack([blocks[i, :6, i, :6] for i in range(len(calibrate))])
     return RigidAdjustment(stations, poses, system.residual, covariance, steps)
 
 
 def _free(calibrate: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(s * 10,) unknowns that are estimated."""
-    free = np.ones((len(calibrate), UNKNOWNS), bool)
+    free = np.ones((len(calibrate), STATION_UNKNOWNS), bool)
     free[0, :6] = False
     # The first phase is zero in every unit.
     free[:, 6:] = calibrate[:, None] & np.array([True, True, False, True])
     return free.ravel()
-
-
-def _own(calibration: Calibration) -> Array:
-    return np.concatenate([calibration.sweeps[:, TILT], calibration.sweeps[:, PHASE]])
 
 
 def _linearise(
@@ -141,7 +128,7 @@ def _linearise(
     lever, place = places(looks, poses)
     missed = np.full(looks.angle.shape, np.nan)
     by_place = np.zeros((*looks.angle.shape, 3))
-    own = np.zeros((*looks.angle.shape, UNKNOWNS))
+    own = np.zeros((*looks.angle.shape, STATION_UNKNOWNS))
     for i, calibration in enumerate(stations[2]):
         seen = looks.seen & (looks.station == i)
         offset = place[seen] - stations[0][i]
@@ -149,7 +136,7 @@ def _linearise(
         rows, plane = np.arange(len(offset)), looks.plane[seen]
         missed[seen] = angles[rows, plane] - looks.angle[seen]
         by_place[seen] = gradient[rows, plane] @ stations[1][i].T
-        jacobian = np.zeros((len(offset), UNKNOWNS))
+        jacobian = np.zeros((len(offset), STATION_UNKNOWNS))
         jacobian[:, 0:3] = -by_place[seen]
         jacobian[:, 3:6] = np.cross(by_place[seen], offset)
         jacobian[rows, 6 + plane] = by_tilt[rows, plane]
@@ -174,8 +161,11 @@ def _linearise(
     blocks_rhs[:, 6:] += share[:, None] * poses.rate / SPEED_SIGMA**2
     cost = float(share @ (loss + 0.5 * np.sum((poses.rate / SPEED_SIGMA) ** 2, axis=1)))
 
-    full, rhs = np.zeros((s, UNKNOWNS, s, UNKNOWNS)), np.zeros((s, UNKNOWNS))
-    mixed = np.zeros((m, s, UNKNOWNS, 12))
+    full, rhs = (
+        np.zeros((s, STATION_UNKNOWNS, s, STATION_UNKNOWNS)),
+        np.zeros((s, STATION_UNKNOWNS)),
+    )
+    mixed = np.zeros((m, s, STATION_UNKNOWNS, 12))
     spread = np.concatenate([PHASE_TILT_SIGMA[:, 1], PHASE_TILT_SIGMA[:, 0]])
     prior = np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0) ** 2, 0.0)
     for i in range(s):
@@ -186,11 +176,11 @@ def _linearise(
         rhs[i] = flat.T @ pulled[seen][:, 0]
         mixed[:, i] = np.swapaxes(mine, -1, -2) @ by_pose
         if calibrate[i]:
-            away = _own(stations[2][i]) - _own(GENERIC)
+            away = unknowns_of(stations[2][i]) - unknowns_of(GENERIC)
             full[i, range(6, 10), i, range(6, 10)] += prior
             rhs[i, 6:] += prior * away
             cost += 0.5 * float(prior @ away**2)
-    size = s * UNKNOWNS
+    size = s * STATION_UNKNOWNS
     return _System(
         full.reshape(size, size),
         rhs.ravel(),
@@ -229,19 +219,10 @@ def _step(
     delta = np.zeros(len(free))
     delta[free] = -np.linalg.lstsq(reduced[np.ix_(free, free)], rhs[free], rcond=1e-14)[0]
     back = system.poses_rhs + np.einsum("mac,a->mc", system.mixed, delta)
-    change = delta.reshape(-1, UNKNOWNS)
+    change = delta.reshape(-1, STATION_UNKNOWNS)
     moved = (
         stations[0] + change[:, 0:3],
         rotation_exp(change[:, 3:6]) @ stations[1],
-        tuple(_bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)),
+        tuple(bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)),
     )
     return moved, poses.stepped(-(inverses @ back[..., None])[..., 0])
-
-
-def _bent(calibration: Calibration, change: Array) -> Calibration:
-    if not np.any(change):
-        return calibration
-    sweeps = calibration.sweeps.copy()
-    sweeps[:, TILT] += change[0:2]
-    sweeps[:, PHASE] += change[2:4]
-    return replace(calibration, sweeps=sweeps, source="estimated")

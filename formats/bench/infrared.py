@@ -20,6 +20,7 @@ from locatk.core.lighthouse import paper_light, weak
 from locatk.core.lighthouse.identify import Matches
 from locatk.core.lighthouse.judge import Reading
 from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.paper_receive import WINDOW_START_S
 from locatk.core.lighthouse.receive import SHORTEST_S, Reception, receive
 from locatk.core.lighthouse.windows import read_windows
 from locatk.formats.bench import Figure
@@ -40,7 +41,6 @@ PPM = {1: -15.49, 2: -18.69}
 
 ROTOR_S = 1e-6
 
-WINDOW_START_S = 9e-6
 PHASE_TICKS = -1
 """With which the peer's own program reads what it is said to: its samples come a tick later."""
 
@@ -163,11 +163,7 @@ def _stations(reception: Reception) -> list[Figure]:
 
 
 def _windows(folder: Path) -> list[Figure]:
-    edges = capture(folder, CAPTURES[0])
-    bursts = light_bursts.split(edges)
-    bursts = bursts.take(bursts.duration_s > SHORTEST_S)
-    start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
-    windows = paper_light.windows_of(edges, start)
+    windows = published_windows(folder)
     matches = read_windows(windows).matches
     good = matches.certain()
     strange = good & ~np.isin(matches.polynomial, POLYNOMIALS)
@@ -220,9 +216,9 @@ def _fpga(folder: Path) -> list[Figure]:
     return rows
 
 
-def published_windows(data: Path) -> NDArray[np.uint8]:
+def published_windows(folder: Path) -> NDArray[np.uint8]:
     """The peer's windows of the demodulation capture, (11136, 64)."""
-    edges = capture(data / "lighthouse", CAPTURES[0])
+    edges = capture(folder, CAPTURES[0])
     bursts = light_bursts.split(edges)
     bursts = bursts.take(bursts.duration_s > SHORTEST_S)
     start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS

@@ -57,10 +57,11 @@ def measure(data: str) -> list[float]:
     start = time.process_time()
     lfsr.tables()
     tables = time.process_time() - start
-    windows = np.concatenate([published_windows(Path(data))] * BATCH)
+    folder = Path(data) / "lighthouse"
+    windows = np.concatenate([published_windows(folder)] * BATCH)
     whole = cpu_seconds(lambda: read_windows(windows), REPEATS)
     bits = soft_bits(of_windows(windows))
     index = cpu_seconds(lambda: identify(bits), REPEATS)
-    edges = capture(Path(data) / "lighthouse", CAPTURES[0])
+    edges = capture(folder, CAPTURES[0])
     light = cpu_seconds(lambda: receive([edges]), 3)
     return [len(windows) / whole, len(windows) / index, tables, light]

@@ -6,7 +6,7 @@ station's rotor (:mod:`~locatk.formats.importers.libsurvive_lines`). From them c
 
 * counts: the turn since the rotor's zero on the station's own clock, times the nominal
   rotation, so that the tracker's clock bends no angle
-  (:mod:`~locatk.formats.importers.libsurvive_rotor`). The angle is libsurvive's:
+  (:mod:`~locatk.core.lighthouse.syncs`). The angle is libsurvive's:
   2 pi turn - 2 pi / 3 of the first plane and - 4 pi / 3 of the second are
   :data:`~locatk.core.lighthouse.angles.ROTOR_ZERO`, the sign is the same;
 * times: of the device's counter, mapped on the host's seconds by one line

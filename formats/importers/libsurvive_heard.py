@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.sweeps import UNKNOWN
+from locatk.core.lighthouse.syncs import Rotor, fit_rotor
 from locatk.formats.importers.libsurvive_clock import Run, runs
 from locatk.formats.importers.libsurvive_lines import Columns, Recording
-from locatk.formats.importers.libsurvive_rotor import Rotor, fit_rotor
 
 Rows = NDArray[np.int64]
 Array = NDArray[np.float64]

@@ -42,6 +42,10 @@ def test_poses_are_full_and_in_the_frame_of_the_markers(
     assert answer["poses"] > 500
     for row in answer["detections"]:
         assert row["verification_m"] < 0.01
+    shown = locatk("info", solved).stdout
+    assert "off others [mrad]" in shown
+    first = answer["detections"][0]
+    assert f"{1e3 * first['verification_rad']:.2f}" in shown
     score = json.loads(locatk("eval", solved, "--truth", session, "--json").stdout)
     assert score["ape"]["translation_m"]["median"] < 2e-3
     assert score["ape"]["rotation_deg"]["median"] < 2.0

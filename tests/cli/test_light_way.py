@@ -259,6 +259,7 @@ def test_a_capture_becomes_poses(locatk, minute: tuple[Path, Places], tmp_path: 
     facts = answer(locatk("info", run, "--json"))
     assert [station["id"] for station in facts["stations"]] == [lamp.number for lamp in LAMPS]
     assert facts["sweeps"] == told["sweeps"] > 1900
+    assert facts["metadata"]["facts"]["false polynomials"].startswith("0 of 1,9")
     options = ("--artifact", source.with_name("scene.toml"), "--save-scene", scene)
     [entry] = answer(locatk("solve", run, "-o", solved, *options, "--json"))["sessions"]
     assert {each["calibration"] for each in entry["detections"]} == {"factory"}

@@ -22,12 +22,12 @@ from locatk.core.lighthouse.calibration import predict_angles
 from locatk.core.lighthouse.channels import period_counts, period_ticks
 from locatk.core.lighthouse.ootx import encode
 from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.syncs import fit_rotor
 from locatk.formats.importers import libsurvive_lines
 from locatk.formats.importers.libsurvive import read_libsurvive
 from locatk.formats.importers.libsurvive_device import read_stored
 from locatk.formats.importers.libsurvive_heard import hear, planes
 from locatk.formats.importers.libsurvive_lines import read_lines
-from locatk.formats.importers.libsurvive_rotor import fit_rotor
 
 PUBLISHED = "lighthouse/libsurvive/tracker-cal-attempt.rec.gz"
 

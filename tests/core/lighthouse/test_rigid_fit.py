@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp, rotation_log
-from locatk.core.lighthouse import rigid_bundle
+from locatk.core.lighthouse import bundle, rigid_bundle
 from locatk.core.lighthouse.calibration import predict_angles
 from locatk.core.lighthouse.generic import GENERIC
 from locatk.core.lighthouse.rigid_bundle import adjust_rigid
@@ -106,7 +106,7 @@ def test_the_gradient_of_the_joint_adjustment_is_that_of_its_cost() -> None:
     # Of a spinning device the turn at each sweep's time stands for that at the moment.
     poses = Poses.at_rest(poses.position, poses.rotation)
     share, free = np.array([1.0, 0.5, 0.25, 1.0]), np.array([True, True])
-    bent = tuple(rigid_bundle._bent(c, np.array([1e-3, -2e-3, 0.0, 1e-3])) for c in STATIONS[2])
+    bent = tuple(bundle.bent(c, np.array([1e-3, -2e-3, 0.0, 1e-3])) for c in STATIONS[2])
     stations = (STATIONS[0], STATIONS[1], bent)
 
     def system(change: Array, by_pose: Array) -> rigid_bundle._System:
@@ -114,7 +114,7 @@ def test_the_gradient_of_the_joint_adjustment_is_that_of_its_cost() -> None:
             stations[0] + change[:, :3],
             rotation_exp(change[:, 3:6]) @ stations[1],
             tuple(
-                rigid_bundle._bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)
+                bundle.bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)
             ),
         )
         return rigid_bundle._linearise(

@@ -1,0 +1,81 @@
+"""The figures of light: each promise is measured, and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from locatk.core.lighthouse import identify
+from locatk.formats.bench import Figure, infrared, infrared_places, infrared_survive
+from locatk.formats.importers.libsurvive import read_libsurvive
+
+
+def named(figures: Iterable[Figure]) -> dict[str, Figure]:
+    return {figure.name: figure for figure in figures}
+
+
+def missed(figures: Iterable[Figure]) -> list[str]:
+    return [figure.name for figure in figures if figure.met is False]
+
+
+def test_the_demodulation_capture(data: Path) -> None:
+    found = named(infrared._demodulation(data / "lighthouse"))
+    assert missed(found.values()) == []
+    assert (found["bursts decoded of 11,136"].target, found["false polynomials"].target) == (
+        98.5,
+        0.05,
+    )
+    # What a rim counts for must not be what anything would count for.
+    assert (found["rims taken for a wrong place"].value or 0) < 1.5
+    assert (found["bursts read by themselves"].value or 0) > 96.5
+
+
+def test_windows_beat_the_peer_and_the_paper_is_the_paper(data: Path) -> None:
+    found = named(infrared._windows(data / "lighthouse"))
+    assert (found["windows of 16 us read"].value or 0) > 95
+    assert found["windows: false polynomials"].value == 0
+    paper = found["windows read by --method paper"]
+    assert paper.value == pytest.approx(79.6, abs=1.5)
+    assert paper.peer_value == 79.6
+
+
+def test_strong_and_weak_recordings_of_the_deck(data: Path) -> None:
+    found = infrared._fpga(data / "lighthouse")
+    assert [figure.target for figure in found] == [103, 95]
+    assert missed(found) == []
+
+
+def test_stored_calibrations_are_told_from_wrong_ones(data: Path) -> None:
+    path = data / "lighthouse" / "libsurvive" / infrared_survive.RECORDING
+    session = read_libsurvive([path])
+    assert infrared_survive._calibrations(session, path).value == 0
+    for station in session.stations[:1]:
+        assert station.calibration is not None
+        station.calibration.sweeps[1, 3] += 2e-6  # of 1e-6 that libsurvive's file holds
+    assert infrared_survive._calibrations(session, path).value == 1
+
+
+def test_a_wrong_place_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert infrared_places.wrong_places(3) == 0
+    monkeypatch.setattr(identify, "FOLLOW", 50)  # more than 60 bits can show
+    assert infrared_places.wrong_places(3) == 131_071
+
+
+def test_noise_that_passes_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(infrared_places, "NOISE", 3_000)
+    assert infrared_places.noise_share() < 0.005
+    monkeypatch.setattr(infrared_places, "ALONE", 10.0)
+    assert infrared_places.noise_share() > 0.05
+
+
+def test_without_data_each_figure_says_why(tmp_path: Path) -> None:
+    (tmp_path / "lighthouse").mkdir()
+    for measure in (infrared._demodulation, infrared._fpga):
+        (row,) = infrared._or_why(measure, tmp_path / "lighthouse", {"a figure": "%"})
+        assert row.value is None
+        assert row.how.startswith("not measured")
+    rows = infrared_survive.figures(tmp_path)
+    assert len(rows) == 3
+    assert all(row.value is None and row.met is None for row in rows)
