@@ -113,9 +113,7 @@ def test_the_gradient_of_the_joint_adjustment_is_that_of_its_cost() -> None:
         moved = (
             stations[0] + change[:, :3],
             rotation_exp(change[:, 3:6]) @ stations[1],
-            tuple(
-                bundle.bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)
-            ),
+            tuple(bundle.bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)),
         )
         return rigid_bundle._linearise(
             looks, moved, poses.stepped(by_pose), 1e-3, 3e-3, share, free
