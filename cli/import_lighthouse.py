@@ -11,7 +11,7 @@ import click
 from locatk.cli import console, info_lighthouse, options
 
 if TYPE_CHECKING:
-    from locatk.core.lighthouse.heard import HeardStation
+    from locatk.core.lighthouse.recording import StationReport
     from locatk.formats.importers.sweeps import ImportedSession
 
 DOTBOT = ("truth", "calibration")
@@ -168,5 +168,5 @@ def _some(devices: Sequence[str], most: int = 8) -> str:
     return f"{len(devices)} device{'s' * (len(devices) != 1)} ({names})"
 
 
-def _stations(heard: Sequence[HeardStation]) -> list[dict[str, Any]]:
+def _stations(heard: Sequence[StationReport]) -> list[dict[str, Any]]:
     return [info_lighthouse.told(station, station.channel) for station in heard]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from locatk.core.errors import LocatkError
 
 if TYPE_CHECKING:
-    from locatk.core.lighthouse.heard import HeardStation
     from locatk.core.lighthouse.receiver import Receiver
+    from locatk.core.lighthouse.recording import StationReport
     from locatk.core.lighthouse.scene import Scene
     from locatk.formats.session import Session
 
@@ -97,7 +97,7 @@ def _detections(session: Session) -> list[dict[str, Any]]:
 def scene(
     known: Scene,
     counts: Mapping[int, int] | None = None,
-    heard: Iterable[HeardStation] = (),
+    heard: Iterable[StationReport] = (),
     detections: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """Stations that are in the scene, were heard, solved or only seen in sweeps (``counts``,
@@ -138,7 +138,7 @@ def scene(
     }
 
 
-def told(station: HeardStation | None, channel: int) -> dict[str, Any]:
+def told(station: StationReport | None, channel: int) -> dict[str, Any]:
     """What a recording tells of a station; its nominal period where it was not measured."""
     from locatk.core.lighthouse.channels import period_ticks
 

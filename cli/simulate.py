@@ -119,7 +119,7 @@ def lighthouse(
     """
     import math
 
-    from locatk.core.lighthouse import simulate
+    from locatk.core.lighthouse.simulation import session as simulate
     from locatk.formats import observations
 
     carried = None if receiver is None else _receiver(receiver)

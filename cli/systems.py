@@ -16,7 +16,7 @@ from locatk.core.errors import FormatError, InputError, LocatkError
 
 if TYPE_CHECKING:
     from locatk.core.lighthouse.receiver import Receiver
-    from locatk.core.lighthouse.sweeps import Sweeps
+    from locatk.core.lighthouse.recording import Sweeps
     from locatk.core.solution import Solution
     from locatk.formats.session import Session
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
-from locatk.core.lighthouse.scene import Distance, Marker, Scene, Sighting, Station
+from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.formats import toml
 from locatk.formats.toml import Inline, Shifted, Table
 from locatk.formats.toml_checks import above
@@ -126,7 +126,7 @@ def _calibration_key(parameter: str) -> str:
     return f"{parameter}_rad" if parameter in ANGLES else parameter
 
 
-def _sighting_table(sighting: Sighting) -> dict[str, Any]:
+def _sighting_table(sighting: MarkerVisit) -> dict[str, Any]:
     if sighting.counts:
         counts = {str(c): [float(n) for n in pair] for c, pair in sighting.counts.items()}
         return {"counts": Inline(counts)}
@@ -255,19 +255,19 @@ def _distance(table: Table) -> Distance:
     return Distance(first, second, distance)
 
 
-def _sighting(table: Table) -> Sighting:
+def _sighting(table: Table) -> MarkerVisit:
     if "counts" in table:
         counts = table.table("counts")
         found = {_channel(counts, key): _pair(counts, key) for key in counts}
         table.end()
-        return Sighting(counts=found)
+        return MarkerVisit(counts=found)
     device = table.text("device")
     start, end = (_time(table, key) for key in ("start", "end"))
     if end < start:
         raise table.error("end", "is before start")
     table.raw("counts", None)
     table.end()
-    return Sighting(device, start, end)
+    return MarkerVisit(device, start, end)
 
 
 def _channel(table: Table, key: str) -> int:

@@ -28,9 +28,8 @@ import yaml
 from numpy.typing import NDArray
 
 from locatk.core.errors import ArtifactError, InputError
-from locatk.core.lighthouse.calibration import PARAMETERS, Calibration
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, PARAMETERS, Calibration
 from locatk.core.lighthouse.channels import CHANNELS
-from locatk.core.lighthouse.generic import GENERIC
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.formats.files import read_bytes
 from locatk.formats.output import atomic_write
@@ -140,7 +139,7 @@ def loads_config(text: str | bytes, *, file: str | os.PathLike[str] = "<config>"
             Station(
                 channel,
                 *geometries[channel],
-                calibrations.get(channel, GENERIC),
+                calibrations.get(channel, GENERIC_CALIBRATION),
                 ids.get(channel),
             )
             for channel in sorted(geometries)

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.recording import StationReport
 from locatk.core.lighthouse.scene import Scene
 from locatk.formats import artifacts
 from locatk.formats.session import Session
@@ -26,7 +26,7 @@ _COUNTS = ("sweeps", "missed", "frames", "damaged")
 _OPTIONAL = ("missed",)
 
 
-def record_of(station: HeardStation) -> dict[str, str]:
+def record_of(station: StationReport) -> dict[str, str]:
     """The metadata record of a station; what is not known has no entry."""
     known = {
         "id": None if station.id is None else f"{station.id:08x}",
@@ -37,7 +37,7 @@ def record_of(station: HeardStation) -> dict[str, str]:
     return {key: str(value) for key, value in known.items() if value is not None}
 
 
-def records_of(stations: Sequence[HeardStation]) -> dict[str, dict[str, str]]:
+def records_of(stations: Sequence[StationReport]) -> dict[str, dict[str, str]]:
     """Metadata records (name to entries) of the stations of a session, ascending in channel.
 
     Raises
@@ -58,7 +58,7 @@ def records_of(stations: Sequence[HeardStation]) -> dict[str, dict[str, str]]:
     return records
 
 
-def with_heard(scene: Scene | None, stations: Sequence[HeardStation]) -> Scene | None:
+def with_heard(scene: Scene | None, stations: Sequence[StationReport]) -> Scene | None:
     """``scene`` with the calibrations and serial numbers that the stations sent themselves,
     where it has none of its own for their channels."""
     calibrations = {each.channel: each.calibration for each in stations if each.calibration}
@@ -73,7 +73,7 @@ def with_heard(scene: Scene | None, stations: Sequence[HeardStation]) -> Scene |
     )
 
 
-def strangers(scene: Scene, stations: Sequence[HeardStation]) -> list[str]:
+def strangers(scene: Scene, stations: Sequence[StationReport]) -> list[str]:
     """What to say where a station that was heard is not the one of the scene on its channel."""
     notes = []
     for each in stations:
@@ -88,7 +88,7 @@ def strangers(scene: Scene, stations: Sequence[HeardStation]) -> list[str]:
     return notes
 
 
-def read_heard(session: Session) -> tuple[HeardStation, ...]:
+def read_heard(session: Session) -> tuple[StationReport, ...]:
     """The stations that a recording heard, ascending in channel; none where it does not tell.
 
     Raises
@@ -115,7 +115,7 @@ def read_heard(session: Session) -> tuple[HeardStation, ...]:
 
 def _station(
     name: str, record: Mapping[str, str], calibrations: Mapping[int, Calibration]
-) -> HeardStation:
+) -> StationReport:
     """The station of a record; raises ValueError, which says what is wrong."""
     channel = name.removeprefix(PREFIX)
     if not re.fullmatch("[1-9]|1[0-6]", channel, re.ASCII):
@@ -138,7 +138,7 @@ def _station(
             if not re.fullmatch("[0-9]{1,18}", text, re.ASCII):
                 raise ValueError(f"{key} {text[:20]!r} is no count")
             counts[key] = int(text)
-    return HeardStation(
+    return StationReport(
         channel=int(channel),
         id=None if number is None else int(number, 16),
         period_ticks=period,

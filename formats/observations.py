@@ -12,10 +12,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from locatk.core.errors import FormatError
-from locatk.core.lighthouse.heard import HeardStation
 from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats import artifacts
 from locatk.formats import heard as heard_stations
@@ -161,7 +160,7 @@ def write_session(
     odometry: Sequence[Trajectory] = (),
     scene: Scene | None = None,
     facts: Mapping[str, object] | None = None,
-    stations: Sequence[HeardStation] = (),
+    stations: Sequence[StationReport] = (),
     receivers: Mapping[str, Receiver] | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -184,7 +183,7 @@ def write_session(
         Attached as ``scene.toml``.
     facts : mapping, optional
         Where the data comes from; written as texts to the metadata record ``facts``.
-    stations : sequence of HeardStation
+    stations : sequence of StationReport
         What was measured of each station, in a metadata record ``station-<channel>`` each.
         Calibrations and serial numbers that they sent go into the scene, where it has none of
         its own for their channels.

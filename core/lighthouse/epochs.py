@@ -12,16 +12,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse.angles import counts_to_angles
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
-from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
+from locatk.core.lighthouse.light_planes import counts_to_angles
+from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 
 PAIR_NS = 10_500_000
 """The second plane of a rotation follows the first within this time; the first of the next
 rotation comes later than that after the second. (Half a rotation, and a little.)"""
 
-CLOSEST_TURN = 0.125
-FARTHEST_TURN = 0.55
+MIN_PLANE_DELAY_TURNS = 0.125
+MAX_PLANE_DELAY_TURNS = 0.55
 """By how much of a turn the second plane can follow the first: a third, less or more by
 what the elevation of the photodiode makes of two planes that are tilted apart."""
 
@@ -184,7 +184,7 @@ def _pair(
     close = same & (np.diff(time) <= PAIR_NS)
     told = stated != UNKNOWN
     turn = np.diff(count) / period_counts(channel[1:])
-    apart = (turn > CLOSEST_TURN) & (turn < FARTHEST_TURN)
+    apart = (turn > MIN_PLANE_DELAY_TURNS) & (turn < MAX_PLANE_DELAY_TURNS)
     in_order = np.where(
         told[:-1] & told[1:], stated[:-1] < stated[1:], ~(told[:-1] | told[1:]) & apart
     )

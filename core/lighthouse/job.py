@@ -10,18 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.lighthouse import frame as frames
-from locatk.core.lighthouse import poses
-from locatk.core.lighthouse.angles import rays as rays_of
-from locatk.core.lighthouse.assemble import Assembly, assemble
-from locatk.core.lighthouse.bundle import Rig, adjust
-from locatk.core.lighthouse.calibration import Calibration, ideal_angles
+from locatk.core.lighthouse.calibration import (
+    GENERIC_CALIBRATION,
+    MODEL_SIGMA_RAD,
+    Calibration,
+    ideal_angles,
+)
 from locatk.core.lighthouse.epochs import Epochs, angles_of
-from locatk.core.lighthouse.floor_map import fit_floor_map
-from locatk.core.lighthouse.generic import GENERIC, MODEL_SIGMA
-from locatk.core.lighthouse.places import gather
-from locatk.core.lighthouse.resection import resect_on_plane
+from locatk.core.lighthouse.light_planes import rays as rays_of
+from locatk.core.lighthouse.localization.floor_map import fit_floor_map
+from locatk.core.lighthouse.noise import INLIER_GATE_RAD
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene import frame as frames
+from locatk.core.lighthouse.scene.assembly import Assembly, assemble
+from locatk.core.lighthouse.scene.bundle_adjustment import Rig, adjust
+from locatk.core.lighthouse.scene.keyframes import gather
+from locatk.core.lighthouse.scene.resection import resect_on_plane
 from locatk.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -89,7 +93,7 @@ class Job:
 
     def calibration(self, channel: int) -> Calibration:
         """What is known of a station's calibration, else the mean of other units."""
-        return self.scene.calibrations.get(channel, GENERIC)
+        return self.scene.calibrations.get(channel, GENERIC_CALIBRATION)
 
     # ---- scenes
 
@@ -125,7 +129,7 @@ class Job:
         assembly = assemble(
             places,
             tuple(self.calibration(int(c)) for c in self.epochs.channels),
-            sigma=MODEL_SIGMA,
+            sigma=MODEL_SIGMA_RAD,
             planar=planar,
             misfit=self._marker_misfit if self.scene.markers else None,
             seed=self.options.seed,
@@ -200,7 +204,7 @@ class Job:
         done = adjust(
             seen,
             Rig(position[None], rotation[None], (calibration,), flat),
-            sigma=MODEL_SIGMA,
+            sigma=MODEL_SIGMA_RAD,
             planar=True,
             fixed_points=True,
             calibrate=False,
@@ -262,7 +266,7 @@ class Job:
             return scale, "distance"
         if self.odometry:
             fixes = frames.sight(rig, planar, self.angles)
-            good = fixes.worst < poses.GATE
+            good = fixes.worst < INLIER_GATE_RAD
             position = np.where(good[:, None], fixes.position, np.nan)
             found = frames.scale_of_odometry(
                 position,

@@ -18,7 +18,7 @@ class Receiver:
     ----------
     position_m : (k, 3) ndarray
         Of each photodiode in the device's axes, in metres; row i is sensor i of
-        :class:`~locatk.core.lighthouse.sweeps.Sweeps`.
+        :class:`~locatk.core.lighthouse.recording.Sweeps`.
     normal : (k, 3) ndarray, optional
         Unit vectors in which the photodiodes look; light from behind does not reach them.
     name : str

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from locatk.core.errors import DegenerateError, InputError
-from locatk.core.lighthouse import poses
-from locatk.core.lighthouse.devices import rigid_devices, solve_devices
+from locatk.core.lighthouse.devices.solver import rigid_devices, solve_devices
 from locatk.core.lighthouse.epochs import group
 from locatk.core.lighthouse.job import Job
+from locatk.core.lighthouse.localization import photodiodes as poses
 from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -114,7 +114,7 @@ def _solve_points(
             )
         return poses.answer(job, known)
     if options.method == "paper":
-        from locatk.core.lighthouse.paper_solver import solve_as_paper
+        from locatk.core.lighthouse.published.scene_solver import solve_as_paper
 
         return solve_as_paper(job)
     return poses.answer(job, job.solve_scene())

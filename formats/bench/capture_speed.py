@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from locatk.core.lighthouse.simulate import SimulationOptions, simulate
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.formats.bench import Figure
 from locatk.formats.bench.capture_line import SEQUENCES, block

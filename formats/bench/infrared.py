@@ -15,14 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
-from locatk.core.lighthouse import bursts as light_bursts
-from locatk.core.lighthouse import paper_light, weak
-from locatk.core.lighthouse.identify import Matches
-from locatk.core.lighthouse.judge import Reading
-from locatk.core.lighthouse.light import Edges
-from locatk.core.lighthouse.paper_receive import WINDOW_START_S
-from locatk.core.lighthouse.receive import SHORTEST_S, Reception, receive
-from locatk.core.lighthouse.windows import read_windows
+from locatk.core.lighthouse.demodulation import bursts as light_bursts
+from locatk.core.lighthouse.demodulation import weak_bursts as weak
+from locatk.core.lighthouse.demodulation.burst_validation import Reading
+from locatk.core.lighthouse.demodulation.identification import Matches
+from locatk.core.lighthouse.demodulation.pipeline import SHORTEST_S, Reception, receive
+from locatk.core.lighthouse.demodulation.windows import read_windows
+from locatk.core.lighthouse.published import light_decoding as paper_light
+from locatk.core.lighthouse.published.light_receiver import WINDOW_START_S
+from locatk.core.lighthouse.recording import Edges
 from locatk.formats.bench import Figure
 from locatk.formats.bench.infrared_places import figures as place_figures
 from locatk.formats.bench.infrared_speed import figures as speed_figures

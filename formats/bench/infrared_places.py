@@ -6,8 +6,8 @@ import numpy as np
 
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIALS
-from locatk.core.lighthouse.demodulate import CERTAIN, SoftBits
-from locatk.core.lighthouse.identify import ALONE, Matches, identify
+from locatk.core.lighthouse.demodulation.identification import ALONE, Matches, identify
+from locatk.core.lighthouse.demodulation.soft_bits import CERTAIN, SoftBits
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED
 

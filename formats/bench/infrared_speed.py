@@ -9,10 +9,10 @@ import numpy as np
 
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.bursts import of_windows
-from locatk.core.lighthouse.demodulate import soft_bits
-from locatk.core.lighthouse.identify import identify
-from locatk.core.lighthouse.windows import read_windows
+from locatk.core.lighthouse.demodulation.bursts import of_windows
+from locatk.core.lighthouse.demodulation.identification import identify
+from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
+from locatk.core.lighthouse.demodulation.windows import read_windows
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import alone, cpu_seconds
 
@@ -51,7 +51,7 @@ def figures(data: Path) -> list[Figure]:
 
 def measure(data: str) -> list[float]:
     """Windows a second, soft bits a second, seconds for the tables, seconds for a capture."""
-    from locatk.core.lighthouse.receive import receive
+    from locatk.core.lighthouse.demodulation.pipeline import receive
     from locatk.formats.bench.infrared import CAPTURES, capture, published_windows
 
     start = time.process_time()

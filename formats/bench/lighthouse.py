@@ -19,8 +19,8 @@ from locatk.core import metrics
 from locatk.core.errors import DegenerateError, LocatkError
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse import SolveOptions, solve
-from locatk.core.lighthouse.scene import Distance, Scene, Sighting
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.bench import Figure
@@ -263,9 +263,9 @@ def _grid_positions(session: ImportedSession, truth: Array, method: str) -> Arra
     """Positions in mm in the unit that one edge of the grid gives."""
     device, when = session.sweeps.devices[0], session.truth[0].time_ns
 
-    def standing(at: tuple[int, int, int]) -> Sighting:
+    def standing(at: tuple[int, int, int]) -> MarkerVisit:
         there = when[np.all(truth == at, axis=1)]
-        return Sighting(device, int(there.min()), int(there.max()))
+        return MarkerVisit(device, int(there.min()), int(there.max()))
 
     edge = Distance(standing((0, 0, 0)), standing((40, 0, 0)), 0.040)
     solution = solve(
@@ -358,9 +358,8 @@ def _speed_on_a_million() -> list[Figure]:
 
 def _a_million() -> tuple[Sweeps, Scene]:
     """A robot under two stations that reports each rotation, made by the forward model."""
-    from locatk.core.lighthouse.angles import angles_to_counts
-    from locatk.core.lighthouse.calibration import predict_angles
-    from locatk.core.lighthouse.generic import GENERIC
+    from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, predict_angles
+    from locatk.core.lighthouse.light_planes import angles_to_counts
     from locatk.core.lighthouse.scene import Station
 
     moments = MILLION // 4
@@ -373,10 +372,10 @@ def _a_million() -> tuple[Sweeps, Scene]:
         left = np.cross([0.0, 0.0, 1.0], forward)
         left /= np.linalg.norm(left)
         rotation = np.stack([forward, left, np.cross(forward, left)], axis=1)
-        angles = predict_angles((points - place) @ rotation, GENERIC)
+        angles = predict_angles((points - place) @ rotation, GENERIC_CALIBRATION)
         noise = rng.normal(0, 1.0, angles.shape)
         counts.append(np.rint(angles_to_counts(angles, channel) + noise))
-        stations.append(Station(channel, place, rotation, GENERIC))
+        stations.append(Station(channel, place, rotation, GENERIC_CALIBRATION))
     sweeps = Sweeps(
         devices=("robot",),
         time_ns=np.repeat(np.arange(moments, dtype=np.int64) * 20_000_000 + 10**18, 4),

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse.channels import POLYNOMIALS, channel_of
-from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
+from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers import dotbot_floor as floor
 from locatk.formats.importers.sweeps import ImportedSession

@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError, FormatError, InputError, MissingDataError
 from locatk.core.geometry import apply_homography, fit_homography
-from locatk.core.lighthouse.angles import angles_to_counts, paper_image_points
-from locatk.core.lighthouse.calibration import IDEAL, predict_angles
-from locatk.core.lighthouse.scene import Marker, Scene, Sighting
+from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
+from locatk.core.lighthouse.light_planes import angles_to_counts, paper_image_points
+from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.table import parse_time_ns, read_table, read_text
 
@@ -222,7 +222,7 @@ def scene_of(
     square: FloorSquare, rows: Rows, facts: dict[str, str], warnings: list[str]
 ) -> Scene | None:
     """Markers at the corners with what the recording says of them; None without any."""
-    sightings: dict[str, Sighting] = {}
+    sightings: dict[str, MarkerVisit] = {}
     if square.plane and rows.plane is not None:
         sightings = _sightings_of_plane(square, rows, facts, warnings)
     elif square.stays:
@@ -240,7 +240,7 @@ def scene_of(
 
 def _sightings_of_plane(
     square: FloorSquare, rows: Rows, facts: dict[str, str], warnings: list[str]
-) -> dict[str, Sighting]:
+) -> dict[str, MarkerVisit]:
     """Counts on the corners, from the homography hidden in columns x and y."""
     assert rows.plane is not None
     channels = np.unique(rows.channel)
@@ -264,28 +264,28 @@ def _sightings_of_plane(
     corners = np.array(list(square.plane.values()))
     right, up = apply_homography(np.linalg.inv(to_plane), corners).T
     # The plane was made with ideal stations, whatever the real one is like.
-    angles = predict_angles(np.stack([np.ones(len(right)), -right, up], axis=1), IDEAL)
+    angles = predict_angles(np.stack([np.ones(len(right)), -right, up], axis=1), IDEAL_CALIBRATION)
     counts = angles_to_counts(angles, channel)
     facts["markers"] = (
         f"{len(corners)}: counts on the corners, recovered from the homography of columns x "
         f"and y (residual {residual:.1g}) that PyDotBot was calibrated with"
     )
     return {
-        name: Sighting(counts={channel: (float(first), float(second))})
+        name: MarkerVisit(counts={channel: (float(first), float(second))})
         for name, (first, second) in zip(square.plane, counts, strict=True)
     }
 
 
 def _sightings_of_stays(
     square: FloorSquare, rows: Rows, facts: dict[str, str], warnings: list[str]
-) -> dict[str, Sighting]:
+) -> dict[str, MarkerVisit]:
     """Which device reported during each stay on a corner."""
     sightings = {}
     for name, (start, end) in square.stays.items():
         during = (rows.time_ns >= start) & (rows.time_ns <= end)
         present = np.unique(rows.device[during])
         if len(present) == 1:
-            sightings[name] = Sighting(rows.devices[present[0]], start, end)
+            sightings[name] = MarkerVisit(rows.devices[present[0]], start, end)
         else:
             who = "no device" if len(present) == 0 else "more than one device"
             warnings.append(f"marker {name!r}: {who} reported during the stay on it")

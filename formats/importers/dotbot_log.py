@@ -41,8 +41,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIALS, channel_of
-from locatk.core.lighthouse.heard import HeardStation
-from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
+from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
 from locatk.core.ticks import TickClock
 from locatk.formats.artifacts import parse_time
 from locatk.formats.importers.sweeps import ImportedSession
@@ -173,7 +172,7 @@ def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
         facts,
         warnings,
         stations=tuple(
-            HeardStation(channel, sweeps=n)
+            StationReport(channel, sweeps=n)
             for channel, n in zip(channels.tolist(), sizes.tolist(), strict=True)
         ),
         lost=f"{log.damaged} of {log.records} records are damaged" if log.damaged else None,

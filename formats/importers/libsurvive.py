@@ -6,9 +6,9 @@ station's rotor (:mod:`~locatk.formats.importers.libsurvive_lines`). From them c
 
 * counts: the turn since the rotor's zero on the station's own clock, times the nominal
   rotation, so that the tracker's clock bends no angle
-  (:mod:`~locatk.core.lighthouse.syncs`). The angle is libsurvive's:
+  (:mod:`~locatk.core.lighthouse.demodulation.tracker_syncs`). The angle is libsurvive's:
   2 pi turn - 2 pi / 3 of the first plane and - 4 pi / 3 of the second are
-  :data:`~locatk.core.lighthouse.angles.ROTOR_ZERO`, the sign is the same;
+  :data:`~locatk.core.lighthouse.light_planes.ROTOR_ZERO`, the sign is the same;
 * times: of the device's counter, mapped on the host's seconds by one line
   (:mod:`~locatk.formats.importers.libsurvive_clock`);
 * factory data, from the slow bits of the syncs;
@@ -27,13 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import ArtifactError, FormatError, InputError, MissingDataError
-from locatk.core.lighthouse import ootx
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.channels import period_counts
-from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.demodulation import ootx
 from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.libsurvive_device import (
     read_receiver,
@@ -167,7 +166,7 @@ def _sweeps(recording: Recording, heard: list[HeardSweeps]) -> Sweeps:
 
 def _stations(
     heard: list[HeardSweeps], sweeps: Sweeps, warnings: list[str]
-) -> tuple[HeardStation, ...]:
+) -> tuple[StationReport, ...]:
     """What all devices together heard of each station."""
     told = []
     for channel in sorted({channel for h in heard for channel in h.rotors}):
@@ -176,7 +175,7 @@ def _stations(
         frames = [frame for rotor in rotors for frame in ootx.frames(rotor.bits())]
         data = _factory_data([f.payload for f in frames if f.right], channel + 1, warnings)
         told.append(
-            HeardStation(
+            StationReport(
                 channel + 1,
                 None if data is None else data.id,
                 longest.period,
@@ -219,7 +218,7 @@ def _factory_data(
 
 def _scene(
     recording: Recording,
-    told: tuple[HeardStation, ...],
+    told: tuple[StationReport, ...],
     stations: bool,
     warnings: list[str],
 ) -> Scene | None:

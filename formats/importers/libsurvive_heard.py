@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import period_ticks
-from locatk.core.lighthouse.sweeps import UNKNOWN
-from locatk.core.lighthouse.syncs import Rotor, fit_rotor
+from locatk.core.lighthouse.demodulation.tracker_syncs import Rotor, fit_rotor
+from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.formats.importers.libsurvive_clock import Run, runs
 from locatk.formats.importers.libsurvive_lines import Columns, Recording
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.errors import FormatError, InputError
-from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.recording import Edges
 from locatk.formats.importers.saleae_archive import archive_lines, file_line
 from locatk.formats.importers.saleae_binary import MAGIC
 from locatk.formats.importers.saleae_csv import read_lines

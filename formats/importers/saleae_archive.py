@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.errors import FormatError, LocatkError
-from locatk.core.lighthouse.light import NANOSECOND
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
 from locatk.formats.importers import saleae_binary as binary
 from locatk.formats.importers.saleae_lines import Line, Piece, clean_name, readable
 
@@ -77,7 +77,7 @@ def file_line(path: Path) -> Line:
     match = DIGITAL.fullmatch(path.name) or EXPORTED.fullmatch(path.name)
     number = int(match[1]) if match else None
     name = clean_name(path.stem) if number is None else f"Channel {number}"
-    ticks = head.rate_hz or float(NANOSECOND)
+    ticks = head.rate_hz or float(NANOSECONDS_PER_S)
     rate = rate and min(rate, ticks)
     return Line(name, number, ticks, rate, head.start_ns, partial(_pieces, path, ""))
 

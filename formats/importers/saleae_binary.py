@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError
-from locatk.core.lighthouse.light import NANOSECOND
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
 from locatk.formats.importers.saleae_lines import Piece, Ticks
 
 MAGIC = b"<SALEAE>"
@@ -378,4 +378,4 @@ def _export_head(source: Source, version: int) -> tuple[int, int, int, int]:
 def _nanoseconds(source: Source, seconds: NDArray[np.float64]) -> Ticks:
     if not np.all(np.abs(seconds) <= MOST_SECONDS):  # not for NaN either
         source.fail("a time that is no number of seconds within eleven days")
-    return np.rint(seconds * NANOSECOND).astype(np.int64)
+    return np.rint(seconds * NANOSECONDS_PER_S).astype(np.int64)

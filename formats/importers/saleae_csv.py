@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
-from locatk.core.lighthouse.light import NANOSECOND
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
 from locatk.formats.importers.saleae_lines import Line, Piece, Ticks, clean_name, readable
 
 Levels = NDArray[np.int8]
@@ -134,7 +134,7 @@ def _lines(path: Path, stream: IO[bytes]) -> list[Line]:
         match = CHANNEL.fullmatch(name)
         number = int(match[1]) if match else None
         pieces: Callable[[], Iterator[Piece]] = partial(_once, piece)
-        found.append(Line(name, number, float(NANOSECOND), None, start, pieces))
+        found.append(Line(name, number, float(NANOSECONDS_PER_S), None, start, pieces))
     return found
 
 
@@ -247,7 +247,7 @@ class _Rows:
             return None
         if not np.all(np.abs(values[:, 0]) <= MOST_SECONDS):
             return None
-        return np.rint(values[:, 0] * NANOSECOND).astype(np.int64), level.astype(np.int8)
+        return np.rint(values[:, 0] * NANOSECONDS_PER_S).astype(np.int64), level.astype(np.int8)
 
     def _any(self, block: bytes) -> tuple[Ticks, Levels]:
         try:
@@ -291,7 +291,7 @@ class _Rows:
             value = float(text) if SECONDS.fullmatch(text) else np.inf
             if not abs(value) <= MOST_SECONDS:
                 self.fail(lines[k], f"{clean_name(text)!r} is no number of seconds")
-            tick[k] = round(value * NANOSECOND)
+            tick[k] = round(value * NANOSECONDS_PER_S)
         return tick
 
     def _stamps(self, times: tuple[str, ...], lines: list[int]) -> Ticks:
@@ -309,4 +309,4 @@ class _Rows:
             if zone[0]:
                 minutes[zone] = int(f"{zone[0]}1") * (60 * int(zone[1]) + int(zone[2]))
         ahead = np.array([minutes[m.group(3, 4, 5)] for m in found], np.int64)
-        return tick - ahead * 60 * NANOSECOND
+        return tick - ahead * 60 * NANOSECONDS_PER_S

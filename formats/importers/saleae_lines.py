@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError, LocatkError, MissingDataError
-from locatk.core.lighthouse.light import NANOSECOND, Edges
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, Edges
 
 Ticks = NDArray[np.int64]
 
@@ -162,7 +162,7 @@ class Tally:
         if not len(tick):
             return
         before = tick[0] if self._last is None else self._last
-        ns = np.diff(tick, prepend=before) * (NANOSECOND / self.rate_hz)
+        ns = np.diff(tick, prepend=before) * (NANOSECONDS_PER_S / self.rate_hz)
         ns = ns[1:] if self._last is None else ns
         quick = ns[ns < BURST_NS]
         self.edges += len(tick)
@@ -209,9 +209,9 @@ def resolution_of(tick: Ticks) -> float:
         (24 MHz: 41.67 ns). 1e9 where there are too few edges to tell.
     """
     if len(tick) < LEAST_RUNS:
-        return float(NANOSECOND)
+        return float(NANOSECONDS_PER_S)
     since = tick - tick[0]
-    exact = NANOSECOND / int(np.gcd.reduce(since))
+    exact = NANOSECONDS_PER_S / int(np.gcd.reduce(since))
     for mhz in range(1, WHOLE_MHZ + 1):
         samples = since * mhz
         away = np.abs(samples - 1000 * np.round(samples / 1000))

@@ -9,12 +9,10 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.channels import channel_of
-from locatk.core.lighthouse.heard import HeardStation
-from locatk.core.lighthouse.identify import false_rate
-from locatk.core.lighthouse.light import NANOSECOND
-from locatk.core.lighthouse.receive import Caught, Reception, receive
+from locatk.core.lighthouse.demodulation.identification import false_rate
+from locatk.core.lighthouse.demodulation.pipeline import Caught, Reception, receive
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.formats.importers.saleae import LightCapture, read_capture
 from locatk.formats.importers.sweeps import ImportedSession
 
@@ -108,7 +106,7 @@ def _false_polynomials(reception: Reception) -> str:
 
 
 def _as_paper(capture: LightCapture, device: str) -> ImportedSession:
-    from locatk.core.lighthouse import paper_receive
+    from locatk.core.lighthouse.published import light_receiver as paper_receive
 
     caught, bursts = paper_receive.receive(capture.edges)
     facts = capture.facts()
@@ -128,7 +126,7 @@ def _as_paper(capture: LightCapture, device: str) -> ImportedSession:
         facts,
         warnings,
         stations=tuple(
-            HeardStation(int(channel), sweeps=int(number))
+            StationReport(int(channel), sweeps=int(number))
             for channel, number in zip(channels, numbers, strict=True)
         ),
     )
@@ -137,7 +135,7 @@ def _as_paper(capture: LightCapture, device: str) -> ImportedSession:
 def _sweeps(capture: LightCapture, caught: Caught, device: str) -> Sweeps:
     """Sweeps by the recorder's clock; a capture without a date begins in 1970."""
     rate, start_ns = capture.edges[0].rate_hz, capture.edges[0].start_ns
-    since_ns = np.rint(caught.tick * (NANOSECOND / rate)).astype(np.int64)
+    since_ns = np.rint(caught.tick * (NANOSECONDS_PER_S / rate)).astype(np.int64)
     if not start_ns and len(since_ns):
         # Times before a trigger are below zero, which no session holds.
         start_ns = max(0, -int(since_ns.min()))
@@ -153,7 +151,7 @@ def _sweeps(capture: LightCapture, caught: Caught, device: str) -> Sweeps:
     )
 
 
-def _scene(stations: Sequence[HeardStation]) -> Scene | None:
+def _scene(stations: Sequence[StationReport]) -> Scene | None:
     """What the stations told of themselves, for the solver."""
     told = [station for station in stations if station.calibration is not None]
     if not told:

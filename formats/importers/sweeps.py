@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from locatk.core.lighthouse.heard import HeardStation
 from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.trajectory import Trajectory
 
 
@@ -29,7 +28,7 @@ class ImportedSession:
         What was read and assumed, for people.
     warnings : list of str
         What was lost or is doubtful, one line each.
-    stations : tuple of HeardStation
+    stations : tuple of StationReport
         What was measured of each station, ascending in channel.
     receivers : dict of str to Receiver
         By device, where its photodiodes sit.
@@ -42,6 +41,6 @@ class ImportedSession:
     truth: list[Trajectory]
     facts: dict[str, str]
     warnings: list[str]
-    stations: tuple[HeardStation, ...] = ()
+    stations: tuple[StationReport, ...] = ()
     receivers: Mapping[str, Receiver] = field(default_factory=dict)
     lost: str | None = None

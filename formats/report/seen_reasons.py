@@ -26,7 +26,8 @@ def meaning(system: str, reason: str) -> Reason | None:
 
 
 def _lighthouse() -> dict[str, Reason]:
-    from locatk.core.lighthouse import epochs, poses
+    from locatk.core.lighthouse import epochs, noise
+    from locatk.core.lighthouse.localization import photodiodes as poses
 
     sweeps = {
         "unknown_channel": "The channel is none of 1 to 16.",
@@ -50,8 +51,8 @@ def _lighthouse() -> dict[str, Reason]:
         "moment_with_too_few_sweeps": "The sweeps of the moment do not determine a position.",
         "pose_not_determined": "The photodiodes that were lit do not determine a full pose.",
         "moment_inconsistent": f"The planes of the moment miss their meeting point by more than "
-        f"{poses.GATE_SIGMAS:g} times the noise of the recording (at most "
-        f"{1e3 * poses.GATE:g} mrad).",
+        f"{noise.INLIER_GATE_SIGMAS:g} times the noise of the recording (at most "
+        f"{1e3 * noise.INLIER_GATE_RAD:g} mrad).",
         "moment_out_of_reach": f"The position would be farther than {poses.REACH_M:g} m from "
         "every station, where none is received.",
         "moment_jumps": "No second measurement checks the position, and it leaves the path of its "

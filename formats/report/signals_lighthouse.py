@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import FormatError
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
 from locatk.core.lighthouse.epochs import Epochs, group
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.solution import Solution
 from locatk.formats.messages import SWEEPS, BatchError
 from locatk.formats.plot_clock import origin_ns

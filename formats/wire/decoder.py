@@ -70,7 +70,7 @@ class Batch:
             ``b_tesla`` (n, N), positive upward.
         ``lighthouse``
             ``sensor``, ``channel`` (1 to 16), ``polynomial``, ``sweep``, ``count``, as in
-            :class:`locatk.core.lighthouse.sweeps.Sweeps`.
+            :class:`locatk.core.lighthouse.recording.Sweeps`.
         ``captures``
             ``sensor``, ``bits`` (uint64), ``polynomial``, ``bit_offset``, as in
             ``locatk.LighthouseCapture``.

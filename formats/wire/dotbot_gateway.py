@@ -58,7 +58,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import CHANNELS, POLYNOMIALS, channel_of
-from locatk.core.lighthouse.sweeps import UNKNOWN
+from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.formats.wire.decoder import Batch, Counts, Options, Stream, Ticks
 from locatk.formats.wire.hdlc import HdlcDecoder, packed
 from locatk.formats.wire.recording import Recording

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_of
 from locatk.core.lighthouse.channels import CHANNELS
-from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
+from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.formats.wire import payloads
 from locatk.formats.wire.framing import LARGEST_CONTENT
 from locatk.formats.wire.payloads import FrameWriter, Type

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import CHANNELS, channel_of
-from locatk.core.lighthouse.sweeps import UNKNOWN
+from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.formats.wire.decoder import Batch, Counts, Options, Stream, Ticks
 from locatk.formats.wire.recording import Recording
 

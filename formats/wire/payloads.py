@@ -168,7 +168,7 @@ def sweeps(
     sweep: ArrayLike,
     count: ArrayLike,
 ) -> bytes:
-    """Lighthouse sweeps, (k,) each, as in :class:`locatk.core.lighthouse.sweeps.Sweeps`."""
+    """Lighthouse sweeps, (k,) each, as in :class:`locatk.core.lighthouse.recording.Sweeps`."""
     parts = np.rint(np.asarray(count, float) * COUNT_STEPS)
     return _records(
         _SWEEP,

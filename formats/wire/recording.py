@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from locatk.core.landmarks.halls import HallSamples
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples
 from locatk.core.trajectory import Trajectory
 

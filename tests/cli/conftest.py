@@ -19,8 +19,8 @@ import pytest
 from locatk.cli import systems
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import observations

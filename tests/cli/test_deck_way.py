@@ -11,7 +11,7 @@ import pytest
 from click.testing import Result
 
 from locatk.core.lighthouse.receiver import DECK
-from locatk.core.lighthouse.simulate import SimulationOptions, simulate
+from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
 
 Run = Callable[..., Result]
 

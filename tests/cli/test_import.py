@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.heard import HeardStation
 from locatk.core.lighthouse.receiver import DECK
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.formats import artifacts, observations
 from locatk.formats.importers.sweeps import ImportedSession
 from locatk.formats.session import Session
@@ -103,11 +102,11 @@ def test_published_tracks(locatk, data: Path, tmp_path: Path) -> None:
 # ---- Lighthouse from others, with a reader that needs no file
 
 
-def heard_stations() -> tuple[HeardStation, ...]:
+def heard_stations() -> tuple[StationReport, ...]:
     calibration = Calibration(np.full((2, 7), 0.01), "factory")
     return (
-        HeardStation(1, 0x4CC60647, 958985.25, 40, 2, calibration, 11, 1),
-        HeardStation(5, sweeps=3),
+        StationReport(1, 0x4CC60647, 958985.25, 40, 2, calibration, 11, 1),
+        StationReport(5, sweeps=3),
     )
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.heard import HeardStation
 from locatk.core.lighthouse.receiver import DECK, Receiver
+from locatk.core.lighthouse.recording import StationReport
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.solution import Solution
 from locatk.formats import artifacts, captured, observations, receivers
@@ -23,8 +23,8 @@ from locatk.formats.solutions import write_solution
 
 FACTORY = Calibration(np.full((2, 7), 0.01), "factory")
 HEARD = (
-    HeardStation(1, 0x4CC60647, 958985.25, 40, 1, FACTORY, 11, 0),
-    HeardStation(4, None, None, 7, 3, None, 0, 2),
+    StationReport(1, 0x4CC60647, 958985.25, 40, 1, FACTORY, 11, 0),
+    StationReport(4, None, None, 7, 3, None, 0, 2),
 )
 KNOWN = Scene(
     stations=(Station(9, np.array([1.0, 2.0, 3.0]), np.eye(3), FACTORY, id=0xF),),
@@ -101,7 +101,7 @@ def test_stations_as_they_were_heard(locatk, write, tmp_path: Path) -> None:
 
 
 def test_all_but_one_decoded_is_not_all(locatk, write, tmp_path: Path) -> None:
-    path = write(tmp_path / "1.mcap", stations=(HeardStation(1, sweeps=99_999, missed=1),))
+    path = write(tmp_path / "1.mcap", stations=(StationReport(1, sweeps=99_999, missed=1),))
     assert " 99.9 % " in locatk("info", path).stdout
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from locatk.core.lighthouse.calibration import Calibration, predict_angles
-from locatk.core.lighthouse.ootx import encode
+from locatk.core.lighthouse.demodulation.ootx import encode
 from locatk.formats.observations import read_sweeps, read_trajectories
 from locatk.formats.session import Session
 

@@ -12,10 +12,9 @@ import pytest
 from locatk.cli.systems import Request, solve_session
 from locatk.core import lighthouse
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.heard import HeardStation
 from locatk.core.lighthouse.receiver import DECK
+from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Marker, Scene
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.formats import artifacts, observations
 from locatk.formats.session import Session
@@ -68,7 +67,7 @@ def test_receivers_and_what_stations_sent(
         system="lighthouse",
         sweeps=sweeps_of(session, sensors=4),
         scene=Scene(markers=(Marker("old", np.zeros(3)),)),
-        stations=(HeardStation(1, 0xA, calibration=sent), HeardStation(2, 0xB, calibration=sent)),
+        stations=(StationReport(1, 0xA, calibration=sent), StationReport(2, 0xB, calibration=sent)),
         receivers={"red": DECK},
     )
     artifacts.write_scene(

@@ -12,10 +12,15 @@ from scipy.interpolate import CubicSpline
 from locatk.core import lighthouse, metrics
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_of
-from locatk.core.lighthouse.calibration import Calibration, predict_angles
+from locatk.core.lighthouse.calibration import (
+    FACTORY_UNITS,
+    GENERIC_CALIBRATION,
+    Calibration,
+    predict_angles,
+)
 from locatk.core.lighthouse.channels import channel_of, period_counts, period_ticks
-from locatk.core.lighthouse.generic import GENERIC, UNITS
-from locatk.core.lighthouse.simulate import (
+from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
+from locatk.core.lighthouse.simulation.session import (
     EPOCH_NS,
     FLAT_MARKERS,
     RAISED_MARKERS,
@@ -23,7 +28,6 @@ from locatk.core.lighthouse.simulate import (
     SimulationOptions,
     simulate,
 )
-from locatk.core.lighthouse.sweeps import UNKNOWN, Sweeps
 
 Array = NDArray[np.float64]
 QUIET = SimulationOptions(noise_rad=0.0, seed=4)
@@ -137,7 +141,7 @@ def reproject(point: Array, unit: Array, sweep: int) -> float:
 def test_factory_planes_pass_moving_robots_when_their_sweeps_say() -> None:
     made = simulate(replace(QUIET, planar=False, robots=2, stations=3))
     station = made.stations.stations[2]
-    [unit] = [u for u in UNITS if u[1] == station.calibration.sweeps[0, 1]]
+    [unit] = [u for u in FACTORY_UNITS if u[1] == station.calibration.sweeps[0, 1]]
     turns = turns_of(made, 1, 3)
     _, path = path_of(made, 1)
     rotor = 2 * np.pi * ((turns.time_s - turns.zero_s) / turns.period_s - np.array([1 / 3, 2 / 3]))
@@ -300,19 +304,19 @@ def test_stations_stand_as_they_would_and_have_real_calibrations() -> None:
             assert s.rotation[:, 0] @ toward > np.cos(np.radians(6.0))
             assert abs(np.degrees(np.arcsin(s.rotation[2, 1]))) < 4.0
             assert s.calibration.source == "factory"
-            assert not np.allclose(s.calibration.sweeps, GENERIC.sweeps)
+            assert not np.allclose(s.calibration.sweeps, GENERIC_CALIBRATION.sweeps)
         tilts = {float(s.calibration.sweeps[0, 1]) for s in stations}
-        assert len(tilts) == len(set(UNITS[:, 1]))  # no unit twice
+        assert len(tilts) == len(set(FACTORY_UNITS[:, 1]))  # no unit twice
 
 
 def test_the_prior_is_the_mean_of_the_units() -> None:
     """The columns of a unit are read as the prior reads them."""
     many = simulate(SimulationOptions(stations=11, duration_s=1.0)).stations.stations
     mean = np.mean([s.calibration.sweeps[:, :3] for s in many], axis=0)
-    np.testing.assert_allclose(mean, GENERIC.sweeps[:, :3], atol=1e-12)
+    np.testing.assert_allclose(mean, GENERIC_CALIBRATION.sweeps[:, :3], atol=1e-12)
     generic = simulate(SimulationOptions(duration_s=1.0, calibration="generic"))
     assert all(isinstance(s.calibration, Calibration) for s in generic.stations.stations)
-    assert all(s.calibration is GENERIC for s in generic.stations.stations)
+    assert all(s.calibration is GENERIC_CALIBRATION for s in generic.stations.stations)
 
 
 @pytest.mark.parametrize("planar", [True, False])

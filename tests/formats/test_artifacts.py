@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from locatk.core.errors import ArtifactError
 from locatk.core.geometry import rotation_exp
 from locatk.core.lighthouse.calibration import MODELS, Calibration
-from locatk.core.lighthouse.scene import Distance, Marker, Scene, Sighting, Station
+from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.formats import artifacts
 from locatk.formats.artifacts import dumps_scene, format_time, loads_scene, parse_time
 
@@ -30,14 +30,14 @@ def vectors(n: int) -> st.SearchStrategy[np.ndarray]:
 
 
 @st.composite
-def sightings(draw: st.DrawFn) -> Sighting:
+def sightings(draw: st.DrawFn) -> MarkerVisit:
     if draw(st.booleans()):
         pair = st.tuples(st.floats(0, 2e5), st.floats(0, 2e5))
-        return Sighting(
+        return MarkerVisit(
             counts=draw(st.dictionaries(st.integers(1, 16), pair, min_size=1, max_size=3))
         )
     start, end = sorted([draw(times), draw(times)])
-    return Sighting(draw(st.text(max_size=5)), start, end)
+    return MarkerVisit(draw(st.text(max_size=5)), start, end)
 
 
 @st.composite

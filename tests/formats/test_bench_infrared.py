@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from locatk.core.lighthouse import identify
+from locatk.core.lighthouse.demodulation import identification as identify
 from locatk.formats.bench import Figure, infrared, infrared_places, infrared_survive
 from locatk.formats.importers.libsurvive import read_libsurvive
 

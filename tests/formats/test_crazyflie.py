@@ -13,8 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import ArtifactError, InputError, LocatkError, OutputExistsError
-from locatk.core.lighthouse.calibration import IDEAL, PARAMETERS, Calibration
-from locatk.core.lighthouse.generic import GENERIC
+from locatk.core.lighthouse.calibration import (
+    GENERIC_CALIBRATION,
+    IDEAL_CALIBRATION,
+    PARAMETERS,
+    Calibration,
+)
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.formats import crazyflie
 
@@ -93,7 +97,7 @@ def test_reads_what_cflib_writes() -> None:
     assert (first.id, second.id) == (None, 1083618720)
     assert second.calibration.sweeps.tolist() == SWEEPS
     assert (second.calibration.source, second.calibration.model) == ("factory", "libsurvive")
-    assert first.calibration is GENERIC
+    assert first.calibration is GENERIC_CALIBRATION
     # Channel 4 is known by its calibration only.
     assert list(found.calibrations) == [4]
     assert found.calibrations[4].sweeps.tolist() == SWEEPS
@@ -165,14 +169,18 @@ def test_cflib_reads_it(tmp_path: Path) -> None:
 
 def test_only_factory_calibrations_are_written() -> None:
     first, second = scene().stations
-    for other in (GENERIC, IDEAL, Calibration(np.array(SWEEPS), "estimated")):
+    for other in (
+        GENERIC_CALIBRATION,
+        IDEAL_CALIBRATION,
+        Calibration(np.array(SWEEPS), "estimated"),
+    ):
         text = crazyflie.dumps_config(
             scene(stations=(first, dataclasses.replace(second, calibration=other)))
         )
         assert list(yaml.safe_load(text)["calibs"]) == [0]
         assert "# No factory calibration of channel 16" in text
         again = crazyflie.loads_config(text)
-        assert again.stations[1].calibration is GENERIC
+        assert again.stations[1].calibration is GENERIC_CALIBRATION
 
 
 def test_scenes_that_cannot_be_written() -> None:
@@ -218,7 +226,7 @@ def test_a_calibration_of_zeros_is_none() -> None:
     for value in {str(v) for row in SWEEPS for v in row} - {"0.0"}:
         zeros = zeros.replace(f": {value}\n", ": 0.0\n")
     found = crazyflie.loads_config(zeros)
-    assert found.stations[1].calibration is GENERIC
+    assert found.stations[1].calibration is GENERIC_CALIBRATION
     assert found.stations[1].id == 1083618720
     assert found.calibrations == {}
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
 from locatk.core.geometry import apply_homography, fit_homography
-from locatk.core.lighthouse.angles import angles_to_counts, paper_image_points
-from locatk.core.lighthouse.calibration import IDEAL, predict_angles
+from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
+from locatk.core.lighthouse.light_planes import angles_to_counts, paper_image_points
 from locatk.core.metrics import evaluate_all
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot import read_dotbot
@@ -481,7 +481,7 @@ def test_corners_on_a_line_are_refused(write: Write) -> None:
 @given(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2), st.integers(1, 16))
 def test_image_points_go_back_to_counts(right: float, up: float, channel: int) -> None:
     """What the recovery of markers rests on: the inverse of the paper's image point."""
-    angles = predict_angles(np.array([1.0, -right, up]), IDEAL)
+    angles = predict_angles(np.array([1.0, -right, up]), IDEAL_CALIBRATION)
     counts = angles_to_counts(angles, channel)
     assert counts[0] < counts[1]
     np.testing.assert_allclose(paper_image_points(counts, channel), [right, up], atol=1e-9)

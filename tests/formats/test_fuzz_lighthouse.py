@@ -29,12 +29,14 @@ import pytest
 
 from locatk.cli import info_lighthouse
 from locatk.core.errors import LocatkError
-from locatk.core.lighthouse import lfsr, ootx, paper_light, paper_receive
+from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import period_counts
-from locatk.core.lighthouse.heard import HeardStation
-from locatk.core.lighthouse.light import Edges
-from locatk.core.lighthouse.receive import receive
+from locatk.core.lighthouse.demodulation import ootx
+from locatk.core.lighthouse.demodulation.pipeline import receive
+from locatk.core.lighthouse.published import light_decoding as paper_light
+from locatk.core.lighthouse.published import light_receiver as paper_receive
 from locatk.core.lighthouse.receiver import DECK
+from locatk.core.lighthouse.recording import Edges, StationReport
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.formats import artifacts, crazyflie, heard, observations, receivers
 from locatk.formats.importers.dotbot_log import read_dotbot_log
@@ -239,8 +241,8 @@ SCENE = Scene(
     ids={2: 0xFF22226, 3: 12},
 )
 HEARD = (
-    HeardStation(1, 0x4CC60647, 958985.25, 40, 1, FACTORY, 11, 0),
-    HeardStation(4, None, None, 7, 3, None, 0, 2),
+    StationReport(1, 0x4CC60647, 958985.25, 40, 1, FACTORY, 11, 0),
+    StationReport(4, None, None, 7, 3, None, 0, 2),
 )
 
 # ---- how it is damaged

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.heard import HeardStation
+from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.formats import observations
 from locatk.formats.heard import read_heard, strangers
 from locatk.formats.session import Session
@@ -26,10 +25,10 @@ counts = st.integers(0, 10**15)
 
 
 @st.composite
-def stations(draw: st.DrawFn, channel: int) -> HeardStation:
+def stations(draw: st.DrawFn, channel: int) -> StationReport:
     values = st.lists(st.floats(-10, 10), min_size=14, max_size=14)
     calibration = values.map(lambda v: Calibration(np.array(v).reshape(2, 7), "factory"))
-    return HeardStation(
+    return StationReport(
         channel=channel,
         id=draw(st.none() | st.integers(0, 2**32 - 1)),
         period_ticks=draw(st.none() | st.floats(8e5, 1e6)),
@@ -46,14 +45,14 @@ heard = st.lists(st.integers(1, 16), max_size=4, unique=True).flatmap(
 )
 
 
-def plain(station: HeardStation) -> dict[str, object]:
+def plain(station: StationReport) -> dict[str, object]:
     calibration = station.calibration
     told = None if calibration is None else (calibration.sweeps.tolist(), calibration.source)
     return {**vars(station), "calibration": told}
 
 
 def write(
-    path: Path, found: tuple[HeardStation, ...], scene: Scene | None = None, **more: bool
+    path: Path, found: tuple[StationReport, ...], scene: Scene | None = None, **more: bool
 ) -> Session:
     observations.write_session(
         path, system="lighthouse", sweeps=NO_SWEEPS, scene=scene, stations=found, **more
@@ -64,7 +63,7 @@ def write(
 @settings(max_examples=60, deadline=None)
 @given(heard)
 def test_all_that_was_heard_comes_back(
-    tmp_path_factory: pytest.TempPathFactory, found: tuple[HeardStation, ...]
+    tmp_path_factory: pytest.TempPathFactory, found: tuple[StationReport, ...]
 ) -> None:
     path = tmp_path_factory.mktemp("heard") / "run.mcap"
     read = read_heard(write(path, found))
@@ -83,7 +82,7 @@ MINE = Calibration(np.zeros((2, 7)), "estimated")
 
 def test_the_calibration_of_the_scene_stays(tmp_path: Path) -> None:
     """What an importer puts into the scene is not replaced by what the stations sent."""
-    sent = (HeardStation(1, 7, calibration=FACTORY), HeardStation(2, 8, calibration=FACTORY))
+    sent = (StationReport(1, 7, calibration=FACTORY), StationReport(2, 8, calibration=FACTORY))
     session = write(tmp_path / "run.mcap", sent, Scene(calibrations={1: MINE}, ids={1: 9}))
     scene = observations.read_scene(session)
     assert scene is not None
@@ -96,17 +95,17 @@ def test_the_calibration_of_the_scene_stays(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "found",
     [
-        (HeardStation(3), HeardStation(3)),
-        (HeardStation(0),),
-        (HeardStation(17),),
-        (HeardStation(3, sweeps=-1),),
-        (HeardStation(3, period_ticks=float("nan")),),
-        (HeardStation(3, period_ticks=0.0),),
-        (HeardStation(3, id=-4),),
+        (StationReport(3), StationReport(3)),
+        (StationReport(0),),
+        (StationReport(17),),
+        (StationReport(3, sweeps=-1),),
+        (StationReport(3, period_ticks=float("nan")),),
+        (StationReport(3, period_ticks=0.0),),
+        (StationReport(3, id=-4),),
     ],
     ids=str,
 )
-def test_what_cannot_be_is_not_written(tmp_path: Path, found: tuple[HeardStation, ...]) -> None:
+def test_what_cannot_be_is_not_written(tmp_path: Path, found: tuple[StationReport, ...]) -> None:
     with pytest.raises(InputError):
         write(tmp_path / "run.mcap", found)
     assert list(tmp_path.iterdir()) == []
@@ -172,6 +171,6 @@ def test_wild_records(
 def test_a_station_of_another_place_is_noticed() -> None:
     place = Station(1, np.zeros(3), np.eye(3), FACTORY, id=0xA)
     scene = Scene(stations=(place,), ids={2: 0xB})
-    found = (HeardStation(1, 0xA), HeardStation(2, 0xC), HeardStation(3, 0xD), HeardStation(4))
+    found = (StationReport(1, 0xA), StationReport(2, 0xC), StationReport(3, 0xD), StationReport(4))
     [note] = strangers(scene, found)
     assert note.startswith("on channel 2 the scene has the station 0000000b")

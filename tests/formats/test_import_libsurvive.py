@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
 from locatk.core.geometry import matrix_from_quaternion
-from locatk.core.lighthouse.angles import ROTOR_ZERO
 from locatk.core.lighthouse.calibration import predict_angles
 from locatk.core.lighthouse.channels import period_counts, period_ticks
-from locatk.core.lighthouse.ootx import encode
-from locatk.core.lighthouse.sweeps import Sweeps
-from locatk.core.lighthouse.syncs import fit_rotor
+from locatk.core.lighthouse.demodulation.ootx import encode
+from locatk.core.lighthouse.demodulation.tracker_syncs import fit_rotor
+from locatk.core.lighthouse.light_planes import ROTOR_ZERO
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.formats.importers import libsurvive_lines
 from locatk.formats.importers.libsurvive import read_libsurvive
 from locatk.formats.importers.libsurvive_device import read_stored

@@ -16,8 +16,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from locatk.core.errors import FormatError, InputError, OutputExistsError
 from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import observations

@@ -17,7 +17,7 @@ from matplotlib.text import Text
 from locatk.core import metrics
 from locatk.core.errors import InputError, MissingDataError, OutputExistsError
 from locatk.core.geometry import Similarity, rotation_exp
-from locatk.core.lighthouse.calibration import IDEAL
+from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -37,7 +37,7 @@ def track(device: str, n: int = 120, off_m: float = 0.0, sigma_m: float = 1e-3) 
 
 
 def station(channel: int, x: float, y: float) -> Station:
-    return Station(channel, np.array([x, y, 2.0]), ROTATION, IDEAL)
+    return Station(channel, np.array([x, y, 2.0]), ROTATION, IDEAL_CALIBRATION)
 
 
 SCENE = Scene(
@@ -216,7 +216,7 @@ def test_stations_are_in_view_or_named_at_the_margin() -> None:
 )
 def test_a_small_map_tells_how_far_stations_are(far_m: float, said: str) -> None:
     small = replace(track("red"), position=0.01 * track("red").position)
-    station = Station(1, np.array([0.0, far_m, 0.0]), np.eye(3), IDEAL)
+    station = Station(1, np.array([0.0, far_m, 0.0]), np.eye(3), IDEAL_CALIBRATION)
     scene = Scene(stations=(station,), scale="markers")
     figure = draw(Solution("lighthouse", "bundle", (small,), artifact=scene))
     assert figure.axes[0].get_xlabel() == "x [mm]"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import ArtifactError
 from locatk.core.lighthouse.receiver import DECK, Receiver
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.formats import observations, receivers
 from locatk.formats.capture.artifacts import attachments
 from locatk.formats.receivers import dumps_receiver, loads_receiver, read_receivers

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError, LocatkError, MissingDataError
-from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.recording import Edges
 from locatk.formats.importers import saleae_lines
 from locatk.formats.importers.saleae import read_capture, read_light
 

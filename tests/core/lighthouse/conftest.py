@@ -17,10 +17,9 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.generic import UNITS
-from locatk.core.lighthouse.light import Edges
-from locatk.core.lighthouse.scene import Marker, Sighting
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.calibration import FACTORY_UNITS
+from locatk.core.lighthouse.recording import Edges, Sweeps
+from locatk.core.lighthouse.scene import Marker, MarkerVisit
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -52,7 +51,7 @@ class Plane:
 
 
 def planes_of(unit: Array) -> tuple[Plane, Plane]:
-    """Both planes of a row of ``generic.UNITS``."""
+    """Both planes of a row of ``generic.FACTORY_UNITS``."""
     p1, t0, t1, c0, c1, gm0, gm1, gp0, gp1, om0, om1, op0, op1 = map(float, unit)
     return Plane(0.0, t0, c0, gp0, gm0, op0, om0), Plane(p1, t1, c1, gp1, gm1, op1, om1)
 
@@ -127,7 +126,7 @@ def lamps(*channels: int, units: tuple[int, ...] = (5, 7, 2, 9)) -> tuple[Lamp, 
         place, roll = PLACES[channel]
         position = np.array(place)
         rotation = look(position, np.array([0.1 * k, -0.1, 0.1]), roll)
-        found.append(Lamp(channel, position, rotation, planes_of(UNITS[units[k]])))
+        found.append(Lamp(channel, position, rotation, planes_of(FACTORY_UNITS[units[k]])))
     return tuple(found)
 
 
@@ -277,7 +276,7 @@ def markers_of(world: tuple[Lamp, ...], places: Array) -> tuple[Marker, ...]:
             lamp.channel: tuple(map(float, lamp.counts(lamp.angles(place[None]))[0]))
             for lamp in world
         }
-        found.append(Marker(f"m{k}", place, (Sighting(counts=counts),)))  # type: ignore[arg-type]
+        found.append(Marker(f"m{k}", place, (MarkerVisit(counts=counts),)))  # type: ignore[arg-type]
     return tuple(found)
 
 

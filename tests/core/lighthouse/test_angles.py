@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse import angles
+from locatk.core.lighthouse import light_planes as angles
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
 
 Array = NDArray[np.float64]

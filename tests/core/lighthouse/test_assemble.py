@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse.assemble import Assembly, assemble
-from locatk.core.lighthouse.generic import GENERIC, MODEL_SIGMA
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD
+from locatk.core.lighthouse.scene.assembly import Assembly, assemble
 
 Array = NDArray[np.float64]
 
@@ -25,10 +25,10 @@ def angles_of(lamps: Any, points: Array, noise: float = 1e-4, seed: int = 0) -> 
 
 
 def run(angles: Array, planar: bool | None = None, seed: int = 0) -> Assembly:
-    generic = (GENERIC,) * angles.shape[1]
+    generic = (GENERIC_CALIBRATION,) * angles.shape[1]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return assemble(angles, generic, sigma=MODEL_SIGMA, planar=planar, seed=seed)
+        return assemble(angles, generic, sigma=MODEL_SIGMA_RAD, planar=planar, seed=seed)
 
 
 def off(assembly: Assembly, points: Array) -> float:

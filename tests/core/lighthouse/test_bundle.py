@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from locatk.core.geometry import rotation_exp, rotation_log, umeyama
-from locatk.core.lighthouse.bundle import Rig, adjust
-from locatk.core.lighthouse.calibration import PHASE, TILT, Calibration
-from locatk.core.lighthouse.generic import GENERIC, PHASE_TILT_SIGMA
+from locatk.core.lighthouse.calibration import (
+    GENERIC_CALIBRATION,
+    PHASE,
+    PHASE_TILT_SIGMA_RAD,
+    TILT,
+    Calibration,
+)
+from locatk.core.lighthouse.scene.bundle_adjustment import Rig, adjust
 
 Array = NDArray[np.float64]
 
@@ -180,17 +185,19 @@ def test_tilt_and_phase_are_found_where_they_show(world: Any) -> None:
     lamps = world.lamps(1, 2, 5, 16)
     points = world.curve(100, flat=False)
     angles = angles_of(lamps, points)
-    start = rig_of(lamps, points, (GENERIC,) * 4)
+    start = rig_of(lamps, points, (GENERIC_CALIBRATION,) * 4)
     done = adjust(angles, start, sigma=1e-3)
     for lamp, calibration in zip(lamps, done.rig.calibrations, strict=True):
         true = factory(lamp).sweeps[:, TILT]
-        before = np.abs(GENERIC.sweeps[:, TILT] - true).max()
+        before = np.abs(GENERIC_CALIBRATION.sweeps[:, TILT] - true).max()
         after = np.abs(calibration.sweeps[:, TILT] - true).max()
         assert after < max(before, 1.5e-3)
         assert calibration.source == "estimated"
         # Only tilt and phase move, and the first phase is zero by definition.
         others = [c for c in range(7) if c not in (TILT, PHASE)]
-        np.testing.assert_array_equal(calibration.sweeps[:, others], GENERIC.sweeps[:, others])
+        np.testing.assert_array_equal(
+            calibration.sweeps[:, others], GENERIC_CALIBRATION.sweeps[:, others]
+        )
         assert calibration.sweeps[0, PHASE] == pytest.approx(0, abs=1e-6)
 
 
@@ -198,18 +205,21 @@ def test_priors_hold_what_the_data_do_not_tell(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = world.curve(4, flat=True)
     done = adjust(
-        angles_of(lamps, points), rig_of(lamps, points, (GENERIC,) * 2), sigma=1e-3, planar=True
+        angles_of(lamps, points),
+        rig_of(lamps, points, (GENERIC_CALIBRATION,) * 2),
+        sigma=1e-3,
+        planar=True,
     )
     for calibration in done.rig.calibrations:
-        change = calibration.sweeps - GENERIC.sweeps
-        assert np.all(np.abs(change[:, TILT]) < 3 * PHASE_TILT_SIGMA[:, 1])
-        assert np.abs(change[1, PHASE]) < 3 * PHASE_TILT_SIGMA[1, 0]
+        change = calibration.sweeps - GENERIC_CALIBRATION.sweeps
+        assert np.all(np.abs(change[:, TILT]) < 3 * PHASE_TILT_SIGMA_RAD[:, 1])
+        assert np.abs(change[1, PHASE]) < 3 * PHASE_TILT_SIGMA_RAD[1, 0]
 
 
 def test_factory_calibration_is_never_touched(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = world.curve(30, flat=False)
-    mixed = (factory(lamps[0]), GENERIC)
+    mixed = (factory(lamps[0]), GENERIC_CALIBRATION)
     done = adjust(angles_of(lamps, points), rig_of(lamps, points, mixed), sigma=1e-3)
     assert done.rig.calibrations[0] is mixed[0]
     assert done.rig.calibrations[1].source == "estimated"

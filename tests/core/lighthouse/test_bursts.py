@@ -12,8 +12,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from locatk.core.errors import InputError
-from locatk.core.lighthouse.bursts import GAP_S, of_mocap, of_windows, split, window_edges_numpy
-from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.demodulation.bursts import (
+    GAP_S,
+    of_mocap,
+    of_windows,
+    split,
+    window_edges_numpy,
+)
+from locatk.core.lighthouse.recording import Edges
 
 CAPTURE = "benchmarks/demodulation_code/logic_analyser_capture.sal"
 

@@ -15,8 +15,12 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse import calibration as cal
-from locatk.core.lighthouse.angles import plane_normals, rays
-from locatk.core.lighthouse.generic import GENERIC, PHASE_TILT_SIGMA, UNITS
+from locatk.core.lighthouse.calibration import (
+    FACTORY_UNITS,
+    GENERIC_CALIBRATION,
+    PHASE_TILT_SIGMA_RAD,
+)
+from locatk.core.lighthouse.light_planes import plane_normals, rays
 
 Array = NDArray[np.float64]
 
@@ -49,9 +53,9 @@ def crazyflie_angle(point: Array, t: float, sweep: Array) -> float:
     return base - (sweep[cal.PHASE] + gib)
 
 
-@pytest.mark.parametrize("unit", range(len(UNITS)))
+@pytest.mark.parametrize("unit", range(len(FACTORY_UNITS)))
 def test_libsurvive_in_its_own_axes(unit: int, world: Any) -> None:
-    planes = world.planes_of(UNITS[unit])
+    planes = world.planes_of(FACTORY_UNITS[unit])
     points = wide()
     forward, left, up = points.T
     theirs = [world.libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(planes)]
@@ -65,12 +69,14 @@ def test_ideal_planes_are_those_of_crazyflies_documentation() -> None:
     x, y, z = points.T
     for k, t in enumerate((-math.pi / 6, math.pi / 6)):
         theirs = np.arctan2(y, x) + np.arcsin(z * math.tan(t) / np.hypot(x, y))
-        np.testing.assert_allclose(cal.predict_angles(points, cal.IDEAL)[:, k], theirs, atol=1e-14)
+        np.testing.assert_allclose(
+            cal.predict_angles(points, cal.IDEAL_CALIBRATION)[:, k], theirs, atol=1e-14
+        )
 
 
 def test_ideal_gradient_is_crazyflies_h_vector() -> None:
     points = wide(50)
-    _, by_point, _ = cal.predict_with_gradient(points, cal.IDEAL)
+    _, by_point, _ = cal.predict_with_gradient(points, cal.IDEAL_CALIBRATION)
     for (x, y, z), rows in zip(points, by_point, strict=True):
         for k, t in enumerate((-math.pi / 6, math.pi / 6)):
             r = math.hypot(x, y)
@@ -81,7 +87,7 @@ def test_ideal_gradient_is_crazyflies_h_vector() -> None:
 
 @pytest.mark.parametrize("unit", [0, 4, 9])
 def test_crazyflie_model_is_its_firmwares(unit: int, world: Any) -> None:
-    calibration = calibration_of(world.planes_of(UNITS[unit]), "crazyflie")
+    calibration = calibration_of(world.planes_of(FACTORY_UNITS[unit]), "crazyflie")
     points = wide(50)
     nominal = (-np.pi / 6, np.pi / 6)
     theirs = [
@@ -94,7 +100,7 @@ def test_crazyflie_model_is_its_firmwares(unit: int, world: Any) -> None:
 @pytest.mark.parametrize("model", cal.MODELS)
 @pytest.mark.parametrize("unit", [1, 6, 9])
 def test_gradients_are_those_of_small_steps(unit: int, model: str, world: Any) -> None:
-    calibration = calibration_of(world.planes_of(UNITS[unit]), model)
+    calibration = calibration_of(world.planes_of(FACTORY_UNITS[unit]), model)
     points = wide(60)
     angles, by_point, by_tilt = cal.predict_with_gradient(points, calibration)
     np.testing.assert_array_equal(angles, cal.predict_angles(points, calibration))
@@ -119,7 +125,7 @@ def test_phase_turns_the_angle_back() -> None:
     sweeps[1, cal.PHASE] = -0.005
     points = wide(5)
     change = cal.predict_angles(points, cal.Calibration(sweeps, "factory")) - cal.predict_angles(
-        points, cal.IDEAL
+        points, cal.IDEAL_CALIBRATION
     )
     np.testing.assert_allclose(change, np.tile([0, 0.005], (5, 1)), atol=1e-15)
 
@@ -127,16 +133,18 @@ def test_phase_turns_the_angle_back() -> None:
 def test_points_above_the_cone_have_no_angle() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        above = cal.predict_angles(np.array([[0.1, 0.0, 2.0], [2.0, 0.0, 0.1]]), GENERIC)
-        gradient = cal.predict_with_gradient(np.array([[0.1, 0.0, 2.0]]), GENERIC)[1]
+        above = cal.predict_angles(
+            np.array([[0.1, 0.0, 2.0], [2.0, 0.0, 0.1]]), GENERIC_CALIBRATION
+        )
+        gradient = cal.predict_with_gradient(np.array([[0.1, 0.0, 2.0]]), GENERIC_CALIBRATION)[1]
     assert np.isnan(above[0]).all()
     assert np.isfinite(above[1]).all()
     assert not np.isfinite(gradient).any()
 
 
-@pytest.mark.parametrize("unit", range(len(UNITS)))
+@pytest.mark.parametrize("unit", range(len(FACTORY_UNITS)))
 def test_correcting_gives_plain_planes_through_the_point(unit: int, world: Any) -> None:
-    planes = world.planes_of(UNITS[unit])
+    planes = world.planes_of(FACTORY_UNITS[unit])
     calibration = calibration_of(planes)
     points = wide()
     forward, left, up = points.T
@@ -156,7 +164,7 @@ def test_correcting_gives_plain_planes_through_the_point(unit: int, world: Any) 
 
 def test_correcting_three_steps_is_correct_to_a_tenth_of_a_microradian(world: Any) -> None:
     # What the docstring of ideal_angles promises, within the field of a usual scene.
-    for unit in UNITS:
+    for unit in FACTORY_UNITS:
         calibration = calibration_of(world.planes_of(unit))
         points = wide()
         points = points[np.abs(points[:, 2]) < 0.5 * np.hypot(points[:, 0], points[:, 1])]
@@ -168,7 +176,7 @@ def test_correcting_three_steps_is_correct_to_a_tenth_of_a_microradian(world: An
 
 def test_correcting_as_crazyflie_does_gives_its_ray(world: Any) -> None:
     # The firmware's fixed point: corrected angles are those of 30-degree planes.
-    calibration = calibration_of(world.planes_of(UNITS[3]), "crazyflie")
+    calibration = calibration_of(world.planes_of(FACTORY_UNITS[3]), "crazyflie")
     for point in wide(40):
         raw = [
             crazyflie_angle(point, t, calibration.sweeps[k])
@@ -191,22 +199,26 @@ def test_unseen_angles_stay_unseen() -> None:
     observed = np.array([[0.1, np.nan], [np.nan, np.nan], [0.1, -0.1]])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        corrected = cal.ideal_angles(observed, GENERIC)
+        corrected = cal.ideal_angles(observed, GENERIC_CALIBRATION)
     assert not np.isfinite(corrected[:2]).all(axis=1).any()
     assert np.isfinite(corrected[2]).all()
 
 
 def test_generic_is_what_other_units_are() -> None:
     # facts/lighthouse.md 1.6: mean and spread over the units that libsurvive recorded.
-    assert GENERIC.source == "generic"
-    np.testing.assert_allclose(GENERIC.sweeps[:, cal.TILT], [-0.0493, 0.0459], atol=5e-4)
-    np.testing.assert_allclose(GENERIC.sweeps[:, cal.PHASE], [0, -0.0051], atol=5e-4)
-    np.testing.assert_allclose(PHASE_TILT_SIGMA, [[0, 0.0016], [0.0019, 0.0020]], atol=5e-4)
+    assert GENERIC_CALIBRATION.source == "generic"
+    np.testing.assert_allclose(
+        GENERIC_CALIBRATION.sweeps[:, cal.TILT], [-0.0493, 0.0459], atol=5e-4
+    )
+    np.testing.assert_allclose(GENERIC_CALIBRATION.sweeps[:, cal.PHASE], [0, -0.0051], atol=5e-4)
+    np.testing.assert_allclose(PHASE_TILT_SIGMA_RAD, [[0, 0.0016], [0.0019, 0.0020]], atol=5e-4)
     # The mean of gib is that of the waves, not of their sizes and phases.
     azimuth = np.linspace(-1, 1, 9)
     for k in range(2):
-        waves = UNITS[:, 5 + k, None] * np.cos(azimuth + UNITS[:, 7 + k, None])
-        ours = GENERIC.sweeps[k, cal.GIBMAG] * np.cos(azimuth + GENERIC.sweeps[k, cal.GIBPHASE])
+        waves = FACTORY_UNITS[:, 5 + k, None] * np.cos(azimuth + FACTORY_UNITS[:, 7 + k, None])
+        ours = GENERIC_CALIBRATION.sweeps[k, cal.GIBMAG] * np.cos(
+            azimuth + GENERIC_CALIBRATION.sweeps[k, cal.GIBPHASE]
+        )
         np.testing.assert_allclose(ours, waves.mean(axis=0), atol=1e-12)
 
 
@@ -219,7 +231,7 @@ def test_units_are_those_of_libsurvives_file(recordings: Path, world: Any) -> No
             continue
         names = [f.name for f in dataclasses.fields(world.Plane)]
         theirs = {name: [float(v) for v in lamp[f"fcal{name}"]] for name in names}
-        unit = min(UNITS, key=lambda u: np.abs(u[1:3] - theirs["tilt"]).sum())
+        unit = min(FACTORY_UNITS, key=lambda u: np.abs(u[1:3] - theirs["tilt"]).sum())
         for k, plane in enumerate(world.planes_of(unit)):
             for key, values in theirs.items():
                 assert getattr(plane, key) == pytest.approx(values[k], abs=1e-6), key
@@ -228,8 +240,10 @@ def test_units_are_those_of_libsurvives_file(recordings: Path, world: Any) -> No
 
 
 def test_what_a_calibration_says_of_itself(world: Any) -> None:
-    assert not cal.IDEAL.bends
-    assert cal.IDEAL.source == "none"
-    assert GENERIC.bends
-    factory = calibration_of(world.planes_of(UNITS[0]))
-    np.testing.assert_allclose(factory.tilts, [np.pi / 6 + UNITS[0, 1], -np.pi / 6 + UNITS[0, 2]])
+    assert not cal.IDEAL_CALIBRATION.bends
+    assert cal.IDEAL_CALIBRATION.source == "none"
+    assert GENERIC_CALIBRATION.bends
+    factory = calibration_of(world.planes_of(FACTORY_UNITS[0]))
+    np.testing.assert_allclose(
+        factory.tilts, [np.pi / 6 + FACTORY_UNITS[0, 1], -np.pi / 6 + FACTORY_UNITS[0, 2]]
+    )

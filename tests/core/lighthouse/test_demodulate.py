@@ -10,9 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.lighthouse.bursts import Bursts, of_windows, split
-from locatk.core.lighthouse.demodulate import CERTAIN, LONGEST_S, soft_bits, soft_bits_numpy
-from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.demodulation.bursts import Bursts, of_windows, split
+from locatk.core.lighthouse.demodulation.soft_bits import (
+    CERTAIN,
+    LONGEST_S,
+    soft_bits,
+    soft_bits_numpy,
+)
+from locatk.core.lighthouse.recording import Edges
 
 CAPTURE = "benchmarks/demodulation_code/logic_analyser_capture.sal"
 RATES = (24e6, 32e6, 40e6, 100e6, 500e6)

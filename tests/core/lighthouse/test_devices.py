@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.core.lighthouse.devices import rigid_devices
+from locatk.core.lighthouse.devices.solver import rigid_devices
 from locatk.core.lighthouse.receiver import DECK, Receiver
-from locatk.core.lighthouse.scene import Marker, Scene, Sighting
+from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
 
 SPAN = np.array([[-0.06, 0.04, 0.0], [-0.06, -0.04, 0.0], [0.06, 0.04, 0.0], [0.06, -0.04, 0.02]])
@@ -107,7 +107,7 @@ def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
             f"m{k}",
             PLACES[k],
             (
-                Sighting(
+                MarkerVisit(
                     "robot",
                     start + round((ROUND_S * k + 0.2) * 1e9),
                     start + round((ROUND_S * k + 1.3) * 1e9),

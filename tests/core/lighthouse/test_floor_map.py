@@ -11,10 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.lighthouse.angles import rays as rays_of
-from locatk.core.lighthouse.calibration import ideal_angles, predict_angles
-from locatk.core.lighthouse.floor_map import fit_floor_map, locate_on_map
-from locatk.core.lighthouse.generic import GENERIC
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, ideal_angles, predict_angles
+from locatk.core.lighthouse.light_planes import rays as rays_of
+from locatk.core.lighthouse.localization.floor_map import fit_floor_map, locate_on_map
 
 Array = NDArray[np.float64]
 
@@ -25,7 +24,9 @@ def lamp(world: Any) -> Any:
 
 
 def seen(lamp: Any, points: Array) -> Array:
-    return rays_of(ideal_angles(lamp.angles(points), GENERIC), GENERIC.tilts)
+    return rays_of(
+        ideal_angles(lamp.angles(points), GENERIC_CALIBRATION), GENERIC_CALIBRATION.tilts
+    )
 
 
 def mapped(floor_map: Array, rays: Array) -> Array:
@@ -96,7 +97,7 @@ def test_positions_and_their_covariance(world: Any, lamp: Any) -> None:
     sigma = 2e-4
     angles = lamp.angles(places)
     draws = angles[:, None] + rng.normal(0, sigma, (6, 3000, 2))
-    fixes = locate_on_map(draws.reshape(-1, 1, 2), GENERIC, floor_map, 0.03)
+    fixes = locate_on_map(draws.reshape(-1, 1, 2), GENERIC_CALIBRATION, floor_map, 0.03)
     position = fixes.position.reshape(6, 3000, 3)
     np.testing.assert_array_equal(position[..., 2], 0.03)
     stated = fixes.covariance(sigma, True).reshape(6, 3000, 3, 3)[:, 0]
@@ -115,7 +116,7 @@ def test_an_unseen_plane_gives_no_place(world: Any, lamp: Any) -> None:
     angles[1] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fixes = locate_on_map(angles, GENERIC, floor_map, 0.0)
+        fixes = locate_on_map(angles, GENERIC_CALIBRATION, floor_map, 0.0)
         fixes.covariance(1e-4, True)
     assert np.isnan(fixes.position[:2]).all()
     assert np.isfinite(fixes.position[2:]).all()
@@ -125,5 +126,5 @@ def test_an_unseen_plane_gives_no_place(world: Any, lamp: Any) -> None:
 def test_generic_planes_are_what_the_map_was_fitted_to(lamp: Any) -> None:
     # The map goes with the calibration it was fitted with: predicted and corrected agree.
     ray = np.array([[1.0, 0.2, -0.4]])
-    corrected = ideal_angles(predict_angles(ray, GENERIC), GENERIC)
-    np.testing.assert_allclose(rays_of(corrected, GENERIC.tilts), ray, atol=1e-7)
+    corrected = ideal_angles(predict_angles(ray, GENERIC_CALIBRATION), GENERIC_CALIBRATION)
+    np.testing.assert_allclose(rays_of(corrected, GENERIC_CALIBRATION.tilts), ray, atol=1e-7)

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import Similarity, rotation_exp
-from locatk.core.lighthouse import frame
-from locatk.core.lighthouse.bundle import Rig
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
 from locatk.core.lighthouse.epochs import angles_of, group
-from locatk.core.lighthouse.generic import GENERIC
-from locatk.core.lighthouse.locate import locate
-from locatk.core.lighthouse.scene import Distance, Sighting
+from locatk.core.lighthouse.localization.positions import locate
+from locatk.core.lighthouse.scene import Distance, MarkerVisit, frame
+from locatk.core.lighthouse.scene.bundle_adjustment import Rig
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -35,7 +34,7 @@ class Recorded:
         self.epochs = group(self.drive.sweeps)
         self.angles = angles_of(self.epochs)
         self.to = Similarity(0.2, rotation_exp(np.array([0.0, 0.0, 0.7])), np.array([3.0, 1, 0]))
-        ideal = replace(GENERIC, sweeps=np.zeros((2, 7)))
+        ideal = replace(GENERIC_CALIBRATION, sweeps=np.zeros((2, 7)))
         self.rig = frame.moved(
             Rig(
                 np.stack([s.position for s in self.lamps]),
@@ -46,9 +45,9 @@ class Recorded:
             self.to,
         )
 
-    def stay(self, k: int) -> Sighting:
+    def stay(self, k: int) -> MarkerVisit:
         start = int(self.drive.time_ns[30 * k])
-        return Sighting("robot", start, start + int(2.9 * SECOND))
+        return MarkerVisit("robot", start, start + int(2.9 * SECOND))
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +65,9 @@ def test_sighting_by_time_is_the_median_of_its_time(recorded: Recorded) -> None:
 
 def test_sighting_by_counts_takes_either_order(recorded: Recorded) -> None:
     counts = {1: (80_000.0, 41_000.0), 9: (1.0, 2.0)}
-    seen = frame.sighted_angles(Sighting(counts=counts), recorded.epochs, recorded.angles)
+    seen = frame.sighted_angles(MarkerVisit(counts=counts), recorded.epochs, recorded.angles)
     same = frame.sighted_angles(
-        Sighting(counts={1: (41_000.0, 80_000.0)}), recorded.epochs, recorded.angles
+        MarkerVisit(counts={1: (41_000.0, 80_000.0)}), recorded.epochs, recorded.angles
     )
     np.testing.assert_array_equal(seen, same)
     assert np.isfinite(seen[0]).all()
@@ -77,13 +76,13 @@ def test_sighting_by_counts_takes_either_order(recorded: Recorded) -> None:
 
 
 def test_a_sighting_outside_the_recording_shows_nothing(recorded: Recorded) -> None:
-    early = Sighting("robot", 0, 10)
+    early = MarkerVisit("robot", 0, 10)
     assert np.isnan(frame.sighted_angles(early, recorded.epochs, recorded.angles)).all()
 
 
 def test_an_unknown_device_is_named(recorded: Recorded) -> None:
     with pytest.raises(InputError, match="'green'") as refused:
-        frame.sighted_angles(Sighting("green", 0, 1), recorded.epochs, recorded.angles)
+        frame.sighted_angles(MarkerVisit("green", 0, 1), recorded.epochs, recorded.angles)
     assert "robot" in str(refused.value.hint)
 
 
@@ -162,7 +161,7 @@ def test_distances_give_the_scale(recorded: Recorded) -> None:
 
 
 def test_distances_nobody_saw_are_refused(recorded: Recorded) -> None:
-    unseen = Distance(recorded.stay(0), Sighting("robot", 0, 1), 1.0)
+    unseen = Distance(recorded.stay(0), MarkerVisit("robot", 0, 1), 1.0)
     with pytest.raises(DegenerateError) as refused:
         frame.scale_of_distances(
             seen_on_floor(recorded), [unseen], recorded.epochs, recorded.angles

@@ -11,9 +11,8 @@ import pytest
 
 from locatk.core.kernels import kernels
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.bursts import of_windows, split
-from locatk.core.lighthouse.demodulate import CERTAIN, SoftBits, soft_bits
-from locatk.core.lighthouse.identify import (
+from locatk.core.lighthouse.demodulation.bursts import of_windows, split
+from locatk.core.lighthouse.demodulation.identification import (
     ALONE,
     ERROR_SHARE,
     FOLLOW,
@@ -25,7 +24,8 @@ from locatk.core.lighthouse.identify import (
     identify,
     identify_numpy,
 )
-from locatk.core.lighthouse.light import Edges
+from locatk.core.lighthouse.demodulation.soft_bits import CERTAIN, SoftBits, soft_bits
+from locatk.core.lighthouse.recording import Edges
 
 CAPTURE = "benchmarks/demodulation_code/logic_analyser_capture.sal"
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.lighthouse.bursts import split
 from locatk.core.lighthouse.channels import channel_of
-from locatk.core.lighthouse.identify import ALONE
-from locatk.core.lighthouse.judge import Reading, identified, judge
-from locatk.core.lighthouse.light import Edges
-from locatk.core.lighthouse.rotor import Found, find_rotors
+from locatk.core.lighthouse.demodulation.burst_validation import Reading, identified, judge
+from locatk.core.lighthouse.demodulation.bursts import split
+from locatk.core.lighthouse.demodulation.identification import ALONE
+from locatk.core.lighthouse.demodulation.rotor import Found, find_rotors
+from locatk.core.lighthouse.recording import Edges
 
 
 def reading(line: Edges, found: Found | None = None) -> Reading:

@@ -11,9 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.generic import UNITS
-from locatk.core.lighthouse.locate import BLOCK, Fixes, locate
+from locatk.core.lighthouse.calibration import FACTORY_UNITS, Calibration
+from locatk.core.lighthouse.localization.positions import BLOCK, Fixes, locate
 
 Array = NDArray[np.float64]
 Rig = tuple[Array, Array, tuple[Calibration, ...]]
@@ -178,7 +177,7 @@ def test_no_place_behind_a_station(world: Any) -> None:
 
 
 def test_a_ray_along_the_floor_meets_it_nowhere_near(world: Any) -> None:
-    level = world.Lamp(1, np.array([0.0, 0.0, 0.5]), np.eye(3), world.planes_of(UNITS[0]))
+    level = world.Lamp(1, np.array([0.0, 0.0, 0.5]), np.eye(3), world.planes_of(FACTORY_UNITS[0]))
     angles = level.angles(np.array([[2.0, 0.0, 0.5]]))[None]
     with warnings.catch_warnings():
         warnings.simplefilter("error")

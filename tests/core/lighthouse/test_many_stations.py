@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse.assemble import Assembly, assemble
-from locatk.core.lighthouse.generic import GENERIC, MODEL_SIGMA, UNITS
+from locatk.core.lighthouse.calibration import FACTORY_UNITS, GENERIC_CALIBRATION, MODEL_SIGMA_RAD
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.simulate import SimulationOptions, simulate
+from locatk.core.lighthouse.scene.assembly import Assembly, assemble
+from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
 from locatk.core.lighthouse.solver import solve
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ def hall(world: Any, number: int, length: float) -> tuple[Any, ...]:
         x = length * (k + 0.5) / number
         place = np.array([x, 2.4 * (-1) ** k, rng.uniform(1.8, 2.6)])
         aim = np.array([x + rng.normal(0, 0.3), 0.0, 0.2])
-        planes = world.planes_of(UNITS[k % len(UNITS)])
+        planes = world.planes_of(FACTORY_UNITS[k % len(FACTORY_UNITS)])
         found.append(world.Lamp(k + 1, place, world.look(place, aim, rng.normal(0, 0.03)), planes))
     return tuple(found)
 
@@ -72,7 +72,9 @@ def nearest(lamps: Any, points: Array, angles: Array, number: int) -> Array:
 def run(angles: Array, planar: bool | None = None) -> Assembly:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return assemble(angles, (GENERIC,) * angles.shape[1], sigma=MODEL_SIGMA, planar=planar)
+        return assemble(
+            angles, (GENERIC_CALIBRATION,) * angles.shape[1], sigma=MODEL_SIGMA_RAD, planar=planar
+        )
 
 
 def check(found: Assembly, lamps: Any, points: Array, mean_m: float) -> None:

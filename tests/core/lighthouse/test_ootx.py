@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError, LocatkError
-from locatk.core.lighthouse import ootx
 from locatk.core.lighthouse.calibration import PARAMETERS
 from locatk.core.lighthouse.channels import PERIOD_TICKS
+from locatk.core.lighthouse.demodulation import ootx
 
 Bits = NDArray[np.int8]
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse import paper
-from locatk.core.lighthouse.angles import paper_image_points
-from locatk.core.lighthouse.scene import Distance, Scene, Sighting
+from locatk.core.lighthouse.light_planes import paper_image_points
+from locatk.core.lighthouse.published import scene as paper
+from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
 
 Array = NDArray[np.float64]
@@ -139,8 +139,8 @@ def test_a_session_is_solved_as_the_paper_does(world: Any, flat: bool) -> None:
 def test_a_distance_nobody_saw_is_refused(world: Any) -> None:
     lamps = ideal(world, 2, 16)
     recording = world.drive(lamps, world.curve(60, flat=True))
-    seen = Sighting("robot", int(recording.time_ns[0]), int(recording.time_ns[3]))
-    scene = Scene(distances=(Distance(seen, Sighting("robot", 0, 1), 1.0),))
+    seen = MarkerVisit("robot", int(recording.time_ns[0]), int(recording.time_ns[3]))
+    scene = Scene(distances=(Distance(seen, MarkerVisit("robot", 0, 1), 1.0),))
     with pytest.raises(DegenerateError, match="distance") as refused:
         solve(recording.sweeps, scene, SolveOptions(method="paper", scene="two-planar"))
     assert refused.value.hint

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.lighthouse import lfsr, paper_light
-from locatk.core.lighthouse.light import Edges
-from locatk.core.lighthouse.paper_light import decode, demodulate, identify, windows_of
+from locatk.core.lighthouse import lfsr
+from locatk.core.lighthouse.published import light_decoding as paper_light
+from locatk.core.lighthouse.published.light_decoding import decode, demodulate, identify, windows_of
+from locatk.core.lighthouse.recording import Edges
 
 BIT_SAMPLES = 32 / 6
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from locatk.core.lighthouse.places import STILL, gather
+from locatk.core.lighthouse.scene.keyframes import STILL, gather
 
 
 def standing(places: np.ndarray, each: int, noise: float = 1e-4) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from locatk.core.lighthouse.planes import NEAR_ROTATIONS, planes_of
+from locatk.core.lighthouse.demodulation.planes import NEAR_ROTATIONS, planes_of
 
 
 def both(rotations: int, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,9 +8,14 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp, rotation_log
-from locatk.core.lighthouse.calibration import IDEAL, Calibration, predict_angles
-from locatk.core.lighthouse.generic import GENERIC, UNITS
-from locatk.core.lighthouse.pnp import lit_from_behind, locate_device
+from locatk.core.lighthouse.calibration import (
+    FACTORY_UNITS,
+    GENERIC_CALIBRATION,
+    IDEAL_CALIBRATION,
+    Calibration,
+    predict_angles,
+)
+from locatk.core.lighthouse.devices.pnp import lit_from_behind, locate_device
 from locatk.core.lighthouse.receiver import DECK, Receiver
 
 Array = NDArray[np.float64]
@@ -27,7 +32,7 @@ TRACKER = Receiver(0.045 * BALL + [0.01, 0.0, 0.02], BALL)
 
 
 def factory(unit: int) -> Calibration:
-    row = UNITS[unit]
+    row = FACTORY_UNITS[unit]
     sweeps = np.zeros((2, 7))
     sweeps[1, 0] = row[0]
     for column in range(6):
@@ -69,7 +74,7 @@ def test_the_pose_is_that_of_opencvs_camera(turn: list[float]) -> None:
     angles = ideal_angles_of(camera_rays(TRACKER, position, rotation))
     place = position + TRACKER.position_m @ rotation.T
     angles[lit_from_behind(place, TRACKER.normal @ rotation.T)] = np.nan
-    best = locate_device(angles, TRACKER, IDEAL)[0]
+    best = locate_device(angles, TRACKER, IDEAL_CALIBRATION)[0]
     assert best.position == pytest.approx(position, abs=1e-6)
     assert np.linalg.norm(rotation_log(best.rotation @ rotation.T)) < 1e-6
     assert best.from_behind == 0.0
@@ -146,16 +151,21 @@ def test_light_from_behind_comes_last() -> None:
     """A deck with its photodiodes numbered the other way round is seen from below."""
     position, rotation = np.array([2.0, 0.1, -1.0]), rotation_exp([0.1, 0.1, 0.4])
     mirrored = Receiver(DECK.position_m * [-1.0, 1.0, 1.0], DECK.normal)
-    angles = seen(DECK, position, rotation, GENERIC)
-    readings = locate_device(angles, mirrored, GENERIC)
+    angles = seen(DECK, position, rotation, GENERIC_CALIBRATION)
+    readings = locate_device(angles, mirrored, GENERIC_CALIBRATION)
     assert readings
     assert all(r.from_behind > 0.9 for r in readings)
 
 
 def test_too_little_has_no_pose() -> None:
-    angles = seen(DECK, np.array([2.0, 0.0, 0.0]), np.eye(3), IDEAL)
+    angles = seen(DECK, np.array([2.0, 0.0, 0.0]), np.eye(3), IDEAL_CALIBRATION)
     angles[2:, 0] = np.nan
-    assert locate_device(angles, DECK, IDEAL) == []
-    assert locate_device(np.full((4, 2), np.nan), DECK, IDEAL) == []
+    assert locate_device(angles, DECK, IDEAL_CALIBRATION) == []
+    assert locate_device(np.full((4, 2), np.nan), DECK, IDEAL_CALIBRATION) == []
     line = Receiver(np.array([[0.0, 0, 0], [0.01, 0, 0], [0.02, 0, 0], [0.03, 0, 0]]))
-    assert locate_device(seen(line, np.array([2.0, 0, 0]), np.eye(3), IDEAL), line, IDEAL) == []
+    assert (
+        locate_device(
+            seen(line, np.array([2.0, 0, 0]), np.eye(3), IDEAL_CALIBRATION), line, IDEAL_CALIBRATION
+        )
+        == []
+    )

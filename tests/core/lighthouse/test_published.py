@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from locatk.core import metrics
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse.scene import Distance, Scene, Sighting
+from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot import read_dotbot
@@ -38,9 +38,9 @@ class Grid:
     def edge(self) -> Scene:
         """One 40 mm edge of the grid, as the paper's protocol has it."""
 
-        def stay(place: tuple[int, int, int]) -> Sighting:
+        def stay(place: tuple[int, int, int]) -> MarkerVisit:
             there = self.time_ns[np.all(self.truth == place, axis=1)]
-            return Sighting(self.sweeps.devices[0], int(there.min()), int(there.max()))
+            return MarkerVisit(self.sweeps.devices[0], int(there.min()), int(there.max()))
 
         return Scene(distances=(Distance(stay((0, 0, 0)), stay((40, 0, 0)), 0.040),))
 

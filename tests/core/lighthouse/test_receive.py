@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.lighthouse import ootx
 from locatk.core.lighthouse.calibration import PARAMETERS
-from locatk.core.lighthouse.light import Edges
-from locatk.core.lighthouse.receive import Reception, receive
+from locatk.core.lighthouse.demodulation import ootx
+from locatk.core.lighthouse.demodulation.pipeline import Reception, receive
+from locatk.core.lighthouse.recording import Edges
 
 CAPTURE = "benchmarks/demodulation_code/logic_analyser_capture.sal"
 

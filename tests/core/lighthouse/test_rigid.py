@@ -17,15 +17,14 @@ from locatk.core.geometry import (
     rotation_log,
     umeyama,
 )
-from locatk.core.lighthouse.calibration import Calibration, predict_angles
+from locatk.core.lighthouse.calibration import FACTORY_UNITS, Calibration, predict_angles
 from locatk.core.lighthouse.channels import period_ticks
-from locatk.core.lighthouse.generic import UNITS
-from locatk.core.lighthouse.pnp import lit_from_behind
+from locatk.core.lighthouse.devices.pnp import lit_from_behind
+from locatk.core.lighthouse.devices.rigid_solver import RigidAnswer, solve_rigid
 from locatk.core.lighthouse.receiver import DECK, Receiver
-from locatk.core.lighthouse.rigid import RigidAnswer, solve_rigid
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.simulate_light import Light
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.simulation.optics import Light
 
 Array = NDArray[np.float64]
 Motion = Callable[[Array], tuple[Array, Array]]
@@ -42,7 +41,7 @@ TRACKER = Receiver(0.045 * BALL + [0.01, 0.0, 0.02], BALL)
 
 
 def factory(unit: int) -> Calibration:
-    row = UNITS[unit]
+    row = FACTORY_UNITS[unit]
     sweeps = np.zeros((2, 7))
     sweeps[1, 0] = row[0]
     for column in range(6):

@@ -7,18 +7,18 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp, rotation_log
-from locatk.core.lighthouse import bundle, rigid_bundle
-from locatk.core.lighthouse.calibration import predict_angles
-from locatk.core.lighthouse.generic import GENERIC
-from locatk.core.lighthouse.rigid_bundle import adjust_rigid
-from locatk.core.lighthouse.rigid_fit import Looks, Poses, Stations, fit, linearise, places
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, predict_angles
+from locatk.core.lighthouse.devices import bundle_adjustment as rigid_bundle
+from locatk.core.lighthouse.devices.bundle_adjustment import adjust_rigid
+from locatk.core.lighthouse.devices.pose_fit import Looks, Poses, Stations, fit, linearise, places
+from locatk.core.lighthouse.scene import bundle_adjustment as bundle
 
 Array = NDArray[np.float64]
 
 STATIONS: Stations = (
     np.array([[-2.0, 0.0, 1.0], [0.3, -2.0, 1.2]]),
     rotation_exp(np.array([[0.0, 0.3, 0.1], [0.1, 0.2, 1.5]])),
-    (GENERIC, GENERIC),
+    (GENERIC_CALIBRATION, GENERIC_CALIBRATION),
 )
 
 

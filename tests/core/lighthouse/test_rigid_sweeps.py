@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.lighthouse.rigid_sweeps import DeviceSweeps, planes, windows
+from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, planes, windows
 
 PERIOD_NS = 959_000 / 48e6 * 1e9
 COUNTS = 959_000 / 8

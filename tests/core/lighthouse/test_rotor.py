@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse.rotor import AGREE_S, LEAST_BURSTS, Found, Rotor, find_rotors
+from locatk.core.lighthouse.demodulation.rotor import (
+    AGREE_S,
+    LEAST_BURSTS,
+    Found,
+    Rotor,
+    find_rotors,
+)
 
 Array = NDArray[np.float64]
 RATE = 40e6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from locatk.core.lighthouse.selection import LEAST_HELD_OUT_FROM, evenly, hold_out
+from locatk.core.lighthouse.scene.selection import LEAST_HELD_OUT_FROM, evenly, hold_out
 
 ALL = np.ones((1000, 2), bool)
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError, InputError, LocatkError
 from locatk.core.geometry import Similarity, rotation_exp, umeyama
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.poses import REACH_M
-from locatk.core.lighthouse.scene import Distance, Scene, Sighting
+from locatk.core.lighthouse.localization.photodiodes import REACH_M
+from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
-from locatk.core.lighthouse.sweeps import Sweeps
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -145,7 +145,7 @@ def test_a_distance_gives_metres(world: Any, flat: bool) -> None:
     points = places[np.r_[[0] * 10, :120, [119] * 10]]
     drive = world.drive(lamps, points)
     stays = [
-        Sighting("robot", int(drive.time_ns[a]), int(drive.time_ns[b]))
+        MarkerVisit("robot", int(drive.time_ns[a]), int(drive.time_ns[b]))
         for a, b in ((0, 9), (-10, -1))
     ]
     length = float(np.linalg.norm(places[-1] - places[0]))
@@ -786,7 +786,7 @@ def test_a_marker_on_an_unknown_device_is_named(world: Any) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(60, flat=True))
     (marker, *_) = world.markers_of(lamps, world.square)
-    wrong = replace(marker, sightings=(Sighting("green", 0, 1),))
+    wrong = replace(marker, sightings=(MarkerVisit("green", 0, 1),))
     with pytest.raises(InputError, match="green") as refused:
         strict(drive.sweeps, Scene(markers=(wrong,)))
     assert "robot" in str(refused.value.hint)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse import twoview
+from locatk.core.lighthouse.scene import two_view as twoview
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.verification import StationCheck, verify, wrong_station
 from locatk.core.lighthouse.solver import solve
-from locatk.core.lighthouse.verification import StationCheck, verify, wrong_station
 
 Array = NDArray[np.float64]
 NAMES = ("phase", "tilt", "curve", "gibmag", "gibpha", "ogeemag", "ogeephase")

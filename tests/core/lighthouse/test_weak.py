@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.lighthouse.bursts import Bursts, split
-from locatk.core.lighthouse.demodulate import soft_bits
-from locatk.core.lighthouse.identify import identify
-from locatk.core.lighthouse.weak import BESIDE_S, CHANCE, DELAY_BITS, belongs
+from locatk.core.lighthouse.demodulation.bursts import Bursts, split
+from locatk.core.lighthouse.demodulation.identification import identify
+from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
+from locatk.core.lighthouse.demodulation.weak_bursts import BESIDE_S, CHANCE, DELAY_BITS, belongs
 
 
 def fragment(light: Any, index: int, start_s: float, length: int) -> np.ndarray:

@@ -9,11 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.lighthouse import lfsr, windows
-from locatk.core.lighthouse.bursts import of_windows
-from locatk.core.lighthouse.demodulate import soft_bits
-from locatk.core.lighthouse.identify import identify
-from locatk.core.lighthouse.windows import read_windows
+from locatk.core.lighthouse import lfsr
+from locatk.core.lighthouse.demodulation import windows
+from locatk.core.lighthouse.demodulation.bursts import of_windows
+from locatk.core.lighthouse.demodulation.identification import identify
+from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
+from locatk.core.lighthouse.demodulation.windows import read_windows
 
 
 def sampled(

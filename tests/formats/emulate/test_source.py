@@ -12,7 +12,7 @@ import pytest
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.landmarks.halls import HallSamples, HallSensors
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats import arrays, halls, observations, wire

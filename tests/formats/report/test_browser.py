@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from locatk.core import metrics
-from locatk.core.lighthouse.calibration import IDEAL
+from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -86,7 +86,7 @@ def subject(name: str = "red", n: int = 200) -> Subject:
     noisy = place + 1e-3 * rng.standard_normal((n, 3))
     solved = Trajectory.from_positions(name, "floor", time_ns, noisy, covariance)
     scene = Scene(
-        stations=(Station(1, np.array([-2.0, 0.0, 2.0]), np.eye(3), IDEAL),),
+        stations=(Station(1, np.array([-2.0, 0.0, 2.0]), np.eye(3), IDEAL_CALIBRATION),),
         markers=(Marker(name, np.array([0.5, 0.5, 0.0])),),
         scale="markers",
     )

@@ -19,7 +19,7 @@ import pytest
 from locatk.core import metrics
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import MissingDataError, OutputExistsError
-from locatk.core.lighthouse.calibration import IDEAL
+from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -33,7 +33,7 @@ from locatk.formats.session import Session
 START_NS = 1_767_225_600_000_000_000
 EVIL = "</script><img src=x onerror=alert(1)>"
 SCENE = Scene(
-    stations=(Station(1, np.array([-2.0, 0.0, 2.0]), np.eye(3), IDEAL),),
+    stations=(Station(1, np.array([-2.0, 0.0, 2.0]), np.eye(3), IDEAL_CALIBRATION),),
     markers=(Marker("corner", np.array([0.5, 0.5, 0.0])),),
     planar=True,
     scale="markers",

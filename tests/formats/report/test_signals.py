@@ -16,8 +16,8 @@ pytest.importorskip("plotly")
 from locatk.core.dots import simulate as dots_simulate
 from locatk.core.dots import solver as dots_solver
 from locatk.core.landmarks.halls import HallSamples, HallSensors
-from locatk.core.lighthouse import simulate as lighthouse_simulate
 from locatk.core.lighthouse import solver as lighthouse_solver
+from locatk.core.lighthouse.simulation import session as lighthouse_simulate
 from locatk.core.polaris import simulate as polaris_simulate
 from locatk.core.polaris import solver as polaris_solver
 from locatk.core.polaris.array import Samples

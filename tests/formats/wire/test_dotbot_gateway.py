@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.formats.importers.dotbot import read_dotbot
 from locatk.formats.wire.decoder import Batch, Options
 from locatk.formats.wire.dotbot_gateway import (

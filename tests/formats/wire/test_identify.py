@@ -12,7 +12,7 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats.wire import DEVICES, Device, identify

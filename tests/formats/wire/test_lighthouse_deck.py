@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.sweeps import Sweeps
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.formats.importers.dotbot import read_dotbot
 from locatk.formats.wire.decoder import Batch, Options
 from locatk.formats.wire.lighthouse_deck import (

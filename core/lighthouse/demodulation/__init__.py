@@ -1,0 +1,1 @@
+"""Demodulation: edges of light to sweeps, rotors and factory data."""

@@ -1,0 +1,1 @@
+"""Rigid devices: poses of devices with several photodiodes at known positions."""

@@ -1,0 +1,1 @@
+"""Positions of single photodiodes in a known scene."""
