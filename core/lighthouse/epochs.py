@@ -78,7 +78,7 @@ class Epochs:
         )
 
 
-def group(sweeps: Sweeps) -> Epochs:
+def group_epochs(sweeps: Sweeps) -> Epochs:
     """Collect sweeps into epochs.
 
     Sweeps of one epoch that were received at different times are moved to its middle

@@ -18,13 +18,13 @@ from locatk.core.lighthouse.calibration import (
 )
 from locatk.core.lighthouse.epochs import Epochs, angles_of
 from locatk.core.lighthouse.light_planes import rays as rays_of
-from locatk.core.lighthouse.localization.floor_map import fit_floor_map
+from locatk.core.lighthouse.localization.floor_map import fit_floor_homography
 from locatk.core.lighthouse.noise import INLIER_GATE_RAD
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene import frame as frames
-from locatk.core.lighthouse.scene.assembly import Assembly, assemble
-from locatk.core.lighthouse.scene.bundle_adjustment import Rig, adjust
-from locatk.core.lighthouse.scene.keyframes import gather
+from locatk.core.lighthouse.scene.assembly import Assembly, estimate_stations
+from locatk.core.lighthouse.scene.bundle_adjustment import BundleState, adjust_bundle
+from locatk.core.lighthouse.scene.keyframes import average_standstills
 from locatk.core.lighthouse.scene.resection import resect_on_plane
 from locatk.core.trajectory import Trajectory
 
@@ -125,8 +125,8 @@ class Job:
                 hint="use --scene one-planar with markers",
             )
         planar = {"two-planar": True, "two-3d": False}.get(self.kind)
-        places, _ = gather(self.angles, self.epochs.device)
-        assembly = assemble(
+        places, _ = average_standstills(self.angles, self.epochs.device)
+        assembly = estimate_stations(
             places,
             tuple(self.calibration(int(c)) for c in self.epochs.channels),
             sigma=MODEL_SIGMA_RAD,
@@ -173,7 +173,7 @@ class Job:
             self.notes.append(f"station on channel {', '.join(channels)} {reason}: left out")
         self.keep_stations(assembly.stations, "station_not_solved")
 
-    def _marker_misfit(self, rig: Rig, columns: tuple[int, int]) -> float:
+    def _marker_misfit(self, rig: BundleState, columns: tuple[int, int]) -> float:
         """Rms distance in metres of the markers from where two stations on a plane see them;
         infinite where too few are seen to tell."""
         known, seen = frames.sighted_markers(self.scene.markers, self.epochs, self.angles)
@@ -201,9 +201,9 @@ class Job:
         calibration = self.calibration(int(self.epochs.channels[0]))
         rays = rays_of(ideal_angles(seen[:, 0], calibration), calibration.tilts)
         position, rotation = resect_on_plane(flat[:, :2], rays)
-        done = adjust(
+        done = adjust_bundle(
             seen,
-            Rig(position[None], rotation[None], (calibration,), flat),
+            BundleState(position[None], rotation[None], (calibration,), flat),
             sigma=MODEL_SIGMA_RAD,
             planar=True,
             fixed_points=True,
@@ -213,12 +213,12 @@ class Job:
         self.facts["marker_residual_rad"] = float(np.sqrt(np.nanmean(done.residuals**2)))
         rig = done.rig
         raised = rig.positions + np.array([0.0, 0.0, floor_z])
-        rig = Rig(raised, rig.rotations, rig.calibrations, rig.points)
+        rig = BundleState(raised, rig.rotations, rig.calibrations, rig.points)
         solved = self._scene_of(rig, True, floor_z, "markers", done.station_covariance)
-        station = replace(solved.stations[0], floor_map=fit_floor_map(flat[:, :2], rays))
+        station = replace(solved.stations[0], floor_map=fit_floor_homography(flat[:, :2], rays))
         return replace(solved, stations=(station,))
 
-    def _framed(self, rig: Rig, planar: bool, covariance: Array) -> Scene:
+    def _framed(self, rig: BundleState, planar: bool, covariance: Array) -> Scene:
         """Bring a rig into the frame and scale that markers, distances or odometry give."""
         known, seen = frames.sighted_markers(self.scene.markers, self.epochs, self.angles)
         to = frames.place_on_markers(rig, planar, known, seen)
@@ -230,8 +230,8 @@ class Job:
                     f"the markers are {1e3 * misfit:.0f} mm (rms) from where the stations see "
                     "them: a marker is measured wrong, or the scene is"
                 )
-            rig = frames.moved(rig, to)
-            covariance = frames.turned(covariance, to.scale, to.rotation)
+            rig = frames.transform_state(rig, to)
+            covariance = frames.transform_covariance(covariance, to.scale, to.rotation)
             floor_z = float(np.mean(known[:, 2])) if planar else 0.0
             if planar and np.mean(rig.positions[:, 2]) < floor_z:
                 self.notes.append(
@@ -247,15 +247,15 @@ class Job:
         to = frames.at_first_station(rig, planar, scale)
         frame = self.scene.frame if planar else f"station-{self.epochs.channels[0]}"
         scene = self._scene_of(
-            frames.moved(rig, to),
+            frames.transform_state(rig, to),
             planar,
             0.0,
             source,
-            frames.turned(covariance, scale, to.rotation),
+            frames.transform_covariance(covariance, scale, to.rotation),
         )
         return replace(scene, frame=frame)
 
-    def _scale(self, rig: Rig, planar: bool) -> tuple[float, str]:
+    def _scale(self, rig: BundleState, planar: bool) -> tuple[float, str]:
         if self.scene.distances:
             scale = frames.scale_of_distances(
                 lambda seen: frames.sight(rig, planar, seen).position,
@@ -285,7 +285,7 @@ class Job:
         return 1.0 / float(np.linalg.norm(rig.positions[1] - rig.positions[0])), "unit"
 
     def _scene_of(
-        self, rig: Rig, planar: bool, floor_z: float, scale: str, covariance: Array
+        self, rig: BundleState, planar: bool, floor_z: float, scale: str, covariance: Array
     ) -> Scene:
         """The artifact: a station each, with the assumptions it stands on."""
         guessed = [

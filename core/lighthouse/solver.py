@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.lighthouse.devices.solver import rigid_devices, solve_devices
-from locatk.core.lighthouse.epochs import group
+from locatk.core.lighthouse.epochs import group_epochs
 from locatk.core.lighthouse.job import Job
 from locatk.core.lighthouse.localization import photodiodes as poses
 from locatk.core.lighthouse.receiver import Receiver
@@ -97,7 +97,7 @@ def _solve_points(
     sweeps: Sweeps, scene: Scene, options: SolveOptions, odometry: Sequence[Trajectory]
 ) -> Solution:
     """Poses of photodiodes, each by itself."""
-    epochs = group(sweeps)
+    epochs = group_epochs(sweeps)
     if len(epochs) == 0 or len(epochs.channels) == 0:
         raise DegenerateError(
             "the recording has no usable sweep",

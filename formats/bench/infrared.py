@@ -17,9 +17,13 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse.demodulation import bursts as light_bursts
 from locatk.core.lighthouse.demodulation import weak_bursts as weak
-from locatk.core.lighthouse.demodulation.burst_validation import Reading
-from locatk.core.lighthouse.demodulation.identification import Matches
-from locatk.core.lighthouse.demodulation.pipeline import SHORTEST_S, Reception, receive
+from locatk.core.lighthouse.demodulation.burst_validation import ValidatedBursts
+from locatk.core.lighthouse.demodulation.identification import SequenceMatches
+from locatk.core.lighthouse.demodulation.pipeline import (
+    SHORTEST_S,
+    DemodulatedRecording,
+    demodulate_recording,
+)
 from locatk.core.lighthouse.demodulation.windows import read_windows
 from locatk.core.lighthouse.published import light_decoding as paper_light
 from locatk.core.lighthouse.published.light_receiver import WINDOW_START_S
@@ -84,7 +88,7 @@ def capture(folder: Path, name: str) -> Edges:
 
 
 def _demodulation(folder: Path) -> list[Figure]:
-    reception = receive([capture(folder, CAPTURES[0])])
+    reception = demodulate_recording([capture(folder, CAPTURES[0])])
     (reading,) = reception.readings
     alone = reading.read & (np.abs(reading.off_s) <= ROTOR_S)
     rims = reading.beside >= 0
@@ -122,23 +126,23 @@ def _percent(true: NDArray[np.bool_]) -> float:
     return 100 * float(np.mean(true))
 
 
-def _wrong_rims(reading: Reading) -> float:
+def _wrong_rims(reading: ValidatedBursts) -> float:
     """Share of unread bursts that are taken for light of a place where nothing was sent."""
     m = reading.matches
-    elsewhere = Matches(
+    elsewhere = SequenceMatches(
         m.polynomial, (m.index + 20_000) % 131_071, m.evidence, m.begin, m.end, m.known, m.wrong
     )
-    beside = weak.belongs(reading.bursts, reading.bits, elsewhere, reading.read)
+    beside = weak.match_fragments(reading.bursts, reading.bits, elsewhere, reading.read)
     return float(np.mean(beside[~reading.read] >= 0))
 
 
-def _decode_rate(reception: Reception) -> float:
+def _decode_rate(reception: DemodulatedRecording) -> float:
     sweeps = sum(station.sweeps for station in reception.stations)
     missed = sum(station.missed or 0 for station in reception.stations)
     return sweeps / (sweeps + missed)
 
 
-def _stations(reception: Reception) -> list[Figure]:
+def _stations(reception: DemodulatedRecording) -> list[Figure]:
     """Factory data and periods of both stations."""
     heard = {station.channel: station for station in reception.stations}
     right = sum(channel in heard and heard[channel].id == IDS[channel] for channel in IDS)
@@ -191,7 +195,7 @@ def _windows(folder: Path) -> list[Figure]:
 def _others(folder: Path) -> list[Figure]:
     rows = []
     for name in CAPTURES[1:]:
-        reception = receive([capture(folder, name)])
+        reception = demodulate_recording([capture(folder, name)])
         (reading,) = reception.readings
         decoded = _percent(reading.read | (reading.beside >= 0))
         rows.append(
@@ -205,7 +209,7 @@ def _others(folder: Path) -> list[Figure]:
 def _fpga(folder: Path) -> list[Figure]:
     rows = []
     for name, (target, peer) in FPGA.items():
-        reception = receive(read_light(folder / "fpga" / f"{name}.csv"))
+        reception = demodulate_recording(read_light(folder / "fpga" / f"{name}.csv"))
         (reading,) = reception.readings
         right = reading.read & np.isin(reading.matches.polynomial, (12, 13))
         sigma = next(iter(reception.rotors.values())).sigma / reading.bursts.rate_hz
@@ -220,7 +224,7 @@ def _fpga(folder: Path) -> list[Figure]:
 def published_windows(folder: Path) -> NDArray[np.uint8]:
     """The peer's windows of the demodulation capture, (11136, 64)."""
     edges = capture(folder, CAPTURES[0])
-    bursts = light_bursts.split(edges)
+    bursts = light_bursts.split_bursts(edges)
     bursts = bursts.take(bursts.duration_s > SHORTEST_S)
     start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
     return paper_light.windows_of(edges, start)

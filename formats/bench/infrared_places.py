@@ -6,7 +6,11 @@ import numpy as np
 
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIALS
-from locatk.core.lighthouse.demodulation.identification import ALONE, Matches, identify
+from locatk.core.lighthouse.demodulation.identification import (
+    ALONE,
+    SequenceMatches,
+    identify_sequences,
+)
 from locatk.core.lighthouse.demodulation.soft_bits import CERTAIN, SoftBits
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED
@@ -40,7 +44,7 @@ def _right(polynomial: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     words = lfsr.bits_at(index, polynomial, BITS)
     shift = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
     ones = (words[:, None] >> shift & np.uint64(1)).astype(np.int8)
-    found: Matches = identify(_sure(ones))
+    found: SequenceMatches = identify_sequences(_sure(ones))
     return np.asarray(found.certain() & (found.polynomial == polynomial) & (found.index == index))
 
 
@@ -50,7 +54,7 @@ def noise_share() -> float:
     sign = rng.integers(0, 2, (NOISE, NOISE_BITS))
     size = rng.integers(0, CERTAIN + 1, (NOISE, NOISE_BITS))
     value = np.where(sign > 0, size, -size).astype(np.int8)
-    return float(np.mean(identify(_rows(value)).certain(ALONE)))
+    return float(np.mean(identify_sequences(_rows(value)).certain(ALONE)))
 
 
 def _sure(ones: np.ndarray[tuple[int, ...], np.dtype[np.int8]]) -> SoftBits:

@@ -9,8 +9,8 @@ import numpy as np
 
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.demodulation.bursts import of_windows
-from locatk.core.lighthouse.demodulation.identification import identify
+from locatk.core.lighthouse.demodulation.bursts import bursts_of_windows
+from locatk.core.lighthouse.demodulation.identification import identify_sequences
 from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
 from locatk.core.lighthouse.demodulation.windows import read_windows
 from locatk.formats.bench import Figure
@@ -51,7 +51,7 @@ def figures(data: Path) -> list[Figure]:
 
 def measure(data: str) -> list[float]:
     """Windows a second, soft bits a second, seconds for the tables, seconds for a capture."""
-    from locatk.core.lighthouse.demodulation.pipeline import receive
+    from locatk.core.lighthouse.demodulation.pipeline import demodulate_recording
     from locatk.formats.bench.infrared import CAPTURES, capture, published_windows
 
     start = time.process_time()
@@ -60,8 +60,8 @@ def measure(data: str) -> list[float]:
     folder = Path(data) / "lighthouse"
     windows = np.concatenate([published_windows(folder)] * BATCH)
     whole = cpu_seconds(lambda: read_windows(windows), REPEATS)
-    bits = soft_bits(of_windows(windows))
-    index = cpu_seconds(lambda: identify(bits), REPEATS)
+    bits = soft_bits(bursts_of_windows(windows))
+    index = cpu_seconds(lambda: identify_sequences(bits), REPEATS)
     edges = capture(folder, CAPTURES[0])
-    light = cpu_seconds(lambda: receive([edges]), 3)
+    light = cpu_seconds(lambda: demodulate_recording([edges]), 3)
     return [len(windows) / whole, len(windows) / index, tables, light]

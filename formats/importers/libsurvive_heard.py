@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import period_ticks
-from locatk.core.lighthouse.demodulation.tracker_syncs import Rotor, fit_rotor
+from locatk.core.lighthouse.demodulation.tracker_syncs import TrackerRotor, fit_rotor
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.formats.importers.libsurvive_clock import Run, runs
 from locatk.formats.importers.libsurvive_lines import Columns, Recording
@@ -46,7 +46,7 @@ class HeardSweeps:
         Slow bit of the rotation, -1 where it is not known.
     plane : (n,) int64 ndarray
         0, 1, or -1 where it can be both.
-    rotors : dict of int to list of Rotor
+    rotors : dict of int to list of TrackerRotor
         By channel (from 0), one a run of the device's counter.
     warnings : list of str
     unplaced : int
@@ -64,7 +64,7 @@ class HeardSweeps:
     turn: Array
     bit: Rows
     plane: Rows
-    rotors: dict[int, list[Rotor]] = field(default_factory=dict)
+    rotors: dict[int, list[TrackerRotor]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     unplaced: int = 0
     rotorless: int = 0

@@ -10,7 +10,11 @@ import numpy as np
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.channels import channel_of
 from locatk.core.lighthouse.demodulation.identification import false_rate
-from locatk.core.lighthouse.demodulation.pipeline import Caught, Reception, receive
+from locatk.core.lighthouse.demodulation.pipeline import (
+    DecodedSweeps,
+    DemodulatedRecording,
+    demodulate_recording,
+)
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.formats.importers.saleae import LightCapture, read_capture
@@ -60,12 +64,14 @@ def read_saleae(
     try:
         if method == "paper":
             return _as_paper(capture, device)
-        return _session(capture, receive(capture.edges), device)
+        return _session(capture, demodulate_recording(capture.edges), device)
     except InputError as error:
         raise InputError(error.message, file=capture.file, hint=error.hint) from None
 
 
-def _session(capture: LightCapture, reception: Reception, device: str) -> ImportedSession:
+def _session(
+    capture: LightCapture, reception: DemodulatedRecording, device: str
+) -> ImportedSession:
     facts = capture.facts()
     bursts = sum(len(reading.bursts) for reading in reception.readings)
     read = sum(int(np.count_nonzero(reading.read)) for reading in reception.readings)
@@ -90,7 +96,7 @@ def _session(capture: LightCapture, reception: Reception, device: str) -> Import
     )
 
 
-def _false_polynomials(reception: Reception) -> str:
+def _false_polynomials(reception: DemodulatedRecording) -> str:
     """How many bursts name a station that no rotor supports, and how many by chance would."""
     strange, alone, chance = 0, 0, 0.0
     for reading in reception.readings:
@@ -132,7 +138,7 @@ def _as_paper(capture: LightCapture, device: str) -> ImportedSession:
     )
 
 
-def _sweeps(capture: LightCapture, caught: Caught, device: str) -> Sweeps:
+def _sweeps(capture: LightCapture, caught: DecodedSweeps, device: str) -> Sweeps:
     """Sweeps by the recorder's clock; a capture without a date begins in 1970."""
     rate, start_ns = capture.edges[0].rate_hz, capture.edges[0].start_ns
     since_ns = np.rint(caught.tick * (NANOSECONDS_PER_S / rate)).astype(np.int64)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
-from locatk.core.lighthouse.epochs import Epochs, group
+from locatk.core.lighthouse.epochs import Epochs, group_epochs
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.solution import Solution
 from locatk.formats.messages import SWEEPS, BatchError
@@ -83,7 +83,7 @@ def _sweeps(session: Session, topic: str, device: str, payloads: list[bytes]) ->
 
 def _used(sweeps: Sweeps, solution: Solution) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which sweeps the solver's moments hold, and which belong to a moment that has a pose."""
-    epochs = group(sweeps)
+    epochs = group_epochs(sweeps)
     held, posed = np.zeros(len(sweeps), bool), np.zeros(len(sweeps), bool)
     poses = {each.device: each.time_ns for each in solution.trajectories}
     column = np.searchsorted(epochs.channels, sweeps.channel)

@@ -1,4 +1,4 @@
-"""Simulated sweeps against physics that is written down here a second time."""
+"""SimulatedSession sweeps against physics that is written down here a second time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from locatk.core.lighthouse.simulation.session import (
     EPOCH_NS,
     FLAT_MARKERS,
     RAISED_MARKERS,
-    Simulated,
+    SimulatedSession,
     SimulationOptions,
     simulate,
 )
@@ -46,7 +46,7 @@ class Turns:
     period_s: float
 
 
-def turns_of(made: Simulated, device: int, channel: int) -> Turns:
+def turns_of(made: SimulatedSession, device: int, channel: int) -> Turns:
     """Find rotations again from times and counts alone."""
     s = made.sweeps
     mine = np.flatnonzero((s.device == device) & (s.channel == channel))
@@ -63,7 +63,7 @@ def turns_of(made: Simulated, device: int, channel: int) -> Turns:
     return Turns(time_s[rows], count[rows], mine[rows], float(zero_s), float(period_s))
 
 
-def path_of(made: Simulated, device: int) -> tuple[Array, CubicSpline]:
+def path_of(made: SimulatedSession, device: int) -> tuple[Array, CubicSpline]:
     """Times and positions of a robot from the truth, between its samples by splines."""
     truth = made.truth[device]
     time_s = (truth.time_ns - EPOCH_NS) * 1e-9
@@ -429,7 +429,7 @@ def test_outliers_jump_are_reflected_and_are_swapped() -> None:
         assert kind == pytest.approx(total / 3, abs=6)
 
 
-def _is_mirrored(made: Simulated, k: int) -> bool:
+def _is_mirrored(made: SimulatedSession, k: int) -> bool:
     """Whether a sweep is where the robot's image in one of four walls would be seen."""
     s = made.sweeps
     station = made.stations.stations[s.channel[k] - 1]

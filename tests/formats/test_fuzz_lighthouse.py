@@ -32,7 +32,7 @@ from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.demodulation import ootx
-from locatk.core.lighthouse.demodulation.pipeline import receive
+from locatk.core.lighthouse.demodulation.pipeline import demodulate_recording
 from locatk.core.lighthouse.published import light_decoding as paper_light
 from locatk.core.lighthouse.published import light_receiver as paper_receive
 from locatk.core.lighthouse.receiver import DECK
@@ -480,7 +480,7 @@ def edges(rng: np.random.Generator, folder: Path, further: bool) -> None:
     if further:
         paper_receive.receive(lines)
         return
-    sweeps = receive(lines).sweeps
+    sweeps = demodulate_recording(lines).sweeps
     assert np.all(np.isfinite(sweeps.tick))
     assert np.all(np.isfinite(sweeps.count))
     assert np.all(np.diff(sweeps.tick) >= 0)

@@ -14,10 +14,14 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import channel_of, period_counts
 from locatk.core.lighthouse.demodulation.bursts import Bursts
-from locatk.core.lighthouse.demodulation.identification import Matches, expect, identify
-from locatk.core.lighthouse.demodulation.rotor import AGREE_S, SEED, Found, Rotor, zeros
+from locatk.core.lighthouse.demodulation.identification import (
+    SequenceMatches,
+    expect,
+    identify_sequences,
+)
+from locatk.core.lighthouse.demodulation.rotor import AGREE_S, SEED, Rotor, RotorSet, zeros
 from locatk.core.lighthouse.demodulation.soft_bits import SoftBits, soft_bits
-from locatk.core.lighthouse.demodulation.weak_bursts import belongs
+from locatk.core.lighthouse.demodulation.weak_bursts import match_fragments
 
 Array = NDArray[np.float64]
 
@@ -31,7 +35,7 @@ for the rotor, and some for the noise before the first edge."""
 
 
 @dataclass(frozen=True)
-class Reading:
+class ValidatedBursts:
     """The bursts of one photodiode, (n,) ascending in time, and what they say.
 
     Attributes
@@ -51,20 +55,22 @@ class Reading:
 
     bursts: Bursts
     bits: SoftBits
-    matches: Matches
+    matches: SequenceMatches
     read: NDArray[np.bool_]
     beside: NDArray[np.int64]
     off_s: Array
     rejected: dict[str, int]
 
 
-def identified(bursts: Bursts) -> tuple[SoftBits, Matches]:
+def identified(bursts: Bursts) -> tuple[SoftBits, SequenceMatches]:
     """What bursts say by themselves."""
     bits = soft_bits(bursts)
-    return bits, identify(bits)
+    return bits, identify_sequences(bits)
 
 
-def judge(bursts: Bursts, bits: SoftBits, matches: Matches, found: Found) -> Reading:
+def validate_bursts(
+    bursts: Bursts, bits: SoftBits, matches: SequenceMatches, found: RotorSet
+) -> ValidatedBursts:
     """Judge the bursts of one photodiode by the rotors of all."""
     rate_hz = bursts.rate_hz
     alone = matches.certain()
@@ -81,7 +87,7 @@ def judge(bursts: Bursts, bits: SoftBits, matches: Matches, found: Found) -> Rea
         off_s = np.full(len(bursts), np.nan)
         doubled = np.isin(channel_of(matches.polynomial), found.doubled)
         read = alone & ~doubled
-    beside = belongs(bursts, bits, matches, read)
+    beside = match_fragments(bursts, bits, matches, read)
     left = ~read & (beside < 0)
     doubled = alone & np.isin(channel_of(matches.polynomial), found.doubled)
     rejected = {
@@ -89,10 +95,12 @@ def judge(bursts: Bursts, bits: SoftBits, matches: Matches, found: Found) -> Rea
         "burst_off_rotor": int(np.count_nonzero(left & alone & ~doubled)),
         "burst_not_read": int(np.count_nonzero(left & ~alone)),
     }
-    return Reading(bursts, bits, matches, read, beside, off_s, rejected)
+    return ValidatedBursts(bursts, bits, matches, read, beside, off_s, rejected)
 
 
-def _off_rotor(bits: SoftBits, matches: Matches, rotors: dict[int, Rotor], rate_hz: float) -> Array:
+def _off_rotor(
+    bits: SoftBits, matches: SequenceMatches, rotors: dict[int, Rotor], rate_hz: float
+) -> Array:
     """Seconds (n,) by which bursts are late for the rotor of their channel."""
     off = np.full(len(bits), np.nan)
     channel = channel_of(matches.polynomial)
@@ -105,9 +113,9 @@ def _off_rotor(bits: SoftBits, matches: Matches, rotors: dict[int, Rotor], rate_
 
 
 def _expected(
-    bits: SoftBits, matches: Matches, weak: NDArray[np.bool_], found: Found
-) -> tuple[Matches, NDArray[np.bool_]]:
-    """Matches with the weak ones looked for where the rotors say, and which were found so."""
+    bits: SoftBits, matches: SequenceMatches, weak: NDArray[np.bool_], found: RotorSet
+) -> tuple[SequenceMatches, NDArray[np.bool_]]:
+    """SequenceMatches with the weak ones looked for where the rotors say, and which were found so."""
     rows = np.flatnonzero(weak & (np.diff(bits.first) > 0))
     helped = np.zeros(len(bits), bool)
     if not len(rows):
@@ -123,10 +131,10 @@ def _expected(
     good = best.certain(EXPECTED)
     helped[rows[good]] = True
     columns = {}
-    for field in fields(Matches):
+    for field in fields(SequenceMatches):
         columns[field.name] = getattr(matches, field.name).copy()
         columns[field.name][rows[good]] = getattr(best, field.name)[good]
-    return Matches(**columns), helped
+    return SequenceMatches(**columns), helped
 
 
 def _rows(bits: SoftBits, rows: NDArray[np.int64]) -> SoftBits:

@@ -1,7 +1,7 @@
 """Light that passes a photodiode comes in bursts: edges that lie close together.
 
 Between bursts nothing is sent that reaches the receiver. Edges come from a recording
-(:func:`split`) or from bits that were sampled at a fixed rate (:func:`of_windows`).
+(:func:`split_bursts`) or from bits that were sampled at a fixed rate (:func:`bursts_of_windows`).
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Bursts:
         )
 
 
-def split(edges: Edges, gap_s: float = GAP_S) -> Bursts:
+def split_bursts(edges: Edges, gap_s: float = GAP_S) -> Bursts:
     """Bursts of a recording: a longer silence than ``gap_s`` divides them.
 
     Raises
@@ -95,7 +95,7 @@ def split(edges: Edges, gap_s: float = GAP_S) -> Bursts:
     return Bursts(edges.tick, first, (first[:-1] % 2 == 0) == edges.rises, edges.rate_hz)
 
 
-def of_windows(windows: NDArray[np.uint8], rate_hz: float = 32e6) -> Bursts:
+def bursts_of_windows(windows: NDArray[np.uint8], rate_hz: float = 32e6) -> Bursts:
     """Bursts of windows of bits that were sampled at a fixed rate.
 
     Parameters
@@ -142,7 +142,7 @@ def _window_edges(
 def window_edges_numpy(
     windows: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Ticks, first edges and first directions of :func:`of_windows`, in numpy."""
+    """Ticks, first edges and first directions of :func:`bursts_of_windows`, in numpy."""
     level = np.unpackbits(windows, axis=1)
     row, column = np.nonzero(level[:, 1:] != level[:, :-1])
     size = np.bincount(row, minlength=len(windows))
@@ -167,7 +167,7 @@ def require_rate(rate_hz: float) -> None:
         )
 
 
-def of_mocap(bursts: Bursts) -> NDArray[np.bool_]:
+def is_mocap_flash(bursts: Bursts) -> NDArray[np.bool_]:
     """Which bursts (n,) are the 1 MHz flashes of motion capture cameras.
 
     Judged by the time between edges of the same direction.

@@ -63,7 +63,7 @@ MISS = np.rint(STEPS * np.log2(2 / (1 + np.exp(_LEVELS)))).astype(np.int32)
 
 
 @dataclass(frozen=True)
-class Matches:
+class SequenceMatches:
     """The best explanation of each burst.
 
     Attributes
@@ -106,7 +106,7 @@ def false_rate(evidence: float) -> float:
     return float(min(1.0, 2.0 ** (HYPOTHESES_BITS - evidence)))
 
 
-def identify(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
+def identify_sequences(bits: SoftBits, polynomials: int = POLYNOMIALS) -> SequenceMatches:
     """Polynomial and place of each burst.
 
     Parameters
@@ -117,7 +117,7 @@ def identify(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
 
     Returns
     -------
-    Matches
+    SequenceMatches
     """
     if kernels is None:
         return identify_numpy(bits, polynomials)
@@ -144,7 +144,7 @@ def identify(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
 
 def expect(
     bits: SoftBits, polynomial: NDArray[np.int32], index: NDArray[np.int64], reach: int
-) -> Matches:
+) -> SequenceMatches:
     """The best explanation of each burst near a place that is expected.
 
     Parameters
@@ -177,7 +177,7 @@ def expect(
 
 def expect_numpy(
     bits: SoftBits, polynomial: NDArray[np.int32], index: NDArray[np.int64], reach: int
-) -> Matches:
+) -> SequenceMatches:
     """The same in numpy; :func:`expect` where nothing is compiled."""
     rows = np.zeros((len(bits), 7), np.int32)
     rows[:, 0:2] = -1
@@ -194,9 +194,9 @@ def expect_numpy(
     return _matches(rows)
 
 
-def _matches(rows: NDArray[np.int32]) -> Matches:
+def _matches(rows: NDArray[np.int32]) -> SequenceMatches:
     polynomial, index, score, begin, end, known, wrong = rows.T
-    return Matches(
+    return SequenceMatches(
         polynomial.copy(),
         index.astype(np.int64),
         score / STEPS,
@@ -207,8 +207,8 @@ def _matches(rows: NDArray[np.int32]) -> Matches:
     )
 
 
-def identify_numpy(bits: SoftBits, polynomials: int = POLYNOMIALS) -> Matches:
-    """The same in numpy; :func:`identify` where nothing is compiled."""
+def identify_numpy(bits: SoftBits, polynomials: int = POLYNOMIALS) -> SequenceMatches:
+    """The same in numpy; :func:`identify_sequences` where nothing is compiled."""
     rows = np.zeros((len(bits), 7), np.int32)
     rows[:, 0:2] = -1
     for chosen in _alike(bits, lfsr.BITS + FOLLOW):

@@ -18,11 +18,15 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import channel_of, period_counts, slow_bit_of
 from locatk.core.lighthouse.demodulation import ootx
-from locatk.core.lighthouse.demodulation.burst_validation import Reading, identified, judge
-from locatk.core.lighthouse.demodulation.bursts import Bursts, of_mocap, split
-from locatk.core.lighthouse.demodulation.identification import Matches
+from locatk.core.lighthouse.demodulation.burst_validation import (
+    ValidatedBursts,
+    identified,
+    validate_bursts,
+)
+from locatk.core.lighthouse.demodulation.bursts import Bursts, is_mocap_flash, split_bursts
+from locatk.core.lighthouse.demodulation.identification import SequenceMatches
 from locatk.core.lighthouse.demodulation.planes import planes_of
-from locatk.core.lighthouse.demodulation.rotor import Found, Rotor, find_rotors
+from locatk.core.lighthouse.demodulation.rotor import Rotor, RotorSet, find_rotors
 from locatk.core.lighthouse.demodulation.soft_bits import CERTAIN, SoftBits
 from locatk.core.lighthouse.demodulation.weak_bursts import BESIDE_S
 from locatk.core.lighthouse.recording import UNKNOWN, Edges, StationReport
@@ -41,7 +45,7 @@ TRACK_S = 0.25
 
 
 @dataclass(frozen=True)
-class Caught:
+class DecodedSweeps:
     """Sweeps that passed photodiodes, (n,) each, ascending in time.
 
     Attributes
@@ -68,13 +72,13 @@ class Caught:
 
 
 @dataclass(frozen=True)
-class Reception:
+class DemodulatedRecording:
     """What a recording of light says.
 
     Attributes
     ----------
-    sweeps : Caught
-    readings : tuple of Reading
+    sweeps : DecodedSweeps
+    readings : tuple of ValidatedBursts
         The bursts of each photodiode.
     rotors : dict of int to Rotor
         By channel.
@@ -86,15 +90,15 @@ class Reception:
         What is doubtful or left out, one line each.
     """
 
-    sweeps: Caught
-    readings: tuple[Reading, ...]
+    sweeps: DecodedSweeps
+    readings: tuple[ValidatedBursts, ...]
     rotors: dict[int, Rotor]
     stations: tuple[StationReport, ...]
     flashes: int
     notes: tuple[str, ...]
 
 
-def receive(lines: Sequence[Edges]) -> Reception:
+def demodulate_recording(lines: Sequence[Edges]) -> DemodulatedRecording:
     """Sweeps, rotors and factory data of a recording.
 
     Parameters
@@ -115,13 +119,13 @@ def receive(lines: Sequence[Edges]) -> Reception:
         raise InputError("lines of light that were recorded by different clocks")
     flashes, heard = 0, []
     for edges in lines:
-        bursts = split(edges)
-        flash = of_mocap(bursts)
+        bursts = split_bursts(edges)
+        flash = is_mocap_flash(bursts)
         flashes += int(np.count_nonzero(flash))
         bursts = bursts.take(~flash & (bursts.duration_s > SHORTEST_S))
         heard.append((bursts, *identified(bursts)))
     found = _rotors(heard, rate_hz)
-    readings = tuple(judge(*each, found) for each in heard)
+    readings = tuple(validate_bursts(*each, found) for each in heard)
     notes = []
     if found.doubled:
         listed = ", ".join(map(str, found.doubled))
@@ -141,10 +145,10 @@ def receive(lines: Sequence[Edges]) -> Reception:
         _station(int(number), sweeps, readings, found.rotors.get(int(number)), rate_hz, notes)
         for number in np.unique(sweeps.channel)
     )
-    return Reception(sweeps, readings, found.rotors, stations, flashes, tuple(notes))
+    return DemodulatedRecording(sweeps, readings, found.rotors, stations, flashes, tuple(notes))
 
 
-def _rotors(heard: list[tuple[Bursts, SoftBits, Matches]], rate_hz: float) -> Found:
+def _rotors(heard: list[tuple[Bursts, SoftBits, SequenceMatches]], rate_hz: float) -> RotorSet:
     """Of all photodiodes together: they see the same rotors by the same clock."""
     tick = np.concatenate([bits.tick for _, bits, _ in heard])
     polynomial = np.concatenate([m.polynomial for _, _, m in heard])
@@ -157,20 +161,26 @@ def _rotors(heard: list[tuple[Bursts, SoftBits, Matches]], rate_hz: float) -> Fo
 # ---- sweeps
 
 
-def _sweeps(readings: Sequence[Reading], rotors: dict[int, Rotor], rate_hz: float) -> Caught:
+def _sweeps(
+    readings: Sequence[ValidatedBursts], rotors: dict[int, Rotor], rate_hz: float
+) -> DecodedSweeps:
     """The bursts of each sweep put together."""
     parts = [_sweeps_of(k, reading, rotors, rate_hz) for k, reading in enumerate(readings)]
-    columns = [np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Caught)]
+    columns = [
+        np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(DecodedSweeps)
+    ]
     order = np.argsort(columns[0], kind="stable")
-    return Caught(*(column[order] for column in columns))
+    return DecodedSweeps(*(column[order] for column in columns))
 
 
-def _sweeps_of(sensor: int, reading: Reading, rotors: dict[int, Rotor], rate_hz: float) -> Caught:
+def _sweeps_of(
+    sensor: int, reading: ValidatedBursts, rotors: dict[int, Rotor], rate_hz: float
+) -> DecodedSweeps:
     """Sweeps of one photodiode, station by station."""
     rows = np.flatnonzero(reading.read)
     if not len(rows):
         none = np.zeros(0, np.int32)
-        return Caught(np.zeros(0), none, none, none, none, np.zeros(0))
+        return DecodedSweeps(np.zeros(0), none, none, none, none, np.zeros(0))
     weight, middle = _middles(reading, rows)
     channel = channel_of(reading.matches.polynomial[rows])
     order = np.lexsort((middle, channel))
@@ -194,10 +204,12 @@ def _sweeps_of(sensor: int, reading: Reading, rotors: dict[int, Rotor], rate_hz:
     # seconds, and its station counts from where it is.
     bit = (tick - reading.bits.tick[first]) / ticks_per_bit
     count = np.maximum(reading.matches.index[first] + bit, 0.0)
-    return Caught(tick, np.full(len(tick), sensor, np.int32), station, polynomial, plane, count)
+    return DecodedSweeps(
+        tick, np.full(len(tick), sensor, np.int32), station, polynomial, plane, count
+    )
 
 
-def _middles(reading: Reading, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+def _middles(reading: ValidatedBursts, rows: NDArray[np.int64]) -> tuple[Array, Array]:
     """How much of its sequence each burst shows, in bits, and the middle of that, in ticks.
 
     In the stretch that agrees, each bit counts by how sure it is, and one that contradicts
@@ -222,8 +234,8 @@ def _middles(reading: Reading, rows: NDArray[np.int64]) -> tuple[Array, Array]:
 
 def _station(
     number: int,
-    sweeps: Caught,
-    readings: Sequence[Reading],
+    sweeps: DecodedSweeps,
+    readings: Sequence[ValidatedBursts],
     rotor: Rotor | None,
     rate_hz: float,
     notes: list[str],
@@ -277,8 +289,8 @@ def slow_bits(tick: Array, polynomial: Int, rotor: Rotor) -> NDArray[np.int8]:
 
 def _missed(
     sensor: int,
-    reading: Reading,
-    sweeps: Caught,
+    reading: ValidatedBursts,
+    sweeps: DecodedSweeps,
     mine: NDArray[np.int64],
     rotor: Rotor,
     rate_hz: float,

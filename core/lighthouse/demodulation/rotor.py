@@ -133,7 +133,7 @@ class Rotor:
 
 
 @dataclass(frozen=True)
-class Found:
+class RotorSet:
     """The rotors of a recording.
 
     Attributes
@@ -154,7 +154,7 @@ def find_rotors(
     index: NDArray[np.int64],
     evidence: Array,
     rate_hz: float,
-) -> Found:
+) -> RotorSet:
     """Rotors that bursts agree on.
 
     Parameters
@@ -164,7 +164,7 @@ def find_rotors(
     polynomial, index : (n,) ndarray
         As decoded; bursts with polynomial -1 are passed over.
     evidence : (n,) ndarray
-        In bits (:class:`~locatk.core.lighthouse.demodulation.identification.Matches`).
+        In bits (:class:`~locatk.core.lighthouse.demodulation.identification.SequenceMatches`).
     rate_hz : float
         Ticks of the recorder a second.
     """
@@ -189,7 +189,7 @@ def find_rotors(
         mine = mine[order]
         parts = [mine[rows] for rows in stretches]
         rotors[number] = _followed(number, tick, index, parts, period, rate_hz)
-    return Found(rotors, tuple(doubled))
+    return RotorSet(rotors, tuple(doubled))
 
 
 def zeros(tick: Array, index: NDArray[np.int64], channel: int, period: float) -> Array:

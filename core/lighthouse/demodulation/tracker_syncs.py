@@ -52,7 +52,7 @@ GAP = 600
 
 
 @dataclass(frozen=True)
-class Rotor:
+class TrackerRotor:
     """One station's rotor, by one tracker's counter.
 
     Attributes
@@ -105,7 +105,7 @@ class Rotor:
         return bits
 
 
-def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal: float) -> Rotor | None:
+def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal: float) -> TrackerRotor | None:
     """Find the rotor that most syncs of one channel agree on.
 
     Parameters
@@ -119,7 +119,7 @@ def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal: float) -> Rotor | No
 
     Returns
     -------
-    Rotor or None
+    TrackerRotor or None
         None where fewer than four syncs agree.
     """
     order = np.argsort(tick, kind="stable")
@@ -144,7 +144,7 @@ def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal: float) -> Rotor | No
     wander = _smoothed(x[kept] - np.polyval(line, number), number)
     zero = base + np.polyval(line, number) + wander
     rejected = len(tick) - int(np.count_nonzero(good))
-    return Rotor(float(line[0]), zero, number, bit[kept].astype(np.int8), rejected)
+    return TrackerRotor(float(line[0]), zero, number, bit[kept].astype(np.int8), rejected)
 
 
 def _rotation(x: Array, nominal: float) -> float | None:

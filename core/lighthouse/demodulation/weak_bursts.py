@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.demodulation.bursts import Bursts
-from locatk.core.lighthouse.demodulation.identification import Matches
+from locatk.core.lighthouse.demodulation.identification import SequenceMatches
 from locatk.core.lighthouse.demodulation.soft_bits import SoftBits
 
 Array = NDArray[np.float64]
@@ -37,8 +37,8 @@ CHANCE = 0.005
 LONGEST_BITS = 400
 
 
-def belongs(
-    bursts: Bursts, bits: SoftBits, matches: Matches, read: NDArray[np.bool_]
+def match_fragments(
+    bursts: Bursts, bits: SoftBits, matches: SequenceMatches, read: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """The burst beside each fragment whose sequence the fragment continues.
 

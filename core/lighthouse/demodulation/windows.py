@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import POLYNOMIALS
-from locatk.core.lighthouse.demodulation.bursts import of_windows
-from locatk.core.lighthouse.demodulation.identification import Matches, identify
+from locatk.core.lighthouse.demodulation.bursts import bursts_of_windows
+from locatk.core.lighthouse.demodulation.identification import SequenceMatches, identify_sequences
 from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
 
 BLOCK = 2048
@@ -27,14 +27,14 @@ class WindowMatches:
 
     Attributes
     ----------
-    matches : Matches
+    matches : SequenceMatches
         Polynomial, and index of the first bit, of each.
     start : (n,) float64 ndarray
         When that bit began, in samples from the start of its window; may be below 0,
         and is ``nan`` where a window has no bits.
     """
 
-    matches: Matches
+    matches: SequenceMatches
     start: NDArray[np.float64]
 
 
@@ -60,10 +60,10 @@ def read_windows(
     """
     parts, starts = [], []
     for at in range(0, max(len(windows), 1), BLOCK):
-        bursts = of_windows(windows[at : at + BLOCK], rate_hz)
+        bursts = bursts_of_windows(windows[at : at + BLOCK], rate_hz)
         bits = soft_bits(bursts)
-        parts.append(identify(bits, polynomials))
+        parts.append(identify_sequences(bits, polynomials))
         begin = bits.tick - 8 * windows.shape[1] * np.arange(len(bits))
         starts.append(np.where(np.diff(bits.first) > 0, begin, np.nan))
-    columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Matches))
-    return WindowMatches(Matches(*columns), np.concatenate(starts))
+    columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SequenceMatches))
+    return WindowMatches(SequenceMatches(*columns), np.concatenate(starts))

@@ -21,12 +21,16 @@ from locatk.core.lighthouse.calibration import (
 from locatk.core.lighthouse.devices.pose_fit import (
     SPEED_SIGMA,
     UNSEEN,
-    Looks,
-    Poses,
+    DeviceStates,
     Stations,
-    places,
+    SweepObservations,
+    photodiode_positions,
 )
-from locatk.core.lighthouse.scene.bundle_adjustment import STATION_UNKNOWNS, bent, unknowns_of
+from locatk.core.lighthouse.scene.bundle_adjustment import (
+    STATION_UNKNOWNS,
+    calibration_parameters,
+    with_parameters,
+)
 from locatk.core.robust import descend
 
 Array = NDArray[np.float64]
@@ -39,7 +43,7 @@ class RigidAdjustment:
     Attributes
     ----------
     stations : Stations
-    poses : Poses
+    poses : DeviceStates
     residual : (m, n) ndarray
         Predicted minus observed angle in radians; ``nan`` where unseen.
     covariance : (s, 6, 6) ndarray
@@ -49,7 +53,7 @@ class RigidAdjustment:
     """
 
     stations: Stations
-    poses: Poses
+    poses: DeviceStates
     residual: Array
     covariance: Array
     iterations: int
@@ -67,9 +71,9 @@ class _System:
 
 
 def adjust_rigid(
-    looks: Looks,
+    looks: SweepObservations,
     stations: Stations,
-    poses: Poses,
+    poses: DeviceStates,
     *,
     sigma: float,
     soft: float,
@@ -81,7 +85,7 @@ def adjust_rigid(
 
     Parameters
     ----------
-    looks : Looks
+    looks : SweepObservations
     stations, poses
         Starting values; the first station stays where it is.
     sigma : float
@@ -96,8 +100,8 @@ def adjust_rigid(
     """
 
     def attempt(
-        state: tuple[Stations, Poses], system: _System, damping: float, _: int
-    ) -> tuple[tuple[Stations, Poses], _System]:
+        state: tuple[Stations, DeviceStates], system: _System, damping: float, _: int
+    ) -> tuple[tuple[Stations, DeviceStates], _System]:
         trial = _step(system, *state, damping, calibrate)
         return trial, _linearise(looks, *trial, sigma, soft, share, calibrate)
 
@@ -124,16 +128,16 @@ def _free(calibrate: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _linearise(
-    looks: Looks,
+    looks: SweepObservations,
     stations: Stations,
-    poses: Poses,
+    poses: DeviceStates,
     sigma: float,
     soft: float,
     share: Array,
     calibrate: NDArray[np.bool_],
 ) -> _System:
     m, s = len(looks), len(stations[2])
-    lever, place = places(looks, poses)
+    lever, place = photodiode_positions(looks, poses)
     missed = np.full(looks.angle.shape, np.nan)
     by_place = np.zeros((*looks.angle.shape, 3))
     own = np.zeros((*looks.angle.shape, STATION_UNKNOWNS))
@@ -184,7 +188,9 @@ def _linearise(
         rhs[i] = flat.T @ pulled[seen][:, 0]
         mixed[:, i] = np.swapaxes(mine, -1, -2) @ by_pose
         if calibrate[i]:
-            away = unknowns_of(stations[2][i]) - unknowns_of(GENERIC_CALIBRATION)
+            away = calibration_parameters(stations[2][i]) - calibration_parameters(
+                GENERIC_CALIBRATION
+            )
             full[i, range(6, 10), i, range(6, 10)] += prior
             rhs[i, 6:] += prior * away
             cost += 0.5 * float(prior @ away**2)
@@ -218,10 +224,10 @@ def _reduce(system: _System, damping: float) -> tuple[Array, Array, Array]:
 def _step(
     system: _System,
     stations: Stations,
-    poses: Poses,
+    poses: DeviceStates,
     damping: float,
     calibrate: NDArray[np.bool_],
-) -> tuple[Stations, Poses]:
+) -> tuple[Stations, DeviceStates]:
     free = _free(calibrate)
     reduced, rhs, inverses = _reduce(system, damping)
     delta = np.zeros(len(free))
@@ -231,6 +237,6 @@ def _step(
     moved = (
         stations[0] + change[:, 0:3],
         rotation_exp(change[:, 3:6]) @ stations[1],
-        tuple(bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)),
+        tuple(with_parameters(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)),
     )
     return moved, poses.stepped(-(inverses @ back[..., None])[..., 0])

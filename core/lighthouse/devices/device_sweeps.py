@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import CHANNELS, TICK_HZ, period_counts, period_ticks
-from locatk.core.lighthouse.devices.pose_fit import Looks
+from locatk.core.lighthouse.devices.pose_fit import SweepObservations
 from locatk.core.lighthouse.epochs import MIN_PLANE_DELAY_TURNS
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO
 from locatk.core.lighthouse.receiver import Receiver
@@ -56,7 +56,7 @@ class DeviceSweeps:
         return DeviceSweeps(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
-def sweeps_of(
+def select_device_sweeps(
     sweeps: Sweeps, device: int, receiver: Receiver, channels: Sequence[int]
 ) -> tuple[DeviceSweeps, dict[str, int]]:
     """Usable sweeps of one device, and how many are left out under which reason.
@@ -89,7 +89,7 @@ def sweeps_of(
         inside = (counts >= 0) & (counts < period_counts(sweeps.channel[mine]))
     keep(inside, "count_above_period")
     mine = mine[np.argsort(sweeps.time_ns[mine], kind="stable")]
-    plane = planes(sweeps.time_ns[mine], sweeps.channel[mine], sweeps.count[mine])
+    plane = assign_planes(sweeps.time_ns[mine], sweeps.channel[mine], sweeps.count[mine])
     plane = np.where(sweeps.sweep[mine] == UNKNOWN, plane, sweeps.sweep[mine])
     known = (plane == 0) | (plane == 1)
     plane = plane[known]
@@ -108,7 +108,7 @@ def sweeps_of(
     ), rejected
 
 
-def planes(
+def assign_planes(
     time_ns: NDArray[np.int64], channel: NDArray[np.int32], count: NDArray[np.float64]
 ) -> NDArray[np.int64]:
     """Which plane each sweep of a device was: 0, 1 or -1 where nothing tells.
@@ -142,7 +142,7 @@ def planes(
 
 
 @dataclass(frozen=True)
-class Windows:
+class SweepWindows:
     """Moments of a device, each with the sweeps around it.
 
     Attributes
@@ -160,11 +160,11 @@ class Windows:
         return len(self.time_ns)
 
 
-def windows(mine: DeviceSweeps, every_ns: int, reach_ns: int) -> Windows:
+def make_windows(mine: DeviceSweeps, every_ns: int, reach_ns: int) -> SweepWindows:
     """A moment every ``every_ns`` wherever there are sweeps, with those up to ``reach_ns``
     before and after it."""
     if len(mine) == 0:
-        return Windows(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
+        return SweepWindows(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
     since = mine.time_ns - mine.time_ns[0]
     stretch, start = np.unique(since // every_ns, return_index=True)
     # The middle of a stretch, or near its first sweep where it is longer than the reach.
@@ -183,18 +183,18 @@ def windows(mine: DeviceSweeps, every_ns: int, reach_ns: int) -> Windows:
     mean = np.rint(total / np.count_nonzero(held, axis=1)).astype(np.int64)
     # Beside a pause two windows may hold the same sweeps.
     fresh = np.r_[True, np.diff(np.maximum.accumulate(mean)) > 0]
-    return Windows(mine.time_ns[0] + mean[fresh], sweep[fresh])
+    return SweepWindows(mine.time_ns[0] + mean[fresh], sweep[fresh])
 
 
-def looks_of(
-    mine: DeviceSweeps, around: Windows, receiver: Receiver, moments: NDArray[np.int64]
-) -> Looks:
+def gather_observations(
+    mine: DeviceSweeps, around: SweepWindows, receiver: Receiver, moments: NDArray[np.int64]
+) -> SweepObservations:
     """The sweeps of the chosen moments."""
     sweep = around.sweep[moments]
     wide = int(np.max(np.count_nonzero(sweep >= 0, axis=1), initial=0))
     sweep = sweep[:, :wide]
     since = mine.time_ns[sweep] - around.time_ns[moments][:, None]
-    return Looks(
+    return SweepObservations(
         receiver.position_m[mine.sensor[sweep]],
         mine.station[sweep],
         mine.plane[sweep],

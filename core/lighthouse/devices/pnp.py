@@ -15,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
-from locatk.core.lighthouse.devices.pose_fit import Fit, Looks, Poses, fit
+from locatk.core.lighthouse.devices.pose_fit import (
+    DeviceStates,
+    PoseFit,
+    SweepObservations,
+    fit_poses,
+)
 from locatk.core.lighthouse.light_planes import rays
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
@@ -28,7 +33,7 @@ CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 FLAT = 1e-3
 """Thickness of a device over its extent below which its photodiodes are on one plane."""
 
-SOFT = 3e-3
+LOSS_SCALE_RAD = 3e-3
 """Residual in radians from which on an angle counts less: reflections are far beyond it."""
 
 TRIPLES = 12
@@ -45,7 +50,7 @@ covers and edges let a little light around."""
 
 
 @dataclass(frozen=True)
-class Reading:
+class PoseCandidate:
     """One pose that explains what a device saw of a station.
 
     Attributes
@@ -72,8 +77,10 @@ class Reading:
     covariance: Array
 
 
-def locate_device(angles: Array, receiver: Receiver, calibration: Calibration) -> list[Reading]:
-    """Poses of a device from what it saw of one station at one time.
+def locate_device(
+    angles: Array, receiver: Receiver, calibration: Calibration
+) -> list[PoseCandidate]:
+    """DeviceStates of a device from what it saw of one station at one time.
 
     Parameters
     ----------
@@ -86,7 +93,7 @@ def locate_device(angles: Array, receiver: Receiver, calibration: Calibration) -
 
     Returns
     -------
-    list of Reading
+    list of PoseCandidate
         Distinct minima, the best first: light from the front before light from behind, then
         by cost. A flat device far away has two of nearly the same cost. Empty where fewer
         than three photodiodes have both planes.
@@ -96,12 +103,14 @@ def locate_device(angles: Array, receiver: Receiver, calibration: Calibration) -
         return []
     looks = _looks(angles, receiver, len(starts))
     stations = (np.zeros((1, 3)), np.eye(3)[None], (calibration,))
-    start = Poses.at_rest(np.stack([s[0] for s in starts]), np.stack([s[1] for s in starts]))
-    found = fit(looks, stations, start, sigma=ANGLE_SIGMA_RAD, soft=SOFT, rates=False)
+    start = DeviceStates.at_rest(np.stack([s[0] for s in starts]), np.stack([s[1] for s in starts]))
+    found = fit_poses(
+        looks, stations, start, sigma=ANGLE_SIGMA_RAD, soft=LOSS_SCALE_RAD, rates=False
+    )
     # Reflections pulled while nothing was known of the rest; now the rest tells its spread.
     spread = 1.4826 * np.median(np.abs(found.residual), axis=1)
-    soft = np.clip(3 * spread, 3 * ANGLE_SIGMA_RAD, SOFT)
-    found = fit(looks, stations, found.poses, sigma=ANGLE_SIGMA_RAD, soft=soft, rates=False)
+    soft = np.clip(3 * spread, 3 * ANGLE_SIGMA_RAD, LOSS_SCALE_RAD)
+    found = fit_poses(looks, stations, found.poses, sigma=ANGLE_SIGMA_RAD, soft=soft, rates=False)
     readings = [_reading(found, i, angles, receiver) for i in range(len(starts))]
     return _distinct(readings)
 
@@ -155,10 +164,10 @@ def candidates(
     return starts
 
 
-def _looks(angles: Array, receiver: Receiver, copies: int) -> Looks:
+def _looks(angles: Array, receiver: Receiver, copies: int) -> SweepObservations:
     """All seen angles as one moment, ``copies`` times."""
     sensor, plane = np.nonzero(np.isfinite(angles))
-    one = Looks(
+    one = SweepObservations(
         receiver.position_m[sensor][None],
         np.zeros((1, len(sensor)), np.int64),
         plane[None],
@@ -169,7 +178,7 @@ def _looks(angles: Array, receiver: Receiver, copies: int) -> Looks:
     return one.take(np.zeros(copies, np.int64))
 
 
-def _reading(found: Fit, row: int, angles: Array, receiver: Receiver) -> Reading:
+def _reading(found: PoseFit, row: int, angles: Array, receiver: Receiver) -> PoseCandidate:
     residual = np.full(angles.shape, np.nan)
     residual[np.isfinite(angles)] = found.residual[row]
     position, rotation = found.poses.position[row], found.poses.rotation[row]
@@ -181,7 +190,7 @@ def _reading(found: Fit, row: int, angles: Array, receiver: Receiver) -> Reading
     covariance = np.asarray(
         np.linalg.pinv(found.information[row, :6, :6], hermitian=True), np.float64
     )
-    return Reading(position, rotation, float(found.cost[row]), residual, behind, covariance)
+    return PoseCandidate(position, rotation, float(found.cost[row]), residual, behind, covariance)
 
 
 def lit_from_behind(away: Array, normal: Array) -> NDArray[np.bool_]:
@@ -191,8 +200,8 @@ def lit_from_behind(away: Array, normal: Array) -> NDArray[np.bool_]:
     return np.asarray(cosine < LIT_FROM_BEHIND)
 
 
-def _distinct(readings: list[Reading]) -> list[Reading]:
-    kept: list[Reading] = []
+def _distinct(readings: list[PoseCandidate]) -> list[PoseCandidate]:
+    kept: list[PoseCandidate] = []
     for reading in sorted(readings, key=lambda r: r.cost):
         away = float(np.linalg.norm(reading.position))
         if not np.isfinite(reading.cost) or reading.position[0] <= 0:

@@ -1,4 +1,4 @@
-"""Poses of rigid devices from the angles of their photodiodes, many at once.
+"""DeviceStates of rigid devices from the angles of their photodiodes, many at once.
 
 Each sweep tells one angle of one photodiode at its own time: a tracker that moves at half a
 metre a second moves 10 mm in a rotation, so that a rotation is no instant. The unknowns of a
@@ -30,7 +30,7 @@ UNSEEN = 1e3
 
 
 @dataclass(frozen=True)
-class Looks:
+class SweepObservations:
     """Sweeps by moment: (m, n) each, padded where ``seen`` is False.
 
     Attributes
@@ -56,13 +56,13 @@ class Looks:
     def __len__(self) -> int:
         return len(self.angle)
 
-    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> Looks:
+    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> SweepObservations:
         """The chosen moments."""
-        return Looks(*(getattr(self, f.name)[chosen] for f in fields(self)))
+        return SweepObservations(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
 @dataclass(frozen=True)
-class Poses:
+class DeviceStates:
     """Device to frame, with rates.
 
     Attributes
@@ -78,33 +78,33 @@ class Poses:
     rate: Array
 
     @classmethod
-    def at_rest(cls, position: Array, rotation: Array) -> Poses:
-        """Poses (m, 3), (m, 3, 3) of devices that stand still."""
+    def at_rest(cls, position: Array, rotation: Array) -> DeviceStates:
+        """DeviceStates (m, 3), (m, 3, 3) of devices that stand still."""
         return cls(position, rotation, np.zeros((len(position), 6)))
 
     def __len__(self) -> int:
         return len(self.position)
 
-    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> Poses:
+    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> DeviceStates:
         """The chosen moments."""
-        return Poses(self.position[chosen], self.rotation[chosen], self.rate[chosen])
+        return DeviceStates(self.position[chosen], self.rotation[chosen], self.rate[chosen])
 
-    def put(self, chosen: NDArray[np.int64] | NDArray[np.bool_], other: Poses) -> None:
+    def put(self, chosen: NDArray[np.int64] | NDArray[np.bool_], other: DeviceStates) -> None:
         """Overwrite the chosen moments in place."""
         for f in fields(self):
             getattr(self, f.name)[chosen] = getattr(other, f.name)
 
-    def later(self, seconds: Array) -> Poses:
+    def later(self, seconds: Array) -> DeviceStates:
         """Where the devices are after (m,) seconds at their rates."""
-        return Poses(
+        return DeviceStates(
             self.position + self.rate[:, :3] * seconds[:, None],
             rotation_exp(self.rate[:, 3:] * seconds[:, None]) @ self.rotation,
             self.rate.copy(),
         )
 
-    def stepped(self, change: Array) -> Poses:
+    def stepped(self, change: Array) -> DeviceStates:
         """Moved by (m, 12): shift, turn in the frame's axes, changes of both rates."""
-        return Poses(
+        return DeviceStates(
             self.position + change[:, 0:3],
             rotation_exp(change[:, 3:6]) @ self.rotation,
             self.rate + change[:, 6:12],
@@ -112,12 +112,12 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """Result of :func:`fit`.
+class PoseFit:
+    """Result of :func:`fit_poses`.
 
     Attributes
     ----------
-    poses : Poses
+    poses : DeviceStates
     residual : (m, n) ndarray
         Predicted minus observed angle in radians; ``nan`` where unseen.
     information : (m, 12, 12) ndarray
@@ -126,16 +126,16 @@ class Fit:
         Half the robust sum of squares.
     """
 
-    poses: Poses
+    poses: DeviceStates
     residual: Array
     information: Array
     cost: Array
 
 
-def fit(
-    looks: Looks,
+def fit_poses(
+    looks: SweepObservations,
     stations: Stations,
-    start: Poses,
+    start: DeviceStates,
     *,
     sigma: float,
     soft: float | Array,
@@ -143,14 +143,14 @@ def fit(
     iterations: int = 30,
     settled: float = 1e-4,
     lost: float = np.inf,
-) -> Fit:
-    """Poses at which the sweeps' angles fit best, from starting values.
+) -> PoseFit:
+    """DeviceStates at which the sweeps' angles fit best, from starting values.
 
     Parameters
     ----------
-    looks : Looks
+    looks : SweepObservations
     stations : Stations
-    start : Poses
+    start : DeviceStates
     sigma : float
         Standard deviation of an angle in radians.
     soft : float or (m,) ndarray
@@ -167,17 +167,17 @@ def fit(
 
     Returns
     -------
-    Fit
+    PoseFit
     """
-    poses = Poses(*(np.array(getattr(start, f.name)) for f in fields(Poses)))
+    poses = DeviceStates(*(np.array(getattr(start, f.name)) for f in fields(DeviceStates)))
     m, n = looks.angle.shape
     residual, information = np.full((m, n), np.nan), np.zeros((m, 12, 12))
     right, cost = np.zeros((m, 12)), np.zeros(m)
     width = np.broadcast_to(np.asarray(soft) / sigma, m)[:, None]
 
-    def evaluate(rows: NDArray[np.int64], trial: Poses) -> tuple[Array, Array, Array, Array]:
+    def evaluate(rows: NDArray[np.int64], trial: DeviceStates) -> tuple[Array, Array, Array, Array]:
         chosen = looks if len(rows) == m else looks.take(rows)
-        missed, gradient = linearise(chosen, stations, trial)
+        missed, gradient = linearize(chosen, stations, trial)
         return _normal(
             chosen, trial, missed / sigma, gradient / sigma, width[rows], rates, lost / sigma
         )
@@ -210,17 +210,19 @@ def fit(
         done = (better & (gain < settled)) | small | (damping[open_] > 1e6)
         open_ = open_[~done]
     missed = np.where(looks.seen, residual * sigma, np.nan)
-    return Fit(poses, missed, information, cost)
+    return PoseFit(poses, missed, information, cost)
 
 
-def linearise(looks: Looks, stations: Stations, poses: Poses) -> tuple[Array, Array]:
+def linearize(
+    looks: SweepObservations, stations: Stations, poses: DeviceStates
+) -> tuple[Array, Array]:
     """Angles missed (m, n) in radians, and their derivatives (m, n, 6) by shift and turn of
     the device at the time of each sweep; ``nan`` where no plane meets the photodiode.
 
     The turn at the moment is taken for that at the sweep's time: within a rotation a device
     turns little, and the steps only have to lead downhill.
     """
-    lever, place = places(looks, poses)
+    lever, place = photodiode_positions(looks, poses)
     missed = np.full(looks.angle.shape, np.nan)
     by_place = np.full((*looks.angle.shape, 3), np.nan)
     for i, calibration in enumerate(stations[2]):
@@ -236,7 +238,7 @@ def linearise(looks: Looks, stations: Stations, poses: Poses) -> tuple[Array, Ar
     return missed, np.concatenate([by_place, np.cross(lever, by_place)], axis=-1)
 
 
-def places(looks: Looks, poses: Poses) -> tuple[Array, Array]:
+def photodiode_positions(looks: SweepObservations, poses: DeviceStates) -> tuple[Array, Array]:
     """Photodiodes (m, n, 3) about their device and in the frame, at the times of their sweeps."""
     lever = looks.place @ np.swapaxes(poses.rotation, -1, -2)
     since = looks.since_s[..., None]
@@ -254,8 +256,8 @@ def _turned(vectors: Array, turns: Array) -> Array:
 
 
 def _normal(
-    looks: Looks,
-    poses: Poses,
+    looks: SweepObservations,
+    poses: DeviceStates,
     missed: Array,
     gradient: Array,
     width: Array,

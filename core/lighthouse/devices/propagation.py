@@ -13,9 +13,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, Windows, looks_of
-from locatk.core.lighthouse.devices.pnp import SOFT, candidates, lit_from_behind
-from locatk.core.lighthouse.devices.pose_fit import Looks, Poses, Stations, fit, places
+from locatk.core.lighthouse.devices.device_sweeps import (
+    DeviceSweeps,
+    SweepWindows,
+    gather_observations,
+)
+from locatk.core.lighthouse.devices.pnp import LOSS_SCALE_RAD, candidates, lit_from_behind
+from locatk.core.lighthouse.devices.pose_fit import (
+    DeviceStates,
+    Stations,
+    SweepObservations,
+    fit_poses,
+    photodiode_positions,
+)
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD, INLIER_GATE_RAD, MIN_INLIER_GATE_RAD
 from locatk.core.lighthouse.receiver import Receiver
 
@@ -54,7 +64,7 @@ OPEN, SOLVED, FAILED = 0, 1, 2
 
 
 @dataclass
-class Track:
+class DeviceTrack:
     """One device under way.
 
     ``reach_ns`` is how far its moments reach before and after them,
@@ -65,9 +75,9 @@ class Track:
     mine: DeviceSweeps
     receiver: Receiver
     stations: Stations
-    around: Windows
+    around: SweepWindows
     reach_ns: int
-    poses: Poses
+    poses: DeviceStates
     status: NDArray[np.int64]
     source: NDArray[np.int64]
     margin: list[float] = field(default_factory=list)
@@ -77,11 +87,11 @@ class Track:
         if number:
             self.rejected[reason] = self.rejected.get(reason, 0) + int(number)
 
-    def looks(self, moments: NDArray[np.int64]) -> Looks:
-        return looks_of(self.mine, self.around, self.receiver, moments)
+    def looks(self, moments: NDArray[np.int64]) -> SweepObservations:
+        return gather_observations(self.mine, self.around, self.receiver, moments)
 
 
-def locate_all(track: Track) -> None:
+def locate_all(track: DeviceTrack) -> None:
     """Give a pose to every open moment that has one."""
     able = np.flatnonzero(track.status == OPEN)
     _drop_anchors(track, able[::ANCHORS_APART], triples=False)
@@ -108,7 +118,7 @@ def locate_all(track: Track) -> None:
         track.poses.put(mine[back], before.take(back))
 
 
-def enough(mine: DeviceSweeps, sweep: NDArray[np.int64]) -> NDArray[np.bool_]:
+def has_enough_sweeps(mine: DeviceSweeps, sweep: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether moments with these sweeps (m, n) can have a pose."""
     sensor = np.sort(np.where(sweep >= 0, mine.sensor[sweep] if len(mine) else 0, -1), axis=1)
     different = np.count_nonzero(np.diff(sensor, axis=1, prepend=-1), axis=1)
@@ -119,13 +129,13 @@ def enough(mine: DeviceSweeps, sweep: NDArray[np.int64]) -> NDArray[np.bool_]:
 # ---- anchors
 
 
-def _drop_anchors(track: Track, moments: NDArray[np.int64], *, triples: bool) -> None:
+def _drop_anchors(track: DeviceTrack, moments: NDArray[np.int64], *, triples: bool) -> None:
     """Locate moments without a guess."""
     for k in range(0, len(moments), 32):
         _locate_block(track, moments[k : k + 32], triples)
 
 
-def _locate_block(track: Track, moments: NDArray[np.int64], triples: bool) -> None:
+def _locate_block(track: DeviceTrack, moments: NDArray[np.int64], triples: bool) -> None:
     owner, origins, shifts, turns = [], [], [], []
     for i, moment in enumerate(moments):
         for origin, shift, turn in scene_candidates(track, int(moment), triples):
@@ -135,25 +145,36 @@ def _locate_block(track: Track, moments: NDArray[np.int64], triples: bool) -> No
             turns.append(turn)
     if not owner:
         return
-    start = Poses.at_rest(np.stack(shifts), np.stack(turns))
+    start = DeviceStates.at_rest(np.stack(shifts), np.stack(turns))
     whose = np.array(owner)
     looks = track.looks(moments)
     # First under the station it comes from, with its motion; then all stations say which few
     # are worth more.
     alone = looks.take(whose)
     alone = replace(alone, seen=alone.seen & (alone.station == np.array(origins)[:, None]))
-    start = fit(alone, track.stations, start, sigma=ANGLE_SIGMA_RAD, soft=SOFT, settled=0.03).poses
-    rough = fit(
-        looks.take(whose), track.stations, start, sigma=ANGLE_SIGMA_RAD, soft=SOFT, iterations=0
+    start = fit_poses(
+        alone, track.stations, start, sigma=ANGLE_SIGMA_RAD, soft=LOSS_SCALE_RAD, settled=0.03
+    ).poses
+    rough = fit_poses(
+        looks.take(whose),
+        track.stations,
+        start,
+        sigma=ANGLE_SIGMA_RAD,
+        soft=LOSS_SCALE_RAD,
+        iterations=0,
     )
     order = np.lexsort((_score(rough.residual, looks.seen[whose], INLIER_GATE_RAD), whose))
     rank = np.arange(len(order)) - np.searchsorted(whose[order], whose[order])
     chosen = order[rank < READINGS_TRIED]
     whose = whose[chosen]
-    found = fit(
-        looks.take(whose), track.stations, start.take(chosen), sigma=ANGLE_SIGMA_RAD, soft=SOFT
+    found = fit_poses(
+        looks.take(whose),
+        track.stations,
+        start.take(chosen),
+        sigma=ANGLE_SIGMA_RAD,
+        soft=LOSS_SCALE_RAD,
     )
-    good = accepted(looks.take(whose), found.residual)
+    good = is_accepted(looks.take(whose), found.residual)
     cost = _score(found.residual, looks.seen[whose], MIN_INLIER_GATE_RAD)
     cost += 1e6 * (from_behind(track, moments[whose], found.poses) > 0.3)
     for i in np.unique(whose[good]):
@@ -179,7 +200,9 @@ def _score(residual: Array, seen: NDArray[np.bool_], gate: float) -> Array:
     return np.asarray(0.5 * (gate / ANGLE_SIGMA_RAD) ** 2 * np.sum(ratio**2, axis=1, where=seen))
 
 
-def scene_candidates(track: Track, moment: int, triples: bool) -> list[tuple[int, Array, Array]]:
+def scene_candidates(
+    track: DeviceTrack, moment: int, triples: bool
+) -> list[tuple[int, Array, Array]]:
     """Rough poses of the device in the scene, each with the station that it comes from."""
     sweep = track.around.sweep[moment]
     sweep = sweep[sweep >= 0]
@@ -202,12 +225,12 @@ def mean_angles(mine: DeviceSweeps, sensors: int) -> Array:
         return np.asarray(total / number)
 
 
-def from_behind(track: Track, moments: NDArray[np.int64], poses: Poses) -> Array:
+def from_behind(track: DeviceTrack, moments: NDArray[np.int64], poses: DeviceStates) -> Array:
     """(m,) share of sweeps that would have come from behind their photodiodes."""
     if track.receiver.normal is None:
         return np.zeros(len(moments))
     looks = track.looks(moments)
-    _, place = places(looks, poses)
+    _, place = photodiode_positions(looks, poses)
     sensor = track.mine.sensor[track.around.sweep[moments][:, : looks.angle.shape[1]]]
     normal = track.receiver.normal[sensor] @ np.swapaxes(poses.rotation, -1, -2)
     behind = lit_from_behind(place - track.stations[0][looks.station], normal)
@@ -217,7 +240,7 @@ def from_behind(track: Track, moments: NDArray[np.int64], poses: Poses) -> Array
 # ---- waves
 
 
-def _carry_on(track: Track) -> None:
+def _carry_on(track: DeviceTrack) -> None:
     """Solve open moments from solved neighbours until no wave goes on."""
     ready = np.flatnonzero(track.status != FAILED)
     time = track.around.time_ns
@@ -239,35 +262,37 @@ def _carry_on(track: Track) -> None:
         track.source[moments[good]] = track.source[sources[good]]
 
 
-def _solve(track: Track, moments: NDArray[np.int64], start: Poses) -> NDArray[np.bool_]:
+def _solve(
+    track: DeviceTrack, moments: NDArray[np.int64], start: DeviceStates
+) -> NDArray[np.bool_]:
     """Fit moments from starting values, and say which are explained."""
     good = np.zeros(len(moments), bool)
     for k in range(0, len(moments), BLOCK):
         rows = np.arange(k, min(k + BLOCK, len(moments)))
         looks = track.looks(moments[rows])
-        found = fit(
+        found = fit_poses(
             looks,
             track.stations,
             start.take(rows),
             sigma=ANGLE_SIGMA_RAD,
-            soft=SOFT,
+            soft=LOSS_SCALE_RAD,
             settled=0.03,
             lost=LOST,
         )
-        good[rows] = accepted(looks, found.residual)
+        good[rows] = is_accepted(looks, found.residual)
         fine = good[rows]
         track.poses.put(moments[rows[fine]], found.poses.take(fine))
     return good
 
 
-def accepted(looks: Looks, residual: Array) -> NDArray[np.bool_]:
+def is_accepted(looks: SweepObservations, residual: Array) -> NDArray[np.bool_]:
     """Moments of which most sweeps are met."""
     with np.errstate(invalid="ignore"):
         met = np.count_nonzero(np.abs(residual) < INLIER_GATE_RAD, axis=1)
     return np.asarray((met >= FEWEST_SWEEPS) & (met >= MOST * np.count_nonzero(looks.seen, axis=1)))
 
 
-def _less_certain(track: Track, settled: set[int]) -> int | None:
+def _less_certain(track: DeviceTrack, settled: set[int]) -> int | None:
     """The less certain of two anchors whose waves disagree; None where all agree."""
     solved = np.flatnonzero(track.status == SOLVED)
     first, second = solved[:-1], solved[1:]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.channels import CHANNELS
-from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, sweeps_of
+from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, select_device_sweeps
 from locatk.core.lighthouse.devices.scene_initialization import solve_scene
-from locatk.core.lighthouse.devices.tracking import Followed, follow
+from locatk.core.lighthouse.devices.tracking import TrackedDevice, track_device
 from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
@@ -27,8 +27,8 @@ BEHIND = 0.3
 
 
 @dataclass
-class RigidAnswer:
-    """What :func:`solve_rigid` found.
+class DeviceSolution:
+    """What :func:`solve_rigid_devices` found.
 
     Attributes
     ----------
@@ -64,13 +64,13 @@ class RigidAnswer:
     residual: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def solve_rigid(
+def solve_rigid_devices(
     sweeps: Sweeps,
     receivers: Mapping[str, Receiver],
     scene: Scene | None = None,
     *,
     every_s: float | None = None,
-) -> RigidAnswer:
+) -> DeviceSolution:
     """Poses of all devices whose photodiodes have known places.
 
     Parameters
@@ -104,9 +104,9 @@ def solve_rigid(
             + "; the recording has "
             + (", ".join(sweeps.devices) or "none"),
         )
-    answer = RigidAnswer((), scene)
+    answer = DeviceSolution((), scene)
     if not scene.stations:
-        taken = [sweeps_of(sweeps, i, receivers[name], heard)[0] for i, name in chosen]
+        taken = [select_device_sweeps(sweeps, i, receivers[name], heard)[0] for i, name in chosen]
         devices = [(t, receivers[name]) for t, (_, name) in zip(taken, chosen, strict=True)]
         solved = solve_scene(devices, heard, scene)
         answer.scene = scene = solved.scene
@@ -130,8 +130,10 @@ def solve_rigid(
     every_ns = None if every_s is None else max(1, round(every_s * 1e9))
     parts = []
     for i, name in chosen:
-        own, left_out = sweeps_of(sweeps, i, receivers[name], channels)
-        followed = follow(name, scene.frame, own, receivers[name], stations, channels, every_ns)
+        own, left_out = select_device_sweeps(sweeps, i, receivers[name], channels)
+        followed = track_device(
+            name, scene.frame, own, receivers[name], stations, channels, every_ns
+        )
         parts.append((own, followed))
         for reasons in (left_out, followed.rejected):
             for reason, number in reasons.items():
@@ -144,7 +146,7 @@ def solve_rigid(
 
 
 def _account(
-    answer: RigidAnswer, parts: list[tuple[DeviceSweeps, Followed]], channels: list[int]
+    answer: DeviceSolution, parts: list[tuple[DeviceSweeps, TrackedDevice]], channels: list[int]
 ) -> None:
     """Residuals and numbers of sweeps by channel."""
     column = np.concatenate([own.station for own, _ in parts])
@@ -165,7 +167,7 @@ def _account(
     }
 
 
-def _remark_stations(answer: RigidAnswer) -> None:
+def _remark_stations(answer: DeviceSolution) -> None:
     """Stations that most poses do without."""
     wrong = [c for c, used in answer.used.items() if used < answer.unused[c]]
     if wrong and len(wrong) < len(answer.used) and any(len(t) for t in answer.trajectories):
@@ -175,7 +177,7 @@ def _remark_stations(answer: RigidAnswer) -> None:
         )
 
 
-def _remark(answer: RigidAnswer, parts: list[tuple[DeviceSweeps, Followed]]) -> None:
+def _remark(answer: DeviceSolution, parts: list[tuple[DeviceSweeps, TrackedDevice]]) -> None:
     for _, followed in parts:
         name, number = followed.trajectory.device, len(followed.trajectory)
         if number == 0:

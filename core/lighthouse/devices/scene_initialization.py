@@ -17,10 +17,26 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD, Calibration
 from locatk.core.lighthouse.devices.bundle_adjustment import adjust_rigid
-from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, Windows, looks_of, windows
-from locatk.core.lighthouse.devices.pnp import SOFT
-from locatk.core.lighthouse.devices.pose_fit import Looks, Poses, Stations, fit
-from locatk.core.lighthouse.devices.station_links import Link, Views, join, links_of, views_of
+from locatk.core.lighthouse.devices.device_sweeps import (
+    DeviceSweeps,
+    SweepWindows,
+    gather_observations,
+    make_windows,
+)
+from locatk.core.lighthouse.devices.pnp import LOSS_SCALE_RAD
+from locatk.core.lighthouse.devices.pose_fit import (
+    DeviceStates,
+    Stations,
+    SweepObservations,
+    fit_poses,
+)
+from locatk.core.lighthouse.devices.station_links import (
+    StationLink,
+    StationViews,
+    join,
+    links_of,
+    views_of,
+)
 from locatk.core.lighthouse.devices.tracking import REPEATS, rotation_ns
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
@@ -39,7 +55,7 @@ and together they weigh as one."""
 
 SAME_PLACE_M = 0.05
 SAME_TURN = 0.15
-"""Poses (m, rad) nearer than this are one place."""
+"""DeviceStates (m, rad) nearer than this are one place."""
 
 FEW_PLACES = 8
 """Places below which a scene calls for a word."""
@@ -78,12 +94,12 @@ def solve_scene(
     every_ns, reach_ns = rotation_ns(list(channels))
     looks, views, number = [], [], 0
     for mine, receiver in devices:
-        around = windows(mine, every_ns, reach_ns)
+        around = make_windows(mine, every_ns, reach_ns)
         moments = _promising(mine, around)
         if not len(moments):
             continue
         found = views_of(mine, receiver, around, moments, calibrations)
-        looks.append(looks_of(mine, around, receiver, moments))
+        looks.append(gather_observations(mine, around, receiver, moments))
         views.append((found, number))
         number += len(moments)
     if not views or not any(len(v.moment) for v, _ in views):
@@ -92,7 +108,7 @@ def solve_scene(
             hint="three or more must see both planes of one station; is the receiver's file of "
             "this device?",
         )
-    every = Views(
+    every = StationViews(
         np.concatenate([v.moment + n for v, n in views]),
         np.concatenate([v.station for v, _ in views]),
         np.concatenate([v.position for v, _ in views]),
@@ -111,7 +127,7 @@ def solve_scene(
 # ---- single stations
 
 
-def _promising(mine: DeviceSweeps, around: Windows) -> NDArray[np.int64]:
+def _promising(mine: DeviceSweeps, around: SweepWindows) -> NDArray[np.int64]:
     """Moments spread over the recording, of each stretch that with the most looks."""
     if not len(around):
         return np.zeros(0, np.int64)
@@ -130,7 +146,7 @@ def _promising(mine: DeviceSweeps, around: Windows) -> NDArray[np.int64]:
 # ---- all together
 
 
-def _stacked(parts: list[Looks]) -> Looks:
+def _stacked(parts: list[SweepObservations]) -> SweepObservations:
     """Moments of several devices, padded to one width."""
     wide = max(p.angle.shape[1] for p in parts)
 
@@ -138,7 +154,7 @@ def _stacked(parts: list[Looks]) -> Looks:
         room = [(0, 0), (0, wide - values.shape[1])] + [(0, 0)] * (values.ndim - 2)
         return np.pad(values, room)
 
-    return Looks(
+    return SweepObservations(
         *(
             np.concatenate([widened(getattr(p, name)) for p in parts])
             for name in ("place", "station", "plane", "angle", "since_s", "seen")
@@ -147,18 +163,18 @@ def _stacked(parts: list[Looks]) -> Looks:
 
 
 def _adjusted(
-    looks: Looks,
-    views: Views,
+    looks: SweepObservations,
+    views: StationViews,
     stations: Stations,
     joined: list[int],
     channels: Sequence[int],
     scene: Scene,
-    links: list[Link],
+    links: list[StationLink],
 ) -> SolvedScene:
     """Stations adjusted together with the devices' poses, in the first station's axes."""
     columns = np.full(len(channels), -1)
     columns[joined] = np.arange(len(joined))
-    looks = Looks(
+    looks = SweepObservations(
         looks.place, columns[looks.station], looks.plane, looks.angle, looks.since_s,
         looks.seen & (columns[looks.station] >= 0),
     )  # fmt: skip
@@ -173,7 +189,7 @@ def _adjusted(
     guessed = np.array([c.source == "generic" for c in stations[2]])
     sigma = MODEL_SIGMA_RAD if np.any(guessed) else 2 * ANGLE_SIGMA_RAD
     done = adjust_rigid(
-        looks, stations, poses, sigma=sigma, soft=SOFT, share=share, calibrate=guessed
+        looks, stations, poses, sigma=sigma, soft=LOSS_SCALE_RAD, share=share, calibrate=guessed
     )
     # Again with the noise that the recording shows.
     sigma = max(ANGLE_SIGMA_RAD, robust_sigma(done.residual))
@@ -182,7 +198,7 @@ def _adjusted(
         done.stations,
         done.poses,
         sigma=sigma,
-        soft=min(3 * sigma, SOFT),
+        soft=min(3 * sigma, LOSS_SCALE_RAD),
         share=share,
         calibrate=guessed,
     )
@@ -231,31 +247,38 @@ def _adjusted(
 
 
 def _first_poses(
-    looks: Looks, views: Views, stations: Stations, columns: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], Poses, NDArray[np.int64]]:
+    looks: SweepObservations, views: StationViews, stations: Stations, columns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], DeviceStates, NDArray[np.int64]]:
     """Moments with a pose that all their stations accept; the poses; stations of each."""
     known = np.flatnonzero(columns[views.station] >= 0)
     column = columns[views.station[known]]
     turn = stations[1][column]
-    start = Poses.at_rest(
+    start = DeviceStates.at_rest(
         stations[0][column] + (turn @ views.position[known][..., None])[..., 0],
         turn @ views.rotation[known],
     )
     whose = views.moment[known]
-    rough = fit(
-        looks.take(whose), stations, start, sigma=MODEL_SIGMA_RAD, soft=10 * SOFT, iterations=0
+    rough = fit_poses(
+        looks.take(whose),
+        stations,
+        start,
+        sigma=MODEL_SIGMA_RAD,
+        soft=10 * LOSS_SCALE_RAD,
+        iterations=0,
     )
     order = np.lexsort((rough.cost, whose))
     first = order[np.r_[True, np.diff(whose[order]) > 0]]
     seen = looks.take(whose[first])
-    found = fit(seen, stations, start.take(first), sigma=MODEL_SIGMA_RAD, soft=10 * SOFT)
+    found = fit_poses(
+        seen, stations, start.take(first), sigma=MODEL_SIGMA_RAD, soft=10 * LOSS_SCALE_RAD
+    )
     number = np.zeros(len(first), np.int64)
     for i in range(len(stations[2])):
         number += np.any(seen.seen & (seen.station == i), axis=1)
     return whose[first], found.poses, number
 
 
-def _places(poses: Poses) -> NDArray[np.int64]:
+def _places(poses: DeviceStates) -> NDArray[np.int64]:
     """(m,) number of the place and orientation at which a device was; greedy, in order."""
     at: list[int] = []
     place = np.empty(len(poses), np.int64)

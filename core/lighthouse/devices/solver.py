@@ -18,13 +18,13 @@ from locatk.core.geometry import (
     umeyama,
 )
 from locatk.core.lighthouse.channels import period_ticks
-from locatk.core.lighthouse.devices.rigid_solver import RigidAnswer, solve_rigid
-from locatk.core.lighthouse.devices.verification import verify_rigid
+from locatk.core.lighthouse.devices.rigid_solver import DeviceSolution, solve_rigid_devices
+from locatk.core.lighthouse.devices.verification import verify_devices
 from locatk.core.lighthouse.job import LARGEST_MISFIT_M
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import MarkerVisit, Scene
-from locatk.core.lighthouse.scene.frame import turned
+from locatk.core.lighthouse.scene.frame import transform_covariance
 from locatk.core.lighthouse.scene.verification import StationCheck
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution
@@ -68,14 +68,14 @@ def solve_devices(
     """
     from locatk.core.lighthouse.solver import solve
 
-    answer = solve_rigid(sweeps, rigid, scene)
+    answer = solve_rigid_devices(sweeps, rigid, scene)
     if not scene.stations and scene.markers:
         answer = _on_markers(answer, scene.frame)
     if answer.scene.scale == "device" and not scene.stations:
         answer.notes.append("the scale is that of the device's own photodiodes")
         if scene.distances:
             answer.notes.append("distances are not used")
-    checks = verify_rigid(sweeps, rigid, answer)
+    checks = verify_devices(sweeps, rigid, answer)
     if checks:
         answer.facts["verification"] = {
             "held_out": bool(scene.stations),
@@ -91,7 +91,7 @@ def solve_devices(
     return _together(own, others, tuple(rigid))
 
 
-def _on_markers(answer: RigidAnswer, frame: str) -> RigidAnswer:
+def _on_markers(answer: DeviceSolution, frame: str) -> DeviceSolution:
     """The scene and the poses moved onto the markers on which devices stood.
 
     Markers lie farther apart than photodiodes, so that they give the scale as well.
@@ -127,7 +127,7 @@ def _on_markers(answer: RigidAnswer, frame: str) -> RigidAnswer:
             rotation=to.rotation @ station.rotation,
             covariance=None
             if station.covariance is None
-            else turned(station.covariance, to.scale, to.rotation),
+            else transform_covariance(station.covariance, to.scale, to.rotation),
         )
         for station in answer.scene.stations
     )
@@ -145,7 +145,7 @@ def _moved(track: Trajectory, to: Similarity, frame: str) -> Trajectory:
         frame=frame,
         position=to.apply(track.position),
         quaternion=quaternion_multiply(quaternion_from_matrix(to.rotation), track.quaternion),
-        covariance=turned(track.covariance, to.scale, to.rotation),
+        covariance=transform_covariance(track.covariance, to.scale, to.rotation),
     )
 
 
@@ -162,7 +162,7 @@ def _stood(sighting: MarkerVisit, trajectories: tuple[Trajectory, ...]) -> Array
 
 
 def _solution(
-    answer: RigidAnswer, options: SolveOptions, checks: tuple[StationCheck, ...]
+    answer: DeviceSolution, options: SolveOptions, checks: tuple[StationCheck, ...]
 ) -> Solution:
     """What the rigid devices alone say."""
     checked = {check.channel: check for check in checks}

@@ -8,10 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, Windows, looks_of
-from locatk.core.lighthouse.devices.pnp import SOFT, candidates
-from locatk.core.lighthouse.devices.pose_fit import Looks, Poses, Stations, fit
-from locatk.core.lighthouse.devices.propagation import accepted, enough, mean_angles
+from locatk.core.lighthouse.devices.device_sweeps import (
+    DeviceSweeps,
+    SweepWindows,
+    gather_observations,
+)
+from locatk.core.lighthouse.devices.pnp import LOSS_SCALE_RAD, candidates
+from locatk.core.lighthouse.devices.pose_fit import (
+    DeviceStates,
+    Stations,
+    SweepObservations,
+    fit_poses,
+)
+from locatk.core.lighthouse.devices.propagation import has_enough_sweeps, is_accepted, mean_angles
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
 
@@ -36,8 +45,8 @@ AMBIGUOUS = 50.0
 
 
 @dataclass
-class Views:
-    """Poses of devices under single stations: one row a reading.
+class StationViews:
+    """DeviceStates of devices under single stations: one row a reading.
 
     Attributes
     ----------
@@ -58,10 +67,10 @@ class Views:
 def views_of(
     mine: DeviceSweeps,
     receiver: Receiver,
-    around: Windows,
+    around: SweepWindows,
     moments: NDArray[np.int64],
     calibrations: tuple[Calibration, ...],
-) -> Views:
+) -> StationViews:
     """The device's poses under each station alone."""
     parts = []
     for i, calibration in enumerate(calibrations):
@@ -70,7 +79,7 @@ def views_of(
         # Pads to the end, as windows have them.
         of_it = np.take_along_axis(of_it, np.argsort(of_it < 0, axis=1, kind="stable"), axis=1)
         whose, shifts, turns = [], [], []
-        for k in np.flatnonzero(enough(mine, of_it)):
+        for k in np.flatnonzero(has_enough_sweeps(mine, of_it)):
             row = of_it[k]
             angles = mean_angles(mine.take(row[row >= 0]), len(receiver))
             for shift, turn in candidates(angles, receiver, calibration, triples=False):
@@ -80,23 +89,25 @@ def views_of(
         if not whose:
             continue
         owner = np.array(whose)
-        looks = looks_of(
-            mine, Windows(around.time_ns[moments], of_it), receiver, np.arange(len(moments))
+        looks = gather_observations(
+            mine, SweepWindows(around.time_ns[moments], of_it), receiver, np.arange(len(moments))
         ).take(owner)
         alone: Stations = (np.zeros((1, 3)), np.eye(3)[None], (calibration,))
-        looks = Looks(
+        looks = SweepObservations(
             looks.place, np.zeros_like(looks.station), looks.plane, looks.angle,
             looks.since_s, looks.seen,
         )  # fmt: skip
-        start = Poses.at_rest(np.stack(shifts), np.stack(turns))
-        found = fit(looks, alone, start, sigma=ANGLE_SIGMA_RAD, soft=SOFT, iterations=15)
-        good = accepted(looks, found.residual) & (found.poses.position[:, 0] > 0)
+        start = DeviceStates.at_rest(np.stack(shifts), np.stack(turns))
+        found = fit_poses(
+            looks, alone, start, sigma=ANGLE_SIGMA_RAD, soft=LOSS_SCALE_RAD, iterations=15
+        )
+        good = is_accepted(looks, found.residual) & (found.poses.position[:, 0] > 0)
         kept = _best_readings(owner, found.cost, found.poses.rotation, good)
         parts.append((owner[kept], np.full(len(kept), i), found.poses.take(kept)))
     if not parts:
         empty = np.zeros(0, np.int64)
-        return Views(empty, empty, np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    return Views(
+        return StationViews(empty, empty, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    return StationViews(
         np.concatenate([p[0] for p in parts]),
         np.concatenate([p[1] for p in parts]),
         np.concatenate([p[2].position for p in parts]),
@@ -126,7 +137,7 @@ def _best_readings(
 
 
 @dataclass(frozen=True)
-class Link:
+class StationLink:
     """How a second station stands in the axes of a first, and how many moments agree.
 
     ``rivalled`` where quite another answer has about as many: a flat device that only stood
@@ -141,7 +152,7 @@ class Link:
     rivalled: bool = False
 
 
-def links_of(views: Views, number: int) -> list[Link]:
+def links_of(views: StationViews, number: int) -> list[StationLink]:
     """Pairs of stations that saw a device at the same moments."""
     found = []
     for i in range(number):
@@ -152,7 +163,7 @@ def links_of(views: Views, number: int) -> list[Link]:
     return found
 
 
-def _link(views: Views, i: int, j: int) -> Link | None:
+def _link(views: StationViews, i: int, j: int) -> StationLink | None:
     first, second = np.flatnonzero(views.station == i), np.flatnonzero(views.station == j)
     a, b = np.nonzero(views.moment[first][:, None] == views.moment[second][None])
     if not len(a):
@@ -190,11 +201,11 @@ def _link(views: Views, i: int, j: int) -> Link | None:
     agreed = len(np.unique(moment[near]))
     other = misfit(proposals, shift[None], turn[None])[0] >= 1.0
     votes = np.count_nonzero(least[other] < 1.0, axis=1)
-    return Link(i, j, shift, turn, agreed, bool(np.any(votes >= RIVAL * agreed)))
+    return StationLink(i, j, shift, turn, agreed, bool(np.any(votes >= RIVAL * agreed)))
 
 
 def join(
-    links: list[Link], views: Views, number: int
+    links: list[StationLink], views: StationViews, number: int
 ) -> tuple[list[int], dict[int, tuple[Array, Array]]]:
     """Stations that hang together, ascending, with poses in the axes of the first of them."""
     best: dict[int, tuple[Array, Array]] = {}

@@ -1,4 +1,4 @@
-"""Poses of a rigid device over time in a known scene, and why some moments have none.
+"""DeviceStates of a rigid device over time in a known scene, and why some moments have none.
 
 Moments are located roughly (:mod:`locatk.core.lighthouse.devices.propagation`) and then fitted again
 with the noise that the recording itself shows.
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import quaternion_from_matrix
 from locatk.core.lighthouse.channels import TICK_HZ, period_ticks
-from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, windows
-from locatk.core.lighthouse.devices.pnp import SOFT
-from locatk.core.lighthouse.devices.pose_fit import Fit, Poses, Stations, fit
+from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, make_windows
+from locatk.core.lighthouse.devices.pnp import LOSS_SCALE_RAD
+from locatk.core.lighthouse.devices.pose_fit import DeviceStates, PoseFit, Stations, fit_poses
 from locatk.core.lighthouse.devices.propagation import (
     BLOCK,
     FAILED,
     LOST,
     SOLVED,
-    Track,
-    enough,
+    DeviceTrack,
     from_behind,
+    has_enough_sweeps,
     locate_all,
 )
 from locatk.core.lighthouse.noise import (
@@ -53,7 +53,7 @@ AGAIN_NS = 30_000_000
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackedDevice:
     """A device's poses.
 
     Attributes
@@ -91,7 +91,7 @@ def rotation_ns(channels: list[int]) -> tuple[int, int]:
     return int(np.min(ticks)), int(np.max(ticks))
 
 
-def follow(
+def track_device(
     name: str,
     frame: str,
     mine: DeviceSweeps,
@@ -99,8 +99,8 @@ def follow(
     stations: Stations,
     channels: list[int],
     every_ns: int | None = None,
-) -> Followed:
-    """Poses of one device in a known scene.
+) -> TrackedDevice:
+    """DeviceStates of one device in a known scene.
 
     Parameters
     ----------
@@ -120,19 +120,19 @@ def follow(
     other share half of theirs and are not independent.
     """
     fastest, slowest = rotation_ns(channels)
-    around = windows(mine, every_ns or fastest, slowest)
+    around = make_windows(mine, every_ns or fastest, slowest)
     m = len(around)
-    track = Track(
+    track = DeviceTrack(
         mine,
         receiver,
         stations,
         around,
         slowest,
-        Poses.at_rest(np.zeros((m, 3)), np.tile(np.eye(3), (m, 1, 1))),
+        DeviceStates.at_rest(np.zeros((m, 3)), np.tile(np.eye(3), (m, 1, 1))),
         np.zeros(m, np.int64),
         np.full(m, -1),
     )
-    few = ~enough(mine, around.sweep)
+    few = ~has_enough_sweeps(mine, around.sweep)
     track.status[few] = FAILED
     track.reject("moment_with_too_few_sweeps", np.count_nonzero(few))
     locate_all(track)
@@ -143,10 +143,10 @@ def follow(
 # ---- the end
 
 
-def _finish(name: str, frame: str, track: Track) -> Followed:
-    """Fit all solved moments again, with the noise and the gate that the recording shows."""
+def _finish(name: str, frame: str, track: DeviceTrack) -> TrackedDevice:
+    """PoseFit all solved moments again, with the noise and the gate that the recording shows."""
     solved = np.flatnonzero(track.status == SOLVED)
-    rough = _refit(track, solved[::4], ANGLE_SIGMA_RAD, SOFT, iterations=0)
+    rough = _refit(track, solved[::4], ANGLE_SIGMA_RAD, LOSS_SCALE_RAD, iterations=0)
     noise = max(ANGLE_SIGMA_RAD, robust_sigma(rough.residual))
     last = _refit(track, solved, noise, 3 * noise, iterations=10)
     sweep = track.around.sweep[solved]
@@ -156,7 +156,7 @@ def _finish(name: str, frame: str, track: Track) -> Followed:
     )
     with np.errstate(invalid="ignore"):
         used = np.abs(residual) < gate
-        few = ~enough(track.mine, np.where(np.abs(last.residual) < gate, sweep, -1))
+        few = ~has_enough_sweeps(track.mine, np.where(np.abs(last.residual) < gate, sweep, -1))
     sigma, lasting = _noise(track.mine, residual, used, sweep)
 
     guessed = any(c.source in ("generic", "estimated") for c in track.stations[2])
@@ -184,7 +184,7 @@ def _finish(name: str, frame: str, track: Track) -> Followed:
     ambiguous = int(np.count_nonzero(unsure[track.source[solved[good]]])) if len(unsure) else 0
     some = solved[good][:: max(1, np.count_nonzero(good) // BLOCK)]
     behind = from_behind(track, some, track.poses.take(some))
-    return Followed(
+    return TrackedDevice(
         trajectory,
         residual,
         used,
@@ -198,15 +198,15 @@ def _finish(name: str, frame: str, track: Track) -> Followed:
 
 
 def _refit(
-    track: Track, moments: NDArray[np.int64], sigma: float, soft: float, iterations: int
-) -> Fit:
+    track: DeviceTrack, moments: NDArray[np.int64], sigma: float, soft: float, iterations: int
+) -> PoseFit:
     """All moments fitted from where they are; residuals (m, n) as the windows' sweeps."""
     wide = track.around.sweep.shape[1]
     parts = []
     for k in range(0, max(len(moments), 1), BLOCK):
         rows = moments[k : k + BLOCK]
         looks, start = track.looks(rows), track.poses.take(rows)
-        found = fit(
+        found = fit_poses(
             looks,
             track.stations,
             start,
@@ -219,17 +219,17 @@ def _refit(
         residual = np.full((len(rows), wide), np.nan)
         residual[:, : looks.angle.shape[1]] = found.residual
         parts.append(replace(found, residual=residual))
-    poses = Poses(
-        *(np.concatenate([getattr(p.poses, f.name) for p in parts]) for f in fields(Poses))
+    poses = DeviceStates(
+        *(np.concatenate([getattr(p.poses, f.name) for p in parts]) for f in fields(DeviceStates))
     )
     residual, information, cost = (
         np.concatenate([getattr(p, name) for p in parts])
         for name in ("residual", "information", "cost")
     )
-    return Fit(poses, residual, information, cost)
+    return PoseFit(poses, residual, information, cost)
 
 
-def _nearest(track: Track, moments: NDArray[np.int64], residual: Array) -> Array:
+def _nearest(track: DeviceTrack, moments: NDArray[np.int64], residual: Array) -> Array:
     """(n,) residual of each sweep at the moment next to it; ``nan`` where it was in none."""
     seen = np.isfinite(residual)
     sweep = track.around.sweep[moments][seen]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import matrix_from_quaternion
 from locatk.core.lighthouse.calibration import predict_angles
-from locatk.core.lighthouse.devices.device_sweeps import sweeps_of
-from locatk.core.lighthouse.devices.rigid_solver import RigidAnswer, solve_rigid
+from locatk.core.lighthouse.devices.device_sweeps import select_device_sweeps
+from locatk.core.lighthouse.devices.rigid_solver import DeviceSolution, solve_rigid_devices
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Station
@@ -35,8 +35,8 @@ NEAR_NS = 10_000_000
 """A pose predicts sweeps this close to it: at half a metre a second 5 mm, on both sides alike."""
 
 
-def verify_rigid(
-    sweeps: Sweeps, receivers: Mapping[str, Receiver], answer: RigidAnswer
+def verify_devices(
+    sweeps: Sweeps, receivers: Mapping[str, Receiver], answer: DeviceSolution
 ) -> tuple[StationCheck, ...]:
     """Check each station of a solved scene; empty where there is only one.
 
@@ -45,7 +45,7 @@ def verify_rigid(
     sweeps : Sweeps
     receivers : mapping of str to Receiver
         By device; all of them in ``answer``.
-    answer : RigidAnswer
+    answer : DeviceSolution
         Of these sweeps.
     """
     channels = sorted(answer.used)
@@ -62,7 +62,7 @@ def verify_rigid(
 def _check(
     sweeps: Sweeps,
     receivers: Mapping[str, Receiver],
-    answer: RigidAnswer,
+    answer: DeviceSolution,
     channel: int,
     middles: NDArray[np.int64],
 ) -> StationCheck:
@@ -70,7 +70,7 @@ def _check(
     others = tuple(s for s in answer.scene.stations if s.channel != channel)
     none = StationCheck(channel, "others", 0, None, None, None, None, None)
     try:
-        without = solve_rigid(
+        without = solve_rigid_devices(
             sweeps.take(sweeps.channel != channel),
             receivers,
             replace(answer.scene, stations=others),
@@ -127,7 +127,7 @@ def _off(
 ) -> tuple[Array, Array]:
     """Predicted minus observed angle of a station's sweeps near poses, and their distances."""
     device = sweeps.devices.index(trajectory.device)
-    own, _ = sweeps_of(sweeps, device, receiver, [station.channel])
+    own, _ = select_device_sweeps(sweeps, device, receiver, [station.channel])
     pose = _nearest(trajectory.time_ns, own.time_ns)
     own_near = np.abs(trajectory.time_ns[pose] - own.time_ns) < NEAR_NS
     own, pose = own.take(own_near), pose[own_near]

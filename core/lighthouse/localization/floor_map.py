@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.light_planes import plane_normals
-from locatk.core.lighthouse.localization.positions import Fixes
+from locatk.core.lighthouse.localization.positions import PositionEstimates
 from locatk.core.lighthouse.scene.resection import require_plane_map
 from locatk.core.lighthouse.scene.two_view import GATE, fit_homography, homography_residuals
 from locatk.core.robust import consensus
@@ -22,7 +22,7 @@ from locatk.core.robust import consensus
 Array = NDArray[np.float64]
 
 
-def fit_floor_map(points: Array, rays: Array) -> Array:
+def fit_floor_homography(points: Array, rays: Array) -> Array:
     """Homography (3, 3) from rays (1, y, z) to floor points (1, x, y).
 
     Parameters
@@ -72,9 +72,9 @@ def _inverse(h: Array) -> Array:
     return inverse
 
 
-def locate_on_map(
+def estimate_floor_positions(
     angles: Array, calibration: Calibration, floor_map: Array, floor_z: float
-) -> Fixes:
+) -> PositionEstimates:
     """Positions on the floor of photodiodes that one station saw.
 
     Parameters
@@ -83,13 +83,13 @@ def locate_on_map(
         Rotor angles in radians, ``nan`` where not seen.
     calibration : Calibration
     floor_map : (3, 3) ndarray
-        From :func:`fit_floor_map`.
+        From :func:`fit_floor_homography`.
     floor_z : float
         Height of the floor points, in metres.
 
     Returns
     -------
-    Fixes
+    PositionEstimates
         Nothing checks these positions: their freedom is 0 or less.
     """
     plain = ideal_angles(angles[:, 0], calibration)
@@ -113,4 +113,6 @@ def locate_on_map(
     information[:, :2, :2] = np.linalg.inv(covariance)
     freedom = np.count_nonzero(np.isfinite(angles), axis=(1, 2)) - 2
     position = np.where(seen[:, None], np.c_[place, np.full(m, floor_z)], np.nan)
-    return Fixes(position, information, np.where(np.isfinite(angles), 0.0, np.nan), freedom)
+    return PositionEstimates(
+        position, information, np.where(np.isfinite(angles), 0.0, np.nan), freedom
+    )

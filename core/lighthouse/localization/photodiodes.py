@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.epochs import Epochs, angles_of
-from locatk.core.lighthouse.localization.floor_map import locate_on_map
-from locatk.core.lighthouse.localization.positions import Fixes, locate
+from locatk.core.lighthouse.localization.floor_map import estimate_floor_positions
+from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
 from locatk.core.lighthouse.noise import (
     ANGLE_SIGMA_RAD,
     CALIBRATION_SIGMA_RAD,
@@ -26,7 +26,7 @@ from locatk.core.lighthouse.noise import (
     MIN_INLIER_GATE_RAD,
 )
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.scene.selection import evenly
+from locatk.core.lighthouse.scene.selection import spread_evenly
 from locatk.core.lighthouse.scene.verification import MOST, StationCheck, verify, wrong_station
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution
@@ -61,9 +61,9 @@ def answer(job: Job, scene: Scene) -> Solution:
     floor = scene.floor_z if scene.planar else None
     floor_map = stations[0].floor_map if len(stations) == 1 else None
     if floor_map is not None:
-        fixes = locate_on_map(job.angles, rig[2][0], floor_map, scene.floor_z)
+        fixes = estimate_floor_positions(job.angles, rig[2][0], floor_map, scene.floor_z)
     else:
-        fixes = locate(job.angles, *rig, floor_z=floor)
+        fixes = estimate_positions(job.angles, *rig, floor_z=floor)
         fixes = _swap_back(job, fixes, rig, floor)
     gate = _gate(fixes)
     if floor_map is None:
@@ -129,10 +129,10 @@ def _verified(job: Job, rig: Stations, floor: float | None) -> tuple[StationChec
         seen = _sights(job.angles)
         rows = np.flatnonzero(np.count_nonzero(seen, axis=1) > 1)
         rows = rows[:: 1 + len(rows) // FEW]
-        angles, held_out = job.angles[evenly(seen, rows, MOST)], True
+        angles, held_out = job.angles[spread_evenly(seen, rows, MOST)], True
     if angles.shape[1] < 2 or len(angles) == 0:
         return ()
-    angles = angles[evenly(_sights(angles), np.arange(len(angles)), MOST)]
+    angles = angles[spread_evenly(_sights(angles), np.arange(len(angles)), MOST)]
     checks = verify(angles, job.epochs.channels.tolist(), *rig, floor_z=floor)
     job.facts["verification"] = {
         "held_out": held_out,
@@ -154,14 +154,14 @@ def _sights(angles: Array) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(angles).any(axis=2))
 
 
-def _gate(fixes: Fixes) -> float:
+def _gate(fixes: PositionEstimates) -> float:
     """Angle by which a plane may miss its position, in radians: far out in what the
     recording itself shows, and never more than :data:`INLIER_GATE_RAD`."""
     noise = _noise(fixes, fixes.worst < INLIER_GATE_RAD)
     return float(np.clip(INLIER_GATE_SIGMAS * noise, MIN_INLIER_GATE_RAD, INLIER_GATE_RAD))
 
 
-def _jumps(epochs: Epochs, fixes: Fixes, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _jumps(epochs: Epochs, fixes: PositionEstimates, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Moments that nothing checks and that leave the path of their device.
 
     Compared is each position with the median of the five around it, which a steady motion
@@ -187,7 +187,9 @@ def _jumps(epochs: Epochs, fixes: Fixes, good: NDArray[np.bool_]) -> NDArray[np.
     return jumps
 
 
-def _swap_back(job: Job, fixes: Fixes, rig: Stations, floor: float | None) -> Fixes:
+def _swap_back(
+    job: Job, fixes: PositionEstimates, rig: Stations, floor: float | None
+) -> PositionEstimates:
     """Give sweeps back to their stations where a report without polynomials mixed them up.
 
     Reports that sort all counts of two stations exchange a plane of theirs, or both,
@@ -202,7 +204,7 @@ def _swap_back(job: Job, fixes: Fixes, rig: Stations, floor: float | None) -> Fi
         counts = job.epochs.counts[wrong].copy()
         counts[:, :, planes] = counts[:, ::-1, planes]
         trial = angles_of(replace(job.epochs, counts=counts))
-        fresh = locate(trial, *rig, floor_z=floor)
+        fresh = estimate_positions(trial, *rig, floor_z=floor)
         right = np.isfinite(fresh.position[:, 0]) & (fresh.worst < INLIER_GATE_RAD / 2)
         rows = wrong[right]
         job.correct(rows, counts[right])
@@ -219,11 +221,11 @@ def _swap_back(job: Job, fixes: Fixes, rig: Stations, floor: float | None) -> Fi
 
 def _without_worst_station(
     job: Job,
-    fixes: Fixes,
+    fixes: PositionEstimates,
     rig: Stations,
     floor: float | None,
     gate: float,
-) -> Fixes:
+) -> PositionEstimates:
     """Where one of three or more stations contradicts the others, go on without it."""
     if len(job.epochs.channels) < 3:
         return fixes
@@ -233,7 +235,7 @@ def _without_worst_station(
     for column in range(len(job.epochs.channels)):
         trial = job.angles[wrong].copy()
         trial[:, column] = np.nan
-        fresh = locate(trial, *rig, floor_z=floor)
+        fresh = estimate_positions(trial, *rig, floor_z=floor)
         better = (
             np.isfinite(fresh.position[:, 0])
             & (fresh.worst < np.minimum(best, gate))
@@ -246,16 +248,21 @@ def _without_worst_station(
     return fixes
 
 
-def _with(fixes: Fixes, rows: NDArray[np.int64], fresh: Fixes, chosen: NDArray[np.bool_]) -> Fixes:
+def _with(
+    fixes: PositionEstimates,
+    rows: NDArray[np.int64],
+    fresh: PositionEstimates,
+    chosen: NDArray[np.bool_],
+) -> PositionEstimates:
     """``fixes`` with the chosen ones of ``fresh`` at ``rows``."""
     changed = {}
     for name in ("position", "information", "residual", "freedom"):
         changed[name] = getattr(fixes, name).copy()
         changed[name][rows] = getattr(fresh, name)[chosen]
-    return Fixes(**changed)
+    return PositionEstimates(**changed)
 
 
-def _noise(fixes: Fixes, good: NDArray[np.bool_]) -> float:
+def _noise(fixes: PositionEstimates, good: NDArray[np.bool_]) -> float:
     """Standard deviation of an angle in radians, from what redundancy shows of it.
 
     The sum of squares of a moment's residuals has a chi-square distribution; its median

@@ -22,7 +22,7 @@ BLOCK = 4096
 
 
 @dataclass(frozen=True)
-class Fixes:
+class PositionEstimates:
     """Positions with what they are worth.
 
     Attributes
@@ -63,7 +63,7 @@ class Fixes:
         return full
 
 
-def locate(
+def estimate_positions(
     angles: Array,
     positions: Array,
     rotations: Array,
@@ -71,7 +71,7 @@ def locate(
     *,
     floor_z: float | None = None,
     passes: int = 3,
-) -> Fixes:
+) -> PositionEstimates:
     """Where photodiodes are that saw the given rotor angles.
 
     Parameters
@@ -90,13 +90,13 @@ def locate(
 
     Returns
     -------
-    Fixes
+    PositionEstimates
     """
     blocks = [
         _locate_block(angles[k : k + BLOCK], positions, rotations, calibrations, floor_z, passes)
         for k in range(0, max(len(angles), 1), BLOCK)
     ]
-    return Fixes(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+    return PositionEstimates(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
 def _locate_block(

@@ -8,8 +8,8 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.channels import channel_of
-from locatk.core.lighthouse.demodulation.bursts import split
-from locatk.core.lighthouse.demodulation.pipeline import SHORTEST_S, Caught
+from locatk.core.lighthouse.demodulation.bursts import split_bursts
+from locatk.core.lighthouse.demodulation.pipeline import SHORTEST_S, DecodedSweeps
 from locatk.core.lighthouse.published import light_decoding as paper_light
 from locatk.core.lighthouse.recording import UNKNOWN, Edges
 
@@ -19,7 +19,7 @@ Their receiver begins with the edge of an envelope that a recording of the data 
 not have."""
 
 
-def receive(lines: Sequence[Edges]) -> tuple[Caught, int]:
+def receive(lines: Sequence[Edges]) -> tuple[DecodedSweeps, int]:
     """Sweeps of a recording, and the number of bursts that were tried.
 
     Parameters
@@ -29,7 +29,7 @@ def receive(lines: Sequence[Edges]) -> tuple[Caught, int]:
 
     Returns
     -------
-    sweeps : Caught
+    sweeps : DecodedSweeps
         Dated by the start of their window, with the index as it was decoded; nothing is
         refused, and nothing tells the planes apart.
     bursts : int
@@ -41,7 +41,7 @@ def receive(lines: Sequence[Edges]) -> tuple[Caught, int]:
     """
     parts, tried = [], 0
     for sensor, edges in enumerate(lines):
-        bursts = split(edges)
+        bursts = split_bursts(edges)
         bursts = bursts.take(bursts.duration_s > SHORTEST_S)
         tried += len(bursts)
         start = bursts.start + round(WINDOW_START_S * edges.rate_hz)
@@ -59,7 +59,7 @@ def receive(lines: Sequence[Edges]) -> tuple[Caught, int]:
             f"the paper's method decodes none of {tried} bursts", hint="Use --method soft"
         )
     order = np.argsort(tick, kind="stable")
-    return Caught(
+    return DecodedSweeps(
         tick[order].astype(float),
         sensors[order].astype(np.int32),
         channel_of(polynomial[order]).astype(np.int32),

@@ -16,7 +16,7 @@ from locatk.core.lighthouse.localization.photodiodes import detections
 from locatk.core.lighthouse.published import scene as paper
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene import frame as frames
-from locatk.core.lighthouse.scene.keyframes import require_places
+from locatk.core.lighthouse.scene.keyframes import require_distinct_positions
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -64,7 +64,7 @@ def solve_as_paper(job: Job) -> Solution:
         to, scale = Similarity.identity(), "markers"
     else:
         first, second = (np.insert(image[seen, k], 0, 1.0, axis=1) for k in (0, 1))
-        require_places(first, second, 4 if kind == "two-planar" else 8)
+        require_distinct_positions(first, second, 4 if kind == "two-planar" else 8)
         solve = paper.two_planar if kind == "two-planar" else paper.two_3d
         solved = solve(image[seen])
         to, scale = _frame(job, solved, known, sighted)

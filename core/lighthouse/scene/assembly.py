@@ -18,10 +18,14 @@ from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.light_planes import rays as rays_of
 from locatk.core.lighthouse.scene import two_view as twoview
-from locatk.core.lighthouse.scene.bundle_adjustment import Adjustment, Rig, adjust
-from locatk.core.lighthouse.scene.pairs import Misfit, Pair, looks_flat, solve_pair
-from locatk.core.lighthouse.scene.registration import Growth
-from locatk.core.lighthouse.scene.selection import evenly, hold_out
+from locatk.core.lighthouse.scene.bundle_adjustment import (
+    BundleAdjustment,
+    BundleState,
+    adjust_bundle,
+)
+from locatk.core.lighthouse.scene.pairs import Misfit, StationPair, looks_flat, solve_pair
+from locatk.core.lighthouse.scene.registration import StationRegistration
+from locatk.core.lighthouse.scene.selection import split_held_out, spread_evenly
 
 Array = NDArray[np.float64]
 
@@ -47,7 +51,7 @@ class Assembly:
 
     Attributes
     ----------
-    adjustment : Adjustment
+    adjustment : BundleAdjustment
         The bundle adjustment over ``chosen``; in a planar scene z = 0 is the plane of the
         photodiodes and z is up.
     stations : tuple of int
@@ -63,7 +67,7 @@ class Assembly:
         Columns of the other stations, with the reason.
     """
 
-    adjustment: Adjustment
+    adjustment: BundleAdjustment
     stations: tuple[int, ...]
     chosen: NDArray[np.int64]
     planar: bool
@@ -72,7 +76,7 @@ class Assembly:
     left_out: dict[int, str] = field(default_factory=dict)
 
 
-def assemble(
+def estimate_stations(
     angles: Array,
     calibrations: tuple[Calibration, ...],
     *,
@@ -111,9 +115,9 @@ def assemble(
     )
     seen = np.isfinite(rays[..., 0])
     joint = _joint(seen)
-    found: dict[tuple[int, int, bool | None], Pair | DegenerateError] = {}
+    found: dict[tuple[int, int, bool | None], StationPair | DegenerateError] = {}
 
-    def pair_of(i: int, j: int, planar: bool | None) -> Pair | DegenerateError:
+    def pair_of(i: int, j: int, planar: bool | None) -> StationPair | DegenerateError:
         columns = (min(i, j), max(i, j))
         key = (*columns, planar)
         if key not in found:
@@ -138,15 +142,15 @@ def assemble(
         planar = False
     starts = _starts(joint, group, lambda i, j: pair_of(i, j, planar))
 
-    def neighbours(i: int, j: int) -> Pair | None:
+    def neighbours(i: int, j: int) -> StationPair | None:
         pair = pair_of(i, j, starts[0].planar)
-        return pair if isinstance(pair, Pair) else None
+        return pair if isinstance(pair, StationPair) else None
 
-    grown: list[tuple[Growth, Pair, dict[int, str]]] = []
+    grown: list[tuple[StationRegistration, StationPair, dict[int, str]]] = []
     for start in starts:
         if any({*start.columns} <= {*growth.known} for growth, _, _ in grown):
             continue
-        growth = Growth(angles, rays, calibrations, start, sigma)
+        growth = StationRegistration(angles, rays, calibrations, start, sigma)
         grown.append((growth, start, growth.add_all(neighbours)))
         if 2 * len(growth.known) > len(group):
             break
@@ -159,9 +163,9 @@ def assemble(
 
 
 def _adjusted(
-    growth: Growth,
+    growth: StationRegistration,
     calibrations: tuple[Calibration, ...],
-    start: Pair,
+    start: StationPair,
     left_out: dict[int, str],
     facts: dict[str, object],
 ) -> Assembly:
@@ -181,12 +185,12 @@ def _adjusted(
             hint="the recording holds little but wrong sweeps; `locatk info` shows its channels",
         )
     seen = growth.seen[:, known]
-    taken, held_out = hold_out(seen, usable)
-    chosen = evenly(seen, taken, BUNDLE_POINTS)
+    taken, held_out = split_held_out(seen, usable)
+    chosen = spread_evenly(seen, taken, BUNDLE_POINTS)
     # From the calibrations that came in: the prior holds whatever an adjustment starts from.
-    final = adjust(
+    final = adjust_bundle(
         growth.angles[chosen][:, known],
-        Rig(
+        BundleState(
             growth.positions[known],
             growth.rotations[known],
             tuple(calibrations[k] for k in known),
@@ -250,18 +254,18 @@ def _fills_space(rays: Array, joint: NDArray[np.int64], group: tuple[int, ...], 
 def _starts(
     joint: NDArray[np.int64],
     group: tuple[int, ...],
-    pair_of: Callable[[int, int], Pair | DegenerateError],
-) -> list[Pair]:
+    pair_of: Callable[[int, int], StationPair | DegenerateError],
+) -> list[StationPair]:
     """The pairs of a group with the most common places, the one that stands firmest first."""
     ranked = sorted(combinations(group, 2), key=lambda p: -int(joint[p]))
-    pairs: list[Pair] = []
+    pairs: list[StationPair] = []
     refused: DegenerateError | None = None
     for i, j in ranked:
         weak = joint[i, j] < LEAST_JOINT or 4 * joint[i, j] < joint[ranked[0]]
         if pairs and (weak or len(pairs) == STARTS):
             break
         pair = pair_of(i, j)
-        if isinstance(pair, Pair):
+        if isinstance(pair, StationPair):
             pairs.append(pair)
         else:
             refused = refused or pair

@@ -36,7 +36,7 @@ after each: that is twice the work, but gets it through the valleys of narrow fi
 
 
 @dataclass(frozen=True)
-class Rig:
+class BundleState:
     """Stations and points in one frame: the unknowns of the adjustment.
 
     Attributes
@@ -57,12 +57,12 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Adjustment:
-    """Result of :func:`adjust`.
+class BundleAdjustment:
+    """Result of :func:`adjust_bundle`.
 
     Attributes
     ----------
-    rig : Rig
+    rig : BundleState
     residuals : (m, s, 2) ndarray
         Predicted minus observed angle, in radians; ``nan`` where nothing was seen.
     weights : (m, s, 2) ndarray
@@ -74,7 +74,7 @@ class Adjustment:
         Half the robust sum of squares at the end.
     """
 
-    rig: Rig
+    rig: BundleState
     residuals: Array
     weights: Array
     station_covariance: Array
@@ -82,9 +82,9 @@ class Adjustment:
     cost: float
 
 
-def adjust(
+def adjust_bundle(
     angles: Array,
-    rig: Rig,
+    rig: BundleState,
     *,
     sigma: float,
     planar: bool = False,
@@ -93,14 +93,14 @@ def adjust(
     independent: int = 100,
     soft: float = 3e-3,
     iterations: int = 50,
-) -> Adjustment:
+) -> BundleAdjustment:
     """Refine a rig so that it predicts the observed angles.
 
     Parameters
     ----------
     angles : (m, s, 2) ndarray
         Observed rotor angles, ``nan`` where a station was not seen.
-    rig : Rig
+    rig : BundleState
         Where to start.
     sigma : float
         Standard deviation of an angle, in radians.
@@ -122,7 +122,7 @@ def adjust(
 
     Returns
     -------
-    Adjustment
+    BundleAdjustment
     """
     seen = np.isfinite(angles)
     observed = np.where(seen, angles, 0.0)
@@ -132,10 +132,12 @@ def adjust(
     prior = _Prior.of(rig, free)
     dims = 0 if fixed_points else (2 if planar else 3)
 
-    def linearised(rig: Rig) -> _System:
+    def linearised(rig: BundleState) -> _System:
         return _linearise(observed, seen, rig, sigma, loss_width, prior, dims)
 
-    def attempt(rig: Rig, system: _System, damping: float, step: int) -> tuple[Rig, _System]:
+    def attempt(
+        rig: BundleState, system: _System, damping: float, step: int
+    ) -> tuple[BundleState, _System]:
         trial = _step(system, rig, damping, planar, dims)
         found = linearised(trial)
         if dims and step > SLOW:
@@ -154,7 +156,7 @@ def adjust(
     covariance = loose @ np.linalg.pinv(loose @ reduced @ loose, hermitian=True) @ loose
     s = len(rig.positions)
     blocks = covariance.reshape(s, STATION_UNKNOWNS, s, STATION_UNKNOWNS)
-    return Adjustment(
+    return BundleAdjustment(
         rig,
         np.where(seen, system.residuals * sigma, np.nan),
         np.where(seen, system.weights, np.nan),
@@ -172,9 +174,9 @@ class _Prior:
     information: Array
 
     @classmethod
-    def of(cls, rig: Rig, free: NDArray[np.bool_]) -> _Prior:
-        own = np.stack([unknowns_of(c) for c in rig.calibrations])
-        mean = np.where(free[:, None], unknowns_of(GENERIC_CALIBRATION), own)
+    def of(cls, rig: BundleState, free: NDArray[np.bool_]) -> _Prior:
+        own = np.stack([calibration_parameters(c) for c in rig.calibrations])
+        mean = np.where(free[:, None], calibration_parameters(GENERIC_CALIBRATION), own)
         spread = np.concatenate([PHASE_TILT_SIGMA_RAD[:, 1], PHASE_TILT_SIGMA_RAD[:, 0]])
         information = np.full(mean.shape, np.inf)
         # What is the same in every unit (the first phase is zero) is not estimated.
@@ -185,7 +187,7 @@ class _Prior:
         return cls(mean, information)
 
 
-def unknowns_of(calibration: Calibration) -> Array:
+def calibration_parameters(calibration: Calibration) -> Array:
     """(4,) both tilts and both phases, which an adjustment may estimate, in radians."""
     return np.concatenate([calibration.sweeps[:, TILT], calibration.sweeps[:, PHASE]])
 
@@ -207,7 +209,7 @@ class _System:
 def _linearise(
     observed: Array,
     seen: NDArray[np.bool_],
-    rig: Rig,
+    rig: BundleState,
     sigma: float,
     loss_width: float,
     prior: _Prior,
@@ -248,7 +250,7 @@ def _linearise(
         flat = jacobian.reshape(-1, n)
         stations[i] = flat.T @ flat
         stations_rhs[i] = flat.T @ pulled.ravel()
-        deviation = unknowns_of(rig.calibrations[i]) - prior.mean[i]
+        deviation = calibration_parameters(rig.calibrations[i]) - prior.mean[i]
         held = np.isinf(prior.information[i])
         information = np.where(held, 0.0, prior.information[i])
         stations[i][range(6, 10), range(6, 10)] += information
@@ -291,7 +293,7 @@ def _reduce(system: _System, damping: float, dims: int) -> tuple[Array, Array, A
     return full, rhs, inverses
 
 
-def _hold_gauge(matrix: Array, rig: Rig, planar: bool, dims: int) -> Array:
+def _hold_gauge(matrix: Array, rig: BundleState, planar: bool, dims: int) -> Array:
     """Add a penalty on moving, turning and scaling the whole rig."""
     if not dims:
         return matrix
@@ -299,7 +301,7 @@ def _hold_gauge(matrix: Array, rig: Rig, planar: bool, dims: int) -> Array:
     return matrix + np.max(np.diag(matrix)) * basis @ basis.T
 
 
-def _gauge(rig: Rig, planar: bool) -> Array:
+def _gauge(rig: BundleState, planar: bool) -> Array:
     """(s * 10, g) orthonormal directions of the unknowns that no angle depends on."""
     s = len(rig.positions)
     motions = []
@@ -329,7 +331,9 @@ def _settled(system: _System, points: Array, dims: int) -> Array:
     return moved
 
 
-def _step(system: _System, rig: Rig, damping: float, planar: bool, dims: int) -> Rig:
+def _step(
+    system: _System, rig: BundleState, damping: float, planar: bool, dims: int
+) -> BundleState:
     reduced, rhs, inverses = _reduce(system, damping, dims)
     frozen = ~np.any(reduced, axis=1)
     reduced = _hold_gauge(reduced, rig, planar, dims)
@@ -341,16 +345,16 @@ def _step(system: _System, rig: Rig, damping: float, planar: bool, dims: int) ->
         back = system.points_rhs + np.einsum("mkd,k->md", system.mixed, delta)
         points = points.copy()
         points[:, :dims] -= (inverses @ back[..., None])[..., 0]
-    return Rig(
+    return BundleState(
         rig.positions + change[:, 0:3],
         rotation_exp(change[:, 3:6]) @ rig.rotations,
-        tuple(bent(c, d) for c, d in zip(rig.calibrations, change[:, 6:], strict=True)),
+        tuple(with_parameters(c, d) for c, d in zip(rig.calibrations, change[:, 6:], strict=True)),
         points,
     )
 
 
-def bent(calibration: Calibration, change: Array) -> Calibration:
-    """A calibration with its :func:`unknowns_of` changed by so much."""
+def with_parameters(calibration: Calibration, change: Array) -> Calibration:
+    """A calibration with its :func:`calibration_parameters` changed by so much."""
     if not np.any(change):
         return calibration
     sweeps = calibration.sweeps.copy()

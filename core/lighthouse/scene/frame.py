@@ -16,9 +16,9 @@ from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import Similarity, umeyama
 from locatk.core.lighthouse.epochs import Epochs
 from locatk.core.lighthouse.light_planes import counts_to_angles
-from locatk.core.lighthouse.localization.positions import Fixes, locate
+from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit
-from locatk.core.lighthouse.scene.bundle_adjustment import Rig
+from locatk.core.lighthouse.scene.bundle_adjustment import BundleState
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -72,14 +72,14 @@ def sighted_markers(
     return np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows])
 
 
-def sight(rig: Rig, planar: bool, angles: Array) -> Fixes:
+def sight(rig: BundleState, planar: bool, angles: Array) -> PositionEstimates:
     """Where a rig sees photodiodes (m, s, 2), in its own unit; on z = 0 where ``planar``."""
-    return locate(
+    return estimate_positions(
         angles, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0 if planar else None
     )
 
 
-def marker_misfit(rig: Rig, planar: bool, known: Array, seen: Array) -> float:
+def marker_misfit(rig: BundleState, planar: bool, known: Array, seen: Array) -> float:
     """Rms distance in metres of markers from where the rig sees them, after the best
     similarity; infinite for fewer than four, which fit too easily to tell.
 
@@ -93,13 +93,15 @@ def marker_misfit(rig: Rig, planar: bool, known: Array, seen: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((to.apply(position[good]) - known[good]) ** 2, axis=1))))
 
 
-def place_on_markers(rig: Rig, planar: bool, known: Array, seen: Array) -> Similarity | None:
+def place_on_markers(
+    rig: BundleState, planar: bool, known: Array, seen: Array
+) -> Similarity | None:
     """Similarity that brings the rig into the frame of its markers, or None where fewer
     than three are seen well enough.
 
     Parameters
     ----------
-    rig : Rig
+    rig : BundleState
     planar : bool
         The rig's photodiodes have z = 0.
     known : (k, 3) ndarray
@@ -202,9 +204,9 @@ def scale_of_odometry(
     return float(np.median(found)) if len(found) >= 5 else None
 
 
-def moved(rig: Rig, to: Similarity) -> Rig:
+def transform_state(rig: BundleState, to: Similarity) -> BundleState:
     """The rig in another frame and unit."""
-    return Rig(
+    return BundleState(
         to.apply(rig.positions),
         to.rotation @ rig.rotations,
         rig.calibrations,
@@ -212,7 +214,7 @@ def moved(rig: Rig, to: Similarity) -> Rig:
     )
 
 
-def at_first_station(rig: Rig, planar: bool, scale: float) -> Similarity:
+def at_first_station(rig: BundleState, planar: bool, scale: float) -> Similarity:
     """Frame of a rig that nothing ties to the world.
 
     In space the axes are the first station's. On a floor z stays up and the origin lies
@@ -229,7 +231,7 @@ def at_first_station(rig: Rig, planar: bool, scale: float) -> Similarity:
     return Similarity(scale, rotation, -scale * rotation @ origin)
 
 
-def turned(covariance: Array, scale: float, rotation: Array) -> Array:
+def transform_covariance(covariance: Array, scale: float, rotation: Array) -> Array:
     """Covariances (..., k, k) of stations after a similarity of their frame; their first six
     unknowns are position and rotation vector."""
     change = np.eye(covariance.shape[-1])

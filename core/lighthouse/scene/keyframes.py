@@ -22,7 +22,9 @@ SAME_PLACE = 1e-3
 """Rays closer than this (as tangents) saw one place: 2 mm at 2 m."""
 
 
-def gather(angles: Array, device: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+def average_standstills(
+    angles: Array, device: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.int64]]:
     """Average runs of consecutive moments that saw the same angles.
 
     Parameters
@@ -57,7 +59,7 @@ def gather(angles: Array, device: NDArray[np.int64]) -> tuple[Array, NDArray[np.
     return places.reshape(-1, *angles.shape[1:]), run
 
 
-def require_places(a: Array, b: Array, number: int) -> None:
+def require_distinct_positions(a: Array, b: Array, number: int) -> None:
     """Refuse what cannot determine two stations.
 
     Parameters

@@ -15,11 +15,15 @@ from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.scene import two_view as twoview
 from locatk.core.lighthouse.scene import two_view_candidates as candidates
-from locatk.core.lighthouse.scene.bundle_adjustment import Adjustment, Rig, adjust
-from locatk.core.lighthouse.scene.keyframes import SAME_PLACE, require_places
+from locatk.core.lighthouse.scene.bundle_adjustment import (
+    BundleAdjustment,
+    BundleState,
+    adjust_bundle,
+)
+from locatk.core.lighthouse.scene.keyframes import SAME_PLACE, require_distinct_positions
 
 Array = NDArray[np.float64]
-Misfit = Callable[[Rig, tuple[int, int]], float]
+Misfit = Callable[[BundleState, tuple[int, int]], float]
 
 START_POINTS = 300
 """Moments with which candidate rigs are compared."""
@@ -51,14 +55,14 @@ published floor has 0.007, its grid in space 0.3, photodiodes on a body of 8 cm 
 
 
 @dataclass(frozen=True)
-class Pair:
+class StationPair:
     """Two stations that saw the same places.
 
     Attributes
     ----------
     columns : (int, int)
         Of the stations.
-    adjustment : Adjustment
+    adjustment : BundleAdjustment
         Of both, over some of the places; in a planar scene z = 0 is the plane of the
         photodiodes and z is up.
     inside : (k,) int ndarray
@@ -69,13 +73,13 @@ class Pair:
     """
 
     columns: tuple[int, int]
-    adjustment: Adjustment
+    adjustment: BundleAdjustment
     inside: NDArray[np.int64]
     planar: bool
     facts: dict[str, object]
 
     @property
-    def rig(self) -> Rig:
+    def rig(self) -> BundleState:
         """Both stations, in the order of ``columns``."""
         return self.adjustment.rig
 
@@ -97,7 +101,7 @@ def solve_pair(
     planar: bool | None = None,
     misfit: Misfit | None = None,
     seed: int = 0,
-) -> Pair:
+) -> StationPair:
     """Solve for two stations.
 
     Parameters
@@ -111,7 +115,7 @@ def solve_pair(
     columns : (int, int)
         The two stations.
     sigma, planar, misfit, seed
-        As for :func:`~locatk.core.lighthouse.scene.assembly.assemble`.
+        As for :func:`~locatk.core.lighthouse.scene.assembly.estimate_stations`.
 
     Raises
     ------
@@ -121,12 +125,12 @@ def solve_pair(
     i, j = columns
     joint = np.flatnonzero(np.isfinite(rays[:, i, 0]) & np.isfinite(rays[:, j, 0]))
     a, b = rays[joint, i], rays[joint, j]
-    require_places(a, b, 5 if planar is None else 4 if planar else 8)
+    require_distinct_positions(a, b, 5 if planar is None else 4 if planar else 8)
 
     facts: dict[str, object] = {}
     flat, on_plane = twoview.agree_on_plane(a, b, seed)
     planar, agreed = _decide(a, b, flat, on_plane, planar, seed, facts)
-    require_places(a[agreed], b[agreed], 4 if planar else 8)
+    require_distinct_positions(a[agreed], b[agreed], 4 if planar else 8)
     if not planar:
         miss = twoview.homography_residuals(
             twoview.fit_homography(a[agreed], b[agreed]), a[agreed], b[agreed]
@@ -150,7 +154,7 @@ def solve_pair(
         )
     inside = joint[agreed]
     best = _choose(angles[inside][:, [i, j]], starts, planar, sigma, misfit, (i, j), facts)
-    return Pair((i, j), best, inside, planar, facts)
+    return StationPair((i, j), best, inside, planar, facts)
 
 
 def looks_flat(a: Array, b: Array, median: float) -> bool:
@@ -214,13 +218,13 @@ def _decide(
 
 def _choose(
     angles: Array,
-    starts: list[Rig],
+    starts: list[BundleState],
     planar: bool,
     sigma: float,
     misfit: Misfit | None,
     columns: tuple[int, int],
     facts: dict[str, object],
-) -> Adjustment:
+) -> BundleAdjustment:
     """The start that explains the angles best; of two that do, the one that fits the markers,
     else the upright one.
 
@@ -231,9 +235,9 @@ def _choose(
     some = np.unique(np.linspace(0, len(angles) - 1, START_POINTS).astype(int))
     tried = []
     for rig in starts:
-        small = Rig(rig.positions, rig.rotations, rig.calibrations, rig.points[some])
+        small = BundleState(rig.positions, rig.rotations, rig.calibrations, rig.points[some])
         # All residuals count in full: a soft loss would let a bad start stay bad.
-        done = adjust(
+        done = adjust_bundle(
             angles[some], small, sigma=sigma, planar=planar, soft=1.0, iterations=START_STEPS
         )
         tried.append((done.cost, _roll(done.rig.rotations) if planar else 0.0, done))

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.localization.positions import Fixes, locate
+from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
 from locatk.core.lighthouse.scene import two_view as twoview
-from locatk.core.lighthouse.scene.bundle_adjustment import Rig, adjust
-from locatk.core.lighthouse.scene.pairs import START_POINTS, Pair
+from locatk.core.lighthouse.scene.bundle_adjustment import BundleState, adjust_bundle
+from locatk.core.lighthouse.scene.pairs import START_POINTS, StationPair
 from locatk.core.lighthouse.scene.resection import Pose, resect_in_space, resect_on_plane
-from locatk.core.lighthouse.scene.selection import evenly
+from locatk.core.lighthouse.scene.selection import spread_evenly
 
 Array = NDArray[np.float64]
-Neighbours = Callable[[int, int], Pair | None]
+Neighbours = Callable[[int, int], StationPair | None]
 """The arrangement of two stations, by their columns, or None where they have none."""
 
 LEAST_COMMON = 3
@@ -45,7 +45,7 @@ SAME_TURN = np.deg2rad(5.0)
 REFINE_STEPS = 10
 
 
-class Growth:
+class StationRegistration:
     """Stations of known place, to which others are added.
 
     Parameters
@@ -56,7 +56,7 @@ class Growth:
         The directions (1, y, z) that they mean.
     calibrations : tuple of Calibration
         One a station.
-    start : Pair
+    start : StationPair
         The two stations to begin with.
     sigma : float
         Standard deviation of an angle, in radians.
@@ -67,7 +67,7 @@ class Growth:
         angles: Array,
         rays: Array,
         calibrations: tuple[Calibration, ...],
-        start: Pair,
+        start: StationPair,
         sigma: float,
     ) -> None:
         self.angles, self.rays, self.sigma = angles, rays, sigma
@@ -80,10 +80,10 @@ class Growth:
         self.known: list[int] = []
         self._take(sorted(start.columns), _ordered(start))
 
-    def fixes(self, stations: Sequence[int] | None = None) -> Fixes:
+    def fixes(self, stations: Sequence[int] | None = None) -> PositionEstimates:
         """All places as the known stations (or some of them) locate them."""
         chosen = list(self.known if stations is None else stations)
-        return locate(
+        return estimate_positions(
             self.angles[:, chosen],
             self.positions[chosen],
             self.rotations[chosen],
@@ -121,13 +121,15 @@ class Growth:
             self._refine()
         return apart
 
-    def _take(self, columns: Sequence[int], rig: Rig) -> None:
+    def _take(self, columns: Sequence[int], rig: BundleState) -> None:
         for k, index in enumerate(columns):
             self.positions[index], self.rotations[index] = rig.positions[k], rig.rotations[k]
             self.calibrations[index] = rig.calibrations[k]
         self.known = sorted({*self.known, *columns})
 
-    def _resected(self, index: int, rows: NDArray[np.int64], fixes: Fixes) -> Rig | None:
+    def _resected(
+        self, index: int, rows: NDArray[np.int64], fixes: PositionEstimates
+    ) -> BundleState | None:
         """The station (alone in a rig) on the places that the known ones locate."""
         points, rays = fixes.position[rows], self.rays[rows, index]
         try:
@@ -139,9 +141,9 @@ class Growth:
         except DegenerateError:
             return None
         tries = [
-            adjust(
+            adjust_bundle(
                 self.angles[rows][:, [index]],
-                Rig(position[None], rotation[None], (self.calibrations[index],), points),
+                BundleState(position[None], rotation[None], (self.calibrations[index],), points),
                 sigma=self.sigma,
                 fixed_points=True,
             )
@@ -154,8 +156,8 @@ class Growth:
         return best.rig if agrees and spread < LOOSE * away else None
 
     def _by_neighbours(
-        self, index: int, rows: NDArray[np.int64], fixes: Fixes, neighbours: Neighbours
-    ) -> Rig | None:
+        self, index: int, rows: NDArray[np.int64], fixes: PositionEstimates, neighbours: Neighbours
+    ) -> BundleState | None:
         """The station (alone in a rig) by the pairs that it makes with known ones.
 
         On a floor nothing is gained: there one station locates places alone.
@@ -179,7 +181,7 @@ class Growth:
                     return self._alone(index, where, rotation, pair)
         return None
 
-    def _direction(self, pair: Pair, index: int) -> tuple[int, Array, Array]:
+    def _direction(self, pair: StationPair, index: int) -> tuple[int, Array, Array]:
         """The known station of a pair, and from there the new one's rotation and direction."""
         new = pair.columns.index(index)
         here = pair.columns[1 - new]
@@ -189,14 +191,14 @@ class Growth:
         return here, to @ rig.rotations[new], step / np.linalg.norm(step)
 
     def _distance(
-        self, pair: Pair, here: int, rows: NDArray[np.int64], fixes: Fixes
+        self, pair: StationPair, here: int, rows: NDArray[np.int64], fixes: PositionEstimates
     ) -> float | None:
         """Distance of the stations of a pair, from common places that others locate."""
         rows = rows[self.seen[rows, here] & (fixes.freedom[rows] > 0)]
         if len(rows) < LEAST_COMMON:
             return None
         rig = pair.rig
-        local = locate(
+        local = estimate_positions(
             self.angles[rows][:, list(pair.columns)],
             rig.positions,
             rig.rotations,
@@ -213,21 +215,23 @@ class Growth:
             return None
         return middle * float(np.linalg.norm(rig.positions[1] - rig.positions[0]))
 
-    def _alone(self, index: int, position: Array, rotation: Array, pair: Pair) -> Rig:
+    def _alone(
+        self, index: int, position: Array, rotation: Array, pair: StationPair
+    ) -> BundleState:
         calibration = pair.rig.calibrations[pair.columns.index(index)]
-        return Rig(position[None], rotation[None], (calibration,), np.zeros((0, 3)))
+        return BundleState(position[None], rotation[None], (calibration,), np.zeros((0, 3)))
 
     def _refine(self) -> None:
         """Adjust the known stations together, so that errors do not add up along a chain."""
         fixes = self.fixes()
         good = np.isfinite(fixes.position[:, 0]) & (fixes.freedom > 0)
         good &= fixes.worst < 3 * twoview.GATE
-        rows = evenly(self.seen[:, self.known], np.flatnonzero(good), START_POINTS)
+        rows = spread_evenly(self.seen[:, self.known], np.flatnonzero(good), START_POINTS)
         if len(rows) < 4:
             return
-        done = adjust(
+        done = adjust_bundle(
             self.angles[rows][:, self.known],
-            Rig(
+            BundleState(
                 self.positions[self.known],
                 self.rotations[self.known],
                 tuple(self.calibrations[k] for k in self.known),
@@ -251,10 +255,10 @@ class Growth:
         return "shares too few places with the others"
 
 
-def _ordered(pair: Pair) -> Rig:
+def _ordered(pair: StationPair) -> BundleState:
     """The rig of a pair, its stations in ascending order of their columns."""
     rig, order = pair.rig, np.argsort(pair.columns)
-    return Rig(
+    return BundleState(
         rig.positions[order],
         rig.rotations[order],
         tuple(rig.calibrations[k] for k in order),

@@ -14,7 +14,7 @@ LEAST_HELD_OUT_FROM = 200
 """Fewer places are all needed to solve the scene; nothing is held out of them."""
 
 
-def evenly(seen: NDArray[np.bool_], usable: Indices, most: int) -> Indices:
+def spread_evenly(seen: NDArray[np.bool_], usable: Indices, most: int) -> Indices:
     """At most so many of the usable places, spread over all ways in which they were seen.
 
     Places that link two groups of stations can be few among many: of each set of stations
@@ -51,12 +51,12 @@ def evenly(seen: NDArray[np.bool_], usable: Indices, most: int) -> Indices:
     return usable[np.sort(np.concatenate(chosen))]
 
 
-def hold_out(seen: NDArray[np.bool_], usable: Indices) -> tuple[Indices, Indices]:
+def split_held_out(seen: NDArray[np.bool_], usable: Indices) -> tuple[Indices, Indices]:
     """Split usable places into those to solve with and every fifth to verify with.
 
     Counted within each set of stations that saw places together, so that each is verified.
     Nothing is held out of less than :data:`LEAST_HELD_OUT_FROM`. Parameters as for
-    :func:`evenly`.
+    :func:`spread_evenly`.
     """
     held = np.zeros(len(usable), bool)
     if len(usable) >= LEAST_HELD_OUT_FROM:

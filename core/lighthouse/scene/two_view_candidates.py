@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.scene import two_view as twoview
-from locatk.core.lighthouse.scene.bundle_adjustment import Rig
+from locatk.core.lighthouse.scene.bundle_adjustment import BundleState
 
 Array = NDArray[np.float64]
 
 
-def on_plane(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
+def on_plane(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[BundleState]:
     """Rigs with the plane at z = 0 in which all points lie before both stations."""
     rigs = []
     for rotation, translation, normal in twoview.split_homography(twoview.fit_homography(a, b)):
@@ -33,12 +33,14 @@ def on_plane(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
         points = local @ level.T + first
         points[:, 2] = 0.0
         rigs.append(
-            Rig(np.stack([first, second]), np.stack([level, level @ rotation.T]), pair, points)
+            BundleState(
+                np.stack([first, second]), np.stack([level, level @ rotation.T]), pair, points
+            )
         )
     return rigs
 
 
-def in_space(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
+def in_space(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[BundleState]:
     """Rigs in the first station's axes in which most points lie before both stations."""
     motions = twoview.split_essential(twoview.fit_epipolar(a, b))
     # Few places in a narrow field make the essential matrix loose; the plane through them
@@ -54,7 +56,7 @@ def in_space(a: Array, b: Array, pair: tuple[Calibration, ...]) -> list[Rig]:
             continue
         depth = np.where(ahead, depth, np.median(depth[ahead]))
         rigs.append(
-            Rig(
+            BundleState(
                 np.stack([np.zeros(3), -rotation.T @ translation]),
                 np.stack([np.eye(3), rotation.T]),
                 pair,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration, predict_angles
-from locatk.core.lighthouse.localization.positions import Fixes, locate
+from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
 from locatk.core.robust import robust_sigma
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ def verify(
         solving the scene.
     channels : sequence of int
     positions, rotations, calibrations
-        Of the stations, as for :func:`~locatk.core.lighthouse.localization.positions.locate`.
+        Of the stations, as for :func:`~locatk.core.lighthouse.localization.positions.estimate_positions`.
     floor_z : float, optional
         Height of all photodiodes, where they move on a plane.
 
@@ -94,8 +94,8 @@ def verify(
         In the order of ``channels``.
     """
 
-    def where(seen: Array) -> Fixes:
-        return locate(seen, positions, rotations, calibrations, floor_z=floor_z)
+    def where(seen: Array) -> PositionEstimates:
+        return estimate_positions(seen, positions, rotations, calibrations, floor_z=floor_z)
 
     joint = where(angles)
     checks = []

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import period_counts
-from locatk.core.lighthouse.simulation.optics import Link, Pairs, Places
+from locatk.core.lighthouse.simulation.optics import OpticalLink, Places, SweepPairs
 
 Array = NDArray[np.float64]
 
@@ -19,9 +19,9 @@ JUMP_RAD = (float(np.radians(2.0)), float(np.radians(60.0)))
 """Size of demodulation errors (paper IV.A: more than 2 degrees for a single step)."""
 
 
-def spoil(
-    pairs: Pairs,
-    links: Sequence[Link],
+def inject_faults(
+    pairs: SweepPairs,
+    links: Sequence[OpticalLink],
     outliers: float,
     noise_rad: float,
     rng: np.random.Generator,
@@ -30,9 +30,9 @@ def spoil(
 
     Parameters
     ----------
-    pairs : Pairs
+    pairs : SweepPairs
         Changed in place; of a report that one station only was seen in, none are swapped.
-    links : sequence of Link
+    links : sequence of OpticalLink
     outliers : float
         The share, 0 to 1. What cannot be swapped or reflected jumps.
     noise_rad : float
@@ -45,7 +45,9 @@ def spoil(
     _jump(pairs, total - int(np.count_nonzero(pairs.wrong)), rng)
 
 
-def _swap(pairs: Pairs, links: Sequence[Link], events: int, rng: np.random.Generator) -> None:
+def _swap(
+    pairs: SweepPairs, links: Sequence[OpticalLink], events: int, rng: np.random.Generator
+) -> None:
     """Exchange the labels of two sweeps, one each of two stations, within reports."""
     robot = np.array([link.robot for link in links])[pairs.link]
     order = np.lexsort((rng.random(len(robot)), pairs.report, robot))
@@ -68,8 +70,8 @@ def _swap(pairs: Pairs, links: Sequence[Link], events: int, rng: np.random.Gener
 
 
 def _reflect(
-    pairs: Pairs,
-    links: Sequence[Link],
+    pairs: SweepPairs,
+    links: Sequence[OpticalLink],
     events: int,
     noise_rad: float,
     rng: np.random.Generator,
@@ -89,7 +91,7 @@ def _reflect(
         pairs.wrong[rows] = True
 
 
-def _mirrored(link: Link) -> Places:
+def _mirrored(link: OpticalLink) -> Places:
     """Where the robot seems to be, seen in the wall before the station."""
     forward = link.light.station.rotation[:2, 0]
     axis = int(np.argmax(np.abs(forward)))
@@ -103,7 +105,7 @@ def _mirrored(link: Link) -> Places:
     return where
 
 
-def _jump(pairs: Pairs, events: int, rng: np.random.Generator) -> None:
+def _jump(pairs: SweepPairs, events: int, rng: np.random.Generator) -> None:
     """Errors of demodulation: a sweep's count is off by an angle of :data:`JUMP_RAD`."""
     good = np.flatnonzero((np.isfinite(pairs.count) & ~pairs.wrong).ravel())
     chosen = np.unravel_index(rng.permutation(good)[:events], pairs.count.shape)

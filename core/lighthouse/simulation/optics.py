@@ -26,7 +26,7 @@ PROCESSING_S = 1e-3
 
 
 @dataclass(frozen=True)
-class Light:
+class SimulatedStation:
     """A station with its rotor: zero at ``zero_s`` and every ``period_s`` since, in seconds
     of true time; ``bits`` are the slow bits of its rotations."""
 
@@ -77,7 +77,7 @@ class Light:
 
 
 @dataclass(frozen=True)
-class Link:
+class OpticalLink:
     """A photodiode of a robot under a station.
 
     ``offset`` (3,) is where it sits, from the robot's middle and in its axes, and ``normal``
@@ -86,7 +86,7 @@ class Link:
 
     robot: int
     course: Course
-    light: Light
+    light: SimulatedStation
     sensor: int = 0
     offset: Array | None = None
     normal: Array | None = None
@@ -112,7 +112,7 @@ class Link:
 
 
 @dataclass
-class Pairs:
+class SweepPairs:
     """Both sweeps of each rotation that some report holds.
 
     Attributes
@@ -138,13 +138,13 @@ class Pairs:
     wrong: NDArray[np.bool_]
 
     @classmethod
-    def joined(cls, parts: Sequence[Pairs]) -> Pairs:
+    def joined(cls, parts: Sequence[SweepPairs]) -> SweepPairs:
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
 
-def receive(
-    link: Link, number: int, reports_s: Array, hidden: Sequence[Array], noise: Array
-) -> Pairs:
+def observe_reports(
+    link: OpticalLink, number: int, reports_s: Array, hidden: Sequence[Array], noise: Array
+) -> SweepPairs:
     """The last pair before each report that no earlier report had.
 
     ``hidden`` are ascending starts and ends of times without reception, ``noise`` (n, 2) is
@@ -166,7 +166,7 @@ def receive(
         lost |= np.searchsorted(edges, time_s) % 2 == 1
     count[lost] = np.nan
     channel = np.full(time_s.shape, light.station.channel)
-    return Pairs(
+    return SweepPairs(
         np.full(len(report), number),
         report,
         start_s,

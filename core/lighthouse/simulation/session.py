@@ -25,8 +25,13 @@ from locatk.core.lighthouse.channels import TICK_HZ, period_ticks
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene, Station
-from locatk.core.lighthouse.simulation.faults import spoil
-from locatk.core.lighthouse.simulation.optics import Light, Link, Pairs, receive
+from locatk.core.lighthouse.simulation.faults import inject_faults
+from locatk.core.lighthouse.simulation.optics import (
+    OpticalLink,
+    SimulatedStation,
+    SweepPairs,
+    observe_reports,
+)
 from locatk.core.lighthouse.simulation.paths import Course
 from locatk.core.simulation import check_options
 from locatk.core.trajectory import Trajectory
@@ -131,7 +136,7 @@ class SimulationOptions:
 
 
 @dataclass(frozen=True)
-class Simulated:
+class SimulatedSession:
     """A session that never was.
 
     Attributes
@@ -156,7 +161,7 @@ class Simulated:
     wrong: Mask
 
 
-def simulate(options: SimulationOptions | None = None) -> Simulated:
+def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
     """Simulate a session; the same options give the same arrays.
 
     Notes
@@ -173,8 +178,8 @@ def simulate(options: SimulationOptions | None = None) -> Simulated:
     )
     lights = _lights(layout, options)
     known = FLAT_MARKERS if options.planar else RAISED_MARKERS
-    links: list[Link] = []
-    parts: list[Pairs] = []
+    links: list[OpticalLink] = []
+    parts: list[SweepPairs] = []
     courses = []
     for robot in range(options.robots):
         course = Course(driving, options.planar, options.duration_s, known[: 0 if robot else None])
@@ -185,9 +190,9 @@ def simulate(options: SimulationOptions | None = None) -> Simulated:
             for link in _links(robot, course, light, options.receiver):
                 noise = jitter.normal(0.0, options.noise_rad, (len(reports_s), 2))
                 links.append(link)
-                parts.append(receive(link, len(parts), reports_s, hidden, noise))
-    pairs = Pairs.joined(parts)
-    spoil(pairs, links, options.outliers, options.noise_rad, faults)
+                parts.append(observe_reports(link, len(parts), reports_s, hidden, noise))
+    pairs = SweepPairs.joined(parts)
+    inject_faults(pairs, links, options.outliers, options.noise_rad, faults)
 
     digits = len(str(options.robots))
     names = tuple(f"robot-{k + 1:0{digits}d}" for k in range(options.robots))
@@ -197,7 +202,7 @@ def simulate(options: SimulationOptions | None = None) -> Simulated:
         planar=options.planar,
         scale="markers",
     )
-    return Simulated(
+    return SimulatedSession(
         sweeps,
         scene,
         tuple(_truth(n, c, options.duration_s) for n, c in zip(names, courses, strict=True)),
@@ -209,7 +214,7 @@ def simulate(options: SimulationOptions | None = None) -> Simulated:
 # ---- stations
 
 
-def _lights(rng: np.random.Generator, options: SimulationOptions) -> list[Light]:
+def _lights(rng: np.random.Generator, options: SimulationOptions) -> list[SimulatedStation]:
     """Stations around the floor, 2 m from its middle, that look down at it."""
     count = options.stations
     azimuth = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 3)
@@ -231,7 +236,7 @@ def _lights(rng: np.random.Generator, options: SimulationOptions) -> list[Light]
         ppm = rng.uniform(-CLOCK_PPM, CLOCK_PPM)
         period_s = float(period_ticks(k + 1)) / TICK_HZ * (1 + ppm * 1e-6)
         bits = rng.integers(0, 2, int(options.duration_s / period_s) + 2)
-        lights.append(Light(station, -period_s * rng.random(), period_s, bits))
+        lights.append(SimulatedStation(station, -period_s * rng.random(), period_s, bits))
     return lights
 
 
@@ -254,13 +259,15 @@ def _calibration_of(unit: Array) -> Calibration:
 # ---- robots
 
 
-def _links(robot: int, course: Course, light: Light, receiver: Receiver | None) -> list[Link]:
+def _links(
+    robot: int, course: Course, light: SimulatedStation, receiver: Receiver | None
+) -> list[OpticalLink]:
     """One a photodiode."""
     if receiver is None:
-        return [Link(robot, course, light)]
+        return [OpticalLink(robot, course, light)]
     normals = [None] * len(receiver) if receiver.normal is None else list(receiver.normal)
     return [
-        Link(robot, course, light, k, offset, normal)
+        OpticalLink(robot, course, light, k, offset, normal)
         for k, (offset, normal) in enumerate(zip(receiver.position_m, normals, strict=True))
     ]
 
@@ -291,7 +298,7 @@ def _blocks(rng: np.random.Generator, options: SimulationOptions) -> Array:
 
 
 def _as_sweeps(
-    pairs: Pairs, links: Sequence[Link], names: tuple[str, ...], labelled: bool
+    pairs: SweepPairs, links: Sequence[OpticalLink], names: tuple[str, ...], labelled: bool
 ) -> tuple[Sweeps, Mask]:
     """The sweeps that were received in the order of time, and which of them are wrong."""
     seen = np.isfinite(pairs.count)

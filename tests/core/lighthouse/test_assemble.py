@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD
-from locatk.core.lighthouse.scene.assembly import Assembly, assemble
+from locatk.core.lighthouse.scene.assembly import Assembly, estimate_stations
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ def run(angles: Array, planar: bool | None = None, seed: int = 0) -> Assembly:
     generic = (GENERIC_CALIBRATION,) * angles.shape[1]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return assemble(angles, generic, sigma=MODEL_SIGMA_RAD, planar=planar, seed=seed)
+        return estimate_stations(angles, generic, sigma=MODEL_SIGMA_RAD, planar=planar, seed=seed)
 
 
 def off(assembly: Assembly, points: Array) -> float:

@@ -19,7 +19,7 @@ from locatk.core.lighthouse.calibration import (
     TILT,
     Calibration,
 )
-from locatk.core.lighthouse.scene.bundle_adjustment import Rig, adjust
+from locatk.core.lighthouse.scene.bundle_adjustment import BundleState, adjust_bundle
 
 Array = NDArray[np.float64]
 
@@ -31,8 +31,8 @@ def factory(lamp: Any) -> Calibration:
     return Calibration(np.array(rows), "factory")
 
 
-def rig_of(lamps: Any, points: Array, calibrations: Any = None) -> Rig:
-    return Rig(
+def rig_of(lamps: Any, points: Array, calibrations: Any = None) -> BundleState:
+    return BundleState(
         np.stack([s.position for s in lamps]),
         np.stack([s.rotation for s in lamps]),
         tuple(map(factory, lamps)) if calibrations is None else calibrations,
@@ -44,7 +44,7 @@ def angles_of(lamps: Any, points: Array) -> Array:
     return np.stack([s.angles(points) for s in lamps], axis=1)
 
 
-def shaken(rig: Rig, size: float, seed: int = 0, planar: bool = False) -> Rig:
+def shaken(rig: BundleState, size: float, seed: int = 0, planar: bool = False) -> BundleState:
     rng = np.random.default_rng(seed)
     move = rng.normal(0, size, rig.points.shape)
     if planar:
@@ -57,7 +57,7 @@ def shaken(rig: Rig, size: float, seed: int = 0, planar: bool = False) -> Rig:
     )
 
 
-def gap(rig: Rig, truth: Rig) -> float:
+def gap(rig: BundleState, truth: BundleState) -> float:
     """Largest distance of stations and points after the best similarity."""
     mine = np.concatenate([rig.positions, rig.points])
     true = np.concatenate([truth.positions, truth.points])
@@ -72,7 +72,9 @@ def test_exact_angles_lead_back_to_the_truth(
     lamps = world.lamps(*channels)
     truth = rig_of(lamps, world.curve(40, flat=planar))
     angles = angles_of(lamps, truth.points)
-    done = adjust(angles, shaken(truth, 0.05, planar=planar), sigma=1e-4, planar=planar, soft=1.0)
+    done = adjust_bundle(
+        angles, shaken(truth, 0.05, planar=planar), sigma=1e-4, planar=planar, soft=1.0
+    )
     assert gap(done.rig, truth) < 1e-4
     assert np.max(np.abs(done.residuals)) < 2e-6
     assert done.cost < 1e-2
@@ -88,7 +90,7 @@ def test_same_optimum_as_a_general_solver(world: Any) -> None:
     sigma = 1e-3
     angles = angles_of(lamps, points) + rng.normal(0, sigma, (12, 2, 2))
     truth = rig_of(lamps, points)
-    ours = adjust(angles, truth, sigma=sigma, soft=1e3, iterations=200)
+    ours = adjust_bundle(angles, truth, sigma=sigma, soft=1e3, iterations=200)
 
     second = lamps[1]
     base = np.linalg.norm(second.position - lamps[0].position)
@@ -107,7 +109,7 @@ def test_same_optimum_as_a_general_solver(world: Any) -> None:
     assert ours.cost == pytest.approx(theirs.cost, rel=1e-5)
     x = theirs.x
     toward = direction + x[:2] @ side
-    best = Rig(
+    best = BundleState(
         np.stack([lamps[0].position, lamps[0].position + base * toward / np.linalg.norm(toward)]),
         np.stack([lamps[0].rotation, rotation_exp(x[2:5]) @ second.rotation]),
         truth.calibrations,
@@ -129,7 +131,7 @@ def draws(world: Any, request: pytest.FixtureRequest) -> list[tuple[Array, Array
     errors, stated = [], []
     for _ in range(300):
         noisy = exact + rng.normal(0, sigma, exact.shape)
-        done = adjust(noisy, truth, sigma=sigma, planar=request.param, soft=1e3)
+        done = adjust_bundle(noisy, truth, sigma=sigma, planar=request.param, soft=1e3)
         turn = rotation_log(done.rig.rotations @ np.swapaxes(truth.rotations, 1, 2))
         errors.append(np.concatenate([done.rig.positions - truth.positions, turn], axis=1))
         stated.append(done.station_covariance[:, :6, :6])
@@ -161,7 +163,7 @@ def test_known_points_fix_a_station_without_gauge(world: Any) -> None:
     sigma = 2e-4
     errors, told = [], []
     for _ in range(200):
-        done = adjust(
+        done = adjust_bundle(
             exact + rng.normal(0, sigma, exact.shape),
             truth,
             sigma=sigma,
@@ -186,7 +188,7 @@ def test_tilt_and_phase_are_found_where_they_show(world: Any) -> None:
     points = world.curve(100, flat=False)
     angles = angles_of(lamps, points)
     start = rig_of(lamps, points, (GENERIC_CALIBRATION,) * 4)
-    done = adjust(angles, start, sigma=1e-3)
+    done = adjust_bundle(angles, start, sigma=1e-3)
     for lamp, calibration in zip(lamps, done.rig.calibrations, strict=True):
         true = factory(lamp).sweeps[:, TILT]
         before = np.abs(GENERIC_CALIBRATION.sweeps[:, TILT] - true).max()
@@ -204,7 +206,7 @@ def test_tilt_and_phase_are_found_where_they_show(world: Any) -> None:
 def test_priors_hold_what_the_data_do_not_tell(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = world.curve(4, flat=True)
-    done = adjust(
+    done = adjust_bundle(
         angles_of(lamps, points),
         rig_of(lamps, points, (GENERIC_CALIBRATION,) * 2),
         sigma=1e-3,
@@ -220,10 +222,10 @@ def test_factory_calibration_is_never_touched(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = world.curve(30, flat=False)
     mixed = (factory(lamps[0]), GENERIC_CALIBRATION)
-    done = adjust(angles_of(lamps, points), rig_of(lamps, points, mixed), sigma=1e-3)
+    done = adjust_bundle(angles_of(lamps, points), rig_of(lamps, points, mixed), sigma=1e-3)
     assert done.rig.calibrations[0] is mixed[0]
     assert done.rig.calibrations[1].source == "estimated"
-    held = adjust(
+    held = adjust_bundle(
         angles_of(lamps, points), rig_of(lamps, points, mixed), sigma=1e-3, calibrate=False
     )
     assert held.rig.calibrations == mixed
@@ -236,7 +238,7 @@ def test_outliers_weigh_little(world: Any) -> None:
     angles = angles_of(lamps, truth.points) + rng.normal(0, 1e-4, (100, 3, 2))
     wrong = rng.random(angles.shape) < 0.05
     angles[wrong] += rng.uniform(0.05, 0.17, np.count_nonzero(wrong))
-    done = adjust(angles, truth, sigma=1e-4)
+    done = adjust_bundle(angles, truth, sigma=1e-4)
     clean = ~wrong.any(axis=(1, 2))
     assert np.median(done.weights[wrong]) < 0.05
     assert np.median(done.weights[clean]) > 0.95
@@ -254,7 +256,7 @@ def test_unseen_angles_take_no_part(world: Any) -> None:
     angles[hidden] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        done = adjust(angles, shaken(truth, 0.02), sigma=1e-4)
+        done = adjust_bundle(angles, shaken(truth, 0.02), sigma=1e-4)
     np.testing.assert_array_equal(np.isnan(done.residuals), np.isnan(angles))
     np.testing.assert_array_equal(np.isnan(done.weights), np.isnan(angles))
     assert gap(done.rig, truth) < 5e-4
@@ -268,7 +270,7 @@ def test_a_start_outside_the_cone_is_no_crash(world: Any) -> None:
     start[3] = lamps[0].position + lamps[0].rotation @ [0.05, 0, 1.0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        done = adjust(angles_of(lamps, points), replace(truth, points=start), sigma=1e-4)
+        done = adjust_bundle(angles_of(lamps, points), replace(truth, points=start), sigma=1e-4)
     others = np.delete(np.arange(30), 3)
     some = replace(done.rig, points=done.rig.points[others])
     assert gap(some, replace(truth, points=points[others])) < 1e-3
@@ -281,13 +283,13 @@ def test_the_frame_does_not_matter(world: Any) -> None:
     rng = np.random.default_rng(8)
     angles = angles_of(lamps, points) + rng.normal(0, 3e-4, (25, 2, 2))
     rig = rig_of(lamps, points)
-    here = adjust(angles, rig, sigma=3e-4, soft=1e3)
+    here = adjust_bundle(angles, rig, sigma=3e-4, soft=1e3)
     turn = rotation_exp(np.array([0.3, -0.2, 1.1]))
-    there_rig = Rig(
+    there_rig = BundleState(
         5 * rig.positions @ turn.T + [1, 2, 3], turn @ rig.rotations, rig.calibrations,
         5 * rig.points @ turn.T + [1, 2, 3],
     )  # fmt: skip
-    there = adjust(angles, there_rig, sigma=3e-4, soft=1e3)
+    there = adjust_bundle(angles, there_rig, sigma=3e-4, soft=1e3)
     assert there.cost == pytest.approx(here.cost, rel=1e-5)
     np.testing.assert_allclose(there.residuals, here.residuals, atol=2e-6)
 
@@ -297,12 +299,12 @@ def test_many_moments_share_the_error_of_the_model(world: Any) -> None:
     lamps = world.lamps(1, 2)
     few, many = (world.curve(n, flat=False) for n in (100, 400))
     a, b = (
-        adjust(angles_of(lamps, p), rig_of(lamps, p), sigma=1e-3).station_covariance
+        adjust_bundle(angles_of(lamps, p), rig_of(lamps, p), sigma=1e-3).station_covariance
         for p in (few, many)
     )
     ratio = np.sqrt(np.trace(b[1, :3, :3]) / np.trace(a[1, :3, :3]))
     assert ratio == pytest.approx(1, abs=0.1)
-    free = adjust(
+    free = adjust_bundle(
         angles_of(lamps, many), rig_of(lamps, many), sigma=1e-3, independent=10**6
     ).station_covariance
     assert np.sqrt(np.trace(free[1, :3, :3]) / np.trace(a[1, :3, :3])) == pytest.approx(

@@ -14,9 +14,9 @@ from hypothesis.extra.numpy import arrays
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.demodulation.bursts import (
     GAP_S,
-    of_mocap,
-    of_windows,
-    split,
+    bursts_of_windows,
+    is_mocap_flash,
+    split_bursts,
     window_edges_numpy,
 )
 from locatk.core.lighthouse.recording import Edges
@@ -30,17 +30,17 @@ def edges(*ticks: int, rate_hz: float = 40e6, rises: bool = True) -> Edges:
 
 def test_a_silence_divides() -> None:
     gap = round(GAP_S * 40e6)
-    bursts = split(edges(5, 9, 9 + gap, 10 + 2 * gap, 20 + 2 * gap))
+    bursts = split_bursts(edges(5, 9, 9 + gap, 10 + 2 * gap, 20 + 2 * gap))
     assert bursts.first.tolist() == [0, 3, 5]
     # Three edges before it: the second burst begins downwards.
     assert bursts.rises.tolist() == [True, False]
     assert bursts.start.tolist() == [5, 10 + 2 * gap]
     assert bursts.duration_s.tolist() == [(4 + gap) / 40e6, 10 / 40e6]
-    assert split(edges(1, 2, rises=False)).rises.tolist() == [False]
+    assert split_bursts(edges(1, 2, rises=False)).rises.tolist() == [False]
 
 
 def test_some_bursts_of_all() -> None:
-    bursts = split(edges(0, 5, 1000, 1007, 1009, 2000, 2002))
+    bursts = split_bursts(edges(0, 5, 1000, 1007, 1009, 2000, 2002))
     some = bursts.take(np.array([True, False, True]))
     assert some.tick.tolist() == [0, 5, 2000, 2002]
     assert some.first.tolist() == [0, 2, 4]
@@ -49,34 +49,34 @@ def test_some_bursts_of_all() -> None:
 
 
 def test_little_or_nothing() -> None:
-    assert len(split(edges())) == 0
-    assert not len(of_mocap(split(edges())))
-    one = split(edges(7))
+    assert len(split_bursts(edges())) == 0
+    assert not len(is_mocap_flash(split_bursts(edges())))
+    one = split_bursts(edges(7))
     assert len(one) == 1
     assert one.duration_s.tolist() == [0.0]
-    assert of_mocap(one).tolist() == [False]
+    assert is_mocap_flash(one).tolist() == [False]
 
 
 @pytest.mark.parametrize("rate_hz", [1e6, 20e6, 23.9e6])
 def test_a_coarse_recording_is_refused(rate_hz: float) -> None:
     with pytest.raises(InputError, match="too few"):
-        split(edges(1, 2, rate_hz=rate_hz))
+        split_bursts(edges(1, 2, rate_hz=rate_hz))
     with pytest.raises(InputError, match="too few"):
-        of_windows(np.zeros((1, 64), np.uint8), rate_hz)
+        bursts_of_windows(np.zeros((1, 64), np.uint8), rate_hz)
     # What counts is what the times resolve.
     with pytest.raises(InputError, match="too few"):
-        split(Edges(np.arange(9), 1e9, rate_hz, True, 10))
+        split_bursts(Edges(np.arange(9), 1e9, rate_hz, True, 10))
 
 
 @pytest.mark.parametrize("rate_hz", [24e6, 23.999e6, 500e6])
 def test_a_fine_one_is_not(rate_hz: float) -> None:
-    assert len(split(edges(1, 2, rate_hz=rate_hz))) == 1
+    assert len(split_bursts(edges(1, 2, rate_hz=rate_hz))) == 1
 
 
 def test_edges_that_go_back_are_refused() -> None:
     with pytest.raises(InputError, match="back in time"):
-        split(edges(5, 9, 8))
-    assert len(split(edges(5, 9, 9, 12))) == 1
+        split_bursts(edges(5, 9, 8))
+    assert len(split_bursts(edges(5, 9, 9, 12))) == 1
 
 
 @given(
@@ -87,7 +87,7 @@ def test_edges_that_go_back_are_refused() -> None:
     )
 )
 def test_edges_of_windows(windows: np.ndarray) -> None:
-    bursts = of_windows(windows)
+    bursts = bursts_of_windows(windows)
     assert len(bursts) == len(windows)
     width = 8 * windows.shape[1]
     for k, row in enumerate(np.unpackbits(windows, axis=1)):
@@ -105,7 +105,7 @@ def test_edges_of_windows(windows: np.ndarray) -> None:
 @pytest.mark.parametrize("windows", [np.zeros(64, np.uint8), np.zeros((2, 64))])
 def test_windows_of_another_kind(windows: Any) -> None:
     with pytest.raises(InputError, match="rows of bytes"):
-        of_windows(windows)
+        bursts_of_windows(windows)
 
 
 @pytest.mark.parametrize("rate_hz", [24e6, 40e6, 100e6])
@@ -121,9 +121,9 @@ def test_flashes_of_motion_capture(
         flashes += [rise, rise + duty * 1e-6]
     edge = np.sort(np.concatenate(flashes))
     edge += noise.normal(0, jitter_s, len(edge)) if jitter_s else 0
-    bursts = split(light.edges(edge, 0.01, light.Receiving(rate_hz=rate_hz)))
+    bursts = split_bursts(light.edges(edge, 0.01, light.Receiving(rate_hz=rate_hz)))
     assert len(bursts) == 3
-    assert of_mocap(bursts).all()
+    assert is_mocap_flash(bursts).all()
 
 
 @pytest.mark.parametrize("rate_hz", [24e6, 40e6])
@@ -132,9 +132,9 @@ def test_sweeps_are_no_flashes(light: Any, rate_hz: float) -> None:
         rate_hz=rate_hz, jitter_s=1e-8, delay_s=3e-8, rim_s=3e-6, lost=0.2, width_s=1.2e-5
     )
     (line,), _ = light.of([light.Sender(channel) for channel in (1, 8, 16)], 2.0, path)
-    assert not of_mocap(split(line)).any()
+    assert not is_mocap_flash(split_bursts(line)).any()
 
 
 def test_no_published_sweep_is_a_flash(published: Callable[[str], Edges]) -> None:
     for name in (CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"):
-        assert not of_mocap(split(published(name))).any()
+        assert not is_mocap_flash(split_bursts(published(name))).any()

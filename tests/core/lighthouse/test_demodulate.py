@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.lighthouse.demodulation.bursts import Bursts, of_windows, split
+from locatk.core.lighthouse.demodulation.bursts import Bursts, bursts_of_windows, split_bursts
 from locatk.core.lighthouse.demodulation.soft_bits import (
     CERTAIN,
     LONGEST_S,
@@ -38,7 +38,7 @@ def read_back(light: Any, bits: np.ndarray, path: Any, start_s: float, seed: int
     noise = np.random.default_rng(seed + 1000)
     change = start_s + light.biphase(bits) / 6e6
     line = light.edges(light.as_received(change, path, noise), 1.0, path)
-    soft = soft_bits(split(line))
+    soft = soft_bits(split_bursts(line))
     assert len(soft) == 1
     begin = round((start_s * path.rate_hz - soft.tick[0]) / soft.ticks_per_bit)
     # The first pulse may be among the lost ones.
@@ -91,7 +91,7 @@ def test_a_lost_pulse_is_no_lost_burst(light: Any) -> None:
     change = light.biphase(bits) / 6e6 + 1e-4
     for at in (20, 51, 100):
         (change_left,) = [np.delete(change, [at, at + 1])]
-        soft = soft_bits(split(light.edges(change_left, 1e-3)))
+        soft = soft_bits(split_bursts(light.edges(change_left, 1e-3)))
         begin = round((1e-4 * 40e6 - soft.tick[0]) / soft.ticks_per_bit)
         off = np.flatnonzero((soft.value[begin : begin + 128] > 0) != (bits > 0))
         # Only what is near the loss is wrong; a decoder of runs would slip from there on.
@@ -104,7 +104,7 @@ def test_dates_of_bits(light: Any) -> None:
     for _ in range(50):
         start = noise.uniform(1e-3, 2e-3)
         bits = noise.integers(0, 2, 100).astype(np.int8)
-        soft = soft_bits(split(light.edges(start + light.biphase(bits) / 6e6, 1.0)))
+        soft = soft_bits(split_bursts(light.edges(start + light.biphase(bits) / 6e6, 1.0)))
         late = (soft.tick[0] + 0.5 - start * 40e6) / soft.ticks_per_bit
         off.append(late - np.rint(late))
     # A sample of 25 ns is 0.15 bits; the phase averages over a hundred edges.
@@ -112,12 +112,12 @@ def test_dates_of_bits(light: Any) -> None:
 
 
 def test_odd_bursts(light: Any) -> None:
-    none = soft_bits(split(Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 1)))
+    none = soft_bits(split_bursts(Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 1)))
     assert len(none) == 0
     assert none.first.tolist() == [0]
     long = np.arange(0, 600e-6, 1.67e-7)
     edge = np.concatenate([[1e-3], [2e-3, 2.0001e-3], 3e-3 + long, 5e-3 + long[:200]])
-    bursts = split(light.edges(edge, 0.01))
+    bursts = split_bursts(light.edges(edge, 0.01))
     soft = soft_bits(bursts)
     size = np.diff(soft.first)
     assert size[0] == 0  # a single edge
@@ -134,7 +134,7 @@ def test_twins_on_drawn_light(light: Any, rate_hz: float) -> None:
         rate_hz=rate_hz, delay_s=3e-8, jitter_s=1e-8, lost=0.1, rim_s=2e-6, spoiled=0.1
     )
     (line,), _ = light.of([light.Sender(2), light.Sender(13, zero_s=0.0)], 1.0, path)
-    agree(split(line))
+    agree(split_bursts(line))
 
 
 @given(
@@ -148,17 +148,19 @@ def test_twins_on_drawn_light(light: Any, rate_hz: float) -> None:
 def test_twins_on_any_edges(runs: list[int], rate_hz: float, rises: bool) -> None:
     # Equal ticks, single edges, whole and half chips: ties of all kinds.
     tick = np.cumsum(np.array(runs, np.int64))
-    agree(split(Edges(tick, rate_hz, rate_hz, rises, 10**9)))
+    agree(split_bursts(Edges(tick, rate_hz, rate_hz, rises, 10**9)))
 
 
 @pytest.mark.parametrize("width", [1, 2, 7, 8, 9, 64, 100])
 def test_twins_on_windows(width: int) -> None:
     noise = np.random.default_rng(width)
-    agree(of_windows(noise.integers(0, 256, (400, width)).astype(np.uint8)))
-    agree(of_windows(np.repeat(noise.integers(0, 2, (50, width)) * 255, 1, 1).astype(np.uint8)))
-    agree(of_windows(np.zeros((0, width), np.uint8)))
+    agree(bursts_of_windows(noise.integers(0, 256, (400, width)).astype(np.uint8)))
+    agree(
+        bursts_of_windows(np.repeat(noise.integers(0, 2, (50, width)) * 255, 1, 1).astype(np.uint8))
+    )
+    agree(bursts_of_windows(np.zeros((0, width), np.uint8)))
 
 
 @pytest.mark.parametrize("name", [CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"])
 def test_twins_on_published_light(published: Callable[[str], Edges], name: str) -> None:
-    agree(split(published(name)))
+    agree(split_bursts(published(name)))

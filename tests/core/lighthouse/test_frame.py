@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
-from locatk.core.lighthouse.epochs import angles_of, group
-from locatk.core.lighthouse.localization.positions import locate
+from locatk.core.lighthouse.epochs import angles_of, group_epochs
+from locatk.core.lighthouse.localization.positions import estimate_positions
 from locatk.core.lighthouse.scene import Distance, MarkerVisit, frame
-from locatk.core.lighthouse.scene.bundle_adjustment import Rig
+from locatk.core.lighthouse.scene.bundle_adjustment import BundleState
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -31,12 +31,12 @@ class Recorded:
         self.lamps = tuple(replace(s, planes=plain) for s in world.lamps(1, 2))
         self.places = world.square
         self.drive = world.drive(self.lamps, np.repeat(self.places, 30, axis=0))
-        self.epochs = group(self.drive.sweeps)
+        self.epochs = group_epochs(self.drive.sweeps)
         self.angles = angles_of(self.epochs)
         self.to = Similarity(0.2, rotation_exp(np.array([0.0, 0.0, 0.7])), np.array([3.0, 1, 0]))
         ideal = replace(GENERIC_CALIBRATION, sweeps=np.zeros((2, 7)))
-        self.rig = frame.moved(
-            Rig(
+        self.rig = frame.transform_state(
+            BundleState(
                 np.stack([s.position for s in self.lamps]),
                 np.stack([s.rotation for s in self.lamps]),
                 (ideal, ideal),
@@ -92,7 +92,7 @@ def test_markers_bring_the_rig_home(recorded: Recorded, world: Any) -> None:
     np.testing.assert_array_equal(known, recorded.places)
     to = frame.place_on_markers(recorded.rig, True, known, seen)
     assert to is not None
-    home = frame.moved(recorded.rig, to)
+    home = frame.transform_state(recorded.rig, to)
     for k, lamp in enumerate(recorded.lamps):
         np.testing.assert_allclose(home.positions[k], lamp.position, atol=1e-5)
         np.testing.assert_allclose(home.rotations[k], lamp.rotation, atol=1e-5)
@@ -108,7 +108,7 @@ def test_several_markers_average_the_error_of_one(recorded: Recorded, world: Any
     moved[0, 0] += 0.03  # measured badly
     to = frame.place_on_markers(recorded.rig, True, moved, seen)
     assert to is not None
-    home = frame.moved(recorded.rig, to)
+    home = frame.transform_state(recorded.rig, to)
     assert np.max(np.abs(home.points - recorded.places)) < 0.012
 
 
@@ -141,7 +141,9 @@ def seen_on_floor(recorded: Recorded) -> Any:
     """Positions on the floor, in the rig's unit, of photodiodes that saw given angles."""
     rig = recorded.rig
     return lambda angles: (
-        locate(angles, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0).position
+        estimate_positions(
+            angles, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0
+        ).position
     )
 
 
@@ -208,7 +210,7 @@ def test_odometry_of_another_or_of_no_motion_says_nothing(world: Any) -> None:
 def test_a_rig_of_its_own_stands_at_its_first_station(recorded: Recorded) -> None:
     for planar in (True, False):
         to = frame.at_first_station(recorded.rig, planar, 5.0)
-        home = frame.moved(recorded.rig, to)
+        home = frame.transform_state(recorded.rig, to)
         true = np.stack([s.position for s in recorded.lamps])
         np.testing.assert_allclose(
             np.linalg.norm(home.positions[1] - home.positions[0]),

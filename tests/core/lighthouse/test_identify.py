@@ -11,18 +11,18 @@ import pytest
 
 from locatk.core.kernels import kernels
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.demodulation.bursts import of_windows, split
+from locatk.core.lighthouse.demodulation.bursts import bursts_of_windows, split_bursts
 from locatk.core.lighthouse.demodulation.identification import (
     ALONE,
     ERROR_SHARE,
     FOLLOW,
     UNKNOWN,
-    Matches,
+    SequenceMatches,
     expect,
     expect_numpy,
     false_rate,
-    identify,
     identify_numpy,
+    identify_sequences,
 )
 from locatk.core.lighthouse.demodulation.soft_bits import CERTAIN, SoftBits, soft_bits
 from locatk.core.lighthouse.recording import Edges
@@ -43,8 +43,8 @@ def sent(light: Any, polynomial: int, index: np.ndarray, length: int) -> np.ndar
     return np.where(bits > 0, CERTAIN, -CERTAIN).astype(np.int8)
 
 
-def same(a: Matches, b: Matches) -> None:
-    for field in fields(Matches):
+def same(a: SequenceMatches, b: SequenceMatches) -> None:
+    for field in fields(SequenceMatches):
         assert np.array_equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
@@ -53,7 +53,7 @@ def test_every_clean_window_of_60_bits(light: Any, polynomial: int) -> None:
     index = np.arange(0, lfsr.LENGTH, 1 if kernels else 911)
     # The first and the last places, at which a window runs over the register's end.
     index = np.unique(np.concatenate([index, np.arange(70), lfsr.LENGTH - 1 - np.arange(70)]))
-    found = identify(soft(sent(light, polynomial, index, 60)))
+    found = identify_sequences(soft(sent(light, polynomial, index, 60)))
     assert np.array_equal(found.polynomial, np.full(len(index), polynomial))
     assert np.array_equal(found.index, index)
     assert found.certain().all()
@@ -66,7 +66,7 @@ def test_shorter_windows(light: Any) -> None:
     for length in (36, 42, 48, 59):
         right = wrong = 0
         for polynomial in range(0, 32, 3):
-            found = identify(soft(sent(light, polynomial, index, length)))
+            found = identify_sequences(soft(sent(light, polynomial, index, length)))
             hit = (found.polynomial == polynomial) & (found.index == index)
             right += np.count_nonzero(hit)
             wrong += np.count_nonzero(~hit & found.certain())
@@ -81,7 +81,7 @@ def test_all_channels_and_slow_bits_through_errors(light: Any, polynomial: int) 
     value = sent(light, polynomial, index, 150)
     value = np.where(noise.random(value.shape) < 0.03, -value, value)
     value = np.where(noise.random(value.shape) < 0.03, 0, value)
-    found = identify(soft(value))
+    found = identify_sequences(soft(value))
     sure = found.certain()
     assert sure.mean() > 0.9
     assert np.array_equal(found.polynomial[sure], np.full(sure.sum(), polynomial))
@@ -93,7 +93,7 @@ def test_noise_around_does_not_matter(light: Any) -> None:
     index = noise.integers(100, 119_000, 500)
     value = noise.choice([-CERTAIN, CERTAIN], (500, 200)).astype(np.int8)
     value[:, 60:140] = sent(light, 9, index, 80)
-    found = identify(soft(value))
+    found = identify_sequences(soft(value))
     assert np.mean((found.polynomial == 9) & (found.index == index - 60)) == 1
     # Noise goes on agreeing by accident: a bit in two.
     assert np.abs(found.begin - 60).max() < 25
@@ -104,10 +104,10 @@ def test_noise_around_does_not_matter(light: Any) -> None:
 def test_unknown_bits_count_neither_way(light: Any) -> None:
     index = np.arange(5, 119_000, 977)
     value = sent(light, 4, index, 120)
-    clean = identify(soft(value))
+    clean = identify_sequences(soft(value))
     unknown = value.copy()
     unknown[:, 30:50] = np.resize([UNKNOWN, -UNKNOWN, 0], 20)
-    found = identify(soft(unknown))
+    found = identify_sequences(soft(unknown))
     assert np.array_equal(found.index, index)
     assert np.all(found.known == 100)
     assert np.all(found.wrong == 0)
@@ -121,7 +121,7 @@ def test_contradictions_in_proportion_to_known_bits() -> None:
     known = np.array([100, 100, 50, 50, 0, 10], np.int32)
     wrong = np.array([20, 21, 10, 11, 0, 3], np.int32)
     rows = [np.zeros(n, np.int32), np.zeros(n, np.int64), np.full(n, ALONE)]
-    found = Matches(*rows, np.zeros(n, np.int32), known, known, wrong)
+    found = SequenceMatches(*rows, np.zeros(n, np.int32), known, known, wrong)
     assert ERROR_SHARE == 0.2
     assert found.certain().tolist() == [True, False, True, False, True, False]
     assert not found.certain(ALONE + 1).any()
@@ -135,7 +135,7 @@ def test_weak_bits_with_many_contradictions_are_not_certain(light: Any) -> None:
     value[:, 100:130] *= 4
     flip = noise.random(value.shape) < 0.26
     flip[:, 100:130] = False
-    found = identify(soft(np.where(flip, -value, value)))
+    found = identify_sequences(soft(np.where(flip, -value, value)))
     share = found.wrong / np.maximum(found.known, 1)
     many = (found.evidence >= ALONE) & (share > ERROR_SHARE)
     assert many.any()
@@ -143,28 +143,33 @@ def test_weak_bits_with_many_contradictions_are_not_certain(light: Any) -> None:
 
 
 def test_too_little_to_say(light: Any) -> None:
-    nothing = identify(SoftBits(np.zeros(0, np.int8), np.zeros(1, np.int64), np.zeros(0), 5.0))
+    nothing = identify_sequences(
+        SoftBits(np.zeros(0, np.int8), np.zeros(1, np.int64), np.zeros(0), 5.0)
+    )
     assert len(nothing) == 0
     for length in (0, 1, 17, lfsr.BITS + FOLLOW - 1):
-        found = identify(soft(sent(light, 3, np.array([77]), length)))
+        found = identify_sequences(soft(sent(light, 3, np.array([77]), length)))
         assert found.polynomial.tolist() == [-1]
         assert found.index.tolist() == [-1]
         assert not found.certain(0.0).any()
     # All zeros follow from themselves under any polynomial, and are none of a station's.
-    assert not identify(soft(np.full((2, 90), -CERTAIN))).certain().any()
-    assert not identify(soft(np.zeros((2, 90)))).certain(0.1).any()
+    assert not identify_sequences(soft(np.full((2, 90), -CERTAIN))).certain().any()
+    assert not identify_sequences(soft(np.zeros((2, 90)))).certain(0.1).any()
 
 
 def test_only_the_first_polynomials(light: Any) -> None:
     index = np.array([1000, 50_000])
-    assert identify(soft(sent(light, 5, index, 80)), 4).certain().tolist() == [False, False]
-    assert identify(soft(sent(light, 3, index, 80)), 4).polynomial.tolist() == [3, 3]
+    assert identify_sequences(soft(sent(light, 5, index, 80)), 4).certain().tolist() == [
+        False,
+        False,
+    ]
+    assert identify_sequences(soft(sent(light, 3, index, 80)), 4).polynomial.tolist() == [3, 3]
 
 
 def test_bits_of_noise() -> None:
     n = 20_000 if kernels else 1000
     value = np.random.default_rng(8).choice([-CERTAIN, CERTAIN], (n, 150))
-    found = identify(soft(value))
+    found = identify_sequences(soft(value))
     for evidence in (32.0, 34.0, 36.0, ALONE):
         expected = false_rate(evidence) * n
         assert np.count_nonzero(found.certain(evidence)) <= expected + 3 * np.sqrt(expected) + 1
@@ -177,8 +182,8 @@ def test_edges_of_noise(light: Any, runs: tuple[float, ...]) -> None:
     noise = np.random.default_rng(3)
     run = noise.choice(runs, 400_000) / 12e6
     run[noise.random(len(run)) < 0.01] = 1e-4
-    bursts = split(light.edges(np.cumsum(run), 1.0))
-    found = identify(soft_bits(bursts.take(bursts.duration_s > 5e-6)))
+    bursts = split_bursts(light.edges(np.cumsum(run), 1.0))
+    found = identify_sequences(soft_bits(bursts.take(bursts.duration_s > 5e-6)))
     assert np.count_nonzero(found.certain()) <= 1 + 3 * false_rate(ALONE) * len(found)
 
 
@@ -190,7 +195,7 @@ def test_twins(light: Any) -> None:
         value *= noise.uniform(-0.2, 1, value.shape) * noise.choice([-0.3, 1, 1], (64, 1))
         value[:20] = noise.normal(0, 30, (20, length))
         bits = soft(np.clip(np.rint(value), -CERTAIN, CERTAIN))
-        same(identify(bits), identify_numpy(bits))
+        same(identify_sequences(bits), identify_numpy(bits))
         polynomial = noise.integers(0, 32, (64, 3)).astype(np.int32)
         place = noise.integers(-9, 2 * lfsr.LENGTH, (64, 3))
         same(expect(bits, polynomial, place, 2), expect_numpy(bits, polynomial, place, 2))
@@ -198,8 +203,8 @@ def test_twins(light: Any) -> None:
 
 @pytest.mark.parametrize("name", [CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"])
 def test_twins_on_published_light(published: Callable[[str], Edges], name: str) -> None:
-    bits = soft_bits(split(published(name)))
-    found = identify(bits)
+    bits = soft_bits(split_bursts(published(name)))
+    found = identify_sequences(bits)
     same(found, identify_numpy(bits))
     some = np.flatnonzero(np.diff(bits.first) > 20)[:500]
     few = SoftBits(
@@ -233,7 +238,7 @@ def test_windows_of_a_microcontroller(light: Any) -> None:
     for row, index in zip(level, truth, strict=True):
         change = light.biphase(light.sequence(11)[index : index + 110]) - noise.uniform(0, 1)
         row[:] = (np.searchsorted(change, np.arange(512) / (32 / 6)) + index) % 2
-    found = identify(soft_bits(of_windows(np.packbits(level, axis=1))))
+    found = identify_sequences(soft_bits(bursts_of_windows(np.packbits(level, axis=1))))
     assert found.certain().all()
     assert np.all(found.polynomial == 11)
     assert np.all(np.abs(found.index - truth) <= 2)

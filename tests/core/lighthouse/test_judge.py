@@ -7,22 +7,26 @@ from typing import Any
 import numpy as np
 
 from locatk.core.lighthouse.channels import channel_of
-from locatk.core.lighthouse.demodulation.burst_validation import Reading, identified, judge
-from locatk.core.lighthouse.demodulation.bursts import split
+from locatk.core.lighthouse.demodulation.burst_validation import (
+    ValidatedBursts,
+    identified,
+    validate_bursts,
+)
+from locatk.core.lighthouse.demodulation.bursts import split_bursts
 from locatk.core.lighthouse.demodulation.identification import ALONE
-from locatk.core.lighthouse.demodulation.rotor import Found, find_rotors
+from locatk.core.lighthouse.demodulation.rotor import RotorSet, find_rotors
 from locatk.core.lighthouse.recording import Edges
 
 
-def reading(line: Edges, found: Found | None = None) -> Reading:
+def reading(line: Edges, found: RotorSet | None = None) -> ValidatedBursts:
     """A photodiode's bursts, judged by what they say themselves or by ``found``."""
-    bursts = split(line)
+    bursts = split_bursts(line)
     bits, matches = identified(bursts)
     if found is None:
         found = find_rotors(
             bits.tick, matches.polynomial, matches.index, matches.evidence, line.rate_hz
         )
-    return judge(bursts, bits, matches, found)
+    return validate_bursts(bursts, bits, matches, found)
 
 
 def test_clean_light_is_read(light: Any) -> None:
@@ -58,14 +62,14 @@ def test_weak_bursts_are_taken_where_a_rotor_expects_them(light: Any) -> None:
     weak = light.Receiving(width_s=6.5e-6, jitter_s=5e-9)
     sender = light.Sender(5)
     (line,), _ = light.of([sender], 2.0, strong)
-    bursts = split(line)
+    bursts = split_bursts(line)
     bits, matches = identified(bursts)
     found = find_rotors(
         bits.tick, matches.polynomial, matches.index, matches.evidence, line.rate_hz
     )
     (thin,), passed = light.of([sender], 2.0, weak)
     read = reading(thin, found)
-    assert np.mean(identified(split(thin))[1].certain()) < 0.2
+    assert np.mean(identified(split_bursts(thin))[1].certain()) < 0.2
     assert read.read.sum() > 0.9 * len(passed.time_s)
     right = read.matches.polynomial[read.read] == passed.polynomial[read.read]
     assert right.all()
@@ -88,7 +92,7 @@ def test_without_a_rotor_only_what_stands_alone(light: Any) -> None:
     assert 0 < len(passed.time_s) < 4
     assert read.read.sum() == len(passed.time_s)
     assert np.isnan(read.off_s).all()
-    assert not reading(line, Found({}, (3,))).read.any()
+    assert not reading(line, RotorSet({}, (3,))).read.any()
 
 
 def test_nothing() -> None:

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, Calibration
-from locatk.core.lighthouse.localization.positions import BLOCK, Fixes, locate
+from locatk.core.lighthouse.localization.positions import (
+    BLOCK,
+    PositionEstimates,
+    estimate_positions,
+)
 
 Array = NDArray[np.float64]
 Rig = tuple[Array, Array, tuple[Calibration, ...]]
@@ -39,7 +43,7 @@ def angles_of(lamps: Any, points: Array) -> Array:
 def test_exact_angles_give_exact_places(world: Any, channels: tuple[int, ...]) -> None:
     lamps = world.lamps(*channels)
     points = world.curve(80, flat=False)
-    fixes = locate(angles_of(lamps, points), *factory(lamps))
+    fixes = estimate_positions(angles_of(lamps, points), *factory(lamps))
     np.testing.assert_allclose(fixes.position, points, atol=3e-6)
     assert np.max(np.abs(fixes.residual)) < 1e-6
     np.testing.assert_array_equal(fixes.freedom, 2 * len(channels) - 3)
@@ -49,7 +53,7 @@ def test_exact_angles_give_exact_places(world: Any, channels: tuple[int, ...]) -
 def test_on_a_floor_one_station_is_enough(world: Any, channels: tuple[int, ...]) -> None:
     lamps = world.lamps(*channels)
     points = world.curve(80, flat=True) + [0, 0, 0.07]
-    fixes = locate(angles_of(lamps, points), *factory(lamps), floor_z=0.07)
+    fixes = estimate_positions(angles_of(lamps, points), *factory(lamps), floor_z=0.07)
     np.testing.assert_allclose(fixes.position, points, atol=1e-5)
     np.testing.assert_array_equal(fixes.freedom, 2 * len(channels) - 2)
     assert np.all(fixes.position[:, 2] == 0.07)
@@ -62,7 +66,7 @@ def test_a_single_plane_helps_where_others_see_too(world: Any) -> None:
     points = world.curve(10, flat=False)
     angles = angles_of(lamps, points)
     angles[:, 1, 0] = np.nan
-    fixes = locate(angles, *factory(lamps))
+    fixes = estimate_positions(angles, *factory(lamps))
     np.testing.assert_allclose(fixes.position, points, atol=1e-6)
     np.testing.assert_array_equal(fixes.freedom, 0)
     assert np.isnan(fixes.residual[:, 1, 0]).all()
@@ -73,7 +77,7 @@ def test_a_bent_plane_alone_is_left_out_and_not_counted(world: Any) -> None:
     points = world.curve(10, flat=False)
     angles = angles_of(lamps, points)
     angles[:, 1, 0] = np.nan
-    fixes = locate(angles, *factory(lamps))
+    fixes = estimate_positions(angles, *factory(lamps))
     np.testing.assert_allclose(fixes.position, points, atol=1e-3)
     counted = np.count_nonzero(np.isfinite(fixes.residual), axis=(1, 2))
     np.testing.assert_array_equal(fixes.freedom, counted - 3)
@@ -84,9 +88,9 @@ def test_the_unit_does_not_matter(world: Any) -> None:
     points = world.curve(30, flat=False)
     angles = angles_of(lamps, points) + np.random.default_rng(0).normal(0, 1e-3, (30, 2, 2))
     position, rotation, calibration = factory(lamps)
-    metres = locate(angles, position, rotation, calibration)
+    metres = estimate_positions(angles, position, rotation, calibration)
     for unit in (1e-3, 1e3):
-        other = locate(angles, position * unit, rotation, calibration)
+        other = estimate_positions(angles, position * unit, rotation, calibration)
         np.testing.assert_allclose(other.position, metres.position * unit, rtol=1e-8)
         np.testing.assert_allclose(other.residual, metres.residual, atol=1e-10)
         np.testing.assert_allclose(
@@ -100,7 +104,7 @@ def test_places_are_least_squares_of_the_angles(world: Any, flat: bool) -> None:
     points = world.curve(12, flat=flat)
     rng = np.random.default_rng(2)
     angles = angles_of(lamps, points) + rng.normal(0, 1e-3, (12, 3, 2))
-    fixes = locate(angles, *factory(lamps), floor_z=0.0 if flat else None)
+    fixes = estimate_positions(angles, *factory(lamps), floor_z=0.0 if flat else None)
     dims = 2 if flat else 3
     for k in range(12):
 
@@ -124,7 +128,9 @@ def test_covariance_is_that_of_noise_draws(world: Any, flat: bool) -> None:
     rng = np.random.default_rng(0)
     sigma, draws = 3e-4, 2000
     angles = angles_of(lamps, points)[:, None] + rng.normal(0, sigma, (8, draws, 2, 2))
-    fixes = locate(angles.reshape(-1, 2, 2), *factory(lamps), floor_z=0.0 if flat else None)
+    fixes = estimate_positions(
+        angles.reshape(-1, 2, 2), *factory(lamps), floor_z=0.0 if flat else None
+    )
     dims = 2 if flat else 3
     error = (fixes.position.reshape(8, draws, 3) - points[:, None])[..., :dims]
     stated = fixes.covariance(sigma, flat).reshape(8, draws, 3, 3)[:, 0, :dims, :dims]
@@ -142,7 +148,7 @@ def test_residuals_measure_the_noise(world: Any) -> None:
     points = world.curve(3000, flat=False)
     rng = np.random.default_rng(0)
     angles = angles_of(lamps, points) + rng.normal(0, 5e-4, (3000, 3, 2))
-    fixes = locate(angles, *factory(lamps))
+    fixes = estimate_positions(angles, *factory(lamps))
     squares = np.sum(fixes.residual**2, axis=(1, 2)) / fixes.freedom
     assert np.sqrt(squares.mean()) == pytest.approx(5e-4, rel=0.03)
 
@@ -156,7 +162,7 @@ def test_no_place_where_planes_do_not_meet_in_one(world: Any) -> None:
     angles[2, 1] = angles[2, 0, 0] = np.nan  # one plane
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fixes = locate(angles, *factory(lamps))
+        fixes = estimate_positions(angles, *factory(lamps))
         covariance = fixes.covariance(1e-4, False)
     np.testing.assert_array_equal(np.isnan(fixes.position).all(axis=1), [1, 1, 1, 0, 0, 0])
     np.testing.assert_array_equal(fixes.freedom, [-3, -1, fixes.freedom[2], 1, 1, 1])
@@ -172,7 +178,7 @@ def test_no_place_behind_a_station(world: Any) -> None:
     up = lamp.position + lamp.rotation @ [-2.0, 0.3, 0.1]
     ahead = lamp.position + lamp.rotation @ [2.0, -0.3, -0.1]
     rig = factory((lamp,))
-    fixes = locate(lamp.angles(ahead[None])[None], *rig, floor_z=float(up[2]))
+    fixes = estimate_positions(lamp.angles(ahead[None])[None], *rig, floor_z=float(up[2]))
     assert np.isnan(fixes.position).all()
 
 
@@ -181,7 +187,7 @@ def test_a_ray_along_the_floor_meets_it_nowhere_near(world: Any) -> None:
     angles = level.angles(np.array([[2.0, 0.0, 0.5]]))[None]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fixes = locate(angles, *factory((level,)), floor_z=0.0)
+        fixes = estimate_positions(angles, *factory((level,)), floor_z=0.0)
     assert np.isnan(fixes.position[0]).all() or abs(fixes.position[0, 0]) > 100
 
 
@@ -189,8 +195,8 @@ def test_blocks_do_not_show(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = np.tile(world.curve(9, flat=False), (BLOCK // 9 + 3, 1))
     angles = angles_of(lamps, points)
-    fixes = locate(angles, *factory(lamps))
-    alone = locate(angles[-5:], *factory(lamps))
+    fixes = estimate_positions(angles, *factory(lamps))
+    alone = estimate_positions(angles[-5:], *factory(lamps))
     for name in ("position", "information", "residual", "freedom"):
         assert len(getattr(fixes, name)) == len(points)
         np.testing.assert_allclose(getattr(fixes, name)[-5:], getattr(alone, name), atol=1e-9)
@@ -198,8 +204,8 @@ def test_blocks_do_not_show(world: Any) -> None:
 
 def test_nothing_seen_is_nothing_found(world: Any) -> None:
     lamps = world.lamps(1, 2)
-    fixes = locate(np.zeros((0, 2, 2)), *factory(lamps))
-    assert isinstance(fixes, Fixes)
+    fixes = estimate_positions(np.zeros((0, 2, 2)), *factory(lamps))
+    assert isinstance(fixes, PositionEstimates)
     assert fixes.position.shape == (0, 3)
     assert fixes.worst.shape == (0,)
     assert fixes.covariance(1e-4, False).shape == (0, 3, 3)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, GENERIC_CALIBRATION, MODEL_SIGMA_RAD
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.scene.assembly import Assembly, assemble
+from locatk.core.lighthouse.scene.assembly import Assembly, estimate_stations
 from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
 from locatk.core.lighthouse.solver import solve
 
@@ -72,7 +72,7 @@ def nearest(lamps: Any, points: Array, angles: Array, number: int) -> Array:
 def run(angles: Array, planar: bool | None = None) -> Assembly:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return assemble(
+        return estimate_stations(
             angles, (GENERIC_CALIBRATION,) * angles.shape[1], sigma=MODEL_SIGMA_RAD, planar=planar
         )
 

@@ -14,13 +14,13 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import PARAMETERS
 from locatk.core.lighthouse.demodulation import ootx
-from locatk.core.lighthouse.demodulation.pipeline import Reception, receive
+from locatk.core.lighthouse.demodulation.pipeline import DemodulatedRecording, demodulate_recording
 from locatk.core.lighthouse.recording import Edges
 
 CAPTURE = "benchmarks/demodulation_code/logic_analyser_capture.sal"
 
 
-def paired(got: Reception, passed: Any, path: Any) -> tuple[np.ndarray, np.ndarray]:
+def paired(got: DemodulatedRecording, passed: Any, path: Any) -> tuple[np.ndarray, np.ndarray]:
     """Rows of caught sweeps and of the true ones that they are."""
     sweeps = got.sweeps
     time = sweeps.tick / path.rate_hz / (1 + path.clock_ppm * 1e-6)
@@ -60,7 +60,7 @@ def test_all_at_once(light: Any, rate_hz: float, resolution_hz: float | None) ->
         light.Sender(16, zero_s=0.007, ppm=30),
     ]
     lines, passed = light.of(senders, 5.0, path, sensors=2)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     caught, row = paired(got, passed, path)
     clean = np.count_nonzero(~passed.spoiled)
     # Where two stations shine at once a sweep is lost, or its middle is; and a fragment of a
@@ -85,7 +85,7 @@ def test_all_at_once(light: Any, rate_hz: float, resolution_hz: float | None) ->
 def test_clean_light_to_a_fraction_of_a_bit(light: Any) -> None:
     path = light.Receiving(rate_hz=100e6)
     lines, passed = light.of([light.Sender(3, ppm=8)], 5.0, path)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     off = np.abs(got.sweeps.count - passed.count)
     assert np.median(off) < 0.3
     assert off.max() < 1.5
@@ -98,7 +98,7 @@ def test_each_channel(light: Any, first: int) -> None:
     channels = range(first, first + 4)
     senders = [light.Sender(c, ppm=c, zero_s=0.0007 * c, slow=(0, 1)) for c in channels]
     lines, passed = light.of(senders, 1.0)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert [station.channel for station in got.stations] == list(channels)
     assert set(got.sweeps.polynomial.tolist()) == set(passed.polynomial.tolist())
     for station in got.stations:
@@ -115,7 +115,7 @@ def test_factory_data_of_two_stations(light: Any) -> None:
     ]
     path = light.Receiving(missing=0.1, spoiled=0.05, rim_s=1e-6)
     lines, _ = light.of(senders, 20.0, path)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert [station.id for station in got.stations] == [0xABCDEF01, 0x12345678]
     for station in got.stations:
         assert station.calibration is not None
@@ -127,19 +127,19 @@ def test_factory_data_of_two_stations(light: Any) -> None:
 
 def test_a_station_that_says_another_channel(light: Any) -> None:
     lines, _ = light.of([light.Sender(4, slow=factory(7, 5))], 10.0)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert any("channel 4" in note and "channel 7" in note for note in got.notes)
 
 
 def test_missed_sweeps_are_counted(light: Any) -> None:
     path = light.Receiving(spoiled=0.1, rim_s=1e-6)
     lines, passed = light.of([light.Sender(2)], 20.0, path, sensors=2)
-    (station,) = receive(lines).stations
+    (station,) = demodulate_recording(lines).stations
     assert station.missed == pytest.approx(passed.spoiled.sum(), rel=0.03)
     assert station.decode_rate == pytest.approx(0.9, abs=0.015)
     # What did not arrive is not missed.
     lines, _ = light.of([light.Sender(2)], 5.0, light.Receiving(missing=0.3))
-    assert receive(lines).stations[0].decode_rate == 1.0
+    assert demodulate_recording(lines).stations[0].decode_rate == 1.0
 
 
 def test_motion_capture_is_dropped(light: Any) -> None:
@@ -151,7 +151,7 @@ def test_motion_capture_is_dropped(light: Any) -> None:
     other = np.concatenate(flashes) + noise.normal(0, 8e-9, sum(map(len, flashes)))
     senders = [light.Sender(1), light.Sender(2, zero_s=0.0012)]
     lines, passed = light.of(senders, 3.0, others=[np.sort(other)])
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert got.flashes == pytest.approx(len(flashes) / 2, rel=0.06)
     assert any("flashes" in note for note in got.notes)
     caught, row = paired(got, passed, light.Receiving())
@@ -169,7 +169,7 @@ def test_light_that_does_not_end(light: Any) -> None:
     (line,), passed = light.of([light.Sender(3)], 1.0)
     last = line.tick[np.searchsorted(line.tick, 0.4 * 40e6) - 1] + 80
     tick = np.union1d(line.tick, last + 9 * np.arange(2_200_000))
-    got = receive([replace(line, tick=tick)])
+    got = demodulate_recording([replace(line, tick=tick)])
     left = passed.time_s[(passed.time_s < 0.3999) | (passed.time_s > 0.9)]
     assert len(left) - 4 <= len(got.sweeps) <= len(left) + 2
 
@@ -177,13 +177,13 @@ def test_light_that_does_not_end(light: Any) -> None:
 def test_two_stations_on_one_channel(light: Any) -> None:
     doubled = [light.Sender(3), light.Sender(3, zero_s=0.011, ppm=5)]
     lines, passed = light.of([*doubled, light.Sender(9, zero_s=0.002)], 5.0)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert set(got.sweeps.channel.tolist()) == {9}
     assert len(got.sweeps) > 0.97 * np.count_nonzero(passed.channel == 9)
     assert any("more than one station sends on channel 3" in note for note in got.notes)
     lines, _ = light.of(doubled, 5.0)
     with pytest.raises(InputError, match="more than one station sends on channel 3"):
-        receive(lines)
+        demodulate_recording(lines)
 
 
 def test_stations_come_and_go(light: Any) -> None:
@@ -194,7 +194,7 @@ def test_stations_come_and_go(light: Any) -> None:
     ]
     path = light.Receiving(spoiled=0.1)
     lines, passed = light.of(senders, 6.0, path)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert [station.channel for station in got.stations] == [1, 3, 7]
     for station in got.stations:
         sent = np.count_nonzero((passed.channel == station.channel) & ~passed.spoiled)
@@ -205,7 +205,7 @@ def test_a_station_that_is_switched_off_and_on(light: Any) -> None:
     senders = [light.Sender(3, until_s=3), light.Sender(3, zero_s=0.0111, since_s=5)]
     path = light.Receiving(spoiled=0.1)
     lines, passed = light.of(senders, 9.0, path)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     caught, row = paired(got, passed, path)
     assert len(caught) >= np.count_nonzero(~passed.spoiled)
     assert np.abs(got.sweeps.count[caught] - passed.count[row]).max() < 5
@@ -219,7 +219,7 @@ def test_a_silence_of_two_hours(light: Any) -> None:
     second, later = light.of([light.Sender(3, ppm=4.2, zero_s=0.0077)], 6.0, path, seed=2)
     shift = round(7200 * path.rate_hz)
     tick = np.concatenate([first[0].tick, second[0].tick + shift])
-    got = receive([replace(first[0], tick=tick, end_tick=int(tick[-1]) + 1)])
+    got = demodulate_recording([replace(first[0], tick=tick, end_tick=int(tick[-1]) + 1)])
     assert len(got.sweeps) == len(passed.time_s) + len(later.time_s)
     for part, offset in ((passed, 0.0), (later, 7200.0)):
         rows = np.searchsorted(got.sweeps.tick / path.rate_hz, part.time_s + offset - 1e-5)
@@ -231,18 +231,18 @@ def test_a_silence_of_two_hours(light: Any) -> None:
 
 def test_three_sweeps_and_short_recordings(light: Any) -> None:
     lines, passed = light.of([light.Sender(3, until_s=0.03)], 1.0, light.Receiving(missing=0.3))
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert len(got.sweeps) == len(passed.time_s) < 4
     assert got.rotors == {}
     assert np.abs(got.sweeps.count - passed.count).max() < 2
     assert got.stations[0].period_ticks is None
     lines, passed = light.of([light.Sender(3), light.Sender(5, zero_s=0.001)], 1.0)
-    assert len(receive(lines).sweeps) == len(passed.time_s)
+    assert len(demodulate_recording(lines).sweeps) == len(passed.time_s)
 
 
 def test_one_plane_only(light: Any) -> None:
     lines, passed = light.of([light.Sender(3, planes=(lambda time: 0.3,))], 2.0)
-    got = receive(lines)
+    got = demodulate_recording(lines)
     assert len(got.sweeps) == len(passed.time_s)
     assert np.all(got.sweeps.plane == -1)
 
@@ -253,36 +253,36 @@ def test_no_light_of_a_station(light: Any, seed: int) -> None:
     run = noise.choice([8.3e-8, 1.67e-7, 2.5e-7, 6e-8], 300_000)
     run[noise.random(len(run)) < 0.01] = 3e-4
     with pytest.raises(InputError, match="no light of a base station among"):
-        receive([light.edges(np.cumsum(run), 1.0)])
+        demodulate_recording([light.edges(np.cumsum(run), 1.0)])
 
 
 def test_nothing_to_read(light: Any) -> None:
     with pytest.raises(InputError, match="no line"):
-        receive([])
+        demodulate_recording([])
     empty = Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 100)
     with pytest.raises(InputError, match="among 0 bursts"):
-        receive([empty])
+        demodulate_recording([empty])
     # A photodiode in the shadow beside one in the light.
     (line,), passed = light.of([light.Sender(3)], 1.0)
-    got = receive([empty, line])
+    got = demodulate_recording([empty, line])
     assert len(got.sweeps) == len(passed.time_s)
     assert np.all(got.sweeps.sensor == 1)
     with pytest.raises(InputError, match="too few"):
-        receive([light.edges(line.tick / 40e6, 1.0, light.Receiving(rate_hz=20e6))])
+        demodulate_recording([light.edges(line.tick / 40e6, 1.0, light.Receiving(rate_hz=20e6))])
     with pytest.raises(InputError, match="different clocks"):
-        receive([line, replace(empty, rate_hz=50e6, resolution_hz=50e6)])
+        demodulate_recording([line, replace(empty, rate_hz=50e6, resolution_hz=50e6)])
 
 
 def test_a_jump_of_a_clock_ends(light: Any) -> None:
     (line,), passed = light.of([light.Sender(3)], 1.0)
     tick = line.tick.copy()
     tick[len(tick) // 2 :] += 2**52
-    got = receive([replace(line, tick=tick, end_tick=int(tick[-1]) + 1)])
+    got = demodulate_recording([replace(line, tick=tick, end_tick=int(tick[-1]) + 1)])
     assert len(got.sweeps) >= len(passed.time_s) - 1
 
 
 def test_the_published_capture(published: Callable[[str], Edges]) -> None:
-    got = receive([published(CAPTURE)])
+    got = demodulate_recording([published(CAPTURE)])
     (reading,) = got.readings
     assert len(reading.bursts) == 11_136
     taken = reading.read | (reading.beside >= 0)
@@ -309,7 +309,7 @@ def test_the_published_capture(published: Callable[[str], Edges]) -> None:
 def test_published_captures_of_the_deck(
     published: Callable[[str], Edges], name: str, least: int
 ) -> None:
-    got = receive([published(name)])
+    got = demodulate_recording([published(name)])
     (reading,) = got.readings
     assert len(reading.bursts) == 103
     assert reading.read.sum() >= least
@@ -323,7 +323,7 @@ def test_the_published_capture_at_lower_rates(
 ) -> None:
     edges = published(CAPTURE)
     lower = light.edges(edges.tick[:800_000] / 40e6, 20.0, light.Receiving(rate_hz=rate_hz))
-    got = receive([lower])
+    got = demodulate_recording([lower])
     (reading,) = got.readings
     assert (reading.read | (reading.beside >= 0)).mean() > least
     assert np.all(reading.matches.polynomial[reading.read] < 4)
@@ -336,7 +336,9 @@ def test_a_rotor_that_wanders_within_seconds_does_not_move_a_standing_photodiode
     from locatk.formats.importers.saleae import read_light
 
     for name, plane, limit in (("take1", 0, 0.6), ("about_4m", 1, 2.6)):
-        caught = receive(read_light(data / "lighthouse" / "fpga" / f"{name}.csv")).sweeps
+        caught = demodulate_recording(
+            read_light(data / "lighthouse" / "fpga" / f"{name}.csv")
+        ).sweeps
         count = caught.count[caught.plane == plane]
         assert len(count) > 45
         assert 1.4826 * np.median(np.abs(count - np.median(count))) < limit

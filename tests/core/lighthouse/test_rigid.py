@@ -20,11 +20,11 @@ from locatk.core.geometry import (
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, Calibration, predict_angles
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.devices.pnp import lit_from_behind
-from locatk.core.lighthouse.devices.rigid_solver import RigidAnswer, solve_rigid
+from locatk.core.lighthouse.devices.rigid_solver import DeviceSolution, solve_rigid_devices
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.simulation.optics import Light
+from locatk.core.lighthouse.simulation.optics import SimulatedStation
 
 Array = NDArray[np.float64]
 Motion = Callable[[Array], tuple[Array, Array]]
@@ -99,7 +99,7 @@ def record(
     rows = []
     for s in stations:
         period = float(period_ticks(s.channel)) / 48e6
-        light = Light(s, rng.uniform(0, period), period, np.zeros(1, np.int64))
+        light = SimulatedStation(s, rng.uniform(0, period), period, np.zeros(1, np.int64))
         start = light.zero_s + np.arange(int(seconds / period) - 1) * period
         for k, (place, normal) in enumerate(zip(receiver.position_m, receiver.normal, strict=True)):
 
@@ -137,7 +137,7 @@ def record(
     )
 
 
-def errors(answer: RigidAnswer, motion: Motion) -> Array:
+def errors(answer: DeviceSolution, motion: Motion) -> Array:
     """(m, 6) position and rotation beside the truth."""
     track = answer.trajectories[0]
     position, rotation = motion((track.time_ns - START_NS) * 1e-9)
@@ -145,7 +145,7 @@ def errors(answer: RigidAnswer, motion: Motion) -> Array:
     return np.c_[track.position - position, rotation_log(turned)]
 
 
-def normalised(answer: RigidAnswer, motion: Motion) -> float:
+def normalised(answer: DeviceSolution, motion: Motion) -> float:
     """Mean of the squared errors in their own covariance, over six: 1 where it is right."""
     off = errors(answer, motion)
     inverse = np.linalg.inv(answer.trajectories[0].covariance)
@@ -155,7 +155,7 @@ def normalised(answer: RigidAnswer, motion: Motion) -> float:
 @pytest.mark.parametrize("planes_told", [True, False])
 def test_a_carried_tracker_is_followed(planes_told: bool) -> None:
     sweeps = record(ROOM, TRACKER, carried, 2.0, planes_told=planes_told)
-    answer = solve_rigid(sweeps, {"device": TRACKER}, Scene(ROOM, frame="room"))
+    answer = solve_rigid_devices(sweeps, {"device": TRACKER}, Scene(ROOM, frame="room"))
     (track,) = answer.trajectories
     assert (track.device, track.frame) == ("device", "room")
     assert len(track) >= 98
@@ -171,7 +171,7 @@ def test_a_carried_tracker_is_followed(planes_told: bool) -> None:
 
 def test_one_station_is_enough_for_a_device_with_depth() -> None:
     sweeps = record(ROOM[:1], TRACKER, carried, 2.0)
-    answer = solve_rigid(sweeps, {"device": TRACKER}, Scene(ROOM, frame="room"))
+    answer = solve_rigid_devices(sweeps, {"device": TRACKER}, Scene(ROOM, frame="room"))
     assert len(answer.trajectories[0]) >= 95
     assert 0.3 < normalised(answer, carried) < 1.5
     assert np.percentile(np.linalg.norm(errors(answer, carried)[:, :3], axis=1), 95) < 0.03
@@ -180,7 +180,9 @@ def test_one_station_is_enough_for_a_device_with_depth() -> None:
 def test_the_scene_comes_from_the_device_alone() -> None:
     sweeps = record(ROOM, TRACKER, carried, 6.0)
     known = {s.channel: s.calibration for s in ROOM}
-    answer = solve_rigid(sweeps, {"device": TRACKER}, Scene(calibrations=known, ids={4: 77}))
+    answer = solve_rigid_devices(
+        sweeps, {"device": TRACKER}, Scene(calibrations=known, ids={4: 77})
+    )
     scene = answer.scene
     assert (scene.scale, scene.frame, scene.planar) == ("device", "station-1", False)
     assert [s.id for s in scene.stations] == [None, 77, None]
@@ -198,7 +200,7 @@ def test_the_scene_comes_from_the_device_alone() -> None:
 
 def test_without_calibration_the_shape_is_right_after_a_rigid_motion() -> None:
     sweeps = record(ROOM, TRACKER, carried, 6.0)
-    answer = solve_rigid(sweeps, {"device": TRACKER})
+    answer = solve_rigid_devices(sweeps, {"device": TRACKER})
     track = answer.trajectories[0]
     truth, rotation = carried((track.time_ns - START_NS) * 1e-9)
     to = umeyama(track.position, truth, with_scale=False)
@@ -233,7 +235,7 @@ def cramer_rao(
 def test_the_deck_is_as_good_as_its_angles_allow() -> None:
     stations = (station(1, (-1.5, 0.0, 1.8), 0), station(2, (1.2, -1.0, 1.8), 1))
     sweeps = record(stations, DECK, standing, 4.0)
-    answer = solve_rigid(sweeps, {"device": DECK}, Scene(stations))
+    answer = solve_rigid_devices(sweeps, {"device": DECK}, Scene(stations))
     best = cramer_rao(stations, DECK, standing, 2.0)
     rms = np.sqrt(np.mean(errors(answer, standing) ** 2, axis=0))
     assert len(answer.trajectories[0]) >= 195
@@ -246,7 +248,7 @@ def test_the_deck_is_as_good_as_its_angles_allow() -> None:
 def test_a_deck_under_one_station_says_that_it_may_be_read_in_two_ways() -> None:
     stations = (station(1, (-1.5, 0.0, 1.8), 0),)
     sweeps = record(stations, DECK, standing, 2.0)
-    answer = solve_rigid(sweeps, {"device": DECK}, Scene(stations))
+    answer = solve_rigid_devices(sweeps, {"device": DECK}, Scene(stations))
     assert any("two orientations" in note for note in answer.notes)
 
 
@@ -254,7 +256,7 @@ def test_a_deck_that_never_moved_does_not_fix_a_scene_and_the_answer_says_so() -
     stations = (station(1, (-1.5, 0.0, 1.8), 0), station(2, (1.2, -1.0, 1.8), 1))
     sweeps = record(stations, DECK, standing, 2.0)
     known = {s.channel: s.calibration for s in stations}
-    answer = solve_rigid(sweeps, {"device": DECK}, Scene(calibrations=known))
+    answer = solve_rigid_devices(sweeps, {"device": DECK}, Scene(calibrations=known))
     assert any("two answers" in note for note in answer.notes)
     assert any("only: carry" in note for note in answer.notes)
 
@@ -264,7 +266,7 @@ def test_reflections_and_junk_are_counted_and_left_out() -> None:
     rng = np.random.default_rng(1)
     wrong = rng.random(len(sweeps)) < 0.1
     count = np.where(wrong, sweeps.count + rng.normal(0, 4000, len(sweeps)), sweeps.count)
-    answer = solve_rigid(replace(sweeps, count=count), {"device": TRACKER}, Scene(ROOM))
+    answer = solve_rigid_devices(replace(sweeps, count=count), {"device": TRACKER}, Scene(ROOM))
     off = errors(answer, carried)
     assert len(off) >= 95
     assert np.percentile(np.linalg.norm(off[:, :3], axis=1), 95) < 0.5e-3
@@ -277,7 +279,7 @@ def test_reflections_and_junk_are_counted_and_left_out() -> None:
 def test_a_station_that_was_moved_shows() -> None:
     moved = replace(ROOM[2], position=ROOM[2].position + [0.3, 0.0, 0.0])
     sweeps = record((*ROOM[:2], moved), TRACKER, carried, 2.0)
-    answer = solve_rigid(sweeps, {"device": TRACKER}, Scene(ROOM))
+    answer = solve_rigid_devices(sweeps, {"device": TRACKER}, Scene(ROOM))
     off = errors(answer, carried)
     assert np.percentile(np.linalg.norm(off[:, :3], axis=1), 95) < 1e-3
     assert answer.used[8] < 0.2 * answer.unused[8]
@@ -289,7 +291,7 @@ def test_a_mirrored_receiver_is_told() -> None:
     stations = (station(1, (-1.5, 0.0, 1.8), 0), station(2, (1.2, -1.0, 1.8), 1))
     sweeps = record(stations, DECK, standing, 1.0)
     mirrored = Receiver(DECK.position_m * [-1.0, 1.0, 1.0], DECK.normal)
-    answer = solve_rigid(sweeps, {"device": mirrored}, Scene(stations))
+    answer = solve_rigid_devices(sweeps, {"device": mirrored}, Scene(stations))
     assert any("from behind" in note for note in answer.notes)
 
 
@@ -311,7 +313,7 @@ def test_broken_sweeps_give_reasons_not_poses(broken: dict[str, float]) -> None:
         name: np.full(len(sweeps), value).astype(getattr(sweeps, name).dtype)
         for name, value in broken.items()
     }
-    answer = solve_rigid(replace(sweeps, **wrong), {"device": DECK}, Scene(ROOM))
+    answer = solve_rigid_devices(replace(sweeps, **wrong), {"device": DECK}, Scene(ROOM))
     assert sum(answer.rejected.values()) > 0 or "time_ns" in broken
     assert len(answer.trajectories[0]) <= 1
 
@@ -319,18 +321,18 @@ def test_broken_sweeps_give_reasons_not_poses(broken: dict[str, float]) -> None:
 def test_what_has_no_answer_is_refused() -> None:
     sweeps = record(ROOM[:2], TRACKER, standing, 0.5)
     with pytest.raises(DegenerateError, match="known photodiodes"):
-        solve_rigid(sweeps, {"other": TRACKER}, Scene(ROOM))
+        solve_rigid_devices(sweeps, {"other": TRACKER}, Scene(ROOM))
     with pytest.raises(DegenerateError, match="none of the recording's stations"):
-        solve_rigid(sweeps, {"device": TRACKER}, Scene(ROOM[2:]))
+        solve_rigid_devices(sweeps, {"device": TRACKER}, Scene(ROOM[2:]))
     lone = replace(sweeps, sensor=np.zeros_like(sweeps.sensor))
     with pytest.raises(DegenerateError, match="no station sees enough"):
-        solve_rigid(lone, {"device": TRACKER})
+        solve_rigid_devices(lone, {"device": TRACKER})
 
 
 def test_a_pause_and_far_times_cost_nothing() -> None:
     sweeps = record(ROOM, TRACKER, standing, 0.5)
     later = sweeps.time_ns + np.where(sweeps.time_ns - START_NS > 250_000_000, 10**17, 0)
-    answer = solve_rigid(replace(sweeps, time_ns=later), {"device": TRACKER}, Scene(ROOM))
+    answer = solve_rigid_devices(replace(sweeps, time_ns=later), {"device": TRACKER}, Scene(ROOM))
     assert 20 <= len(answer.trajectories[0]) <= 30
     assert normalised(answer, standing) < 1.5
 
@@ -354,7 +356,7 @@ def test_the_recorded_tracker_stands_where_libsurvive_saw_it(data: Path) -> None
             )
         ),
     )  # fmt: skip
-    answer = solve_rigid(sweeps, session.receivers, session.scene)
+    answer = solve_rigid_devices(sweeps, session.receivers, session.scene)
     (track,) = answer.trajectories
     assert len(track) > 145
     at = np.searchsorted(truth.time_ns, track.time_ns)
@@ -368,7 +370,7 @@ def test_the_recorded_tracker_stands_where_libsurvive_saw_it(data: Path) -> None
     assert sum(answer.unused.values()) < 0.05 * len(sweeps)
 
     calibrations = {s.channel: s.calibration for s in session.scene.stations}
-    own = solve_rigid(sweeps, session.receivers, Scene(calibrations=calibrations))
+    own = solve_rigid_devices(sweeps, session.receivers, Scene(calibrations=calibrations))
     assert [s.channel for s in own.scene.stations] == [1, 4, 8, 12]
     # One look of 100 mm of device at two metres: stations to some centimetres.
     true = np.stack([s.position for s in session.scene.stations])

@@ -10,7 +10,14 @@ from locatk.core.geometry import rotation_exp, rotation_log
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, predict_angles
 from locatk.core.lighthouse.devices import bundle_adjustment as rigid_bundle
 from locatk.core.lighthouse.devices.bundle_adjustment import adjust_rigid
-from locatk.core.lighthouse.devices.pose_fit import Looks, Poses, Stations, fit, linearise, places
+from locatk.core.lighthouse.devices.pose_fit import (
+    DeviceStates,
+    Stations,
+    SweepObservations,
+    fit_poses,
+    linearize,
+    photodiode_positions,
+)
 from locatk.core.lighthouse.scene import bundle_adjustment as bundle
 
 Array = NDArray[np.float64]
@@ -22,16 +29,18 @@ STATIONS: Stations = (
 )
 
 
-def world(moments: int, sweeps: int, *, seed: int = 0, noise: float = 0.0) -> tuple[Looks, Poses]:
+def world(
+    moments: int, sweeps: int, *, seed: int = 0, noise: float = 0.0
+) -> tuple[SweepObservations, DeviceStates]:
     """Sweeps of moving devices, and their true poses."""
     rng = np.random.default_rng(seed)
-    poses = Poses(
+    poses = DeviceStates(
         rng.uniform(-0.3, 0.3, (moments, 3)) + [0.0, 0.0, 0.3],
         rotation_exp(rng.normal(0, 1, (moments, 3))),
         rng.normal(0, 1, (moments, 6)) * np.repeat([0.5, 2.0], 3),
     )
     shape = (moments, sweeps)
-    looks = Looks(
+    looks = SweepObservations(
         rng.uniform(-0.05, 0.05, (*shape, 3)),
         rng.integers(0, 2, shape),
         rng.integers(0, 2, shape),
@@ -48,28 +57,30 @@ def world(moments: int, sweeps: int, *, seed: int = 0, noise: float = 0.0) -> tu
         angle[m, n] = predict_angles(local, STATIONS[2][i])[looks.plane[m, n]]
     angle += rng.normal(0, noise, shape) if noise else 0.0
     angle[~looks.seen] = 99.0
-    return Looks(looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen), poses
+    return SweepObservations(
+        looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen
+    ), poses
 
 
 def test_the_model_meets_its_own_world() -> None:
     looks, poses = world(3, 20)
-    missed, _ = linearise(looks, STATIONS, poses)
+    missed, _ = linearize(looks, STATIONS, poses)
     assert np.abs(missed[looks.seen]).max() < 1e-12
     assert np.all(np.isnan(missed[~looks.seen]))
-    lever, _ = places(looks, poses)
+    lever, _ = photodiode_positions(looks, poses)
     assert np.linalg.norm(lever, axis=-1) == pytest.approx(np.linalg.norm(looks.place, axis=-1))
 
 
 def test_derivatives_are_those_of_small_steps() -> None:
     looks, poses = world(3, 20)
     # At rest, so that pose and sweep share their time; rates enter as steps times time.
-    poses = Poses.at_rest(poses.position, poses.rotation)
-    _, gradient = linearise(looks, STATIONS, poses)
+    poses = DeviceStates.at_rest(poses.position, poses.rotation)
+    _, gradient = linearize(looks, STATIONS, poses)
     for k in range(12):
         step = np.zeros((3, 12))
         step[:, k] = 1e-5
-        ahead, _ = linearise(looks, STATIONS, poses.stepped(step))
-        behind, _ = linearise(looks, STATIONS, poses.stepped(-step))
+        ahead, _ = linearize(looks, STATIONS, poses.stepped(step))
+        behind, _ = linearize(looks, STATIONS, poses.stepped(-step))
         numeric = ((ahead - behind) / 2e-5)[looks.seen]
         analytic = gradient[..., k % 6] * (looks.since_s if k >= 6 else 1.0)
         assert numeric == pytest.approx(analytic[looks.seen], abs=1e-7)
@@ -78,11 +89,11 @@ def test_derivatives_are_those_of_small_steps() -> None:
 def test_the_fit_comes_back_from_a_poor_start() -> None:
     looks, true = world(40, 40)
     rng = np.random.default_rng(1)
-    start = Poses.at_rest(
+    start = DeviceStates.at_rest(
         true.position + rng.normal(0, 0.05, (40, 3)),
         rotation_exp(rng.normal(0, 0.2, (40, 3))) @ true.rotation,
     )
-    found = fit(looks, STATIONS, start, sigma=1e-4, soft=3e-3)
+    found = fit_poses(looks, STATIONS, start, sigma=1e-4, soft=3e-3)
     assert np.abs(found.poses.position - true.position).max() < 2e-5
     turn = rotation_log(found.poses.rotation @ np.swapaxes(true.rotation, 1, 2))
     assert np.abs(turn).max() < 1e-3
@@ -94,9 +105,11 @@ def test_lost_sweeps_pull_nothing() -> None:
     looks, true = world(5, 60)
     angle = looks.angle.copy()
     angle[:, ::3] += 0.05
-    bent = Looks(looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen)
-    pulled = fit(bent, STATIONS, true, sigma=1e-4, soft=3e-3)
-    exact = fit(bent, STATIONS, true, sigma=1e-4, soft=3e-3, lost=0.02)
+    bent = SweepObservations(
+        looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen
+    )
+    pulled = fit_poses(bent, STATIONS, true, sigma=1e-4, soft=3e-3)
+    exact = fit_poses(bent, STATIONS, true, sigma=1e-4, soft=3e-3, lost=0.02)
     assert np.abs(exact.poses.position - true.position).max() < 2e-5
     assert np.abs(pulled.poses.position - true.position).max() > 2e-5
 
@@ -104,16 +117,19 @@ def test_lost_sweeps_pull_nothing() -> None:
 def test_the_gradient_of_the_joint_adjustment_is_that_of_its_cost() -> None:
     looks, poses = world(4, 30, noise=1e-3)
     # Of a spinning device the turn at each sweep's time stands for that at the moment.
-    poses = Poses.at_rest(poses.position, poses.rotation)
+    poses = DeviceStates.at_rest(poses.position, poses.rotation)
     share, free = np.array([1.0, 0.5, 0.25, 1.0]), np.array([True, True])
-    bent = tuple(bundle.bent(c, np.array([1e-3, -2e-3, 0.0, 1e-3])) for c in STATIONS[2])
+    bent = tuple(bundle.with_parameters(c, np.array([1e-3, -2e-3, 0.0, 1e-3])) for c in STATIONS[2])
     stations = (STATIONS[0], STATIONS[1], bent)
 
     def system(change: Array, by_pose: Array) -> rigid_bundle._System:
         moved = (
             stations[0] + change[:, :3],
             rotation_exp(change[:, 3:6]) @ stations[1],
-            tuple(bundle.bent(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)),
+            tuple(
+                bundle.with_parameters(c, d)
+                for c, d in zip(stations[2], change[:, 6:], strict=True)
+            ),
         )
         return rigid_bundle._linearise(
             looks, moved, poses.stepped(by_pose), 1e-3, 3e-3, share, free

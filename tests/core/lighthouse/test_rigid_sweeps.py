@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, planes, windows
+from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, assign_planes, make_windows
 
 PERIOD_NS = 959_000 / 48e6 * 1e9
 COUNTS = 959_000 / 8
@@ -24,7 +24,7 @@ def told(*rotations: list[float]) -> list[list[int]]:
         times += time
         counts += count
     channel = np.ones(len(times), np.int32)
-    found = planes(np.rint(times).astype(np.int64), channel, np.array(counts)).tolist()
+    found = assign_planes(np.rint(times).astype(np.int64), channel, np.array(counts)).tolist()
     return [[found.pop(0) for _ in turns] for turns in rotations]
 
 
@@ -40,7 +40,7 @@ def test_stations_do_not_mix() -> None:
     time = np.array([0.30, 0.30, 0.62]) * PERIOD_NS
     channel = np.array([1, 2, 1], np.int32)
     count = np.array([0.30, 0.45, 0.62]) * COUNTS
-    assert planes(time.astype(np.int64), channel, count).tolist() == [0, -1, 1]
+    assert assign_planes(time.astype(np.int64), channel, count).tolist() == [0, -1, 1]
 
 
 def sweeps_at(time_ns: list[int]) -> DeviceSweeps:
@@ -56,7 +56,7 @@ def sweeps_at(time_ns: list[int]) -> DeviceSweeps:
 )
 def test_windows_hold_what_is_near(times: list[int], every_ns: int, reach_ns: int) -> None:
     mine = sweeps_at(times)
-    around = windows(mine, every_ns, reach_ns)
+    around = make_windows(mine, every_ns, reach_ns)
     assert 1 <= len(around) <= len(times)
     assert np.all(np.diff(around.time_ns) > 0)
     for row in around.sweep:
@@ -67,10 +67,10 @@ def test_windows_hold_what_is_near(times: list[int], every_ns: int, reach_ns: in
 
 
 def test_very_many_sweeps_at_once_are_thinned() -> None:
-    around = windows(sweeps_at(list(range(5000))), 10**9, 10**9)
+    around = make_windows(sweeps_at(list(range(5000))), 10**9, 10**9)
     assert around.sweep.shape == (1, 500)
     assert np.all(np.diff(around.sweep[0]) == 10)
 
 
 def test_no_sweeps_have_no_windows() -> None:
-    assert len(windows(sweeps_at([]), 10, 10)) == 0
+    assert len(make_windows(sweeps_at([]), 10, 10)) == 0

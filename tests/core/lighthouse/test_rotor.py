@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from locatk.core.lighthouse.demodulation.rotor import (
     AGREE_S,
     LEAST_BURSTS,
-    Found,
     Rotor,
+    RotorSet,
     find_rotors,
 )
 
@@ -63,7 +63,7 @@ class Decoded:
         ]
         self.rows.append(np.stack(rows))
 
-    def found(self) -> Found:
+    def found(self) -> RotorSet:
         table = np.concatenate(self.rows, axis=1)
         tick, polynomial, index, evidence = table[:, np.argsort(table[0])]
         return find_rotors(
@@ -131,7 +131,7 @@ def test_few_bursts() -> None:
     assert list(drawn.found().rotors) == [1]
     none = np.zeros(0)
     empty = find_rotors(none, none.astype(np.int32), none.astype(np.int64), none, RATE)
-    assert empty == Found({}, ())
+    assert empty == RotorSet({}, ())
 
 
 def test_one_second_is_enough() -> None:
@@ -145,7 +145,7 @@ def test_accidents_make_no_rotor() -> None:
     for seed in range(20):
         drawn = Decoded(np.random.default_rng(seed))
         drawn.accidents(3000, 30.0)
-        assert drawn.found() == Found({}, ())
+        assert drawn.found() == RotorSet({}, ())
 
 
 def test_many_accidents_do_not_hide_a_rotor() -> None:

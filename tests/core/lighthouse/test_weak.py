@@ -6,10 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.lighthouse.demodulation.bursts import Bursts, split
-from locatk.core.lighthouse.demodulation.identification import identify
+from locatk.core.lighthouse.demodulation.bursts import Bursts, split_bursts
+from locatk.core.lighthouse.demodulation.identification import identify_sequences
 from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
-from locatk.core.lighthouse.demodulation.weak_bursts import BESIDE_S, CHANCE, DELAY_BITS, belongs
+from locatk.core.lighthouse.demodulation.weak_bursts import (
+    BESIDE_S,
+    CHANCE,
+    DELAY_BITS,
+    match_fragments,
+)
 
 
 def fragment(light: Any, index: int, start_s: float, length: int) -> np.ndarray:
@@ -36,15 +41,15 @@ def scene(light: Any, shift: int, gap_bits: int = 20, seed: int = 0) -> Bursts:
         if np.diff(weak).max() > 1.4e-6:
             continue  # would be two bursts
         lines += [whole[: len(whole) // 2 * 2], weak[: len(weak) // 2 * 2]]
-    return split(light.edges(np.concatenate(lines), 1.0))
+    return split_bursts(light.edges(np.concatenate(lines), 1.0))
 
 
 def judged(bursts: Bursts) -> tuple[np.ndarray, np.ndarray]:
     bits = soft_bits(bursts)
-    found = identify(bits)
+    found = identify_sequences(bits)
     read = np.arange(len(bursts)) % 2 == 0
     assert found.certain()[read].all()
-    return belongs(bursts, bits, found, read), read
+    return match_fragments(bursts, bits, found, read), read
 
 
 def test_fragments_continue_their_sequence(light: Any) -> None:
@@ -71,7 +76,7 @@ def test_noise_does_not(light: Any) -> None:
         bits = light.sequence(2)[500 * k : 500 * k + 80]
         lines.append(start + light.biphase(bits)[:100] / 6e6)
         lines.append(start + 25e-6 + np.cumsum(noise.uniform(8e-8, 6e-7, 40)))
-    of, read = judged(split(light.edges(np.concatenate(lines), 1.0)))
+    of, read = judged(split_bursts(light.edges(np.concatenate(lines), 1.0)))
     assert np.mean(of[~read] >= 0) <= 4 * CHANCE
 
 
@@ -84,6 +89,6 @@ def test_far_ones_do_not(light: Any) -> None:
 def test_nothing_read_or_nothing_left(light: Any) -> None:
     bursts = scene(light, 0)
     bits = soft_bits(bursts)
-    found = identify(bits)
+    found = identify_sequences(bits)
     for read in (np.zeros(len(bursts), bool), np.ones(len(bursts), bool)):
-        assert np.all(belongs(bursts, bits, found, read) == -1)
+        assert np.all(match_fragments(bursts, bits, found, read) == -1)

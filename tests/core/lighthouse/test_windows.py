@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.demodulation import windows
-from locatk.core.lighthouse.demodulation.bursts import of_windows
-from locatk.core.lighthouse.demodulation.identification import identify
+from locatk.core.lighthouse.demodulation.bursts import bursts_of_windows
+from locatk.core.lighthouse.demodulation.identification import identify_sequences
 from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
 from locatk.core.lighthouse.demodulation.windows import read_windows
 
@@ -87,5 +87,5 @@ def test_published_windows_are_read(data: Path) -> None:
     good = matches.certain()
     assert np.mean(good) > 0.95
     assert set(np.unique(matches.polynomial[good])) == {0, 1, 2, 3}
-    again = identify(soft_bits(of_windows(rows)))
+    again = identify_sequences(soft_bits(bursts_of_windows(rows)))
     assert np.array_equal(again.index, matches.index)

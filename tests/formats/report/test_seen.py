@@ -45,7 +45,7 @@ RETURNING = {"_incomplete", "_misplaced"}
 def reasons(system: str) -> set[str]:
     """Every reason that the sources of a system can give."""
     found: set[str] = set()
-    for path in sorted((ROOT / "core" / system).glob("*.py")):
+    for path in sorted((ROOT / "core" / system).rglob("*.py")):
         if not path.name.startswith(("simulate", "paper_study", "camera_views")):
             tree = ast.parse(path.read_text())
             constants = {
