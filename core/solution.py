@@ -77,28 +77,17 @@ class Solution:
         return sum(len(t) for t in self.trajectories)
 
 
-def optional(json: str | None = None) -> Any:
-    """Declare a field of a record that defaults to None and is then left out of the JSON form.
-
-    ``json`` is its key in the JSON form, if that differs from the name of the field.
-    """
-    metadata: dict[str, Any] = {"optional": True}
-    if json is not None:
-        metadata["json"] = json
-    return field(default=None, metadata=metadata)
-
-
 def to_json(record: Any) -> Any:
     """Return the JSON form of a dataclass, or of a value in one.
 
-    Fields become keys in their order. A field that was declared by :func:`optional` is left out
-    if it is None; arrays and tuples become lists.
+    Fields become keys in their order, named by their metadata ``"json"`` if they have it. A field
+    that is None by default is left out if it is None; arrays and tuples become lists.
     """
     if is_dataclass(record) and not isinstance(record, type):
         table = {}
         for item in fields(record):
             value = getattr(record, item.name)
-            if value is not None or not item.metadata.get("optional"):
+            if value is not None or item.default is not None:
                 table[item.metadata.get("json", item.name)] = to_json(value)
         return table
     if isinstance(record, Mapping):

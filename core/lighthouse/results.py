@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from locatk.core.solution import optional
-
 
 @dataclass(frozen=True)
 class StationDetection:
@@ -42,9 +40,9 @@ class StationDetection:
     calibration: str
     sweeps: int
     rejected: int
-    residual_rad: float | None = optional()
-    verification_rad: float | None = optional()
-    verification_m: float | None = optional()
+    residual_rad: float | None = None
+    verification_rad: float | None = None
+    verification_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -180,26 +178,28 @@ class LighthouseFacts:
         Figures of the rigid devices, if single photodiodes were solved as well.
     """
 
-    planar_decided_by: str | None = optional()
-    plane_fraction: float | None = optional("plane_share")
-    plane_median_rad: float | None = optional()
-    candidates: tuple[TwoViewCandidate, ...] | None = optional()
-    candidate_decided_by: str | None = optional("reading_decided_by")
-    bundle_points: int | None = optional()
-    bundle_iterations: int | None = optional()
-    planar: bool | None = optional()
-    marker_misfit_m: float | None = optional()
-    marker_residual_rad: float | None = optional()
-    marker_scale: float | None = optional()
-    adjusted_epochs: int | None = optional("moments_adjusted")
-    adjusted_positions: int | None = optional("places_adjusted")
-    scene_angle_sigma_rad: float | None = optional()
-    iterations: int | None = optional()
-    links: tuple[StationPairLink, ...] | None = optional()
-    angle_sigma_rad: float | None = optional()
-    lasting_angle_sigma_rad: float | None = optional()
-    calibration_sigma_rad: float | None = optional()
-    station_residual_rad: dict[str, float] | None = optional()
-    restored_swapped_epochs: int | None = optional("moments_with_swapped_sweeps_restored")
-    verification: SceneVerification | None = optional()
-    rigid: LighthouseFacts | None = optional()
+    planar_decided_by: str | None = None
+    plane_fraction: float | None = field(default=None, metadata={"json": "plane_share"})
+    plane_median_rad: float | None = None
+    candidates: tuple[TwoViewCandidate, ...] | None = None
+    candidate_decided_by: str | None = field(default=None, metadata={"json": "reading_decided_by"})
+    bundle_points: int | None = None
+    bundle_iterations: int | None = None
+    planar: bool | None = None
+    marker_misfit_m: float | None = None
+    marker_residual_rad: float | None = None
+    marker_scale: float | None = None
+    adjusted_epochs: int | None = field(default=None, metadata={"json": "moments_adjusted"})
+    adjusted_positions: int | None = field(default=None, metadata={"json": "places_adjusted"})
+    scene_angle_sigma_rad: float | None = None
+    iterations: int | None = None
+    links: tuple[StationPairLink, ...] | None = None
+    angle_sigma_rad: float | None = None
+    lasting_angle_sigma_rad: float | None = None
+    calibration_sigma_rad: float | None = None
+    station_residual_rad: dict[str, float] | None = None
+    restored_swapped_epochs: int | None = field(
+        default=None, metadata={"json": "moments_with_swapped_sweeps_restored"}
+    )
+    verification: SceneVerification | None = None
+    rigid: LighthouseFacts | None = None
