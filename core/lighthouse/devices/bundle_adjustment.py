@@ -1,54 +1,54 @@
-"""Joint adjustment of stations and of rigid devices seen at many moments.
+"""Joint adjustment of base stations and of the poses of rigid devices.
 
-As :mod:`locatk.core.lighthouse.scene.bundle_adjustment`, with devices of known shape in place of points: they
-bring the scale with them. The poses and rates of the moments are eliminated one by one (Schur
-complement). The first station holds the frame.
+The counterpart of :mod:`locatk.core.lighthouse.scene.bundle_adjustment` with devices of known
+shape in place of points: they determine the scale. Poses and velocities of the epochs are
+eliminated (:class:`locatk.core.least_squares.SchurEquations`). The first station fixes the frame.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import rotation_exp
-from locatk.core.lighthouse.calibration import (
-    GENERIC_CALIBRATION,
-    PHASE_TILT_SIGMA_RAD,
-    predict_with_gradient,
-)
+from locatk.core.least_squares import Indices, SchurEquations, SchurStep, cauchy_loss, minimize
+from locatk.core.lighthouse.calibration import predict_with_gradient
 from locatk.core.lighthouse.devices.pose_fit import (
+    RATE,
     SPEED_SIGMA,
-    UNSEEN,
+    UNREACHABLE_RESIDUAL,
     DeviceStates,
     Stations,
     SweepObservations,
     photodiode_positions,
 )
 from locatk.core.lighthouse.scene.bundle_adjustment import (
-    STATION_UNKNOWNS,
-    calibration_parameters,
-    with_parameters,
+    STATION_PARAMETERS,
+    BundleState,
+    add_calibration_prior,
+    free_parameters,
+    retract_stations,
+    station_blocks,
+    station_jacobian,
 )
-from locatk.core.robust import descend
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RigidAdjustment:
-    """Result of :func:`adjust_rigid`.
+class DeviceAdjustment:
+    """Result of :func:`adjust_devices`.
 
     Attributes
     ----------
     stations : Stations
     poses : DeviceStates
     residual : (m, n) ndarray
-        Predicted minus observed angle in radians; ``nan`` where unseen.
+        Predicted minus observed angle in radians; ``nan`` if not observed.
     covariance : (s, 6, 6) ndarray
-        Of position and rotation of each station in the first station's frame, of which
-        that itself has none.
+        Covariance of position and rotation of each station in the frame of the first station,
+        for which it is zero.
     iterations : int
     """
 
@@ -59,18 +59,7 @@ class RigidAdjustment:
     iterations: int
 
 
-@dataclass(frozen=True)
-class _System:
-    stations: Array  # (s * 10, s * 10)
-    stations_rhs: Array  # (s * 10,)
-    poses: Array  # (m, 12, 12)
-    poses_rhs: Array  # (m, 12)
-    mixed: Array  # (m, s * 10, 12)
-    residual: Array  # (m, n) radians
-    cost: float
-
-
-def adjust_rigid(
+def adjust_devices(
     looks: SweepObservations,
     stations: Stations,
     poses: DeviceStates,
@@ -80,163 +69,137 @@ def adjust_rigid(
     share: Array,
     calibrate: NDArray[np.bool_],
     iterations: int = 40,
-) -> RigidAdjustment:
-    """Stations and poses that explain the angles best.
+) -> DeviceAdjustment:
+    """Refine stations and device states so that they predict the observed angles.
 
     Parameters
     ----------
     looks : SweepObservations
-    stations, poses
-        Starting values; the first station stays where it is.
+    stations : Stations
+        Initial guess; the first station stays where it is.
+    poses : DeviceStates
+        Initial guess.
     sigma : float
         Standard deviation of an angle in radians.
     soft : float
-        Residual in radians from which on a sweep counts less (Cauchy's loss).
+        Residual in radians at which the weight of a sweep is one half (Cauchy loss).
     share : (m,) ndarray
-        Weight of each moment, 0 to 1: moments at one place repeat each other's errors.
+        Weight of each epoch, 0 to 1: epochs at one position repeat each other's errors.
     calibrate : (s,) bool ndarray
-        Stations of which tilts and phases are estimated, about the mean of other units.
+        Stations of which tilts and phases are estimated, with their spread over units as prior.
     iterations : int
+        Maximum number of iterations.
+    """
+    free = free_parameters(calibrate)
+    free[0, :6] = False
+    problem = _DeviceBundle(looks, sigma, soft / sigma, share, free)
+    minimum = minimize(
+        problem, _BundledDevices(stations, poses), damping=1e-4, max_iterations=iterations
+    )
+    equations: SchurEquations = minimum.equations
+    blocks = station_blocks(equations.covariance(), len(calibrate))
+    return DeviceAdjustment(
+        minimum.state.stations,
+        minimum.state.poses,
+        np.where(looks.seen, equations.residual * sigma, np.nan),
+        blocks[:, :6, :6],
+        int(minimum.iterations[0]),
+    )
+
+
+@dataclass(frozen=True)
+class _BundledDevices:
+    stations: Stations
+    poses: DeviceStates
+
+
+@dataclass(frozen=True)
+class _DeviceBundle:
+    """The adjustment as a problem for :func:`~locatk.core.least_squares.minimize`.
+
+    ``loss_scale`` is in standard deviations; ``free`` (s, 10) are the unknowns of the stations
+    that are estimated.
     """
 
-    def attempt(
-        state: tuple[Stations, DeviceStates], system: _System, damping: float, _: int
-    ) -> tuple[tuple[Stations, DeviceStates], _System]:
-        trial = _step(system, *state, damping, calibrate)
-        return trial, _linearise(looks, *trial, sigma, soft, share, calibrate)
+    observations: SweepObservations
+    sigma_rad: float
+    loss_scale: float
+    epoch_weight: Array
+    free: NDArray[np.bool_]
 
-    begin = _linearise(looks, stations, poses, sigma, soft, share, calibrate)
-    (stations, poses), system, steps = descend(
-        (stations, poses), begin, attempt, damping=1e-4, iterations=iterations
-    )
-    free = _free(calibrate)
-    reduced = _reduce(system, 0.0)[0][np.ix_(free, free)]
-    full = np.zeros((len(free), len(free)))
-    full[np.ix_(free, free)] = np.linalg.pinv(reduced, hermitian=True)
-    blocks = full.reshape(len(calibrate), STATION_UNKNOWNS, len(calibrate), STATION_UNKNOWNS)
-    covariance = np.stack([blocks[i, :6, i, :6] for i in range(len(calibrate))])
-    return RigidAdjustment(stations, poses, system.residual, covariance, steps)
+    def linearize(self, state: _BundledDevices, _: Indices) -> SchurEquations:
+        observations, weights = self.observations, self.epoch_weight
+        residual, by_pose, by_station = self._residuals(state)
+        observed = observations.seen
+        unreachable = observed & ~np.isfinite(residual)
+        residual = np.where(unreachable, UNREACHABLE_RESIDUAL, np.nan_to_num(residual))
+        loss, weight = cauchy_loss(residual, self.loss_scale)
+        weight = np.where(observed & ~unreachable, weights[:, None] * weight, 0.0)
+        root = np.sqrt(weight)[..., None]
+        by_pose, by_station = np.nan_to_num(by_pose) * root, np.nan_to_num(by_station) * root
+        weighted = residual[..., None] * root
 
+        transposed = np.swapaxes(by_pose, -1, -2)
+        block_hessian, block_gradient = transposed @ by_pose, (transposed @ weighted)[..., 0]
+        rate_index = range(RATE.start, RATE.stop)
+        block_hessian[:, rate_index, rate_index] += weights[:, None] * SPEED_SIGMA**-2
+        block_gradient[:, RATE] += weights[:, None] * state.poses.rate / SPEED_SIGMA**2
+        epoch_cost = np.sum(loss, axis=1, where=observed)
+        epoch_cost = epoch_cost + 0.5 * np.sum((state.poses.rate / SPEED_SIGMA) ** 2, axis=1)
 
-def _free(calibrate: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(s * 10,) unknowns that are estimated."""
-    free = np.ones((len(calibrate), STATION_UNKNOWNS), bool)
-    free[0, :6] = False
-    # The first phase is zero in every unit.
-    free[:, 6:] = calibrate[:, None] & np.array([True, True, False, True])
-    return free.ravel()
+        m, s, n = len(observations), len(self.free), STATION_PARAMETERS
+        hessian, gradient = np.zeros((s, n, s, n)), np.zeros((s, n))
+        coupling = np.zeros((m, s, n, by_pose.shape[-1]))
+        cost = float(weights @ epoch_cost)
+        cost += add_calibration_prior(hessian, gradient, state.stations[2], self.free)
+        for i in range(s):
+            of_station = observations.station == i
+            own = by_station[of_station]
+            hessian[i, :, i, :] += own.T @ own
+            gradient[i] += own.T @ weighted[of_station][:, 0]
+            padded = by_station * of_station[..., None]
+            coupling[:, i] = np.swapaxes(padded, -1, -2) @ by_pose
+        return SchurEquations(
+            np.array([cost]),
+            hessian.reshape(s * n, s * n),
+            gradient.ravel(),
+            block_hessian,
+            block_gradient,
+            coupling.reshape(m, s * n, -1),
+            self.free.ravel(),
+            np.zeros((s * n, 0)),
+            np.where(observed, residual, np.nan),
+            weight,
+        )
 
-
-def _linearise(
-    looks: SweepObservations,
-    stations: Stations,
-    poses: DeviceStates,
-    sigma: float,
-    soft: float,
-    share: Array,
-    calibrate: NDArray[np.bool_],
-) -> _System:
-    m, s = len(looks), len(stations[2])
-    lever, place = photodiode_positions(looks, poses)
-    missed = np.full(looks.angle.shape, np.nan)
-    by_place = np.zeros((*looks.angle.shape, 3))
-    own = np.zeros((*looks.angle.shape, STATION_UNKNOWNS))
-    for i, calibration in enumerate(stations[2]):
-        seen = looks.seen & (looks.station == i)
-        offset = place[seen] - stations[0][i]
-        angles, gradient, by_tilt = predict_with_gradient(offset @ stations[1][i], calibration)
-        rows, plane = np.arange(len(offset)), looks.plane[seen]
-        missed[seen] = angles[rows, plane] - looks.angle[seen]
-        by_place[seen] = gradient[rows, plane] @ stations[1][i].T
-        jacobian = np.zeros((len(offset), STATION_UNKNOWNS))
-        jacobian[:, 0:3] = -by_place[seen]
-        jacobian[:, 3:6] = np.cross(by_place[seen], offset)
-        jacobian[rows, 6 + plane] = by_tilt[rows, plane]
-        jacobian[rows, 8 + plane] = -1.0
-        own[seen] = jacobian
-    lost = looks.seen & ~np.isfinite(missed)
-    scaled = np.where(lost, UNSEEN, np.nan_to_num(missed) / sigma)
-    width = soft / sigma
-    ratio = (scaled / width) ** 2
-    loss = 0.5 * width**2 * np.sum(np.log1p(ratio), axis=1, where=looks.seen)
-    weight = np.where(looks.seen & ~lost, share[:, None] / (1.0 + ratio), 0.0)
-    root = np.sqrt(weight)[..., None]
-    by_pose = np.concatenate([by_place, np.cross(lever, by_place)], axis=-1)
-    by_pose = np.concatenate([by_pose, by_pose * looks.since_s[..., None]], axis=-1)
-    by_pose = np.nan_to_num(by_pose) * root / sigma
-    own = np.nan_to_num(own) * root / sigma
-    pulled = scaled[..., None] * root
-
-    across = np.swapaxes(by_pose, -1, -2)
-    blocks, blocks_rhs = across @ by_pose, (across @ pulled)[..., 0]
-    blocks[:, range(6, 12), range(6, 12)] += share[:, None] * SPEED_SIGMA**-2
-    blocks_rhs[:, 6:] += share[:, None] * poses.rate / SPEED_SIGMA**2
-    cost = float(share @ (loss + 0.5 * np.sum((poses.rate / SPEED_SIGMA) ** 2, axis=1)))
-
-    full, rhs = (
-        np.zeros((s, STATION_UNKNOWNS, s, STATION_UNKNOWNS)),
-        np.zeros((s, STATION_UNKNOWNS)),
-    )
-    mixed = np.zeros((m, s, STATION_UNKNOWNS, 12))
-    spread = np.concatenate([PHASE_TILT_SIGMA_RAD[:, 1], PHASE_TILT_SIGMA_RAD[:, 0]])
-    prior = np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0) ** 2, 0.0)
-    for i in range(s):
-        seen = looks.station == i
-        mine = own * seen[..., None]
-        flat = mine[seen]
-        full[i, :, i, :] = flat.T @ flat
-        rhs[i] = flat.T @ pulled[seen][:, 0]
-        mixed[:, i] = np.swapaxes(mine, -1, -2) @ by_pose
-        if calibrate[i]:
-            away = calibration_parameters(stations[2][i]) - calibration_parameters(
-                GENERIC_CALIBRATION
+    def _residuals(self, state: _BundledDevices) -> tuple[Array, Array, Array]:
+        """Residuals (m, n), and derivatives by device states (m, n, 12) and by the unknowns of
+        the station (m, n, 10), in standard deviations."""
+        observations = self.observations
+        positions, rotations, calibrations = state.stations
+        lever_arm, position = photodiode_positions(observations, state.poses)
+        shape = observations.angle.shape
+        residual, by_position = np.full(shape, np.nan), np.zeros((*shape, 3))
+        by_station = np.zeros((*shape, STATION_PARAMETERS))
+        for i, calibration in enumerate(calibrations):
+            of_station = observations.seen & (observations.station == i)
+            offset = position[of_station] - positions[i]
+            angles, gradient, by_tilt = predict_with_gradient(offset @ rotations[i], calibration)
+            rows, plane = np.arange(len(offset)), observations.plane[of_station]
+            residual[of_station] = angles[rows, plane] - observations.angle[of_station]
+            by_position[of_station] = gradient[rows, plane] @ rotations[i].T
+            by_station[of_station] = station_jacobian(
+                by_position[of_station], offset, by_tilt[rows, plane], plane
             )
-            full[i, range(6, 10), i, range(6, 10)] += prior
-            rhs[i, 6:] += prior * away
-            cost += 0.5 * float(prior @ away**2)
-    size = s * STATION_UNKNOWNS
-    return _System(
-        full.reshape(size, size),
-        rhs.ravel(),
-        blocks,
-        blocks_rhs,
-        mixed.reshape(m, size, 12),
-        np.where(looks.seen, missed, np.nan),
-        cost,
-    )
+        by_pose = np.concatenate([by_position, np.cross(lever_arm, by_position)], axis=-1)
+        by_pose = np.concatenate([by_pose, by_pose * observations.since_s[..., None]], axis=-1)
+        return residual / self.sigma_rad, by_pose / self.sigma_rad, by_station / self.sigma_rad
 
-
-def _reduce(system: _System, damping: float) -> tuple[Array, Array, Array]:
-    """Reduced matrix and right side of the stations, and the inverses of the poses' blocks."""
-    blocks = system.poses.copy()
-    diagonal = np.einsum("mii->mi", blocks)
-    diagonal *= 1.0 + damping
-    diagonal += 1e-12 * np.max(diagonal, axis=1, keepdims=True) + 1e-12
-    inverses = np.linalg.inv(blocks).astype(np.float64, copy=False)
-    full = system.stations.copy()
-    full[np.diag_indices(len(full))] *= 1.0 + damping
-    eliminated = system.mixed @ inverses
-    full -= np.einsum("mac,mbc->ab", eliminated, system.mixed)
-    rhs = system.stations_rhs - np.asarray(np.einsum("mac,mc->a", eliminated, system.poses_rhs))
-    return full, rhs, inverses
-
-
-def _step(
-    system: _System,
-    stations: Stations,
-    poses: DeviceStates,
-    damping: float,
-    calibrate: NDArray[np.bool_],
-) -> tuple[Stations, DeviceStates]:
-    free = _free(calibrate)
-    reduced, rhs, inverses = _reduce(system, damping)
-    delta = np.zeros(len(free))
-    delta[free] = -np.linalg.lstsq(reduced[np.ix_(free, free)], rhs[free], rcond=1e-14)[0]
-    back = system.poses_rhs + np.einsum("mac,a->mc", system.mixed, delta)
-    change = delta.reshape(-1, STATION_UNKNOWNS)
-    moved = (
-        stations[0] + change[:, 0:3],
-        rotation_exp(change[:, 3:6]) @ stations[1],
-        tuple(with_parameters(c, d) for c, d in zip(stations[2], change[:, 6:], strict=True)),
-    )
-    return moved, poses.stepped(-(inverses @ back[..., None])[..., 0])
+    def retract(self, state: _BundledDevices, step: SchurStep) -> _BundledDevices:
+        stations = BundleState(*state.stations, np.zeros((0, 3)))
+        change = step.shared.reshape(-1, STATION_PARAMETERS)
+        return replace(
+            state,
+            stations=retract_stations(stations, change),
+            poses=state.poses.stepped(step.blocks),
+        )

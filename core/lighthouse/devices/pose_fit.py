@@ -1,10 +1,10 @@
-"""DeviceStates of rigid devices from the angles of their photodiodes, many at once.
+"""Poses and velocities of rigid devices from the angles of their photodiodes, in batches.
 
-Each sweep tells one angle of one photodiode at its own time: a tracker that moves at half a
-metre a second moves 10 mm in a rotation, so that a rotation is no instant. The unknowns of a
-moment are its pose and, where asked for, how fast the device moves and turns, which is taken
-as steady within the moment. Levenberg-Marquardt with a Cauchy loss on the observed angles;
-all moments of a batch step together and each stops by itself.
+Each sweep measures one angle of one photodiode at its own time. A tracker that moves at 0.5 m/s
+moves 10 mm during a rotation, so that the sweeps of a rotation do not share one pose. The unknowns
+of an epoch are therefore the pose of the device and its velocity and angular velocity, which are
+taken as constant within the epoch. The residuals are predicted minus observed rotor angles, under
+a Cauchy loss; :func:`locatk.core.least_squares.minimize` solves all epochs of a batch together.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
+from locatk.core.least_squares import DenseEquations, Indices, cauchy_loss, minimize
 from locatk.core.lighthouse.calibration import Calibration, predict_with_gradient
 
 Array = NDArray[np.float64]
@@ -22,27 +23,37 @@ Stations = tuple[Array, Array, tuple[Calibration, ...]]
 """Positions (s, 3), rotations (s, 3, 3) station to frame, and calibrations."""
 
 SPEED_SIGMA = np.repeat([2.0, 10.0], 3)
-"""Velocities (m/s) and turning rates (rad/s) that a hand or a drone gives a device: what a
-rate is held to where the sweeps do not tell it."""
+"""Standard deviations of the prior on velocity [m/s] and angular velocity [rad/s]: what a hand or
+a drone gives a device. They keep a velocity near zero that the sweeps do not determine."""
 
-UNSEEN = 1e3
-"""Residual, in sigmas, of an angle at which no plane meets the photodiode."""
+UNREACHABLE_RESIDUAL = 1e3
+"""Residual, in standard deviations, of an angle at which no light plane meets the photodiode."""
+
+MAX_ROTATION_STEP_RAD = 0.7
+"""Largest rotation of one step: the angles are far from linear in larger ones, which could turn a
+device over."""
+
+MIN_STEP = 1e-8
+"""Norm of a step (m, rad, m/s, rad/s) below which a pose has converged."""
+
+POSE, RATE = slice(0, 6), slice(6, 12)
+"""Ranges of the twelve unknowns: translation and rotation vector; velocity and angular velocity."""
 
 
 @dataclass(frozen=True)
 class SweepObservations:
-    """Sweeps by moment: (m, n) each, padded where ``seen`` is False.
+    """Sweeps by epoch: (m, n) each, padded where ``seen`` is False.
 
     Attributes
     ----------
     place : (m, n, 3) ndarray
-        Of the photodiode in the device's axes, in metres.
+        Position of the photodiode in the device's axes, in metres.
     station, plane : (m, n) int ndarray
-        Column of the station, and which of its two planes.
+        Column of the station, and number of its light plane.
     angle : (m, n) ndarray
         Observed rotor angle in radians.
     since_s : (m, n) ndarray
-        Time of the sweep since the moment, in seconds.
+        Time of the sweep minus the time of the epoch, in seconds.
     seen : (m, n) bool ndarray
     """
 
@@ -56,21 +67,22 @@ class SweepObservations:
     def __len__(self) -> int:
         return len(self.angle)
 
-    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> SweepObservations:
-        """The chosen moments."""
-        return SweepObservations(*(getattr(self, f.name)[chosen] for f in fields(self)))
+    def take(self, epochs: Indices | NDArray[np.bool_]) -> SweepObservations:
+        """The observations of the chosen epochs."""
+        return SweepObservations(*(getattr(self, f.name)[epochs] for f in fields(self)))
 
 
 @dataclass(frozen=True)
 class DeviceStates:
-    """Device to frame, with rates.
+    """Poses of devices, device to frame, with their rates of change.
 
     Attributes
     ----------
     position : (m, 3) ndarray
+        Metres.
     rotation : (m, 3, 3) ndarray
     rate : (m, 6) ndarray
-        Velocity in m/s and turning rate in rad/s, in the frame's axes.
+        Velocity in m/s and angular velocity in rad/s, in the frame's axes.
     """
 
     position: Array
@@ -79,23 +91,23 @@ class DeviceStates:
 
     @classmethod
     def at_rest(cls, position: Array, rotation: Array) -> DeviceStates:
-        """DeviceStates (m, 3), (m, 3, 3) of devices that stand still."""
+        """States of devices at rest, at poses (m, 3), (m, 3, 3)."""
         return cls(position, rotation, np.zeros((len(position), 6)))
 
     def __len__(self) -> int:
         return len(self.position)
 
-    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> DeviceStates:
-        """The chosen moments."""
-        return DeviceStates(self.position[chosen], self.rotation[chosen], self.rate[chosen])
+    def take(self, epochs: Indices | NDArray[np.bool_]) -> DeviceStates:
+        """A copy of the chosen states."""
+        return DeviceStates(self.position[epochs], self.rotation[epochs], self.rate[epochs])
 
-    def put(self, chosen: NDArray[np.int64] | NDArray[np.bool_], other: DeviceStates) -> None:
-        """Overwrite the chosen moments in place."""
+    def put(self, epochs: Indices | NDArray[np.bool_], other: DeviceStates) -> None:
+        """Overwrite the chosen states in place."""
         for f in fields(self):
-            getattr(self, f.name)[chosen] = getattr(other, f.name)
+            getattr(self, f.name)[epochs] = getattr(other, f.name)
 
     def later(self, seconds: Array) -> DeviceStates:
-        """Where the devices are after (m,) seconds at their rates."""
+        """States after (m,) seconds at constant rates."""
         return DeviceStates(
             self.position + self.rate[:, :3] * seconds[:, None],
             rotation_exp(self.rate[:, 3:] * seconds[:, None]) @ self.rotation,
@@ -103,11 +115,11 @@ class DeviceStates:
         )
 
     def stepped(self, change: Array) -> DeviceStates:
-        """Moved by (m, 12): shift, turn in the frame's axes, changes of both rates."""
+        """States after a change (m, 12): translation, rotation in the frame's axes, rates."""
         return DeviceStates(
             self.position + change[:, 0:3],
             rotation_exp(change[:, 3:6]) @ self.rotation,
-            self.rate + change[:, 6:12],
+            self.rate + change[:, RATE],
         )
 
 
@@ -119,9 +131,9 @@ class PoseFit:
     ----------
     poses : DeviceStates
     residual : (m, n) ndarray
-        Predicted minus observed angle in radians; ``nan`` where unseen.
+        Predicted minus observed angle in radians; ``nan`` if not observed.
     information : (m, 12, 12) ndarray
-        Inverse covariance of pose and rates for angles of the given sigma.
+        Inverse covariance of pose and rates, for angles of the given standard deviation.
     cost : (m,) ndarray
         Half the robust sum of squares.
     """
@@ -144,147 +156,142 @@ def fit_poses(
     settled: float = 1e-4,
     lost: float = np.inf,
 ) -> PoseFit:
-    """DeviceStates at which the sweeps' angles fit best, from starting values.
+    """Fit the state of a device at each epoch to the angles of its sweeps.
 
     Parameters
     ----------
     looks : SweepObservations
     stations : Stations
     start : DeviceStates
+        Initial guess.
     sigma : float
         Standard deviation of an angle in radians.
     soft : float or (m,) ndarray
-        Residual in radians from which on a sweep counts less (Cauchy's loss).
+        Residual in radians at which the weight of a sweep is one half (Cauchy loss).
     rates : bool
-        False for devices that stand, or moments too short to tell.
+        Estimate velocities. False for devices at rest, and for epochs too short to tell.
     iterations : int
+        Maximum number of iterations.
     settled : float
-        Gain of a step, in parts of the cost, from which on a moment is done; the step after
-        it would gain about the square of that.
+        A pose has converged when a step lowers its cost by less than this fraction. The next
+        step would gain about the square of it.
     lost : float
-        Residual in radians from which on a sweep does not count at all: a hundred of a moved
-        station pull, however little each. Starting values must be better than this.
-
-    Returns
-    -------
-    PoseFit
+        Residual in radians beyond which a sweep has no weight at all: a hundred sweeps of a
+        displaced station bias a pose, however small the weight of each. The initial guess must
+        be better than this.
     """
-    poses = DeviceStates(*(np.array(getattr(start, f.name)) for f in fields(DeviceStates)))
-    m, n = looks.angle.shape
-    residual, information = np.full((m, n), np.nan), np.zeros((m, 12, 12))
-    right, cost = np.zeros((m, 12)), np.zeros(m)
-    width = np.broadcast_to(np.asarray(soft) / sigma, m)[:, None]
+    width = np.broadcast_to(np.asarray(soft) / sigma, len(looks))[:, None]
+    problem = _PoseProblem(looks, stations, sigma, width, rates, lost / sigma)
+    minimum = minimize(
+        problem,
+        start,
+        len(looks),
+        damping=1e-4,
+        max_iterations=iterations,
+        min_gain=settled,
+        min_step=MIN_STEP,
+    )
+    equations: DenseEquations = minimum.equations
+    residual = np.where(looks.seen, equations.residual * sigma, np.nan)
+    return PoseFit(minimum.state, residual, equations.hessian, equations.cost)
 
-    def evaluate(rows: NDArray[np.int64], trial: DeviceStates) -> tuple[Array, Array, Array, Array]:
-        chosen = looks if len(rows) == m else looks.take(rows)
-        missed, gradient = linearize(chosen, stations, trial)
-        return _normal(
-            chosen, trial, missed / sigma, gradient / sigma, width[rows], rates, lost / sigma
+
+@dataclass(frozen=True)
+class _PoseProblem:
+    """The fit as a problem for :func:`~locatk.core.least_squares.minimize`.
+
+    ``loss_scale`` (m, 1) and ``cutoff`` are in standard deviations.
+    """
+
+    observations: SweepObservations
+    stations: Stations
+    sigma_rad: float
+    loss_scale: Array
+    estimate_rates: bool
+    cutoff: float
+
+    def linearize(self, state: DeviceStates, epochs: Indices) -> DenseEquations:
+        everything = len(epochs) == len(self.observations)
+        observations = self.observations if everything else self.observations.take(epochs)
+        residual, by_pose = linearize(observations, self.stations, state)
+        residual, by_pose = residual / self.sigma_rad, by_pose / self.sigma_rad
+        observed = observations.seen
+        unreachable = observed & ~np.isfinite(residual)
+        residual = np.where(unreachable, UNREACHABLE_RESIDUAL, np.nan_to_num(residual))
+        loss, weight = cauchy_loss(residual, self.loss_scale[epochs], self.cutoff)
+        weight = np.where(observed & ~unreachable, weight, 0.0)
+        cost = np.sum(loss, axis=1, where=observed)
+        by_pose = np.nan_to_num(by_pose)
+        if self.estimate_rates:
+            by_rate = by_pose * observations.since_s[..., None]
+            jacobian = np.concatenate([by_pose, by_rate], axis=-1)
+            equations = DenseEquations.from_residuals(residual, jacobian, weight, cost)
+            equations.add_prior(RATE, state.rate, SPEED_SIGMA)
+            return equations
+        equations = DenseEquations.from_residuals(residual, by_pose, weight, cost)
+        # The rates stay at zero: an identity block keeps the equations solvable.
+        hessian = np.tile(np.eye(12), (len(epochs), 1, 1))
+        hessian[:, POSE, POSE] = equations.hessian
+        gradient = np.zeros((len(epochs), 12))
+        gradient[:, POSE] = equations.gradient
+        return DenseEquations(cost, gradient, hessian, residual)
+
+    def retract(self, state: DeviceStates, step: Array) -> DeviceStates:
+        angle = np.linalg.norm(step[:, 3:6], axis=1, keepdims=True)
+        return state.stepped(
+            step * np.minimum(1.0, MAX_ROTATION_STEP_RAD / np.maximum(angle, 1e-12))
         )
-
-    open_ = np.arange(m)
-    residual[:], information[:], right[:], cost[:] = evaluate(open_, poses)
-    damping = np.full(m, 1e-4)
-    for _ in range(iterations):
-        if not len(open_):
-            break
-        matrix = information[open_]
-        diagonal = np.einsum("mii->mi", matrix)
-        diagonal *= 1.0 + damping[open_, None]
-        diagonal += 1e-12 * np.max(diagonal, axis=1, keepdims=True) + 1e-12
-        change: Array = -np.linalg.solve(matrix, right[open_, :, None])[..., 0].astype(float)
-        # No step may turn a device over: the angles are far from linear in that.
-        far = np.linalg.norm(change[:, 3:6], axis=1, keepdims=True)
-        change *= np.minimum(1.0, 0.7 / np.maximum(far, 1e-12))
-        trial = poses.take(open_).stepped(change)
-        found = evaluate(open_, trial)
-        better = found[3] < cost[open_]
-        gain = (cost[open_] - found[3]) / np.maximum(cost[open_], 1e-12)
-        rows = open_[better]
-        poses.put(rows, trial.take(better))
-        for into, fresh in zip((residual, information, right, cost), found, strict=True):
-            into[rows] = fresh[better]
-        damping[rows] = np.maximum(damping[rows] / 10, 1e-9)
-        damping[open_[~better]] *= 10
-        small = np.linalg.norm(change[:, :6], axis=1) < 1e-8
-        done = (better & (gain < settled)) | small | (damping[open_] > 1e6)
-        open_ = open_[~done]
-    missed = np.where(looks.seen, residual * sigma, np.nan)
-    return PoseFit(poses, missed, information, cost)
 
 
 def linearize(
     looks: SweepObservations, stations: Stations, poses: DeviceStates
 ) -> tuple[Array, Array]:
-    """Angles missed (m, n) in radians, and their derivatives (m, n, 6) by shift and turn of
-    the device at the time of each sweep; ``nan`` where no plane meets the photodiode.
+    """Return residuals and their derivatives by the pose of the device.
 
-    The turn at the moment is taken for that at the sweep's time: within a rotation a device
-    turns little, and the steps only have to lead downhill.
+    Returns
+    -------
+    residual : (m, n) ndarray
+        Predicted minus observed angle in radians; ``nan`` if no light plane meets the photodiode.
+    by_pose : (m, n, 6) ndarray
+        Derivative by translation and rotation of the device at the time of each sweep. They stand
+        for those at the epoch: a device rotates little within a rotation of the station, and the
+        derivatives only have to point downhill.
     """
-    lever, place = photodiode_positions(looks, poses)
-    missed = np.full(looks.angle.shape, np.nan)
-    by_place = np.full((*looks.angle.shape, 3), np.nan)
+    lever_arm, position = photodiode_positions(looks, poses)
+    residual = np.full(looks.angle.shape, np.nan)
+    by_position = np.full((*looks.angle.shape, 3), np.nan)
     for i, calibration in enumerate(stations[2]):
-        mine = looks.seen & (looks.station == i)
-        if not np.any(mine):
+        of_station = looks.seen & (looks.station == i)
+        if not np.any(of_station):
             continue
         rotation = stations[1][i]
-        local = (place[mine] - stations[0][i]) @ rotation
+        local = (position[of_station] - stations[0][i]) @ rotation
         angles, gradient, _ = predict_with_gradient(local, calibration)
-        rows, plane = np.arange(len(local)), looks.plane[mine]
-        missed[mine] = angles[rows, plane] - looks.angle[mine]
-        by_place[mine] = gradient[rows, plane] @ rotation.T
-    return missed, np.concatenate([by_place, np.cross(lever, by_place)], axis=-1)
+        rows, plane = np.arange(len(local)), looks.plane[of_station]
+        residual[of_station] = angles[rows, plane] - looks.angle[of_station]
+        by_position[of_station] = gradient[rows, plane] @ rotation.T
+    by_rotation = np.cross(lever_arm, by_position)
+    return residual, np.concatenate([by_position, by_rotation], axis=-1)
 
 
 def photodiode_positions(looks: SweepObservations, poses: DeviceStates) -> tuple[Array, Array]:
-    """Photodiodes (m, n, 3) about their device and in the frame, at the times of their sweeps."""
-    lever = looks.place @ np.swapaxes(poses.rotation, -1, -2)
+    """Return the photodiodes at the times of their sweeps.
+
+    Returns
+    -------
+    lever_arm, position : (m, n, 3) ndarray
+        From the device to the photodiode, and in the frame; both in the frame's axes.
+    """
+    lever_arm = looks.place @ np.swapaxes(poses.rotation, -1, -2)
     since = looks.since_s[..., None]
     if np.any(poses.rate):
-        lever = _turned(lever, poses.rate[:, None, 3:] * since)
-    return lever, poses.position[:, None] + poses.rate[:, None, :3] * since + lever
+        lever_arm = _rotated(lever_arm, poses.rate[:, None, 3:] * since)
+    return lever_arm, poses.position[:, None] + poses.rate[:, None, :3] * since + lever_arm
 
 
-def _turned(vectors: Array, turns: Array) -> Array:
-    """``vectors`` (..., 3) turned by rotation vectors (Rodrigues, without matrices)."""
-    angle = np.sqrt(np.einsum("...i,...i->...", turns, turns))[..., None]
-    once = np.cross(turns, vectors)
+def _rotated(vectors: Array, rotation_vectors: Array) -> Array:
+    """Rotate vectors (..., 3) by rotation vectors: Rodrigues' formula without matrices."""
+    angle = np.sqrt(np.einsum("...i,...i->...", rotation_vectors, rotation_vectors))[..., None]
+    once = np.cross(rotation_vectors, vectors)
     versine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return vectors + np.sinc(angle / np.pi) * once + versine * np.cross(turns, once)
-
-
-def _normal(
-    looks: SweepObservations,
-    poses: DeviceStates,
-    missed: Array,
-    gradient: Array,
-    width: Array,
-    rates: bool,
-    gate: float,
-) -> tuple[Array, Array, Array, Array]:
-    """Residuals, normal matrices (m, 12, 12), right sides (m, 12) and costs (m,), in sigmas."""
-    lost = looks.seen & ~np.isfinite(missed)
-    missed = np.where(lost, UNSEEN, np.nan_to_num(missed))
-    lost |= np.abs(missed) > gate
-    ratio = (np.minimum(np.abs(missed), gate) / width) ** 2
-    weight = np.where(looks.seen & ~lost, 1.0 / (1.0 + ratio), 0.0)
-    cost = 0.5 * width[:, 0] ** 2 * np.sum(np.log1p(ratio), axis=1, where=looks.seen)
-    root = np.sqrt(weight)[..., None]
-    near = np.nan_to_num(gradient) * root
-    pulled = missed[..., None] * root
-    matrix, right = np.zeros((len(looks), 12, 12)), np.zeros((len(looks), 12))
-    if not rates:
-        matrix[:, :6, :6] = np.swapaxes(near, -1, -2) @ near
-        matrix[:, range(6, 12), range(6, 12)] = 1.0
-        right[:, :6] = (np.swapaxes(near, -1, -2) @ pulled)[..., 0]
-        return missed, matrix, right, cost
-    both = np.concatenate([near, near * looks.since_s[..., None]], axis=-1)
-    across = np.swapaxes(both, -1, -2)
-    matrix += across @ both
-    right += (across @ pulled)[..., 0]
-    matrix[:, range(6, 12), range(6, 12)] += SPEED_SIGMA**-2
-    right[:, 6:] += poses.rate / SPEED_SIGMA**2
-    cost = cost + 0.5 * np.sum((poses.rate / SPEED_SIGMA) ** 2, axis=1)
-    return missed, matrix, right, cost
+    return vectors + np.sinc(angle / np.pi) * once + versine * np.cross(rotation_vectors, once)

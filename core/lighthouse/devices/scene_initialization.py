@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD, Calibration
-from locatk.core.lighthouse.devices.bundle_adjustment import adjust_rigid
+from locatk.core.lighthouse.devices.bundle_adjustment import adjust_devices
 from locatk.core.lighthouse.devices.device_sweeps import (
     DeviceSweeps,
     SweepWindows,
@@ -188,12 +188,12 @@ def _adjusted(
 
     guessed = np.array([c.source == "generic" for c in stations[2]])
     sigma = MODEL_SIGMA_RAD if np.any(guessed) else 2 * ANGLE_SIGMA_RAD
-    done = adjust_rigid(
+    done = adjust_devices(
         looks, stations, poses, sigma=sigma, soft=LOSS_SCALE_RAD, share=share, calibrate=guessed
     )
     # Again with the noise that the recording shows.
     sigma = max(ANGLE_SIGMA_RAD, robust_sigma(done.residual))
-    done = adjust_rigid(
+    done = adjust_devices(
         looks,
         done.stations,
         done.poses,

@@ -1,20 +1,26 @@
-"""Robust bundle adjustment over stations, points and, where observable, tilt and phase.
+"""Robust bundle adjustment of base stations and points.
 
-Levenberg-Marquardt on the observed rotor angles. The points are eliminated one by one
-(Schur complement), so that a step costs a few matrix products over all points and one
-solve of at most ten unknowns a station. What the data cannot fix (the frame, and the scale
-where nothing measures it) is held by penalising just those directions; there the
-covariance is zero by convention, as it is inside that frame.
+The unknowns are the pose of each station, the position of each point (a photodiode at one time)
+and, for stations without a factory calibration, the tilts and phases of both light planes. The
+residuals are the rotor angles that the state predicts minus the observed ones, under a Cauchy
+loss. :mod:`locatk.core.least_squares` eliminates the points; a step then costs one solve of ten
+unknowns per station.
+
+The data do not determine the frame, nor the scale unless points are known. These directions (the
+gauge) are constrained to the initial guess, and the covariance is zero along them: it holds in
+that frame.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
+from locatk.core.least_squares import Indices, SchurEquations, SchurStep, cauchy_loss, minimize
 from locatk.core.lighthouse.calibration import (
     GENERIC_CALIBRATION,
     PHASE,
@@ -23,16 +29,31 @@ from locatk.core.lighthouse.calibration import (
     Calibration,
     predict_with_gradient,
 )
-from locatk.core.robust import descend
 
 Array = NDArray[np.float64]
 
-STATION_UNKNOWNS = 10
-"""Position, rotation vector, two tilts, two phases."""
+STATION_PARAMETERS = 10
+"""Unknowns of a station: position, rotation vector in the frame, two tilts, two phases."""
 
-SLOW = 10
-"""Steps after which an adjustment counts as slow, and its points take a step of their own
-after each: that is twice the work, but gets it through the valleys of narrow fields."""
+POSITION, ROTATION = slice(0, 3), slice(3, 6)
+CALIBRATION = slice(6, 10)
+"""Ranges of these unknowns."""
+
+LOSS_SCALE_RAD = 3e-3
+"""Residual at which the weight of an angle is one half: beyond what a generic calibration leaves
+unmodelled (1 mrad), and far below reflections and demodulation errors."""
+
+INDEPENDENT_POINTS = 100
+"""Points that carry independent information, at most: points share the error of the model, and
+the accuracy of a scene saturates at about so many (Alvarado-Marin et al. 2024, Fig. 12). With more,
+tilts and phases would be bent to explain what they do not cause."""
+
+INNER_ITERATIONS_AFTER = 10
+"""Iterations after which the points take a step of their own as well, which doubles the work and
+carries the adjustment through the curved valleys of a narrow field of view."""
+
+UNREACHABLE_RESIDUAL = 1e3
+"""Residual, in standard deviations, of an angle at which no light plane meets the photodiode."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +68,7 @@ class BundleState:
         Station to frame.
     calibrations : tuple of Calibration
     points : (m, 3) ndarray
-        Of the photodiodes, one a moment; same unit.
+        Positions of the photodiodes, one per epoch, in the same unit.
     """
 
     positions: Array
@@ -64,14 +85,14 @@ class BundleAdjustment:
     ----------
     rig : BundleState
     residuals : (m, s, 2) ndarray
-        Predicted minus observed angle, in radians; ``nan`` where nothing was seen.
+        Predicted minus observed angle in radians; ``nan`` if not observed.
     weights : (m, s, 2) ndarray
-        Robust weight of each, 0 to 1.
+        Robust weights, 0 to 1.
     station_covariance : (s, 10, 10) ndarray
-        Of each station's unknowns, in the frame that was held.
+        Covariance of each station's unknowns, in the frame of the gauge.
     iterations : int
     cost : float
-        Half the robust sum of squares at the end.
+        Half the robust sum of squares at the minimum.
     """
 
     rig: BundleState
@@ -90,271 +111,267 @@ def adjust_bundle(
     planar: bool = False,
     fixed_points: bool = False,
     calibrate: bool = True,
-    independent: int = 100,
-    soft: float = 3e-3,
+    independent: int = INDEPENDENT_POINTS,
+    soft: float = LOSS_SCALE_RAD,
     iterations: int = 50,
 ) -> BundleAdjustment:
-    """Refine a rig so that it predicts the observed angles.
+    """Refine stations and points so that they predict the observed angles.
 
     Parameters
     ----------
     angles : (m, s, 2) ndarray
-        Observed rotor angles, ``nan`` where a station was not seen.
+        Observed rotor angles in radians; ``nan`` if a station was not observed.
     rig : BundleState
-        Where to start.
+        Initial guess.
     sigma : float
-        Standard deviation of an angle, in radians.
+        Standard deviation of an angle in radians.
     planar : bool
-        Keep the z of all points as it is.
+        Keep the z coordinate of all points.
     fixed_points : bool
-        Points are known (markers): only the stations move.
+        Points are known (markers): only the stations are estimated.
     calibrate : bool
-        Also estimate tilt and phase of the stations whose calibration is generic, with
-        its spread over units as prior. Factory calibration is never touched.
+        Estimate tilts and phases of the stations without a factory calibration, with their
+        spread over units as prior. A factory calibration is never changed.
     independent : int
-        Moments share the error of the model: they inform as this many independent ones,
-        at most (the paper's Fig. 12 saturates there), or tilt and phase would be bent to
-        explain what they do not cause.
+        Number of points that carry independent information, at most.
     soft : float
-        Residual at which the Cauchy loss turns soft, in radians.
+        Residual in radians at which the weight of an angle is one half.
     iterations : int
-        At most so many steps.
-
-    Returns
-    -------
-    BundleAdjustment
+        Maximum number of iterations.
     """
-    seen = np.isfinite(angles)
-    observed = np.where(seen, angles, 0.0)
-    sigma = sigma * np.sqrt(max(1.0, len(angles) / independent))
-    loss_width = soft / sigma
-    free = np.array([calibrate and c.source in ("generic", "estimated") for c in rig.calibrations])
-    prior = _Prior.of(rig, free)
-    dims = 0 if fixed_points else (2 if planar else 3)
-
-    def linearised(rig: BundleState) -> _System:
-        return _linearise(observed, seen, rig, sigma, loss_width, prior, dims)
-
-    def attempt(
-        rig: BundleState, system: _System, damping: float, step: int
-    ) -> tuple[BundleState, _System]:
-        trial = _step(system, rig, damping, planar, dims)
-        found = linearised(trial)
-        if dims and step > SLOW:
-            # Along a curved valley the points fall behind: let them find their own best place.
-            trial = replace(trial, points=_settled(found, trial.points, dims))
-            found = linearised(trial)
-        return trial, found
-
-    rig, system, steps = descend(rig, linearised(rig), attempt, damping=1e-3, iterations=iterations)
-    reduced, _, _ = _reduce(system, 0.0, dims)
-    # Held directions and frozen calibrations carry no information of their own.
-    loose = np.eye(len(reduced))
-    if dims:
-        basis = _gauge(rig, planar)
-        loose -= basis @ basis.T
-    covariance = loose @ np.linalg.pinv(loose @ reduced @ loose, hermitian=True) @ loose
-    s = len(rig.positions)
-    blocks = covariance.reshape(s, STATION_UNKNOWNS, s, STATION_UNKNOWNS)
-    return BundleAdjustment(
+    observed = np.isfinite(angles)
+    sigma = sigma * float(np.sqrt(max(1.0, len(angles) / independent)))
+    calibrated = [calibrate and c.source in ("generic", "estimated") for c in rig.calibrations]
+    problem = _PointBundle(
+        angles=np.where(observed, angles, 0.0),
+        observed=observed,
+        sigma_rad=sigma,
+        loss_scale=soft / sigma,
+        free=free_parameters(calibrated),
+        dims=0 if fixed_points else 2 if planar else 3,
+    )
+    minimum = minimize(
+        problem,
         rig,
-        np.where(seen, system.residuals * sigma, np.nan),
-        np.where(seen, system.weights, np.nan),
-        np.stack([blocks[i, :, i, :] for i in range(s)]),
-        steps,
-        system.cost,
+        damping=1e-3,
+        max_iterations=iterations,
+        inner_iterations_after=None if fixed_points else INNER_ITERATIONS_AFTER,
+    )
+    equations: SchurEquations = minimum.equations
+    return BundleAdjustment(
+        minimum.state,
+        np.where(observed, equations.residual * sigma, np.nan),
+        np.where(observed, equations.weight, np.nan),
+        station_blocks(equations.covariance(), len(rig.positions)),
+        int(minimum.iterations[0]),
+        float(equations.cost[0]),
     )
 
 
 @dataclass(frozen=True)
-class _Prior:
-    """Where tilts and phases are expected, and how firmly: (s, 4) each."""
+class _PointBundle:
+    """The adjustment as a problem for :func:`~locatk.core.least_squares.minimize`.
 
-    mean: Array
-    information: Array
+    Attributes
+    ----------
+    angles, observed : (m, s, 2) ndarray
+    sigma_rad : float
+    loss_scale : float
+        In standard deviations.
+    free : (s, 10) bool ndarray
+        Unknowns of the stations that are estimated.
+    dims : int
+        Coordinates of each point that are estimated: 0, 2 (x and y) or 3.
+    """
 
-    @classmethod
-    def of(cls, rig: BundleState, free: NDArray[np.bool_]) -> _Prior:
-        own = np.stack([calibration_parameters(c) for c in rig.calibrations])
-        mean = np.where(free[:, None], calibration_parameters(GENERIC_CALIBRATION), own)
-        spread = np.concatenate([PHASE_TILT_SIGMA_RAD[:, 1], PHASE_TILT_SIGMA_RAD[:, 0]])
-        information = np.full(mean.shape, np.inf)
-        # What is the same in every unit (the first phase is zero) is not estimated.
-        loose = free[:, None] & (spread > 0)
-        information[loose] = np.broadcast_to(
-            1.0 / np.where(spread > 0, spread, 1.0) ** 2, mean.shape
-        )[loose]
-        return cls(mean, information)
+    angles: Array
+    observed: NDArray[np.bool_]
+    sigma_rad: float
+    loss_scale: float
+    free: NDArray[np.bool_]
+    dims: int
+
+    def linearize(self, state: BundleState, _: Indices) -> SchurEquations:
+        m, s = self.angles.shape[:2]
+        n, dims = STATION_PARAMETERS, self.dims
+        hessian, gradient = np.zeros((s, n, s, n)), np.zeros((s, n))
+        points = m if dims else 0
+        block_hessian, block_gradient = np.zeros((points, dims, dims)), np.zeros((points, dims))
+        coupling = np.zeros((points, s, n, dims))
+        residuals, weights = np.zeros((m, s, 2)), np.zeros((m, s, 2))
+        cost = add_calibration_prior(hessian, gradient, state.calibrations, self.free)
+        for i, calibration in enumerate(state.calibrations):
+            offset = state.points - state.positions[i]
+            predicted, by_local, by_tilt = predict_with_gradient(
+                offset @ state.rotations[i], calibration
+            )
+            by_point = by_local @ state.rotations[i].T
+            residual = (predicted - self.angles[:, i]) / self.sigma_rad
+            reachable = np.isfinite(residual)
+            residual = np.where(reachable, residual, UNREACHABLE_RESIDUAL)
+            loss, weight = cauchy_loss(residual, self.loss_scale)
+            weight = np.where(self.observed[:, i], weight, 0.0)
+            cost += float(np.sum(loss, where=self.observed[:, i]))
+            root = np.sqrt(weight)
+            scale = np.where(reachable, root, 0.0)[..., None] / self.sigma_rad
+            jacobian = station_jacobian(by_point, offset[:, None], by_tilt, np.arange(2))
+            jacobian = np.nan_to_num(jacobian) * scale
+            weighted = residual * root
+            flat = jacobian.reshape(-1, n)
+            hessian[i, :, i, :] += flat.T @ flat
+            gradient[i] += flat.T @ weighted.ravel()
+            if dims:
+                by_free = np.nan_to_num(by_point[..., :dims]) * scale
+                transposed = by_free.transpose(0, 2, 1)
+                block_hessian += transposed @ by_free
+                block_gradient += (transposed @ weighted[..., None])[..., 0]
+                coupling[:, i] = jacobian.transpose(0, 2, 1) @ by_free
+            residuals[:, i], weights[:, i] = np.where(self.observed[:, i], residual, 0.0), weight
+        return SchurEquations(
+            np.array([cost]),
+            hessian.reshape(s * n, s * n),
+            gradient.ravel(),
+            block_hessian,
+            block_gradient,
+            coupling.reshape(points, s * n, dims),
+            self.free.ravel(),
+            _gauge_directions(state.positions, dims),
+            residuals,
+            weights,
+        )
+
+    def retract(self, state: BundleState, step: SchurStep) -> BundleState:
+        change = step.shared.reshape(-1, STATION_PARAMETERS)
+        moved = BundleState(*retract_stations(state, change), state.points)
+        return self.retract_blocks(moved, step.blocks) if self.dims else moved
+
+    def retract_blocks(self, state: BundleState, step: Array) -> BundleState:
+        points = state.points.copy()
+        points[:, : self.dims] += step
+        return replace(state, points=points)
+
+
+def _gauge_directions(positions: Array, dims: int) -> Array:
+    """Orthonormal directions (s * 10, g) of the stations' unknowns that no angle depends on.
+
+    Translation, rotation and scale of everything; in a plane (``dims`` 2) translation in x and
+    y, rotation about z, and scale. None if the points are known.
+    """
+    s = len(positions)
+    motions = []
+    for axis in range(dims):
+        translation = np.zeros((s, STATION_PARAMETERS))
+        translation[:, axis] = 1.0
+        motions.append(translation)
+    for axis in {0: (), 2: (2,), 3: (0, 1, 2)}[dims]:
+        rotation = np.zeros((s, STATION_PARAMETERS))
+        rotation[:, POSITION] = np.cross(np.eye(3)[axis], positions)
+        rotation[:, ROTATION] = np.eye(3)[axis]
+        motions.append(rotation)
+    if not motions:
+        return np.zeros((s * STATION_PARAMETERS, 0))
+    scale = np.zeros((s, STATION_PARAMETERS))
+    scale[:, POSITION] = positions
+    motions.append(scale)
+    return np.linalg.qr(np.stack([motion.ravel() for motion in motions], axis=1))[0]
+
+
+# ---- unknowns of stations, common to all adjustments
+
+
+def free_parameters(calibrated: Sequence[bool] | NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(s, 10) unknowns that are estimated; tilts and phases only of ``calibrated`` stations.
+
+    The first phase is zero in every unit and never estimated.
+    """
+    free = np.ones((len(calibrated), STATION_PARAMETERS), bool)
+    varies = calibration_sigma() > 0
+    free[:, CALIBRATION] = np.asarray(calibrated, bool)[:, None] & varies
+    return free
+
+
+def station_jacobian(
+    by_position: Array, offset: Array, by_tilt: Array, plane: NDArray[np.int64]
+) -> Array:
+    """Derivatives (..., 10) of rotor angles by the unknowns of their station.
+
+    Parameters
+    ----------
+    by_position : (..., 3) ndarray
+        Derivative of each angle by the position of the photodiode in the frame.
+    offset : (..., 3) ndarray
+        From the station to the photodiode, in the frame.
+    by_tilt : (...) ndarray
+        Derivative by the tilt of the plane. (By its phase it is -1.)
+    plane : (...) int ndarray
+        0 or 1.
+    """
+    is_plane = np.asarray(plane)[..., None] == np.arange(2)
+    jacobian = np.empty((*by_position.shape[:-1], STATION_PARAMETERS))
+    jacobian[..., POSITION] = -by_position
+    jacobian[..., ROTATION] = np.cross(by_position, offset)
+    jacobian[..., 6:8] = np.where(is_plane, by_tilt[..., None], 0.0)
+    jacobian[..., 8:10] = np.where(is_plane, -1.0, 0.0)
+    return jacobian
+
+
+def add_calibration_prior(
+    hessian: Array,
+    gradient: Array,
+    calibrations: Sequence[Calibration],
+    free: NDArray[np.bool_],
+) -> float:
+    """Add the spread of tilts and phases over units to normal equations; return its cost.
+
+    ``hessian`` (s, 10, s, 10) and ``gradient`` (s, 10) are changed in place.
+    """
+    sigma = calibration_sigma()
+    mean = calibration_parameters(GENERIC_CALIBRATION)
+    cost = 0.0
+    for i, calibration in enumerate(calibrations):
+        estimated = free[i, CALIBRATION]
+        index = np.arange(CALIBRATION.start, CALIBRATION.stop)[estimated]
+        deviation = (calibration_parameters(calibration) - mean)[estimated]
+        information = sigma[estimated] ** -2.0
+        hessian[i, index, i, index] += information
+        gradient[i, index] += information * deviation
+        cost += 0.5 * float(information @ deviation**2)
+    return cost
+
+
+def retract_stations(
+    state: BundleState, change: Array
+) -> tuple[Array, Array, tuple[Calibration, ...]]:
+    """Positions, rotations and calibrations after a change (s, 10) of their unknowns."""
+    return (
+        state.positions + change[:, POSITION],
+        rotation_exp(change[:, ROTATION]) @ state.rotations,
+        tuple(
+            with_parameters(calibration, step)
+            for calibration, step in zip(state.calibrations, change[:, CALIBRATION], strict=True)
+        ),
+    )
+
+
+def station_blocks(covariance: Array, stations: int) -> Array:
+    """(s, 10, 10) diagonal blocks of a covariance (s * 10, s * 10)."""
+    n = STATION_PARAMETERS
+    blocks = covariance.reshape(stations, n, stations, n)
+    return np.stack([blocks[i, :, i, :] for i in range(stations)])
 
 
 def calibration_parameters(calibration: Calibration) -> Array:
-    """(4,) both tilts and both phases, which an adjustment may estimate, in radians."""
+    """(4,) both tilts and both phases in radians, which an adjustment may estimate."""
     return np.concatenate([calibration.sweeps[:, TILT], calibration.sweeps[:, PHASE]])
 
 
-@dataclass(frozen=True)
-class _System:
-    """Normal equations before the points are eliminated."""
-
-    stations: Array  # (s, 10, 10)
-    stations_rhs: Array  # (s, 10)
-    points: Array  # (m, d, d)
-    points_rhs: Array  # (m, d)
-    mixed: Array  # (m, s * 10, d)
-    residuals: Array  # (m, s, 2) in sigmas
-    weights: Array
-    cost: float
-
-
-def _linearise(
-    observed: Array,
-    seen: NDArray[np.bool_],
-    rig: BundleState,
-    sigma: float,
-    loss_width: float,
-    prior: _Prior,
-    dims: int,
-) -> _System:
-    m, s = observed.shape[:2]
-    n = STATION_UNKNOWNS
-    stations = np.zeros((s, n, n))
-    stations_rhs = np.zeros((s, n))
-    points = np.zeros((m, dims, dims))
-    points_rhs = np.zeros((m, dims))
-    mixed = np.zeros((m, s * n, dims))
-    residuals = np.zeros((m, s, 2))
-    weights = np.zeros((m, s, 2))
-    cost = 0.0
-    for i in range(s):
-        rotation = rig.rotations[i]
-        offset = rig.points - rig.positions[i]
-        predicted, by_local, by_tilt = predict_with_gradient(offset @ rotation, rig.calibrations[i])
-        residual = np.where(seen[:, i], predicted - observed[:, i], 0.0) / sigma
-        # A point outside the cone of a sweep cannot have been seen by it.
-        residual = np.where(np.isfinite(residual), residual, 1e3)
-        ratio = (residual / loss_width) ** 2
-        weight = np.where(seen[:, i], 1.0 / (1.0 + ratio), 0.0)
-        cost += 0.5 * loss_width**2 * float(np.sum(np.log1p(ratio)))
-        root = np.where(np.isfinite(predicted), np.sqrt(weight), 0.0) / sigma
-
-        by_point = by_local @ rotation.T
-        jacobian = np.zeros((m, 2, n))
-        jacobian[..., 0:3] = -by_point
-        jacobian[..., 3:6] = np.cross(by_point, offset[:, None, :])
-        jacobian[:, 0, 6] = by_tilt[:, 0]
-        jacobian[:, 1, 7] = by_tilt[:, 1]
-        jacobian[:, 0, 8] = jacobian[:, 1, 9] = -1.0
-        jacobian = np.nan_to_num(jacobian) * root[..., None]
-        pulled = residual * np.sqrt(weight)
-
-        flat = jacobian.reshape(-1, n)
-        stations[i] = flat.T @ flat
-        stations_rhs[i] = flat.T @ pulled.ravel()
-        deviation = calibration_parameters(rig.calibrations[i]) - prior.mean[i]
-        held = np.isinf(prior.information[i])
-        information = np.where(held, 0.0, prior.information[i])
-        stations[i][range(6, 10), range(6, 10)] += information
-        stations_rhs[i][6:] += information * deviation
-        cost += 0.5 * float(np.sum(information * deviation**2))
-        frozen = 6 + np.flatnonzero(held)
-        flat[:, frozen] = 0.0
-        stations[i][frozen, :] = stations[i][:, frozen] = 0.0
-        stations_rhs[i][frozen] = 0.0
-        if dims:
-            by_free = np.nan_to_num(by_point[..., :dims]) * root[..., None]
-            transposed = by_free.transpose(0, 2, 1)
-            points += transposed @ by_free
-            points_rhs += (transposed @ pulled[..., None])[..., 0]
-            mixed[:, i * n : (i + 1) * n] = flat.reshape(m, 2, n).transpose(0, 2, 1) @ by_free
-        residuals[:, i], weights[:, i] = residual, weight
-    return _System(stations, stations_rhs, points, points_rhs, mixed, residuals, weights, cost)
-
-
-def _reduce(system: _System, damping: float, dims: int) -> tuple[Array, Array, Array]:
-    """Reduced station matrix and right side, and the inverses of the points' blocks."""
-    s, n = system.stations_rhs.shape
-    full = np.zeros((s * n, s * n))
-    for i in range(s):
-        full[i * n : (i + 1) * n, i * n : (i + 1) * n] = system.stations[i]
-    rhs = system.stations_rhs.ravel().copy()
-    full[np.diag_indices(s * n)] *= 1.0 + damping
-    if not dims:
-        return full, rhs, np.zeros((0, 0, 0), np.float64)
-    blocks = system.points.copy()
-    diagonal = np.einsum("mii->mi", blocks)
-    diagonal *= 1.0 + damping
-    # A point seen by too few planes has no place: leave it where it is.
-    diagonal += 1e-12 * diagonal.max() + 1e-300
-    inverses = np.linalg.inv(blocks).astype(np.float64, copy=False)
-    eliminated = system.mixed @ inverses
-    columns = eliminated.transpose(1, 0, 2).reshape(s * n, -1)
-    full -= columns @ system.mixed.transpose(1, 0, 2).reshape(s * n, -1).T
-    rhs -= columns @ system.points_rhs.ravel()
-    return full, rhs, inverses
-
-
-def _hold_gauge(matrix: Array, rig: BundleState, planar: bool, dims: int) -> Array:
-    """Add a penalty on moving, turning and scaling the whole rig."""
-    if not dims:
-        return matrix
-    basis = _gauge(rig, planar)
-    return matrix + np.max(np.diag(matrix)) * basis @ basis.T
-
-
-def _gauge(rig: BundleState, planar: bool) -> Array:
-    """(s * 10, g) orthonormal directions of the unknowns that no angle depends on."""
-    s = len(rig.positions)
-    motions = []
-    for axis in range(2 if planar else 3):
-        shift = np.zeros((s, STATION_UNKNOWNS))
-        shift[:, axis] = 1.0
-        motions.append(shift)
-    for axis in (2,) if planar else range(3):
-        turn = np.zeros((s, STATION_UNKNOWNS))
-        unit = np.eye(3)[axis]
-        turn[:, 0:3] = np.cross(unit, rig.positions)
-        turn[:, 3:6] = unit
-        motions.append(turn)
-    growth = np.zeros((s, STATION_UNKNOWNS))
-    growth[:, 0:3] = rig.positions
-    motions.append(growth)
-    return np.linalg.qr(np.stack([g.ravel() for g in motions], axis=1))[0]
-
-
-def _settled(system: _System, points: Array, dims: int) -> Array:
-    """Points after a step of their own, the stations held."""
-    blocks = system.points.copy()
-    diagonal = np.einsum("mii->mi", blocks)
-    diagonal += 1e-9 * np.max(diagonal, initial=0.0) + 1e-300
-    moved = points.copy()
-    moved[:, :dims] -= np.linalg.solve(blocks, system.points_rhs[..., None])[..., 0]
-    return moved
-
-
-def _step(
-    system: _System, rig: BundleState, damping: float, planar: bool, dims: int
-) -> BundleState:
-    reduced, rhs, inverses = _reduce(system, damping, dims)
-    frozen = ~np.any(reduced, axis=1)
-    reduced = _hold_gauge(reduced, rig, planar, dims)
-    delta = -np.linalg.lstsq(reduced, rhs, rcond=1e-14)[0]
-    delta[frozen] = 0.0
-    change = delta.reshape(len(rig.positions), STATION_UNKNOWNS)
-    points = rig.points
-    if dims:
-        back = system.points_rhs + np.einsum("mkd,k->md", system.mixed, delta)
-        points = points.copy()
-        points[:, :dims] -= (inverses @ back[..., None])[..., 0]
-    return BundleState(
-        rig.positions + change[:, 0:3],
-        rotation_exp(change[:, 3:6]) @ rig.rotations,
-        tuple(with_parameters(c, d) for c, d in zip(rig.calibrations, change[:, 6:], strict=True)),
-        points,
-    )
+def calibration_sigma() -> Array:
+    """(4,) standard deviations of :func:`calibration_parameters` over units, in radians."""
+    return np.concatenate([PHASE_TILT_SIGMA_RAD[:, 1], PHASE_TILT_SIGMA_RAD[:, 0]])
 
 
 def with_parameters(calibration: Calibration, change: Array) -> Calibration:
-    """A calibration with its :func:`calibration_parameters` changed by so much."""
+    """Return a calibration whose :func:`calibration_parameters` are changed by (4,)."""
     if not np.any(change):
         return calibration
     sweeps = calibration.sweeps.copy()
