@@ -47,7 +47,7 @@ on the whole Jacobian), and it returns no covariance.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +100,13 @@ class Problem(Protocol[State]):
 
     def retract(self, state: State, step: Any) -> State:
         """Return the state after a step of :meth:`Equations.solve`."""
+
+
+class BlockProblem(Problem[State], Protocol):
+    """Problem with eliminated blocks, for inner iterations."""
+
+    def retract_blocks(self, state: State, step: Array) -> State:
+        """Return the state after a step (k, d) of the blocks alone."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +168,7 @@ def minimize(
         only).
     inner_iterations_after : int, optional
         From this iteration on, the eliminated blocks take a step of their own after each step
-        (Schur equations only; ``problem.retract_blocks`` applies it). That doubles the work of
+        (Schur equations only; the problem is a :class:`BlockProblem`). That doubles the work of
         an iteration and shortens the way through curved valleys (inner iterations in Ceres
         Solver; Ruhe and Wedin, SIAM Rev. 22 (1980) 318).
 
@@ -170,7 +177,9 @@ def minimize(
     Minimum
     """
     active = np.arange(size)
-    state = start if size == 1 else start.take(active)  # type: ignore[attr-defined]
+    state: Any = start
+    if size != 1:
+        state = state.take(active)
     equations = problem.linearize(state, active)
     dampings = np.full(size, damping)
     iterations = np.zeros(size, np.int64)
@@ -179,11 +188,12 @@ def minimize(
         if not len(active):
             break
         step = equations.solve(dampings[active], active)
-        before = state if size == 1 else state.take(active)  # type: ignore[attr-defined]
-        trial = problem.retract(before, step)
+        before = state if size == 1 else state.take(active)
+        trial: Any = problem.retract(before, step)
         after = problem.linearize(trial, active)
         if inner_iterations_after is not None and iteration > inner_iterations_after:
-            trial = problem.retract_blocks(trial, after.solve_blocks())  # type: ignore[attr-defined]
+            blocks = cast(BlockProblem[State], problem)
+            trial = blocks.retract_blocks(trial, after.solve_blocks())
             after = problem.linearize(trial, active)
         cost = equations.cost[active]
         # A cost of nan is no improvement.
@@ -192,7 +202,7 @@ def minimize(
         if size == 1:
             state, equations = (trial, after) if improved[0] else (state, equations)
         elif np.any(improved):
-            state.put(active[improved], trial.take(improved))  # type: ignore[attr-defined]
+            state.put(active[improved], trial.take(improved))
             equations.put(active[improved], after, improved)
         iterations[active] = iteration
         lower = np.maximum(dampings[active] / DAMPING_FACTOR, MIN_DAMPING)
@@ -251,7 +261,8 @@ class DenseEquations:
         """Damped steps (k, p) of the chosen problems (k,)."""
         matrix = self.hessian[problems]
         _damp(matrix, damping[:, None])
-        return -np.linalg.solve(matrix, self.gradient[problems][..., None])[..., 0]
+        step = -np.linalg.solve(matrix, self.gradient[problems][..., None])[..., 0]
+        return step.astype(np.float64, copy=False)
 
     def put(self, problems: Indices, other: DenseEquations, chosen: NDArray[np.bool_]) -> None:
         """Replace the equations of some problems by chosen ones of ``other``."""
@@ -320,7 +331,8 @@ class SchurEquations:
         """Undamped step (k, d) of the blocks, the shared parameters being fixed."""
         matrix = self.block_hessian.copy()
         _damp(matrix, 0.0)
-        return -np.linalg.solve(matrix, self.block_gradient[..., None])[..., 0]
+        step = -np.linalg.solve(matrix, self.block_gradient[..., None])[..., 0]
+        return step.astype(np.float64, copy=False)
 
     def covariance(self) -> Array:
         """(p, p) covariance of the shared parameters, the blocks being estimated as well.
