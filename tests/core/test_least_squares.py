@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -296,6 +296,21 @@ def test_no_step_and_no_variance_along_the_gauge() -> None:
     projection = np.eye(SHARED) - gauge @ gauge.T
     inside = projection @ full[:SHARED, :SHARED] @ projection
     np.testing.assert_allclose(covariance, inside, atol=1e-9)
+
+
+def test_the_gauge_is_held_against_rounding() -> None:
+    gauge = np.linalg.qr(np.random.default_rng(5).normal(size=(SHARED, 1)))[0]
+    equations, _, _ = arrow(gauge=gauge)
+    exact = equations.solve(np.zeros(1)).shared
+    # What rounding and robust weights leave along the gauge would be a step of a hundred.
+    rounded = replace(
+        equations,
+        hessian=equations.hessian + 1e-6 * gauge @ gauge.T,
+        gradient=equations.gradient + 1e-4 * gauge[:, 0],
+    )
+    step = rounded.solve(np.zeros(1)).shared
+    np.testing.assert_allclose(step, exact, atol=1e-3)
+    np.testing.assert_allclose(rounded.covariance(), equations.covariance(), atol=1e-9)
 
 
 def test_a_block_that_nothing_observed_stays() -> None:

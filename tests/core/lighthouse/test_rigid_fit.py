@@ -10,6 +10,7 @@ from locatk.core.geometry import rotation_exp, rotation_log
 from locatk.core.least_squares import SchurEquations
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, predict_angles
 from locatk.core.lighthouse.devices import bundle_adjustment as device_bundle
+from locatk.core.lighthouse.devices import pose_fit
 from locatk.core.lighthouse.devices.bundle_adjustment import adjust_devices
 from locatk.core.lighthouse.devices.pose_fit import (
     DeviceStates,
@@ -173,3 +174,17 @@ def test_the_adjustment_finds_a_station_that_was_put_wrong() -> None:
     assert off @ np.linalg.solve(done.covariance[1], off) < 25
     assert np.array_equal(done.stations[0][0], STATIONS[0][0])
     assert not np.any(done.covariance[0])
+
+
+def test_no_step_turns_a_device_over() -> None:
+    looks, poses = world(2, 30)
+    problem = pose_fit._PoseProblem(looks, STATIONS, 1e-4, np.ones((2, 1)), True, np.inf)
+    step = np.zeros((2, 12))
+    step[0, :6] = [0.1, 0.0, 0.0, 0.0, 0.0, 2.8]
+    step[1, :6] = [0.1, 0.0, 0.0, 0.0, 0.0, 0.3]
+    after = problem.retract(poses, step)
+    turn = rotation_log(after.rotation @ np.swapaxes(poses.rotation, 1, 2))
+    np.testing.assert_allclose(turn[:, 2], [pose_fit.MAX_ROTATION_STEP_RAD, 0.3], rtol=1e-9)
+    # The whole step is shortened, so that its direction stays.
+    shift = after.position - poses.position
+    np.testing.assert_allclose(shift[:, 0], [0.1 * pose_fit.MAX_ROTATION_STEP_RAD / 2.8, 0.1])
