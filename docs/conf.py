@@ -30,7 +30,7 @@ html_show_search_summary = False
 
 MENU = {
     "First hour": ["first-hour-*"],
-    "Systems": ["lighthouse", "light", "dots", "polaris", "landmarks"],
+    "Systems": ["lighthouse", "light", "lighthouse-signal", "dots", "polaris", "landmarks"],
     "From port to viewer": ["capture", "batch", "viewers"],
     "Reference": [
         "Commands <commands>",
@@ -38,6 +38,7 @@ MENU = {
         "Benchmarks <bench>",
         "Firmware <firmware/README>",
         "Architecture <architecture>",
+        "Glossary <glossary>",
         "Changes <changelog>",
     ],
 }
