@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import predict_angles
 from locatk.core.lighthouse.channels import period_counts
-from locatk.core.lighthouse.light_planes import ROTOR_ZERO, angles_to_counts
+from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD, angles_to_counts
 from locatk.core.lighthouse.scene import Station
 from locatk.core.lighthouse.simulation.paths import Course
 
@@ -63,13 +63,13 @@ class SimulatedStation:
             local = (where(time) - self.station.position) @ self.station.rotation
             # Each plane at its own time: the other plane at that time is not asked for.
             angle = predict_angles(local, self.station.calibration)[..., [0, 1], [0, 1]]
-            time = start_s[:, None] + (angle - ROTOR_ZERO) / (2 * np.pi) * self.period_s
+            time = start_s[:, None] + (angle - ROTOR_ZERO_RAD) / (2 * np.pi) * self.period_s
             time = np.where(np.isfinite(time), time, nominal)
         azimuth = np.arctan2(local[..., 1], local[..., 0])
         elevation = np.arctan2(local[..., 2], np.hypot(local[..., 0], local[..., 1]))
         lit = (np.abs(azimuth) < CONE_RAD[0]) & (np.abs(elevation) < CONE_RAD[1])
         angle = np.where(lit, angle + noise, np.nan)
-        turn = (angle - ROTOR_ZERO) / (2 * np.pi)
+        turn = (angle - ROTOR_ZERO_RAD) / (2 * np.pi)
         count = np.rint(angles_to_counts(angle, self.station.channel))
         # Only noise beyond all measure leaves the rotation.
         count[(count < 0) | (count >= period_counts(self.station.channel))] = np.nan
@@ -153,7 +153,7 @@ def observe_reports(
     light = link.light
     # The second plane passes last: of the rotation in which it had passed.
     local = (link.position(reports_s) - light.station.position) @ light.station.rotation
-    turn = (predict_angles(local, light.station.calibration)[:, 1] - ROTOR_ZERO[1]) / (2 * np.pi)
+    turn = (predict_angles(local, light.station.calibration)[:, 1] - ROTOR_ZERO_RAD[1]) / (2 * np.pi)
     since = (reports_s - PROCESSING_S - light.zero_s) / light.period_s - turn
     rotation = np.floor(np.where(np.isfinite(since), since, -1.0)).astype(np.int64)
     fresh = (rotation >= 0) & np.r_[True, np.diff(rotation) != 0][: len(rotation)]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse import light_planes as angles
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
+from locatk.core.lighthouse.published.scene import paper_image_points
 
 Array = NDArray[np.float64]
 
@@ -134,7 +135,7 @@ def test_paper_image_is_dotbots_but_for_the_cosine(
     channel: int, expected: tuple[float, float]
 ) -> None:
     counts = np.array([49341.0, 85887.0])
-    x, y = angles.paper_image_points(counts, channel)
+    x, y = paper_image_points(counts, channel)
     assert x == pytest.approx(expected[0], abs=1e-12)
     # Theirs has no 1/cos(theta), theta being half a turn where the planes look ahead.
     theta = 2 * np.pi * counts.mean() / period_counts(channel)
@@ -147,6 +148,6 @@ def test_paper_image_is_the_ray_of_ideal_planes(world: Any) -> None:
     for channel in (1, 16):
         lamp = world.Lamp(channel, np.zeros(3), np.eye(3), ideal)
         counts = lamp.counts(lamp.angles(POINTS))
-        image = angles.paper_image_points(counts, channel)
+        image = paper_image_points(counts, channel)
         expected = np.c_[-POINTS[:, 1], POINTS[:, 2]] / POINTS[:, :1]
         np.testing.assert_allclose(image, expected, atol=1e-9)

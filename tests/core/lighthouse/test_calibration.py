@@ -240,9 +240,9 @@ def test_units_are_those_of_libsurvives_file(recordings: Path, world: Any) -> No
 
 
 def test_what_a_calibration_says_of_itself(world: Any) -> None:
-    assert not cal.IDEAL_CALIBRATION.bends
+    assert not cal.IDEAL_CALIBRATION.is_distorted
     assert cal.IDEAL_CALIBRATION.source == "none"
-    assert GENERIC_CALIBRATION.bends
+    assert GENERIC_CALIBRATION.is_distorted
     factory = calibration_of(world.planes_of(FACTORY_UNITS[0]))
     np.testing.assert_allclose(
         factory.tilts, [np.pi / 6 + FACTORY_UNITS[0, 1], -np.pi / 6 + FACTORY_UNITS[0, 2]]

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse.light_planes import paper_image_points
 from locatk.core.lighthouse.published import scene as paper
+from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
 
