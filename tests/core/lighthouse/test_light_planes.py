@@ -115,7 +115,7 @@ def test_channels_may_differ_row_by_row() -> None:
 
 
 def test_rays_are_those_of_crazyflie() -> None:
-    # lighthouse_calibration.c, idealToDistortedV2: y and z at x = 1 of ideal light_planes.
+    # lighthouse_calibration.c, idealToDistortedV2: y and z at x = 1 of ideal angles.
     rng = np.random.default_rng(0)
     pairs = rng.uniform(-0.8, 0.8, (50, 1)) + rng.uniform(-0.4, 0.4, (50, 2))
     a1, a2 = pairs.T
