@@ -264,10 +264,13 @@ def test_distorted_means_a_wave_or_a_curve(name: str) -> None:
     assert bool(difference > 1e-6) is calibration.is_distorted
 
 
-@pytest.mark.parametrize("name", ["curve", "gibmag", "ogeemag"])
-def test_every_distortion_is_corrected(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("phase", 0.005), ("tilt", 0.05), ("curve", 0.3), ("gibmag", 0.005), ("ogeemag", 0.3)],
+)
+def test_every_parameter_is_corrected(name: str, value: float) -> None:
     sweeps = np.zeros((2, 7))
-    sweeps[:, cal.PARAMETERS.index(name)] = 0.3 if name != "gibmag" else 0.005
+    sweeps[:, cal.PARAMETERS.index(name)] = value
     calibration = cal.Calibration(sweeps, "estimated")
     points = field_points(50)
     corrected = cal.ideal_angles(cal.predict_angles(points, calibration), calibration)

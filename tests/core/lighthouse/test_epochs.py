@@ -324,6 +324,10 @@ def test_three_sweeps_with_one_time_stamp_are_ambiguous() -> None:
     counts = (10_000.0, 50_000.0, 90_000.0)
     crowd = group_epochs(make_sweeps(*((0, c) for c in counts)))
     assert crowd.rejected == {"plane_unknown": 3}
+    # A possible pair of the last two is as ambiguous, and so are two possible pairs.
+    for counts_of_crowd in ((10_000.0, 11_000.0, 51_000.0), (1e3, 2.5e4, 5e4, 7.5e4)):
+        ambiguous = group_epochs(make_sweeps(*((0, c) for c in counts_of_crowd)))
+        assert ambiguous.rejected == {"plane_unknown": len(counts_of_crowd)}
     # Reported planes resolve it.
     planes = (0, 1, -1)
     known = group_epochs(make_sweeps(*((0, c, 1, p) for c, p in zip(counts, planes, strict=True))))
@@ -351,6 +355,11 @@ def test_an_epoch_ends_after_its_longest_duration(end_ns: int, number: int) -> N
 def test_an_epoch_ends_with_a_silence(silence_ns: int, number: int) -> None:
     epochs = group_epochs(make_sweeps((0, 4e4, 1, 0), (silence_ns, 4e4, 2, 0)))
     assert len(epochs) == number
+
+
+def test_an_epoch_is_of_one_photodiode() -> None:
+    epochs = group_epochs(make_sweeps((0, 4e4, 1, 0, 0), (1 * MS, 4e4, 2, 0, 1)))
+    np.testing.assert_array_equal(epochs.device, [0, 1])
 
 
 def test_an_epoch_ends_when_a_plane_occurs_again() -> None:
@@ -398,8 +407,9 @@ def test_the_neighbours_of_a_spike_agree(after: float, spikes: int) -> None:
     assert group_epochs(spike_sweeps(5.0, after=after)).rejected.get("spike", 0) == spikes
 
 
-def test_a_step_that_one_neighbour_confirms_is_no_spike() -> None:
-    assert group_epochs(spike_sweeps(3.0, after=1.5)).rejected == {}
+@pytest.mark.parametrize(("degrees", "after"), [(3.0, 1.5), (1.5, -1.0)])
+def test_a_step_that_one_neighbour_confirms_is_no_spike(degrees: float, after: float) -> None:
+    assert group_epochs(spike_sweeps(degrees, after=after)).rejected == {}
 
 
 @pytest.mark.parametrize(("step_ms", "spikes"), [(499.0, 1), (500.0, 0)])
