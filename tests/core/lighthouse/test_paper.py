@@ -90,6 +90,16 @@ def test_equations_6_to_10_decompose_the_homography(world: Any) -> None:
     assert min(np.abs(ours - turn).max() for turn in turns) < 1e-4
 
 
+def test_a_plane_behind_the_second_camera_is_not_selected() -> None:
+    image = np.tile([[[0.0, -0.5]]], (5, 2, 1))
+    # Both planes are below the cameras, the first one more so, but behind the second camera.
+    behind = (np.array([0.0, -1.0, 0.0]), np.eye(3), np.array([0.0, 0.0, 5.0]))
+    ahead = (np.array([0.0, -0.8, 0.6]), np.eye(3), np.zeros(3))
+    for candidates in ([behind, ahead], [ahead, behind]):
+        normal, _, _ = paper._select_candidate(candidates, image, 1.0)
+        np.testing.assert_array_equal(normal, ahead[0])
+
+
 def test_missing_points_have_no_position(world: Any) -> None:
     lamps = ideal(world, 1, 5)
     image = image_of(lamps, world.curve(30, flat=False))

@@ -15,11 +15,15 @@ from locatk.core.geometry import heading_of
 from locatk.core.lighthouse.calibration import (
     FACTORY_UNITS,
     GENERIC_CALIBRATION,
+    IDEAL_CALIBRATION,
     Calibration,
     predict_angles,
 )
 from locatk.core.lighthouse.channels import channel_of, period_counts, period_ticks
+from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
+from locatk.core.lighthouse.scene import Station
+from locatk.core.lighthouse.simulation.optics import SimulatedStation
 from locatk.core.lighthouse.simulation.session import (
     FLOOR_MARKERS_M,
     RAISED_MARKERS_M,
@@ -296,6 +300,45 @@ def test_the_whole_floor_is_in_the_beams() -> None:
             assert np.count_nonzero(others) / 2 > 0.99 * reports
 
 
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "received"),
+    [(74, 0, True), (76, 0, False), (-74, 0, True), (-76, 0, False), (0, 49, True),
+     (0, 51, False), (0, -49, True), (0, -51, False)],
+)  # fmt: skip
+def test_light_is_received_inside_the_beam(
+    azimuth: float, elevation: float, received: bool
+) -> None:
+    a, e = np.radians([azimuth, elevation])
+    point = 2 * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    station = SimulatedStation(
+        Station(1, np.zeros(3), np.eye(3), IDEAL_CALIBRATION), 0.0, 0.02, np.zeros(1, np.int64)
+    )
+    _, count = station.observe(
+        np.zeros(1), lambda time: np.broadcast_to(point, (*time.shape, 3)), np.zeros((1, 2))
+    )
+    assert np.isfinite(count).all() == received
+    assert np.isfinite(count).any() == received
+
+
+def test_photodiodes_receive_only_stations_that_they_face() -> None:
+    normal = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    receiver = Receiver(np.array([[0.05, 0.02, 0.0], [-0.05, 0.0, 0.01]]), normal)
+    session = simulate(replace(NOISELESS, receiver=receiver, robots=2, stations=3))
+    s, truth = session.sweeps, session.truth[1]
+    rows = np.flatnonzero(s.device == 1)
+    assert set(s.sensor[rows]) == {0, 1}
+    nearest = np.searchsorted(truth.time_ns, s.time_ns[rows]).clip(max=len(truth) - 1)
+    heading = heading_of(truth.quaternion[nearest])
+    direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * normal[s.sensor[rows], :1]
+    station = np.stack([x.position for x in session.true_scene.stations])[s.channel[rows] - 1]
+    towards = (station - truth.position[nearest])[:, :2]
+    facing = np.sum(direction * towards, axis=-1)
+    # The photodiodes are up to 5 cm from the robot's position.
+    assert facing.min() > -0.06
+    # Every station is faced by one of the two.
+    assert len(rows) > 0.95 * 2 * 3 * 10 * 30
+
+
 def test_stations_are_mounted_realistically_and_have_real_calibrations() -> None:
     for seed in range(10):
         session = simulate(SimulationOptions(stations=11, duration_s=1.0, seed=seed))
@@ -433,6 +476,16 @@ def test_outliers_jump_are_reflected_and_are_swapped() -> None:
     total = np.count_nonzero(faulty.is_outlier)
     for kind in (jumps, swaps, reflections):
         assert kind == pytest.approx(total / 3, abs=6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exchanged_stations_exchange_their_labels_once(seed: int) -> None:
+    # A sweep that were exchanged with two others would change the number of each station.
+    options = SimulationOptions(robots=3, stations=6, seed=seed)
+    clean, faulty = simulate(options).sweeps, simulate(replace(options, outliers=0.9)).sweeps
+    assert np.count_nonzero(clean.channel != faulty.channel) > 100
+    np.testing.assert_array_equal(np.bincount(clean.channel), np.bincount(faulty.channel))
+    np.testing.assert_array_equal(np.bincount(clean.polynomial), np.bincount(faulty.polynomial))
 
 
 def _is_reflection(session: SimulatedSession, k: int) -> bool:
