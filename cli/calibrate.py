@@ -60,7 +60,7 @@ def scene(
       locatk calibrate scene run.mcap -o scene.toml --scene two-3d
       locatk solve later.mcap -o solved.mcap --artifact scene.toml
     """
-    from locatk.cli.solve import entry, notes, text
+    from locatk.cli.solve_text import entry, notes, text
     from locatk.cli.systems import Request, solve_session
     from locatk.formats import artifacts
 

@@ -24,7 +24,7 @@ Maker = Callable[[Path, int, bool], "tuple[Trajectory, ...]"]
 
 
 def lighthouse(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+    from locatk.core.lighthouse.simulation import SimulationOptions, simulate
     from locatk.formats import observations
 
     simulated = simulate(

@@ -119,15 +119,15 @@ def lighthouse(
     """
     import math
 
-    from locatk.core.lighthouse.simulation import session as simulate
+    from locatk.core.lighthouse import simulation
     from locatk.formats import observations
 
     carried = None if receiver is None else _receiver(receiver)
     aside = () if receiver in (None, DECK) else (Path(str(receiver)),)
     options.guard_output(output, overwrite=overwrite, inputs=aside)
     with console.working("Simulating"):
-        simulated = simulate.simulate(
-            simulate.SimulationOptions(
+        simulated = simulation.simulate(
+            simulation.SimulationOptions(
                 robots=robots,
                 stations=stations,
                 planar=planar,

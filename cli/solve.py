@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, options, seen
-
-if TYPE_CHECKING:
-    from locatk.cli.systems import Solved
+from locatk.cli import console, options
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 
@@ -170,58 +165,3 @@ def check_scene(sessions: Sequence[str]) -> None:
     system = places.facts_of(sessions[0]).get("system")
     if system in ("dots", "landmarks", "polaris"):
         raise click.UsageError(f"--save-scene is for lighthouse: {system} solves no scene.")
-
-
-def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, Any]:
-    """One session of ``--json`` (ARCHITECTURE 4; docs/commands.md)."""
-    solution = solved.solution
-    return {
-        "session": session,
-        "system": solution.system,
-        "method": solution.method,
-        "output": output,
-        "poses": solution.poses,
-        "rejected": solution.rejected,
-        "solve_s": solved.solve_s,
-        "detections": solution.detections,
-        **({"facts": solution.facts} if solution.system == "landmarks" else {}),
-    }
-
-
-def text(session: str | Path, output: str | Path, solved: Solved) -> str:
-    """The same for people: a line, a table of devices, and what was rejected."""
-    solution = solved.solution
-    # A scene that nothing measured has no metres.
-    unit = "1e-3" if getattr(solution.artifact, "scale", None) == "unit" else "mm"
-    sigmas = [f"sigma {axis} [{unit}]" for axis in "xyz"]
-    header = ("device", "poses", *sigmas, "sigma heading [deg]")
-    rows = [(t.device, len(t), *_spread(t.sigma)) for t in solution.trajectories]
-    rejected = ", ".join(
-        f"{count} {reason.replace('_', ' ')}" for reason, count in solution.rejected.items()
-    )
-    saw = seen.seen(solution)
-    took = "solved before" if math.isnan(solved.solve_s) else f"{solved.solve_s:.3g} s"
-    return "\n".join(
-        [
-            f"{session} -> {output}: {solution.poses} poses, {solution.system} by "
-            f"{solution.method}, {took}",
-            *([saw] if saw else []),
-            *([console.table(header, rows)] if rows else []),
-            f"rejected: {rejected or 'nothing'}",
-        ]
-    )
-
-
-def notes(session: str | Path, solved: Solved) -> list[str]:
-    """What must be known to use the poses; said with ``--json`` too, on stderr."""
-    return [f"{Path(session).name}: {note}" for note in solved.solution.notes]
-
-
-def _spread(sigma: Any) -> list[str]:
-    """Median standard deviations: x, y, z in mm and heading in degrees, `-` where unknown."""
-    import numpy as np
-
-    in_units = sigma[:, [0, 1, 2, 5]] * [1e3, 1e3, 1e3, 180 / np.pi]
-    known = [column[np.isfinite(column)] for column in in_units.T]
-    # Of lighthouse these are millimetres, of dots a thousandth of that.
-    return [f"{np.median(column):#.3g}" if len(column) else "-" for column in known]

@@ -155,17 +155,17 @@ def _solved(job: Job, stack: contextlib.ExitStack, names: dict[str, str]) -> dic
 
 
 def _told(job: Job, solved: Any) -> dict[str, Any]:
-    from locatk.cli import seen, solve
+    from locatk.cli import seen, solve_text
 
-    entry = solve.entry(job.session, job.output, solved)
+    entry = solve_text.entry(job.session, job.output, solved)
     if not job.detections:
         del entry["detections"]
     if job.resume:
         entry["resumed"] = math.isnan(solved.solve_s)
     return {
         "entry": console.plain(entry),
-        "text": solve.text(job.session, job.output, solved),
-        "notes": solve.notes(job.session, solved),
+        "text": solve_text.text(job.session, job.output, solved),
+        "notes": solve_text.notes(job.session, solved),
         "losses": [f"{job.session}: {loss}" for loss in seen.lost(solved.solution)],
     }
 

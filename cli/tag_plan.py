@@ -97,7 +97,7 @@ def _head(plan: Plan) -> str:
 
 def _limits(plan: Plan) -> list[tuple[str, str, str, str]]:
     """Name, value, limit and where the limit is from."""
-    from locatk.core.polaris.advice import EARTH_T, FEWEST_SAMPLES, WEAKEST
+    from locatk.core.polaris.planning import EARTH_T, FEWEST_SAMPLES, WEAKEST
 
     tags, use = plan.tags, plan.use
     noise = ", ".join(f"{value * 1e6:.3g}" for value in plan.noise_t)

@@ -1,31 +1,37 @@
-"""The house: arrows run one way, and every room is in the package."""
+"""Structure of the package: layers, import cycles, dependencies of core, installed packages."""
 
 from __future__ import annotations
 
 import ast
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 LAYERS = ("cli", "core", "formats")
-ALLOWED = {
+ALLOWED_IMPORTS = {
     "core": {"core"},
     "formats": {"core", "formats"},
     "cli": {"core", "formats", "cli"},
 }
-NOT_IN_CORE = {"click", "mcap", "google", "serial", "reportlab", "matplotlib", "time", "datetime"}
-"""No terminal, no files, no clock."""
+FORBIDDEN_IN_CORE = {
+    "click", "mcap", "google", "serial", "reportlab", "matplotlib", "time", "datetime",
+}  # fmt: skip
+"""Core is pure computation: no terminal, no files, no clock."""
 
 
-def modules(root: Path, layer: str) -> list[Path]:
+def find_modules(root: Path, layer: str) -> list[Path]:
+    """Return the Python files of a layer, except generated ones."""
     return [p for p in sorted((root / layer).rglob("*.py")) if not p.name.endswith("_pb2.py")]
 
 
-def imported(nodes: Iterator[ast.AST]) -> set[str]:
-    """Dotted names that the import statements among ``nodes`` name."""
+def imported_names(nodes: Iterable[ast.AST]) -> set[str]:
+    """Return the dotted names in the import statements among ``nodes``.
+
+    ``from a import b`` gives ``a.b``, which is a module or a name in the module ``a``.
+    """
     names = set()
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -36,32 +42,141 @@ def imported(nodes: Iterator[ast.AST]) -> set[str]:
     return names
 
 
-def at_top(node: ast.AST) -> Iterator[ast.AST]:
-    """What runs when a module is imported; not what is under TYPE_CHECKING."""
+def walk_import_time(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes that run when a module is imported: no functions, no TYPE_CHECKING."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
             continue
         if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         yield child
-        yield from at_top(child)
+        yield from walk_import_time(child)
+
+
+# ---- import cycles
+
+
+def import_graph(root: Path, layers: Iterable[str] = LAYERS) -> dict[str, set[str]]:
+    """Return the modules that each module imports, by their names below ``locatk``.
+
+    All imports count: at the top, inside functions, and under TYPE_CHECKING. A package is the
+    module of its ``__init__.py``; importing one of its modules does not count as importing it.
+    """
+    paths = {}
+    for layer in layers:
+        for path in find_modules(root, layer):
+            parts = path.relative_to(root).with_suffix("").parts
+            paths[".".join(part for part in parts if part != "__init__")] = path
+    graph = {}
+    for module, path in paths.items():
+        imports = set()
+        for name in imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+            name = name.removeprefix("locatk.")
+            # A name that is not a module is defined in the module before its last dot.
+            imports.add(name if name in paths else name.rpartition(".")[0])
+        graph[module] = imports & paths.keys()
+    return graph
+
+
+def find_cycle(graph: dict[str, set[str]]) -> list[str] | None:
+    """Return the modules along an import cycle, the first one repeated, or None."""
+    done: set[str] = set()
+    for start in sorted(graph):
+        # Depth-first search with the iterators of the modules on the current path.
+        path, pending = [start], [iter(sorted(graph[start]))]
+        while path:
+            module = next(pending[-1], None)
+            if module is None:
+                done.add(path.pop())
+                pending.pop()
+            elif module in path:
+                return [*path[path.index(module) :], module]
+            elif module not in done:
+                path.append(module)
+                pending.append(iter(sorted(graph[module])))
+    return None
+
+
+def write_package(root: Path, **sources: str) -> Path:
+    """Write modules of a package ``core.tiny``."""
+    folder = root / "core" / "tiny"
+    folder.mkdir(parents=True)
+    (root / "core" / "__init__.py").write_text("")
+    (folder / "__init__.py").write_text("")
+    for name, source in sources.items():
+        (folder / f"{name}.py").write_text(source)
+    return root
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "from locatk.core.tiny.first import value\n",
+        "from locatk.core.tiny import first\n",
+        "import locatk.core.tiny.first\n",
+        "def later():\n    from locatk.core.tiny.first import value\n    return value\n",
+        "from typing import TYPE_CHECKING\n"
+        "if TYPE_CHECKING:\n    from locatk.core.tiny.first import value\n",
+    ],
+    ids=["top", "module", "plain", "function", "type-checking"],
+)
+def test_import_cycles_of_every_kind_are_found(tmp_path: Path, back: str) -> None:
+    root = write_package(
+        tmp_path,
+        first="from locatk.core.tiny import second\nvalue = 1\n",
+        second="from locatk.core.tiny import third\n",
+        third=back,
+        other="from locatk.core.tiny import first\n",
+    )
+    cycle = find_cycle(import_graph(root, ["core"]))
+    assert cycle == [f"core.tiny.{name}" for name in ("first", "second", "third", "first")]
+
+
+def test_a_package_and_its_module_can_form_a_cycle(tmp_path: Path) -> None:
+    root = write_package(tmp_path, first="from locatk.core.tiny import value\n")
+    (root / "core/tiny/__init__.py").write_text("from locatk.core.tiny.first import value\n")
+    assert find_cycle(import_graph(root, ["core"])) == [
+        "core.tiny", "core.tiny.first", "core.tiny",
+    ]  # fmt: skip
+
+
+def test_a_diamond_is_not_a_cycle(tmp_path: Path) -> None:
+    root = write_package(
+        tmp_path,
+        first="from locatk.core.tiny import second, third\n",
+        second="from locatk.core.tiny import fourth\nimport numpy\n",
+        third="def later():\n    from locatk.core.tiny.fourth import value\n    return value\n",
+        fourth="value = 1\n",
+    )
+    assert find_cycle(import_graph(root, ["core"])) is None
+
+
+def test_no_import_cycles(root: Path) -> None:
+    graph = import_graph(root)
+    # There are hundreds of modules: an empty graph would have no cycle either.
+    assert sum(map(len, graph.values())) > 1000
+    cycle = find_cycle(graph)
+    assert cycle is None, "import cycle: " + " -> ".join(cycle or [])
+
+
+# ---- layers
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_arrows_run_one_way(root: Path, layer: str) -> None:
-    found = modules(root, layer)
-    assert found
-    for path in found:
-        for name in imported(ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+def test_layers_import_only_layers_below(root: Path, layer: str) -> None:
+    paths = find_modules(root, layer)
+    assert paths
+    for path in paths:
+        for name in imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
             if name.startswith("locatk."):
-                assert name.split(".")[1] in ALLOWED[layer], f"{path} imports {name}"
+                assert name.split(".")[1] in ALLOWED_IMPORTS[layer], f"{path} imports {name}"
 
 
-def test_core_is_pure(root: Path) -> None:
-    for path in modules(root, "core"):
+def test_core_is_pure_computation(root: Path) -> None:
+    for path in find_modules(root, "core"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        tops = {name.split(".")[0] for name in imported(ast.walk(tree))}
-        assert not tops & NOT_IN_CORE, f"{path} imports {tops & NOT_IN_CORE}"
+        packages = {name.split(".")[0] for name in imported_names(ast.walk(tree))}
+        assert not packages & FORBIDDEN_IN_CORE, f"{path} imports {packages & FORBIDDEN_IN_CORE}"
         calls = {
             node.func.id
             for node in ast.walk(tree)
@@ -70,34 +185,28 @@ def test_core_is_pure(root: Path) -> None:
         assert not calls & {"open", "print", "input"}, path
 
 
-def test_commands_import_little_at_the_top(root: Path) -> None:
-    bare = {"locatk.core.errors", "locatk.core.units"}  # they take the standard library alone
-    light = {"click", "locatk.cli", *bare} | set(sys.stdlib_module_names)
-    for item in bare:
-        path = root / item.removeprefix("locatk.").replace(".", "/")
+def test_commands_import_little_at_import_time(root: Path) -> None:
+    """Commands start fast: numpy and the like are imported inside their functions."""
+    light_modules = {"locatk.core.errors", "locatk.core.units"}
+    light = {"click", "locatk.cli", *light_modules} | set(sys.stdlib_module_names)
+    for module in light_modules:
+        path = root / module.removeprefix("locatk.").replace(".", "/")
         tree = ast.parse(path.with_suffix(".py").read_text(encoding="utf-8"))
-        tops = {name.split(".")[0] for name in imported(at_top(tree))}
-        assert tops <= set(sys.stdlib_module_names), item
-    for path in modules(root, "cli"):
-        for name in imported(at_top(ast.parse(path.read_text(encoding="utf-8")))):
-            known = name.split(".")[0] in light or any(
-                name == item or name.startswith(item + ".") for item in light
+        packages = {name.split(".")[0] for name in imported_names(walk_import_time(tree))}
+        assert packages <= set(sys.stdlib_module_names), module
+    for path in find_modules(root, "cli"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for name in imported_names(walk_import_time(tree)):
+            is_light = name.split(".")[0] in light or any(
+                name == module or name.startswith(module + ".") for module in light
             )
-            assert known, f"{path} imports {name} at its top"
+            assert is_light, f"{path} imports {name} at its top"
 
 
 def test_every_package_is_installed(root: Path) -> None:
     settings = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
-    listed = set(settings["tool"]["setuptools"]["packages"])
+    installed = set(settings["tool"]["setuptools"]["packages"])
     folders = {path.parent for layer in LAYERS for path in (root / layer).rglob("*.py")}
-    there = {"locatk." + ".".join(folder.relative_to(root).parts) for folder in folders}
-    assert listed == there
+    assert installed == {"locatk." + ".".join(f.relative_to(root).parts) for f in folders}
     for folder in folders:
         assert (folder / "__init__.py").exists(), f"{folder} has no __init__.py"
-
-
-def test_modules_stay_small(root: Path) -> None:
-    for layer in LAYERS:
-        for path in modules(root, layer):
-            lines = len(path.read_text(encoding="utf-8").splitlines())
-            assert lines <= 400, f"{path} has {lines} lines"

@@ -1,9 +1,40 @@
-"""How a real base station bends its two light planes.
+"""Calibration of base stations: how the light planes of a real unit differ from ideal ones.
 
-Factory calibration has seven numbers a sweep. The forward model is libsurvive's
-(``survive_reproject_gen2.c``, MIT), written in the axes used here: x forward, y left,
-z up. It predicts the angle that is observed for a point; it is not a correction of
-angles, so that correcting needs its inverse (:func:`ideal_angles`).
+A station broadcasts seven factory parameters for each of its two sweeps (OOTX frame). The
+manufacturer has not published their meaning; libsurvive's authors found it. This module holds
+them (:class:`Calibration`), predicts the rotor angle at which a calibrated plane
+crosses a point (:func:`predict_angles`, the forward model), corrects measured angles to those
+of ideal planes (:func:`ideal_angles`, its inverse), and describes units whose factory data are
+unknown (:data:`GENERIC_CALIBRATION`, the prior).
+
+The forward model is libsurvive's (cntools/libsurvive, ``src/survive_reproject_gen2.c``, MIT),
+in the axes of :mod:`~locatk.core.lighthouse.light_planes`: x forward, y left, z up. It predicts
+the measured angle of a given point; it is not a correction of measured angles (libsurvive issue
+215). With tilt ``t = nominal + factory tilt`` of a plane and a point at
+
+    azimuth  = atan2(y, x)
+    slope    = z / hypot(x, y)                        tangent of the elevation
+
+an ideal plane tilted by ``t`` has the rotor angle ``azimuth - offset`` when it crosses the point:
+
+    sin(offset) = tan(t) slope                                                      (1)
+
+A real plane is curved. Its curvature is a constant ("curve") and a wave of one period per
+rotation ("ogee"); it acts through a polynomial L, common to all units, of the angle ``beta``
+from the plane's horizontal direction to the point, measured in the plane:
+
+    curvature   = curve + ogeemag cos(azimuth - offset + ogeephase)                 (2)
+    sin(beta)   = sin(elevation) / cos(t)                                           (3)
+    sin(curved offset) = tan(t) slope
+                         + L(beta) curvature / (cos(t) - L'(beta) curvature sin(t)) (4)
+
+Another wave of one period per rotation ("gib") and a constant angle ("phase") remain:
+
+    crossing = azimuth - curved offset                                              (5)
+    measured = crossing + gibmag cos(crossing + gibphase) - phase                   (6)
+
+libsurvive measures azimuths from an axis a quarter of a revolution away, so that its sines are
+cosines here.
 """
 
 from __future__ import annotations
@@ -14,20 +45,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse.light_planes import PLANE_TILT, rays
+from locatk.core.lighthouse.light_planes import PLANE_TILT_RAD, rays
 
 Array = NDArray[np.float64]
 
 PARAMETERS = ("phase", "tilt", "curve", "gibmag", "gibphase", "ogeemag", "ogeephase")
-"""A sweep's seven parameters in the order of the arrays below, as the station sends
-them; angles in radians."""
+"""Names of the seven parameters of a sweep, in the order of the columns of
+:attr:`Calibration.sweeps`. Phase, tilt and the phases of the waves are in radians, the
+magnitude of gib in radians, those of curve and ogee without unit."""
 
 PHASE, TILT, CURVE, GIBMAG, GIBPHASE, OGEEMAG, OGEEPHASE = range(7)
 
 MODELS = ("libsurvive", "crazyflie")
 
-LENS_SERIES = np.array([0.0, 0.0, 0.0076069798, 5.3685255e-06, 0.0028679863, -8.0108022e-06])
-"""Coefficients of the lens polynomial, constant term first (libsurvive)."""
+LENS_POLYNOMIAL = np.array([0.0, 0.0, 0.0076069798, 5.3685255e-06, 0.0028679863, -8.0108022e-06])
+"""Coefficients of L in Eq. 4, constant term first (survive_reproject_gen2.c)."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +69,13 @@ class Calibration:
     Attributes
     ----------
     sweeps : (2, 7) ndarray
-        One row a sweep, columns as in :data:`PARAMETERS`.
+        One row per sweep, columns as in :data:`PARAMETERS`.
     source : str
         ``"factory"``, ``"generic"``, ``"estimated"`` or ``"none"``.
     model : str
-        One of :data:`MODELS`: libsurvive's full model, or what Crazyflie firmware makes of
-        the same numbers (``lighthouse_calibration.c``), which leaves curve and ogee out and
-        takes the gib wave at the azimuth of the point.
+        Forward model, one of :data:`MODELS`: libsurvive's, or that of the Crazyflie firmware
+        (``lighthouse_calibration.c``) for the same parameters. The firmware ignores curve and
+        ogee, and takes the gib wave at the azimuth of the point instead of Eq. 5.
     """
 
     sweeps: Array
@@ -52,21 +84,21 @@ class Calibration:
 
     @property
     def tilts(self) -> Array:
-        """(2,) tilt of each plane in radians, nominal plus factory tilt."""
-        return PLANE_TILT + self.sweeps[:, TILT]
+        """Tilts (2,) of the planes in radians, nominal plus factory tilt."""
+        return PLANE_TILT_RAD + self.sweeps[:, TILT]
 
     @property
-    def bends(self) -> bool:
-        """Whether more than tilt and phase is known."""
+    def is_distorted(self) -> bool:
+        """True if a parameter other than phase and tilt has an effect."""
         return bool(np.any(self.sweeps[:, [CURVE, GIBMAG, OGEEMAG]]))
 
 
 IDEAL_CALIBRATION = Calibration(np.zeros((2, 7)), "none")
-"""Planes exactly 30 degrees off and nothing else, as the paper takes them."""
+"""Planes with the nominal tilt and no distortion, as the paper assumes them."""
 
 
 def predict_angles(points: Array, calibration: Calibration) -> Array:
-    """Rotor angles at which both planes of a station meet points.
+    """Predict the rotor angles at which both planes of a station cross points.
 
     Parameters
     ----------
@@ -77,184 +109,219 @@ def predict_angles(points: Array, calibration: Calibration) -> Array:
     Returns
     -------
     (..., 2) ndarray
-        Radians; ``nan`` for points that no plane reaches (above or below the cone of
-        the sweep).
+        Radians; ``nan`` for points that no plane crosses (steeper than the planes).
     """
     x, y, z = (points[..., None, i] for i in range(3))
-    return _Sweep(np.arctan2(y, x), z / np.hypot(x, y), calibration).angles
+    return _ForwardModel(np.arctan2(y, x), z / np.hypot(x, y), calibration).angles
 
 
 def predict_with_gradient(points: Array, calibration: Calibration) -> tuple[Array, Array, Array]:
-    """Rotor angles with their derivatives.
+    """Predict rotor angles and their derivatives.
 
-    Parameters as for :func:`predict_angles`.
+    Parameters
+    ----------
+    points, calibration
+        See :func:`predict_angles`.
 
     Returns
     -------
     angles : (..., 2) ndarray
+        Radians.
     by_point : (..., 2, 3) ndarray
-        Derivative of each angle by (x, y, z), in radians a unit of length.
+        Derivative of each angle by (x, y, z), in radians per unit of length.
     by_tilt : (..., 2) ndarray
-        Derivative by the sweep's tilt. (By its phase it is -1.)
+        Derivative of each angle by the tilt of its plane. (The derivative by phase is -1.)
     """
     x, y, z = (points[..., None, i] for i in range(3))
     r = np.hypot(x, y)
     slope = z / r
-    sweep = _Sweep(np.arctan2(y, x), slope, calibration)
-    by_azimuth, by_slope, by_tilt = sweep.gradient()
-    across, along = by_azimuth / r, by_slope / r
+    model = _ForwardModel(np.arctan2(y, x), slope, calibration)
+    by_azimuth, by_slope, by_tilt = model.gradient()
+    # d azimuth = (-y, x, 0) / r^2 and d slope = (-slope x, -slope y, r) / r^2.
+    tangential, radial = by_azimuth / r, by_slope / r
     by_point = np.stack(
         [
-            (-across * y - along * slope * x) / r,
-            (across * x - along * slope * y) / r,
-            along,
+            (-tangential * y - radial * slope * x) / r,
+            (tangential * x - radial * slope * y) / r,
+            radial,
         ],
         axis=-1,
     )
-    return sweep.angles, by_point, by_tilt
+    return model.angles, by_point, by_tilt
 
 
-class _Sweep:
-    """The forward model for directions, given as azimuth and slope z / hypot(x, y).
+class _ForwardModel:
+    """Eq. 1 to 6 of the module for directions, evaluated once for angles and derivatives.
 
-    Attributes are the steps of the model, so that the gradient can follow them:
-    ``lead`` is how far a tilted plane runs ahead of a point, ``bent_lead`` the same of
-    the curved plane, ``angles`` what the receiver sees.
+    All arrays are (..., 2), one value per plane.
+
+    Attributes
+    ----------
+    sin_offset, offset
+        Eq. 1: azimuth of the point relative to the direction of an ideal tilted plane.
+    curvature, ogee_angle, plane_angle, lens, lens_slope, denominator
+        Terms of Eq. 2 to 4: the curvature, the argument of its cosine, ``beta``, L(beta),
+        L'(beta) and the denominator of Eq. 4. Set only if the model is curved.
+    sin_curved_offset
+        Eq. 4; Eq. 1 if the plane is not curved.
+    gib_angle
+        Argument of the cosine of Eq. 6.
+    angles
+        Rotor angles in radians (Eq. 6).
     """
 
     def __init__(self, azimuth: Array, slope: Array, calibration: Calibration) -> None:
-        p = calibration.sweeps
-        tilt = calibration.tilts
-        self.parameters, self.slope = p, slope
-        self.tan, self.cos, self.sin = np.tan(tilt), np.cos(tilt), np.sin(tilt)
-        self.gib_at_azimuth = calibration.model == "crazyflie"
-        self.curved = not self.gib_at_azimuth and bool(np.any(p[:, [CURVE, OGEEMAG]]))
+        self.parameters, self.slope = calibration.sweeps, slope
+        parameters, tilt = calibration.sweeps, calibration.tilts
+        self.tan_tilt, self.cos_tilt, self.sin_tilt = np.tan(tilt), np.cos(tilt), np.sin(tilt)
+        self.is_crazyflie = calibration.model == "crazyflie"
+        has_curvature = bool(np.any(parameters[:, [CURVE, OGEEMAG]]))
+        self.is_curved = has_curvature and not self.is_crazyflie
         with np.errstate(invalid="ignore"):
-            self.lift = self.tan * slope
-            self.lead = np.arcsin(self.lift)
-            self.bent, self.bent_lead = self.lift, self.lead
-            if self.curved:
+            self.sin_offset = self.tan_tilt * slope
+            self.offset = np.arcsin(self.sin_offset)
+            self.sin_curved_offset, curved_offset = self.sin_offset, self.offset
+            if self.is_curved:
                 self._curve(azimuth)
-                self.bent_lead = np.arcsin(self.bent)
-        seen = azimuth - self.bent_lead
-        self.wave = (azimuth if self.gib_at_azimuth else seen) + p[:, GIBPHASE]
-        self.angles = seen + p[:, GIBMAG] * np.cos(self.wave) - p[:, PHASE]
+                curved_offset = np.arcsin(self.sin_curved_offset)
+        crossing = azimuth - curved_offset
+        self.gib_angle = (azimuth if self.is_crazyflie else crossing) + parameters[:, GIBPHASE]
+        gib = parameters[:, GIBMAG] * np.cos(self.gib_angle)
+        self.angles = crossing + gib - parameters[:, PHASE]
 
     def _curve(self, azimuth: Array) -> None:
-        p = self.parameters
-        self.ogee = azimuth - self.lead + p[:, OGEEPHASE]
-        self.bend = p[:, CURVE] + p[:, OGEEMAG] * np.cos(self.ogee)
-        self.elevation_sin = self.slope / np.sqrt(1.0 + self.slope**2)
-        self.off = np.arcsin(self.elevation_sin / self.cos)
-        self.lens, self.d_lens = _LENS(self.off), _D_LENS(self.off)
-        self.depth = self.cos - self.d_lens * self.bend * self.sin
-        self.bent = self.lift + self.lens * self.bend / self.depth
+        """Evaluate Eq. 2 to 4."""
+        parameters = self.parameters
+        self.ogee_angle = azimuth - self.offset + parameters[:, OGEEPHASE]
+        self.curvature = parameters[:, CURVE] + parameters[:, OGEEMAG] * np.cos(self.ogee_angle)
+        self.sin_elevation = self.slope / np.sqrt(1.0 + self.slope**2)
+        self.plane_angle = np.arcsin(self.sin_elevation / self.cos_tilt)
+        self.lens, self.lens_slope = _LENS(self.plane_angle), _LENS_SLOPE(self.plane_angle)
+        self.denominator = self.cos_tilt - self.lens_slope * self.curvature * self.sin_tilt
+        self.sin_curved_offset = self.sin_offset + self.lens * self.curvature / self.denominator
 
     def gradient(self) -> tuple[Array, Array, Array]:
-        """Derivatives of the angles by azimuth, slope and tilt."""
-        p = self.parameters
+        """Return the derivatives of the angles by azimuth, slope and tilt, each (..., 2)."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            d_asin = 1.0 / np.sqrt(1.0 - self.lift**2)
-            d_tan = 1.0 / self.cos**2
-            if self.curved:
-                parts = self._curved_gradient(d_asin, d_tan)
+            # Derivatives of the offset by its sine, and of the tangent by the tilt.
+            d_offset = 1.0 / np.sqrt(1.0 - self.sin_offset**2)
+            d_tan_tilt = 1.0 / self.cos_tilt**2
+            if self.is_curved:
+                crossing = self._curved_gradient(d_offset, d_tan_tilt)
             else:
-                parts = (
-                    np.ones_like(self.lead),
-                    -self.tan * d_asin,
-                    -self.slope * d_tan * d_asin,
+                crossing = (
+                    np.ones_like(self.offset),
+                    -self.tan_tilt * d_offset,
+                    -self.slope * d_tan_tilt * d_offset,
                 )
-        wobble = p[:, GIBMAG] * np.sin(self.wave)
-        if self.gib_at_azimuth:
-            return parts[0] - wobble, parts[1], parts[2]
-        return parts[0] * (1.0 - wobble), parts[1] * (1.0 - wobble), parts[2] * (1.0 - wobble)
+        d_gib = self.parameters[:, GIBMAG] * np.sin(self.gib_angle)
+        by_azimuth, by_slope, by_tilt = crossing
+        if self.is_crazyflie:
+            return by_azimuth - d_gib, by_slope, by_tilt
+        return by_azimuth * (1.0 - d_gib), by_slope * (1.0 - d_gib), by_tilt * (1.0 - d_gib)
 
-    def _curved_gradient(self, d_asin: Array, d_tan: Array) -> tuple[Array, Array, Array]:
-        dd_lens = _DD_LENS(self.off)
-        d_off = 1.0 / np.sqrt(1.0 - (self.elevation_sin / self.cos) ** 2)
-        d_bent_asin = 1.0 / np.sqrt(1.0 - self.bent**2)
-        bend_by_seen = -self.parameters[:, OGEEMAG] * np.sin(self.ogee)
+    def _curved_gradient(self, d_offset: Array, d_tan_tilt: Array) -> tuple[Array, Array, Array]:
+        """Return the derivatives of the crossing (Eq. 5) of curved planes."""
+        lens_curvature = _LENS_CURVATURE(self.plane_angle)
+        d_plane_angle = 1.0 / np.sqrt(1.0 - (self.sin_elevation / self.cos_tilt) ** 2)
+        d_curved_offset = 1.0 / np.sqrt(1.0 - self.sin_curved_offset**2)
+        d_ogee = -self.parameters[:, OGEEMAG] * np.sin(self.ogee_angle)
 
-        def derivative(d_azimuth: float, d_lift: Array, d_sine: Array, d_tilt: float) -> Array:
-            """Of (azimuth - bent_lead), for given changes of what it is made from."""
-            d_bend = bend_by_seen * (d_azimuth - d_lift * d_asin)
-            change = d_off * d_sine
-            d_depth = (
-                -self.sin * d_tilt
-                - dd_lens * change * self.bend * self.sin
-                - self.d_lens * d_bend * self.sin
-                - self.d_lens * self.bend * self.cos * d_tilt
+        def derivative(
+            azimuth_rate: float,
+            sin_offset_rate: Array,
+            sin_plane_angle_rate: Array,
+            tilt_rate: float,
+        ) -> Array:
+            """Apply the chain rule to Eq. 2 to 5, for given rates of the inner terms."""
+            curvature_rate = d_ogee * (azimuth_rate - sin_offset_rate * d_offset)
+            plane_angle_rate = d_plane_angle * sin_plane_angle_rate
+            denominator_rate = (
+                -self.sin_tilt * tilt_rate
+                - lens_curvature * plane_angle_rate * self.curvature * self.sin_tilt
+                - self.lens_slope * curvature_rate * self.sin_tilt
+                - self.lens_slope * self.curvature * self.cos_tilt * tilt_rate
             )
-            d_bent = (
-                d_lift
-                + (self.d_lens * change * self.bend + self.lens * d_bend) / self.depth
-                - self.lens * self.bend / self.depth**2 * d_depth
+            numerator_rate = (
+                self.lens_slope * plane_angle_rate * self.curvature + self.lens * curvature_rate
             )
-            return d_azimuth - d_bent * d_bent_asin
+            sin_curved_offset_rate = (
+                sin_offset_rate
+                + numerator_rate / self.denominator
+                - self.lens * self.curvature / self.denominator**2 * denominator_rate
+            )
+            return azimuth_rate - sin_curved_offset_rate * d_curved_offset
 
-        zero = np.zeros_like(self.lift)
-        flat = np.sqrt(1.0 + self.slope**2)
+        zero = np.zeros_like(self.sin_offset)
+        secant = np.sqrt(1.0 + self.slope**2)
         return (
             derivative(1.0, zero, zero, 0.0),
-            derivative(0.0, self.tan + zero, 1.0 / (flat**3 * self.cos), 0.0),
-            derivative(0.0, self.slope * d_tan, self.elevation_sin * self.sin / self.cos**2, 1.0),
+            derivative(0.0, self.tan_tilt + zero, 1.0 / (secant**3 * self.cos_tilt), 0.0),
+            derivative(
+                0.0,
+                self.slope * d_tan_tilt,
+                self.sin_elevation * self.sin_tilt / self.cos_tilt**2,
+                1.0,
+            ),
         )
 
 
-def _horner(coefficients: Array) -> Callable[[Array], Array]:
+def _polynomial(coefficients: Array) -> Callable[[Array], Array]:
+    """Return a function that evaluates a polynomial by Horner's scheme, in place."""
+
     def evaluate(x: Array) -> Array:
-        total = np.full_like(x, coefficients[-1])
-        for c in coefficients[-2::-1]:
-            total *= x
-            total += c
-        return total
+        value = np.full_like(x, coefficients[-1])
+        for coefficient in coefficients[-2::-1]:
+            value *= x
+            value += coefficient
+        return value
 
     return evaluate
 
 
 def _derivative(coefficients: Array) -> Array:
+    """Return the coefficients of the derivative, constant term first."""
     return coefficients[1:] * np.arange(1, len(coefficients))
 
 
-_LENS = _horner(LENS_SERIES)
-_D_LENS = _horner(_derivative(LENS_SERIES))
-_DD_LENS = _horner(_derivative(_derivative(LENS_SERIES)))
+_LENS = _polynomial(LENS_POLYNOMIAL)
+_LENS_SLOPE = _polynomial(_derivative(LENS_POLYNOMIAL))
+_LENS_CURVATURE = _polynomial(_derivative(_derivative(LENS_POLYNOMIAL)))
 
 
 def ideal_angles(angles: Array, calibration: Calibration, iterations: int = 3) -> Array:
-    """Observed rotor angles of a pair, corrected to plain tilted planes.
+    """Correct the measured rotor angles of pairs to those of ideal tilted planes.
 
     Parameters
     ----------
     angles : (..., 2) ndarray
-        As observed, in radians.
+        Measured angles in radians. Both of a pair are needed; ``nan`` makes both ``nan``.
     calibration : Calibration
     iterations : int
-        Fixed-point steps; each shrinks the error by the slope of the bending, about a
-        hundred times, so that three leave less than 1e-7 rad.
+        Fixed-point steps. Each multiplies the error by the derivative of the distortion, about
+        0.01, so that three steps leave less than 1e-7 rad.
 
     Returns
     -------
     (..., 2) ndarray
-        Angles of planes with :attr:`Calibration.tilts` and nothing else, for
-        :func:`~locatk.core.lighthouse.light_planes.plane_normals`.
+        Rotor angles of planes with :attr:`Calibration.tilts` and no distortion through the same
+        point, for :func:`~locatk.core.lighthouse.light_planes.plane_normals` and
+        :func:`~locatk.core.lighthouse.light_planes.rays`.
     """
     ideal = angles + calibration.sweeps[:, PHASE]
-    if not calibration.bends:
+    if not calibration.is_distorted:
         return ideal
     for _ in range(iterations):
         direction = rays(ideal, calibration.tilts)
         y, z = direction[..., 1:2], direction[..., 2:3]
-        bent = _Sweep(np.arctan(y), z / np.hypot(1.0, y), calibration).angles
-        # The plain planes meet this direction at the very angles it was made from.
-        ideal = angles - (bent - ideal)
+        predicted = _ForwardModel(np.arctan(y), z / np.hypot(1.0, y), calibration).angles
+        # Ideal planes at `ideal` meet in this ray, so that the difference is the distortion.
+        ideal = angles - (predicted - ideal)
     return ideal
 
 
-# ---- calibration of unknown units
+# ---- prior over units
 
-# One row a unit: phase of sweep 2 (that of sweep 1 is zero in all), then for both sweeps
-# tilt, curve, gibmag, gibphase, ogeemag, ogeephase.
 FACTORY_UNITS = np.array(
     [
         # 1083618720
@@ -275,7 +342,7 @@ FACTORY_UNITS = np.array(
         # 3671943459
         (-0.007420, -0.047119, 0.045990, 0.154785, 0.326416, -0.004402, -0.003576,
          2.369141, 2.714844, -0.176636, -0.218994, 0.476562, 0.965332),
-        # three units of one recording without serial numbers
+        # Three units of one recording, without serial numbers.
         (-0.005741, -0.046600, 0.043671, 0.012390, 0.341309, 0.002470, 0.002228,
          1.010742, 2.107422, -0.417969, -0.391602, 1.328125, 1.465820),
         (-0.005077, -0.051788, 0.048309, 0.045410, 0.244629, -0.006950, -0.005329,
@@ -290,10 +357,16 @@ FACTORY_UNITS = np.array(
          1.968750, 2.410156, 0.248657, 0.330811, 2.167969, 3.070312),
     ]
 )  # fmt: skip
+"""(11, 13) factory parameters of real base stations, one row per unit.
+
+Columns: phase of sweep 2 (that of sweep 1 is zero in every unit), then for both sweeps tilt,
+curve, gibmag, gibphase, ogeemag and ogeephase. Comments are the serial numbers. The first nine
+units are those of the recordings in jdavidberger/libsurvive-extras-data (MIT), the last two
+were published by Bitcraze."""
 
 
-def _mean(units: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 7) mean calibration; a magnitude and its phase are averaged as a phasor."""
+def _mean(units: Array) -> Array:
+    """Return the mean calibration (2, 7); waves are averaged as phasors."""
     sweeps = np.zeros((2, 7))
     sweeps[1, PHASE] = units[:, 0].mean()
     sweeps[:, TILT] = units[:, 1:3].mean(axis=0)
@@ -305,21 +378,22 @@ def _mean(units: NDArray[np.float64]) -> NDArray[np.float64]:
     return sweeps
 
 
-def _spread(units: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 2) standard deviation of (phase, tilt) over units."""
-    spread = np.zeros((2, 2))
-    spread[1, 0] = units[:, 0].std(ddof=1)
-    spread[:, 1] = units[:, 1:3].std(axis=0, ddof=1)
-    return spread
+def _phase_tilt_sigma(units: Array) -> Array:
+    """Return the standard deviation (2, 2) over units: a row per sweep, columns phase, tilt."""
+    sigma = np.zeros((2, 2))
+    sigma[1, 0] = units[:, 0].std(ddof=1)
+    sigma[:, 1] = units[:, 1:3].std(axis=0, ddof=1)
+    return sigma
 
 
 GENERIC_CALIBRATION = Calibration(_mean(FACTORY_UNITS), "generic")
-"""Mean of the published factory calibrations."""
+"""Mean of :data:`FACTORY_UNITS`, for stations whose factory data are unknown."""
 
-PHASE_TILT_SIGMA_RAD = _spread(FACTORY_UNITS)
-"""(2, 2) spread of phase and tilt of each sweep over units, in radians; the phase of
-sweep 1 is zero by definition."""
+PHASE_TILT_SIGMA_RAD = _phase_tilt_sigma(FACTORY_UNITS)
+"""(2, 2) standard deviation of phase and tilt of each sweep over :data:`FACTORY_UNITS`, in
+radians; the phase of sweep 1 is zero by definition."""
 
 MODEL_SIGMA_RAD = 1e-3
-"""What a generic calibration leaves unmodelled, in radians: the spread of gibmag over units
-is 3 mrad, of which most is a constant that a station's pose absorbs."""
+"""Standard deviation of what a generic calibration leaves unmodelled, in radians, when phase and
+tilt are estimated. gibmag varies over :data:`FACTORY_UNITS` by 3 mrad, but most of that is a
+constant that the station's pose absorbs."""

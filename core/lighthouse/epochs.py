@@ -1,8 +1,13 @@
-"""Sweeps that belong together: one moment, one photodiode, all stations.
+"""Grouping of sweeps into epochs: one time, one photodiode, all stations.
 
-A moment (an epoch) collects the sweeps of a photodiode within one rotation. Which plane a
-sweep was is told by its counts where the source does not say: the second plane always
-follows the first by about a third of a turn, so that the smaller count is the first.
+An epoch holds at most one sweep of each light plane of each station, received within about one
+rotation. Stations are not synchronised, so that the sweeps of an epoch are up to a rotation
+apart; counts of a moving photodiode are therefore interpolated to the mean time of the epoch.
+
+Sources that report the plane of a sweep (``Sweeps.sweep``) are believed. Otherwise two
+consecutive sweeps of a station are recognised as the first and second plane of one rotation by
+their times and by their counts, which differ by about a third of a rotation. A sweep without
+such a partner is rejected (``plane_unknown``).
 """
 
 from __future__ import annotations
@@ -16,45 +21,61 @@ from locatk.core.lighthouse.channels import CHANNELS, period_counts
 from locatk.core.lighthouse.light_planes import counts_to_angles
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 
-PAIR_NS = 10_500_000
-"""The second plane of a rotation follows the first within this time; the first of the next
-rotation comes later than that after the second. (Half a rotation, and a little.)"""
+MAX_PAIR_DELAY_NS = 10_500_000
+"""Longest time from the first to the second plane of one rotation [ns]: half of the slowest
+rotation (19.98 ms on channel 1) and a margin. At the height of the station it is a third of a
+rotation, and the first plane of the next rotation follows after two thirds."""
 
 MIN_PLANE_DELAY_TURNS = 0.125
 MAX_PLANE_DELAY_TURNS = 0.55
-"""By how much of a turn the second plane can follow the first: a third, less or more by
-what the elevation of the photodiode makes of two planes that are tilted apart."""
+"""Difference of the counts of both planes of one rotation [rotations]. It is 1/3 at the height of
+the station. Elevation changes it because the planes are tilted by 60 degrees to each other: the
+limits correspond to 47 degrees below and above the station, by Eq. 1 of
+:mod:`~locatk.core.lighthouse.calibration`."""
 
-WINDOW_NS = 30_000_000
-"""Longest epoch: a report holds the last pair of each station, up to a rotation apart."""
+MAX_EPOCH_NS = 30_000_000
+"""Longest time from the start of an epoch to its last pair [ns]. A device reports the last pair of
+each station, and these are up to one rotation (20 ms) apart."""
 
-QUIET_NS = 20_000_000
-"""A longer silence than a rotation ends an epoch: the report of a device is over."""
+MAX_SILENCE_NS = 20_000_000
+"""Longest time between two pairs of an epoch [ns], the slowest rotation rounded up. A longer
+silence means that the report of the device is complete."""
 
-SPIKE = np.deg2rad(2.0)
-"""Demodulation errors move an angle by more than this for one step (paper IV.A)."""
+MAX_RATE_INTERVAL_S = 0.5
+"""Longest time between two counts of a plane from which its rate of change is estimated [s]. Over
+longer times the motion of a robot is not linear."""
+
+SPIKE_RAD = np.deg2rad(2.0)
+"""Smallest change of a rotor angle for a single epoch that is a demodulation error [rad]: such
+errors exceed 2 degrees (paper IV.A)."""
+
+MAX_SPIKE_INTERVAL_NS = 1_000_000_000
+"""Longest time from the sweep before to the sweep after a spike [ns]. Over longer times a robot
+can move by as much, so that its neighbours do not contradict a sweep."""
 
 
 @dataclass(frozen=True)
 class Epochs:
-    """Counts by moment and station.
+    """Counts by epoch and station.
 
     Attributes
     ----------
     devices : tuple of str
-        Names to which ``device`` points: of devices, or ``device/sensor`` where a device
-        has several photodiodes.
+        Names that ``device`` indexes: of devices, or ``device/sensor`` for devices with several
+        photodiodes.
     time_ns : (m,) int64 ndarray
+        Mean time of the sweeps of each epoch.
     device : (m,) int ndarray
+        Index of ``devices``.
     channels : (s,) int ndarray
-        Of the stations, ascending.
+        Channels of the stations, ascending.
     counts : (m, s, 2) ndarray
-        LFSR indices of both sweeps; ``nan`` where not seen.
+        LFSR indices of both sweeps; ``nan`` for sweeps that were not received or rejected.
     labelled : bool
-        Whether polynomials say which station sent a sweep; otherwise a report may have
-        mixed them up.
+        True if every sweep has a polynomial, which identifies its station. Otherwise a report
+        may have mixed stations up.
     rejected : dict of str to int
-        Reason to number of sweeps left out.
+        Number of rejected sweeps by reason.
     """
 
     devices: tuple[str, ...]
@@ -68,247 +89,306 @@ class Epochs:
     def __len__(self) -> int:
         return len(self.time_ns)
 
-    def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Epochs:
-        """The chosen moments only."""
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Epochs:
+        """Return the epochs of ``rows``, a mask or indices."""
         return replace(
             self,
-            time_ns=self.time_ns[chosen],
-            device=self.device[chosen],
-            counts=self.counts[chosen],
+            time_ns=self.time_ns[rows],
+            device=self.device[rows],
+            counts=self.counts[rows],
         )
 
 
 def group_epochs(sweeps: Sweeps) -> Epochs:
-    """Collect sweeps into epochs.
+    """Group sweeps into epochs.
 
-    Sweeps of one epoch that were received at different times are moved to its middle
-    along the line through their neighbours in time, so that a moving robot is seen by
-    all stations at one moment.
+    Parameters
+    ----------
+    sweeps : Sweeps
+        In any order.
+
+    Returns
+    -------
+    Epochs
+        Sorted by photodiode, then by time. Every sweep of ``sweeps`` is either in ``counts`` or
+        counted in ``rejected``, as ``unknown_channel``, ``count_above_period``,
+        ``repeated_in_rotation``, ``plane_unknown`` or ``spike``.
+
+    Notes
+    -----
+    Counts are interpolated linearly to the time of their epoch, so that all stations observe a
+    moving robot at one time.
     """
     rejected: dict[str, int] = {}
-    usable = _usable(sweeps, rejected)
-    key, names = _photodiodes(sweeps)
-    order = usable[
+    valid = _select_valid(sweeps, rejected)
+    photodiode, names = _photodiodes(sweeps)
+    order = valid[
         np.lexsort(
-            (sweeps.count[usable], sweeps.time_ns[usable], sweeps.channel[usable], key[usable])
+            (
+                sweeps.count[valid],
+                sweeps.time_ns[valid],
+                sweeps.channel[valid],
+                photodiode[valid],
+            )
         )
     ]
-    key, time, channel = key[order], sweeps.time_ns[order], sweeps.channel[order]
-    count, stated = sweeps.count[order], sweeps.sweep[order]
-    fresh = _not_repeated(key, channel, time, count, stated)
-    _note(rejected, "repeated_in_rotation", np.count_nonzero(~fresh))
-    key, time, channel = key[fresh], time[fresh], channel[fresh]
-    count, stated = count[fresh], stated[fresh]
-    pair, plane = _pair(key, channel, time, count, stated)
-    _note(rejected, "plane_unknown", np.count_nonzero(plane == UNKNOWN))
+    photodiode, time_ns, channel = photodiode[order], sweeps.time_ns[order], sweeps.channel[order]
+    count, reported_plane = sweeps.count[order], sweeps.sweep[order]
+    unique = _differs_from_previous(photodiode, channel, time_ns, count, reported_plane)
+    _add_rejected(rejected, "repeated_in_rotation", np.count_nonzero(~unique))
+    photodiode, time_ns, channel = photodiode[unique], time_ns[unique], channel[unique]
+    count, reported_plane = count[unique], reported_plane[unique]
+    pair, plane = _pair_planes(photodiode, channel, time_ns, count, reported_plane)
+    _add_rejected(rejected, "plane_unknown", np.count_nonzero(plane == UNKNOWN))
 
     channels = np.unique(channel)
-    column = np.searchsorted(channels, channel)
-    epoch = _cut(key, time, column, plane, pair)
-    slot = (epoch * len(channels) + column) * 2 + plane
-    kept = plane != UNKNOWN
-    _, first = np.unique(np.where(kept, slot, -1), return_index=True)
-    first = first[kept[first]]
-    _note(rejected, "repeated_in_rotation", np.count_nonzero(kept) - len(first))
+    station = np.searchsorted(channels, channel)
+    epoch = _split_epochs(photodiode, time_ns, station, plane, pair)
+    # Flat index into `counts`; if a plane occurs twice in an epoch, its first sweep is used.
+    slot = (epoch * len(channels) + station) * 2 + plane
+    has_plane = plane != UNKNOWN
+    _, used = np.unique(np.where(has_plane, slot, -1), return_index=True)
+    used = used[has_plane[used]]
+    _add_rejected(rejected, "repeated_in_rotation", np.count_nonzero(has_plane) - len(used))
 
     m = int(epoch.max()) + 1 if len(epoch) else 0
     shape = (m, len(channels), 2)
     counts = np.full(shape, np.nan)
-    counts.ravel()[slot[first]] = count[first]
-    epoch_key = np.zeros(m, np.int64)
-    epoch_key[epoch] = key
-    base, middle, offset = _middle_times(epoch, time, m)
-    if np.any(offset):
-        lag = np.full(shape, np.nan)
-        lag.ravel()[slot[first]] = offset[first]
-        _move_to_middle(counts, lag, middle, epoch_key)
+    counts.ravel()[slot[used]] = count[used]
+    epoch_photodiode = np.zeros(m, np.int64)
+    epoch_photodiode[epoch] = photodiode
+    start_ns, mean_ns, offset_s = _mean_times(epoch, time_ns, m)
+    if np.any(offset_s):
+        offsets_s = np.full(shape, np.nan)
+        offsets_s.ravel()[slot[used]] = offset_s[used]
+        _interpolate_to_mean_time(counts, offsets_s, mean_ns, epoch_photodiode)
     epochs = Epochs(
         tuple(names),
-        base + middle,
-        epoch_key,
+        start_ns + mean_ns,
+        epoch_photodiode,
         channels.astype(np.int64),
         counts,
         bool(np.all(sweeps.polynomial[order] != UNKNOWN)) and len(order) > 0,
         rejected,
     )
-    _drop_spikes(epochs)
+    _reject_spikes(epochs)
     return epochs
 
 
-def _usable(sweeps: Sweeps, rejected: dict[str, int]) -> NDArray[np.int64]:
-    """Indices of sweeps with a known channel and a count that a rotation can hold."""
-    known = np.isin(sweeps.channel, CHANNELS)
-    _note(rejected, "unknown_channel", np.count_nonzero(~known))
-    period = period_counts(np.where(known, sweeps.channel, 1))
-    with np.errstate(invalid="ignore"):
-        inside = (sweeps.count >= 0) & (sweeps.count < period)
-    _note(rejected, "count_above_period", np.count_nonzero(known & ~inside))
-    return np.flatnonzero(known & inside)
-
-
-def _photodiodes(sweeps: Sweeps) -> tuple[NDArray[np.int64], list[str]]:
-    """A number for each photodiode, and the names behind the numbers."""
-    if not np.any(sweeps.sensor):
-        return sweeps.device.astype(np.int64), list(sweeps.devices)
-    sensors = int(sweeps.sensor.max()) + 1
-    present, key = np.unique(
-        sweeps.device.astype(np.int64) * sensors + sweeps.sensor, return_inverse=True
-    )
-    return key, [f"{sweeps.devices[k // sensors]}/{k % sensors}" for k in present]
-
-
-def _not_repeated(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:
-    """Which of the sorted sweeps differ in any column from the one before."""
-    changed = np.zeros(max(len(columns[0]) - 1, 0), bool)
-    for column in columns:
-        changed |= column[1:] != column[:-1]
-    return np.r_[True, changed][: len(columns[0])]
-
-
-def _pair(
-    key: NDArray[np.int64],
-    channel: NDArray[np.int32],
-    time: NDArray[np.int64],
-    count: NDArray[np.float64],
-    stated: NDArray[np.int32],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair number and plane (0, 1, or -1 where nobody can tell) of each sweep.
-
-    Sweeps are sorted by photodiode, station, time and count, so that a pair is a sweep and
-    the next one.
-    """
-    n = len(time)
-    if n == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    same = (np.diff(key) == 0) & (np.diff(channel) == 0)
-    close = same & (np.diff(time) <= PAIR_NS)
-    told = stated != UNKNOWN
-    turn = np.diff(count) / period_counts(channel[1:])
-    apart = (turn > MIN_PLANE_DELAY_TURNS) & (turn < MAX_PLANE_DELAY_TURNS)
-    in_order = np.where(
-        told[:-1] & told[1:], stated[:-1] < stated[1:], ~(told[:-1] | told[1:]) & apart
-    )
-    linked = np.r_[close & in_order, False]
-    # In a chain of links every other one is a pair.
-    head = np.r_[True, ~linked[:-1]]
-    place = np.arange(n) - np.flatnonzero(head)[np.cumsum(head) - 1]
-    starts = linked & (place % 2 == 0)
-    follows = np.r_[False, starts[:-1]]
-    plane = np.where(told, stated, np.where(starts, 0, np.where(follows, 1, UNKNOWN)))
-    # Three sweeps under one stamp: any two could be the pair.
-    crowd = np.r_[False, same[:-1] & same[1:] & (time[2:] == time[:-2]), False] if n > 2 else None
-    if crowd is not None and np.any(crowd):
-        crowd[:-1] |= crowd[1:]
-        crowd[1:] |= crowd[:-1]
-        plane = np.where(crowd & ~told, UNKNOWN, plane)
-    return np.cumsum(~follows) - 1, plane.astype(np.int64)
-
-
-def _cut(
-    key: NDArray[np.int64],
-    time: NDArray[np.int64],
-    column: NDArray[np.int64],
-    plane: NDArray[np.int64],
-    pair: NDArray[np.int64],
-) -> NDArray[np.int64]:
-    """Epoch number of each sweep; a pair is never cut in two.
-
-    An epoch ends with a silence, when it grows too long, or when a plane comes again.
-    """
-    if not len(time):
-        return np.zeros(0, np.int64)
-    first = np.flatnonzero(np.r_[True, np.diff(pair) != 0])
-    base = time.min()
-    since = (time - base).astype(np.float64)
-    middle = np.add.reduceat(since, first) / np.diff(np.r_[first, len(time)])
-    bits = np.where(plane == UNKNOWN, 0, np.left_shift(1, np.maximum(column * 2 + plane, 0)))
-    mask = np.bitwise_or.reduceat(bits, first)
-    order = np.lexsort((middle, key[first]))
-    middle, mask, owner = middle[order], mask[order], key[first][order]
-    fresh = np.r_[True, (np.diff(middle) > QUIET_NS) | (np.diff(owner) != 0)]
-    number = np.empty(len(order), np.int64)
-    epoch, seen, begun = -1, 0, 0.0
-    # Where an epoch ends depends on where it began: this one loop cannot be vectorised.
-    labels = []
-    for new, at, planes in zip(fresh.tolist(), middle.tolist(), mask.tolist(), strict=True):
-        if new or seen & planes or at - begun > WINDOW_NS:
-            epoch, seen, begun = epoch + 1, 0, at
-        seen |= planes
-        labels.append(epoch)
-    number[order] = labels
-    return number[pair]
-
-
-def _middle_times(
-    epoch: NDArray[np.int64], time: NDArray[np.int64], m: int
-) -> tuple[np.int64, NDArray[np.int64], NDArray[np.float64]]:
-    """A base time, each epoch's mean time since then in ns, and how many seconds each
-    sweep is away from that mean."""
-    if not m:
-        return np.int64(0), np.zeros(0, np.int64), np.zeros(0)
-    base = time.min()
-    since = (time - base).astype(np.float64)
-    total = np.bincount(epoch, since, m)
-    middle = np.rint(total / np.bincount(epoch, minlength=m)).astype(np.int64)
-    return base, middle, (since - middle[epoch]) * 1e-9
-
-
-def _move_to_middle(
-    counts: NDArray[np.float64],
-    lag: NDArray[np.float64],
-    middle: NDArray[np.int64],
-    key: NDArray[np.int64],
-) -> None:
-    """Shift counts along their own rate of change to the middle of their epoch."""
-    seconds = middle * 1e-9
-    for column in np.ndindex(counts.shape[1:]):
-        seen = np.flatnonzero(np.isfinite(counts[(slice(None), *column)]))
-        if len(seen) < 2:
-            continue
-        value = counts[(seen, *column)]
-        when = seconds[seen] + lag[(seen, *column)]
-        # At the ends of a device's path the one neighbour there is must do.
-        here = np.arange(len(seen))
-        turns = np.diff(key[seen]) != 0
-        before = np.where(np.r_[True, turns], here, here - 1)
-        after = np.where(np.r_[turns, True], here, here + 1)
-        span = when[after] - when[before]
-        near = (span > 0) & (span < 0.5)
-        rate = np.where(near, (value[after] - value[before]) / np.where(near, span, 1.0), 0.0)
-        counts[(seen, *column)] = value - rate * lag[(seen, *column)]
-
-
-def _drop_spikes(epochs: Epochs) -> None:
-    """Remove single angles that leave a smooth run by more than :data:`SPIKE`."""
-    limit = SPIKE / (2 * np.pi) * period_counts(epochs.channels)
-    dropped = 0
-    for station, plane in np.ndindex(epochs.counts.shape[1:]):
-        seen = np.flatnonzero(np.isfinite(epochs.counts[:, station, plane]))
-        value = epochs.counts[seen, station, plane]
-        before, here, after = value[:-2], value[1:-1], value[2:]
-        same = (epochs.device[seen[2:]] == epochs.device[seen[:-2]]) & (
-            epochs.time_ns[seen[2:]] - epochs.time_ns[seen[:-2]] < 1_000_000_000
-        )
-        step = limit[station]
-        spike = (
-            same
-            & (np.abs(here - before) > step)
-            & (np.abs(here - after) > step)
-            & (np.abs(after - before) < step)
-        )
-        epochs.counts[seen[1:-1][spike], station, plane] = np.nan
-        dropped += int(np.count_nonzero(spike))
-    _note(epochs.rejected, "spike", dropped)
-
-
-def _note(rejected: dict[str, int], reason: str, number: int | np.signedinteger) -> None:
-    if number:
-        rejected[reason] = rejected.get(reason, 0) + int(number)
-
-
-def angles_of(epochs: Epochs) -> NDArray[np.float64]:
-    """Rotor angles (m, s, 2) of epochs, in radians."""
+def rotor_angles(epochs: Epochs) -> NDArray[np.float64]:
+    """Return the rotor angles (m, s, 2) of epochs in radians."""
     angles = np.empty_like(epochs.counts)
     for i, channel in enumerate(epochs.channels):
         angles[:, i] = counts_to_angles(epochs.counts[:, i], int(channel))
     return angles
+
+
+def _select_valid(sweeps: Sweeps, rejected: dict[str, int]) -> NDArray[np.int64]:
+    """Return the indices of sweeps with a known channel and a count within one rotation."""
+    is_known = np.isin(sweeps.channel, CHANNELS)
+    _add_rejected(rejected, "unknown_channel", np.count_nonzero(~is_known))
+    period = period_counts(np.where(is_known, sweeps.channel, 1))
+    with np.errstate(invalid="ignore"):
+        is_in_rotation = (sweeps.count >= 0) & (sweeps.count < period)
+    _add_rejected(rejected, "count_above_period", np.count_nonzero(is_known & ~is_in_rotation))
+    return np.flatnonzero(is_known & is_in_rotation)
+
+
+def _photodiodes(sweeps: Sweeps) -> tuple[NDArray[np.int64], list[str]]:
+    """Return the photodiode of each sweep as an index, and the names of the photodiodes."""
+    if not np.any(sweeps.sensor):
+        return sweeps.device.astype(np.int64), list(sweeps.devices)
+    sensors = int(sweeps.sensor.max()) + 1
+    codes, photodiode = np.unique(
+        sweeps.device.astype(np.int64) * sensors + sweeps.sensor, return_inverse=True
+    )
+    return photodiode, [f"{sweeps.devices[k // sensors]}/{k % sensors}" for k in codes]
+
+
+def _differs_from_previous(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Return a mask of the rows that differ from the row before in any of the sorted columns."""
+    differs = np.zeros(max(len(columns[0]) - 1, 0), bool)
+    for column in columns:
+        differs |= column[1:] != column[:-1]
+    return np.r_[True, differs][: len(columns[0])]
+
+
+def _pair_planes(
+    photodiode: NDArray[np.int64],
+    channel: NDArray[np.int32],
+    time_ns: NDArray[np.int64],
+    count: NDArray[np.float64],
+    reported_plane: NDArray[np.int32],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find the sweeps of both planes of one rotation, and the plane of each sweep.
+
+    Parameters
+    ----------
+    photodiode, channel, time_ns, count, reported_plane : (n,) ndarray
+        Sorted by photodiode, channel, time and count, so that a pair is two neighbours.
+        ``reported_plane`` is 0, 1 or ``UNKNOWN``.
+
+    Returns
+    -------
+    pair : (n,) ndarray
+        Number of the pair, ascending; a single sweep has a number of its own.
+    plane : (n,) ndarray
+        0, 1 or ``UNKNOWN``.
+    """
+    n = len(time_ns)
+    if n == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    # Arrays of length n - 1 are about a sweep and the next one.
+    same_source = (np.diff(photodiode) == 0) & (np.diff(channel) == 0)
+    is_close = same_source & (np.diff(time_ns) <= MAX_PAIR_DELAY_NS)
+    reported = reported_plane != UNKNOWN
+    delay_turns = np.diff(count) / period_counts(channel[1:])
+    delay_fits = (delay_turns > MIN_PLANE_DELAY_TURNS) & (delay_turns < MAX_PLANE_DELAY_TURNS)
+    is_in_order = np.where(
+        reported[:-1] & reported[1:],
+        reported_plane[:-1] < reported_plane[1:],
+        ~(reported[:-1] | reported[1:]) & delay_fits,
+    )
+    links_next = np.r_[is_close & is_in_order, False]
+    # Links can form a chain; every other sweep of a chain, from its first, starts a pair.
+    starts_chain = np.r_[True, ~links_next[:-1]]
+    chain_index = np.arange(n) - np.flatnonzero(starts_chain)[np.cumsum(starts_chain) - 1]
+    starts_pair = links_next & (chain_index % 2 == 0)
+    ends_pair = np.r_[False, starts_pair[:-1]]
+    paired_plane = np.where(starts_pair, 0, np.where(ends_pair, 1, UNKNOWN))
+    plane = np.where(reported, reported_plane, paired_plane)
+    if n > 2:
+        # Of three or more sweeps with one time stamp any two could be the pair.
+        is_crowded = np.r_[
+            False, same_source[:-1] & same_source[1:] & (time_ns[2:] == time_ns[:-2]), False
+        ]
+        is_crowded[:-1] |= is_crowded[1:]
+        is_crowded[1:] |= is_crowded[:-1]
+        plane = np.where(is_crowded & ~reported, UNKNOWN, plane)
+    return np.cumsum(~ends_pair) - 1, plane.astype(np.int64)
+
+
+def _split_epochs(
+    photodiode: NDArray[np.int64],
+    time_ns: NDArray[np.int64],
+    station: NDArray[np.int64],
+    plane: NDArray[np.int64],
+    pair: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Return the epoch number (n,) of each sweep; a pair is never split.
+
+    A new epoch begins after a silence of :data:`MAX_SILENCE_NS`, after :data:`MAX_EPOCH_NS`, or
+    when a plane of a station occurs again.
+    """
+    if not len(time_ns):
+        return np.zeros(0, np.int64)
+    pair_start = np.flatnonzero(np.r_[True, np.diff(pair) != 0])
+    elapsed_ns = (time_ns - time_ns.min()).astype(np.float64)
+    pair_sizes = np.diff(np.r_[pair_start, len(time_ns)])
+    pair_ns = np.add.reduceat(elapsed_ns, pair_start) / pair_sizes
+    # One bit for each plane of each station.
+    plane_bit = np.left_shift(1, np.maximum(station * 2 + plane, 0))
+    pair_planes = np.bitwise_or.reduceat(np.where(plane == UNKNOWN, 0, plane_bit), pair_start)
+    order = np.lexsort((pair_ns, photodiode[pair_start]))
+    pair_ns, pair_planes = pair_ns[order], pair_planes[order]
+    pair_photodiode = photodiode[pair_start][order]
+    after_silence = np.r_[
+        True, (np.diff(pair_ns) > MAX_SILENCE_NS) | (np.diff(pair_photodiode) != 0)
+    ]
+    # The end of an epoch depends on its beginning, which cannot be vectorised.
+    labels = []
+    epoch, epoch_planes, epoch_start_ns = -1, 0, 0.0
+    for is_new, now_ns, planes in zip(
+        after_silence.tolist(), pair_ns.tolist(), pair_planes.tolist(), strict=True
+    ):
+        if is_new or epoch_planes & planes or now_ns - epoch_start_ns > MAX_EPOCH_NS:
+            epoch, epoch_planes, epoch_start_ns = epoch + 1, 0, now_ns
+        epoch_planes |= planes
+        labels.append(epoch)
+    pair_epoch = np.empty(len(order), np.int64)
+    pair_epoch[order] = labels
+    return pair_epoch[pair]
+
+
+def _mean_times(
+    epoch: NDArray[np.int64], time_ns: NDArray[np.int64], m: int
+) -> tuple[np.int64, NDArray[np.int64], NDArray[np.float64]]:
+    """Return the mean times of epochs, and the times of sweeps relative to them.
+
+    Returns
+    -------
+    start_ns : int
+        Time of the first sweep of all.
+    mean_ns : (m,) int64 ndarray
+        Mean time of each epoch since ``start_ns``.
+    offset_s : (n,) ndarray
+        Time of each sweep after the mean of its epoch, in seconds.
+    """
+    if not m:
+        return np.int64(0), np.zeros(0, np.int64), np.zeros(0)
+    start_ns = time_ns.min()
+    elapsed_ns = (time_ns - start_ns).astype(np.float64)
+    total_ns = np.bincount(epoch, elapsed_ns, m)
+    mean_ns = np.rint(total_ns / np.bincount(epoch, minlength=m)).astype(np.int64)
+    return start_ns, mean_ns, (elapsed_ns - mean_ns[epoch]) * 1e-9
+
+
+def _interpolate_to_mean_time(
+    counts: NDArray[np.float64],
+    offsets_s: NDArray[np.float64],
+    mean_ns: NDArray[np.int64],
+    photodiode: NDArray[np.int64],
+) -> None:
+    """Interpolate ``counts`` (m, s, 2) in place to the mean times of their epochs.
+
+    The rate of change of a count is that between the neighbouring epochs of the same photodiode
+    (between one neighbour and itself at the ends), zero if these are not within
+    :data:`MAX_RATE_INTERVAL_S`.
+    """
+    mean_s = mean_ns * 1e-9
+    for station, plane in np.ndindex(counts.shape[1:]):
+        rows = np.flatnonzero(np.isfinite(counts[:, station, plane]))
+        if len(rows) < 2:
+            continue
+        count, offset_s = counts[rows, station, plane], offsets_s[rows, station, plane]
+        time_s = mean_s[rows] + offset_s
+        index = np.arange(len(rows))
+        is_other = np.diff(photodiode[rows]) != 0
+        previous = np.where(np.r_[True, is_other], index, index - 1)
+        following = np.where(np.r_[is_other, True], index, index + 1)
+        interval_s = time_s[following] - time_s[previous]
+        is_usable = (interval_s > 0) & (interval_s < MAX_RATE_INTERVAL_S)
+        change = count[following] - count[previous]
+        rate = np.where(is_usable, change / np.where(is_usable, interval_s, 1.0), 0.0)
+        counts[rows, station, plane] = count - rate * offset_s
+
+
+def _reject_spikes(epochs: Epochs) -> None:
+    """Set single counts to ``nan`` that differ from both neighbours by :data:`SPIKE_RAD`.
+
+    The neighbours must agree with each other, so that motion is not taken for a spike.
+    """
+    limits = SPIKE_RAD / (2 * np.pi) * period_counts(epochs.channels)
+    rejected = 0
+    for station, plane in np.ndindex(epochs.counts.shape[1:]):
+        rows = np.flatnonzero(np.isfinite(epochs.counts[:, station, plane]))
+        count, limit = epochs.counts[rows, station, plane], limits[station]
+        previous, current, following = count[:-2], count[1:-1], count[2:]
+        same_device = epochs.device[rows[2:]] == epochs.device[rows[:-2]]
+        interval_ns = epochs.time_ns[rows[2:]] - epochs.time_ns[rows[:-2]]
+        is_spike = (
+            same_device
+            & (interval_ns < MAX_SPIKE_INTERVAL_NS)
+            & (np.abs(current - previous) > limit)
+            & (np.abs(current - following) > limit)
+            & (np.abs(following - previous) < limit)
+        )
+        epochs.counts[rows[1:-1][is_spike], station, plane] = np.nan
+        rejected += int(np.count_nonzero(is_spike))
+    _add_rejected(epochs.rejected, "spike", rejected)
+
+
+def _add_rejected(rejected: dict[str, int], reason: str, number: int | np.signedinteger) -> None:
+    """Add ``number`` sweeps to those rejected for ``reason``, if there are any."""
+    if number:
+        rejected[reason] = rejected.get(reason, 0) + int(number)

@@ -16,7 +16,7 @@ from locatk.core.lighthouse.calibration import (
     Calibration,
     ideal_angles,
 )
-from locatk.core.lighthouse.epochs import Epochs, angles_of
+from locatk.core.lighthouse.epochs import Epochs, rotor_angles
 from locatk.core.lighthouse.light_planes import rays as rays_of
 from locatk.core.lighthouse.localization.floor_map import fit_floor_homography
 from locatk.core.lighthouse.noise import INLIER_GATE_RAD
@@ -58,7 +58,7 @@ class Job:
 
     def __post_init__(self) -> None:
         self.rejected = dict(self.epochs.rejected)
-        self.angles = angles_of(self.epochs)
+        self.angles = rotor_angles(self.epochs)
 
     def reject(self, reason: str, number: int | np.signedinteger) -> None:
         if number:
@@ -80,7 +80,7 @@ class Job:
         corrected = self.epochs.counts.copy()
         corrected[rows] = counts
         self.epochs = replace(self.epochs, counts=corrected)
-        self.angles = angles_of(self.epochs)
+        self.angles = rotor_angles(self.epochs)
 
     @property
     def kind(self) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.formats.bench import Figure
 from locatk.formats.bench.capture_line import SEQUENCES, block

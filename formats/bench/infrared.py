@@ -8,6 +8,7 @@ that another program stored.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,23 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
+from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.demodulation import bursts as light_bursts
 from locatk.core.lighthouse.demodulation import weak_bursts as weak
 from locatk.core.lighthouse.demodulation.burst_validation import ValidatedBursts
-from locatk.core.lighthouse.demodulation.identification import SequenceMatches
+from locatk.core.lighthouse.demodulation.identification import (
+    SequenceMatches,
+    identify_sequences,
+)
 from locatk.core.lighthouse.demodulation.pipeline import (
     SHORTEST_S,
     DemodulatedRecording,
     demodulate_recording,
 )
+from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
 from locatk.core.lighthouse.demodulation.windows import read_windows
 from locatk.core.lighthouse.published import light_decoding as paper_light
 from locatk.core.lighthouse.published.light_receiver import WINDOW_START_S
 from locatk.core.lighthouse.recording import Edges
 from locatk.formats.bench import Figure
 from locatk.formats.bench.infrared_places import figures as place_figures
-from locatk.formats.bench.infrared_speed import figures as speed_figures
 from locatk.formats.bench.infrared_survive import figures as survive_figures
+from locatk.formats.bench.timing import alone, cpu_seconds
 from locatk.formats.importers.saleae import read_light
 
 DOTBOT = "DotBot C, its best window"
@@ -51,6 +57,12 @@ PHASE_TICKS = -1
 
 CAPTURES = ("demodulation_code/logic", "oneLH_2D/Logic", "twoLH_2D/Logic")
 
+SPEED_BATCH_COPIES = 4
+"""Copies of the published windows in one batch whose speed is measured."""
+
+SPEED_REPEATS = 40
+"""Repetitions of a batch, of which the fastest counts."""
+
 FPGA = {"take1": (103, 103), "about_4m": (95, 31)}
 """Recording to what is promised of its 103 bursts, and what plain run lengths read."""
 
@@ -66,7 +78,7 @@ def figures(data: Path) -> list[Figure]:
         (_fpga, {f"bursts read, {name}": "of 103" for name in FPGA}),
     ):
         found += _or_why(measure, folder, names)
-    return [*found, *place_figures(), *survive_figures(data), *speed_figures(data)]
+    return [*found, *place_figures(), *survive_figures(data), *_speed(data)]
 
 
 def _or_why(
@@ -90,23 +102,23 @@ def capture(folder: Path, name: str) -> Edges:
 def _demodulation(folder: Path) -> list[Figure]:
     reception = demodulate_recording([capture(folder, CAPTURES[0])])
     (reading,) = reception.readings
-    alone = reading.read & (np.abs(reading.off_s) <= ROTOR_S)
+    by_itself = reading.read & (np.abs(reading.off_s) <= ROTOR_S)
     rims = reading.beside >= 0
-    rims[rims] = alone[reading.beside[rims]]
+    rims[rims] = by_itself[reading.beside[rims]]
     n = len(reading.bursts)
     certain = reading.matches.certain()
     strange = certain & ~np.isin(reading.matches.polynomial, POLYNOMIALS)
     wrong = ~np.isin(reading.matches.polynomial[reading.read], POLYNOMIALS)
     how = (
         f"{n:,} bursts of more than 5 us on the data line of demodulation_code, 54 s; "
-        f"{np.count_nonzero(alone):,} were read and are within 1 us of their rotor"
+        f"{np.count_nonzero(by_itself):,} were read and are within 1 us of their rotor"
     )
     return [
-        Figure("bursts decoded of 11,136", _percent(alone | rims), "%",
+        Figure("bursts decoded of 11,136", _percent(by_itself | rims), "%",
                f"{how}; {np.count_nonzero(rims)} more are rims of these: what is left of the "
                "light there is the sequence of that sweep rather than other places of it", 98.5,
                "higher", DOTBOT, 79.6),
-        Figure("bursts read by themselves", _percent(alone), "%", how, None, "higher",
+        Figure("bursts read by themselves", _percent(by_itself), "%", how, None, "higher",
                RUN_LENGTH, 95.4),
         Figure("false polynomials", _percent(wrong), "%",
                f"of {len(wrong):,} bursts that were read, those of stations that are not there",
@@ -228,3 +240,49 @@ def published_windows(folder: Path) -> NDArray[np.uint8]:
     bursts = bursts.take(bursts.duration_s > SHORTEST_S)
     start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
     return paper_light.windows_of(edges, start)
+
+
+# ---- speed
+
+SPEED_ROWS = {
+    "windows of 16 us to index": "k/s",
+    "soft bits to index": "k/s",
+    "tables of all 32 sequences": "s",
+    "import of 54 s of light": "s",
+}
+
+
+def _speed(data: Path) -> list[Figure]:
+    """Speed of the stages, measured in a process of its own with one thread."""
+    try:
+        whole, index, tables, light = alone(f"infrared.measure_speed({str(data)!r})")
+    except (LocatkError, OSError) as error:
+        return [Figure(n, None, unit, f"not measured: {error}") for n, unit in SPEED_ROWS.items()]
+    return [
+        Figure("windows of 16 us to index", whole / 1e3, "k/s",
+               "64 bytes each to polynomial and index, batches of "
+               f"{11_136 * SPEED_BATCH_COPIES:,}, processor time of one thread, best of "
+               f"{SPEED_REPEATS}; the peer's chain does the same for 8 polynomials",
+               400.0, "higher", "DotBot C, -O3", 216.0),
+        Figure("soft bits to index", index / 1e3, "k/s",
+               "the same without demodulation, all 32 polynomials", None, "higher",
+               "DotBot C, -O3, 8 polynomials", 658.0),
+        Figure("tables of all 32 sequences", tables, "s", "made once a process", 1.0),
+        Figure("import of 54 s of light", light, "s",
+               "the demodulation capture from edges in memory to sweeps and factory data", None),
+    ]  # fmt: skip
+
+
+def measure_speed(data: str) -> list[float]:
+    """Return windows per second, soft bits per second, seconds for the tables and for a capture."""
+    start = time.process_time()
+    lfsr.tables()
+    tables = time.process_time() - start
+    folder = Path(data) / "lighthouse"
+    windows = np.concatenate([published_windows(folder)] * SPEED_BATCH_COPIES)
+    whole = cpu_seconds(lambda: read_windows(windows), SPEED_REPEATS)
+    bits = soft_bits(light_bursts.bursts_of_windows(windows))
+    index = cpu_seconds(lambda: identify_sequences(bits), SPEED_REPEATS)
+    edges = capture(folder, CAPTURES[0])
+    light = cpu_seconds(lambda: demodulate_recording([edges]), 3)
+    return [len(windows) / whole, len(windows) / index, tables, light]

@@ -86,7 +86,7 @@ def _landmarks(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None
 
 def _lighthouse(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
     """Two robots under two stations."""
-    from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+    from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 
     simulated = simulate(SimulationOptions(robots=2, seed=seed))
     observations.write_session(

@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError, FormatError, InputError, MissingDataError
 from locatk.core.geometry import apply_homography, fit_homography
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
-from locatk.core.lighthouse.light_planes import angles_to_counts, paper_image_points
+from locatk.core.lighthouse.light_planes import angles_to_counts
+from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.table import parse_time_ns, read_table, read_text

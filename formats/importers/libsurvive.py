@@ -8,7 +8,7 @@ station's rotor (:mod:`~locatk.formats.importers.libsurvive_lines`). From them c
   rotation, so that the tracker's clock bends no angle
   (:mod:`~locatk.core.lighthouse.demodulation.tracker_syncs`). The angle is libsurvive's:
   2 pi turn - 2 pi / 3 of the first plane and - 4 pi / 3 of the second are
-  :data:`~locatk.core.lighthouse.light_planes.ROTOR_ZERO`, the sign is the same;
+  :data:`~locatk.core.lighthouse.light_planes.ROTOR_ZERO_RAD`, the sign is the same;
 * times: of the device's counter, mapped on the host's seconds by one line
   (:mod:`~locatk.formats.importers.libsurvive_clock`);
 * factory data, from the slow bits of the syncs;

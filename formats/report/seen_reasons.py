@@ -36,7 +36,7 @@ def _lighthouse() -> dict[str, Reason]:
         "second plane.",
         "repeated_in_rotation": "The same plane was reported twice in one rotation.",
         "spike": f"For one moment the angle left a smooth run by more than "
-        f"{math.degrees(epochs.SPIKE):g} degrees.",
+        f"{math.degrees(epochs.SPIKE_RAD):g} degrees.",
         "station_not_in_scene": "The station is not in the scene that was given.",
         "station_not_solved": "The station shares too few places with the others to be located.",
         "other_station": "The method uses fewer stations, and this is none of them.",

@@ -11,7 +11,7 @@ import pytest
 from click.testing import Result
 
 from locatk.core.lighthouse.receiver import DECK
-from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 
 Run = Callable[..., Result]
 
@@ -86,7 +86,7 @@ def test_photodiodes_are_where_the_robot_carries_them() -> None:
     )
     sweeps, (truth,) = made.sweeps, made.truth
     assert sorted(np.unique(sweeps.sensor).tolist()) == [0, 1, 2, 3]
-    station = made.stations.stations[0]
+    station = made.true_scene.stations[0]
     late = sweeps.time_ns > truth.time_ns[-800]
     for sensor in (0, 3):
         mine = np.flatnonzero(late & (sweeps.sensor == sensor) & (sweeps.channel == 1))[:40]

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
 from locatk.core.geometry import apply_homography, fit_homography
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
-from locatk.core.lighthouse.light_planes import angles_to_counts, paper_image_points
+from locatk.core.lighthouse.light_planes import angles_to_counts
+from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.metrics import evaluate_all
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot import read_dotbot

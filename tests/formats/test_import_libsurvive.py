@@ -21,7 +21,7 @@ from locatk.core.lighthouse.calibration import predict_angles
 from locatk.core.lighthouse.channels import period_counts, period_ticks
 from locatk.core.lighthouse.demodulation.ootx import encode
 from locatk.core.lighthouse.demodulation.tracker_syncs import fit_rotor
-from locatk.core.lighthouse.light_planes import ROTOR_ZERO
+from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.formats.importers import libsurvive_lines
 from locatk.formats.importers.libsurvive import read_libsurvive
@@ -744,7 +744,7 @@ def test_published_angles_are_libsurvives_but_for_the_noise_of_single_syncs(
     found = order[np.searchsorted(name(sweeps)[order], name(angles))]
     assert np.array_equal(name(sweeps)[found], name(angles))
     assert np.array_equal(heard.plane[found], angles.flag)
-    difference = 2 * np.pi * heard.turn[found] + ROTOR_ZERO[angles.flag] - angles.angle
+    difference = 2 * np.pi * heard.turn[found] + ROTOR_ZERO_RAD[angles.flag] - angles.angle
     # A sync is some 10 ticks from where the rotor was: 0.07 mrad.
     assert np.sqrt(np.mean(difference**2)) < 5e-5
     assert np.abs(difference).max() < 5e-4
@@ -764,7 +764,7 @@ def test_published_poses_photodiodes_and_stations_are_of_one_frame(published: Pa
         local = (places - station.position) @ station.rotation
         predicted = predict_angles(local, station.calibration)
         seen = 2 * np.pi * sweeps.count[ours] / period_counts(station.channel)
-        seen += ROTOR_ZERO[sweeps.sweep[ours]]
+        seen += ROTOR_ZERO_RAD[sweeps.sweep[ours]]
         residual = seen - predicted[sweeps.sensor[ours], sweeps.sweep[ours]]
         # In the axes of the imu, or of the model, it is 10 mrad and more.
         assert np.median(np.abs(residual)) < 4e-4

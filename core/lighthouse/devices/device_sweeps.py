@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from locatk.core.lighthouse.channels import CHANNELS, TICK_HZ, period_counts, period_ticks
 from locatk.core.lighthouse.devices.pose_fit import SweepObservations
 from locatk.core.lighthouse.epochs import MIN_PLANE_DELAY_TURNS
-from locatk.core.lighthouse.light_planes import ROTOR_ZERO
+from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 
@@ -104,7 +104,7 @@ def select_device_sweeps(
         sweeps.sensor[mine].astype(np.int64),
         columns[channel],
         plane.astype(np.int64),
-        2 * np.pi * turn + ROTOR_ZERO[plane],
+        2 * np.pi * turn + ROTOR_ZERO_RAD[plane],
     ), rejected
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.channels import period_ticks
-from locatk.core.lighthouse.epochs import Epochs, angles_of
+from locatk.core.lighthouse.epochs import Epochs, rotor_angles
 from locatk.core.lighthouse.localization.floor_map import estimate_floor_positions
 from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
 from locatk.core.lighthouse.noise import (
@@ -203,7 +203,7 @@ def _swap_back(
     for planes in ((0,), (1,), (0, 1)):
         counts = job.epochs.counts[wrong].copy()
         counts[:, :, planes] = counts[:, ::-1, planes]
-        trial = angles_of(replace(job.epochs, counts=counts))
+        trial = rotor_angles(replace(job.epochs, counts=counts))
         fresh = estimate_positions(trial, *rig, floor_z=floor)
         right = np.isfinite(fresh.position[:, 0]) & (fresh.worst < INLIER_GATE_RAD / 2)
         rows = wrong[right]

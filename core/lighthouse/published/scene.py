@@ -1,11 +1,18 @@
-"""The paper's scene solving as written, for comparison.
+"""Scene solving as published, for comparison.
 
-Alvarado-Marin et al., Lighthouse Localization of Miniature Wireless Robots, RA-L 2024,
-section III: stations are ideal pinhole cameras, estimates are those of OpenCV, and nothing
-is refined. Equation numbers are the paper's. Two departures, without which it gives no
-poses: the image points of Eq. 1 and 3 have one factor 1/cos(theta), not two
-(:func:`~locatk.core.lighthouse.light_planes.paper_image_points`), and the candidate of Eq. 5 to
-10 is chosen by the paper's own conditions instead of by hand, as in the released scripts.
+Alvarado-Marin et al., "Lighthouse Localization of Miniature Wireless Robots", IEEE RA-L 2024
+(DOI 10.1109/LRA.2024.3405345), section III: base stations are ideal pinhole cameras, scenes are
+estimated by OpenCV's homography and fundamental matrix, and nothing is refined. Equation numbers
+are the paper's.
+
+The paper's image axes are x right, y up, and z ahead, a left-handed frame; image points are at
+z = 1. Solving in it is consistent, and the results are converted to station axes (x forward,
+y left, z up) at the end.
+
+Two departures, without which the method yields no poses: the image points have one factor
+1/cos(theta) instead of two (:func:`paper_image_points`), and the solution among the candidates of
+Eq. 5 to 10 is selected automatically by the paper's own conditions, not by hand as in the
+authors' scripts (DotBots/alvarado23lighthouse).
 """
 
 from __future__ import annotations
@@ -17,151 +24,216 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
+from locatk.core.lighthouse.channels import period_counts
 
 Array = NDArray[np.float64]
 
-# The paper's image has x to the right, y up and z ahead: a left-handed frame. Solving in it
-# is consistent; its result is turned into station axes (x ahead, y left, z up) at the end.
 TO_STATION = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""(3, 3) matrix from the paper's image axes to station axes."""
 
 
 @dataclass(frozen=True)
 class PaperScene:
-    """A scene solved the paper's way.
+    """Scene solved by the paper's method.
 
     Attributes
     ----------
     locate : callable
-        From image points (m, s, 2) to positions (m, 3), ``nan`` where not seen.
+        Function from image points (m, s, 2) to positions (m, 3), ``nan`` if a point is missing.
     stations : tuple of ((3,) ndarray, (3, 3) ndarray)
-        Position and rotation (station to scene) of each, in the first one's axes; empty
-        for one station, of which the paper finds no pose.
+        Position and rotation (station to scene) of each station, in the axes of the first one.
+        Empty for one station, whose pose the paper does not estimate.
     """
 
     locate: Callable[[Array], Array]
     stations: tuple[tuple[Array, Array], ...]
 
 
-def one_planar(markers: Array, seen: Array) -> PaperScene:
-    """III.A: homography from image to floor through four or more markers.
+def paper_image_points(
+    counts: NDArray[np.float64], channel: NDArray[np.int32] | int
+) -> NDArray[np.float64]:
+    """Return the image points of pairs of sweeps for an ideal station.
 
-    ``markers`` (k, 2) in metres, ``seen`` (k, 2) image points.
+    Parameters
+    ----------
+    counts : (..., 2) ndarray
+        LFSR indices of the first and second sweep.
+    channel : int or (...) ndarray
+        1 to 16.
+
+    Returns
+    -------
+    (..., 2) ndarray
+        x right and y up at distance 1 ahead.
+
+    Notes
+    -----
+    Eq. 1 and 3 with one factor 1/cos(theta). As printed, Eq. 3 multiplies by it once more
+    although tan(phi) of Eq. 1 contains it already. The authors' released analysis scripts have
+    one factor, as here; the released DotBot firmware has none. Ideal planes meet in a ray through
+    this point only with one.
+    """
+    revolutions = np.asarray(counts) / np.asarray(period_counts(channel))[..., None]
+    first, second = np.moveaxis(2 * np.pi * revolutions, -1, 0)
+    theta = (first + second) / 2
+    phi_term = np.sin((second - first) / 2 - np.pi / 3) / np.tan(np.pi / 6)
+    return np.stack([-np.tan(theta), -phi_term / np.cos(theta)], axis=-1)
+
+
+def one_planar(markers: Array, image: Array) -> PaperScene:
+    """Solve a planar scene of one station by a homography from image to floor (III.A).
+
+    Parameters
+    ----------
+    markers : (k, 2) ndarray
+        Positions on the floor in metres; at least four, no three on one line.
+    image : (k, 2) ndarray
+        Image points of the markers.
+
+    Raises
+    ------
+    DegenerateError
+        The markers do not determine a homography.
     """
     import cv2
 
     if len(markers) < 4:
         raise DegenerateError(
-            f"{len(markers)} sighted markers do not fix a floor",
-            hint="one station needs four markers, no three on one line",
+            f"{len(markers)} observed markers do not determine the floor",
+            hint="one station needs four markers, no three of them on one line",
         )
-    h, _ = cv2.findHomography(seen, markers)
-    if h is None:
-        raise DegenerateError("the markers lie on one line", hint="spread them over the floor")
+    homography, _ = cv2.findHomography(image, markers)
+    if homography is None:
+        raise DegenerateError("the markers are on one line", hint="spread them over the floor")
 
-    def locate(image: Array) -> Array:
-        moved = np.c_[image[:, 0], np.ones(len(image))] @ h.T
-        return np.c_[moved[:, :2] / moved[:, 2:], np.zeros(len(image))]
+    def locate(points: Array) -> Array:
+        homogeneous = np.c_[points[:, 0], np.ones(len(points))] @ homography.T
+        return np.c_[homogeneous[:, :2] / homogeneous[:, 2:], np.zeros(len(points))]
 
     return PaperScene(locate, ())
 
 
 def two_planar(image: Array) -> PaperScene:
-    """III.B: homography between two images, decomposed by Eq. 4 to 10.
+    """Solve a planar scene of two stations by decomposing the homography of their images (III.B).
 
-    ``image`` is (m, 2, 2): points of both stations. Positions come from the first
-    station's image alone (Eq. 11).
+    Parameters
+    ----------
+    image : (m, 2, 2) ndarray
+        Image points of both stations. Positions are computed from those of the first (Eq. 11).
+
+    Raises
+    ------
+    DegenerateError
+        The points do not determine a homography.
     """
     import cv2
 
-    h, _ = cv2.findHomography(image[:, 0], image[:, 1], cv2.LMEDS)
-    if h is None:
+    homography, _ = cv2.findHomography(image[:, 0], image[:, 1], cv2.LMEDS)
+    if homography is None:
         raise DegenerateError("no homography relates the two images")
-    u, s, vt = np.linalg.svd(h)
+    u, s, vt = np.linalg.svd(homography)
     v1, _, v3 = vt
     s1, s3 = s[0] / s[1], s[2] / s[1]
-    zeta = s1 - s3  # the paper's Eq. 4 prints a quotient; its code has the difference
+    # Eq. 4 is printed as a quotient; the authors' code has the difference.
+    zeta = s1 - s3
     a, b = _unit(np.sqrt(max(1 - s3**2, 0)), np.sqrt(max(s1**2 - 1, 0)))  # Eq. 6
     c, d = _unit(1 + s1 * s3, a * b * (s1**2 - s3**2))  # Eq. 8
     e, f = _unit(-b / s1, -a / s3)  # Eq. 10
     candidates = []
     for sign in (1.0, -1.0):
         normal = b * v1 - sign * a * v3  # Eq. 5
-        turn = np.array([[c, 0, sign * d], [0, 1, 0], [-sign * d, 0, c]])
-        rotation = (u @ turn @ vt) * np.sign(np.linalg.det(u @ vt))  # Eq. 7
-        translation = e * v1 + sign * f * v3  # Eq. 9
-        candidates.append((normal, rotation, translation))
-    normal, rotation, place = _real_one(candidates, image, zeta)
+        middle = np.array([[c, 0, sign * d], [0, 1, 0], [-sign * d, 0, c]])
+        rotation = (u @ middle @ vt) * np.sign(np.linalg.det(u @ vt))  # Eq. 7
+        position = e * v1 + sign * f * v3  # Eq. 9
+        candidates.append((normal, rotation, position))
+    normal, rotation, position = _select_candidate(candidates, image, zeta)
 
     def locate(points: Array) -> Array:
-        return _on_plane(points[:, 0], normal, zeta) @ TO_STATION.T
+        return _intersect_plane(points[:, 0], normal, zeta) @ TO_STATION.T
 
-    second = (TO_STATION @ place, TO_STATION @ rotation.T @ TO_STATION.T)
+    second = (TO_STATION @ position, TO_STATION @ rotation.T @ TO_STATION.T)
     return PaperScene(locate, ((np.zeros(3), np.eye(3)), second))
 
 
-def _on_plane(image: Array, normal: Array, zeta: float) -> Array:
-    """Eq. 11: where rays meet the plane, in the first station's image axes."""
+def _intersect_plane(image: Array, normal: Array, zeta: float) -> Array:
+    """Intersect rays of the first station with the plane (Eq. 11), in its image axes."""
     ray = np.c_[image, np.ones(len(image))]
-    places: Array = ray / (zeta * (ray @ normal))[:, None]
-    return places
+    positions: Array = ray / (zeta * (ray @ normal))[:, None]
+    return positions
 
 
-def _real_one(
+def _select_candidate(
     candidates: list[tuple[Array, Array, Array]], image: Array, zeta: float
 ) -> tuple[Array, Array, Array]:
-    """The candidate that the paper's conditions choose.
+    """Select the (normal, rotation, position) that meets the paper's conditions.
 
-    The plane lies ahead of both cameras, and below cameras that stand upright: y is up in
-    the image, so that the normal that leads away from a camera points down in both views.
+    The plane is ahead of both cameras, and below cameras that are mounted upright: y is up in
+    the image, so that the normal that points away from a camera points down in both views.
     """
     ray = np.c_[image[:, 0], np.ones(len(image))]
     ranked = []
-    for normal, rotation, place in candidates:
+    for normal, rotation, position in candidates:
         sign = 1.0 if np.median(ray @ normal) > 0 else -1.0
-        normal, place = sign * normal, sign * place
-        seen = (_on_plane(image[:, 0], normal, zeta) - place) @ rotation.T
-        behind = np.mean(seen[:, 2] <= 0) > 0.5
-        down = normal[1] + (rotation @ normal)[1]
-        ranked.append((bool(behind), float(down), (normal, rotation, place)))
-    return min(ranked, key=lambda r: r[:2])[2]
+        normal, position = sign * normal, sign * position
+        in_second = (_intersect_plane(image[:, 0], normal, zeta) - position) @ rotation.T
+        is_behind = np.mean(in_second[:, 2] <= 0) > 0.5
+        upward = normal[1] + (rotation @ normal)[1]
+        ranked.append((bool(is_behind), float(upward), (normal, rotation, position)))
+    return min(ranked, key=lambda candidate: candidate[:2])[2]
 
 
 def two_3d(image: Array) -> PaperScene:
-    """III.C: fundamental matrix, essential matrix, cheirality, triangulation by DLT.
+    """Solve a scene in space of two stations by the fundamental matrix (III.C).
 
-    ``image`` is (m, 2, 2): points of both stations.
+    The essential matrix is decomposed with OpenCV's cheirality check, and positions are
+    triangulated by the direct linear transform.
+
+    Parameters
+    ----------
+    image : (m, 2, 2) ndarray
+        Image points of both stations.
+
+    Raises
+    ------
+    DegenerateError
+        The points do not determine a fundamental matrix.
     """
     import cv2
 
     first, second = np.ascontiguousarray(image[:, 0]), np.ascontiguousarray(image[:, 1])
-    f, inliers = cv2.findFundamentalMat(first, second, cv2.FM_LMEDS)
-    if f is None or f.shape != (3, 3):
+    fundamental, inliers = cv2.findFundamentalMat(first, second, cv2.FM_LMEDS)
+    if fundamental is None or fundamental.shape != (3, 3):
         raise DegenerateError(
             "no fundamental matrix relates the two images",
-            hint="record at least 8 places that are not on one plane",
+            hint="record at least 8 positions that are not on one plane",
         )
-    _, rotation, translation, _ = cv2.recoverPose(f, first, second, np.eye(3), mask=inliers)
-    ahead = np.hstack([np.eye(3), np.zeros((3, 1))])
-    other = np.hstack([rotation, translation])
+    _, rotation, translation, _ = cv2.recoverPose(
+        fundamental, first, second, np.eye(3), mask=inliers
+    )
+    first_projection = np.hstack([np.eye(3), np.zeros((3, 1))])
+    second_projection = np.hstack([rotation, translation])
 
     def locate(points: Array) -> Array:
-        places = np.full((len(points), 3), np.nan)
-        seen = np.isfinite(points).all(axis=(1, 2))
-        if np.any(seen):
-            h = cv2.triangulatePoints(ahead, other, points[seen, 0].T, points[seen, 1].T)
-            places[seen] = (h[:3] / h[3]).T @ TO_STATION.T
-        return places
+        positions = np.full((len(points), 3), np.nan)
+        rows = np.isfinite(points).all(axis=(1, 2))
+        if np.any(rows):
+            homogeneous = cv2.triangulatePoints(
+                first_projection, second_projection, points[rows, 0].T, points[rows, 1].T
+            )
+            positions[rows] = (homogeneous[:3] / homogeneous[3]).T @ TO_STATION.T
+        return positions
 
-    return PaperScene(locate, _pair(rotation, translation[:, 0]))
+    return PaperScene(locate, _station_poses(rotation, translation[:, 0]))
 
 
-def _pair(rotation: Array, translation: Array) -> tuple[tuple[Array, Array], ...]:
-    """Poses of both stations in the first one's axes, from second = R first + t."""
-    position = TO_STATION @ (-rotation.T @ translation)
-    turned = TO_STATION @ rotation.T @ TO_STATION.T
-    return ((np.zeros(3), np.eye(3)), (position, turned))
+def _station_poses(rotation: Array, translation: Array) -> tuple[tuple[Array, Array], ...]:
+    """Return the poses of both stations in the axes of the first, from second = R first + t."""
+    second_position = TO_STATION @ (-rotation.T @ translation)
+    second_rotation = TO_STATION @ rotation.T @ TO_STATION.T
+    return ((np.zeros(3), np.eye(3)), (second_position, second_rotation))
 
 
 def _unit(p: float, q: float) -> tuple[float, float]:
-    size = float(np.hypot(p, q))
-    return p / size, q / size
+    """Scale (p, q) to unit length."""
+    length = float(np.hypot(p, q))
+    return p / length, q / length

@@ -11,9 +11,10 @@ from locatk.core.errors import DegenerateError
 from locatk.core.geometry import Similarity, umeyama
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.epochs import Epochs
-from locatk.core.lighthouse.light_planes import angles_to_counts, paper_image_points
+from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.localization.photodiodes import detections
 from locatk.core.lighthouse.published import scene as paper
+from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene import frame as frames
 from locatk.core.lighthouse.scene.keyframes import require_distinct_positions

@@ -1,1 +1,13 @@
-"""Simulated sessions with ground truth."""
+"""Simulated Lighthouse sessions with ground truth.
+
+``session`` simulates a session: ``paths`` are the trajectories of the robots, ``optics`` the
+sweeps that their photodiodes receive, ``faults`` the outliers among these.
+"""
+
+from locatk.core.lighthouse.simulation.session import (
+    SimulatedSession,
+    SimulationOptions,
+    simulate,
+)
+
+__all__ = ["SimulatedSession", "SimulationOptions", "simulate"]

@@ -1,4 +1,4 @@
-"""What goes wrong with simulated sweeps: jumps, reflections, mistaken stations."""
+"""Outliers among simulated sweeps: exchanged stations, reflections, demodulation errors."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import period_counts
-from locatk.core.lighthouse.simulation.optics import OpticalLink, Places, SweepPairs
+from locatk.core.lighthouse.simulation.optics import OpticalLink, PositionFunction, SweepPairs
 
 Array = NDArray[np.float64]
 
-WALL_M = 2.5
-"""Distance of the reflecting walls from the middle of the floor, in metres."""
+WALL_DISTANCE_M = 2.5
+"""Distance of the reflecting walls from the centre of the floor [m]."""
 
-JUMP_RAD = (float(np.radians(2.0)), float(np.radians(60.0)))
-"""Size of demodulation errors (paper IV.A: more than 2 degrees for a single step)."""
+ANGLE_ERROR_RAD = (float(np.radians(2.0)), float(np.radians(60.0)))
+"""Range of the demodulation errors, drawn with a uniform logarithm [rad]. Real ones exceed
+2 degrees for a single step (paper IV.A)."""
 
 
 def inject_faults(
@@ -26,47 +27,48 @@ def inject_faults(
     noise_rad: float,
     rng: np.random.Generator,
 ) -> None:
-    """Make a share of the sweeps wrong, a third of each kind.
+    """Turn a fraction of the sweeps into outliers, a third of each kind.
 
     Parameters
     ----------
     pairs : SweepPairs
-        Changed in place; of a report that one station only was seen in, none are swapped.
+        Changed in place.
     links : sequence of OpticalLink
     outliers : float
-        The share, 0 to 1. What cannot be swapped or reflected jumps.
+        Fraction of the received sweeps, 0 to 1. If too few can be exchanged (a report must
+        contain two stations) or reflected, the others get demodulation errors.
     noise_rad : float
         Standard deviation of the rotor angles of reflections.
     rng : Generator
     """
     total = round(outliers * np.count_nonzero(np.isfinite(pairs.count)))
-    _swap(pairs, links, total // 6, rng)
+    _exchange_stations(pairs, links, total // 6, rng)
     _reflect(pairs, links, total // 6, noise_rad, rng)
-    _jump(pairs, total - int(np.count_nonzero(pairs.wrong)), rng)
+    _add_angle_errors(pairs, total - int(np.count_nonzero(pairs.is_outlier)), rng)
 
 
-def _swap(
+def _exchange_stations(
     pairs: SweepPairs, links: Sequence[OpticalLink], events: int, rng: np.random.Generator
 ) -> None:
-    """Exchange the labels of two sweeps, one each of two stations, within reports."""
+    """Exchange the labels of two sweeps of different stations within a report."""
     robot = np.array([link.robot for link in links])[pairs.link]
     order = np.lexsort((rng.random(len(robot)), pairs.report, robot))
     first, second = order[:-1], order[1:]
-    same = (robot[first] == robot[second]) & (pairs.report[first] == pairs.report[second])
-    # The first two of each report in this random order, so that no pair has two partners.
-    same &= np.r_[True, ~same[:-1]][: len(same)]
-    first, second = first[same], second[same]
+    is_partner = (robot[first] == robot[second]) & (pairs.report[first] == pairs.report[second])
+    # Only the first two of each report in this random order, so that no pair has two partners.
+    is_partner &= np.r_[True, ~is_partner[:-1]][: len(is_partner)]
+    first, second = first[is_partner], second[is_partner]
     plane = rng.integers(0, 2, len(first))
     a, b = (first, plane), (second, plane)
-    # A label's period must hold the count; nan compares false.
-    possible = (pairs.count[a] < period_counts(pairs.channel[b])) & (
+    # Each count must be within the period of the other station; nan compares false.
+    is_possible = (pairs.count[a] < period_counts(pairs.channel[b])) & (
         pairs.count[b] < period_counts(pairs.channel[a])
     )
-    chosen = rng.permutation(np.flatnonzero(possible))[:events]
+    chosen = rng.permutation(np.flatnonzero(is_possible))[:events]
     a, b = (first[chosen], plane[chosen]), (second[chosen], plane[chosen])
     for label in (pairs.channel, pairs.polynomial):
         label[a], label[b] = label[b], label[a]
-    pairs.wrong[a] = pairs.wrong[b] = True
+    pairs.is_outlier[a] = pairs.is_outlier[b] = True
 
 
 def _reflect(
@@ -76,44 +78,43 @@ def _reflect(
     noise_rad: float,
     rng: np.random.Generator,
 ) -> None:
-    """Let both sweeps reach the robot by way of the wall that the station looks at."""
-    whole = np.isfinite(pairs.count).all(axis=1) & ~pairs.wrong.any(axis=1)
-    chosen = rng.permutation(np.flatnonzero(whole))[:events]
-    for number in np.unique(pairs.link[chosen]):
-        rows = chosen[pairs.link[chosen] == number]
-        link = links[number]
-        mirrored = _mirrored(link)
+    """Replace both sweeps of rotations by their reflection in the wall ahead of the station."""
+    is_complete = np.isfinite(pairs.count).all(axis=1) & ~pairs.is_outlier.any(axis=1)
+    chosen = rng.permutation(np.flatnonzero(is_complete))[:events]
+    for index in np.unique(pairs.link[chosen]):
+        rows = chosen[pairs.link[chosen] == index]
+        link = links[index]
         noise = rng.normal(0.0, noise_rad, (len(rows), 2))
-        time_s, count = link.light.observe(pairs.start_s[rows], mirrored, noise)
-        lit = np.isfinite(count).all(axis=1)
-        rows = rows[lit]
-        pairs.time_s[rows], pairs.count[rows] = time_s[lit], count[lit]
-        pairs.wrong[rows] = True
+        time_s, count = link.source.observe(pairs.start_s[rows], _mirror_position(link), noise)
+        is_received = np.isfinite(count).all(axis=1)
+        rows = rows[is_received]
+        pairs.time_s[rows], pairs.count[rows] = time_s[is_received], count[is_received]
+        pairs.is_outlier[rows] = True
 
 
-def _mirrored(link: OpticalLink) -> Places:
-    """Where the robot seems to be, seen in the wall before the station."""
-    forward = link.light.station.rotation[:2, 0]
+def _mirror_position(link: OpticalLink) -> PositionFunction:
+    """Return the position of the mirror image of a photodiode in the wall ahead of the station."""
+    forward = link.source.station.rotation[:2, 0]
     axis = int(np.argmax(np.abs(forward)))
-    wall_m = np.copysign(WALL_M, forward[axis])
+    wall_m = np.copysign(WALL_DISTANCE_M, forward[axis])
 
-    def where(time_s: Array) -> Array:
-        place = link.position(time_s)
-        place[..., axis] = 2 * wall_m - place[..., axis]
-        return place
+    def position(time_s: Array) -> Array:
+        mirrored = link.position(time_s)
+        mirrored[..., axis] = 2 * wall_m - mirrored[..., axis]
+        return mirrored
 
-    return where
+    return position
 
 
-def _jump(pairs: SweepPairs, events: int, rng: np.random.Generator) -> None:
-    """Errors of demodulation: a sweep's count is off by an angle of :data:`JUMP_RAD`."""
-    good = np.flatnonzero((np.isfinite(pairs.count) & ~pairs.wrong).ravel())
-    chosen = np.unravel_index(rng.permutation(good)[:events], pairs.count.shape)
+def _add_angle_errors(pairs: SweepPairs, events: int, rng: np.random.Generator) -> None:
+    """Add demodulation errors of :data:`ANGLE_ERROR_RAD` to single sweeps."""
+    inliers = np.flatnonzero((np.isfinite(pairs.count) & ~pairs.is_outlier).ravel())
+    chosen = np.unravel_index(rng.permutation(inliers)[:events], pairs.count.shape)
     period = period_counts(pairs.channel[chosen])
-    low, high = JUMP_RAD
+    low, high = ANGLE_ERROR_RAD
     size = low * (high / low) ** rng.random(len(period)) / (2 * np.pi) * period
     step = np.ceil(size) * rng.choice([-1.0, 1.0], len(period))
     count = pairs.count[chosen]
-    outside = (count + step < 0) | (count + step >= period)
-    pairs.count[chosen] = count + np.where(outside, -step, step)
-    pairs.wrong[chosen] = True
+    is_outside = (count + step < 0) | (count + step >= period)
+    pairs.count[chosen] = count + np.where(is_outside, -step, step)
+    pairs.is_outlier[chosen] = True

@@ -1,4 +1,4 @@
-"""What a receiver gets of the light of a simulated station."""
+"""Sweeps that photodiodes of a moving robot receive from simulated base stations."""
 
 from __future__ import annotations
 
@@ -10,102 +10,134 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import predict_angles
 from locatk.core.lighthouse.channels import period_counts
-from locatk.core.lighthouse.light_planes import ROTOR_ZERO, angles_to_counts
+from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD, angles_to_counts
 from locatk.core.lighthouse.scene import Station
-from locatk.core.lighthouse.simulation.paths import Course
+from locatk.core.lighthouse.simulation.paths import RobotPath
 
 Array = NDArray[np.float64]
-Places = Callable[[Array], Array]
 
-CONE_RAD = np.radians([75.0, 50.0])
-"""Azimuth and elevation to which light of a station is received. The maker says 150 by 110
-degrees in all; at the very edge the beam is too weak."""
+PositionFunction = Callable[[Array], Array]
+"""From times (...) in seconds to positions (..., 3) in metres."""
 
-PROCESSING_S = 1e-3
-"""From the last sweep to a report that has it: what a DotBot takes to decode a packet."""
+BEAM_HALF_WIDTH_RAD = np.radians([75.0, 50.0])
+"""(2,) azimuth and elevation up to which light of a station is received. The manufacturer states
+150 by 110 degrees in all; at its upper and lower edges the beam is too weak."""
+
+DECODING_DELAY_S = 1e-3
+"""Time from the last sweep to a report that contains it [s]. A DotBot decodes a sweep in 0.9 ms
+(paper, Table III)."""
 
 
 @dataclass(frozen=True)
 class SimulatedStation:
-    """A station with its rotor: zero at ``zero_s`` and every ``period_s`` since, in seconds
-    of true time; ``bits`` are the slow bits of its rotations."""
+    """Base station with a rotor.
+
+    Attributes
+    ----------
+    station : Station
+        Channel, pose and calibration.
+    zero_s : float
+        True time at which the rotor first passes its zero.
+    period_s : float
+        Duration of a rotation.
+    bits : (k,) int ndarray
+        Slow bit (OOTX) of each rotation.
+    """
 
     station: Station
     zero_s: float
     period_s: float
     bits: NDArray[np.int64]
 
-    def observe(self, start_s: Array, where: Places, noise: Array) -> tuple[Array, Array]:
-        """When both planes of rotations that start at ``start_s`` (n,) meet a moving point.
+    def observe(
+        self, start_s: Array, position: PositionFunction, noise: Array
+    ) -> tuple[Array, Array]:
+        """Find the times at which both planes of rotations cross a moving point.
 
         Parameters
         ----------
         start_s : (n,) ndarray
-            Seconds of true time.
-        where : callable
+            True times at which the rotations start.
+        position : callable
             From times (...) to points (..., 3).
         noise : (n, 2) ndarray
-            Added to the rotor angles, in radians.
+            Errors of the rotor angles in radians.
 
         Returns
         -------
-        time_s, count : (n, 2) ndarray
-            Times in seconds and whole LFSR counts, ``nan`` where the light does not reach.
+        time_s : (n, 2) ndarray
+            True times.
+        count : (n, 2) ndarray
+            LFSR counts, whole numbers; ``nan`` if the point is outside the beam.
 
         Notes
         -----
-        A fixed point: each step shrinks the error by the angular speed of the robot over
-        that of the rotor, about a thousand times.
+        The time is found by fixed-point iteration. Each step multiplies the error by the ratio
+        of the angular speeds of the robot and of the rotor, about 0.001.
         """
-        nominal = start_s[:, None] + self.period_s * np.array([1 / 3, 2 / 3])
-        time = nominal
+        nominal_s = start_s[:, None] + self.period_s * np.array([1 / 3, 2 / 3])
+        time_s = nominal_s
         for _ in range(4):
-            local = (where(time) - self.station.position) @ self.station.rotation
-            # Each plane at its own time: the other plane at that time is not asked for.
+            local = (position(time_s) - self.station.position) @ self.station.rotation
+            # Points are (n, 2, 3), one per plane at its own time: of the angles (n, 2, 2) only
+            # that of the same plane is used.
             angle = predict_angles(local, self.station.calibration)[..., [0, 1], [0, 1]]
-            time = start_s[:, None] + (angle - ROTOR_ZERO) / (2 * np.pi) * self.period_s
-            time = np.where(np.isfinite(time), time, nominal)
+            time_s = start_s[:, None] + (angle - ROTOR_ZERO_RAD) / (2 * np.pi) * self.period_s
+            time_s = np.where(np.isfinite(time_s), time_s, nominal_s)
         azimuth = np.arctan2(local[..., 1], local[..., 0])
         elevation = np.arctan2(local[..., 2], np.hypot(local[..., 0], local[..., 1]))
-        lit = (np.abs(azimuth) < CONE_RAD[0]) & (np.abs(elevation) < CONE_RAD[1])
-        angle = np.where(lit, angle + noise, np.nan)
-        turn = (angle - ROTOR_ZERO) / (2 * np.pi)
+        in_beam = (np.abs(azimuth) < BEAM_HALF_WIDTH_RAD[0]) & (
+            np.abs(elevation) < BEAM_HALF_WIDTH_RAD[1]
+        )
+        angle = np.where(in_beam, angle + noise, np.nan)
+        revolutions = (angle - ROTOR_ZERO_RAD) / (2 * np.pi)
         count = np.rint(angles_to_counts(angle, self.station.channel))
-        # Only noise beyond all measure leaves the rotation.
+        # Only extreme noise moves a sweep out of its rotation.
         count[(count < 0) | (count >= period_counts(self.station.channel))] = np.nan
-        return start_s[:, None] + turn * self.period_s, count
+        return start_s[:, None] + revolutions * self.period_s, count
 
 
 @dataclass(frozen=True)
 class OpticalLink:
-    """A photodiode of a robot under a station.
+    """One photodiode of a robot in view of one station.
 
-    ``offset`` (3,) is where it sits, from the robot's middle and in its axes, and ``normal``
-    (3,) where it looks; None where it looks everywhere.
+    Attributes
+    ----------
+    robot : int
+        Index of the robot.
+    path : RobotPath
+    source : SimulatedStation
+    sensor : int
+        Index of the photodiode.
+    offset_m : (3,) ndarray or None
+        Position of the photodiode in the robot's axes; None for its origin.
+    normal : (3,) ndarray or None
+        Direction in which the photodiode points, in the robot's axes; None if it receives light
+        from everywhere.
     """
 
     robot: int
-    course: Course
-    light: SimulatedStation
+    path: RobotPath
+    source: SimulatedStation
     sensor: int = 0
-    offset: Array | None = None
+    offset_m: Array | None = None
     normal: Array | None = None
 
     def position(self, time_s: Array) -> Array:
-        """Points (..., 3) in metres at ``time_s`` (...)."""
-        middle = self.course.position(time_s)
-        return middle if self.offset is None else middle + self._turned(self.offset, time_s)
+        """Return the positions (..., 3) of the photodiode in metres at times (...)."""
+        origin = self.path.position(time_s)
+        return origin if self.offset_m is None else origin + self._to_world(self.offset_m, time_s)
 
-    def faces(self, time_s: Array) -> NDArray[np.bool_]:
-        """Whether it looks at the station's side at ``time_s`` (...)."""
+    def is_facing(self, time_s: Array) -> NDArray[np.bool_]:
+        """Return True if the photodiode points towards the station at times (...)."""
         if self.normal is None:
             return np.ones(np.shape(time_s), bool)
-        towards = self.light.station.position - self.position(time_s)
-        return np.sum(towards * self._turned(self.normal, time_s), axis=-1) > 0
+        to_station = self.source.station.position - self.position(time_s)
+        return np.sum(to_station * self._to_world(self.normal, time_s), axis=-1) > 0
 
-    def _turned(self, vector: Array, time_s: Array) -> Array:
-        """A vector (3,) of the robot's axes (..., 3) as it stands at ``time_s``."""
-        heading = self.course.heading(time_s)
+    def _to_world(self, vector: Array, time_s: Array) -> Array:
+        """Rotate a vector (3,) of the robot's axes by the heading at times (...) to (..., 3)."""
+        heading = self.path.heading(time_s)
         cos, sin = np.cos(heading), np.sin(heading)
         x, y, z = vector
         return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=-1)
@@ -113,19 +145,21 @@ class OpticalLink:
 
 @dataclass
 class SweepPairs:
-    """Both sweeps of each rotation that some report holds.
+    """Both sweeps of each rotation that a report contains.
 
     Attributes
     ----------
     link, report : (n,) int ndarray
+        Index of the optical link, and of the report among those of its robot.
     start_s : (n,) ndarray
-        The rotor's zero.
+        True time of the rotor's zero.
     time_s : (n, 2) ndarray
+        True times of the sweeps.
     count : (n, 2) ndarray
-        ``nan`` where a sweep was not received.
+        LFSR counts; ``nan`` for a sweep that was not received.
     channel, polynomial : (n, 2) int ndarray
-        As the receiver labels them.
-    wrong : (n, 2) bool ndarray
+        Labels assigned by the receiver.
+    is_outlier : (n, 2) bool ndarray
     """
 
     link: NDArray[np.int64]
@@ -135,44 +169,58 @@ class SweepPairs:
     count: Array
     channel: NDArray[np.int64]
     polynomial: NDArray[np.int64]
-    wrong: NDArray[np.bool_]
+    is_outlier: NDArray[np.bool_]
 
     @classmethod
-    def joined(cls, parts: Sequence[SweepPairs]) -> SweepPairs:
+    def concatenate(cls, parts: Sequence[SweepPairs]) -> SweepPairs:
+        """Concatenate pairs of several links."""
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
 
 def observe_reports(
-    link: OpticalLink, number: int, reports_s: Array, hidden: Sequence[Array], noise: Array
+    link: OpticalLink, index: int, reports_s: Array, hidden_s: Sequence[Array], noise: Array
 ) -> SweepPairs:
-    """The last pair before each report that no earlier report had.
+    """Simulate the reports of one photodiode about one station.
 
-    ``hidden`` are ascending starts and ends of times without reception, ``noise`` (n, 2) is
-    added to the rotor angles.
+    A report contains the last pair of sweeps before it, unless an earlier report did.
+
+    Parameters
+    ----------
+    link : OpticalLink
+    index : int
+        Index of the link, for :attr:`SweepPairs.link`.
+    reports_s : (n,) ndarray
+        True times of the reports.
+    hidden_s : sequence of (2 k,) ndarray
+        Ascending starts and ends of times without reception.
+    noise : (n, 2) ndarray
+        Errors of the rotor angles in radians.
     """
-    light = link.light
-    # The second plane passes last: of the rotation in which it had passed.
-    local = (link.position(reports_s) - light.station.position) @ light.station.rotation
-    turn = (predict_angles(local, light.station.calibration)[:, 1] - ROTOR_ZERO[1]) / (2 * np.pi)
-    since = (reports_s - PROCESSING_S - light.zero_s) / light.period_s - turn
-    rotation = np.floor(np.where(np.isfinite(since), since, -1.0)).astype(np.int64)
-    fresh = (rotation >= 0) & np.r_[True, np.diff(rotation) != 0][: len(rotation)]
-    report, rotation = np.flatnonzero(fresh), rotation[fresh]
+    source, station = link.source, link.source.station
+    # The last complete rotation is that whose second plane has crossed the photodiode.
+    local = (link.position(reports_s) - station.position) @ station.rotation
+    second_angle = predict_angles(local, station.calibration)[:, 1]
+    crossing_turns = (second_angle - ROTOR_ZERO_RAD[1]) / (2 * np.pi)
+    elapsed_turns = (reports_s - DECODING_DELAY_S - source.zero_s) / source.period_s
+    completed = elapsed_turns - crossing_turns
+    rotation = np.floor(np.where(np.isfinite(completed), completed, -1.0)).astype(np.int64)
+    is_new = (rotation >= 0) & np.r_[True, np.diff(rotation) != 0][: len(rotation)]
+    report, rotation = np.flatnonzero(is_new), rotation[is_new]
 
-    start_s = light.zero_s + rotation * light.period_s
-    time_s, count = light.observe(start_s, link.position, noise[fresh])
-    lost = (time_s < 0) | ~link.faces(time_s)
-    for edges in hidden:
-        lost |= np.searchsorted(edges, time_s) % 2 == 1
-    count[lost] = np.nan
-    channel = np.full(time_s.shape, light.station.channel)
+    start_s = source.zero_s + rotation * source.period_s
+    time_s, count = source.observe(start_s, link.position, noise[is_new])
+    is_missing = (time_s < 0) | ~link.is_facing(time_s)
+    for edges_s in hidden_s:
+        is_missing |= np.searchsorted(edges_s, time_s) % 2 == 1
+    count[is_missing] = np.nan
+    channel = np.full(time_s.shape, station.channel)
     return SweepPairs(
-        np.full(len(report), number),
+        np.full(len(report), index),
         report,
         start_s,
         time_s,
         count,
         channel,
-        2 * (channel - 1) + light.bits[rotation][:, None],
+        2 * (channel - 1) + source.bits[rotation][:, None],
         np.zeros(time_s.shape, bool),
     )

@@ -1,9 +1,10 @@
-"""Sweeps of robots that drive under stations, with all that is true of them.
+"""Simulation of a Lighthouse session: sweeps of moving robots, with ground truth.
 
-What is simulated is time: each station turns its own rotor, and each sweep is the moment
-at which a light plane meets a robot that moves meanwhile. Nothing that a solver takes for
-granted is used: neither that sweeps of a report belong to one moment nor corrected angles.
-Not simulated are sweeps of two stations at once, of which a receiver loses one.
+Every sweep is simulated at its own time: each station rotates its rotor on its own clock, and a
+sweep is the time at which a light plane crosses a photodiode that moves meanwhile. The
+assumptions of the solver are not used: sweeps of a report are not simultaneous, and the planes
+are those of real units. Not simulated are simultaneous sweeps of two stations, of which a real
+receiver loses one.
 """
 
 from __future__ import annotations
@@ -32,66 +33,70 @@ from locatk.core.lighthouse.simulation.optics import (
     SweepPairs,
     observe_reports,
 )
-from locatk.core.lighthouse.simulation.paths import Course
+from locatk.core.lighthouse.simulation.paths import RobotPath
 from locatk.core.simulation import check_options
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-EPOCH_NS = 1_767_225_600_000_000_000
-"""Start of every simulated session: 2026-01-01T00:00:00Z."""
+START_NS = 1_767_225_600_000_000_000
+"""Start of every simulated session, 2026-01-01T00:00:00Z [ns since 1970]."""
 
 CALIBRATIONS = ("units", "generic", "ideal")
+"""Choices of :attr:`SimulationOptions.calibration`."""
 
-TRUTH_HZ = 100.0
+TRUTH_RATE_HZ = 100.0
+"""Sampling rate of the ground truth [Hz]."""
 
-CLOCK_PPM = 25.0
-"""Clocks of stations are off by at most this."""
+MAX_CLOCK_ERROR_PPM = 25.0
+"""Largest error of a station's clock, drawn uniformly [ppm]. Two stations of the published captures
+are off by 15 and 19 ppm (rotation periods of DotBots/alvarado23lighthouse, benchmarks)."""
 
-BLOCK_S = 1.0
-"""Mean time for which something stands between a station and a robot."""
+MEAN_OCCLUSION_S = 1.0
+"""Mean duration for which an obstacle is between a station and a robot [s]."""
 
-FLAT_MARKERS = np.array([[0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0], [-0.5, -0.5, 0.0]])
-"""A square of 1 m on the floor."""
+FLOOR_MARKERS_M = np.array([[0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0], [-0.5, -0.5, 0.0]])
+"""(4, 3) markers of planar sessions: a square of 1 m on the floor."""
 
-RAISED_MARKERS = np.vstack([FLAT_MARKERS + [[0, 0, 0], [0, 0, 0.5]] * 2, [[0.0, 0.0, 0.1]]])
-"""The corners of that square, two of them raised, and a point over its middle."""
+RAISED_MARKERS_M = np.vstack([FLOOR_MARKERS_M + [[0, 0, 0], [0, 0, 0.5]] * 2, [[0.0, 0.0, 0.1]]])
+"""(5, 3) markers of sessions in space: the same square with two corners raised by 0.5 m, and a
+point above its centre."""
 
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What to simulate.
+    """Options of a simulated session.
 
     Attributes
     ----------
     robots : int
-        At least 1. The first stands on the markers before it drives.
+        Number of robots, at least 1. The first rests on the markers before it drives.
     stations : int
-        1 to 16, on channels 1, 2, ...
+        Number of stations, 1 to 16, on channels 1, 2, ...
     planar : bool
-        Robots on the floor z = 0, or moved through the half metre above it.
+        True for robots on the floor z = 0; otherwise they move up to half a metre above it.
     duration_s : float
-        Length of the session. The markers take 12 s of it (15 s in space), or half of a
-        session that is shorter than twice that.
+        Duration of the session. The visit of the markers takes 12 s of it (15 s in space), or
+        half of a session that is shorter than twice that.
     report_hz : float
-        How often a robot reports the last pair of sweeps of each station.
+        Rate at which a robot reports the last pair of sweeps of each station.
     noise_rad : float
-        Standard deviation of a rotor angle. The default are the 300 microdegrees of the
-        paper's IV.A, far below an LFSR step (52 microrad); the published standing receivers
-        scatter by 115 microrad.
+        Standard deviation of a rotor angle. The default is the paper's 300 microdegrees (IV.A),
+        far below an LFSR step (52 microradians). The published receivers at rest scatter by
+        115 microradians (:data:`~locatk.core.lighthouse.noise.ANGLE_SIGMA_RAD`).
     occlusion : float
-        Share of the time in which a station is hidden from a robot, 0 to below 1.
+        Fraction of the time in which a station is hidden from a robot, 0 to below 1.
     outliers : float
-        Share of the sweeps that are wrong, 0 to below 1: jumps, reflections, and sweeps of
-        two stations taken for each other.
+        Fraction of the sweeps that are outliers, 0 to below 1: demodulation errors,
+        reflections, and exchanged stations.
     calibration : str
         ``"units"``: each station has the factory calibration of another real unit.
-        ``"generic"``: all have their mean. ``"ideal"``: plain planes at 30 degrees.
+        ``"generic"``: all have the mean of these. ``"ideal"``: undistorted planes at 30 degrees.
     labelled : bool
-        Whether polynomials are known.
+        True if the receiver reports polynomials.
     receiver : Receiver, optional
-        Each robot carries these photodiodes; without it, one in its middle.
+        Photodiodes that each robot carries. Default: one at its origin.
     seed : int
         At least 0.
 
@@ -137,119 +142,123 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class SimulatedSession:
-    """A session that never was.
+    """Simulated recording and its ground truth.
 
     Attributes
     ----------
     sweeps : Sweeps
-        Ascending in time. As in a DotBot's reports, which plane a sweep was is not told.
+        Ascending in time. As in a DotBot's reports, the plane of a sweep is unknown.
     scene : Scene
-        What a user knows before solving: markers, and when robot 1 stood on them.
+        Knowledge of a user before solving: the markers, and when robot 1 was on them.
     truth : tuple of Trajectory
-        True poses at 100 Hz, one a robot; its x points along the path. None while robot 1
-        is carried from marker to marker: there it is not received either.
-    stations : Scene
-        The same scene with the true stations.
-    wrong : (n,) bool ndarray
-        Which of the sweeps were made outliers.
+        True poses of each robot at 100 Hz; x points along its path. Robot 1 has neither truth
+        nor sweeps while it is carried from marker to marker.
+    true_scene : Scene
+        ``scene`` with the true stations.
+    is_outlier : (n,) bool ndarray
+        True for the sweeps that were turned into outliers.
     """
 
     sweeps: Sweeps
     scene: Scene
     truth: tuple[Trajectory, ...]
-    stations: Scene
-    wrong: Mask
+    true_scene: Scene
+    is_outlier: Mask
 
 
 def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
-    """Simulate a session; the same options give the same arrays.
+    """Simulate a session.
+
+    The same options give the same arrays.
 
     Notes
     -----
-    A plane with rotor angle a(t) = 2 pi (t - t0) / T meets a robot at p(t) when a(t) is the
-    angle at which the plane passes p, which the station's calibration bends. The count is
-    the time since the rotor's zero in steps of the station's own clock, so that an error of
-    that clock shows in times only.
+    A plane with the rotor angle a(t) = 2 pi (t - t0) / T crosses a robot at p(t) when a(t) equals
+    the angle that the station's calibration predicts for p(t). Its count is the time since the
+    rotor's zero in steps of the station's own clock: an error of that clock affects times only.
     """
     options = options or SimulationOptions()
-    # A stream of random numbers for each matter: more noise leaves the paths as they are.
-    layout, driving, timing, jitter, hiding, faults = (
+    # One random stream for each aspect: more noise, for example, leaves the paths as they are.
+    station_rng, path_rng, report_rng, noise_rng, occlusion_rng, fault_rng = (
         np.random.default_rng(s) for s in np.random.SeedSequence(options.seed).spawn(6)
     )
-    lights = _lights(layout, options)
-    known = FLAT_MARKERS if options.planar else RAISED_MARKERS
+    stations = _simulate_stations(station_rng, options)
+    markers_m = FLOOR_MARKERS_M if options.planar else RAISED_MARKERS_M
+    paths: list[RobotPath] = []
     links: list[OpticalLink] = []
     parts: list[SweepPairs] = []
-    courses = []
     for robot in range(options.robots):
-        course = Course(driving, options.planar, options.duration_s, known[: 0 if robot else None])
-        courses.append(course)
-        reports_s = _report_times(timing, options)
-        for light in lights:
-            hidden = (course.carried_s, _blocks(hiding, options))
-            for link in _links(robot, course, light, options.receiver):
-                noise = jitter.normal(0.0, options.noise_rad, (len(reports_s), 2))
+        visited_m = markers_m[: 0 if robot else None]
+        path = RobotPath(path_rng, options.planar, options.duration_s, visited_m)
+        paths.append(path)
+        reports_s = _report_times(report_rng, options)
+        for station in stations:
+            hidden_s = (path.carry_edges_s, _occlusion_edges(occlusion_rng, options))
+            for link in _optical_links(robot, path, station, options.receiver):
+                noise = noise_rng.normal(0.0, options.noise_rad, (len(reports_s), 2))
                 links.append(link)
-                parts.append(observe_reports(link, len(parts), reports_s, hidden, noise))
-    pairs = SweepPairs.joined(parts)
-    inject_faults(pairs, links, options.outliers, options.noise_rad, faults)
+                parts.append(observe_reports(link, len(parts), reports_s, hidden_s, noise))
+    pairs = SweepPairs.concatenate(parts)
+    inject_faults(pairs, links, options.outliers, options.noise_rad, fault_rng)
 
     digits = len(str(options.robots))
     names = tuple(f"robot-{k + 1:0{digits}d}" for k in range(options.robots))
-    sweeps, wrong = _as_sweeps(pairs, links, names, options.labelled)
+    sweeps, is_outlier = _to_sweeps(pairs, links, names, options.labelled)
     scene = Scene(
-        markers=_markers(known, names[0], courses[0].stands_s),
+        markers=_visited_markers(markers_m, names[0], paths[0].visits_s),
         planar=options.planar,
         scale="markers",
     )
     return SimulatedSession(
         sweeps,
         scene,
-        tuple(_truth(n, c, options.duration_s) for n, c in zip(names, courses, strict=True)),
-        replace(scene, stations=tuple(light.station for light in lights)),
-        wrong,
+        tuple(_truth(n, p, options.duration_s) for n, p in zip(names, paths, strict=True)),
+        replace(scene, stations=tuple(station.station for station in stations)),
+        is_outlier,
     )
 
 
 # ---- stations
 
 
-def _lights(rng: np.random.Generator, options: SimulationOptions) -> list[SimulatedStation]:
-    """Stations around the floor, 2 m from its middle, that look down at it."""
+def _simulate_stations(
+    rng: np.random.Generator, options: SimulationOptions
+) -> list[SimulatedStation]:
+    """Place stations around the floor, 2 m from its centre, looking down at it."""
     count = options.stations
     azimuth = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 3)
     azimuth = azimuth + np.radians(rng.uniform(-10, 10, count))
     units = np.resize(rng.permutation(len(FACTORY_UNITS)), count)
-    lights = []
+    stations = []
     for k in range(count):
-        away = rng.uniform(1.9, 2.1)
-        flat = away * np.array([np.cos(azimuth[k]), np.sin(azimuth[k])])
-        place = np.append(flat, rng.uniform(1.5, 2.0))
-        aim = np.append(rng.uniform(-0.15, 0.15, 2), 0.0)
+        distance_m = rng.uniform(1.9, 2.1)
+        horizontal = distance_m * np.array([np.cos(azimuth[k]), np.sin(azimuth[k])])
+        position = np.append(horizontal, rng.uniform(1.5, 2.0))
+        target = np.append(rng.uniform(-0.15, 0.15, 2), 0.0)
         roll = rotation_exp([np.radians(rng.uniform(-4, 4)), 0.0, 0.0])
         calibration = {
-            "units": _calibration_of(FACTORY_UNITS[units[k]]),
+            "units": _unit_calibration(FACTORY_UNITS[units[k]]),
             "generic": GENERIC_CALIBRATION,
             "ideal": IDEAL_CALIBRATION,
         }[options.calibration]
-        station = Station(k + 1, place, _looking(place, aim) @ roll, calibration)
-        ppm = rng.uniform(-CLOCK_PPM, CLOCK_PPM)
-        period_s = float(period_ticks(k + 1)) / TICK_HZ * (1 + ppm * 1e-6)
+        station = Station(k + 1, position, _look_at(position, target) @ roll, calibration)
+        clock_error_ppm = rng.uniform(-MAX_CLOCK_ERROR_PPM, MAX_CLOCK_ERROR_PPM)
+        period_s = float(period_ticks(k + 1)) / TICK_HZ * (1 + clock_error_ppm * 1e-6)
         bits = rng.integers(0, 2, int(options.duration_s / period_s) + 2)
-        lights.append(SimulatedStation(station, -period_s * rng.random(), period_s, bits))
-    return lights
+        stations.append(SimulatedStation(station, -period_s * rng.random(), period_s, bits))
+    return stations
 
 
-def _looking(place: Array, aim: Array) -> Array:
-    """Rotation (3, 3) of a station at ``place`` that looks at ``aim`` without roll."""
-    forward = (aim - place) / np.linalg.norm(aim - place)
+def _look_at(position: Array, target: Array) -> Array:
+    """Return the rotation (3, 3) of a station at ``position`` that faces ``target``, unrolled."""
+    forward = (target - position) / np.linalg.norm(target - position)
     left = np.cross([0.0, 0.0, 1.0], forward)
     left = left / np.linalg.norm(left)
     return np.stack([forward, left, np.cross(forward, left)], axis=1)
 
 
-def _calibration_of(unit: Array) -> Calibration:
-    """Calibration of a row of :data:`~locatk.core.lighthouse.calibration.FACTORY_UNITS`."""
+def _unit_calibration(unit: Array) -> Calibration:
+    """Convert a row of :data:`~locatk.core.lighthouse.calibration.FACTORY_UNITS`."""
     tilt, curve, gibmag, gibphase, ogeemag, ogeephase = unit[1:].reshape(6, 2)
     phase = np.array([0.0, unit[0]])
     sweeps = np.stack([phase, tilt, curve, gibmag, gibphase, ogeemag, ogeephase], axis=1)
@@ -259,87 +268,87 @@ def _calibration_of(unit: Array) -> Calibration:
 # ---- robots
 
 
-def _links(
-    robot: int, course: Course, light: SimulatedStation, receiver: Receiver | None
+def _optical_links(
+    robot: int, path: RobotPath, source: SimulatedStation, receiver: Receiver | None
 ) -> list[OpticalLink]:
-    """One a photodiode."""
+    """Return a link for each photodiode of a robot."""
     if receiver is None:
-        return [OpticalLink(robot, course, light)]
+        return [OpticalLink(robot, path, source)]
     normals = [None] * len(receiver) if receiver.normal is None else list(receiver.normal)
     return [
-        OpticalLink(robot, course, light, k, offset, normal)
-        for k, (offset, normal) in enumerate(zip(receiver.position_m, normals, strict=True))
+        OpticalLink(robot, path, source, sensor, offset_m, normal)
+        for sensor, (offset_m, normal) in enumerate(zip(receiver.position_m, normals, strict=True))
     ]
 
 
 def _report_times(rng: np.random.Generator, options: SimulationOptions) -> Array:
-    """Ascending times (n,) of a robot's reports in seconds, a little irregular."""
-    step = 1.0 / options.report_hz
-    nominal = np.arange(rng.uniform(0, step), options.duration_s, step)
-    return nominal - rng.uniform(0, 0.02 * step, len(nominal))
+    """Return the ascending times (n,) of a robot's reports in seconds, with some jitter."""
+    interval_s = 1.0 / options.report_hz
+    nominal_s = np.arange(rng.uniform(0, interval_s), options.duration_s, interval_s)
+    return nominal_s - rng.uniform(0, 0.02 * interval_s, len(nominal_s))
 
 
-def _blocks(rng: np.random.Generator, options: SimulationOptions) -> Array:
-    """Ascending starts and ends of the times in which a station is hidden, in seconds.
+def _occlusion_edges(rng: np.random.Generator, options: SimulationOptions) -> Array:
+    """Return ascending starts and ends (2 k,) of the times in which a station is hidden [s].
 
-    Together they are exactly the share that was asked for.
+    Their total is exactly the requested fraction of the session.
     """
     hidden_s = options.occlusion * options.duration_s
-    count = int(np.ceil(hidden_s / BLOCK_S))
+    count = int(np.ceil(hidden_s / MEAN_OCCLUSION_S))
     if count == 0:
         return np.zeros(0)
-    edges = np.zeros(2 * count)
-    edges[0::2] = rng.dirichlet(np.ones(count + 1))[:-1] * (options.duration_s - hidden_s)
-    edges[1::2] = rng.dirichlet(np.full(count, 2.0)) * hidden_s
-    return np.cumsum(edges)
+    durations_s = np.zeros(2 * count)
+    durations_s[0::2] = rng.dirichlet(np.ones(count + 1))[:-1] * (options.duration_s - hidden_s)
+    durations_s[1::2] = rng.dirichlet(np.full(count, 2.0)) * hidden_s
+    return np.cumsum(durations_s)
 
 
-# ---- what comes out
+# ---- results
 
 
-def _as_sweeps(
+def _to_sweeps(
     pairs: SweepPairs, links: Sequence[OpticalLink], names: tuple[str, ...], labelled: bool
 ) -> tuple[Sweeps, Mask]:
-    """The sweeps that were received in the order of time, and which of them are wrong."""
-    seen = np.isfinite(pairs.count)
-    time_ns = EPOCH_NS + np.rint(pairs.time_s[seen] * 1e9).astype(np.int64)
+    """Return the received sweeps in order of time, and a mask of the outliers among them."""
+    is_received = np.isfinite(pairs.count)
+    time_ns = START_NS + np.rint(pairs.time_s[is_received] * 1e9).astype(np.int64)
     order = np.argsort(time_ns, kind="stable")
     robot = np.array([link.robot for link in links], np.int32)[pairs.link]
-    device = np.broadcast_to(robot[:, None], seen.shape)[seen][order]
-    number = np.array([link.sensor for link in links], np.int32)[pairs.link]
-    sensor = np.broadcast_to(number[:, None], seen.shape)[seen][order]
+    device = np.broadcast_to(robot[:, None], is_received.shape)[is_received][order]
+    photodiode = np.array([link.sensor for link in links], np.int32)[pairs.link]
+    sensor = np.broadcast_to(photodiode[:, None], is_received.shape)[is_received][order]
     unknown = np.full(len(order), UNKNOWN, np.int32)
     sweeps = Sweeps(
         devices=names,
         time_ns=time_ns[order],
         device=device,
         sensor=sensor,
-        channel=pairs.channel[seen][order].astype(np.int32),
-        polynomial=pairs.polynomial[seen][order].astype(np.int32) if labelled else unknown,
+        channel=pairs.channel[is_received][order].astype(np.int32),
+        polynomial=pairs.polynomial[is_received][order].astype(np.int32) if labelled else unknown,
         sweep=unknown,
-        count=pairs.count[seen][order],
+        count=pairs.count[is_received][order],
     )
-    return sweeps, pairs.wrong[seen][order]
+    return sweeps, pairs.is_outlier[is_received][order]
 
 
-def _markers(known: Array, device: str, stands_s: Array) -> tuple[Marker, ...]:
-    """Markers, each seen while the device stood on it."""
-    stands_ns = EPOCH_NS + np.rint(stands_s * 1e9).astype(np.int64)
+def _visited_markers(markers_m: Array, device: str, visits_s: Array) -> tuple[Marker, ...]:
+    """Return markers that a device visited at ``visits_s`` (k, 2), starts and ends."""
+    visits_ns = START_NS + np.rint(visits_s * 1e9).astype(np.int64)
     return tuple(
-        Marker(f"marker-{k + 1}", place, (MarkerVisit(device, int(start), int(end)),))
-        for k, (place, (start, end)) in enumerate(zip(known, stands_ns, strict=True))
+        Marker(f"marker-{k + 1}", position, (MarkerVisit(device, int(start), int(end)),))
+        for k, (position, (start, end)) in enumerate(zip(markers_m, visits_ns, strict=True))
     )
 
 
-def _truth(device: str, course: Course, duration_s: float) -> Trajectory:
-    """True poses of one robot, but for the times in which it is carried."""
-    time_s = np.arange(int(np.ceil(duration_s * TRUTH_HZ)) + 1) / TRUTH_HZ
-    time_s = time_s[np.searchsorted(course.carried_s, time_s) % 2 == 0]
+def _truth(device: str, path: RobotPath, duration_s: float) -> Trajectory:
+    """Return the true poses of one robot, except while it is carried."""
+    time_s = np.arange(int(np.ceil(duration_s * TRUTH_RATE_HZ)) + 1) / TRUTH_RATE_HZ
+    time_s = time_s[np.searchsorted(path.carry_edges_s, time_s) % 2 == 0]
     return Trajectory(
         device,
         "floor",
-        EPOCH_NS + np.rint(time_s * 1e9).astype(np.int64),
-        course.position(time_s),
-        quaternion_from_heading(course.heading(time_s)),
+        START_NS + np.rint(time_s * 1e9).astype(np.int64),
+        path.position(time_s),
+        quaternion_from_heading(path.heading(time_s)),
         np.zeros((len(time_s), 6, 6)),
     )

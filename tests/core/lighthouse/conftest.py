@@ -1,8 +1,8 @@
-"""A small world of base stations that shares nothing with the solver.
+"""Simulation of base stations for tests, independent of the solver and of its simulator.
 
-Its light planes are libsurvive's (``survive_reproject_gen2.c``), written again in
-libsurvive's own axes: X right, Y up, the view along -Z. Its stations have factory
-calibrations of real units, so that the solver's generic one is never exactly right.
+The light planes are those of libsurvive (``survive_reproject_gen2.c``), implemented a second time
+in libsurvive's own axes: X right, Y up, viewing along -Z. The stations have factory calibrations
+of real units, so that the solver's generic calibration is never exact.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ ROTATION_TICKS = dict(
         strict=True,
     )
 )  # fmt: skip
-"""Bitcraze's table (crazyflie-firmware, pulse_processor_v2.c), copied, not imported."""
+"""Duration of a rotation by channel [ticks of 48 MHz]: a copy of Bitcraze's table
+(crazyflie-firmware, pulse_processor_v2.c), independent of the package's."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """One sweep's factory calibration, under libsurvive's names."""
+    """Factory calibration of one sweep, with libsurvive's names."""
 
     phase: float = 0.0
     tilt: float = 0.0
@@ -51,13 +52,13 @@ class Plane:
 
 
 def planes_of(unit: Array) -> tuple[Plane, Plane]:
-    """Both planes of a row of ``generic.FACTORY_UNITS``."""
+    """Convert a row of ``calibration.FACTORY_UNITS`` to both planes."""
     p1, t0, t1, c0, c1, gm0, gm1, gp0, gp1, om0, om1, op0, op1 = map(float, unit)
     return Plane(0.0, t0, c0, gp0, gm0, op0, om0), Plane(p1, t1, c1, gp1, gm1, op1, om1)
 
 
 def libsurvive_angle(plane: Plane, second: bool, x: Array, y: Array, z: Array) -> Array:
-    """``survive_reproject_axis_gen2``, for arrays; x right, y up, z towards the lamp's back."""
+    """Evaluate ``survive_reproject_axis_gen2`` for arrays; x right, y up, z backwards."""
     z = -z
     b = np.arctan2(z, x)
     y_deg = plane.tilt + (-1 if second else 1) * np.pi / 6
@@ -76,7 +77,10 @@ def libsurvive_angle(plane: Plane, second: bool, x: Array, y: Array, z: Array) -
 
 
 def look(position: Array, target: Array, roll: float = 0.0) -> Array:
-    """Station to world: x looks from ``position`` to ``target``; ``roll`` leans it."""
+    """Return the rotation, station to world, whose x points from ``position`` to ``target``.
+
+    ``roll`` is the rotation about x in radians.
+    """
     forward = np.asarray(target, float) - position
     forward = forward / np.linalg.norm(forward)
     left = np.cross([0.0, 0.0, 1.0], forward)
@@ -88,7 +92,7 @@ def look(position: Array, target: Array, roll: float = 0.0) -> Array:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A base station of the world."""
+    """Base station."""
 
     channel: int
     position: Array
@@ -96,7 +100,7 @@ class Lamp:
     planes: tuple[Plane, Plane]
 
     def angles(self, points: Array) -> Array:
-        """Rotor angles (m, 2) at which both planes meet world points (m, 3)."""
+        """Return the rotor angles (m, 2) at which both planes cross world points (m, 3)."""
         forward, left, up = ((points - self.position) @ self.rotation).T
         return np.stack(
             [libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(self.planes)],
@@ -104,34 +108,36 @@ class Lamp:
         )
 
     def counts(self, angles: Array) -> Array:
-        """Steps of the 6 MHz clock since the rotor's zero: the planes look straight ahead
-        at 120 and 240 degrees of the turn."""
+        """Return the steps of the 6 MHz clock since the rotor's zero.
+
+        The planes point straight ahead after 120 and 240 degrees of the rotation.
+        """
         degrees = np.degrees(angles) + [120.0, 240.0]
         return degrees / 360.0 * ROTATION_TICKS[self.channel] / 8
 
 
-PLACES = {
+STATION_POSES = {
     1: ((2.6, 1.1, 1.9), 0.03),
     2: ((-2.3, 1.4, 2.2), -0.04),
     5: ((0.4, -2.7, 2.0), 0.02),
     16: ((-0.8, 2.9, 1.7), -0.02),
 }
-"""Channel to position in metres and roll in radians."""
+"""Position in metres and roll in radians by channel."""
 
 
 def lamps(*channels: int, units: tuple[int, ...] = (5, 7, 2, 9)) -> tuple[Lamp, ...]:
-    """Stations around a room of 4 m, on the given channels."""
-    found = []
+    """Return stations on the given channels, around an area of 4 m."""
+    stations = []
     for k, channel in enumerate(channels):
-        place, roll = PLACES[channel]
-        position = np.array(place)
+        position_m, roll = STATION_POSES[channel]
+        position = np.array(position_m)
         rotation = look(position, np.array([0.1 * k, -0.1, 0.1]), roll)
-        found.append(Lamp(channel, position, rotation, planes_of(FACTORY_UNITS[units[k]])))
-    return tuple(found)
+        stations.append(Lamp(channel, position, rotation, planes_of(FACTORY_UNITS[units[k]])))
+    return tuple(stations)
 
 
 def curve(m: int, *, flat: bool, size: float = 0.8) -> Array:
-    """Places (m, 3) along a winding drive, in metres; on z = 0 where ``flat``."""
+    """Return positions (m, 3) along a winding path in metres, on z = 0 if ``flat``."""
     t = np.linspace(0, 6.0, m)
     z = np.zeros(m) if flat else 0.4 + 0.3 * np.sin(2.3 * t + 0.5)
     return np.stack([size * np.cos(1.1 * t), size * np.sin(1.7 * t + 0.3), z], axis=1)
@@ -139,9 +145,10 @@ def curve(m: int, *, flat: bool, size: float = 0.8) -> Array:
 
 @dataclass
 class Drive:
-    """Reports of a receiver: one a place, all sweeps of a report under one stamp.
+    """Reports of a receiver, one per position, with one time stamp for all sweeps of a report.
 
-    Change ``counts`` (m, s, 2) to spoil it, ``nan`` to hide; then take :attr:`sweeps`.
+    Tests change ``counts`` (m, s, 2) to inject errors (``nan`` removes a sweep) and then use
+    :attr:`sweeps`.
     """
 
     lamps: tuple[Lamp, ...]
@@ -160,7 +167,7 @@ class Drive:
         return [lamp.channel for lamp in self.lamps].index(channel)
 
     def turned(self, rows: NDArray[np.int64], column: int, plane: int, radians: Array) -> None:
-        """Move angles of some rows."""
+        """Add ``radians`` to the angles of one plane in some rows."""
         per_turn = ROTATION_TICKS[self.lamps[column].channel] / 8
         self.counts[rows, column, plane] += np.asarray(radians) / (2 * np.pi) * per_turn
 
@@ -168,18 +175,18 @@ class Drive:
     def sweeps(self) -> Sweeps:
         m, s, _ = self.counts.shape
         channel = np.array([lamp.channel for lamp in self.lamps], np.int32)
-        seen = np.isfinite(self.counts).ravel()
-        channels = np.broadcast_to(channel[:, None], (m, s, 2)).ravel()[seen]
+        received = np.isfinite(self.counts).ravel()
+        channels = np.broadcast_to(channel[:, None], (m, s, 2)).ravel()[received]
         n = len(channels)
         return Sweeps(
             devices=self.devices,
-            time_ns=np.repeat(self.time_ns, 2 * s)[seen],
-            device=np.repeat(self.device, 2 * s)[seen],
+            time_ns=np.repeat(self.time_ns, 2 * s)[received],
+            device=np.repeat(self.device, 2 * s)[received],
             sensor=np.zeros(n, np.int32),
             channel=channels,
             polynomial=2 * (channels - 1) if self.labelled else np.full(n, -1, np.int32),
             sweep=np.full(n, -1, np.int32),
-            count=self.counts.ravel()[seen],
+            count=self.counts.ravel()[received],
         )
 
     @property
@@ -196,7 +203,7 @@ def drive(
     seed: int = 1,
     start_s: float = 0.0,
 ) -> Drive:
-    """What a receiver at ``points`` reports of the world, one report every ``step_s``."""
+    """Simulate the reports of a receiver at ``points`` (m, 3), one every ``step_s``."""
     rng = np.random.default_rng(seed)
     counts = np.stack(
         [
@@ -212,39 +219,39 @@ def drive(
 
 def stream(
     world: tuple[Lamp, ...],
-    where: Callable[[Array], Array],
+    position: Callable[[Array], Array],
     seconds: float,
     *,
     sensors: Array | None = None,
     seed: int = 1,
 ) -> Sweeps:
-    """Every sweep of rotors that turn freely, at the moment at which it crosses.
+    """Simulate every sweep of unsynchronised rotors, at the time at which it crosses.
 
-    ``where`` gives positions (n, 3) at times (n,) in seconds; ``sensors`` (k, 3) are
+    ``position`` gives positions (n, 3) at times (n,) in seconds; ``sensors`` (k, 3) are the
     offsets of photodiodes from there.
     """
     rng = np.random.default_rng(seed)
     offsets = np.zeros((1, 3)) if sensors is None else sensors
     parts = []
     for lamp in world:
-        turn_s = ROTATION_TICKS[lamp.channel] / 48e6
-        zero = np.arange(rng.uniform(0, turn_s), seconds - turn_s, turn_s)
+        period_s = ROTATION_TICKS[lamp.channel] / 48e6
+        zero_s = np.arange(rng.uniform(0, period_s), seconds - period_s, period_s)
         for sensor, offset in enumerate(offsets):
             for plane in (0, 1):
-                when = zero + 0.4 * turn_s
-                for _ in range(4):  # the receiver moves while the rotor turns
-                    count = lamp.counts(lamp.angles(where(when) + offset))[:, plane]
-                    when = zero + count / 6e6
-                parts.append((when, count, lamp.channel, sensor))
-    when = np.concatenate([p[0] for p in parts])
+                time_s = zero_s + 0.4 * period_s
+                for _ in range(4):  # the receiver moves while the rotor rotates
+                    count = lamp.counts(lamp.angles(position(time_s) + offset))[:, plane]
+                    time_s = zero_s + count / 6e6
+                parts.append((time_s, count, lamp.channel, sensor))
+    time_s = np.concatenate([p[0] for p in parts])
     count = np.concatenate([p[1] for p in parts])
     channel = np.concatenate([np.full(len(p[0]), p[2], np.int32) for p in parts])
     sensor = np.concatenate([np.full(len(p[0]), p[3], np.int32) for p in parts])
-    order = np.argsort(when)
+    order = np.argsort(time_s)
     n = len(order)
     return Sweeps(
         devices=("robot",),
-        time_ns=START_NS + np.rint(when[order] * 1e9).astype(np.int64),
+        time_ns=START_NS + np.rint(time_s[order] * 1e9).astype(np.int64),
         device=np.zeros(n, np.int32),
         sensor=sensor[order],
         channel=channel[order],
@@ -255,36 +262,36 @@ def stream(
 
 
 def take(sweeps: Sweeps, rows: NDArray[np.int64]) -> Sweeps:
-    """Some of the sweeps, in the order of ``rows``."""
+    """Select sweeps, in the order of ``rows``."""
     names = ("time_ns", "device", "sensor", "channel", "polynomial", "sweep", "count")
     return replace(sweeps, **{name: getattr(sweeps, name)[rows] for name in names})
 
 
 def join(*parts: Sweeps) -> Sweeps:
-    """All sweeps of recordings of the same devices."""
+    """Concatenate the sweeps of recordings of the same devices."""
     names = ("time_ns", "device", "sensor", "channel", "polynomial", "sweep", "count")
     return replace(
         parts[0], **{name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
     )
 
 
-def markers_of(world: tuple[Lamp, ...], places: Array) -> tuple[Marker, ...]:
-    """Markers whose sightings are the counts that the world shows there."""
-    found = []
-    for k, place in enumerate(np.asarray(places, float)):
+def markers_of(world: tuple[Lamp, ...], positions: Array) -> tuple[Marker, ...]:
+    """Return markers at positions (k, 3) with the counts that were observed there."""
+    markers = []
+    for k, position in enumerate(np.asarray(positions, float)):
         counts = {
-            lamp.channel: tuple(map(float, lamp.counts(lamp.angles(place[None]))[0]))
+            lamp.channel: tuple(map(float, lamp.counts(lamp.angles(position[None]))[0]))
             for lamp in world
         }
-        found.append(Marker(f"m{k}", place, (MarkerVisit(counts=counts),)))  # type: ignore[arg-type]
-    return tuple(found)
+        markers.append(Marker(f"m{k}", position, (MarkerVisit(counts=counts),)))  # type: ignore[arg-type]
+    return tuple(markers)
 
 
 SQUARE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 
 
 class World:
-    """The functions above, for tests that cannot import a conftest."""
+    """Namespace of the functions above, for tests, which cannot import a conftest."""
 
     Plane, Lamp, Drive = Plane, Lamp, Drive
     start_ns = START_NS
@@ -304,7 +311,7 @@ class World:
 
 @pytest.fixture(scope="session")
 def world() -> type[World]:
-    """The independent world: lamps, drives, streams."""
+    """Independent simulation of stations, reports and sweeps."""
     return World
 
 
@@ -314,12 +321,12 @@ def recordings(data: Path) -> Path:
     return data / "lighthouse"
 
 
-# ---- the light itself
+# ---- light
 
 
 @cache
 def sequence(polynomial: int) -> NDArray[np.int8]:
-    """All bits of a polynomial, twice over, by the register itself."""
+    """Return the bits of a polynomial over two periods, generated by its shift register."""
     state, mask = 1, int(lfsr.TAPS[polynomial])
     bits = np.empty(131071, np.int8)
     for k in range(len(bits)):
@@ -330,7 +337,7 @@ def sequence(polynomial: int) -> NDArray[np.int8]:
 
 @dataclass(frozen=True)
 class Sender:
-    """A station that sends: its rotor and what it says. Times are true seconds."""
+    """Rotor and slow bits of a base station. Times are true seconds."""
 
     channel: int
     zero_s: float = 0.004
@@ -347,27 +354,27 @@ class Sender:
 
 @dataclass(frozen=True)
 class Receiving:
-    """What becomes of the light on its way to the recorder."""
+    """Imperfections of the receiver and of the recorder."""
 
     rate_hz: float = 40e6
     clock_ppm: float = 0.0
     resolution_hz: float | None = None
     delay_s: float = 0.0
-    """By which rising edges are late and falling ones early, together."""
+    """Delay of rising edges plus advance of falling edges."""
     jitter_s: float = 0.0
     lost: float = 0.0
-    """Share of the short pulses."""
+    """Fraction of the short pulses that is lost."""
     rim_s: float = 0.0
-    """Noise before and after the light."""
+    """Duration of noise before and after a burst."""
     missing: float = 0.0
     spoiled: float = 0.0
-    """Shares of the sweeps that do not arrive, and of those whose bits arrive as others."""
+    """Fractions of the sweeps that are not received, and that are received with random bits."""
     width_s: float = 25e-6
 
 
 @dataclass
 class Passed:
-    """Sweeps that passed photodiodes, ascending in time."""
+    """Sweeps that crossed photodiodes, ascending in time."""
 
     time_s: Array
     sensor: NDArray[np.int64]
@@ -380,12 +387,12 @@ class Passed:
 
 
 def biphase(bits: NDArray[np.int8]) -> Array:
-    """Times of the changes of bits, in bits: at each border, and in the middle of ones."""
+    """Return the times of the edges of bits, in bits: between bits, and in the middle of ones."""
     return np.sort(np.concatenate([np.arange(len(bits) + 1), np.flatnonzero(bits) + 0.5]))
 
 
 def as_received(change_s: Array, path: Receiving, noise: np.random.Generator) -> Array:
-    """Edges that are left of changes of light, the first of them upward; as many fall."""
+    """Return the edges received for changes of light: rising first, as many falling."""
     edge = change_s
     if path.rim_s:
         before, after = (np.cumsum(noise.uniform(5e-8, 4e-7, 40)) for _ in range(2))
@@ -415,8 +422,11 @@ def light_of(
     others: Sequence[Array] = (),
     seed: int = 1,
 ) -> tuple[list[Edges], Passed]:
-    """What photodiodes receive, and what is true. ``others`` are edges of other light,
-    in seconds; photodiodes see a sweep 9 us one after the other."""
+    """Simulate the edges that photodiodes receive, and the true sweeps.
+
+    ``others`` are edges of other light, in seconds. A sweep crosses the photodiodes 9 us one
+    after the other.
+    """
     noise = np.random.default_rng(seed)
     rows: list[tuple[float, ...]] = []
     lines: list[list[Array]] = [[np.asarray(each) for each in others] for _ in range(sensors)]
@@ -458,12 +468,12 @@ def light_of(
 
 
 def edges_of(edge_s: Array, seconds: float, path: Receiving = Receiving()) -> Edges:
-    """A recording of edges at true times, the first of them upward."""
+    """Record edges at true times, the first one rising."""
     resolution = path.resolution_hz or path.rate_hz
     clock = 1 + path.clock_ppm * 1e-6
     tick = np.floor(np.sort(edge_s) * clock * resolution) / resolution * path.rate_hz
     tick = np.rint(tick).astype(np.int64)
-    # Two changes within a sample are none.
+    # Two edges within a sample cancel.
     number, times = np.unique(tick, return_counts=True)
     tick = number[times % 2 == 1]
     end = int(max(seconds * path.rate_hz, tick[-1] if len(tick) else 0)) + 1
@@ -471,7 +481,7 @@ def edges_of(edge_s: Array, seconds: float, path: Receiving = Receiving()) -> Ed
 
 
 class Light:
-    """The functions above, for tests that cannot import a conftest."""
+    """Namespace of the functions above, for tests, which cannot import a conftest."""
 
     Sender, Receiving, Passed = Sender, Receiving, Passed
     ticks = ROTATION_TICKS
@@ -484,13 +494,13 @@ class Light:
 
 @pytest.fixture(scope="session")
 def light() -> type[Light]:
-    """An independent drawing of the light of stations, edge by edge."""
+    """Independent simulation of the light of stations, edge by edge."""
     return Light
 
 
 @pytest.fixture(scope="session")
 def published(recordings: Path) -> Callable[[str], Edges]:
-    """A published recording of light by its path, read once."""
+    """Return a published recording of light by its path; each is read once."""
     from locatk.formats.importers.saleae import read_light
 
     @cache

@@ -1,4 +1,4 @@
-"""The bending of light planes: against libsurvive and Crazyflie, written again."""
+"""Calibration of light planes, against independent copies of libsurvive and Crazyflie."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ Array = NDArray[np.float64]
 
 
 def calibration_of(planes: Any, model: str = "libsurvive") -> cal.Calibration:
-    """Our form of two of libsurvive's planes."""
+    """Convert two planes with libsurvive's names of parameters."""
     sweeps = [
         [p.phase, p.tilt, p.curve, p.gibmag, p.gibpha, p.ogeemag, p.ogeephase] for p in planes
     ]
     return cal.Calibration(np.array(sweeps), "factory", model)
 
 
-def wide(n: int = 200, seed: int = 0) -> Array:
-    """Points over a field of 110 by 80 degrees."""
+def field_points(n: int = 200, seed: int = 0) -> Array:
+    """Return points (n, 3) over a field of view of 110 by 80 degrees, 0.5 to 6 m away."""
     rng = np.random.default_rng(seed)
     azimuth, elevation = rng.uniform(-0.96, 0.96, n), rng.uniform(-0.7, 0.7, n)
     away = rng.uniform(0.5, 6, n)
@@ -56,7 +56,7 @@ def crazyflie_angle(point: Array, t: float, sweep: Array) -> float:
 @pytest.mark.parametrize("unit", range(len(FACTORY_UNITS)))
 def test_libsurvive_in_its_own_axes(unit: int, world: Any) -> None:
     planes = world.planes_of(FACTORY_UNITS[unit])
-    points = wide()
+    points = field_points()
     forward, left, up = points.T
     theirs = [world.libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(planes)]
     ours = cal.predict_angles(points, calibration_of(planes))
@@ -65,7 +65,7 @@ def test_libsurvive_in_its_own_axes(unit: int, world: Any) -> None:
 
 def test_ideal_planes_are_those_of_crazyflies_documentation() -> None:
     # alpha = atan2(y, x) + asin(z tan t / hypot(x, y)), t = -30, +30 degrees.
-    points = wide()
+    points = field_points()
     x, y, z = points.T
     for k, t in enumerate((-math.pi / 6, math.pi / 6)):
         theirs = np.arctan2(y, x) + np.arcsin(z * math.tan(t) / np.hypot(x, y))
@@ -75,7 +75,7 @@ def test_ideal_planes_are_those_of_crazyflies_documentation() -> None:
 
 
 def test_ideal_gradient_is_crazyflies_h_vector() -> None:
-    points = wide(50)
+    points = field_points(50)
     _, by_point, _ = cal.predict_with_gradient(points, cal.IDEAL_CALIBRATION)
     for (x, y, z), rows in zip(points, by_point, strict=True):
         for k, t in enumerate((-math.pi / 6, math.pi / 6)):
@@ -88,7 +88,7 @@ def test_ideal_gradient_is_crazyflies_h_vector() -> None:
 @pytest.mark.parametrize("unit", [0, 4, 9])
 def test_crazyflie_model_is_its_firmwares(unit: int, world: Any) -> None:
     calibration = calibration_of(world.planes_of(FACTORY_UNITS[unit]), "crazyflie")
-    points = wide(50)
+    points = field_points(50)
     nominal = (-np.pi / 6, np.pi / 6)
     theirs = [
         [crazyflie_angle(p, t, calibration.sweeps[k]) for k, t in enumerate(nominal)]
@@ -101,7 +101,7 @@ def test_crazyflie_model_is_its_firmwares(unit: int, world: Any) -> None:
 @pytest.mark.parametrize("unit", [1, 6, 9])
 def test_gradients_are_those_of_small_steps(unit: int, model: str, world: Any) -> None:
     calibration = calibration_of(world.planes_of(FACTORY_UNITS[unit]), model)
-    points = wide(60)
+    points = field_points(60)
     angles, by_point, by_tilt = cal.predict_with_gradient(points, calibration)
     np.testing.assert_array_equal(angles, cal.predict_angles(points, calibration))
     step = 1e-6
@@ -120,10 +120,10 @@ def test_gradients_are_those_of_small_steps(unit: int, model: str, world: Any) -
     np.testing.assert_allclose(by_tilt, 0, atol=2e-8)
 
 
-def test_phase_turns_the_angle_back() -> None:
+def test_phase_is_subtracted_from_the_angle() -> None:
     sweeps = np.zeros((2, 7))
     sweeps[1, cal.PHASE] = -0.005
-    points = wide(5)
+    points = field_points(5)
     change = cal.predict_angles(points, cal.Calibration(sweeps, "factory")) - cal.predict_angles(
         points, cal.IDEAL_CALIBRATION
     )
@@ -146,7 +146,7 @@ def test_points_above_the_cone_have_no_angle() -> None:
 def test_correcting_gives_plain_planes_through_the_point(unit: int, world: Any) -> None:
     planes = world.planes_of(FACTORY_UNITS[unit])
     calibration = calibration_of(planes)
-    points = wide()
+    points = field_points()
     forward, left, up = points.T
     observed = np.stack(
         [world.libsurvive_angle(p, k == 1, -left, up, -forward) for k, p in enumerate(planes)], 1
@@ -162,11 +162,11 @@ def test_correcting_gives_plain_planes_through_the_point(unit: int, world: Any) 
     assert np.max(np.abs(raw)) > 1e-3
 
 
-def test_correcting_three_steps_is_correct_to_a_tenth_of_a_microradian(world: Any) -> None:
-    # What the docstring of ideal_angles promises, within the field of a usual scene.
+def test_three_iterations_correct_to_a_tenth_of_a_microradian(world: Any) -> None:
+    # As the docstring of ideal_angles states, in the field of view of a usual scene.
     for unit in FACTORY_UNITS:
         calibration = calibration_of(world.planes_of(unit))
-        points = wide()
+        points = field_points()
         points = points[np.abs(points[:, 2]) < 0.5 * np.hypot(points[:, 0], points[:, 1])]
         observed = cal.predict_angles(points, calibration)
         three = cal.ideal_angles(observed, calibration)
@@ -177,7 +177,7 @@ def test_correcting_three_steps_is_correct_to_a_tenth_of_a_microradian(world: An
 def test_correcting_as_crazyflie_does_gives_its_ray(world: Any) -> None:
     # The firmware's fixed point: corrected angles are those of 30-degree planes.
     calibration = calibration_of(world.planes_of(FACTORY_UNITS[3]), "crazyflie")
-    for point in wide(40):
+    for point in field_points(40):
         raw = [
             crazyflie_angle(point, t, calibration.sweeps[k])
             for k, t in enumerate((-np.pi / 6, np.pi / 6))
@@ -195,7 +195,7 @@ def test_correcting_as_crazyflie_does_gives_its_ray(world: Any) -> None:
         np.testing.assert_allclose(ours, [1.0, y, z], atol=3e-6)
 
 
-def test_unseen_angles_stay_unseen() -> None:
+def test_missing_angles_stay_missing() -> None:
     observed = np.array([[0.1, np.nan], [np.nan, np.nan], [0.1, -0.1]])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -204,8 +204,8 @@ def test_unseen_angles_stay_unseen() -> None:
     assert np.isfinite(corrected[2]).all()
 
 
-def test_generic_is_what_other_units_are() -> None:
-    # facts/lighthouse.md 1.6: mean and spread over the units that libsurvive recorded.
+def test_the_generic_calibration_is_the_mean_of_real_units() -> None:
+    # Mean and spread over the nine units in jdavidberger/libsurvive-extras-data.
     assert GENERIC_CALIBRATION.source == "generic"
     np.testing.assert_allclose(
         GENERIC_CALIBRATION.sweeps[:, cal.TILT], [-0.0493, 0.0459], atol=5e-4
@@ -239,11 +239,51 @@ def test_units_are_those_of_libsurvives_file(recordings: Path, world: Any) -> No
     assert found >= 2
 
 
-def test_what_a_calibration_says_of_itself(world: Any) -> None:
-    assert not cal.IDEAL_CALIBRATION.bends
+def test_properties_of_a_calibration(world: Any) -> None:
+    assert not cal.IDEAL_CALIBRATION.is_distorted
     assert cal.IDEAL_CALIBRATION.source == "none"
-    assert GENERIC_CALIBRATION.bends
+    assert GENERIC_CALIBRATION.is_distorted
     factory = calibration_of(world.planes_of(FACTORY_UNITS[0]))
     np.testing.assert_allclose(
         factory.tilts, [np.pi / 6 + FACTORY_UNITS[0, 1], -np.pi / 6 + FACTORY_UNITS[0, 2]]
+    )
+
+
+@pytest.mark.parametrize("name", cal.PARAMETERS)
+def test_distorted_means_a_wave_or_a_curve(name: str) -> None:
+    sweeps = np.zeros((2, 7))
+    sweeps[1, cal.PARAMETERS.index(name)] = 0.01
+    calibration = cal.Calibration(sweeps, "estimated")
+    assert calibration.is_distorted is (name in ("curve", "gibmag", "ogeemag"))
+    # Undistorted planes are those of the ideal model but for tilt and phase.
+    points = field_points(20)
+    tilts_and_phases = np.zeros((2, 7))
+    tilts_and_phases[:, :2] = sweeps[:, :2]
+    plain = cal.predict_angles(points, cal.Calibration(tilts_and_phases, "estimated"))
+    difference = np.max(np.abs(cal.predict_angles(points, calibration) - plain))
+    assert bool(difference > 1e-6) is calibration.is_distorted
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("phase", 0.005), ("tilt", 0.05), ("curve", 0.3), ("gibmag", 0.005), ("ogeemag", 0.3)],
+)
+def test_every_parameter_is_corrected(name: str, value: float) -> None:
+    sweeps = np.zeros((2, 7))
+    sweeps[:, cal.PARAMETERS.index(name)] = value
+    calibration = cal.Calibration(sweeps, "estimated")
+    points = field_points(50)
+    corrected = cal.ideal_angles(cal.predict_angles(points, calibration), calibration)
+    level = np.hypot(points[:, 0], points[:, 1])[:, None]
+    distance = np.einsum("nki,ni->nk", plane_normals(corrected, calibration.tilts), points) / level
+    assert np.max(np.abs(distance)) < 1e-6
+
+
+def test_the_crazyflie_model_ignores_curve_and_ogee() -> None:
+    sweeps = np.zeros((2, 7))
+    sweeps[:, [cal.CURVE, cal.OGEEMAG]] = 0.3
+    points = field_points(20)
+    np.testing.assert_array_equal(
+        cal.predict_angles(points, cal.Calibration(sweeps, "factory", "crazyflie")),
+        cal.predict_angles(points, cal.IDEAL_CALIBRATION),
     )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
-from locatk.core.lighthouse.epochs import angles_of, group_epochs
+from locatk.core.lighthouse.epochs import group_epochs, rotor_angles
 from locatk.core.lighthouse.localization.positions import estimate_positions
 from locatk.core.lighthouse.scene import Distance, MarkerVisit, frame
 from locatk.core.lighthouse.scene.bundle_adjustment import BundleState
@@ -32,7 +32,7 @@ class Recorded:
         self.places = world.square
         self.drive = world.drive(self.lamps, np.repeat(self.places, 30, axis=0))
         self.epochs = group_epochs(self.drive.sweeps)
-        self.angles = angles_of(self.epochs)
+        self.angles = rotor_angles(self.epochs)
         self.to = Similarity(0.2, rotation_exp(np.array([0.0, 0.0, 0.7])), np.array([3.0, 1, 0]))
         ideal = replace(GENERIC_CALIBRATION, sweeps=np.zeros((2, 7)))
         self.rig = frame.transform_state(

@@ -15,7 +15,7 @@ from locatk.core.geometry import umeyama
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, GENERIC_CALIBRATION, MODEL_SIGMA_RAD
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.assembly import Assembly, estimate_stations
-from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.core.lighthouse.solver import solve
 
 Array = NDArray[np.float64]

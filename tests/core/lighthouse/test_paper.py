@@ -1,7 +1,8 @@
-"""The paper's method, on the planes the paper believes in: exactly 30 degrees, no more."""
+"""The paper's method, on the planes that the paper assumes: undistorted, at 30 degrees."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse.light_planes import paper_image_points
+from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.published import scene as paper
+from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
 
@@ -34,13 +36,13 @@ def image_of(lamps: Any, points: Array) -> Array:
     )
 
 
-def off(found: Array, true: Array) -> float:
-    """Largest error after the best similarity."""
+def largest_error(found: Array, true: Array) -> float:
+    """Return the largest position error after alignment by a similarity."""
     return float(np.max(np.linalg.norm(umeyama(found, true).apply(found) - true, axis=1)))
 
 
-def same_poses(scene: paper.PaperScene, lamps: Any, found: Array, points: Array) -> None:
-    """The stations stand where the points say they stand."""
+def assert_poses(scene: paper.PaperScene, lamps: Any, found: Array, points: Array) -> None:
+    """Check the poses of the stations in the frame of the true points."""
     to = umeyama(found, points)
     for lamp, (position, rotation) in zip(lamps, scene.stations, strict=True):
         np.testing.assert_allclose(to.apply(position), lamp.position, atol=5e-3)
@@ -62,8 +64,8 @@ def test_two_stations_over_a_plane(world: Any, channels: tuple[int, int]) -> Non
     image = image_of(lamps, points)
     scene = paper.two_planar(image)
     found = scene.locate(image)
-    assert off(found, points) < 1e-3
-    same_poses(scene, lamps, found, points)
+    assert largest_error(found, points) < 1e-3
+    assert_poses(scene, lamps, found, points)
 
 
 @pytest.mark.parametrize("channels", PAIRS)
@@ -73,11 +75,11 @@ def test_two_stations_in_space(world: Any, channels: tuple[int, int]) -> None:
     image = image_of(lamps, points)
     scene = paper.two_3d(image)
     found = scene.locate(image)
-    assert off(found, points) < 1e-3
-    same_poses(scene, lamps, found, points)
+    assert largest_error(found, points) < 1e-3
+    assert_poses(scene, lamps, found, points)
 
 
-def test_equation_6_to_10_are_a_decomposition(world: Any) -> None:
+def test_equations_6_to_10_decompose_the_homography(world: Any) -> None:
     # The rotation that the paper's equations give is one of OpenCV's four.
     lamps = ideal(world, 2, 16)
     image = image_of(lamps, world.curve(60, flat=True))
@@ -88,7 +90,17 @@ def test_equation_6_to_10_are_a_decomposition(world: Any) -> None:
     assert min(np.abs(ours - turn).max() for turn in turns) < 1e-4
 
 
-def test_unseen_places_stay_unseen(world: Any) -> None:
+def test_a_plane_behind_the_second_camera_is_not_selected() -> None:
+    image = np.tile([[[0.0, -0.5]]], (5, 2, 1))
+    # Both planes are below the cameras, the first one more so, but behind the second camera.
+    behind = (np.array([0.0, -1.0, 0.0]), np.eye(3), np.array([0.0, 0.0, 5.0]))
+    ahead = (np.array([0.0, -0.8, 0.6]), np.eye(3), np.zeros(3))
+    for candidates in ([behind, ahead], [ahead, behind]):
+        normal, _, _ = paper._select_candidate(candidates, image, 1.0)
+        np.testing.assert_array_equal(normal, ahead[0])
+
+
+def test_missing_points_have_no_position(world: Any) -> None:
     lamps = ideal(world, 1, 5)
     image = image_of(lamps, world.curve(30, flat=False))
     scene = paper.two_3d(image)
@@ -109,7 +121,7 @@ def test_three_markers_are_refused(world: Any) -> None:
 
 @pytest.mark.parametrize("kind", ["two-planar", "two-3d"])
 @pytest.mark.parametrize("drive", ["still", "three places"])
-def test_too_few_places_are_refused(world: Any, kind: str, drive: str) -> None:
+def test_too_few_positions_are_refused(world: Any, kind: str, drive: str) -> None:
     places = world.curve(3 if drive == "three places" else 1, flat=True)
     recording = world.drive(world.lamps(1, 2), np.repeat(places, 30, axis=0))
     with pytest.raises(DegenerateError) as refused:
@@ -136,7 +148,7 @@ def test_a_session_is_solved_as_the_paper_does(world: Any, flat: bool) -> None:
         np.testing.assert_allclose(station.position, lamp.position, atol=0.02)
 
 
-def test_a_distance_nobody_saw_is_refused(world: Any) -> None:
+def test_an_unobserved_distance_is_refused(world: Any) -> None:
     lamps = ideal(world, 2, 16)
     recording = world.drive(lamps, world.curve(60, flat=True))
     seen = MarkerVisit("robot", int(recording.time_ns[0]), int(recording.time_ns[3]))
@@ -146,7 +158,7 @@ def test_a_distance_nobody_saw_is_refused(world: Any) -> None:
     assert refused.value.hint
 
 
-def test_the_paper_must_be_told_of_the_plane(world: Any) -> None:
+def test_an_unknown_kind_of_scene_is_assumed_planar(world: Any) -> None:
     lamps = ideal(world, 2, 16)
     recording = world.drive(lamps, world.curve(100, flat=True))
     solution = solve(recording.sweeps, None, SolveOptions(method="paper"))
@@ -157,13 +169,54 @@ def test_the_paper_must_be_told_of_the_plane(world: Any) -> None:
 
 
 def test_real_planes_cost_the_paper_centimetres(world: Any) -> None:
-    # Why the default method exists: planes of real units lean by 27 degrees.
+    # The reason for the default method: planes of real units are tilted by 27 degrees.
     lamps = world.lamps(2, 16)
     recording = world.drive(lamps, world.curve(100, flat=False))
     errors = {}
     for method in ("paper", "bundle"):
         options = SolveOptions(method=method, scene="two-3d")
         (track,) = solve(recording.sweeps, None, options).trajectories
-        errors[method] = off(track.position, recording.points)
+        errors[method] = largest_error(track.position, recording.points)
     assert errors["paper"] > 0.02
     assert errors["bundle"] < 0.5 * errors["paper"]
+
+
+# ---- image points
+
+POINTS = np.array(
+    [
+        (1.0, 0.0, 0.0), (2.0, 0.7, 0.3), (2.0, -0.7, 0.3), (1.5, 0.9, -0.8), (3.0, -2.4, -0.1),
+        (0.4, 0.3, 0.35), (5.0, 0.0, -2.0),
+    ]
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("channel", "expected"),
+    [
+        # PyDotBot, calculate_camera_point(49341, 85887, poly 1)
+        (1, (-0.4255775370509014, 0.15468717476270966)),
+        # dotbot-lh2-calibration, calculate_camera_point(49341, 85887, index 1), from 0
+        (2, (-0.43435315273542, 0.1512338330873567)),
+    ],
+)
+def test_paper_image_is_dotbots_but_for_the_cosine(
+    channel: int, expected: tuple[float, float]
+) -> None:
+    counts = np.array([49341.0, 85887.0])
+    x, y = paper_image_points(counts, channel)
+    assert x == pytest.approx(expected[0], abs=1e-12)
+    # Theirs has no 1/cos(theta); theta is half a revolution straight ahead.
+    theta = 2 * np.pi * counts.mean() / period_counts(channel)
+    assert y * math.cos(theta) == pytest.approx(expected[1], abs=1e-12)
+
+
+def test_paper_image_is_the_ray_of_ideal_planes(world: Any) -> None:
+    # x right, y up; one factor 1/cos: a point above the axis keeps its height at the side.
+    ideal = (world.Plane(), world.Plane())
+    for channel in (1, 16):
+        lamp = world.Lamp(channel, np.zeros(3), np.eye(3), ideal)
+        counts = lamp.counts(lamp.angles(POINTS))
+        image = paper_image_points(counts, channel)
+        expected = np.c_[-POINTS[:, 1], POINTS[:, 2]] / POINTS[:, :1]
+        np.testing.assert_allclose(image, expected, atol=1e-9)

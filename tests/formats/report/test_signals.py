@@ -16,8 +16,8 @@ pytest.importorskip("plotly")
 from locatk.core.dots import simulate as dots_simulate
 from locatk.core.dots import solver as dots_solver
 from locatk.core.landmarks.halls import HallSamples, HallSensors
+from locatk.core.lighthouse import simulation as lighthouse_simulation
 from locatk.core.lighthouse import solver as lighthouse_solver
-from locatk.core.lighthouse.simulation import session as lighthouse_simulate
 from locatk.core.polaris import simulate as polaris_simulate
 from locatk.core.polaris import solver as polaris_solver
 from locatk.core.polaris.array import Samples
@@ -54,10 +54,10 @@ def values(trace: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def lighthouse(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Solution]:
-    options = lighthouse_simulate.SimulationOptions(
+    options = lighthouse_simulation.SimulationOptions(
         robots=2, duration_s=20.0, outliers=0.02, occlusion=0.05
     )
-    made = lighthouse_simulate.simulate(options)
+    made = lighthouse_simulation.simulate(options)
     path = tmp_path_factory.mktemp("signals") / "run.mcap"
     observations.write_session(path, system="lighthouse", sweeps=made.sweeps)
     session = Session.open(path)

@@ -1,4 +1,4 @@
-"""SimulatedSession sweeps against physics that is written down here a second time."""
+"""Simulated sweeps against an independent implementation of the physics."""
 
 from __future__ import annotations
 
@@ -15,29 +15,33 @@ from locatk.core.geometry import heading_of
 from locatk.core.lighthouse.calibration import (
     FACTORY_UNITS,
     GENERIC_CALIBRATION,
+    IDEAL_CALIBRATION,
     Calibration,
     predict_angles,
 )
 from locatk.core.lighthouse.channels import channel_of, period_counts, period_ticks
+from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
+from locatk.core.lighthouse.scene import Station
+from locatk.core.lighthouse.simulation.optics import SimulatedStation
 from locatk.core.lighthouse.simulation.session import (
-    EPOCH_NS,
-    FLAT_MARKERS,
-    RAISED_MARKERS,
+    FLOOR_MARKERS_M,
+    RAISED_MARKERS_M,
+    START_NS,
     SimulatedSession,
     SimulationOptions,
     simulate,
 )
 
 Array = NDArray[np.float64]
-QUIET = SimulationOptions(noise_rad=0.0, seed=4)
+NOISELESS = SimulationOptions(noise_rad=0.0, seed=4)
 COUNT_RAD = 2 * np.pi / period_counts(1)
 """One LFSR step of channel 1 as an angle."""
 
 
 @dataclass
-class Turns:
-    """Whole rotations of one station as one robot saw them, with the station's rotor."""
+class Rotations:
+    """Complete rotations of one station that one robot observed, and the station's rotor."""
 
     time_s: Array  # (n, 2) since the start of the session
     count: Array  # (n, 2)
@@ -46,65 +50,65 @@ class Turns:
     period_s: float
 
 
-def turns_of(made: SimulatedSession, device: int, channel: int) -> Turns:
-    """Find rotations again from times and counts alone."""
-    s = made.sweeps
-    mine = np.flatnonzero((s.device == device) & (s.channel == channel))
-    time_s, count = (s.time_ns[mine] - EPOCH_NS) * 1e-9, s.count[mine]
+def find_rotations(session: SimulatedSession, device: int, channel: int) -> Rotations:
+    """Recover rotations from times and counts alone."""
+    s = session.sweeps
+    rows = np.flatnonzero((s.device == device) & (s.channel == channel))
+    time_s, count = (s.time_ns[rows] - START_NS) * 1e-9, s.count[rows]
     nominal = float(period_ticks(channel)) / 48e6
     period_s = nominal
-    for _ in range(3):  # a count lasts as long as the station's own clock says
+    for _ in range(3):  # counts are in steps of the station's own clock, estimated here
         start = time_s - count / float(period_counts(channel)) * period_s
         number = np.cumsum(np.rint(np.r_[0.0, np.diff(start)] / nominal))
         period_s, zero_s = np.polyfit(number, start, 1)
     new = np.r_[True, np.diff(number) > 0.5]
     first = np.flatnonzero(new & np.r_[~new[1:], False])
-    rows = np.stack([first, first + 1], axis=1)
-    return Turns(time_s[rows], count[rows], mine[rows], float(zero_s), float(period_s))
+    pairs = np.stack([first, first + 1], axis=1)
+    return Rotations(time_s[pairs], count[pairs], rows[pairs], float(zero_s), float(period_s))
 
 
-def path_of(made: SimulatedSession, device: int) -> tuple[Array, CubicSpline]:
-    """Times and positions of a robot from the truth, between its samples by splines."""
-    truth = made.truth[device]
-    time_s = (truth.time_ns - EPOCH_NS) * 1e-9
+def fit_path(session: SimulatedSession, device: int) -> tuple[Array, CubicSpline]:
+    """Return the times of the ground truth of a robot, and a spline through its positions."""
+    truth = session.truth[device]
+    time_s = (truth.time_ns - START_NS) * 1e-9
     return time_s, CubicSpline(time_s, truth.position)
 
 
 # ---- physics
 
 
-def plane_side(time_s: Array, points: Array, plane: int, turns: Turns) -> Array:
-    """Which side of a rotating plane points (n, 3) of a station's axes are on.
+def plane_side(time_s: Array, points: Array, plane: int, rotations: Rotations) -> Array:
+    """Return the signed distance of points (n, 3), in a station's axes, from a rotating plane.
 
-    Plain geometry: a plane that holds the forward axis and is tilted by 30 degrees about it
-    is turned about the vertical; after a third (two thirds) of a turn it is as it was.
+    The plane contains the forward axis, is tilted by 30 degrees about it, and rotates about the
+    vertical axis. It points forward after a third (two thirds) of a rotation.
     """
     tilt = np.radians([30.0, -30.0])[plane]
-    turn = 2 * np.pi * ((time_s - turns.zero_s) / turns.period_s - (1 + plane) / 3)
+    angle = 2 * np.pi * ((time_s - rotations.zero_s) / rotations.period_s - (1 + plane) / 3)
     normal = np.stack(
         [
-            -np.sin(turn) * np.cos(tilt),
-            np.cos(turn) * np.cos(tilt),
-            np.full_like(turn, -np.sin(tilt)),
+            -np.sin(angle) * np.cos(tilt),
+            np.cos(angle) * np.cos(tilt),
+            np.full_like(angle, -np.sin(tilt)),
         ],
         axis=-1,
     )
     return np.sum(normal * points, axis=-1)
 
 
-def test_ideal_planes_pass_moving_robots_when_their_sweeps_say() -> None:
-    """Brute force: the plane is stepped through time until the robot changes sides."""
-    made = simulate(replace(QUIET, robots=2, calibration="ideal"))
-    station = made.stations.stations[1]
-    turns = turns_of(made, 1, 2)
-    _, path = path_of(made, 1)
-    assert len(turns.time_s) > 250
-    for row in range(0, len(turns.time_s), 10):
+def test_ideal_planes_cross_moving_robots_at_the_times_of_their_sweeps() -> None:
+    """By brute force: the plane is stepped through time until the robot changes sides."""
+    session = simulate(replace(NOISELESS, robots=2, calibration="ideal"))
+    station = session.true_scene.stations[1]
+    rotations = find_rotations(session, 1, 2)
+    _, path = fit_path(session, 1)
+    assert len(rotations.time_s) > 250
+    for row in range(0, len(rotations.time_s), 10):
         for plane in (0, 1):
-            about = turns.time_s[row, plane]
+            about = rotations.time_s[row, plane]
             fine = about + np.arange(-2e-4, 2e-4, 1e-7)
             local = (path(fine) - station.position) @ station.rotation
-            side = plane_side(fine, local, plane, turns)
+            side = plane_side(fine, local, plane, rotations)
             crossed = np.flatnonzero(np.sign(side[1:]) != np.sign(side[:-1]))
             assert len(crossed) == 1
             # The rotor's zero was found from whole counts: 0.17 us each.
@@ -138,17 +142,21 @@ def reproject(point: Array, unit: Array, sweep: int) -> float:
     return float(angle + gibmags[sweep] * np.sin(angle + gibphases[sweep]) - phase - np.pi / 2)
 
 
-def test_factory_planes_pass_moving_robots_when_their_sweeps_say() -> None:
-    made = simulate(replace(QUIET, planar=False, robots=2, stations=3))
-    station = made.stations.stations[2]
+def test_factory_planes_cross_moving_robots_at_the_times_of_their_sweeps() -> None:
+    session = simulate(replace(NOISELESS, planar=False, robots=2, stations=3))
+    station = session.true_scene.stations[2]
     [unit] = [u for u in FACTORY_UNITS if u[1] == station.calibration.sweeps[0, 1]]
-    turns = turns_of(made, 1, 3)
-    _, path = path_of(made, 1)
-    rotor = 2 * np.pi * ((turns.time_s - turns.zero_s) / turns.period_s - np.array([1 / 3, 2 / 3]))
+    rotations = find_rotations(session, 1, 3)
+    _, path = fit_path(session, 1)
+    rotor = (
+        2
+        * np.pi
+        * ((rotations.time_s - rotations.zero_s) / rotations.period_s - np.array([1 / 3, 2 / 3]))
+    )
     worst = 0.0
-    for row in range(0, len(turns.time_s), 5):
+    for row in range(0, len(rotations.time_s), 5):
         for plane in (0, 1):
-            local = (path(turns.time_s[row, plane]) - station.position) @ station.rotation
+            local = (path(rotations.time_s[row, plane]) - station.position) @ station.rotation
             miss = reproject(local, unit, plane) - rotor[row, plane]
             worst = max(worst, abs(np.angle(np.exp(1j * miss))))
     assert worst < 5e-6  # a tenth of an LFSR step
@@ -156,13 +164,13 @@ def test_factory_planes_pass_moving_robots_when_their_sweeps_say() -> None:
 
 @pytest.mark.parametrize("calibration", ["units", "generic", "ideal"])
 def test_standing_robots_obey_the_forward_model(calibration: str) -> None:
-    made = simulate(replace(QUIET, calibration=calibration, stations=4))
-    for marker in made.scene.markers:
-        [sighting] = marker.sightings
-        for station in made.stations.stations:
-            turns = turns_of(made, 0, station.channel)
-            still = (turns.time_s[:, 0] * 1e9 + EPOCH_NS > sighting.start_ns) & (
-                turns.time_s[:, 1] * 1e9 + EPOCH_NS < sighting.end_ns
+    session = simulate(replace(NOISELESS, calibration=calibration, stations=4))
+    for marker in session.scene.markers:
+        [visit] = marker.sightings
+        for station in session.true_scene.stations:
+            rotations = find_rotations(session, 0, station.channel)
+            still = (rotations.time_s[:, 0] * 1e9 + START_NS > visit.start_ns) & (
+                rotations.time_s[:, 1] * 1e9 + START_NS < visit.end_ns
             )
             assert np.count_nonzero(still) >= 18
             local = (marker.position - station.position) @ station.rotation
@@ -170,29 +178,31 @@ def test_standing_robots_obey_the_forward_model(calibration: str) -> None:
             expected = (angles + np.radians([120.0, 240.0])) / (2 * np.pi)
             expected = expected * float(period_counts(station.channel))
             np.testing.assert_allclose(
-                turns.count[still], expected[None].repeat(still.sum(), 0), atol=0.5 + 1e-6
+                rotations.count[still], expected[None].repeat(still.sum(), 0), atol=0.5 + 1e-6
             )
 
 
-def test_rotors_turn_on_their_own_clocks() -> None:
-    made = simulate(replace(QUIET, stations=16, duration_s=20.0))
+def test_rotors_rotate_on_their_own_clocks() -> None:
+    session = simulate(replace(NOISELESS, stations=16, duration_s=20.0))
     phases, errors = [], []
     for channel in range(1, 17):
-        turns = turns_of(made, 0, channel)
-        start = turns.time_s - turns.count / float(period_counts(channel)) * turns.period_s
-        number = np.rint((start - turns.zero_s) / turns.period_s)
-        rest = start - turns.zero_s - number * turns.period_s
+        rotations = find_rotations(session, 0, channel)
+        start = (
+            rotations.time_s - rotations.count / float(period_counts(channel)) * rotations.period_s
+        )
+        number = np.rint((start - rotations.zero_s) / rotations.period_s)
+        rest = start - rotations.zero_s - number * rotations.period_s
         assert np.abs(rest).max() < 1.2e-7  # a count is 1.67e-7 s
-        errors.append(turns.period_s / (float(period_ticks(channel)) / 48e6) - 1)
-        phases.append((turns.zero_s / turns.period_s) % 1)
+        errors.append(rotations.period_s / (float(period_ticks(channel)) / 48e6) - 1)
+        phases.append((rotations.zero_s / rotations.period_s) % 1)
     assert np.max(np.abs(errors)) < 25e-6
     assert np.std(errors) > 5e-6
     assert np.std(phases) > 0.15
 
 
 def test_sweeps_of_a_report_are_spread_in_time() -> None:
-    s = simulate(replace(QUIET, stations=4)).sweeps
-    time_s = (s.time_ns - EPOCH_NS) * 1e-9
+    s = simulate(replace(NOISELESS, stations=4)).sweeps
+    time_s = (s.time_ns - START_NS) * 1e-9
     report = np.r_[True, np.diff(time_s) > 0.05].cumsum()
     spread = [np.ptp(time_s[report == k]) for k in np.unique(report)]
     assert 0.01 < np.median(spread) < 0.03
@@ -202,15 +212,15 @@ def test_sweeps_of_a_report_are_spread_in_time() -> None:
 def test_noise_is_that_of_the_angle_and_of_whole_counts() -> None:
     sigma = 3e-4
     options = SimulationOptions(noise_rad=sigma, report_hz=40.0, calibration="units", seed=2)
-    made = simulate(options)
+    session = simulate(options)
     deviations = []
     for channel in (1, 2):
-        turns = turns_of(made, 0, channel)
-        for marker in made.scene.markers:
-            [sighting] = marker.sightings
-            span = (np.array([sighting.start_ns, sighting.end_ns]) - EPOCH_NS) * 1e-9
-            still = (turns.time_s[:, 0] > span[0]) & (turns.time_s[:, 1] < span[1])
-            counts = turns.count[still]
+        rotations = find_rotations(session, 0, channel)
+        for marker in session.scene.markers:
+            [visit] = marker.sightings
+            span = (np.array([visit.start_ns, visit.end_ns]) - START_NS) * 1e-9
+            still = (rotations.time_s[:, 0] > span[0]) & (rotations.time_s[:, 1] < span[1])
+            counts = rotations.count[still]
             deviations.append(counts - counts.mean(axis=0))
     expected = np.hypot(sigma / COUNT_RAD, 1 / np.sqrt(12))
     assert np.std(np.concatenate(deviations)) == pytest.approx(expected, rel=0.06)
@@ -219,7 +229,7 @@ def test_noise_is_that_of_the_angle_and_of_whole_counts() -> None:
 # ---- shape
 
 
-def same(a: Sweeps, b: Sweeps) -> bool:
+def are_equal(a: Sweeps, b: Sweeps) -> bool:
     names = ("time_ns", "device", "sensor", "channel", "polynomial", "sweep", "count")
     return a.devices == b.devices and all(
         np.array_equal(getattr(a, name), getattr(b, name)) for name in names
@@ -229,29 +239,29 @@ def same(a: Sweeps, b: Sweeps) -> bool:
 def test_same_options_same_arrays() -> None:
     options = SimulationOptions(robots=2, occlusion=0.1, outliers=0.05, duration_s=5.0, seed=9)
     first, second = simulate(options), simulate(options)
-    assert same(first.sweeps, second.sweeps)
-    assert first.sweeps.time_ns.min() >= EPOCH_NS == 1_767_225_600_000_000_000
+    assert are_equal(first.sweeps, second.sweeps)
+    assert first.sweeps.time_ns.min() >= START_NS == 1_767_225_600_000_000_000
     assert all(
         np.array_equal(a.position, b.position)
         for a, b in zip(first.truth, second.truth, strict=True)
     )
-    assert not same(first.sweeps, simulate(replace(options, seed=10)).sweeps)
+    assert not are_equal(first.sweeps, simulate(replace(options, seed=10)).sweeps)
 
 
 def test_noise_and_faults_do_not_move_robots_or_stations() -> None:
     calm, wild = (
-        simulate(QUIET),
-        simulate(replace(QUIET, noise_rad=1e-4, outliers=0.1, occlusion=0.3, labelled=False)),
+        simulate(NOISELESS),
+        simulate(replace(NOISELESS, noise_rad=1e-4, outliers=0.1, occlusion=0.3, labelled=False)),
     )
     np.testing.assert_array_equal(calm.truth[0].position, wild.truth[0].position)
-    for a, b in zip(calm.stations.stations, wild.stations.stations, strict=True):
+    for a, b in zip(calm.true_scene.stations, wild.true_scene.stations, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
 
 
 @pytest.mark.parametrize("planar", [True, False])
 def test_counts_are_whole_and_of_one_rotation(planar: bool) -> None:
-    made = simulate(SimulationOptions(robots=3, stations=16, outliers=0.3, planar=planar))
-    s = made.sweeps
+    session = simulate(SimulationOptions(robots=3, stations=16, outliers=0.3, planar=planar))
+    s = session.sweeps
     assert len(s) > 15_000
     assert np.all(s.count == np.rint(s.count))
     assert np.all((s.count >= 0) & (s.count < period_counts(s.channel)))
@@ -261,42 +271,81 @@ def test_counts_are_whole_and_of_one_rotation(planar: bool) -> None:
 
 
 def test_the_first_plane_has_the_smaller_count_and_the_same_slow_bit() -> None:
-    made = simulate(replace(QUIET, stations=2))
-    s = made.sweeps
-    turns = turns_of(made, 0, 1)
-    assert np.all(turns.count[:, 0] < turns.count[:, 1])
+    session = simulate(replace(NOISELESS, stations=2))
+    s = session.sweeps
+    rotations = find_rotations(session, 0, 1)
+    assert np.all(rotations.count[:, 0] < rotations.count[:, 1])
     assert np.array_equal(channel_of(s.polynomial), s.channel)
-    bits = s.polynomial[turns.row] & 1
+    bits = s.polynomial[rotations.row] & 1
     assert len(bits) > 200
     assert np.array_equal(bits[:, 0], bits[:, 1])
     assert 0.3 < np.mean(bits) < 0.7
 
 
 def test_without_labels_polynomials_are_unknown_and_nothing_else_changes() -> None:
-    known, unknown = simulate(QUIET).sweeps, simulate(replace(QUIET, labelled=False)).sweeps
+    known, unknown = simulate(NOISELESS).sweeps, simulate(replace(NOISELESS, labelled=False)).sweeps
     assert np.all(unknown.polynomial == UNKNOWN)
-    assert same(unknown, replace(known, polynomial=unknown.polynomial))
+    assert are_equal(unknown, replace(known, polynomial=unknown.polynomial))
 
 
-def test_all_of_the_floor_is_in_sight() -> None:
+def test_the_whole_floor_is_in_the_beams() -> None:
     for seed in range(5):
         for planar in (True, False):
             options = SimulationOptions(
                 robots=5, stations=6, planar=planar, duration_s=60.0, seed=seed
             )
-            made = simulate(options)
-            others = made.sweeps.device > 0  # the first is carried for a while
+            session = simulate(options)
+            others = session.sweeps.device > 0  # the first is carried for a while
             reports = 4 * 600 * 6
             assert np.count_nonzero(others) / 2 > 0.99 * reports
 
 
-def test_stations_stand_as_they_would_and_have_real_calibrations() -> None:
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "received"),
+    [(74, 0, True), (76, 0, False), (-74, 0, True), (-76, 0, False), (0, 49, True),
+     (0, 51, False), (0, -49, True), (0, -51, False)],
+)  # fmt: skip
+def test_light_is_received_inside_the_beam(
+    azimuth: float, elevation: float, received: bool
+) -> None:
+    a, e = np.radians([azimuth, elevation])
+    point = 2 * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    station = SimulatedStation(
+        Station(1, np.zeros(3), np.eye(3), IDEAL_CALIBRATION), 0.0, 0.02, np.zeros(1, np.int64)
+    )
+    _, count = station.observe(
+        np.zeros(1), lambda time: np.broadcast_to(point, (*time.shape, 3)), np.zeros((1, 2))
+    )
+    assert np.isfinite(count).all() == received
+    assert np.isfinite(count).any() == received
+
+
+def test_photodiodes_receive_only_stations_that_they_face() -> None:
+    normal = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    receiver = Receiver(np.array([[0.05, 0.02, 0.0], [-0.05, 0.0, 0.01]]), normal)
+    session = simulate(replace(NOISELESS, receiver=receiver, robots=2, stations=3))
+    s, truth = session.sweeps, session.truth[1]
+    rows = np.flatnonzero(s.device == 1)
+    assert set(s.sensor[rows]) == {0, 1}
+    nearest = np.searchsorted(truth.time_ns, s.time_ns[rows]).clip(max=len(truth) - 1)
+    heading = heading_of(truth.quaternion[nearest])
+    direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * normal[s.sensor[rows], :1]
+    station = np.stack([x.position for x in session.true_scene.stations])[s.channel[rows] - 1]
+    towards = (station - truth.position[nearest])[:, :2]
+    facing = np.sum(direction * towards, axis=-1)
+    # The photodiodes are up to 5 cm from the robot's position.
+    assert facing.min() > -0.06
+    # Every station is faced by one of the two.
+    assert len(rows) > 0.95 * 2 * 3 * 10 * 30
+
+
+def test_stations_are_mounted_realistically_and_have_real_calibrations() -> None:
     for seed in range(10):
-        made = simulate(SimulationOptions(stations=11, duration_s=1.0, seed=seed))
-        stations = made.stations.stations
-        place = np.stack([s.position for s in stations])
-        assert np.all(np.abs(np.hypot(place[:, 0], place[:, 1]) - 2.0) <= 0.1)
-        assert np.all((place[:, 2] >= 1.5) & (place[:, 2] <= 2.0))
+        session = simulate(SimulationOptions(stations=11, duration_s=1.0, seed=seed))
+        stations = session.true_scene.stations
+        position = np.stack([s.position for s in stations])
+        assert np.all(np.abs(np.hypot(position[:, 0], position[:, 1]) - 2.0) <= 0.1)
+        assert np.all((position[:, 2] >= 1.5) & (position[:, 2] <= 2.0))
         for s in stations:
             np.testing.assert_allclose(s.rotation @ s.rotation.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(s.rotation) > 0
@@ -310,20 +359,20 @@ def test_stations_stand_as_they_would_and_have_real_calibrations() -> None:
 
 
 def test_the_prior_is_the_mean_of_the_units() -> None:
-    """The columns of a unit are read as the prior reads them."""
-    many = simulate(SimulationOptions(stations=11, duration_s=1.0)).stations.stations
+    """The simulator and the prior interpret the columns of a unit alike."""
+    many = simulate(SimulationOptions(stations=11, duration_s=1.0)).true_scene.stations
     mean = np.mean([s.calibration.sweeps[:, :3] for s in many], axis=0)
     np.testing.assert_allclose(mean, GENERIC_CALIBRATION.sweeps[:, :3], atol=1e-12)
     generic = simulate(SimulationOptions(duration_s=1.0, calibration="generic"))
-    assert all(isinstance(s.calibration, Calibration) for s in generic.stations.stations)
-    assert all(s.calibration is GENERIC_CALIBRATION for s in generic.stations.stations)
+    assert all(isinstance(s.calibration, Calibration) for s in generic.true_scene.stations)
+    assert all(s.calibration is GENERIC_CALIBRATION for s in generic.true_scene.stations)
 
 
 @pytest.mark.parametrize("planar", [True, False])
 def test_robots_drive_smoothly_along_their_heading(planar: bool) -> None:
-    made = simulate(replace(QUIET, robots=4, planar=planar, duration_s=60.0))
-    for truth in made.truth[1:]:
-        time_s = (truth.time_ns - EPOCH_NS) * 1e-9
+    session = simulate(replace(NOISELESS, robots=4, planar=planar, duration_s=60.0))
+    for truth in session.truth[1:]:
+        time_s = (truth.time_ns - START_NS) * 1e-9
         np.testing.assert_allclose(np.diff(time_s), 0.01, atol=1e-6)
         velocity = np.diff(truth.position, axis=0) / 0.01
         speed = np.linalg.norm(velocity, axis=1)
@@ -340,83 +389,83 @@ def test_robots_drive_smoothly_along_their_heading(planar: bool) -> None:
 
 
 @pytest.mark.parametrize("planar", [True, False])
-def test_the_first_robot_stands_on_the_markers(planar: bool) -> None:
-    made = simulate(replace(QUIET, planar=planar, robots=2))
-    known = FLAT_MARKERS if planar else RAISED_MARKERS
-    assert made.scene.stations == ()
-    assert made.scene.planar is planar
-    assert made.stations.markers == made.scene.markers
-    truth = made.truth[0]
-    for marker, place in zip(made.scene.markers, known, strict=True):
-        [sighting] = marker.sightings
-        assert sighting.device == truth.device == made.sweeps.devices[0]
-        assert (sighting.end_ns - sighting.start_ns) * 1e-9 == pytest.approx(2.0)
-        there = (truth.time_ns >= sighting.start_ns) & (truth.time_ns <= sighting.end_ns)
-        assert np.count_nonzero(there) >= 199
+def test_the_first_robot_rests_on_the_markers(planar: bool) -> None:
+    session = simulate(replace(NOISELESS, planar=planar, robots=2))
+    known = FLOOR_MARKERS_M if planar else RAISED_MARKERS_M
+    assert session.scene.stations == ()
+    assert session.scene.planar is planar
+    assert session.true_scene.markers == session.scene.markers
+    truth = session.truth[0]
+    for marker, position in zip(session.scene.markers, known, strict=True):
+        [visit] = marker.sightings
+        assert visit.device == truth.device == session.sweeps.devices[0]
+        assert (visit.end_ns - visit.start_ns) * 1e-9 == pytest.approx(2.0)
+        at_rest = (truth.time_ns >= visit.start_ns) & (truth.time_ns <= visit.end_ns)
+        assert np.count_nonzero(at_rest) >= 199
         np.testing.assert_allclose(
-            truth.position[there], place[None].repeat(there.sum(), 0), atol=1e-9
+            truth.position[at_rest], position[None].repeat(at_rest.sum(), 0), atol=1e-9
         )
-        np.testing.assert_array_equal(marker.position, place)
+        np.testing.assert_array_equal(marker.position, position)
     spread = np.linalg.svd(known - known.mean(axis=0), compute_uv=False)
     assert spread[2] < 1e-12 if planar else spread[2] > 0.3
-    # In the hand, between markers, it is neither received nor has it truth.
+    # While it is carried between markers it has neither sweeps nor ground truth.
     gaps = [
         (a.sightings[0].end_ns, b.sightings[0].start_ns)
-        for a, b in zip(made.scene.markers, made.scene.markers[1:], strict=False)
+        for a, b in zip(session.scene.markers, session.scene.markers[1:], strict=False)
     ]
-    mine = made.sweeps.time_ns[made.sweeps.device == 0]
+    received_ns = session.sweeps.time_ns[session.sweeps.device == 0]
     for start, end in gaps:
-        assert not np.any((mine > start) & (mine < end))
+        assert not np.any((received_ns > start) & (received_ns < end))
         assert not np.any((truth.time_ns > start) & (truth.time_ns < end))
 
 
-# ---- what goes wrong
+# ---- faults
 
 
-def test_occlusion_hides_the_share_in_blocks() -> None:
+def test_occlusion_hides_the_fraction_in_blocks() -> None:
     options = SimulationOptions(robots=8, stations=3, duration_s=60.0)
     free = simulate(options).sweeps
     hidden = simulate(replace(options, occlusion=0.3)).sweeps
     assert 1 - len(hidden) / len(free) == pytest.approx(0.3, abs=0.02)
     kept = np.isin(free.time_ns, hidden.time_ns)
     assert np.count_nonzero(kept) == len(hidden)
-    mine = kept[(free.device == 3) & (free.channel == 2)]
-    changes = np.count_nonzero(mine[1:] != mine[:-1])
+    visible = kept[(free.device == 3) & (free.channel == 2)]
+    changes = np.count_nonzero(visible[1:] != visible[:-1])
     assert 4 < changes < 60  # independent samples: 500
     other = kept[(free.device == 3) & (free.channel == 1)]
-    n = min(len(mine), len(other))
-    assert abs(np.corrcoef(mine[:n], other[:n])[0, 1]) < 0.5  # each on its own
+    n = min(len(visible), len(other))
+    assert abs(np.corrcoef(visible[:n], other[:n])[0, 1]) < 0.5  # each on its own
 
 
-@pytest.mark.parametrize(("share", "stations"), [(0.02, 2), (0.2, 2), (0.2, 1), (0.95, 3)])
-def test_outliers_are_the_share_that_was_asked_for(share: float, stations: int) -> None:
+@pytest.mark.parametrize(("fraction", "stations"), [(0.02, 2), (0.2, 2), (0.2, 1), (0.95, 3)])
+def test_outliers_are_the_requested_fraction(fraction: float, stations: int) -> None:
     options = SimulationOptions(robots=3, stations=stations)
-    clean, made = simulate(options), simulate(replace(options, outliers=share))
-    assert len(made.sweeps) == len(clean.sweeps)
-    assert np.count_nonzero(made.wrong) == round(share * len(clean.sweeps))
-    assert not np.any(clean.wrong)
+    clean, faulty = simulate(options), simulate(replace(options, outliers=fraction))
+    assert len(faulty.sweeps) == len(clean.sweeps)
+    assert np.count_nonzero(faulty.is_outlier) == round(fraction * len(clean.sweeps))
+    assert not np.any(clean.is_outlier)
 
     def rows(s: Sweeps, which: NDArray[np.bool_]) -> set[tuple[float, ...]]:
         return set(
             zip(s.device[which], s.time_ns[which], s.channel[which], s.count[which], strict=True)
         )
 
-    every = rows(clean.sweeps, ~clean.wrong)
-    assert rows(made.sweeps, ~made.wrong) <= every
-    assert not rows(made.sweeps, made.wrong) & every
+    every = rows(clean.sweeps, ~clean.is_outlier)
+    assert rows(faulty.sweeps, ~faulty.is_outlier) <= every
+    assert not rows(faulty.sweeps, faulty.is_outlier) & every
 
 
 def test_outliers_jump_are_reflected_and_are_swapped() -> None:
     options = SimulationOptions(robots=3, noise_rad=0.0, duration_s=60.0)
-    clean, made = simulate(options), simulate(replace(options, outliers=0.12))
-    s, c = made.sweeps, clean.sweeps
+    clean, faulty = simulate(options), simulate(replace(options, outliers=0.12))
+    s, c = faulty.sweeps, clean.sweeps
     before = {(d, t): k for k, (d, t) in enumerate(zip(c.device, c.time_ns, strict=True))}
     jumps = swaps = reflections = 0
-    for k in np.flatnonzero(made.wrong):
+    for k in np.flatnonzero(faulty.is_outlier):
         old = before.get((s.device[k], s.time_ns[k]))
         if old is None:
             reflections += 1
-            assert _is_mirrored(made, k)
+            assert _is_reflection(faulty, k)
         elif s.channel[k] == c.channel[old]:
             jumps += 1
             assert abs(s.count[k] - c.count[old]) * COUNT_RAD > np.radians(2.0)
@@ -424,17 +473,27 @@ def test_outliers_jump_are_reflected_and_are_swapped() -> None:
             swaps += 1
             assert s.count[k] == c.count[old]
             assert channel_of(s.polynomial[k]) == s.channel[k]
-    total = np.count_nonzero(made.wrong)
+    total = np.count_nonzero(faulty.is_outlier)
     for kind in (jumps, swaps, reflections):
         assert kind == pytest.approx(total / 3, abs=6)
 
 
-def _is_mirrored(made: SimulatedSession, k: int) -> bool:
-    """Whether a sweep is where the robot's image in one of four walls would be seen."""
-    s = made.sweeps
-    station = made.stations.stations[s.channel[k] - 1]
-    truth = made.truth[s.device[k]]
-    at = [np.interp(s.time_ns[k] - EPOCH_NS, truth.time_ns - EPOCH_NS, x) for x in truth.position.T]
+@pytest.mark.parametrize("seed", range(3))
+def test_exchanged_stations_exchange_their_labels_once(seed: int) -> None:
+    # A sweep that were exchanged with two others would change the number of each station.
+    options = SimulationOptions(robots=3, stations=6, seed=seed)
+    clean, faulty = simulate(options).sweeps, simulate(replace(options, outliers=0.9)).sweeps
+    assert np.count_nonzero(clean.channel != faulty.channel) > 100
+    np.testing.assert_array_equal(np.bincount(clean.channel), np.bincount(faulty.channel))
+    np.testing.assert_array_equal(np.bincount(clean.polynomial), np.bincount(faulty.polynomial))
+
+
+def _is_reflection(session: SimulatedSession, k: int) -> bool:
+    """Return True if a sweep is that of the robot's mirror image in one of four walls."""
+    s = session.sweeps
+    station = session.true_scene.stations[s.channel[k] - 1]
+    truth = session.truth[s.device[k]]
+    at = [np.interp(s.time_ns[k] - START_NS, truth.time_ns - START_NS, x) for x in truth.position.T]
     for axis, wall in ((0, 2.5), (0, -2.5), (1, 2.5), (1, -2.5)):
         image = np.array(at)
         image[axis] = 2 * wall - image[axis]
@@ -446,7 +505,7 @@ def _is_mirrored(made: SimulatedSession, k: int) -> bool:
     return False
 
 
-# ---- options and the way through the solver
+# ---- options, and solving a simulated session
 
 
 @pytest.mark.parametrize(
@@ -477,9 +536,9 @@ def test_options_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     ],
 )
 def test_odd_sessions_are_whole(options: dict[str, float]) -> None:
-    made = simulate(SimulationOptions(**options))  # type: ignore[arg-type]
-    s = made.sweeps
-    assert len(s.count) == len(s.time_ns) == len(made.wrong)
+    session = simulate(SimulationOptions(**options))  # type: ignore[arg-type]
+    s = session.sweeps
+    assert len(s.count) == len(s.time_ns) == len(session.is_outlier)
     assert np.all((s.count >= 0) & (s.count < period_counts(s.channel)))
     if options.get("report_hz", 0) > 50:  # no rotation is reported twice
         assert len(set(zip(s.channel, s.time_ns, strict=True))) == len(s)
@@ -495,9 +554,9 @@ def test_odd_sessions_are_whole(options: dict[str, float]) -> None:
     ],
 )
 def test_the_solver_finds_the_robots(options: SimulationOptions, largest_mm: float) -> None:
-    made = simulate(options)
-    solution = lighthouse.solve(made.sweeps, made.scene)
-    truth = {t.device: t for t in made.truth}
+    session = simulate(options)
+    solution = lighthouse.solve(session.sweeps, session.scene)
+    truth = {t.device: t for t in session.truth}
     score = metrics.evaluate_all([(t, truth[t.device]) for t in solution.trajectories])
     assert score.n > 0.8 * 10 * options.robots * (options.duration_s - 6)
     assert score.mae < 1e-3 * largest_mm
