@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from locatk.core.ticks import JUMP_S, SLEW_LIMIT, TickClock
+from locatk.core.clock_sync import JUMP_S, SLEW_LIMIT, TickClock
 
 EPOCH_NS = 1_760_000_000_000_000_000
 Times = NDArray[np.int64]

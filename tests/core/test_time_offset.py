@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core import clocks, metrics
 from locatk.core.errors import DegenerateError, InputError
+from locatk.core.evaluation import Evaluation, EvaluationOptions, estimate_coarse_offset, evaluate
+from locatk.core.evaluation.coarse_offset import clocks_agree
 from locatk.core.geometry import rotation_exp
 from locatk.core.trajectory import Trajectory
 
@@ -15,6 +18,10 @@ Array = NDArray[np.float64]
 
 EPOCH = 1_690_218_696_000_000_000
 MONTHS_NS = 123 * 86_400 * 10**9 + 456_789_012_345
+
+
+def evaluate_pair(estimate: Trajectory, truth: Trajectory, **options: Any) -> Evaluation:
+    return evaluate([(estimate, truth)], EvaluationOptions(**options))
 
 
 def way(t: Array) -> Array:
@@ -58,11 +65,11 @@ def test_clocks_that_are_months_apart(align: str, loops: int) -> None:
             scale * estimate.position @ turn.T + [3, -1, 0],
             MONTHS_NS,
         )
-    found = metrics.evaluate(estimate, TRUTH, align=align, offset_s="auto")
+    found = evaluate_pair(estimate, TRUTH, align=align, offset_s="auto")
     # Any loop will do.
     off = (found.offset_s + MONTHS_NS / 1e9 + 20.0) % 40.0 - 20.0
     assert off == pytest.approx(0, abs=5e-3)
-    assert "by motion" in found.offset_source
+    assert found.time_offset.coarse_method == "motion"
     if align != "origin":  # which rests on one pose and its noise
         assert found.mae < 5e-3
     assert found.n + sum(found.unscored.values()) == len(estimate)
@@ -72,10 +79,10 @@ def test_clocks_that_are_months_apart(align: str, loops: int) -> None:
 
 def test_clocks_that_agree_are_searched_as_ever() -> None:
     part = trajectory(TIME[300:900], WAY[300:900])
-    assert clocks.clocks_agree([(part, TRUTH)])
-    assert not clocks.clocks_agree([(later(), TRUTH)])
-    found = metrics.evaluate(part, TRUTH, offset_s="auto")
-    assert "clocks" not in found.offset_source
+    assert clocks_agree([(part, TRUTH)])
+    assert not clocks_agree([(later(), TRUTH)])
+    found = evaluate_pair(part, TRUTH, offset_s="auto")
+    assert found.time_offset.coarse_method is None
     assert found.offset_s == pytest.approx(0, abs=1e-3)
 
 
@@ -83,20 +90,20 @@ def test_a_straight_way_is_placed_where_nothing_is_fitted() -> None:
     """Its shape tells no time; where it is does."""
     line = np.outer(TIME, [0.2, 0.1, 0.0])
     estimate = trajectory(TIME[500:2500], line[500:2500], MONTHS_NS)
-    found = metrics.evaluate(estimate, trajectory(TIME, line), offset_s="auto")
+    found = evaluate_pair(estimate, trajectory(TIME, line), offset_s="auto")
     assert found.offset_s == pytest.approx(-MONTHS_NS / 1e9, abs=1e-3)
 
 
 def test_motions_that_are_unlike_fall_back_to_the_first_stamps() -> None:
     rng = np.random.default_rng(0)
     noise = np.cumsum(rng.normal(0, 0.01, WAY.shape), axis=0)
-    coarse = clocks.coarse_offset([(trajectory(TIME, noise, MONTHS_NS), TRUTH)], align="none")
-    assert coarse.by == "first stamps"
+    coarse = estimate_coarse_offset([(trajectory(TIME, noise, MONTHS_NS), TRUTH)], align="none")
+    assert coarse.method == "first stamps"
     assert coarse.offset_s == pytest.approx(-MONTHS_NS / 1e9)
     with pytest.raises(InputError, match="too unlike"):  # nor do these tell an offset
-        metrics.evaluate(trajectory(TIME, 1e-9 * noise, MONTHS_NS), TRUTH, offset_s="auto")
+        evaluate_pair(trajectory(TIME, 1e-9 * noise, MONTHS_NS), TRUTH, offset_s="auto")
     with pytest.raises(InputError, match="no poses"):
-        clocks.coarse_offset([(trajectory(TIME[:0], WAY[:0]), TRUTH)])
+        estimate_coarse_offset([(trajectory(TIME[:0], WAY[:0]), TRUTH)])
 
 
 def test_a_quarter_without_motion_is_not_what_the_offset_is_taken_from() -> None:
@@ -105,11 +112,11 @@ def test_a_quarter_without_motion_is_not_what_the_offset_is_taken_from() -> None
     time = np.arange(len(position)) * 0.01
     truth = trajectory(time, position)
     shifted = trajectory(time[100:-100:5], position[100:-100:5], 70_000_000)
-    found = metrics.evaluate(shifted, truth, offset_s="auto")
+    found = evaluate_pair(shifted, truth, offset_s="auto")
     assert found.offset_s == pytest.approx(-0.07, abs=2e-3)
-    assert "held-out 25% to 50%" in found.offset_source
+    assert found.time_offset.held_out == (0.25, 0.5)
     with pytest.raises(Exception, match="hardly moved"):
-        metrics.evaluate(shifted, truth, offset_s="auto", held_out=(0.0, 0.25))
+        evaluate_pair(shifted, truth, offset_s="auto", held_out=(0.0, 0.25))
 
 
 def test_long_recordings_are_searched_in_longer_steps() -> None:
@@ -117,7 +124,7 @@ def test_long_recordings_are_searched_in_longer_steps() -> None:
     position = way(time)
     truth = trajectory(time, position)
     late = trajectory(time[5000:15000], position[5000:15000], MONTHS_NS)
-    coarse = clocks.coarse_offset([(late, truth)], align="se2")
+    coarse = estimate_coarse_offset([(late, truth)], align="se2")
     assert coarse.offset_s == pytest.approx(-MONTHS_NS / 1e9, abs=coarse.span_s)
 
 
@@ -145,10 +152,12 @@ def test_a_drive_that_repeats_itself_is_told(apart_m: float, alike: int) -> None
             trajectory(time, truth),
         )
     ]
-    coarse = clocks.coarse_offset(pairs)
-    assert (coarse.by, coarse.alike) == ("motion", alike)
-    found = metrics.evaluate(*pairs[0], offset_s="auto")
-    assert ("fits other offsets as well (4)" in found.offset_source) == (alike > 0)
+    coarse = estimate_coarse_offset(pairs)
+    assert (coarse.method, coarse.alternatives) == ("motion", alike)
+    found = evaluate_pair(*pairs[0], offset_s="auto")
+    assert found.time_offset.alternatives == alike
+    described = "fits other offsets as well (4)" in found.time_offset.describe()
+    assert described == (alike > 0)
     off = found.offset_s + MONTHS_NS / 1e9
     assert (off + 10) % 20 - 10 == pytest.approx(0, abs=5e-3)
     if not alike:
@@ -167,12 +176,12 @@ def test_the_offset_is_taken_from_where_devices_move() -> None:
     seen = np.flatnonzero(~carried | (time > 41))[::10]
     rng = np.random.default_rng(0)
     rough = position[seen] + rng.normal(0, 2e-3, (len(seen), 3))
-    found = metrics.evaluate(
+    found = evaluate_pair(
         trajectory(time[seen], rough, 50_000_000), trajectory(time, position), offset_s="auto"
     )
-    assert "held-out 50% to 75%" in found.offset_source
+    assert found.time_offset.held_out == (0.5, 0.75)
     assert found.offset_s == pytest.approx(-0.05, abs=2e-3)
-    standing = metrics.evaluate(
+    standing = evaluate_pair(
         trajectory(time[seen], rough, 50_000_000),
         trajectory(time, position),
         offset_s="auto",
@@ -184,4 +193,4 @@ def test_the_offset_is_taken_from_where_devices_move() -> None:
 def test_frames_that_differ_are_named_where_nothing_tells_the_offset() -> None:
     estimate = trajectory(TIME[::7], 0.01 * WAY[::7] + 1e3)
     with pytest.raises(DegenerateError, match="frames differ"):
-        metrics.evaluate(estimate, TRUTH, offset_s="auto")
+        evaluate_pair(estimate, TRUTH, offset_s="auto")
