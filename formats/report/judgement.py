@@ -58,7 +58,7 @@ def verdict(subject: Subject) -> str:
             f" Time offset: {evaluation.offset_s:.4f} s ({evaluation.time_offset.describe()})."
         )
     consistency = evaluation.consistency
-    judged = "" if consistency is None else f"{consistency.words().capitalize()}."
+    judged = "" if consistency is None else f"{consistency.describe().capitalize()}."
     return sentences(text, fitted, judged, _left_out(solution))
 
 
