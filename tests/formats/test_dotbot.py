@@ -524,4 +524,4 @@ def test_no_markers_from_a_plane_that_is_not_of_these_counts(write: Write) -> No
     )
     session = read_dotbot([write(still)])
     assert session.scene is None
-    assert "same place" in session.warnings[0]
+    assert "coincide" in session.warnings[0]
