@@ -150,8 +150,7 @@ def whole_way(
     from locatk.cli.demo_sessions import MAKERS, SPEED_MPS
     from locatk.cli.solve_batch import command_line
     from locatk.cli.systems import Request, solve_session
-    from locatk.core import metrics
-    from locatk.core.association import pair_devices
+    from locatk.core.evaluation import evaluate, pair_devices
     from locatk.formats import solutions
     from locatk.formats.batch.made import source_facts
     from locatk.formats.plot import plot_solution
@@ -184,7 +183,7 @@ def whole_way(
         "system": system,
         "poses": solved.solution.poses,
         "mae_m": None if subject.evaluation is None else subject.evaluation.mae,
-        "paper_mae_m": metrics.evaluate_all(pairs).mae if pairs else None,
+        "paper_mae_m": evaluate(pairs).mae if pairs else None,
         "solve_s": solved.solve_s,
     }
     return row, subject

@@ -12,7 +12,7 @@ from locatk.cli import console, options
 from locatk.core.errors import InputError
 
 ALIGNMENTS = ("none", "se2", "se3", "sim2", "sim3", "yaw", "origin")
-"""As in :mod:`locatk.core.alignment`, which imports numpy (a test holds the two equal)."""
+"""Copy of :data:`locatk.core.evaluation.ALIGNMENTS`, which imports numpy (a test compares them)."""
 
 
 class Offset(click.ParamType):
@@ -136,12 +136,10 @@ def command(
       locatk eval solved.mcap --truth mocap.csv --pair robot-785b=red --pair robot-dffa=blue
     """
     from locatk.cli import eval_text
-    from locatk.core import metrics
-    from locatk.core.association import pair_devices
-    from locatk.core.relative import Delta
+    from locatk.core.evaluation import Delta, EvaluationOptions, evaluate, pair_devices
     from locatk.formats import trajectory_files as files
 
-    Delta.parse(delta)
+    pose_distance = Delta.parse(delta)
     mine = files.open_file(estimate)
     true = files.open_file(truth, role="truth")
     files.check_kinds(mine, true)
@@ -171,20 +169,20 @@ def command(
     as_evo = mine.kind in files.EVO_KINDS and true.kind in files.EVO_KINDS
     if match == "auto":
         match = "nearest" if as_evo else "interpolate"
-    found = metrics.evaluate_all(
-        pairs,
+    evaluation_options = EvaluationOptions(
         align=align,
         offset_s=offset,  # type: ignore[arg-type]
         match=match,
         max_diff_s=max_diff,
         # Rows of KITTI are stamped by the second.
         max_gap_s=max(1.0, max_gap) if mine.kind == "kitti" else max_gap,
-        delta=delta,
+        delta=pose_distance,
         all_pairs=all_pairs,
     )
-    if "first stamps" in found.offset_source:
+    found = evaluate(pairs, evaluation_options)
+    if found.time_offset.coarse_method == "first stamps":
         console.warn("the motions are too unlike to set the clocks by: the first stamps were used")
-    if "as well" in found.offset_source:
+    if found.time_offset.alternatives:
         console.warn("the drive repeats itself, and the motion fits several offsets: give --offset")
     if as_json:
         facts = {"version": 1, "estimate": estimate, "truth": truth, **found.as_dict()}

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.core.evaluation import Evaluation
-    from locatk.core.statistics import Statistics
+    from locatk.core.evaluation import Evaluation, Statistics
 
 STATISTICS = ("rmse", "mean", "median", "p95", "max", "std", "min", "sse")
 
@@ -29,7 +28,7 @@ def text(found: Evaluation) -> str:
     if several:
         every = {name: getattr(found, name) for name, _, _ in KINDS}
         scopes.append(("all", every))
-    scopes += [(name, found.of_device(i)) for i, name in enumerate(found.devices)]
+    scopes += [(name, found.device_statistics(i)) for i, name in enumerate(found.devices)]
     rows = [
         _row(name, f"{short} [{unit}]", figures, factor)
         if length
@@ -79,7 +78,7 @@ def _lines(found: Evaluation) -> list[str]:
         f"alignment: {found.align}, fitted on {facts['align_fitted_on']}"
         + (f" (scale {found.alignment.scale:.6f})" if found.align.startswith("sim") else ""),
         f"association: {found.match} ({how})",
-        f"time offset: {found.offset_s:.4f} s ({found.offset_source})",
+        f"time offset: {found.offset_s:.4f} s ({found.time_offset.describe()})",
         f"not scored: {left_out or 'nothing'}",
         _coverage(found),
         f"path: {found.path_m:.3f} m (truth), {found.path_estimate_m:.3f} m (estimate)",
@@ -89,10 +88,10 @@ def _lines(found: Evaluation) -> list[str]:
 
 
 def _coverage(found: Evaluation) -> str:
-    share, time = found.coverage.share, found.coverage
-    if share is None:
+    fraction, time = found.coverage.fraction, found.coverage
+    if fraction is None:
         return "coverage: - (the truth tells of single poses)"
-    return f"coverage: {100 * share:.1f} % ({time.solved_s:.1f} of {time.truth_s:.1f} s)"
+    return f"coverage: {100 * fraction:.1f} % ({time.solved_s:.1f} of {time.truth_s:.1f} s)"
 
 
 def _drift(drift: dict[str, float | None]) -> str:
@@ -108,7 +107,7 @@ def _consistency(found: Evaluation) -> str:
     if said is None:
         return "consistency: - (the estimate has no covariances)"
     return (
-        f"consistency: {said.words()}; NEES {said.mean:.3g} a degree of freedom "
+        f"consistency: {said.describe()}; NEES {said.mean:.3g} a degree of freedom "
         f"({said.low:.2f} to {said.high:.2f} expected of independent poses), "
         f"{100 * said.inside:.0f} % of the poses in their 95 % region"
     )

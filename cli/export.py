@@ -121,12 +121,12 @@ def command(
 
 def stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> None:
     """Write the stations of a scene, of a session or of a solution."""
-    from locatk.core.errors import about
+    from locatk.core.errors import error_context
     from locatk.formats import crazyflie
 
     options.guard_output(output, overwrite=overwrite, inputs=[source])
     scene = scene_of(source)
-    with about(source):
+    with error_context(source):
         crazyflie.write_config(output, scene, overwrite=overwrite)
     channels = [station.channel for station in scene.stations]
     count, s = ("1 station", "") if len(channels) == 1 else (f"{len(channels)} stations", "s")

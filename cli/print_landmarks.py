@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, options
-from locatk.core.errors import OutputExistsError, about
+from locatk.core.errors import OutputExistsError, error_context
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.floor import FloorMap
@@ -124,7 +124,7 @@ def landmarks(
             raise OutputExistsError("drawing and materials would be one file", file=bom)
     floor = read_map(map_file)
     items = bill(floor, spares_percent)
-    with about(map_file):
+    with error_context(map_file):
         if whole_floor:
             data, answer = _floor(floor, on, margin_mm, 10.0 if overlap_mm is None else overlap_mm)
         else:

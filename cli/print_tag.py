@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, options
-from locatk.core.errors import InputError, about
+from locatk.core.errors import InputError, error_context
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -137,7 +137,7 @@ def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int
                 "--id all are drawn",
             )
     wanted = ids or tags.ids or tuple(sorted(tags.site))
-    with about(tag_file):
+    with error_context(tag_file):
         return [(number, layout_of(tags, number)) for number in wanted]
 
 

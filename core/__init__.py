@@ -1,1 +1,1 @@
-"""Pure computation on numpy arrays: no files, no terminal, no clock."""
+"""Pure computation on numpy arrays, without files, terminals or clocks."""

@@ -1,7 +1,7 @@
-"""Line drawings in mm, before they become a PDF or an SVG.
+"""Line drawings in mm, independent of the output as PDF or SVG.
 
-A point is (x, y) from the page's lower left corner, x to the right and y up; turns are in
-degrees, counter-clockwise. Everything is in one ink, black.
+A point is (x, y) from the lower left corner of the page, x to the right and y up; angles are in
+degrees, counter-clockwise. Everything is drawn in black.
 """
 
 from __future__ import annotations
@@ -16,22 +16,39 @@ Point: TypeAlias = tuple[float, float]
 MM_PER_POINT = 25.4 / 72
 
 LINE_MM = 0.15
-"""Width of a line where nothing else is said."""
+"""Default width of a line."""
 
-CAPITAL = 0.72
-"""Height of a capital or a digit in sizes of the font (Helvetica)."""
+CAPITAL_HEIGHT_EM = 0.72
+"""Height of capitals and digits of Helvetica, as a fraction of the font size."""
 
-WIDEST = 0.6
-"""Width of a letter in sizes of the font that few words exceed, in any sans serif."""
+MAX_LETTER_WIDTH_EM = 0.6
+"""Mean width of the letters of a text, as a fraction of the font size, that few texts exceed in any
+sans-serif font."""
 
-RULER_POINTS = 5.0
-RULER_DEPTH_MM = 2.6 + CAPITAL * RULER_POINTS * MM_PER_POINT
-"""How far a ruler's numbers reach from its edge."""
+RULER_FONT_POINTS = 5.0
+
+RULER_BASELINE_MM = 2.6
+"""Distance of the baseline of a ruler's numbers from its edge."""
+
+RULER_DEPTH_MM = RULER_BASELINE_MM + CAPITAL_HEIGHT_EM * RULER_FONT_POINTS * MM_PER_POINT
+"""Extent of a ruler, including its numbers, from its edge."""
+
+CUT_MARK_MM = 3.0
+"""Distance of the outer end of a cut mark from the corner."""
+
+CUT_MARK_GAP_MM = 1.0
+"""Distance of the inner end of a cut mark from the corner."""
+
+TRUE_SIZE = "Print at 100 %, without scaling, and measure the rulers."
+"""Instruction on pages at true size."""
+
+RULER_MM = 100
+"""Length of the rulers of a page that is large enough."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A straight line; ``dash_mm`` is the length of dashes and of the gaps between them."""
+    """Straight line; ``dash_mm`` is the length of its dashes and of the gaps between them."""
 
     start: Point
     end: Point
@@ -41,7 +58,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle; its line runs half inside and half outside of ``radius_mm``."""
+    """Circle; its line is centred on ``radius_mm``."""
 
     centre: Point
     radius_mm: float
@@ -50,7 +67,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class Polygon:
-    """A closed outline, or a black shape."""
+    """Closed outline, or a filled shape."""
 
     corners: tuple[Point, ...]
     filled: bool = False
@@ -58,23 +75,23 @@ class Polygon:
 
 
 @dataclass(frozen=True)
-class Words:
-    """One line of text; ``at`` is on its baseline, at its start, middle or end."""
+class Text:
+    """Line of text; ``position`` is on its baseline, at the ``anchor``."""
 
     text: str
-    at: Point
+    position: Point
     points: float
     anchor: Literal["start", "middle", "end"] = "start"
     bold: bool = False
-    turn_deg: float = 0.0
+    angle_deg: float = 0.0
 
 
-Mark: TypeAlias = Line | Circle | Polygon | Words
+Mark: TypeAlias = Line | Circle | Polygon | Text
 
 
 @dataclass(frozen=True)
 class Group:
-    """Marks that belong together, under a name that the page has once."""
+    """Related marks under a name that is unique on the page."""
 
     name: str
     marks: tuple[Mark, ...]
@@ -82,80 +99,75 @@ class Group:
 
 @dataclass(frozen=True)
 class Page:
-    """A drawing on a paper of ``size_mm`` (width, height)."""
+    """Drawing on a paper of ``size_mm`` (width, height)."""
 
     size_mm: Point
     groups: tuple[Group, ...]
 
 
 def ruler(start: Point, length_mm: int, *, upright: bool = False) -> tuple[Mark, ...]:
-    """A ruler with a tick each mm, a longer one each 5 mm and a number each 10 mm.
+    """Draw a ruler with a tick every mm, a longer one every 5 mm and a number every 10 mm.
 
-    It runs from ``start`` to the right with its ticks below, or up with its ticks at the
-    left; it is :data:`RULER_DEPTH_MM` deep.
+    It runs from ``start`` to the right with its ticks below, or up with its ticks to the left; it
+    is :data:`RULER_DEPTH_MM` deep.
     """
 
-    def point(along: float, deep: float) -> Point:
+    def point(along_mm: float, depth_mm: float) -> Point:
         if upright:
-            return start[0] - deep, start[1] + along
-        return start[0] + along, start[1] - deep
+            return start[0] - depth_mm, start[1] + along_mm
+        return start[0] + along_mm, start[1] - depth_mm
 
-    # Turned words grow away from their baseline to the left, straight ones upwards.
-    baseline = 2.6 if upright else RULER_DEPTH_MM
-    turn = 90.0 if upright else 0.0
+    # The letters of upright text are to the left of its baseline, those of other text above it.
+    baseline = RULER_BASELINE_MM if upright else RULER_DEPTH_MM
+    angle = 90.0 if upright else 0.0
     marks: list[Mark] = [Line(point(0, 0), point(length_mm, 0))]
-    for at in range(length_mm + 1):
-        marks.append(Line(point(at, 0), point(at, _tick(at))))
-        if at % 10 == 0:
-            words = Words(str(at), point(at, baseline), RULER_POINTS, "middle", turn_deg=turn)
-            marks.append(words)
-    after = text_width(str(length_mm), RULER_POINTS) / 2 + 0.8
-    marks.append(Words("mm", point(length_mm + after, baseline), RULER_POINTS, turn_deg=turn))
+    for tick in range(length_mm + 1):
+        marks.append(Line(point(tick, 0), point(tick, _tick_length(tick))))
+        if tick % 10 == 0:
+            position = point(tick, baseline)
+            marks.append(Text(str(tick), position, RULER_FONT_POINTS, "middle", angle_deg=angle))
+    unit_offset = text_width(str(length_mm), RULER_FONT_POINTS) / 2 + 0.8
+    position = point(length_mm + unit_offset, baseline)
+    marks.append(Text("mm", position, RULER_FONT_POINTS, angle_deg=angle))
     return tuple(marks)
 
 
-def _tick(at: int) -> float:
-    return 2.2 if at % 10 == 0 else 1.5 if at % 5 == 0 else 0.9
-
-
-CUT_MM = 3.0
-"""How far cut marks reach."""
+def _tick_length(tick: int) -> float:
+    return 2.2 if tick % 10 == 0 else 1.5 if tick % 5 == 0 else 0.9
 
 
 def cut_marks(left: float, bottom: float, right: float, top: float) -> tuple[Line, ...]:
-    """Lines that lead to the corners of what is to be cut out, up to :data:`CUT_MM` away."""
-    near = 1.0
+    """Draw lines that point to the corners of a rectangle to be cut out.
+
+    They end :data:`CUT_MARK_MM` from the corners.
+    """
     marks = []
-    for x, out in ((left, -1), (right, 1)):
-        marks += [Line((x + out * near, y), (x + out * CUT_MM, y)) for y in (bottom, top)]
-    for y, out in ((bottom, -1), (top, 1)):
-        marks += [Line((x, y + out * near), (x, y + out * CUT_MM)) for x in (left, right)]
+    for x, sign in ((left, -1), (right, 1)):
+        inner, outer = x + sign * CUT_MARK_GAP_MM, x + sign * CUT_MARK_MM
+        marks += [Line((inner, y), (outer, y)) for y in (bottom, top)]
+    for y, sign in ((bottom, -1), (top, 1)):
+        inner, outer = y + sign * CUT_MARK_GAP_MM, y + sign * CUT_MARK_MM
+        marks += [Line((x, inner), (x, outer)) for x in (left, right)]
     return tuple(marks)
 
 
 def arrow(start: Point, tip: Point, head_mm: float, width_mm: float = 0.2) -> list[Mark]:
-    """A line with a filled head of this length."""
+    """Draw a line with a filled arrow head of length ``head_mm``."""
     length = math.dist(start, tip)
     u, v = (tip[0] - start[0]) / length, (tip[1] - start[1]) / length
-    back = (tip[0] - head_mm * u, tip[1] - head_mm * v)
-    wing = 0.35 * head_mm
-    left = (back[0] - wing * v, back[1] + wing * u)
-    right = (back[0] + wing * v, back[1] - wing * u)
-    return [Line(start, back, width_mm), Polygon((tip, left, right), filled=True)]
-
-
-TRUE_SIZE = "Print at 100 %, without scaling, and measure the rulers."
-"""What a page at true size says."""
-
-RULER_MM = 100
+    base = (tip[0] - head_mm * u, tip[1] - head_mm * v)
+    half_width = 0.35 * head_mm
+    left = (base[0] - half_width * v, base[1] + half_width * u)
+    right = (base[0] + half_width * v, base[1] - half_width * u)
+    return [Line(start, base, width_mm), Polygon((tip, left, right), filled=True)]
 
 
 def page_rulers(size: Point, margin: float) -> list[Mark]:
-    """Rulers along the lower and the left edge of a page, as far as there is room."""
+    """Draw rulers along the lower and the left edge of a page, as long as it permits."""
     corner = margin + RULER_DEPTH_MM
     marks: list[Mark] = []
     for side, upright in ((size[0], False), (size[1], True)):
-        # The number at the far end, and "mm" after it, need some room.
+        # The last 8 mm are for the number at the end and the unit after it.
         length = min(RULER_MM, int(side - margin - corner - 8) // 10 * 10)
         if length > 0:
             start = (corner, corner + 2) if upright else (corner + 2, corner)
@@ -164,11 +176,11 @@ def page_rulers(size: Point, margin: float) -> list[Mark]:
 
 
 def text_width(text: str, points: float) -> float:
-    """Width in mm that a line of text hardly exceeds, whatever sans serif shows it."""
-    return WIDEST * points * MM_PER_POINT * len(text)
+    """Return the width in mm that a line of text hardly exceeds in any sans-serif font."""
+    return MAX_LETTER_WIDTH_EM * points * MM_PER_POINT * len(text)
 
 
 def wrap(text: str, points: float, width_mm: float) -> list[str]:
-    """Lines of at most ``width_mm``; a word that is longer than a line is broken anywhere."""
-    most = max(1, int(width_mm / text_width("x", points)))
-    return textwrap.wrap(text, most, break_on_hyphens=False)
+    """Wrap text to lines of at most ``width_mm``; words that are longer are broken anywhere."""
+    max_letters = max(1, int(width_mm / text_width("x", points)))
+    return textwrap.wrap(text, max_letters, break_on_hyphens=False)

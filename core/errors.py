@@ -1,18 +1,18 @@
-"""What can go wrong, and with which hint.
+"""Exceptions of locatk, with hints for the user.
 
 ::
 
     LocatkError
-    +-- InputError          (ValueError)       data that cannot be used
-    |   +-- FormatError                        not the kind of file that was expected
-    |   +-- ArtifactError                      a TOML artifact with a wrong key or value
-    +-- DegenerateError     (ValueError)       the geometry does not determine the answer
-    +-- OutputExistsError   (FileExistsError)  the output is there and --overwrite is not
-    +-- MissingDataError    (FileNotFoundError)  a file or folder that is not there
+    +-- InputError          (ValueError)         unusable data
+    |   +-- FormatError                          damaged file, or of an unexpected kind
+    |   +-- ArtifactError                        TOML artifact with a wrong key or value
+    +-- DegenerateError     (ValueError)         the observations do not determine the result
+    +-- OutputExistsError   (FileExistsError)    the output exists, without --overwrite
+    +-- MissingDataError    (FileNotFoundError)  missing file or folder
 
-Each error is one line and, where one helps, a hint. The command line prints both
-and ends with :attr:`LocatkError.exit_status`; a library user catches the class, or
-the builtin beside it.
+Each error is one line and, if possible, a hint. The command line prints both and exits with
+:attr:`LocatkError.exit_status`; users of the library catch the class, or the builtin exception
+from which it also derives.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from contextlib import contextmanager
 
 
 class LocatkError(Exception):
-    """Root of all errors that locatk raises on purpose.
+    """Base class of all errors that locatk raises deliberately.
 
     Parameters
     ----------
     message : str
-        What is wrong, in one line, without a full stop.
+        The problem in one line, without a full stop.
     file : path, optional
-        The file in which it was found.
+        The file with the problem.
     where : str or int, optional
         The line, key, topic or offset inside ``file``.
     hint : str, optional
-        What the user can do about it, as an imperative.
+        The remedy, as an imperative.
     """
 
     exit_status = 1
@@ -63,32 +63,32 @@ class LocatkError(Exception):
 
 
 class InputError(LocatkError, ValueError):
-    """Data that cannot be used: a bad number, a missing column, a repeated stamp."""
+    """Unusable data: a bad number, a missing column, a repeated stamp."""
 
 
 class FormatError(InputError):
-    """A file that is not of the kind that was expected, or is damaged."""
+    """File that is damaged or not of the expected kind."""
 
 
 class ArtifactError(InputError):
-    """A TOML artifact with a missing, unknown or wrong key."""
+    """TOML artifact with a missing, unknown or wrong key."""
 
 
 class DegenerateError(LocatkError, ValueError):
-    """The observations do not determine the answer; the message names what is missing."""
+    """Observations that do not determine the result; the message names the missing ones."""
 
 
 class OutputExistsError(LocatkError, FileExistsError):
-    """The output exists and overwriting was not asked for."""
+    """Output that exists although overwriting was not requested."""
 
 
 class MissingDataError(LocatkError, FileNotFoundError):
-    """A file or folder that is not there."""
+    """Missing file or folder."""
 
 
 @contextmanager
-def about(file: str | os.PathLike[str]) -> Iterator[None]:
-    """Let an InputError name the file whose contents led to it."""
+def error_context(file: str | os.PathLike[str]) -> Iterator[None]:
+    """Add the file whose contents are processed to every InputError raised inside."""
     try:
         yield
     except InputError as error:

@@ -1,4 +1,4 @@
-"""What artifacts are made of: grades of magnet, and the lines of a bill of materials."""
+"""Materials of artifacts: magnet grades, and the items of a bill of materials."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ GRADES_T = {
     "N50": (1.39, 1.45),
     "N52": (1.42, 1.48),
 }
-"""Remanence of sintered NdFeB by grade at 20 degrees C, from what makers list (K&J
-Magnetics, Vormag); it falls by 0.12 % a degree."""
+"""Lowest and highest remanence of sintered NdFeB at 20 degrees C by grade, in tesla, as listed by
+manufacturers (K&J Magnetics, Vormag). It falls by 0.12 % per degree."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """A line of a bill of materials.
+    """Item of a bill of materials.
 
     Attributes
     ----------
     part : str
     count : int
     detail : str
-        What to buy, in words.
+        Description for buying it.
     price_usd : float or None
-        Upper limit for one, where the paper names one.
+        Upper limit of the price of one piece, if the paper gives one.
     source : str
-        Of the price.
+        Source of the price.
     """
 
     part: str
@@ -44,12 +44,12 @@ class Item:
 
 
 def remanence(grade: str) -> float:
-    """Remanence in tesla of a grade as ``"N52"``: the middle of what is listed.
+    """Return the remanence in tesla of a grade as ``"N52"``, the middle of its listed range.
 
     Raises
     ------
     InputError
-        A grade that is not in :data:`GRADES_T`.
+        The grade is not in :data:`GRADES_T`.
     """
     if grade not in GRADES_T:
         raise InputError(f"no grade {grade!r}", hint=f"Known grades: {', '.join(GRADES_T)}")

@@ -1,4 +1,4 @@
-"""What all simulators share."""
+"""Validation of simulation options, shared by all simulators."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from locatk.core.errors import InputError
 
 
 def check_options(options: object, rules: Iterable[tuple[str, bool, str]]) -> None:
-    """Refuse simulation options that cannot be.
+    """Raise an error for the first simulation option with an impossible value.
 
     Parameters
     ----------
     options : object
-        The options, whose attributes are named in the error.
-    rules : iterable of (name, fits, wanted)
-        Name of an attribute, whether its value fits, and what would.
+        Its attributes are the options.
+    rules : iterable of (name, is_valid, expected)
+        Name of an attribute, validity of its value, and a description of the valid values.
 
     Raises
     ------
     InputError
-        The first that does not fit.
+        The first option that is not valid.
     """
-    for name, fits, wanted in rules:
-        if not fits:
+    for name, is_valid, expected in rules:
+        if not is_valid:
             value = getattr(options, name)
-            raise InputError(f"a simulation with {name} {value!r}", hint=f"give {wanted}")
+            raise InputError(f"a simulation with {name} {value!r}", hint=f"give {expected}")

@@ -1,8 +1,8 @@
-"""Stamped poses with covariance: the one shape in which every system answers."""
+"""Stamped poses with covariance: the common result of all systems."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +15,18 @@ class Trajectory:
     Attributes
     ----------
     device : str
-        Name of the device; one trajectory a device.
+        Name of the device; there is one trajectory per device.
     frame : str
-        Name of the frame in which the poses are given, as in ``"floor"``.
+        Name of the frame of the poses, as in ``"floor"``.
     time_ns : (n,) int64 ndarray
         Nanoseconds since the epoch, ascending.
     position : (n, 3) ndarray
-        Metres.
+        In metres.
     quaternion : (n, 4) ndarray
-        Orientation device to frame as (x, y, z, w), unit length.
+        Orientation from device to frame as (x, y, z, w), unit length.
     covariance : (n, 6, 6) ndarray
-        Of (x, y, z, rotation about x, y, z) in m and rad; ``nan`` in the rows and
-        columns of what was not observed (a single photodiode has no heading).
+        Of (x, y, z, rotation about x, y, z) in m and rad; ``nan`` in the rows and columns of
+        unobserved components (a single photodiode has no heading).
     """
 
     device: str
@@ -59,10 +59,10 @@ class Trajectory:
         position: NDArray[np.float64],
         covariance: NDArray[np.float64] | None = None,
     ) -> Trajectory:
-        """Trajectory of a point: identity orientation, its covariance unknown.
+        """Create the trajectory of a point: identity orientations with unknown covariance.
 
-        ``position`` is (n, 3) in metres; ``covariance`` (n, 3, 3) in m^2 or None
-        where that is unknown too.
+        ``position`` is (n, 3) in metres; ``covariance`` is (n, 3, 3) in m^2, or None if it is
+        unknown as well.
         """
         n = len(time_ns)
         quaternion = np.zeros((n, 4))
@@ -74,5 +74,40 @@ class Trajectory:
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """(n, 6) standard deviations in m and rad; ``nan`` where unobserved."""
+        """Standard deviations (n, 6) in m and rad; ``nan`` for unobserved components."""
         return np.sqrt(np.einsum("nii->ni", self.covariance))
+
+    def select(self, mask: NDArray[np.bool_]) -> Trajectory:
+        """Return only the poses whose ``mask`` (n,) is true."""
+        time_ns, covariance = self.time_ns[mask], self.covariance
+        if len(covariance) and covariance.strides[0] == 0:
+            # One unknown covariance is broadcast to all poses and stays one matrix in memory.
+            covariance = np.broadcast_to(covariance[0], (len(time_ns), 6, 6))
+        else:
+            covariance = covariance[mask]
+        return replace(
+            self,
+            time_ns=time_ns,
+            position=self.position[mask],
+            quaternion=self.quaternion[mask],
+            covariance=covariance,
+        )
+
+    def shifted(self, shift_ns: int) -> Trajectory:
+        """Return the same poses with ``shift_ns`` added to their stamps."""
+        return self if shift_ns == 0 else replace(self, time_ns=self.time_ns + shift_ns)
+
+
+def has_orientation(trajectory: Trajectory, *, trust_identity: bool = False) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the poses that report an orientation.
+
+    A pose reports none if its position has a covariance and its rotation has none (a single
+    photodiode). Nor do the poses of a trajectory without rotation covariances whose orientations
+    are all the identity (a point), unless ``trust_identity`` is set.
+    """
+    rotation_variance = np.stack([trajectory.covariance[:, k, k] for k in (3, 4, 5)])
+    has_rotation_variance = np.any(np.isfinite(rotation_variance), axis=0)
+    is_point = not has_rotation_variance.any() and bool(np.all(trajectory.quaternion[:, :3] == 0.0))
+    if is_point and not trust_identity:
+        return has_rotation_variance
+    return has_rotation_variance | np.isnan(trajectory.covariance[:, 0, 0])

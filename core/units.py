@@ -1,4 +1,4 @@
-"""Lengths as people write them, in mm, exactly."""
+"""Exact conversion between lengths in metres and their decimal form in mm."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from decimal import Decimal
 
 
 def metres(millimetres: float) -> float:
-    """The point is moved, so that 39.7 mm come back as 39.7 mm from a file."""
+    """Convert mm to metres by shifting the decimal point.
+
+    Unlike a multiplication, this lets 39.7 mm return from a file as 39.7 mm.
+    """
     return float(Decimal(repr(millimetres)).scaleb(-3))
 
 
 def mm_text(value_m: float, decimals: int = 1) -> str:
-    """A length or coordinate in mm, to 1 decimal or more, without zeros that say nothing.
+    """Format a length in metres as mm with at most ``decimals`` decimals and no trailing zeros.
 
     Examples
     --------

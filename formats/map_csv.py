@@ -20,7 +20,7 @@ import io
 import math
 import os
 
-from locatk.core.errors import FormatError, about
+from locatk.core.errors import FormatError, error_context
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.gridfit import TOLERANCE_M, built_poses, floor_of
 from locatk.core.landmarks.landmark import CODES
@@ -101,7 +101,7 @@ def loads_csv(
         raise FormatError(
             "no landmarks", file=file, hint=f"Expected lines as in {';'.join(HEADER[:4])}"
         )
-    with about(file):
+    with error_context(file):
         return floor_of(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
 
 

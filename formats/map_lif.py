@@ -21,7 +21,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from locatk.core.errors import FormatError, about
+from locatk.core.errors import FormatError, error_context
 from locatk.core.landmarks.floor import Cell, FloorMap, neighbour
 from locatk.core.landmarks.gridfit import TOLERANCE_M, built_poses, floor_of
 from locatk.core.landmarks.landmark import code_of, name
@@ -141,7 +141,7 @@ def loads_lif(
         names.append(f"node {node_id!r}")
     if not codes:
         raise read.error("a layout without nodes", "nodes")
-    with about(file):
+    with error_context(file):
         floor = floor_of(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
     ways = set()
     for number, edge in enumerate(read.objects(layout, "edges")):

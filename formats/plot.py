@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.metrics import Evaluation
+from locatk.core.evaluation import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import plot_series
@@ -223,8 +223,9 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
         unit = has_no_scale(solution) and not evaluation.align.startswith("sim")
         rmse, mean = (length(value, unscaled=unit) for value in (evaluation.rmse, evaluation.mae))
         text += f", APE rmse {rmse}, mean {mean}"
-        share = evaluation.coverage.share
-        text += "" if share is None else f", {100 * share:.1f} % of the time solved"
-        text += f" (alignment: {evaluation.align}, time offset: {evaluation.offset_source})"
+        fraction = evaluation.coverage.fraction
+        text += "" if fraction is None else f", {100 * fraction:.1f} % of the time solved"
+        offset = evaluation.time_offset.describe()
+        text += f" (alignment: {evaluation.align}, time offset: {offset})"
     notes = textwrap.wrap("; ".join(solution.notes), 160, max_lines=2, placeholder=" ...")
     return plain("\n".join(textwrap.wrap(text, 160) + notes))

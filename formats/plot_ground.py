@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core import metrics
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
+from locatk.core.evaluation import Evaluation, evaluate
 from locatk.core.geometry import Similarity
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.metrics import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import plot_floor
@@ -121,7 +120,7 @@ def compare(solution: Solution, truth: Sequence[Trajectory]) -> Evaluation | Non
     solved = [known(t) for t in solution.trajectories]
     pairs = [(t, true[t.device]) for t in solved if t.device in true and len(t)]
     try:
-        return metrics.evaluate_all(pairs) if pairs else None
+        return evaluate(pairs) if pairs else None
     except InputError:
         return None
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.metrics import Evaluation
+from locatk.core.evaluation import Evaluation
 from locatk.core.solution import Solution
 
 Array = NDArray[np.float64]

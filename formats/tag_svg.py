@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from xml.etree import ElementTree as Xml
 
-from locatk.core.drawing import MM_PER_POINT, Circle, Line, Mark, Page, Point, Words
+from locatk.core.drawing import MM_PER_POINT, Circle, Line, Mark, Page, Point, Text
 
 NAMESPACE = "http://www.w3.org/2000/svg"
 
@@ -42,8 +42,8 @@ def _add(group: Xml.Element, mark: Mark, height: float) -> None:
     def point(at: Point) -> tuple[str, str]:
         return _number(at[0]), _number(height - at[1])
 
-    if isinstance(mark, Words):
-        _add_words(group, mark, *point(mark.at))
+    if isinstance(mark, Text):
+        _add_words(group, mark, *point(mark.position))
         return
     stroke = {"stroke-width": _number(mark.width_mm)}
     if isinstance(mark, Line):
@@ -60,15 +60,15 @@ def _add(group: Xml.Element, mark: Mark, height: float) -> None:
         Xml.SubElement(group, "polygon", {"points": points, **style})
 
 
-def _add_words(group: Xml.Element, words: Words, x: str, y: str) -> None:
+def _add_words(group: Xml.Element, words: Text, x: str, y: str) -> None:
     style = {"x": x, "y": y, "fill": "black", "stroke": "none"}
     style["font-size"] = _number(words.points * MM_PER_POINT)
     if words.anchor != "start":
         style["text-anchor"] = words.anchor
     if words.bold:
         style["font-weight"] = "bold"
-    if words.turn_deg:
-        style["transform"] = f"rotate({_number(-words.turn_deg)} {x} {y})"
+    if words.angle_deg:
+        style["transform"] = f"rotate({_number(-words.angle_deg)} {x} {y})"
     Xml.SubElement(group, "text", style).text = words.text
 
 

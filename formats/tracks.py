@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
-from locatk.core.geometry import heading_of, quaternion_from_heading
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.trajectory import Trajectory
 from locatk.formats import viewers
 from locatk.formats.messages import (
@@ -51,7 +51,7 @@ def odometry_messages(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
         "time_ns": trajectory.time_ns,
         "x_m": trajectory.position[:, 0],
         "y_m": trajectory.position[:, 1],
-        "heading_rad": heading_of(trajectory.quaternion),
+        "heading_rad": heading_from_quaternion(trajectory.quaternion),
     }
     return _batched(ODOMETRY, topic, trajectory, columns)
 

@@ -183,7 +183,7 @@ def _drive_csv(folder: Path, words: list[str]) -> None:
     """A table of hall sensors and odometry over the map of the line."""
     import numpy as np
 
-    from locatk.core.geometry import heading_of
+    from locatk.core.geometry import heading_from_quaternion
     from locatk.core.landmarks.simulate import SimulationOptions, simulate
     from locatk.formats.maps import read_map
 
@@ -191,7 +191,7 @@ def _drive_csv(folder: Path, words: list[str]) -> None:
     (samples,), (odometry,) = made.samples, made.odometry
     times = (samples.time_ns - samples.time_ns[0]) * 1e-9
     known = (odometry.time_ns - samples.time_ns[0]) * 1e-9
-    heading = np.unwrap(heading_of(odometry.quaternion))
+    heading = np.unwrap(heading_from_quaternion(odometry.quaternion))
     way = [1e3 * odometry.position[:, 0], 1e3 * odometry.position[:, 1], np.degrees(heading)]
     columns = [times, *(np.interp(times, known, each) for each in way), *(1e3 * samples.field_t.T)]
     header = "t_s,x_mm,y_mm,heading_deg,front,left,rear,right"

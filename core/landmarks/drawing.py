@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.drawing import (
-    CAPITAL,
+    CAPITAL_HEIGHT_EM,
     MM_PER_POINT,
     Circle,
     Line,
     Mark,
     Point,
     Polygon,
-    Words,
+    Text,
     arrow,
     text_width,
 )
@@ -147,11 +147,11 @@ def draw_landmark(
             (x + middle[0] + side * room * u, y + middle[1] + side * room * v) for side in (-1, 1)
         )
         marks += arrow(tail, tip, min(0.45 * width, 0.6 * room), 0.06 * min(width, 10.0))
-        points = capital / (CAPITAL * MM_PER_POINT)
+        points = capital / (CAPITAL_HEIGHT_EM * MM_PER_POINT)
         for pole, side in (("S", -1), ("N", 1)):
             at = side * (length / 2 - 0.9 * capital)
             place = (x + middle[0] + at * u, y + middle[1] + at * v - capital / 2)
-            marks.append(Words(pole, place, points, "middle", bold=True))
+            marks.append(Text(pole, place, points, "middle", bold=True))
         marks.append(_bar_label(bar, letter, centre, reach_mm(geometry) + _OUT_MM))
     inner = 1e3 * (geometry.radius_m - geometry.bar_width_m / 2)
     arm = min(6.0, 0.5 * inner)
@@ -164,7 +164,7 @@ def draw_landmark(
     points = min(10.0, 0.85 * inner / text_width("x" * longest, 1.0))
     for index, text in enumerate(words):
         up = inner - 2.6 - (index + 1) * 1.25 * points * MM_PER_POINT
-        marks.append(Words(text, (x - 1.5, y + up), points, "end", bold=index == 0))
+        marks.append(Text(text, (x - 1.5, y + up), points, "end", bold=index == 0))
     return marks
 
 
@@ -175,10 +175,10 @@ def _label(bar: int, letter: str) -> str:
     return f"bar {bar}: {letter} ({'ccw' if letter == 'N' else 'cw'})"
 
 
-def _bar_label(bar: int, letter: str, centre: Point, out: float) -> Words:
+def _bar_label(bar: int, letter: str, centre: Point, out: float) -> Text:
     """Outside of a bar, beside the line that the cell's neighbours lie on."""
     up = 1.2
-    capital = CAPITAL * _LABEL * MM_PER_POINT
+    capital = CAPITAL_HEIGHT_EM * _LABEL * MM_PER_POINT
     x, y = (
         (out, up),
         (up, out),
@@ -186,7 +186,7 @@ def _bar_label(bar: int, letter: str, centre: Point, out: float) -> Words:
         (up, -out - capital),
     )[bar]
     anchor: Literal["start", "end"] = "end" if bar == 2 else "start"
-    return Words(_label(bar, letter), (centre[0] + x, centre[1] + y), _LABEL, anchor)
+    return Text(_label(bar, letter), (centre[0] + x, centre[1] + y), _LABEL, anchor)
 
 
 def draw_symbol(code: int, centre: Point, cell_mm: float) -> list[Mark]:
@@ -203,8 +203,8 @@ def draw_symbol(code: int, centre: Point, cell_mm: float) -> list[Mark]:
         corners = [_turned((cell_mm * a, cell_mm * sign * b), bar) for a, b in outline]
         places = tuple((x + a, y + b) for a, b in corners)
         marks.append(Polygon(places, letter == "N", min(0.2, 0.012 * cell_mm)))
-    points = 0.2 * cell_mm / (CAPITAL * MM_PER_POINT)
-    marks.append(Words(digit(code), (x, y - 0.1 * cell_mm), points, "middle", bold=True))
+    points = 0.2 * cell_mm / (CAPITAL_HEIGHT_EM * MM_PER_POINT)
+    marks.append(Text(digit(code), (x, y - 0.1 * cell_mm), points, "middle", bold=True))
     return marks
 
 
@@ -219,5 +219,5 @@ def north_mark(at: Point, height_mm: float, text: str = "map +y") -> list[Mark]:
     points = min(9.0, 1.1 * height_mm)
     return [
         *arrow(at, (x, y + height_mm), 0.45 * height_mm, 0.06 * height_mm),
-        Words(text, (x + 0.2 * height_mm + 0.5, y + 0.3 * height_mm), points, bold=True),
+        Text(text, (x + 0.2 * height_mm + 0.5, y + 0.3 * height_mm), points, bold=True),
     ]

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from locatk.core.dots.layout import paper_size
-from locatk.core.drawing import Line, Mark, Point, Words
+from locatk.core.drawing import Line, Mark, Point, Text
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing import card_mm, check, digit, draw_landmark, north_mark
 from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
@@ -266,7 +266,7 @@ def _marks(floor: FloorMap, corner: Point, box: Box) -> list[Mark]:
             marks += [
                 Line((x - 10, y - 10), (x + 10, y + 10), 0.2),
                 Line((x - 10, y + 10), (x + 10, y - 10), 0.2),
-                Words("no landmark", (x + 2, y + 12), TEXT),
+                Text("no landmark", (x + 2, y + 12), TEXT),
             ]
         else:
             words = (f"row {cell[0]}", f"column {cell[1]}", f"code {digit(code)}")
@@ -288,11 +288,11 @@ def _seam_marks(number: int, count: tuple[int, int], box: Box, overlap: float) -
         (column < count[0] - 1, number + 1, right - inner),
     ):
         if there:
-            # Words read upwards grow to the left of their line.
+            # Text that reads upwards grows to the left of their line.
             shift = -1.0 if at > middle[0] else 3.0
             text = f"joins {block_name(other, count[0])}"
             marks.append(Line((at, bottom), (at, top), 0.1, dash_mm=5.0))
-            marks.append(Words(text, (at + shift, middle[1]), TEXT, "middle", turn_deg=90))
+            marks.append(Text(text, (at + shift, middle[1]), TEXT, "middle", angle_deg=90))
     for there, other, at in (
         (row < count[1] - 1, number + count[0], bottom + inner),
         (row > 0, number - count[0], top - inner),
@@ -301,7 +301,7 @@ def _seam_marks(number: int, count: tuple[int, int], box: Box, overlap: float) -
             shift = 1.0 if at < middle[1] else -3.0
             text = f"joins {block_name(other, count[0])}"
             marks.append(Line((left, at), (right, at), 0.1, dash_mm=5.0))
-            marks.append(Words(text, (middle[0], at + shift), TEXT, "middle"))
+            marks.append(Text(text, (middle[0], at + shift), TEXT, "middle"))
     return marks
 
 
@@ -327,5 +327,5 @@ def _walls(floor: FloorMap, shift: Point, box: Box) -> list[Mark]:
             continue
         u, v = (0.0, half) if one[0] == other[0] else (half, 0.0)
         marks.append(Line((x - u, y - v), (x + u, y + v), 2.0))
-        marks.append(Words("wall", (x + 2.0, y + 2.0), TEXT))
+        marks.append(Text("wall", (x + 2.0, y + 2.0), TEXT))
     return marks

@@ -6,14 +6,14 @@ import itertools
 import math
 
 from locatk.core.drawing import (
-    CAPITAL,
+    CAPITAL_HEIGHT_EM,
     MM_PER_POINT,
     Circle,
     Line,
     Mark,
     Point,
     Polygon,
-    Words,
+    Text,
     arrow,
 )
 from locatk.core.landmarks.drawing import draw_symbol, north_mark
@@ -49,8 +49,8 @@ def legend(floor: FloorMap, scale: float, corner: Point, width: float) -> list[M
     return marks
 
 
-def _head(text: str, at: Point) -> Words:
-    return Words(text, (at[0], at[1] - line_mm(TEXT)), TEXT, bold=True)
+def _head(text: str, at: Point) -> Text:
+    return Text(text, (at[0], at[1] - line_mm(TEXT)), TEXT, bold=True)
 
 
 def _bars(at: Point) -> list[Mark]:
@@ -58,13 +58,13 @@ def _bars(at: Point) -> list[Mark]:
     side = 26.0
     x, y = at[0] + 18.0, at[1] - line_mm(TEXT) - 18.5
     marks = [_head(f"A landmark: {name(SAMPLE)}", at), *draw_symbol(SAMPLE, (x, y), side)]
-    capital = CAPITAL * _SMALL * MM_PER_POINT
+    capital = CAPITAL_HEIGHT_EM * _SMALL * MM_PER_POINT
     out = 0.43 * side
     for bar in range(4):
         u, v = (round(f(math.radians(90 * bar))) for f in (math.cos, math.sin))
         text = f"{bar}: {name(SAMPLE)[bar]}"
         place = (x + out * u, y + out * v - capital / 2)
-        marks.append(Words(text, place, _SMALL, "middle", bold=True))
+        marks.append(Text(text, place, _SMALL, "middle", bold=True))
     # The way around: a quarter of a circle between bars 0 and 1.
     radius = 0.52 * side
     angles = [math.radians(25 + 10 * step) for step in range(5)]
@@ -77,7 +77,7 @@ def _bars(at: Point) -> list[Mark]:
         "at +x; N: magnetised so, too.",
     )
     for index, text in enumerate(lines):
-        marks.append(Words(text, (at[0] + 34.0, at[1] - (index + 2) * line_mm(_SMALL) - 2), _SMALL))
+        marks.append(Text(text, (at[0] + 34.0, at[1] - (index + 2) * line_mm(_SMALL) - 2), _SMALL))
     return marks
 
 
@@ -89,13 +89,13 @@ def _window(window: str, at: Point) -> list[Mark]:
     x, y = at[0], at[1] - line_mm(TEXT) - 3.0 - rows * side
     middles = [(x + (c + 0.5) * side, y + (r + 0.5) * side) for r, c in cells]
     marks: list[Mark] = [_head(f"Window {window}", at)]
-    capital = CAPITAL * TEXT * MM_PER_POINT
+    capital = CAPITAL_HEIGHT_EM * TEXT * MM_PER_POINT
     for number, (a, b) in enumerate(middles, 1):
         half = side / 2
         corners = ((a - half, b - half), (a + half, b - half), (a + half, b + half))
         marks.append(Polygon((*corners, (a - half, b + half)), width_mm=0.15))
         low = (a - half + 0.8, b + half - 0.8 - capital)
-        marks.append(Words(str(number), low, TEXT - 1))
+        marks.append(Text(str(number), low, TEXT - 1))
     for start, end in itertools.pairwise(middles):
         marks += arrow(start, end, 1.8, 0.3)
     marks.append(Circle(middles[0], 0.7, 0.3))
@@ -106,7 +106,7 @@ def _window(window: str, at: Point) -> list[Mark]:
     )
     for index, text in enumerate(lines):
         down = y - (index + 1) * line_mm(_SMALL) - 0.8
-        marks.append(Words(text, (at[0], down), _SMALL))
+        marks.append(Text(text, (at[0], down), _SMALL))
     return marks
 
 
@@ -127,9 +127,9 @@ def _signs(floor: FloorMap, at: Point, scale: float) -> list[Mark]:
         Line((x, low), (x + length, low), 0.3),
         Line((x, low - 1), (x, low + 1), 0.3),
         Line((x + length, low - 1), (x + length, low + 1), 0.3),
-        Words(f"{metre * factor:g} m", (x + length + 1.2, low - 0.8), TEXT),
+        Text(f"{metre * factor:g} m", (x + length + 1.2, low - 0.8), TEXT),
     ]
     patterns = ", ".join(f"{n} {letters}" for n, letters in enumerate(PATTERNS, 1))
     for index, text in enumerate(("Patterns:", patterns[:23], patterns[24:])):
-        marks.append(Words(text, (x, low - 4.5 - index * line_mm(_SMALL)), _SMALL))
+        marks.append(Text(text, (x, low - 4.5 - index * line_mm(_SMALL)), _SMALL))
     return marks

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from locatk.core.drawing import (
-    CAPITAL,
+    CAPITAL_HEIGHT_EM,
     MM_PER_POINT,
     RULER_DEPTH_MM,
     Group,
@@ -15,7 +15,7 @@ from locatk.core.drawing import (
     Mark,
     Page,
     Point,
-    Words,
+    Text,
     page_rulers,
     wrap,
 )
@@ -65,13 +65,13 @@ class Frame:
         """Everything around the box on page ``number`` of ``count``."""
         width, height = self.size
         marks = page_rulers(self.size, self.margin)
-        top = height - self.margin - CAPITAL * TITLE * MM_PER_POINT
+        top = height - self.margin - CAPITAL_HEIGHT_EM * TITLE * MM_PER_POINT
         title = wrap(self.title, TITLE, width - 2 * self.margin - _NUMBER_MM)[0]
-        marks.append(Words(title, (self.margin, top), TITLE, bold=True))
+        marks.append(Text(title, (self.margin, top), TITLE, bold=True))
         page = f"page {number} of {count}"
-        marks.append(Words(page, (width - self.margin, top), TEXT, "end"))
+        marks.append(Text(page, (width - self.margin, top), TEXT, "end"))
         for index, text in enumerate(self._lines, 1):
-            marks.append(Words(text, (self.margin, top - index * line_mm(TEXT)), TEXT))
+            marks.append(Text(text, (self.margin, top - index * line_mm(TEXT)), TEXT))
         return Group("page", tuple(marks))
 
 
@@ -164,7 +164,7 @@ def _block(
         for text, column in zip(row, columns, strict=True):
             place = (x + column.width_mm - 1.0, base) if column.right else (x, base)
             anchor: Literal["start", "end"] = "end" if column.right else "start"
-            marks.append(Words(text, place, points, anchor, bold=index == 0))
+            marks.append(Text(text, place, points, anchor, bold=index == 0))
             x += column.width_mm
         if index and index % 5 == 0 and index < len(rows):
             rule = base - 0.3 * step

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from locatk.core.drawing import (
-    CAPITAL,
+    CAPITAL_HEIGHT_EM,
     MM_PER_POINT,
     Circle,
     Group,
@@ -14,7 +14,7 @@ from locatk.core.drawing import (
     Mark,
     Point,
     Polygon,
-    Words,
+    Text,
     arrow,
     text_width,
 )
@@ -177,8 +177,8 @@ class _Drawn:
         left, top = x - half + 1.2, y + half - line_mm(points) - 0.2
         return [
             *marks,
-            Words(f"row {cell[0]}, column {cell[1]}", (left, top), points),
-            Words(place, (left, y - half + 1.2), points),
+            Text(f"row {cell[0]}, column {cell[1]}", (left, top), points),
+            Text(place, (left, y - half + 1.2), points),
         ]
 
     def _grid(self, block: Block, zero: Point) -> list[Mark]:
@@ -199,24 +199,24 @@ class _Drawn:
         """Numbers of rows and columns, their places in mm, and the axes' arrows."""
         left, bottom = zero[0] + block[1] * self.cell, zero[1] + block[0] * self.cell
         top = zero[1] + block[2] * self.cell
-        capital = CAPITAL * SMALL * MM_PER_POINT
+        capital = CAPITAL_HEIGHT_EM * SMALL * MM_PER_POINT
         marks: list[Mark] = []
         turned = _labels_mm(self.floor)[1] - _AXIS_MM - 4.0 > self.cell
         for row in range(block[0], block[2]):
             y = zero[1] + (row + 0.5) * self.cell - capital / 2
             place = mm_text(self.floor.place((row, 0))[1])
-            marks.append(Words(str(row), (left - 1.2, y), SMALL + 1, "end", bold=True))
-            marks.append(Words(place, (left - 5.5, y), SMALL, "end"))
+            marks.append(Text(str(row), (left - 1.2, y), SMALL + 1, "end", bold=True))
+            marks.append(Text(place, (left - 5.5, y), SMALL, "end"))
         for column in range(block[1], block[3]):
             x = zero[0] + (column + 0.5) * self.cell
             place = mm_text(self.floor.place((0, column))[0])
             at = bottom - 1.2 - 1.2 * capital
-            marks.append(Words(str(column), (x, at), SMALL + 1, "middle", bold=True))
+            marks.append(Text(str(column), (x, at), SMALL + 1, "middle", bold=True))
             if turned:
                 spot = (x + capital / 2, at - 1.2)
-                marks.append(Words(place, spot, SMALL, "end", turn_deg=90))
+                marks.append(Text(place, spot, SMALL, "end", angle_deg=90))
             else:
-                marks.append(Words(place, (x, at - 1.0 - capital), SMALL, "middle"))
+                marks.append(Text(place, (x, at - 1.0 - capital), SMALL, "middle"))
         out = _labels_mm(self.floor)
         x, y = left - out[0] + 3.0, bottom - out[1] + 2.0
         length = min(25.0, max(10.0, top - bottom))
@@ -225,9 +225,9 @@ class _Drawn:
         return [
             *marks,
             *arrow((x, y), (x + length, y), 2.5, 0.3),
-            Words("+x, columns, mm", (x + length + 1.0, y - 0.8), TEXT),
+            Text("+x, columns, mm", (x + length + 1.0, y - 0.8), TEXT),
             *arrow((x, y), (x, y + length), 2.5, 0.3),
-            Words(word, (x + 0.8, y + length + 1.0), TEXT, turn_deg=90),
+            Text(word, (x + 0.8, y + length + 1.0), TEXT, angle_deg=90),
         ]
 
     def _walls(self, block: Block, zero: Point) -> list[Mark]:
@@ -285,9 +285,9 @@ def _key_map(
         name = block_name(number, layout.across)
         points = min(14.0, 0.5 * height / MM_PER_POINT, 0.8 * width / text_width(name, 1.0))
         middle = (x + width / 2, y + height / 2)
-        marks.append(Words(name, middle, points, "middle", bold=True))
+        marks.append(Text(name, middle, points, "middle", bold=True))
         cells = f"rows {block[0]}-{block[2] - 1}, columns {block[1]}-{block[3] - 1}"
         small = min(TEXT, 0.9 * width / text_width(cells, 1.0))
         below = (middle[0], middle[1] - 1.3 * line_mm(small))
-        marks.append(Words(cells, below, small, "middle"))
+        marks.append(Text(cells, below, small, "middle"))
     return [*marks, *north_mark((left - 5.0, bottom), 8.0, "")]

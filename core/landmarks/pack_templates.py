@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from locatk.core.drawing import (
-    CAPITAL,
-    CUT_MM,
+    CAPITAL_HEIGHT_EM,
+    CUT_MARK_MM,
     MM_PER_POINT,
     TRUE_SIZE,
     Group,
@@ -15,7 +15,7 @@ from locatk.core.drawing import (
     Mark,
     Point,
     Polygon,
-    Words,
+    Text,
     cut_marks,
     text_width,
     wrap,
@@ -41,7 +41,7 @@ LARGEST_MM = 100.0
 LIST_LINES = 6
 """For the cells of a template, where the paper has no room for more."""
 
-_GAP_MM = 2 * CUT_MM + 2.0
+_GAP_MM = 2 * CUT_MARK_MM + 2.0
 _NORTH_MM = 11.0
 
 WORDS = (
@@ -101,7 +101,7 @@ def template_leaves(
     if not roomy:
         box = frames[0].box
         lost = (paper_mm[0] - (box[2] - box[0]), paper_mm[1] - (box[3] - box[1]))
-        enough = [math.ceil(2 * least + 2 * CUT_MM + side) for side in lost]
+        enough = [math.ceil(2 * least + 2 * CUT_MARK_MM + side) for side in lost]
         enough[1] = math.ceil(enough[1] + _head_mm() + _list_mm(2))
         raise InputError(
             f"a template needs {2 * least:.0f} x {2 * least:.0f} mm and words beside it, more than "
@@ -132,7 +132,7 @@ def _most(frame: Frame) -> float:
     """Half of the side of the largest template that a page holds with its words."""
     left, bottom, right, top = frame.box
     room = (right - left, top - bottom - _head_mm() - _list_mm(2))
-    return math.floor(min(room) - 2 * CUT_MM) / 2
+    return math.floor(min(room) - 2 * CUT_MARK_MM) / 2
 
 
 def _grid(frame: Frame, half: float) -> tuple[int, int]:
@@ -179,7 +179,7 @@ class _Card:
 
     def centre(self, top: Point) -> Point:
         """Of the landmark, where the middle of the upper edge is at ``top``."""
-        return round(top[0], 3), round(top[1] - _head_mm() - CUT_MM - self.half, 3)
+        return round(top[0], 3), round(top[1] - _head_mm() - CUT_MARK_MM - self.half, 3)
 
     def group(self, top: Point, height: float) -> Group:
         """With the middle of its upper edge at ``top`` and this much room below."""
@@ -187,12 +187,12 @@ class _Card:
         edges = (x - self.half, y - self.half, x + self.half, y + self.half)
         words = (f"code {digit(self.code)}", name(self.code))
         marks: list[Mark] = [
-            Words(self._title(), (edges[0], top[1] - line_mm(TITLE)), TITLE, bold=True),
+            Text(self._title(), (edges[0], top[1] - line_mm(TITLE)), TITLE, bold=True),
             *cut_marks(*edges),
             *self._lines((x, y)),
             *draw_landmark(self.floor.geometry, self.code, (x, y), words),
             *self._corners((x, y)),
-            *self._list((edges[0], edges[1] - CUT_MM), top[1] - height),
+            *self._list((edges[0], edges[1] - CUT_MARK_MM), top[1] - height),
         ]
         return Group(f"code-{digit(self.code)}", tuple(marks))
 
@@ -242,12 +242,15 @@ class _Card:
         )
         lines = wrap(ends, SMALL, max(self.half - 8.0, text_width("x" * 20, SMALL)))
         marks = north_mark((x + 2.5, y), _NORTH_MM)
-        low = centre[1] - self.half + 1.0 + CAPITAL * SMALL * MM_PER_POINT
+        low = centre[1] - self.half + 1.0 + CAPITAL_HEIGHT_EM * SMALL * MM_PER_POINT
         for index, text in enumerate(reversed(lines)):
             up = low + index * line_mm(SMALL)
-            marks.append(Words(text, (x, up), SMALL))
-        right = (centre[0] + self.half - 4.5, centre[1] - CAPITAL * TEXT * MM_PER_POINT - 1.2)
-        marks.append(Words("+x", right, TEXT, "end", bold=True))
+            marks.append(Text(text, (x, up), SMALL))
+        right = (
+            centre[0] + self.half - 4.5,
+            centre[1] - CAPITAL_HEIGHT_EM * TEXT * MM_PER_POINT - 1.2,
+        )
+        marks.append(Text("+x", right, TEXT, "end", bold=True))
         return marks
 
     def _list(self, start: Point, bottom: float) -> list[Mark]:
@@ -258,6 +261,6 @@ class _Card:
         if len(lines) > most:
             lines = [*lines[: most - 1], "... and more: see the marking list"]
         return [
-            Words(line, (start[0], start[1] - (index + 1) * line_mm(TEXT)), TEXT)
+            Text(line, (start[0], start[1] - (index + 1) * line_mm(TEXT)), TEXT)
             for index, line in enumerate(lines)
         ]

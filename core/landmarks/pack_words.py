@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from locatk.core.drawing import TRUE_SIZE, Group, Line, Mark, Polygon, Words, text_width, wrap
+from locatk.core.drawing import TRUE_SIZE, Group, Line, Mark, Polygon, Text, text_width, wrap
 from locatk.core.landmarks.drawing import digit
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.landmark import PATTERN_OF, name
@@ -55,7 +55,7 @@ class Flow:
             marks.append(Polygon((*corners, (left, low + side)), width_mm=0.2))
         for line in lines:
             self._y -= step
-            marks.append(Words(line, (left + indent, self._y), points, bold=bold))
+            marks.append(Text(line, (left + indent, self._y), points, bold=bold))
 
     def row(self, cells: Sequence[str], widths: Sequence[float], *, bold: bool = False) -> None:
         """A row of a table with columns of these widths; the last one's text is wrapped, and
@@ -69,11 +69,11 @@ class Flow:
         marks = self._pages[-1]
         x = left
         for text, width in zip(cells[:-1], widths, strict=True):
-            marks.append(Words(text, (x, self._y - step), _POINTS, bold=bold))
+            marks.append(Text(text, (x, self._y - step), _POINTS, bold=bold))
             x += width
         for line in lines:
             self._y -= step
-            marks.append(Words(line, (x, self._y), _POINTS, bold=bold))
+            marks.append(Text(line, (x, self._y), _POINTS, bold=bold))
         self._y -= 0.3 * step
         marks.append(Line((left, self._y), (right, self._y), 0.2 if bold else 0.05))
         self._y -= 0.1 * step

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of, quaternion_from_heading
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks import paper
 from locatk.core.landmarks.detections import detection
 from locatk.core.landmarks.floor import FloorMap
@@ -154,7 +154,7 @@ def _driven(
     floor: FloorMap,
 ) -> Trajectory:
     """Poses at the times of odometry, each from the last landmark before it."""
-    own = np.column_stack([odometry.position[:, :2], heading_of(odometry.quaternion)])
+    own = np.column_stack([odometry.position[:, :2], heading_from_quaternion(odometry.quaternion)])
     pose = np.empty_like(own)
     numbers = sorted(located)
     starts = np.searchsorted(odometry.time_ns, [found[n].time_ns for n in numbers])

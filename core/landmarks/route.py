@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_of, quaternion_from_heading
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.fit import POSE, Priors
 from locatk.core.landmarks.smooth import FINEST, SYSTEMATIC, Link, StayPose, link
 from locatk.core.landmarks.trace import bent, compose, relative
@@ -67,7 +67,9 @@ def poses(
 
 def _plane(odometry: Trajectory) -> Array:
     """(n, 3) x, y and unwrapped heading."""
-    return np.column_stack([odometry.position[:, :2], np.unwrap(heading_of(odometry.quaternion))])
+    return np.column_stack(
+        [odometry.position[:, :2], np.unwrap(heading_from_quaternion(odometry.quaternion))]
+    )
 
 
 def _way(odometry: Trajectory, one: Visit, other: Visit) -> tuple[NDArray[np.int64], Array]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.clean import cleaned
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
@@ -136,7 +136,7 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
         notes.append(f"{samples.device}: {without} samples without odometry left out")
     field, faults = cleaned(samples)
     field, time = field[covered], time[covered]
-    heading = np.unwrap(heading_of(odometry.quaternion))
+    heading = np.unwrap(heading_from_quaternion(odometry.quaternion))
     way = np.column_stack([odometry.position[:, :2], heading])
     pose = _interpolated(time, odometry.time_ns, way)
     offset = _offsets(field)

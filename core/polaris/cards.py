@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from locatk.core.drawing import (
-    CAPITAL,
-    CUT_MM,
+    CAPITAL_HEIGHT_EM,
+    CUT_MARK_MM,
     MM_PER_POINT,
     RULER_DEPTH_MM,
     TRUE_SIZE,
@@ -16,7 +16,7 @@ from locatk.core.drawing import (
     Mark,
     Page,
     Point,
-    Words,
+    Text,
     cut_marks,
     page_rulers,
     wrap,
@@ -163,10 +163,10 @@ class _Sheet:
     def _box(self) -> tuple[float, float, float, float]:
         ruler_mm = RULER_DEPTH_MM + 1.0
         return (
-            self.margin + ruler_mm + CUT_MM,
-            self.margin + ruler_mm + CUT_MM,
-            self.size[0] - self.margin - CUT_MM,
-            self.size[1] - self.margin - CUT_MM - self._header_mm,
+            self.margin + ruler_mm + CUT_MARK_MM,
+            self.margin + ruler_mm + CUT_MARK_MM,
+            self.size[0] - self.margin - CUT_MARK_MM,
+            self.size[1] - self.margin - CUT_MARK_MM - self._header_mm,
         )
 
     @property
@@ -218,12 +218,12 @@ class _Sheet:
         width, height = self.size
         marks = page_rulers(self.size, self.margin)
         line = _HEADER * MM_PER_POINT
-        top = height - self.margin - CAPITAL * line
+        top = height - self.margin - CAPITAL_HEIGHT_EM * line
         page = f"page {number + 1} of {count}"
-        marks.append(Words(page, (width - self.margin, top), _HEADER, "end"))
+        marks.append(Text(page, (width - self.margin, top), _HEADER, "end"))
         for index, text in enumerate(self._words):
             at = (self.margin, top - index * _LEADING * line)
-            marks.append(Words(text, at, _HEADER, bold=index == 0))
+            marks.append(Text(text, at, _HEADER, bold=index == 0))
         return Group("page", tuple(marks))
 
 
@@ -274,7 +274,7 @@ class _Card:
         ):
             for index, text in enumerate(lines, 1):
                 baseline = origin[1] + top - index * _LEADING * points * MM_PER_POINT
-                words.append(Words(text, (left, baseline), points, bold=points == _TITLE))
+                words.append(Text(text, (left, baseline), points, bold=points == _TITLE))
         return words
 
     def _title(self, tag_id: int) -> list[str]:

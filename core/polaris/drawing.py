@@ -11,14 +11,14 @@ import math
 from dataclasses import dataclass
 
 from locatk.core.drawing import (
-    CAPITAL,
+    CAPITAL_HEIGHT_EM,
     MM_PER_POINT,
     Circle,
     Line,
     Mark,
     Point,
     Polygon,
-    Words,
+    Text,
     arrow,
 )
 from locatk.core.polaris.tag import Cell, Layout, Tags, places, vertices
@@ -31,7 +31,7 @@ _AXIS_POINTS = 5.0
 
 def field_mm(tags: Tags) -> float:
     """From a tag's origin to where the drawing of its magnets ends, on all four sides."""
-    letter = 1.5 * CAPITAL * _points(tags) * MM_PER_POINT
+    letter = 1.5 * CAPITAL_HEIGHT_EM * _points(tags) * MM_PER_POINT
     return 0.5e3 * (tags.order - 1) * tags.spacing_m + _reach_mm(tags) + letter + 0.5
 
 
@@ -110,7 +110,7 @@ class _Drawn:
         size = 0.5e3 * self.tags.magnet.diameter_m + 1.0
         diamond = [(size, 0.0), (0.0, size), (-size, 0.0), (0.0, -size)]
         end = field + AXIS_MM - 0.5
-        text = (end + field) / 2 - 0.5 * CAPITAL * _AXIS_POINTS * MM_PER_POINT
+        text = (end + field) / 2 - 0.5 * CAPITAL_HEIGHT_EM * _AXIS_POINTS * MM_PER_POINT
         y = self._at(-field - 1.0, 0.7)
         return [
             Polygon(tuple(self._at(*corner) for corner in diamond), width_mm=0.1),
@@ -118,8 +118,8 @@ class _Drawn:
             *self._arrow((-field, 0.0), (-end, 0.0), 1.4, 0.2),
             Line(self._at(0, -field), self._at(0, -field - TICK_MM), 0.2),
             Line(self._at(field, 0), self._at(field + TICK_MM, 0), 0.2),
-            Words("x forward", (self.origin[0] + 1.2, self.origin[1] + text), _AXIS_POINTS),
-            Words("y", y, _AXIS_POINTS, "middle"),
+            Text("x forward", (self.origin[0] + 1.2, self.origin[1] + text), _AXIS_POINTS),
+            Text("y", y, _AXIS_POINTS, "middle"),
         ]
 
     def _arrow(self, start: Point, tip: Point, head: float, width: float) -> list[Mark]:
@@ -133,7 +133,7 @@ class _Drawn:
         radius = 0.5e3 * self.tags.magnet.diameter_m
         reach, points = _reach_mm(self.tags), _points(self.tags)
         tail, head, across = 0.6 * reach, min(2.0, 0.3 * reach), radius + min(1.5, 0.2 * reach)
-        letter = CAPITAL * points * MM_PER_POINT
+        letter = CAPITAL_HEIGHT_EM * points * MM_PER_POINT
         out = reach + 0.25 + 0.6 * letter
         north = self._at(x + out * u, y + out * v)
         return [
@@ -144,19 +144,19 @@ class _Drawn:
                 self._at(x - across * v, y + across * u),
                 0.15,
             ),
-            Words("N", (north[0], north[1] - letter / 2), points, "middle", bold=True),
+            Text("N", (north[0], north[1] - letter / 2), points, "middle", bold=True),
             self._label(f"{round(clockwise, 2):g}\u00b0", (x, y), across, (u, v)),
         ]
 
-    def _label(self, text: str, middle: Point, clear: float, north: Point) -> Words:
+    def _label(self, text: str, middle: Point, clear: float, north: Point) -> Text:
         """At the right of a magnet, above or below, where the arrow's line is farther."""
         points = _points(self.tags)
         side = -1.0 if self.mirror else 1.0
         above = side * north[0] * north[1] < 0
         away = 0.8 * clear + 0.3
         x, y = self._at(*middle)
-        drop = away if above else -away - CAPITAL * points * MM_PER_POINT
-        return Words(text, (x + away, y + drop), points)
+        drop = away if above else -away - CAPITAL_HEIGHT_EM * points * MM_PER_POINT
+        return Text(text, (x + away, y + drop), points)
 
     def _empty(self, cell: Cell) -> list[Mark]:
         x, y = self._cell(cell)
@@ -167,6 +167,6 @@ class _Drawn:
         ]
         if cell == vertices(self.tags.order)[3]:
             points = _points(self.tags)
-            at = self._at(x, y - arm - 0.4 - CAPITAL * points * MM_PER_POINT)
-            marks.append(Words("v4 empty", at, points, "middle"))
+            at = self._at(x, y - arm - 0.4 - CAPITAL_HEIGHT_EM * points * MM_PER_POINT)
+            marks.append(Text("v4 empty", at, points, "middle"))
         return marks

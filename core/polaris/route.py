@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_of, quaternion_from_heading
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.identify import Seen
 from locatk.core.polaris.tag import Placed, Tags
@@ -36,7 +36,7 @@ def along(driven: Trajectory, time_ns: NDArray[np.int64]) -> Array:
     its last pose the robot is taken to stand.
     """
     step = np.diff(driven.position[:, :2], axis=0)
-    heading = heading_of(driven.quaternion)
+    heading = heading_from_quaternion(driven.quaternion)
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
     ahead = (step * (forward[1:] + forward[:-1]) / 2).sum(axis=1)
     way = np.concatenate([[0.0], np.cumsum(ahead)])
@@ -140,8 +140,8 @@ def joined(poses: list[Trajectory], driven: Trajectory) -> list[Trajectory]:
 def _filled(poses: Trajectory, driven: Trajectory) -> Trajectory:
     usual = np.median(np.diff(poses.time_ns)) if len(poses) > 1 else 0
     gaps = np.flatnonzero(np.diff(poses.time_ns) > 5 * usual)
-    heading = heading_of(poses.quaternion)
-    own = np.unwrap(heading_of(driven.quaternion))
+    heading = heading_from_quaternion(poses.quaternion)
+    own = np.unwrap(heading_from_quaternion(driven.quaternion))
     way = along(driven, driven.time_ns)
     times, places, turns, covariances = (
         [poses.time_ns],

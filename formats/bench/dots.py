@@ -27,7 +27,7 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulate_decoys import KINDS, decoys
 from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import LocatkError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.formats.bench import Figure
 from locatk.formats.bench.dots_print import codec_figures, page, print_figures
 from locatk.formats.bench.dots_study import study_figures
@@ -138,7 +138,11 @@ def render(
     start = manifest.to_metres(0, manifest.sheets[0].origin)
     away = simulated.truth.position[:, :2] - start
     grid = away @ np.linalg.inv(manifest.jacobian(0)).T + manifest.sheets[0].origin
-    return np.array(list(simulated.frames.images)), grid, heading_of(simulated.truth.quaternion)
+    return (
+        np.array(list(simulated.frames.images)),
+        grid,
+        heading_from_quaternion(simulated.truth.quaternion),
+    )
 
 
 def score(located: Located, grid: Array, heading: Array) -> Score:

@@ -7,8 +7,8 @@ from typing import cast
 
 import numpy as np
 
-from locatk.core import metrics
 from locatk.core.errors import LocatkError
+from locatk.core.evaluation import evaluate
 from locatk.core.lighthouse import solve
 from locatk.core.solution import Solution
 from locatk.formats.bench import Figure
@@ -68,7 +68,7 @@ def _poses(session: ImportedSession) -> list[Figure]:
     """Against the recorded reference, in the recorded stations, without any alignment."""
     solution = solve(session.sweeps, session.scene, receivers=session.receivers)
     pairs = [(e, t) for e in solution.trajectories for t in session.truth if e.device == t.device]
-    found = metrics.evaluate_all(pairs, align="none")
+    found = evaluate(pairs)
     where, turned = 1e3 * found.errors, found.rotation_errors_deg
     start = min(t.time_ns[0] for t in session.truth)
     late = found.time_ns - start > SETTLED_S * 1e9

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.remarks import CERTAIN
 from locatk.core.landmarks.simulate import Simulated, simulate
@@ -77,7 +77,7 @@ def judged(made: Simulated, solution: Solution) -> Session:
     """Compare a solution with the truth."""
     truth = made.truth[0]
     start = truth.time_ns[0]
-    columns = (*truth.position[:, :2].T, np.unwrap(heading_of(truth.quaternion)))
+    columns = (*truth.position[:, :2].T, np.unwrap(heading_from_quaternion(truth.quaternion)))
 
     def true_at(time_ns: NDArray[np.int64]) -> Array:
         at, time = time_ns - start, truth.time_ns - start
@@ -97,7 +97,7 @@ def judged(made: Simulated, solution: Solution) -> Session:
     if not solution.trajectories:
         return Session(False, silent, wrong, none, none, none)
     track = solution.trajectories[0]
-    off = np.column_stack([track.position[:, :2], heading_of(track.quaternion)])
+    off = np.column_stack([track.position[:, :2], heading_from_quaternion(track.quaternion)])
     off -= true_at(track.time_ns)
     off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
     covariance = track.covariance[:, [0, 1, 5]][:, :, [0, 1, 5]]

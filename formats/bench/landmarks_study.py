@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks import estimate, fit, paper, paper_pose, paper_valleys
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
@@ -208,7 +208,7 @@ def true_pose(one: Pass, time_ns: int) -> Array:
     truth = one.truth
     start = truth.time_ns[0]
     time, at = (truth.time_ns - start) * 1e-9, (time_ns - start) * 1e-9
-    heading = np.unwrap(heading_of(truth.quaternion))
+    heading = np.unwrap(heading_from_quaternion(truth.quaternion))
     columns = (truth.position[:, 0], truth.position[:, 1], heading)
     return np.array([np.interp(at, time, column) for column in columns])
 
@@ -242,7 +242,7 @@ def centre_error(seen: Array, true: Array) -> float:
 
 def last_odometry(one: Pass) -> Array:
     """(3,) the robot at the end of the visit, by its odometry."""
-    heading = heading_of(one.odometry.quaternion[-1:])
+    heading = heading_from_quaternion(one.odometry.quaternion[-1:])
     return np.array([*one.odometry.position[-1, :2], heading[0]])
 
 

@@ -15,8 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core import metrics
 from locatk.core.errors import DegenerateError, LocatkError
+from locatk.core.evaluation import (
+    Evaluation,
+    EvaluationOptions,
+    estimate_offset,
+    evaluate,
+)
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse import SolveOptions, solve
 from locatk.core.lighthouse.recording import Sweeps
@@ -133,7 +138,7 @@ def _scored(
     extra = []
     if offset_s is not None:
         every = [pair for experiment in bundle for pair in experiment]
-        ours = metrics.evaluate_all(every, align=align, offset_s=offset_s)
+        ours = evaluate(every, EvaluationOptions(align=align, offset_s=offset_s))
         extra = [
             Figure(f"{name}: MAE, own time offset", 1e3 * own.mae, "mm",
                    "time offset of each experiment from the other four", peer=SCRIPTS,
@@ -153,14 +158,14 @@ def _scored(
     ]  # fmt: skip
 
 
-def _leave_one_out(experiments: list[list[Pair]], align: str) -> metrics.Evaluation:
+def _leave_one_out(experiments: list[list[Pair]], align: str) -> Evaluation:
     """Score all experiments, each with the time offset that the others need."""
     shifted: list[Pair] = []
     for k, pairs in enumerate(experiments):
         others = [pair for j, e in enumerate(experiments) if j != k for pair in e]
-        offset = metrics.estimate_offset(others, align=align)
+        offset = estimate_offset(others, align=align)
         shifted += [(_later(estimate, offset), truth) for estimate, truth in pairs]
-    return metrics.evaluate_all(shifted, align=align)
+    return evaluate(shifted, EvaluationOptions(align=align))
 
 
 def _later(trajectory: Trajectory, seconds: float) -> Trajectory:

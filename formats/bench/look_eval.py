@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from locatk.core import metrics
+from locatk.core.evaluation import EvaluationOptions, evaluate
 from locatk.core.geometry import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -136,7 +136,8 @@ def write(folder: Path, n: int) -> None:
 def _own(folder: Path) -> float:
     truth = trajectories.read_tum(folder / "truth.tum")
     estimate = trajectories.read_tum(folder / "estimate.tum")
-    return cpu_seconds(lambda: metrics.evaluate(estimate, truth, align="se3", match="nearest"))
+    options = EvaluationOptions(align="se3", match="nearest")
+    return cpu_seconds(lambda: evaluate([(estimate, truth)], options))
 
 
 def _difference(evo: Evo, folder: Path) -> Figure:
@@ -147,11 +148,9 @@ def _difference(evo: Evo, folder: Path) -> Figure:
     truth, estimate = small / "truth.tum", small / "estimate.tum"
     largest, count = 0.0, 0
     for align, options in ALIGNMENTS.items():
-        said = metrics.evaluate(
-            trajectories.read_tum(estimate),
-            trajectories.read_tum(truth),
-            align=align,
-            match="nearest",
+        said = evaluate(
+            [(trajectories.read_tum(estimate), trajectories.read_tum(truth))],
+            EvaluationOptions(align=align, match="nearest"),
         ).as_dict()
         for metric, program in (("ape", evo.ape), ("rpe", evo.rpe)):
             for relation, part in PARTS.items():

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris.bound import magnet_covariance, pose_covariance
 from locatk.core.polaris.codec import capacity, layout_of
 from locatk.core.polaris.simulate import Simulated, SimulationOptions, simulate
@@ -141,7 +141,7 @@ def _true(made: Simulated, time_s: float) -> tuple[Array, Array]:
     """
     time_ns = made.truth.time_ns
     at = int(np.argmin(np.abs(time_ns - round(time_s * 1e9))))
-    heading = float(heading_of(made.truth.quaternion[at : at + 1])[0])
+    heading = float(heading_from_quaternion(made.truth.quaternion[at : at + 1])[0])
     cos, sin = math.cos(heading), math.sin(heading)
     points = np.vstack([made.magnets.place_m, np.zeros(2)]) - made.truth.position[at, :2]
     turned = points @ np.array([[cos, -sin], [sin, cos]])

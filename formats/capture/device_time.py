@@ -1,6 +1,6 @@
 """The clock of one device, for as long as it can be believed.
 
-:class:`locatk.core.ticks.TickClock` learns by how many ppm a clock is off. A device that
+:class:`locatk.core.clock_sync.TickClock` learns by how many ppm a clock is off. A device that
 counts twice as fast as it says is another matter: a firmware that means milliseconds, or a
 recording that is played faster. Its ticks tell nothing of the host's time.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.ticks import RATE_LIMIT, TickClock
+from locatk.core.clock_sync import RATE_LIMIT, TickClock
 from locatk.formats.wire.decoder import Ticks
 
 Ints = NDArray[np.int64]

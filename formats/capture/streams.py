@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from locatk.core.ticks import TickClock
+from locatk.core.clock_sync import TickClock
 from locatk.formats import messages
 from locatk.formats.capture.arrivals import Arrivals
 from locatk.formats.capture.device_time import DeviceTime

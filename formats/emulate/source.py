@@ -8,7 +8,7 @@ from functools import partial
 
 from google.protobuf.message import DecodeError
 
-from locatk.core.errors import FormatError, InputError, about
+from locatk.core.errors import FormatError, InputError, error_context
 from locatk.formats import arrays, halls
 from locatk.formats.capture.totals import RECORD
 from locatk.formats.observations import read_halls, read_odometry, read_samples, read_sweeps
@@ -89,7 +89,7 @@ def _chunks(session: Session, topic: str) -> Iterator[tuple[int, bytes]]:
 
 def _encoded(session: Session, sender: Device, recording: Recording) -> Iterator[tuple[int, bytes]]:
     """Bytes that a device makes of observations."""
-    with about(session.path):
+    with error_context(session.path):
         yield from sender.encode(recording)
 
 

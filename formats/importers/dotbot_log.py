@@ -20,7 +20,7 @@ is lost. ``sweep`` numbers a robot's memory, not the planes of the rotor: it is 
 Lines of other events are passed over.
 
 Log lines are late by tens of milliseconds, more than lies between two sweeps. Where robots
-tell db_time, it dates the sweeps (:mod:`locatk.core.ticks`).
+tell db_time, it dates the sweeps (:mod:`locatk.core.clock_sync`).
 
 Source: PyDotBot ``controller.py``, ``logger.py``; ``parse_logfile.py`` of alvarado23lighthouse,
 alvarado24lh-distortion and alvarado24automatic; facts/lighthouse.md 1.1 and 2.8.
@@ -38,11 +38,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.clock_sync import TickClock
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIALS, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
-from locatk.core.ticks import TickClock
 from locatk.formats.artifacts import parse_time
 from locatk.formats.importers.sweeps import ImportedSession
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
-from locatk.core.geometry import heading_of, quaternion_from_heading
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.columns import UNITS, Column, by_quantity, find
@@ -319,7 +319,7 @@ def _updates(poses: Array) -> NDArray[np.int64]:
 
 def _doubts(odometry: Trajectory) -> list[str]:
     """What a robot on wheels cannot have driven: units or axes are other ones then."""
-    place, heading = odometry.position[:, :2], heading_of(odometry.quaternion)
+    place, heading = odometry.position[:, :2], heading_from_quaternion(odometry.quaternion)
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     doubts = []
     seconds = float(odometry.time_ns[-1] - odometry.time_ns[0]) * 1e-9

@@ -4,7 +4,7 @@ libsurvive writes both into each line: when the light was (timecode, 32 bits, st
 every 89 s) and when the host wrote the line, which is later, by milliseconds and in bursts.
 Here the recording is known to its end, so that one line of host time over ticks holds for
 all of it: times between sweeps are then as exact as the counter. (What runs while a recording
-grows is :mod:`locatk.core.ticks`.)
+grows is :mod:`locatk.core.clock_sync`.)
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def draw(canvas: Canvas, marks: Iterable[drawing.Mark]) -> None:
     """Draw marks on the page that was begun."""
     for mark in marks:
         canvas.saveState()
-        if isinstance(mark, drawing.Words):
+        if isinstance(mark, drawing.Text):
             _write(canvas, mark)
         else:
             canvas.setLineWidth(mark.width_mm * mm)
@@ -133,9 +133,9 @@ def draw(canvas: Canvas, marks: Iterable[drawing.Mark]) -> None:
         canvas.restoreState()
 
 
-def _write(canvas: Canvas, words: drawing.Words) -> None:
-    canvas.translate(words.at[0] * mm, words.at[1] * mm)
-    canvas.rotate(words.turn_deg)
+def _write(canvas: Canvas, words: drawing.Text) -> None:
+    canvas.translate(words.position[0] * mm, words.position[1] * mm)
+    canvas.rotate(words.angle_deg)
     font = _BOLD if words.bold else _FONT
     canvas.setFont(font, words.points)
     share = {"start": 0.0, "middle": 0.5, "end": 1.0}[words.anchor]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from plotly.graph_objects import Figure, Scatter
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plot_ground import (
@@ -197,7 +197,7 @@ def _hover(t: Trajectory, ground: Ground, keep: NDArray[np.int64], start: int) -
             lines[-1] += f" \u00b1 %{{customdata[{len(columns)}]:.3g}} {ground.unit}"
             columns.append(spread)
     if np.isfinite(sigma[:, 5]).any():
-        say("heading", np.degrees(heading_of(t.quaternion[keep])), ".2f", "\u00b0")
+        say("heading", np.degrees(heading_from_quaternion(t.quaternion[keep])), ".2f", "\u00b0")
         lines[-1] += f" \u00b1 %{{customdata[{len(columns)}]:.3g}} \u00b0"
         columns.append(np.degrees(sigma[:, 5]))
     return np.column_stack(columns), "<br>".join(lines)

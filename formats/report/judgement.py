@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from locatk.core.consistency import EDGES
-from locatk.core.metrics import Evaluation
+from locatk.core.evaluation import CHI2_95_QUANTILES, Evaluation, Statistics
 from locatk.core.solution import Solution
-from locatk.core.statistics import Statistics
 from locatk.formats import plot_series
 from locatk.formats.plot_clock import origin_ns
 from locatk.formats.plot_ground import has_no_scale, known
@@ -56,9 +54,11 @@ def verdict(subject: Subject) -> str:
         else f"The alignment {evaluation.align} was fitted on the truth, on these same poses."
     )
     if evaluation.offset_s:
-        fitted += f" Time offset: {evaluation.offset_s:.4f} s ({evaluation.offset_source})."
+        fitted += (
+            f" Time offset: {evaluation.offset_s:.4f} s ({evaluation.time_offset.describe()})."
+        )
     consistency = evaluation.consistency
-    judged = "" if consistency is None else f"{consistency.words().capitalize()}."
+    judged = "" if consistency is None else f"{consistency.describe().capitalize()}."
     return sentences(text, fitted, judged, _left_out(solution))
 
 
@@ -105,8 +105,8 @@ def key_figures(subject: Subject) -> list[tuple[str, str]]:
         ]
         if evaluation.ape_rotation is not None:
             found.append((f"{digits(evaluation.ape_rotation.median)}\u00b0", "APE rotation median"))
-        if evaluation.coverage.share is not None:
-            found.append((f"{100 * evaluation.coverage.share:.1f} %", "of the time solved"))
+        if evaluation.coverage.fraction is not None:
+            found.append((f"{100 * evaluation.coverage.fraction:.1f} %", "of the time solved"))
     else:
         spread = _sigma(subject)
         if len(spread):
@@ -204,7 +204,7 @@ def _nees(subject: Subject, evaluation: Evaluation, colors: dict[str, str]) -> l
     told = np.isfinite(evaluation.nees) & (evaluation.nees_dof > 0)
     if evaluation.consistency is None or not told.any():
         return []
-    ratio = evaluation.nees / np.array(EDGES)[evaluation.nees_dof]
+    ratio = evaluation.nees / np.array(CHI2_95_QUANTILES)[evaluation.nees_dof]
     series = {}
     for k, name in enumerate(evaluation.devices):
         mine = told & (evaluation.device == k)
@@ -243,7 +243,7 @@ def _statistics(evaluation: Evaluation, unit: Unit) -> Table:
             rows.append((what, device, unit, str(of.n), *values))
 
     every = {name: getattr(evaluation, name) for name, _ in ERRORS}
-    of_each = {name: evaluation.of_device(k) for k, name in enumerate(evaluation.devices)}
+    of_each = {name: evaluation.device_statistics(k) for k, name in enumerate(evaluation.devices)}
     if len(of_each) > 1:
         of_each = {"all": every, **of_each}
     for name, title in ERRORS:
@@ -264,7 +264,7 @@ def _how(solution: Solution, evaluation: Evaluation) -> str:
         "APE: each pose against the truth at its time. "
         f"RPE: the motion from each pose to {_apart(evaluation.rpe_delta)}, against the true one.",
         f"Alignment: {evaluation.align}; time offset: {evaluation.offset_s:g} s "
-        f"({evaluation.offset_source}).",
+        f"({evaluation.time_offset.describe()}).",
         f"Not scored: {out}." if out else "" if alone else "All poses are scored.",
         f"There is no truth for {listed(alone)}." if alone else "",
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from locatk.core.metrics import Evaluation
+from locatk.core.evaluation import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.session import Session

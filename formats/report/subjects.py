@@ -8,10 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from locatk.core import metrics
-from locatk.core.association import pair_devices
 from locatk.core.errors import FormatError, InputError, LocatkError
-from locatk.core.metrics import Evaluation
+from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import trajectory_files
@@ -43,9 +41,9 @@ def load(
     truth : path, optional
         Reference poses in any format that `locatk eval` reads; by default the session's.
     align : str
-        One of :data:`locatk.core.metrics.ALIGNMENTS`.
+        One of :data:`locatk.core.evaluation.ALIGNMENTS`.
     offset_s : float or "auto"
-        Added to the stamps of the solution, see :func:`locatk.core.metrics.evaluate_all`.
+        Added to the stamps of the solution, see :class:`locatk.core.evaluation.EvaluationOptions`.
 
     Raises
     ------
@@ -132,7 +130,7 @@ def _evaluate(
     if not pairs:
         return None
     try:
-        return metrics.evaluate_all(pairs, align=align, offset_s=offset_s)
+        return evaluate(pairs, EvaluationOptions(align=align, offset_s=offset_s))
     except InputError:
         if align == "none" and offset_s == 0.0:
             return None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.lighthouse.channels import CHANNELS
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.formats.wire import payloads
@@ -93,7 +93,7 @@ def _sampled(recording: Recording) -> list[tuple[Type, str, Times, NDArray[np.fl
         values = (halls.field_t * 1e6).astype("<f4")
         sampled.append((Type.HALLS, halls.device, halls.time_ns, values))
     for track in recording.odometry:
-        poses = np.column_stack([track.position[:, :2], heading_of(track.quaternion)])
+        poses = np.column_stack([track.position[:, :2], heading_from_quaternion(track.quaternion)])
         sampled.append((Type.ODOMETRY, track.device, track.time_ns, poses[:, None].astype("<f4")))
     for _, device, _, values in sampled:
         if values.shape[1] > 255:

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import NAMES
 from locatk.formats.importers.columns import TIMES, UNITS
 from locatk.formats.wire.decoder import Batch, Stream, Ticks
@@ -358,7 +358,7 @@ def _kinds(recording: Recording) -> Mapping[str, list[list[tuple[str, Ints, Arra
         [
             ("x_m", each.time_ns, each.position[:, 0], "%.6f"),
             ("y_m", each.time_ns, each.position[:, 1], "%.6f"),
-            ("heading_rad", each.time_ns, heading_of(each.quaternion), "%.6f"),
+            ("heading_rad", each.time_ns, heading_from_quaternion(each.quaternion), "%.6f"),
         ]
         for each in recording.odometry
     ]

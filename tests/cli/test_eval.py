@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.association import take
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -253,9 +252,9 @@ TUM = "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n3 1 1 0 0 0 0 1\n"
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", TUM, (), "does not ascend"),
         (TUM, "1 0 nan 0 0 0 0 1\n", (), "finite"),
         (TUM, "101 0 0 0 0 0 0 1\n102 1 0 0 0 0 0 1\n", (), "truth at its time"),
-        (TUM.splitlines()[0], TUM, ("--align", "se3"), "two poses or more"),
+        (TUM.splitlines()[0], TUM, ("--align", "se3"), "at least two poses"),
         (TUM.splitlines()[0], TUM, ("--offset", "auto"), "only 0 poses"),
-        ("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n", TUM, ("--align", "se3"), "on a line"),
+        ("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n", TUM, ("--align", "se3"), "collinear"),
         (TUM.replace("1 0 0 0", "0 0 0 0"), TUM, ("--align", "se2", "--offset", "9"), "time"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", TUM, (), "KITTI tells no times"),
     ],
@@ -301,7 +300,7 @@ def test_the_longest_gap_is_chosen(locatk, found: Path, tmp_path: Path) -> None:
     slow = tmp_path / "slow.csv"
     part = unknown(drive())
     rows = np.arange(0, N, 20)
-    trajectories.write_csv(slow, [take(part, np.isin(np.arange(N), rows))])
+    trajectories.write_csv(slow, [part.select(np.isin(np.arange(N), rows))])
     assert answer(locatk, found, "--truth", slow)["n"] == len(rows)
     bridged = answer(locatk, found, "--truth", slow, "--max-gap", 1)
     assert bridged["n"] == rows[-1] + 1
@@ -312,7 +311,7 @@ def test_a_single_pose_and_what_comes_late_are_said_in_words(
     locatk, run: Path, tmp_path: Path
 ) -> None:
     one, late = tmp_path / "one.csv", tmp_path / "late.csv"
-    trajectories.write_csv(one, [take(solved(), np.arange(N) == 5)])
+    trajectories.write_csv(one, [solved().select(np.arange(N) == 5)])
     assert "The one pose with truth lies" in locatk("eval", one, "--truth", run).stdout
     trajectories.write_csv(late, [solved(late_ns=-5_000_000_000_000)])
     said = locatk("eval", late, "--truth", run).stderr

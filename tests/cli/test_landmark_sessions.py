@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from locatk.core.geometry import heading_of, quaternion_from_heading
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.floor import AsBuilt, FloorMap
 from locatk.core.landmarks.halls import NAMES, HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import code_of
@@ -473,7 +473,9 @@ def test_viewers_see_the_bars(locatk, solver: Solver, tmp_path: Path) -> None:
     arrow = first.arrows[0].pose
     assert (arrow.position.x, arrow.position.y) == pytest.approx((0.025, -0.015))
     turn = arrow.orientation
-    assert heading_of(np.array([turn.x, turn.y, turn.z, turn.w])) == pytest.approx(math.pi / 2)
+    assert heading_from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w])) == pytest.approx(
+        math.pi / 2
+    )
     # The last one is S, at the bottom: clockwise is to the left there.
     last = first.arrows[3].pose
     assert (last.position.x, last.position.y) == pytest.approx((0.015, -0.025))
@@ -503,7 +505,7 @@ def test_from_a_log_to_poses(locatk, tmp_path: Path) -> None:
             zip(
                 driven.position[:, 0].tolist(),
                 driven.position[:, 1].tolist(),
-                np.degrees(heading_of(driven.quaternion)).tolist(),
+                np.degrees(heading_from_quaternion(driven.quaternion)).tolist(),
                 strict=True,
             ),
             strict=True,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from locatk.cli.eval import ALIGNMENTS
-from locatk.core import metrics
+from locatk.core import evaluation
 from locatk.formats import artifacts
 
 POSES = 20
@@ -133,7 +133,7 @@ def test_eval_refuses_what_cannot_be_compared(
 
 
 def test_alignments_are_those_of_the_core() -> None:
-    assert ALIGNMENTS == metrics.ALIGNMENTS
+    assert ALIGNMENTS == evaluation.ALIGNMENTS
 
 
 def test_export_csv_is_the_contract(locatk, solved: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from click.testing import Result
 from locatk.cli import systems
 from locatk.cli.eval import ALIGNMENTS
 from locatk.cli.report import plan
-from locatk.core.alignment import ALIGNMENTS as CORE
+from locatk.core.evaluation import ALIGNMENTS as CORE
 
 Locatk = Callable[..., Result]
 Record = Callable[..., Path]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import name
@@ -52,7 +52,7 @@ def holds(path: Path, wanted: Simulated) -> Session:
         assert (read.device, read.frame) == (exact.device, exact.frame)
         assert np.array_equal(read.time_ns, exact.time_ns)
         assert read.position == pytest.approx(exact.position, abs=1e-9)
-        off = heading_of(read.quaternion) - heading_of(exact.quaternion)
+        off = heading_from_quaternion(read.quaternion) - heading_from_quaternion(exact.quaternion)
         assert np.cos(off) == pytest.approx(1)
     return session
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.simulate import CARS, SimulationOptions, simulate, usual_bar
 from locatk.core.polaris.tag import Placed, Tags
@@ -54,7 +54,9 @@ def test_a_session_holds_samples_bar_tag_and_truth(locatk, tmp_path: Path) -> No
     (truth,) = read_truth(session)
     assert (truth.device, truth.frame) == ("bar", "tag-262143")
     assert truth.position == pytest.approx(wanted.truth.position)
-    assert heading_of(truth.quaternion) == pytest.approx(heading_of(wanted.truth.quaternion))
+    assert heading_from_quaternion(truth.quaternion) == pytest.approx(
+        heading_from_quaternion(wanted.truth.quaternion)
+    )
     facts = session.metadata()["facts"]
     assert json.loads(facts["simulated_crossings"]) == [crossing]
     magnets = json.loads(facts["simulated_magnets"])

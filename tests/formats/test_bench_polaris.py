@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris import codec
 from locatk.core.polaris.ddtw import distances, prepare
 from locatk.core.polaris.simulate import Simulated, SimulationOptions, simulate
@@ -200,7 +200,7 @@ def made() -> Simulated:
 def told(made: Simulated, tag_id: int | None, refused: str | None = None) -> dict[str, Any]:
     """The truth at some sample, as a detection."""
     at = 150
-    heading = heading_of(made.truth.quaternion[at : at + 1])[0]
+    heading = heading_from_quaternion(made.truth.quaternion[at : at + 1])[0]
     magnets = turned(made.magnets.place_m - made.truth.position[at, :2], -heading)
     x, y = turned(-made.truth.position[at, :2][None], -heading)[0]
     return {

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
+from locatk.core.evaluation import EvaluationOptions, evaluate
 from locatk.core.geometry import apply_homography, fit_homography
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
 from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.published.scene import paper_image_points
-from locatk.core.metrics import evaluate_all
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot import read_dotbot
 from locatk.formats.importers.sweeps import ImportedSession
@@ -182,10 +182,10 @@ def test_published_error_of_the_authors_is_reproduced(one: Path) -> None:
         position = np.column_stack([plane * np.array([2.0, -2.0]), np.zeros(len(plane))])
         time = session.sweeps.time_ns[::2]
         pairs.append((Trajectory.from_positions("robot", "floor", time, position), *session.truth))
-    theirs = evaluate_all(pairs, offset_s=-0.318109)
+    theirs = evaluate(pairs, EvaluationOptions(offset_s=-0.318109))
     assert theirs.mae == pytest.approx(7.01e-3, abs=0.05e-3)
     assert theirs.rmse == pytest.approx(7.86e-3, abs=0.15e-3)
-    ours = evaluate_all(pairs, offset_s="auto")
+    ours = evaluate(pairs, EvaluationOptions(offset_s="auto"))
     assert ours.offset_s == pytest.approx(-0.25, abs=0.02)
     assert ours.mae < 3.6e-3
 
@@ -525,4 +525,4 @@ def test_no_markers_from_a_plane_that_is_not_of_these_counts(write: Write) -> No
     )
     session = read_dotbot([write(still)])
     assert session.scene is None
-    assert "same place" in session.warnings[0]
+    assert "coincide" in session.warnings[0]

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import NAMES, HallSensors
 from locatk.formats.importers.columns import UNITS
 from locatk.formats.importers.landmark_csv import (
@@ -65,7 +65,9 @@ def check(found: ImportedHalls, rows: np.ndarray) -> None:
     assert found.warnings == []
     np.testing.assert_allclose(found.samples.field_t, rows[:, 4:], rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(found.odometry.position[:, :2], rows[:, 1:3], rtol=1e-12)
-    np.testing.assert_allclose(heading_of(found.odometry.quaternion), rows[:, 3], atol=1e-12)
+    np.testing.assert_allclose(
+        heading_from_quaternion(found.odometry.quaternion), rows[:, 3], atol=1e-12
+    )
     np.testing.assert_allclose(
         (found.samples.time_ns - found.samples.time_ns[0]) * 1e-9, rows[:, 0], atol=1e-9
     )

@@ -19,7 +19,7 @@ import pypdfium2
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.drawing import Line, Page, Words
+from locatk.core.drawing import Line, Page, Text
 from locatk.core.errors import InputError
 from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.landmark import Geometry
@@ -223,14 +223,14 @@ def test_the_plan_shows_each_code_in_its_place(shape: tuple[int, int]) -> None:
     scale = float(next(m.text for m in all_words(pages) if m.text.startswith("Scale"))[10:])
     cell = 200 / scale
     data = render(pages, "t")
-    height = max(mark.points for mark in plan.marks if isinstance(mark, Words) and mark.bold)
+    height = max(mark.points for mark in plan.marks if isinstance(mark, Text) and mark.bold)
     low = 0.85 * height * 0.5 * 25.4 / 72
     digits = [found for found in words(data) if found[3] > low and found[0] in "0123456789abcdef"]
     # The plan is the largest lattice of big digits; titles are not on it.
     xs = np.array([found[1:3] for found in digits])
-    marks = [m for m in plan.marks if isinstance(m, Words) and m.points == height and m.bold]
+    marks = [m for m in plan.marks if isinstance(m, Text) and m.points == height and m.bold]
     assert len(marks) == floor.codes.size
-    first = np.array(marks[0].at) + [0, 0.36 * height * 25.4 / 72]
+    first = np.array(marks[0].position) + [0, 0.36 * height * 25.4 / 72]
     for (row, column), code in np.ndenumerate(floor.codes):
         spot = first + cell * np.array([column, row])
         near = int(np.argmin(np.hypot(*(xs - spot).T)))
@@ -238,13 +238,13 @@ def test_the_plan_shows_each_code_in_its_place(shape: tuple[int, int]) -> None:
         assert digits[near][0] == f"{code:x}"
 
 
-def all_words(pages: tuple[Page, ...]) -> list[Words]:
+def all_words(pages: tuple[Page, ...]) -> list[Text]:
     return [
         mark
         for page in pages
         for group in page.groups
         for mark in group.marks
-        if isinstance(mark, Words)
+        if isinstance(mark, Text)
     ]
 
 
@@ -253,7 +253,7 @@ def test_large_plans_are_cut_into_pages_that_hold_each_cell_once() -> None:
     pages = pack(floor, A4, parts=("plan",)).pages
     assert len(pages) > 3
     seen = sum(
-        isinstance(mark, Words) and mark.bold and len(mark.text) == 1 and mark.points != 6
+        isinstance(mark, Text) and mark.bold and len(mark.text) == 1 and mark.points != 6
         for page in pages
         for group in page.groups
         if group.name == "plan"
@@ -441,10 +441,10 @@ def nothing_drawn_over(pages: tuple[Page, ...], thin: float) -> float:
         )
         return ink(render(kept, "t"), dpi=150)
 
-    letters = only(lambda mark: isinstance(mark, Words))
+    letters = only(lambda mark: isinstance(mark, Text))
     rest = only(
         lambda mark: (
-            not isinstance(mark, Words)
+            not isinstance(mark, Text)
             and getattr(mark, "dash_mm", None) is None
             and mark.width_mm > thin
         )

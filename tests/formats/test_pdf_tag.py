@@ -20,7 +20,7 @@ import pypdfium2
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.drawing import Group, Line, Mark, Page, Words
+from locatk.core.drawing import Group, Line, Mark, Page, Text
 from locatk.core.errors import InputError
 from locatk.core.polaris import cards
 from locatk.core.polaris.tag import AsBuilt, Layout, Magnet, Tags, free_cells
@@ -68,7 +68,7 @@ def only(pages: tuple[Page, ...], *, words: bool) -> tuple[Page, ...]:
     """The pages with nothing but words, or without words and without the grid's dashes."""
 
     def chosen(mark: Mark) -> bool:
-        if isinstance(mark, Words):
+        if isinstance(mark, Text):
             return words
         return not words and not (isinstance(mark, Line) and mark.dash_mm is not None)
 
@@ -305,7 +305,7 @@ def test_long_ids_are_written_whole_within_their_card() -> None:
     number = 3**300
     made = cards.draw(MINI, [(number, some_layout(MINI, 1)), (5, some_layout(MINI, 2))], A4)
     _, group, other = made.pages[0].groups
-    texts = [mark for mark in group.marks if isinstance(mark, Words) and mark.bold]
+    texts = [mark for mark in group.marks if isinstance(mark, Text) and mark.bold]
     digits = "".join(mark.text for mark in texts if mark.text != "N")
     assert digits.replace(" ", "") == f"id{number}"
     page = pypdfium2.PdfDocument(tag_pdf.render(made.pages, "t"))[0].get_textpage()

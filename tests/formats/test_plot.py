@@ -14,8 +14,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from locatk.core import metrics
 from locatk.core.errors import InputError, MissingDataError, OutputExistsError
+from locatk.core.evaluation import EvaluationOptions, evaluate
 from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
@@ -168,7 +168,7 @@ def test_an_alignment_brings_all_into_the_frame_of_the_truth() -> None:
         ),
     )
     pairs = list(zip(moved.trajectories, TRUTH, strict=True))
-    figure = draw(moved, TRUTH, metrics.evaluate_all(pairs, align="sim3"))
+    figure = draw(moved, TRUTH, evaluate(pairs, EvaluationOptions(align="sim3")))
     ground = figure.axes[0]
     assert ground.get_xlabel() == "x [m]"
     paths = [line.get_xydata() for line in ground.lines if len(line.get_xydata()) == 120]

@@ -23,7 +23,7 @@ from locatk.core.dots.simulate_courses import Course, course
 from locatk.core.dots.simulate_decoys import KINDS, decoys
 from locatk.core.dots.simulate_optics import Exposer, Optics, Stand, view
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 
 Array = NDArray[np.float64]
 PLAIN = SimulationOptions(
@@ -153,7 +153,7 @@ def test_each_dot_lies_where_its_symbol_and_the_truth_say() -> None:
     for frame, place, turn in zip(
         simulated.frames.images,
         simulated.truth.position,
-        heading_of(simulated.truth.quaternion),
+        heading_from_quaternion(simulated.truth.quaternion),
         strict=True,
     ):
         middle = np.array([1e3 * place[0], sheet.page_mm[1] - 1e3 * place[1]]) - sheet.first_mm
@@ -397,7 +397,7 @@ def test_a_curve_keeps_its_speed_and_looks_ahead() -> None:
     truth = simulate.simulate(None, options).truth
     step = np.diff(truth.position[:, :2], axis=0)
     assert np.linalg.norm(step, axis=1) == pytest.approx(np.full(1999, 0.0025), rel=0.01)
-    ahead = np.exp(1j * heading_of(truth.quaternion))
+    ahead = np.exp(1j * heading_from_quaternion(truth.quaternion))
     mean = ahead[:-1] + ahead[1:]
     assert np.abs(np.angle((step[:, 0] + 1j * step[:, 1]) / mean)).max() < 0.02
     assert (truth.position.min(axis=0)[:2] > [0.008, 0.008]).all()
@@ -418,7 +418,7 @@ def test_a_curve_knows_how_it_moves() -> None:
 
 def test_random_frames_are_anywhere_and_still_ones_are_not() -> None:
     many = simulate.simulate(None, replace(PLAIN, frames=400)).truth
-    heading = heading_of(many.quaternion)
+    heading = heading_from_quaternion(many.quaternion)
     assert abs(np.exp(1j * heading).mean()) < 0.15
     assert np.ptp(many.position[:, 0]) > 0.17
     still = simulate.simulate(None, replace(PLAIN, frames=5, path="still", noise=2.0))

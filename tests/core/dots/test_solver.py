@@ -20,7 +20,7 @@ from locatk.core.dots.frames import Frames
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -63,7 +63,7 @@ def only(solution: Solution) -> Trajectory:
 
 
 def heading(track: Trajectory) -> NDArray[np.float64]:
-    result: NDArray[np.float64] = np.degrees(heading_of(track.quaternion))
+    result: NDArray[np.float64] = np.degrees(heading_from_quaternion(track.quaternion))
     return result
 
 
@@ -223,7 +223,9 @@ def test_covariance_in_metres(shoot: Shoot) -> None:
     floor = (paper @ np.array([[c, s], [-s, c]]) + [300, -40]) * 1e-3
     right = np.stack([1.003 * np.cos(turn), 0.995 * np.sin(turn)], axis=1)
     angle = np.arctan2(right[:, 1], right[:, 0]) + math.radians(30)
-    error = np.column_stack([track.position[:, :2] - floor, heading_of(track.quaternion) - angle])
+    error = np.column_stack(
+        [track.position[:, :2] - floor, heading_from_quaternion(track.quaternion) - angle]
+    )
     error[:, 2] = np.remainder(error[:, 2] + np.pi, 2 * np.pi) - np.pi
     assert np.abs(error[:, :2]).max() < 10e-6
     covariance = track.covariance[:, [0, 1, 5]][:, :, [0, 1, 5]]

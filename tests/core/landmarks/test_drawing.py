@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from locatk.core.drawing import Circle, Line, Mark, Polygon, Words
+from locatk.core.drawing import Circle, Line, Mark, Polygon, Text
 from locatk.core.errors import InputError
 from locatk.core.landmarks.bars import landmark_field
 from locatk.core.landmarks.drawing import (
@@ -82,7 +82,7 @@ def places(mark: Mark) -> list[tuple[float, float]]:
     if isinstance(mark, Circle):
         x, y = mark.centre
         return [(x - mark.radius_mm, y - mark.radius_mm), (x + mark.radius_mm, y + mark.radius_mm)]
-    return [mark.at]
+    return [mark.position]
 
 
 @pytest.mark.parametrize("geometry", [Geometry(), OTHER])
@@ -96,7 +96,7 @@ def test_a_drawing_stays_within_what_it_says(geometry: Geometry) -> None:
 def test_signs_point_and_are_filled_as_the_bars_lie(code: int) -> None:
     marks = draw_symbol(code, (10.0, 20.0), 8.0)
     bars = [mark for mark in marks if isinstance(mark, Polygon)]
-    words = [mark.text for mark in marks if isinstance(mark, Words)]
+    words = [mark.text for mark in marks if isinstance(mark, Text)]
     assert words == [f"{code:x}"]
     for number, (bar, letter) in enumerate(zip(bars, name(code), strict=True)):
         assert bar.filled == (letter == "N")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.bars import basis
 from locatk.core.landmarks.estimate import Explanation, _in_one_frame, explain, robot, stand
 from locatk.core.landmarks.fit import Priors
@@ -48,7 +48,7 @@ def read(one: Pass, geometry: Geometry = GEOMETRY) -> Read | None:
         return None
     seen, covariance = robot(visit.trace, found[0], visit.trace.reference)
     since = one.truth.time_ns - visit.time_ns[visit.trace.reference]
-    heading = np.unwrap(heading_of(one.truth.quaternion))
+    heading = np.unwrap(heading_from_quaternion(one.truth.quaternion))
     x, y, turned = (
         np.interp(0, since, column) for column in (*one.truth.position[:, :2].T, heading)
     )

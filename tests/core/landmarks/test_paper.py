@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks import paper
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, code_of, name, rotated
@@ -26,7 +26,7 @@ def off(run: Pass, seen: Sighting) -> np.ndarray | None:
     """
     at = int(np.searchsorted(run.truth.time_ns, seen.time_ns))
     x, y = run.truth.position[at, :2]
-    heading = float(heading_of(run.truth.quaternion[at]))
+    heading = float(heading_from_quaternion(run.truth.quaternion[at]))
     for q in range(4):
         turn = q * math.pi / 2
         cos, sin = math.cos(turn), math.sin(turn)
@@ -103,7 +103,8 @@ def test_a_pass_alone_gives_a_centre_only() -> None:
             assert any("first step: centre at" in note for note in seen.notes)
             at = step.stop - 1
             true, own = (
-                float(heading_of(track.quaternion[at])) for track in (run.truth, run.odometry)
+                float(heading_from_quaternion(track.quaternion[at]))
+                for track in (run.truth, run.odometry)
             )
             cos, sin = math.cos(own - true), math.sin(own - true)
             way = np.array([[cos, -sin], [sin, cos]]) @ -run.truth.position[at, :2]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks import route, solver
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.simulate import (
@@ -47,14 +47,14 @@ def session(seed: int, clean: bool = False) -> tuple[Simulated, Trajectory]:
 def errors_of(one: Simulated, told: Trajectory) -> tuple[Array, Array]:
     """Errors (n, 3), and their normalised squares (n,)."""
     truth, start = one.truth[0], one.truth[0].time_ns[0]
-    heading = np.unwrap(heading_of(truth.quaternion))
+    heading = np.unwrap(heading_from_quaternion(truth.quaternion))
     true = np.column_stack(
         [
             np.interp(told.time_ns - start, truth.time_ns - start, column)
             for column in (*truth.position[:, :2].T, heading)
         ]
     )
-    off = np.column_stack([told.position[:, :2], heading_of(told.quaternion)]) - true
+    off = np.column_stack([told.position[:, :2], heading_from_quaternion(told.quaternion)]) - true
     off[:, 2] = np.remainder(off[:, 2] + np.pi, 2 * np.pi) - np.pi
     rows = np.array([0, 1, 5])
     covariance = told.covariance[:, rows[:, None], rows]
@@ -141,8 +141,8 @@ def test_the_way_before_runs_odometry_backwards() -> None:
     stay = StayPose(np.array([0.3, 0.2, 0.4]), wrong, np.eye(3 + width) * 1e-8)
     told = route.poses("robot", [item.visit], [stay], recording.odometry, recording.priors)
     # A way whose curvature is 1.5 sigma more, all along.
-    heading = np.unwrap(heading_of(told.quaternion))
-    own = np.unwrap(heading_of(recording.odometry.quaternion))
+    heading = np.unwrap(heading_from_quaternion(told.quaternion))
+    own = np.unwrap(heading_from_quaternion(recording.odometry.quaternion))
     step = np.hypot(*np.diff(recording.odometry.position[:, :2], axis=0).T)
     way = np.concatenate([[0], np.cumsum(step)])
     bend = 1.5 * recording.priors.drift.curvature_radpm

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.kernels import kernels
 from locatk.core.landmarks import scan
 from locatk.core.landmarks.landmark import Geometry, signs
@@ -18,7 +18,9 @@ GEOMETRY = Geometry()
 
 def trace_of(one: Pass) -> Trace:
     """By the truth, every third sample, as seen from the middle one."""
-    pose = np.column_stack([one.truth.position[:, :2], heading_of(one.truth.quaternion)])[::3]
+    pose = np.column_stack(
+        [one.truth.position[:, :2], heading_from_quaternion(one.truth.quaternion)]
+    )[::3]
     middle = len(pose) // 2
     local = relative(pose, pose[middle])
     return Trace(
@@ -52,7 +54,7 @@ def test_the_truth_is_among_the_first(code: int) -> None:
         pose, laid = scan.candidates(trace, GEOMETRY, scan.WHOLE, 10, scan.COARSE)
         # The landmark as the robot sees it, in any of its four frames.
         middle = one.truth.position[::3][trace.reference, :2]
-        heading = heading_of(one.truth.quaternion)[::3][trace.reference]
+        heading = heading_from_quaternion(one.truth.quaternion)[::3][trace.reference]
         c, s = np.cos(heading), np.sin(heading)
         true = np.array([-(c * middle[0] + s * middle[1]), s * middle[0] - c * middle[1]])
         near = np.hypot(*(pose[:, :2] - true).T) < 1.5 * scan.COARSE.step_m

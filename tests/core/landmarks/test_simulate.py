@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.bars import basis, landmark_field
 from locatk.core.landmarks.floor import HOLE, STEPS, WINDOWS, AsBuilt, Cell, FloorMap
 from locatk.core.landmarks.halls import NAMES, HallSensors, circle
@@ -73,7 +73,7 @@ def nominal() -> Simulated:
 
 def flat(trajectory: Trajectory) -> Array:
     """x, y and heading (n, 3), the heading without jumps."""
-    heading = np.unwrap(heading_of(trajectory.quaternion))
+    heading = np.unwrap(heading_from_quaternion(trajectory.quaternion))
     return np.column_stack([trajectory.position[:, :2], heading])
 
 

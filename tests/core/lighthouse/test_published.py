@@ -13,7 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core import metrics
+from locatk.core.evaluation import (
+    Evaluation,
+    EvaluationOptions,
+    estimate_offset,
+    evaluate,
+)
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
@@ -179,7 +184,7 @@ def test_floor_by_the_authors_alignment(floor: Any) -> None:
     solution = solve(sweeps)
     assert solution.artifact.planar is True  # decided from the data
     every = [pair for truth in truths for pair in pairs_of(solution, truth)]
-    score = metrics.evaluate_all(every, align="sim3", offset_s=-0.265)
+    score = evaluate(every, EvaluationOptions(align="sim3", offset_s=-0.265))
     assert score.n > 1100
     assert 1e3 * score.mae <= 2.9
 
@@ -208,7 +213,7 @@ def test_floor_with_its_markers_is_in_metres(floor: Any) -> None:
     solution = solve(sweeps, scene)
     assert solution.artifact.scale == "markers"
     every = [pair for truth in truths for pair in pairs_of(solution, truth)]
-    score = metrics.evaluate_all(every, offset_s=-0.265)
+    score = evaluate(every, EvaluationOptions(offset_s=-0.265))
     assert 1e3 * score.mae < 6  # the frame of four markers, no alignment
 
 
@@ -217,7 +222,7 @@ def test_floor_does_not_hang_on_order_seed_or_names(floor: Any, world: Any) -> N
     order = np.random.default_rng(0).permutation(len(sweeps))
     solution = solve(world.take(sweeps, order), None, SolveOptions(seed=3))
     every = [pair for truth in truths for pair in pairs_of(solution, truth)]
-    score = metrics.evaluate_all(every, align="sim3", offset_s=-0.265)
+    score = evaluate(every, EvaluationOptions(align="sim3", offset_s=-0.265))
     assert 1e3 * score.mae <= 2.9
 
 
@@ -226,7 +231,7 @@ def test_floor_by_the_papers_method_is_near_that_of_the_authors(floor: Any) -> N
     sweeps, truths, _ = floor
     solution = solve(sweeps, None, SolveOptions(method="paper", scene="two-planar"))
     every = [pair for truth in truths for pair in pairs_of(solution, truth)]
-    score = metrics.evaluate_all(every, align="sim3", offset_s=-0.265)
+    score = evaluate(every, EvaluationOptions(align="sim3", offset_s=-0.265))
     assert 1e3 * score.mae < 4.6
 
 
@@ -245,14 +250,14 @@ def alone(recordings: Path) -> list[Any]:
     ]
 
 
-def leave_one_out(experiments: list[Pairs]) -> metrics.Evaluation:
+def leave_one_out(experiments: list[Pairs]) -> Evaluation:
     """Each experiment scored with the time offset that the other four ask for."""
     shifted: Pairs = []
     for k, pairs in enumerate(experiments):
         others = [pair for j, e in enumerate(experiments) if j != k for pair in e]
-        later = round(metrics.estimate_offset(others) * 1e9)
+        later = round(estimate_offset(others) * 1e9)
         shifted += [(replace(e, time_ns=e.time_ns + later), t) for e, t in pairs]
-    return metrics.evaluate_all(shifted)
+    return evaluate(shifted)
 
 
 def test_one_station_without_any_alignment(alone: list[Any]) -> None:
@@ -270,6 +275,6 @@ def test_one_station_by_the_papers_method_and_offset(alone: list[Any]) -> None:
     for session in alone:
         options = SolveOptions(method="paper")
         every += pairs_of(solve(session.sweeps, session.scene, options), session.truth)
-    score = metrics.evaluate_all(every, offset_s=-0.318109)
+    score = evaluate(every, EvaluationOptions(offset_s=-0.318109))
     assert score.n == pytest.approx(824, abs=15)
     assert 1e3 * score.mae == pytest.approx(7.01, rel=0.05)

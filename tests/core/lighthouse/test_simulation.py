@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from locatk.core import lighthouse, metrics
+from locatk.core import lighthouse
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.evaluation import evaluate
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.lighthouse.calibration import (
     FACTORY_UNITS,
     GENERIC_CALIBRATION,
@@ -328,7 +329,7 @@ def test_photodiodes_receive_only_stations_that_they_face() -> None:
     rows = np.flatnonzero(s.device == 1)
     assert set(s.sensor[rows]) == {0, 1}
     nearest = np.searchsorted(truth.time_ns, s.time_ns[rows]).clip(max=len(truth) - 1)
-    heading = heading_of(truth.quaternion[nearest])
+    heading = heading_from_quaternion(truth.quaternion[nearest])
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * normal[s.sensor[rows], :1]
     station = np.stack([x.position for x in session.true_scene.stations])[s.channel[rows] - 1]
     towards = (station - truth.position[nearest])[:, :2]
@@ -384,7 +385,7 @@ def test_robots_drive_smoothly_along_their_heading(planar: bool) -> None:
         assert np.all(z == 0) if planar else (z.min() >= 0 and z.max() <= 0.5 and np.ptp(z) > 0.1)
         moving = np.hypot(*velocity[:, :2].T) > 0.02
         along = np.arctan2(velocity[:, 1], velocity[:, 0])
-        off = np.angle(np.exp(1j * (along - heading_of(truth.quaternion[:-1]))))
+        off = np.angle(np.exp(1j * (along - heading_from_quaternion(truth.quaternion[:-1]))))
         assert np.abs(off[moving]).max() < 0.05
 
 
@@ -557,6 +558,6 @@ def test_the_solver_finds_the_robots(options: SimulationOptions, largest_mm: flo
     session = simulate(options)
     solution = lighthouse.solve(session.sweeps, session.scene)
     truth = {t.device: t for t in session.truth}
-    score = metrics.evaluate_all([(t, truth[t.device]) for t in solution.trajectories])
+    score = evaluate([(t, truth[t.device]) for t in solution.trajectories])
     assert score.n > 0.8 * 10 * options.robots * (options.duration_s - 6)
     assert score.mae < 1e-3 * largest_mm

@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_of
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.magnetics import dipole_field
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray, bar
@@ -168,7 +168,7 @@ def test_a_turned_array_sees_the_field_in_its_own_axes() -> None:
     # The array passes v1 and v4, 0.25 m behind the tag's middle: to the left, going to +y.
     options = replace(PLAIN, route=route, heading_rad=math.pi / 2, lateral_m=0.25)
     simulated = simulate(LONELY, options)
-    assert heading_of(simulated.truth.quaternion) == pytest.approx(math.pi / 2)
+    assert heading_from_quaternion(simulated.truth.quaternion) == pytest.approx(math.pi / 2)
     assert simulated.truth.position[:, 0] == pytest.approx(-0.25)
     right, above, left = sample_at(simulated, 0.25, axis=1)[3:6]
     assert above == pytest.approx([0, 178.8 * UT, 0], abs=0.2 * UT)
@@ -348,7 +348,7 @@ def test_a_pass_goes_straight_over_the_tag_at_its_heading() -> None:
     assert way[-1] == pytest.approx(-way[0], abs=0.002)
     assert np.diff(way) == pytest.approx(0.2 / 100, rel=1e-6)
     assert truth.position[:, 2] == pytest.approx(0.01)
-    assert heading_of(truth.quaternion) == pytest.approx(2.0)
+    assert heading_from_quaternion(truth.quaternion) == pytest.approx(2.0)
     assert np.diff(truth.time_ns) == pytest.approx(1e7, abs=1)
     (crossing,) = simulated.crossings
     assert crossing.tag_id == 0
@@ -387,7 +387,7 @@ def test_what_wobbles_stays_within_its_share_and_comes_near_it() -> None:
         assert truth.position[:, 1] == pytest.approx(0, abs=1e-12)
         speeds.append(np.diff(truth.position[:, 0]) * 50)
         heights.append(truth.position[:, 2])
-        headings.append(heading_of(truth.quaternion))
+        headings.append(heading_from_quaternion(truth.quaternion))
     for values, middle, swing in (
         (speeds, 0.1, 0.03),
         (heights, 0.01, 2e-3),
@@ -413,7 +413,7 @@ def test_a_tour_crosses_the_tags_of_a_site_in_their_order() -> None:
     simulated = simulate(tags, replace(PLAIN, route=(5, 9, 77, 5)))
     assert simulated.truth.frame == "site"
     assert [crossing.tag_id for crossing in simulated.crossings] == [5, 9, 77, 5]
-    place, heading = simulated.truth.position, heading_of(simulated.truth.quaternion)
+    place, heading = simulated.truth.position, heading_from_quaternion(simulated.truth.quaternion)
     times = simulated.truth.time_ns
     for crossing in simulated.crossings:
         at = tags.site[crossing.tag_id]
@@ -589,8 +589,10 @@ def test_odometry_tells_the_way_too_long_and_turns_away() -> None:
     start = Rotation.from_quat(truth.quaternion[0]).inv()
     moved = start.apply(truth.position - truth.position[0])
     assert right.odometry.position == pytest.approx(moved, abs=1e-12)
-    assert heading_of(right.odometry.quaternion)[0] == pytest.approx(0)
-    turned = heading_of(right.odometry.quaternion) - heading_of(truth.quaternion)
+    assert heading_from_quaternion(right.odometry.quaternion)[0] == pytest.approx(0)
+    turned = heading_from_quaternion(right.odometry.quaternion) - heading_from_quaternion(
+        truth.quaternion
+    )
     assert np.exp(1j * turned) == pytest.approx(np.exp(1j * turned[0]))
     long = simulate(tags, replace(options, odometry_scale=0.03, odometry_turn_rad=0.0))
     assert long.odometry is not None
@@ -601,7 +603,7 @@ def test_odometry_tells_the_way_too_long_and_turns_away() -> None:
     for seed in range(60):
         away = simulate(DARK, replace(options, odometry_turn_rad=0.05, seed=seed)).odometry
         assert away is not None
-        ends.append(heading_of(away.quaternion)[-1] / away.sigma[-1, 5])
+        ends.append(heading_from_quaternion(away.quaternion)[-1] / away.sigma[-1, 5])
     assert np.std(ends) == pytest.approx(1.0, abs=0.3)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core import metrics
+from locatk.core.evaluation import evaluate
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution
@@ -92,7 +92,7 @@ def subject(name: str = "red", n: int = 200) -> Subject:
     )
     rejected = {"spike": 7, "jump": 2}
     solution = Solution("lighthouse", "bundle", (solved,), rejected, artifact=scene, notes=(name,))
-    evaluation = metrics.evaluate_all([(solved, truth)])
+    evaluation = evaluate([(solved, truth)])
     facts = {"command": f"locatk solve {name}", "source": name}
     return Subject(name, solution, facts, truth=(truth,), evaluation=evaluation)
 

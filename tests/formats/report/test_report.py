@@ -16,9 +16,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from locatk.core import metrics
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import MissingDataError, OutputExistsError
+from locatk.core.evaluation import evaluate
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution
@@ -61,7 +61,7 @@ def judged(solved: Solution, **more: Any) -> Subject:
     """A subject with truth."""
     truth = tuple(track(t.device, len(t)) for t in solved.trajectories)
     pairs = [(t, u) for t, u in zip(solved.trajectories, truth, strict=True) if len(t)]
-    evaluation = metrics.evaluate_all(pairs) if pairs else None
+    evaluation = evaluate(pairs) if pairs else None
     return Subject("run.mcap", solved, truth=truth, evaluation=evaluation, **more)
 
 
@@ -236,7 +236,7 @@ def test_poses_that_are_no_numbers_are_left_out_and_counted() -> None:
     solved.trajectories[0].position[5:9] = np.nan
     truth = (track("red"),)
     pairs = [(known(t), u) for t, u in zip(solved.trajectories, truth, strict=True)]
-    subject = Subject("a", solved, truth=truth, evaluation=metrics.evaluate_all(pairs))
+    subject = Subject("a", solved, truth=truth, evaluation=evaluate(pairs))
     said = texts(subject)
     assert "Half of the poses lie within 1.00 mm" in said
     assert "4 poses are not numbers: they are neither drawn nor scored." in said
@@ -248,7 +248,7 @@ def test_poses_that_are_no_numbers_are_left_out_and_counted() -> None:
 
 def test_devices_without_truth_are_named() -> None:
     subject = judged(solution("red", "blue"))
-    only = metrics.evaluate_all([(subject.solution.trajectories[0], subject.truth[0])])
+    only = evaluate([(subject.solution.trajectories[0], subject.truth[0])])
     said = figure(replace(subject, evaluation=only), "Statistics").note
     assert "There is no truth for blue." in said
     assert "All poses are scored" not in said

@@ -136,7 +136,7 @@ def test_alignment_and_offset_are_those_asked_for(session: Path, tmp_path: Path)
     assert subject.evaluation.max < 1e-6
     late = load(solved(tmp_path / "b.mcap"), offset_s=0.1).evaluation
     assert late is not None
-    assert late.offset_source == "given"
+    assert late.time_offset.source == "given"
     assert late.median > 0.05
 
 

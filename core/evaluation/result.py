@@ -1,4 +1,4 @@
-"""What an evaluation says: errors, and under which alignment, offset and association."""
+"""Result of an evaluation: errors, with the alignment, time offset and association behind them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.consistency import Consistency
-from locatk.core.coverage import Coverage
+from locatk.core.evaluation.consistency import Consistency
+from locatk.core.evaluation.coverage import Coverage
+from locatk.core.evaluation.pose_errors import Drift, RelativeErrors, Statistics
+from locatk.core.evaluation.time_offset import TimeOffset
 from locatk.core.geometry import Similarity
-from locatk.core.relative import Drift, Relative
-from locatk.core.statistics import Statistics
 
 Array = NDArray[np.float64]
 
@@ -24,29 +24,29 @@ class Evaluation:
     Attributes
     ----------
     ape_translation : Statistics
-        Of the Euclidean distances, in metres.
+        Euclidean distances, in metres.
     ape_rotation : Statistics or None
-        Of the angles between the orientations, in degrees; None where none is told.
+        Angles between the orientations, in degrees; None if estimate or truth has none.
     rpe_translation, rpe_rotation : Statistics or None
-        Of the relative errors of pairs of poses of one device (:mod:`locatk.core.relative`), in
-        metres and degrees; None where no two poses are far enough apart.
+        Relative errors of pairs of poses of one device
+        (:mod:`locatk.core.evaluation.pose_errors`), in metres and degrees; None if no two poses
+        are far enough from each other.
     rpe_delta : str
-        How far apart those are, as in ``"1f"``.
+        Distance of those poses, as in ``"1f"``.
     unscored : dict of str to int
-        Poses of the estimate that were not scored: ``"no truth"`` and ``"held out"``.
+        Number of poses of the estimate that were not scored, by reason: ``"no truth"`` and
+        ``"held out"``.
     align : str
-        Name of the alignment (:data:`locatk.core.alignment.ALIGNMENTS`), which was fitted on
-        the scored poses. Nothing else was.
+        Name of the alignment (:data:`locatk.core.evaluation.alignment.ALIGNMENTS`), the only
+        quantity that was fitted on the scored poses.
     alignment : Similarity
-        That alignment: estimate to truth.
-    offset_s : float
-        Added to the stamps of the estimate.
-    offset_source : str
-        ``"none"``, ``"given"`` or ``"held-out ..."`` with the part it was estimated on.
+        That alignment, from estimate to truth.
+    time_offset : TimeOffset
+        Time offset, and its origin.
     match : str
-        One of :data:`locatk.core.association.MATCHES`.
+        One of :data:`locatk.core.evaluation.association.MATCHES`.
     devices : tuple of str
-        Names to which ``device`` points.
+        Names of the devices.
     device : (n,) int ndarray
         Index into ``devices``.
     time_ns : (n,) int64 ndarray
@@ -56,19 +56,19 @@ class Evaluation:
     errors : (n,) ndarray
         Lengths of the residuals.
     rotation_errors_deg : (n,) ndarray
-        ``nan`` where estimate or truth tells no orientation.
-    relative : Relative
+        ``nan`` if estimate or truth reports no orientation.
+    relative : RelativeErrors
         Relative errors; their rows are those of the scored poses.
     coverage : Coverage
-        How much of the time of the truth the estimate knows.
+        Time of the truth for which the estimate has poses.
     path_m, path_estimate_m : float
-        Length of the way of truth and (not aligned) estimate, over the scored poses.
+        Path length of truth and (not aligned) estimate over the scored poses.
     drift : Drift
         Errors of sub-trajectories by their length.
     consistency : Consistency or None
-        Of the reported covariances; None where there are none.
+        Consistency of the reported covariances; None if there are none.
     nees : (n,) ndarray
-        Normalised error squared; ``nan`` without covariance.
+        Normalized error squared; ``nan`` without covariance.
     nees_dof : (n,) int ndarray
         Its degrees of freedom.
     """
@@ -81,8 +81,7 @@ class Evaluation:
     unscored: dict[str, int]
     align: str
     alignment: Similarity
-    offset_s: float
-    offset_source: str
+    time_offset: TimeOffset
     match: str
     devices: tuple[str, ...]
     device: NDArray[np.int32]
@@ -90,7 +89,7 @@ class Evaluation:
     residuals: Array
     errors: Array
     rotation_errors_deg: Array
-    relative: Relative
+    relative: RelativeErrors
     coverage: Coverage
     path_m: float
     path_estimate_m: float
@@ -105,8 +104,13 @@ class Evaluation:
         return self.ape_translation.n
 
     @property
+    def offset_s(self) -> float:
+        """Seconds added to the stamps of the estimate."""
+        return self.time_offset.offset_s
+
+    @property
     def mae(self) -> float:
-        """Mean distance in metres, the MAE of the lighthouse paper's Table I."""
+        """Mean distance in metres, the MAE in Table I of the Lighthouse paper."""
         return self.ape_translation.mean
 
     @property
@@ -126,7 +130,7 @@ class Evaluation:
 
     @property
     def p95(self) -> float:
-        """Below which 95 % of the distances are, in metres."""
+        """95th percentile of the distances in metres."""
         return self.ape_translation.p95
 
     @property
@@ -137,53 +141,57 @@ class Evaluation:
     @property
     def drift_percent(self) -> float | None:
         """Mean error of sub-trajectories in percent of their length; None without motion."""
-        found = self.drift.translation
-        return float(100 * found.mean()) if len(found) else None
+        translation = self.drift.translation
+        return float(100 * translation.mean()) if len(translation) else None
 
     @property
     def transform(self) -> Array:
-        """(4, 4) homogeneous matrix of the alignment (its scale included)."""
+        """Homogeneous matrix (4, 4) of the alignment, including its scale."""
         return self.alignment.matrix
 
-    def of_device(self, number: int) -> dict[str, Statistics | None]:
-        """``ape_translation``, ``ape_rotation``, ``rpe_translation`` and ``rpe_rotation`` of the
-        device ``devices[number]``."""
-        mine = self.device == number
-        pairs = mine[self.relative.first]
-        turned = self.relative.rotation_deg
+    def device_statistics(self, index: int) -> dict[str, Statistics | None]:
+        """Return the statistics of the device ``devices[index]``.
+
+        Keys are ``ape_translation``, ``ape_rotation``, ``rpe_translation`` and ``rpe_rotation``.
+        """
+        mask = self.device == index
+        pair_mask = mask[self.relative.first]
+        rotation_deg = self.relative.rotation_deg
         return {
-            "ape_translation": Statistics.known(self.errors[mine]),
-            "ape_rotation": Statistics.known(self.rotation_errors_deg[mine]),
-            "rpe_translation": Statistics.known(self.relative.translation[pairs]),
-            "rpe_rotation": Statistics.known(None if turned is None else turned[pairs]),
+            "ape_translation": Statistics.from_finite(self.errors[mask]),
+            "ape_rotation": Statistics.from_finite(self.rotation_errors_deg[mask]),
+            "rpe_translation": Statistics.from_finite(self.relative.translation[pair_mask]),
+            "rpe_rotation": Statistics.from_finite(
+                None if rotation_deg is None else rotation_deg[pair_mask]
+            ),
         }
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: all but the arrays of poses, with the figures of each device."""
-        every = {
+        """Return the JSON form: everything but the arrays of poses, with figures per device."""
+        overall = {
             "ape_translation": self.ape_translation,
             "ape_rotation": self.ape_rotation,
             "rpe_translation": self.rpe_translation,
             "rpe_rotation": self.rpe_rotation,
         }
-        single = len(self.devices) == 1
+        is_single = len(self.devices) == 1
         per_device = {
-            name: self._figures(every if single else self.of_device(i))
-            for i, name in enumerate(self.devices)
+            name: self._figures(overall if is_single else self.device_statistics(index))
+            for index, name in enumerate(self.devices)
         }
-        turned = Statistics.known(self.drift.rotation)
+        rotation_drift = Statistics.from_finite(self.drift.rotation)
         return {
-            **self._figures(every),
+            **self._figures(overall),
             "unscored": dict(self.unscored),
             "align": self.align,
             "align_fitted_on": _FITTED_ON.get(self.align, "the scored poses"),
             "scale": self.alignment.scale,
             "transform": self.transform.tolist(),
-            "offset_s": self.offset_s,
-            "offset_source": self.offset_source,
+            "offset_s": self.time_offset.offset_s,
+            "offset_source": self.time_offset.describe(),
             "match": self.match,
             "coverage": {
-                "share": self.coverage.share,
+                "share": self.coverage.fraction,
                 "solved_s": self.coverage.solved_s,
                 "truth_s": self.coverage.truth_s,
             },
@@ -191,18 +199,18 @@ class Evaluation:
             "path_estimate_m": self.path_estimate_m,
             "drift": {
                 "translation_percent": self.drift_percent,
-                "rotation_deg_per_m": None if turned is None else turned.mean,
+                "rotation_deg_per_m": None if rotation_drift is None else rotation_drift.mean,
             },
             "nees": None if self.consistency is None else asdict(self.consistency),
             "devices": per_device,
         }
 
-    def _figures(self, found: dict[str, Statistics | None]) -> dict[str, Any]:
-        """Figures of all or of one device: those of the distances by short names as well."""
-        distances = found["ape_translation"]
+    def _figures(self, statistics: dict[str, Statistics | None]) -> dict[str, Any]:
+        """JSON figures of all or of one device; those of distances also under short names."""
+        distances = statistics["ape_translation"]
         if distances is None:
             return {"n": 0}
-        said = {name: each and each.as_dict() for name, each in found.items()}
+        tables = {name: value and value.as_dict() for name, value in statistics.items()}
         return {
             "n": distances.n,
             "mae_m": distances.mean,
@@ -212,13 +220,13 @@ class Evaluation:
             "p95_m": distances.p95,
             "max_m": distances.max,
             "ape": {
-                "translation_m": said["ape_translation"],
-                "rotation_deg": said["ape_rotation"],
+                "translation_m": tables["ape_translation"],
+                "rotation_deg": tables["ape_rotation"],
             },
             "rpe": {
                 "delta": self.rpe_delta,
-                "translation_m": said["rpe_translation"],
-                "rotation_deg": said["rpe_rotation"],
+                "translation_m": tables["rpe_translation"],
+                "rotation_deg": tables["rpe_rotation"],
             },
         }
 
