@@ -9,10 +9,8 @@ import numpy as np
 
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.demodulation.bursts import bursts_of_windows
-from locatk.core.lighthouse.demodulation.identification import identify_sequences
-from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
-from locatk.core.lighthouse.demodulation.windows import read_windows
+from locatk.core.lighthouse.demodulation.identification import identify_sequences, read_windows
+from locatk.core.lighthouse.demodulation.soft_bits import demodulate_bursts, split_windows
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import alone, cpu_seconds
 
@@ -60,7 +58,7 @@ def measure(data: str) -> list[float]:
     folder = Path(data) / "lighthouse"
     windows = np.concatenate([published_windows(folder)] * BATCH)
     whole = cpu_seconds(lambda: read_windows(windows), REPEATS)
-    bits = soft_bits(bursts_of_windows(windows))
+    bits = demodulate_bursts(split_windows(windows))
     index = cpu_seconds(lambda: identify_sequences(bits), REPEATS)
     edges = capture(folder, CAPTURES[0])
     light = cpu_seconds(lambda: demodulate_recording([edges]), 3)

@@ -9,22 +9,22 @@ import numpy as np
 from locatk.core.lighthouse.channels import channel_of
 from locatk.core.lighthouse.demodulation.burst_validation import (
     ValidatedBursts,
-    identified,
+    identify_bursts,
     validate_bursts,
 )
-from locatk.core.lighthouse.demodulation.bursts import split_bursts
-from locatk.core.lighthouse.demodulation.identification import ALONE
+from locatk.core.lighthouse.demodulation.identification import MIN_STANDALONE_EVIDENCE_BITS
 from locatk.core.lighthouse.demodulation.rotor import RotorSet, find_rotors
+from locatk.core.lighthouse.demodulation.soft_bits import split_bursts
 from locatk.core.lighthouse.recording import Edges
 
 
 def reading(line: Edges, found: RotorSet | None = None) -> ValidatedBursts:
     """A photodiode's bursts, judged by what they say themselves or by ``found``."""
     bursts = split_bursts(line)
-    bits, matches = identified(bursts)
+    bits, matches = identify_bursts(bursts)
     if found is None:
         found = find_rotors(
-            bits.tick, matches.polynomial, matches.index, matches.evidence, line.rate_hz
+            bits.start_tick, matches.polynomial, matches.index, matches.evidence_bits, line.rate_hz
         )
     return validate_bursts(bursts, bits, matches, found)
 
@@ -32,9 +32,11 @@ def reading(line: Edges, found: RotorSet | None = None) -> ValidatedBursts:
 def test_clean_light_is_read(light: Any) -> None:
     (line,), passed = light.of([light.Sender(1, ppm=9), light.Sender(12, zero_s=0.001)], 2.0)
     read = reading(line)
-    assert read.read.sum() >= 0.98 * len(passed.time_s)
-    assert np.abs(read.off_s[read.read]).max() < 1e-7
-    assert sum(read.rejected.values()) == np.count_nonzero(~read.read & (read.beside < 0))
+    assert read.is_accepted.sum() >= 0.98 * len(passed.time_s)
+    assert np.abs(read.rotor_residual_s[read.is_accepted]).max() < 1e-7
+    assert sum(read.rejected.values()) == np.count_nonzero(
+        ~read.is_accepted & (read.continued_burst < 0)
+    )
 
 
 def test_spoiled_sweeps_are_not(light: Any) -> None:
@@ -42,7 +44,7 @@ def test_spoiled_sweeps_are_not(light: Any) -> None:
     (line,), passed = light.of([light.Sender(5, ppm=-20)], 10.0, path)
     read = reading(line)
     right = np.count_nonzero(~passed.spoiled)
-    assert right <= read.read.sum() <= right + 3
+    assert right <= read.is_accepted.sum() <= right + 3
     assert read.rejected["burst_not_read"] >= passed.spoiled.sum() - 3
 
 
@@ -53,7 +55,7 @@ def test_bursts_off_the_rotor_are_refused(light: Any) -> None:
     both = Edges(tick, line.rate_hz, line.rate_hz, True, line.end_tick)
     read = reading(both)
     assert read.rejected["burst_off_rotor"] == len(stray.time_s)
-    assert np.all(read.matches.certain()[~read.read])
+    assert np.all(read.matches.is_certain()[~read.is_accepted])
 
 
 def test_weak_bursts_are_taken_where_a_rotor_expects_them(light: Any) -> None:
@@ -63,26 +65,28 @@ def test_weak_bursts_are_taken_where_a_rotor_expects_them(light: Any) -> None:
     sender = light.Sender(5)
     (line,), _ = light.of([sender], 2.0, strong)
     bursts = split_bursts(line)
-    bits, matches = identified(bursts)
+    bits, matches = identify_bursts(bursts)
     found = find_rotors(
-        bits.tick, matches.polynomial, matches.index, matches.evidence, line.rate_hz
+        bits.start_tick, matches.polynomial, matches.index, matches.evidence_bits, line.rate_hz
     )
     (thin,), passed = light.of([sender], 2.0, weak)
     read = reading(thin, found)
-    assert np.mean(identified(split_bursts(thin))[1].certain()) < 0.2
-    assert read.read.sum() > 0.9 * len(passed.time_s)
-    right = read.matches.polynomial[read.read] == passed.polynomial[read.read]
+    assert np.mean(identify_bursts(split_bursts(thin))[1].is_certain()) < 0.2
+    assert read.is_accepted.sum() > 0.9 * len(passed.time_s)
+    right = read.matches.polynomial[read.is_accepted] == passed.polynomial[read.is_accepted]
     assert right.all()
-    assert read.matches.evidence[read.read].min() < ALONE
+    assert read.matches.evidence_bits[read.is_accepted].min() < MIN_STANDALONE_EVIDENCE_BITS
 
 
 def test_what_stands_on_its_own_is_not_talked_into_something_else(light: Any) -> None:
     senders = [light.Sender(3), light.Sender(3, zero_s=0.011), light.Sender(9, zero_s=0.002)]
     (line,), _ = light.of(senders, 10.0, light.Receiving(rim_s=1e-6))
     read = reading(line)
-    assert np.all(channel_of(read.matches.polynomial[read.read]) == 9)
-    sure = read.matches.certain() & (channel_of(read.matches.polynomial) == 3)
-    assert read.rejected["burst_of_doubled_channel"] == np.count_nonzero(sure & (read.beside < 0))
+    assert np.all(channel_of(read.matches.polynomial[read.is_accepted]) == 9)
+    sure = read.matches.is_certain() & (channel_of(read.matches.polynomial) == 3)
+    assert read.rejected["burst_of_doubled_channel"] == np.count_nonzero(
+        sure & (read.continued_burst < 0)
+    )
     assert sure.sum() > 1900
 
 
@@ -90,12 +94,12 @@ def test_without_a_rotor_only_what_stands_alone(light: Any) -> None:
     (line,), passed = light.of([light.Sender(3, until_s=0.03)], 1.0, light.Receiving(missing=0.3))
     read = reading(line)
     assert 0 < len(passed.time_s) < 4
-    assert read.read.sum() == len(passed.time_s)
-    assert np.isnan(read.off_s).all()
-    assert not reading(line, RotorSet({}, (3,))).read.any()
+    assert read.is_accepted.sum() == len(passed.time_s)
+    assert np.isnan(read.rotor_residual_s).all()
+    assert not reading(line, RotorSet({}, (3,))).is_accepted.any()
 
 
 def test_nothing() -> None:
     read = reading(Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 1))
-    assert len(read.read) == 0
+    assert len(read.is_accepted) == 0
     assert not any(read.rejected.values())

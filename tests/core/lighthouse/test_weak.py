@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.lighthouse.demodulation.bursts import Bursts, split_bursts
-from locatk.core.lighthouse.demodulation.identification import identify_sequences
-from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
-from locatk.core.lighthouse.demodulation.weak_bursts import (
-    BESIDE_S,
-    CHANCE,
-    DELAY_BITS,
+from locatk.core.lighthouse.demodulation.burst_validation import (
+    MAX_DECOY_FRACTION,
+    MAX_SWEEP_S,
+    WEAK_LIGHT_DELAY_BITS,
     match_fragments,
 )
+from locatk.core.lighthouse.demodulation.identification import identify_sequences
+from locatk.core.lighthouse.demodulation.soft_bits import Bursts, demodulate_bursts, split_bursts
 
 
 def fragment(light: Any, index: int, start_s: float, length: int) -> np.ndarray:
@@ -25,7 +24,7 @@ def fragment(light: Any, index: int, start_s: float, length: int) -> np.ndarray:
     level = np.arange(len(change)) % 2
     kept = np.flatnonzero(long)
     kept = kept[np.r_[True, np.diff(level[kept]) != 0]]
-    return start_s + (change[kept] + DELAY_BITS) / 6e6
+    return start_s + (change[kept] + WEAK_LIGHT_DELAY_BITS) / 6e6
 
 
 def scene(light: Any, shift: int, gap_bits: int = 20, seed: int = 0) -> Bursts:
@@ -45,10 +44,10 @@ def scene(light: Any, shift: int, gap_bits: int = 20, seed: int = 0) -> Bursts:
 
 
 def judged(bursts: Bursts) -> tuple[np.ndarray, np.ndarray]:
-    bits = soft_bits(bursts)
+    bits = demodulate_bursts(bursts)
     found = identify_sequences(bits)
     read = np.arange(len(bursts)) % 2 == 0
-    assert found.certain()[read].all()
+    assert found.is_certain()[read].all()
     return match_fragments(bursts, bits, found, read), read
 
 
@@ -65,7 +64,7 @@ def test_fragments_continue_their_sequence(light: Any) -> None:
 def test_other_places_do_not(light: Any) -> None:
     for shift in (-30, 17, 400):
         of, read = judged(scene(light, shift))
-        assert np.mean(of[~read] >= 0) <= 0.05 + CHANCE
+        assert np.mean(of[~read] >= 0) <= 0.05 + MAX_DECOY_FRACTION
 
 
 def test_noise_does_not(light: Any) -> None:
@@ -77,18 +76,18 @@ def test_noise_does_not(light: Any) -> None:
         lines.append(start + light.biphase(bits)[:100] / 6e6)
         lines.append(start + 25e-6 + np.cumsum(noise.uniform(8e-8, 6e-7, 40)))
     of, read = judged(split_bursts(light.edges(np.concatenate(lines), 1.0)))
-    assert np.mean(of[~read] >= 0) <= 4 * CHANCE
+    assert np.mean(of[~read] >= 0) <= 4 * MAX_DECOY_FRACTION
 
 
 def test_far_ones_do_not(light: Any) -> None:
-    far = round(1.3 * BESIDE_S * 6e6)
+    far = round(1.3 * MAX_SWEEP_S * 6e6)
     of, _ = judged(scene(light, 0, gap_bits=far))
     assert np.all(of == -1)
 
 
 def test_nothing_read_or_nothing_left(light: Any) -> None:
     bursts = scene(light, 0)
-    bits = soft_bits(bursts)
+    bits = demodulate_bursts(bursts)
     found = identify_sequences(bits)
     for read in (np.zeros(len(bursts), bool), np.ones(len(bursts), bool)):
         assert np.all(match_fragments(bursts, bits, found, read) == -1)
