@@ -28,8 +28,8 @@ def figures() -> list[Figure]:
     return [
         Figure("windows of 60 clean bits told wrong", float(wrong), "windows",
                f"of {POLYNOMIAL_COUNT * lfsr.SEQUENCE_LENGTH:,}: every place of all "
-               f"{POLYNOMIAL_COUNT} sequences; the peer tells 7 of the 21 polynomials wrong that its "
-               "own test tries", 0.0),
+               f"{POLYNOMIAL_COUNT} sequences; the peer tells 7 of the 21 polynomials wrong that "
+               "its own test tries", 0.0),
         Figure("noise taken for a station", 100 * noise_share(), "%",
                f"{NOISE:,} bursts of {NOISE_BITS} random bits, each by its own evidence", 0.05),
     ]  # fmt: skip

@@ -61,7 +61,7 @@ SAMPLES_PER_BIT = 8
 """Samples per bit of the levels that are compared."""
 
 DECOY_COUNT = 1000
-"""Number of other parts of the sequence, one bit apart, that a fragment is compared with."""
+"""Number of other parts of the sequence, at steps of one bit, that a fragment is compared with."""
 
 MIN_DECOY_DISTANCE_BITS = 10
 """Distance of the nearest decoys from the predicted part."""

@@ -240,7 +240,7 @@ def _densest_median(values: Array, width: float) -> float:
 
 
 def _link_segments(zero: Array, period: float, rate_hz: float) -> list[NDArray[np.int64]]:
-    """Link zeros (n,), ascending, that are whole rotations apart to segments.
+    """Link zeros (n,), ascending, to segments if they differ by whole rotations.
 
     Returns the rows of each segment, ascending; the longest segment comes first.
     """

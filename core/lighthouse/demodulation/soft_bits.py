@@ -350,11 +350,11 @@ def demodulate_bursts_numpy(bursts: Bursts) -> SoftBits:
     chips = _round_half_up(time[kept.first[1:] - 1] - begin).astype(np.int64) + 1
     rising = np.where(kept.rises[burst], is_first_direction, ~is_first_direction)
     mean, first_chip = _mean_chip_levels(time - begin[burst], rising, burst, kept.rises, chips)
-    odd = _starts_at_second_chip(mean, first_chip, chips).astype(np.int64)
-    bits = (chips - odd) // 2
+    skipped_chips = _starts_at_second_chip(mean, first_chip, chips).astype(np.int64)
+    bits = (chips - skipped_chips) // 2
     first = np.concatenate([[0], np.cumsum(bits)])
     bit = np.arange(first[-1]) - np.repeat(first[:-1], bits)
-    left = np.repeat(first_chip + odd, bits) + 2 * bit
+    left = np.repeat(first_chip + skipped_chips, bits) + 2 * bit
     # Level changes at both borders of a bit. At an end of the burst, where the neighbour is
     # missing, the change is twice the level of the bit's own chip.
     a, b = mean[left], mean[left + 1]
@@ -364,7 +364,7 @@ def demodulate_bursts_numpy(bursts: Bursts) -> SoftBits:
     value = np.rint(product * MAX_SOFT_BIT).astype(np.int8)
     all_bits, start_tick = np.zeros(n, np.int64), np.zeros(n)
     all_bits[rows] = bits
-    start_tick[rows] = kept.start_tick + (begin + odd) * ticks_per_chip
+    start_tick[rows] = kept.start_tick + (begin + skipped_chips) * ticks_per_chip
     all_first = np.concatenate([[0], np.cumsum(all_bits)])
     return SoftBits(value, all_first, start_tick, 2 * ticks_per_chip)
 
@@ -465,7 +465,7 @@ def _mean_chip_levels(
 def _starts_at_second_chip(
     mean: Array, first_chip: NDArray[np.int64], chips: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the bursts whose first bit starts at their second chip.
+    """Return a mask (n,) of the bursts that have their first bit at the second chip.
 
     The level always changes at borders of bits, and only half of the time in their middles.
     """

@@ -172,10 +172,10 @@ def _estimate_period(time: Array, nominal_tick: float) -> float | None:
 
 def _number_rotations(time: Array, period: float) -> tuple[NDArray[np.int64], Array]:
     """Return the rotation number of each sync, and its offset from the phase of its window."""
-    turns = time / period
-    window = (turns // PHASE_WINDOW_ROTATIONS).astype(np.int64)
+    rotations = time / period
+    window = (rotations // PHASE_WINDOW_ROTATIONS).astype(np.int64)
     starts = np.flatnonzero(np.diff(window, prepend=-1))
-    phases = np.array([_dominant_phase(part % 1.0) for part in np.split(turns, starts[1:])])
+    phases = np.array([_dominant_phase(part % 1.0) for part in np.split(rotations, starts[1:])])
     size = np.diff(np.append(starts, len(time)))
     # Windows with a few wrong syncs have no reliable phase. It is interpolated between windows
     # with many syncs.
@@ -183,8 +183,8 @@ def _number_rotations(time: Array, period: float) -> tuple[NDArray[np.int64], Ar
     number = window[starts].astype(float)
     smooth = np.interp(number, number[is_full], np.unwrap(phases[is_full], period=1.0))
     phase = np.repeat(smooth, size)
-    rotation = np.rint(turns - phase)
-    return rotation.astype(np.int64), turns - phase - rotation
+    rotation = np.rint(rotations - phase)
+    return rotation.astype(np.int64), rotations - phase - rotation
 
 
 def _dominant_phase(phase: Array) -> float:

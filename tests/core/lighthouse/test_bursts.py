@@ -14,6 +14,7 @@ from hypothesis.extra.numpy import arrays
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.demodulation.soft_bits import (
     BURST_GAP_S,
+    Bursts,
     is_mocap_flash,
     split_bursts,
     split_windows,
@@ -138,3 +139,28 @@ def test_sweeps_are_no_flashes(light: Any, rate_hz: float) -> None:
 def test_no_published_sweep_is_a_flash(published: Callable[[str], Edges]) -> None:
     for name in (CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"):
         assert not is_mocap_flash(split_bursts(published(name))).any()
+
+
+def regular(periods: int, irregular: int = 0, steps: tuple[int, int] = (50, 50)) -> Bursts:
+    """A burst at 100 MHz of ``periods`` periods, the last ``irregular`` of which are short."""
+    step = np.resize(steps, periods + 1)
+    step[len(step) - irregular :] = 20
+    tick = np.concatenate([[1000], 1000 + np.cumsum(step)])
+    return Bursts(tick, np.array([0, len(tick)]), np.array([True]), 100e6)
+
+
+def test_a_flash_has_eight_periods_of_which_four_fifths_are_1_us() -> None:
+    assert is_mocap_flash(regular(8)).tolist() == [True]
+    assert is_mocap_flash(regular(7)).tolist() == [False]
+    assert is_mocap_flash(regular(20, irregular=4)).tolist() == [True]
+    assert is_mocap_flash(regular(20, irregular=5)).tolist() == [False]
+
+
+def test_periods_of_a_flash_deviate_by_six_per_cent_at_most() -> None:
+    for steps, is_flash in (
+        ((52, 53), True),
+        ((53, 54), False),
+        ((47, 48), True),
+        ((46, 47), False),
+    ):
+        assert is_mocap_flash(regular(20, steps=steps)).tolist() == [is_flash]

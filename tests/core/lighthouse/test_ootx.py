@@ -304,3 +304,45 @@ def test_four_stations_of_a_libsurvive_recording(data: Path) -> None:
             printed = [f"{np.float32(round(value, 6)):.12f}" for value in values]
             assert [float(v) for v in printed] == [float(v) for v in entry[key]], (channel, name)
     assert {f"{number:08x}" for number in seen} == {"10d7e7bf", "4096b5a0", "a4dbc8a4", "ca94a6b6"}
+
+
+@pytest.mark.parametrize(("received", "starts"), [(36, [0]), (35, [])])
+def test_a_frame_needs_36_of_its_fixed_bits(received: int, starts: list[int]) -> None:
+    bits = np.full(2 * ootx.FRAME_BITS, ootx.MISSING_BIT, np.int8)
+    fixed = ootx._FIXED_POSITIONS[:received]
+    bits[fixed] = ootx._FIXED_BITS[:received]
+    assert len(ootx._FIXED_POSITIONS) == 67
+    assert ootx._find_starts(bits).tolist() == starts
+
+
+@pytest.mark.parametrize(("missing", "is_solved"), [(8, True), (9, False)])
+def test_at_most_eight_bits_are_solved_for(missing: int, is_solved: bool) -> None:
+    frame = ootx.encode_frame(STATION)
+    # Bits of the serial number, none of them fixed.
+    frame[18 + 34 + 17 : 18 + 34 + 17 + missing] = ootx.MISSING_BIT
+    solved = ootx._solve_missing(frame)
+    assert (solved is not None) == is_solved
+    if solved is not None:
+        assert np.array_equal(solved, ootx.encode_frame(STATION))
+
+
+def test_a_wrong_frame_with_missing_bits_is_not_solved() -> None:
+    frame = ootx.encode_frame(STATION)
+    frame[60] ^= 1
+    frame[70:74] = ootx.MISSING_BIT
+    assert ootx._solve_missing(frame) is None
+
+
+@pytest.mark.parametrize(("distance", "votes"), [(8, 1), (9, 0)])
+def test_frames_vote_up_to_eight_frames_away(distance: int, votes: int) -> None:
+    window = np.full((20, ootx.FRAME_BITS), ootx.MISSING_BIT, np.int8)
+    window[10, 50] = 1
+    assert ootx._votes(window)[10 - distance, 50] == votes
+    assert ootx._votes(window)[min(10 + distance, 19), 50] == votes
+
+
+@pytest.mark.parametrize(("distance", "overlaps"), [(442, True), (443, False)])
+def test_frames_overlap_within_their_length(distance: int, overlaps: bool) -> None:
+    starts = np.array([1000 - distance, 1000 + distance])
+    assert ootx._overlaps_valid(starts, np.array([1000])).tolist() == [overlaps] * 2
+    assert ootx._overlaps_valid(starts, np.zeros(0, np.int64)).tolist() == [False] * 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from locatk.core.lighthouse.demodulation.pipeline import MAX_PLANE_TRACK_ROTATIONS, identify_planes
 
@@ -56,3 +57,18 @@ def test_two_that_claim_a_plane_are_both_doubted() -> None:
 def test_a_pair_too_close_is_none() -> None:
     assert np.all(identify_planes(np.array([0, 0]), np.array([0.3, 0.35])) == -1)
     assert np.all(identify_planes(np.array([0, 0]), np.array([0.1, 0.9])) == -1)
+
+
+@pytest.mark.parametrize(("off", "plane"), [(0.029, 0), (-0.029, 0), (0.031, -1), (-0.031, -1)])
+def test_a_single_sweep_is_close_to_those_of_its_plane(off: float, plane: int) -> None:
+    phase = np.array([0.3, 0.62, 0.3 + off])
+    assert identify_planes(np.array([0, 0, 1]), phase).tolist() == [0, 1, plane]
+    phase = np.array([0.3, 0.62, 0.62 + off])
+    assert identify_planes(np.array([0, 0, 1]), phase)[2] == (1 if plane == 0 else -1)
+
+
+def test_a_sweep_between_both_planes_of_a_moving_device_is_unknown() -> None:
+    # Near the second plane of the pair before, and near the first plane of the pair after.
+    rotation = np.array([0, 0, 10, 20, 20])
+    phase = np.array([0.30, 0.55, 0.54, 0.53, 0.78])
+    assert identify_planes(rotation, phase).tolist() == [0, 1, -1, 0, 1]

@@ -13,6 +13,9 @@ from locatk.core.lighthouse.demodulation.rotor import (
     MIN_SEGMENT_BURSTS,
     Rotor,
     RotorSet,
+    _estimate_period,
+    _link_segments,
+    _select_disjoint,
     find_rotors,
 )
 
@@ -225,3 +228,95 @@ def test_absurd_times_end() -> None:
     drawn.station(4, 1e9, 1e9 + 2)
     found = drawn.found()
     assert len(found.rotors[4].knot_tick) < 20
+
+
+# ---- thresholds
+
+PERIOD = 8e5  # ticks of 40 MHz
+
+
+@pytest.mark.parametrize(("shift_s", "sizes"), [(3.4e-6, [12]), (3.6e-6, [6, 6])])
+def test_link_error_grows_with_the_interval(shift_s: float, sizes: list[int]) -> None:
+    # 3 us, and 2 ppm of at most 12 rotations between linked bursts: 3.48 us.
+    zero = np.concatenate([np.arange(6) * PERIOD, np.arange(10, 16) * PERIOD + shift_s * RATE])
+    assert [len(rows) for rows in _link_segments(zero, PERIOD, RATE)] == sizes
+
+
+@pytest.mark.parametrize(("gap", "sizes"), [(50, [8]), (51, [4, 4])])
+def test_segments_end_after_a_gap_of_50_rotations(gap: int, sizes: list[int]) -> None:
+    zero = np.concatenate([np.arange(4), 3 + gap + np.arange(4)]) * PERIOD
+    assert [len(rows) for rows in _link_segments(zero, PERIOD, RATE)] == sizes
+
+
+@pytest.mark.parametrize(("between", "sizes"), [(7, [8]), (8, [4, 4])])
+def test_links_skip_at_most_seven_wrong_bursts(between: int, sizes: list[int]) -> None:
+    wrong = (3.1 + 0.09 * np.arange(between) + 0.002 * np.arange(between) ** 2) * PERIOD
+    zero = np.concatenate([np.arange(4) * PERIOD, wrong, np.arange(4, 8) * PERIOD])
+    assert np.all(np.diff(zero) > 0)
+    assert [len(rows) for rows in _link_segments(zero, PERIOD, RATE)] == sizes
+
+
+@pytest.mark.parametrize(("number", "sizes"), [(3, []), (4, [4])])
+def test_a_segment_has_four_bursts(number: int, sizes: list[int]) -> None:
+    segments = _link_segments(np.arange(number) * PERIOD, PERIOD, RATE)
+    assert [len(rows) for rows in segments] == sizes
+
+
+def test_overlapping_segments_are_excluded() -> None:
+    long, inside, after = np.arange(0, 40, 2), np.arange(11, 21, 2), np.arange(40, 44)
+    selected, excluded = _select_disjoint([long, inside, after])
+    assert [rows.tolist() for rows in selected] == [long.tolist(), after.tolist()]
+    assert excluded == len(inside)
+    # One that begins before a selected one and ends in it overlaps too.
+    selected, excluded = _select_disjoint([np.arange(10, 20), np.array([5, 6, 7, 12])])
+    assert [rows[0] for rows in selected] == [10]
+    assert excluded == 4
+
+
+@pytest.mark.parametrize(("seconds", "doubled"), [(1.7, ()), (2.4, (4,))])
+def test_a_tenth_of_the_bursts_makes_a_second_station(
+    seconds: float, doubled: tuple[int, ...]
+) -> None:
+    # 1.7 s are 8.4 % of the first station's bursts, 2.4 s are 12 %.
+    drawn = Decoded()
+    drawn.station(4, 0, 20)
+    drawn.station(4, 8, 8 + seconds, zero_s=0.0101)
+    assert drawn.found().doubled_channels == doubled
+
+
+@pytest.mark.parametrize(("evidence_bits", "channels"), [(27.9, []), (28.0, [4])])
+def test_bursts_of_little_evidence_do_not_vote(evidence_bits: float, channels: list[int]) -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 1)
+    drawn.rows[0][3] = evidence_bits
+    assert list(drawn.found().rotors) == channels
+
+
+@pytest.mark.parametrize(("ppm", "expected"), [(195.0, 195.0), (-195.0, -195.0), (205.0, 0.0)])
+def test_periods_beyond_the_clocks_are_not_estimated(ppm: float, expected: float) -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 4, ppm=ppm, scatter_s=0.0)
+    tick, _, index, _ = drawn.rows[0]
+    period = _estimate_period(4, tick, index.astype(np.int64), RATE)
+    nominal = TICKS[4] / 48e6 * RATE
+    assert (period / nominal - 1) * 1e6 == pytest.approx(expected, abs=1.0)
+
+
+@pytest.mark.parametrize(("shift_s", "restarts"), [(15e-6, 0), (50e-6, 1), (-50e-6, 1)])
+def test_a_restart_is_a_shift_of_more_than_20_us(shift_s: float, restarts: int) -> None:
+    drawn = Decoded()
+    turn = TICKS[4] / 48e6
+    drawn.station(4, 0, 5)
+    drawn.station(4, 300 * turn, 300 * turn + 5, zero_s=0.003 + shift_s)
+    assert drawn.found().rotors[4].restart_count == restarts
+
+
+def test_start_is_the_inverse_of_rotation_and_phase() -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 20, ppm=5, wander=np.array([1e-5, 11.0]))
+    rotor = drawn.found().rotors[4]
+    rotation = np.arange(0, 900, 7)
+    start = rotor.start_tick(rotation)
+    number, phase = rotor.rotation_and_phase(start + 0.25 * rotor.period_tick)
+    assert np.array_equal(number, rotation)
+    assert phase == pytest.approx(np.full(len(rotation), 0.25), abs=5e-6)

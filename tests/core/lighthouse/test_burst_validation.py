@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
-from locatk.core.lighthouse.channels import channel_of
+from locatk.core.lighthouse.channels import channel_of, period_ticks
 from locatk.core.lighthouse.demodulation.burst_validation import (
     ValidatedBursts,
+    _match_predicted,
     identify_bursts,
     validate_bursts,
 )
-from locatk.core.lighthouse.demodulation.identification import MIN_STANDALONE_EVIDENCE_BITS
-from locatk.core.lighthouse.demodulation.rotor import RotorSet, find_rotors
-from locatk.core.lighthouse.demodulation.soft_bits import split_bursts
+from locatk.core.lighthouse.demodulation.identification import (
+    MIN_STANDALONE_EVIDENCE_BITS,
+    identify_sequences,
+)
+from locatk.core.lighthouse.demodulation.rotor import Rotor, RotorSet, find_rotors
+from locatk.core.lighthouse.demodulation.soft_bits import (
+    MAX_SOFT_BIT,
+    SoftBits,
+    split_bursts,
+)
 from locatk.core.lighthouse.recording import Edges
 
 
@@ -103,3 +113,65 @@ def test_nothing() -> None:
     read = reading(Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 1))
     assert len(read.is_accepted) == 0
     assert not any(read.rejected.values())
+
+
+# ---- thresholds
+
+
+def uniform_rotor(channel: int) -> Rotor:
+    """A rotor at nominal speed, by a recorder of 48 MHz."""
+    knots = np.array([0.0, 1e9])
+    period = float(period_ticks(channel))
+    return Rotor(channel, period, 0.0, knots, np.zeros(2), 100, 0, 1.0)
+
+
+def weak_burst(light: Any, polynomial: int, index: int, length: int, off_bits: int) -> SoftBits:
+    """Clean bits that are received ``off_bits`` after their rotor predicts them."""
+    bits = light.sequence(polynomial)[index : index + length]
+    value = np.where(bits > 0, MAX_SOFT_BIT, -MAX_SOFT_BIT).astype(np.int8)
+    return SoftBits(value, np.array([0, length]), np.array([(index + off_bits) * 8.0]), 8.0)
+
+
+def predicted(light: Any, length: int, off_bits: int) -> bool:
+    """True if a burst of the second polynomial of channel 5 is matched by its rotor."""
+    bits = weak_burst(light, 9, 40_000, length, off_bits)
+    matches, is_replaced = _match_predicted(
+        bits,
+        identify_sequences(bits.take(np.zeros(1, int))),
+        np.array([True]),
+        RotorSet({5: uniform_rotor(5), 12: uniform_rotor(12)}, ()),
+    )
+    if is_replaced[0]:
+        assert (matches.polynomial[0], matches.index[0]) == (9, 40_000)
+    return bool(is_replaced[0])
+
+
+@pytest.mark.parametrize(("length", "is_match"), [(20, False), (21, True)])
+def test_a_predicted_burst_needs_20_bits_of_evidence(
+    light: Any, length: int, is_match: bool
+) -> None:
+    # A clean bit is 0.97 bits of evidence.
+    assert predicted(light, length, 0) == is_match
+
+
+@pytest.mark.parametrize(("off_bits", "is_match"), [(14, True), (-14, True), (15, False)])
+def test_a_predicted_burst_is_searched_within_14_bits(
+    light: Any, off_bits: int, is_match: bool
+) -> None:
+    assert predicted(light, 50, off_bits) == is_match
+
+
+@pytest.mark.parametrize(("shift_s", "accepted"), [(1.8e-6, True), (2.2e-6, False)])
+def test_accepted_bursts_are_within_2_us_of_their_rotor(
+    light: Any, shift_s: float, accepted: bool
+) -> None:
+    (line,), passed = light.of([light.Sender(5)], 1.0)
+    bits, matches = identify_bursts(split_bursts(line))
+    rotors = find_rotors(
+        bits.start_tick, matches.polynomial, matches.index, matches.evidence_bits, line.rate_hz
+    ).rotors
+    shifted = replace(rotors[5], zero_tick=rotors[5].zero_tick + shift_s * line.rate_hz)
+    result = reading(line, RotorSet({5: shifted}, ()))
+    assert result.is_accepted.all() == result.is_accepted.any() == accepted
+    if not accepted:
+        assert result.rejected["burst_off_rotor"] == len(passed.time_s)

@@ -252,3 +252,19 @@ def test_windows_of_a_microcontroller(light: Any) -> None:
     assert found.is_certain().all()
     assert np.all(found.polynomial == 11)
     assert np.all(np.abs(found.index - truth) <= 2)
+
+
+def test_eight_bits_must_follow_from_the_17_before_them(light: Any) -> None:
+    for identify in (identify_sequences, identify_sequences_numpy):
+        for length, polynomial in ((24, -1), (25, 3)):
+            found = identify(soft(sent(light, 3, np.array([77]), length)), 4)
+            assert found.polynomial.tolist() == [polynomial]
+
+
+def test_certain_from_40_bits_of_evidence() -> None:
+    one = np.ones(3, np.int32)
+    evidence = np.array([39.9, 40.0, 27.0])
+    found = SequenceMatches(one, one.astype(np.int64), evidence, one, one, 50 * one, 0 * one)
+    assert found.is_certain().tolist() == [False, True, False]
+    assert false_match_probability(40.0) == 2.0**-13
+    assert false_match_probability(20.0) == 1.0

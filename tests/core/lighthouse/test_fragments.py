@@ -5,11 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
+from locatk.core.lighthouse.demodulation import burst_validation
 from locatk.core.lighthouse.demodulation.burst_validation import (
     MAX_DECOY_FRACTION,
     MAX_SWEEP_S,
     WEAK_LIGHT_DELAY_BITS,
+    decoy_fraction,
     match_fragments,
 )
 from locatk.core.lighthouse.demodulation.identification import identify_sequences
@@ -91,3 +94,39 @@ def test_nothing_read_or_nothing_left(light: Any) -> None:
     found = identify_sequences(bits)
     for read in (np.zeros(len(bursts), bool), np.ones(len(bursts), bool)):
         assert np.all(match_fragments(bursts, bits, found, read) == -1)
+
+
+@pytest.mark.parametrize(("fraction", "continues"), [(0.005, True), (0.006, False)])
+def test_decoys_that_may_look_as_similar(
+    light: Any, monkeypatch: pytest.MonkeyPatch, fraction: float, continues: bool
+) -> None:
+    monkeypatch.setattr(burst_validation, "decoy_fraction", lambda *_: fraction)
+    of, read = judged(scene(light, 0))
+    assert np.all((of[~read] >= 0) == continues)
+
+
+@pytest.mark.parametrize(("late_s", "continues"), [(95e-6, True), (105e-6, False)])
+def test_a_sweep_lasts_100_us_at_most(
+    light: Any, monkeypatch: pytest.MonkeyPatch, late_s: float, continues: bool
+) -> None:
+    monkeypatch.setattr(burst_validation, "decoy_fraction", lambda *_: 0.0)
+    whole = 1e-3 + light.biphase(light.sequence(6)[1000:1100])[:150] / 6e6
+    weak = whole[0] + late_s + np.arange(8) * 2e-7
+    bursts = split_bursts(light.edges(np.concatenate([whole, weak]), 0.01))
+    bits = demodulate_bursts(bursts)
+    of = match_fragments(bursts, bits, identify_sequences(bits), np.array([True, False]))
+    assert of.tolist() == [-1, 0 if continues else -1]
+
+
+def test_a_fragment_resembles_its_own_part_and_not_its_neighbours(light: Any) -> None:
+    index, start_s = 5000, 1e-3
+    bursts = split_bursts(light.edges(fragment(light, index, start_s, 100)[:60], 0.01))
+    late = (bursts.start_tick[0] / 40e6 - start_s) * 6e6  # the first pulses may be missing
+    fractions = [decoy_fraction(bursts, 0, 6, index + late + shift) for shift in (0, -4, 3, 250)]
+    assert fractions[0] <= MAX_DECOY_FRACTION
+    assert min(fractions[1:]) > 5 * MAX_DECOY_FRACTION
+
+
+def test_a_fragment_shorter_than_a_bit_resembles_everything() -> None:
+    bursts = Bursts(np.array([100, 104]), np.array([0, 2]), np.array([True]), 40e6)
+    assert decoy_fraction(bursts, 0, 6, 5000.0) == 1.0

@@ -14,6 +14,8 @@ from locatk.core.lighthouse.demodulation.soft_bits import (
     MAX_BURST_S,
     MAX_SOFT_BIT,
     Bursts,
+    SoftBits,
+    _starts_at_second_chip,
     demodulate_bursts,
     demodulate_bursts_numpy,
     split_bursts,
@@ -164,3 +166,27 @@ def test_twins_on_windows(width: int) -> None:
 @pytest.mark.parametrize("name", [CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"])
 def test_twins_on_published_light(published: Callable[[str], Edges], name: str) -> None:
     agree(split_bursts(published(name)))
+
+
+@pytest.mark.parametrize(("excess", "is_second"), [(0.0, False), (5e-4, False), (2e-3, True)])
+def test_bits_start_at_the_second_chip_only_with_a_margin(excess: float, is_second: bool) -> None:
+    mean = np.array([1.0 + excess, -1.0, 1.0])
+    assert _starts_at_second_chip(mean, np.zeros(1, int), np.array([3])).tolist() == [is_second]
+
+
+@pytest.mark.parametrize(("duration_s", "has_bits"), [(499e-6, True), (501e-6, False)])
+def test_bursts_of_more_than_half_a_millisecond_have_no_bits(
+    duration_s: float, has_bits: bool
+) -> None:
+    tick = np.arange(0, round(duration_s * 40e6) + 1, 20)
+    bursts = split_bursts(Edges(tick, 40e6, 40e6, True, 10**6))
+    for demodulate in (demodulate_bursts, demodulate_bursts_numpy):
+        assert (len(demodulate(bursts).value) > 0) == has_bits
+
+
+def test_some_bursts_of_soft_bits() -> None:
+    bits = SoftBits(np.arange(6, dtype=np.int8), np.array([0, 1, 3, 6]), np.arange(3.0), 5.0)
+    some = bits.take(np.array([0, 2]))
+    assert some.value.tolist() == [0, 3, 4, 5]
+    assert some.first.tolist() == [0, 1, 4]
+    assert some.start_tick.tolist() == [0.0, 2.0]

@@ -14,7 +14,13 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import PARAMETERS
 from locatk.core.lighthouse.demodulation import ootx
-from locatk.core.lighthouse.demodulation.pipeline import DemodulatedRecording, demodulate_recording
+from locatk.core.lighthouse.demodulation.pipeline import (
+    DemodulatedRecording,
+    _latest_factory_data,
+    demodulate_recording,
+    slow_bits,
+)
+from locatk.core.lighthouse.demodulation.rotor import Rotor
 from locatk.core.lighthouse.recording import Edges
 
 CAPTURE = "benchmarks/demodulation_code/logic_analyser_capture.sal"
@@ -352,3 +358,40 @@ def test_a_rotor_that_wanders_within_seconds_does_not_move_a_standing_photodiode
         count = caught.count[caught.plane == plane]
         assert len(count) > 45
         assert 1.4826 * np.median(np.abs(count - np.median(count))) < limit
+
+
+# ---- stages
+
+
+def test_slow_bits_of_rotations() -> None:
+    rotor = Rotor(3, 100.0, 0.0, np.array([0.0, 1e6]), np.zeros(2), 9, 0, 1.0)
+    tick = np.array([10.0, 40.0, 110.0, 140.0, 310.0, 100_010.0])
+    bits = slow_bits(tick, np.array([4, 5, 5, 5, 4, 5], np.int32), rotor)
+    # Sweeps of rotation 0 disagree, rotation 2 has none, and 997 rotations become 500.
+    assert bits[:4].tolist() == [-1, 1, -1, 0]
+    assert len(bits) == 3 + 500 + 1
+    assert bits[-1] == 1
+    assert np.all(bits[4:-1] == -1)
+
+
+def test_the_latest_usable_factory_data() -> None:
+    valid = ootx.decode_frames(factory(4, 17))[0]
+    broken = bytearray(valid.payload)
+    broken[8:10] = struct.pack("<H", 0x7E00)
+    frames = [valid, replace(valid, payload=bytes(broken))]
+    data, warnings = _latest_factory_data(4, frames)
+    assert data is not None
+    assert data.id == 17
+    assert [warning.code for warning in warnings] == ["invalid_factory_data"]
+    data, warnings = _latest_factory_data(5, [valid])
+    assert data is not None
+    assert [warning.code for warning in warnings] == ["channel_mismatch"]
+    assert _latest_factory_data(4, []) == (None, [])
+
+
+def test_the_light_of_a_doubled_channel_alone_is_an_error_with_a_remedy(light: Any) -> None:
+    senders = [light.Sender(3), light.Sender(3, zero_s=0.011)]
+    lines, _ = light.of(senders, 2.0)
+    with pytest.raises(InputError, match="more than one station") as raised:
+        demodulate_recording(lines)
+    assert raised.value.hint == "Set each station to a channel of its own"
