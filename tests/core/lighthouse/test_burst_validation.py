@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from locatk.core.lighthouse.channels import channel_of, period_ticks
+from locatk.core.lighthouse.demodulation import burst_validation
 from locatk.core.lighthouse.demodulation.burst_validation import (
     ValidatedBursts,
     _match_predicted,
@@ -17,6 +18,7 @@ from locatk.core.lighthouse.demodulation.burst_validation import (
 )
 from locatk.core.lighthouse.demodulation.identification import (
     MIN_STANDALONE_EVIDENCE_BITS,
+    SequenceMatches,
     identify_sequences,
 )
 from locatk.core.lighthouse.demodulation.rotor import Rotor, RotorSet, find_rotors
@@ -175,3 +177,20 @@ def test_accepted_bursts_are_within_2_us_of_their_rotor(
     assert result.is_accepted.all() == result.is_accepted.any() == accepted
     if not accepted:
         assert result.rejected["burst_off_rotor"] == len(passed.time_s)
+
+
+def test_a_standalone_match_is_never_replaced(light: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,), _ = light.of([light.Sender(5)], 1.0)
+    weak_rows = []
+
+    def record(
+        bits: SoftBits, matches: SequenceMatches, is_weak: np.ndarray, rotor_set: RotorSet
+    ) -> tuple[SequenceMatches, np.ndarray]:
+        weak_rows.append(is_weak)
+        return matches, np.zeros(len(bits), bool)
+
+    monkeypatch.setattr(burst_validation, "_match_predicted", record)
+    # A rotor of another channel agrees with none of the bursts.
+    result = reading(line, RotorSet({12: uniform_rotor(12)}, ()))
+    assert result.matches.is_certain().all()
+    assert not weak_rows[0].any()

@@ -164,3 +164,8 @@ def test_periods_of_a_flash_deviate_by_six_per_cent_at_most() -> None:
         ((46, 47), False),
     ):
         assert is_mocap_flash(regular(20, steps=steps)).tolist() == [is_flash]
+
+
+@pytest.mark.parametrize(("silence_s", "number"), [(1.45e-6, 1), (1.55e-6, 2)])
+def test_a_silence_of_nine_bits_ends_a_burst(silence_s: float, number: int) -> None:
+    assert len(split_bursts(edges(0, 10, 10 + round(silence_s * 40e6), 80 + 10))) == number

@@ -130,3 +130,15 @@ def test_a_fragment_resembles_its_own_part_and_not_its_neighbours(light: Any) ->
 def test_a_fragment_shorter_than_a_bit_resembles_everything() -> None:
     bursts = Bursts(np.array([100, 104]), np.array([0, 2]), np.array([True]), 40e6)
     assert decoy_fraction(bursts, 0, 6, 5000.0) == 1.0
+
+
+def test_weak_light_is_expected_a_quarter_of_a_bit_late(
+    light: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bursts = split_bursts(light.edges(fragment(light, 5000, 1e-3, 100)[:60], 0.01))
+    shift = (bursts.start_tick[0] / 40e6 - 1e-3) * 6e6
+    fraction = decoy_fraction(bursts, 0, 6, 5000 + shift)
+    monkeypatch.setattr(burst_validation, "WEAK_LIGHT_DELAY_BITS", 0.0)
+    assert WEAK_LIGHT_DELAY_BITS == 0.25
+    # The first edge is already late by that delay.
+    assert decoy_fraction(bursts, 0, 6, 5000 + shift - 0.25) == fraction

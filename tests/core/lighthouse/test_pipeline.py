@@ -16,6 +16,7 @@ from locatk.core.lighthouse.calibration import PARAMETERS
 from locatk.core.lighthouse.demodulation import ootx
 from locatk.core.lighthouse.demodulation.pipeline import (
     DemodulatedRecording,
+    _count_missed,
     _latest_factory_data,
     demodulate_recording,
     slow_bits,
@@ -395,3 +396,17 @@ def test_the_light_of_a_doubled_channel_alone_is_an_error_with_a_remedy(light: A
     with pytest.raises(InputError, match="more than one station") as raised:
         demodulate_recording(lines)
     assert raised.value.hint == "Set each station to a channel of its own"
+
+
+def test_a_rejected_burst_beside_a_decoded_sweep_is_not_missed(light: Any) -> None:
+    (line,), _ = light.of([light.Sender(2)], 2.0)
+    got = demodulate_recording([line])
+    validated, rotor = got.photodiodes[0], got.rotors[2]
+    rows = np.arange(len(got.sweeps))
+    accepted = validated.is_accepted.copy()
+    accepted[20] = False
+    rejected = replace(validated, is_accepted=accepted)
+    # Its sweep was decoded, as from another burst; without that sweep it was missed.
+    assert _count_missed(0, rejected, got.sweeps, rows, rotor, line.rate_hz) == 0
+    others = np.delete(rows, 20)
+    assert _count_missed(0, rejected, got.sweeps, others, rotor, line.rate_hz) == 1

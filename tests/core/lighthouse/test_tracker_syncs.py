@@ -53,11 +53,12 @@ def test_wander_is_smoothed_over_five_rotations_without_a_gap() -> None:
     noise = np.random.default_rng(0).normal(0, 5.0, len(number))
     rotor = fit(number * PERIOD + noise)
     residual = rotor.zero_tick - number * PERIOD
-    assert np.std(residual) < 0.8 * np.std(noise)
+    # The filter reproduces lines, so that the fitted one does not matter.
+    weights = np.array([-3, 12, 17, 12, -3]) / 35
+    assert residual[10] == pytest.approx(weights @ noise[8:13], abs=1e-3)
     # The two rotations on both sides of the gap keep their measured time.
     kept = [18, 19, 20, 21]
     assert residual[kept] == pytest.approx(noise[kept], abs=1e-3)
-    assert abs(residual[10] - noise[10]) > 1e-2
 
 
 @pytest.mark.parametrize(("rotations", "is_known"), [(49.5, True), (50.5, False)])
