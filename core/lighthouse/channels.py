@@ -1,8 +1,9 @@
-"""The sixteen channels of Lighthouse V2: rotor periods and polynomials.
+"""The sixteen channels of Lighthouse V2: rotor periods and LFSR polynomials.
 
-Figures: Bitcraze crazyflie-firmware ``pulse_processor_v2.c`` and lighthouse-fpga;
-confirmed by libsurvive recordings (facts/lighthouse.md 2.1 and 2.2). Two peers have a
-wrong period each, for channels 4 and 14.
+Periods and polynomial numbering: Bitcraze crazyflie-firmware ``pulse_processor_v2.c`` and
+lighthouse-fpga ``utils.scala``. Median sync intervals in recordings of libsurvive-extras-data
+confirm the periods. Two other implementations have one wrong period each: DotBot-libs for
+channel 4 (951000) and dotbot-lh2-calibration for channel 14 (901900).
 """
 
 from __future__ import annotations
@@ -11,10 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 CHANNELS = range(1, 17)
-"""Channels as the user sees and sets them, from 1; also called modes."""
+"""Channels as the user sees and sets them, from 1. Also called modes."""
 
-POLYNOMIALS = 32
+POLYNOMIAL_COUNT = 32
+"""Number of LFSR polynomials: two per channel, one per value of the slow bit."""
+
 TICK_HZ = 48_000_000
+"""Clock of a base station, in which :data:`PERIOD_TICKS` is given."""
+
 TICKS_PER_COUNT = 8
 """One LFSR step (6 MHz) lasts eight ticks of 48 MHz."""
 
@@ -28,20 +33,20 @@ PERIOD_TICKS: NDArray[np.int64] = np.array(
 
 
 def period_ticks(channel: ArrayLike) -> NDArray[np.int64]:
-    """Ticks of 48 MHz in one rotation of each ``channel`` (1 to 16, any shape)."""
+    """Return the ticks of 48 MHz in one rotation of each ``channel`` (1 to 16, any shape)."""
     return PERIOD_TICKS[np.asarray(channel) - 1]
 
 
 def period_counts(channel: ArrayLike) -> NDArray[np.float64]:
-    """LFSR steps in one rotation of each ``channel`` (1 to 16, any shape)."""
+    """Return the LFSR steps in one rotation of each ``channel`` (1 to 16, any shape)."""
     return period_ticks(channel) / TICKS_PER_COUNT
 
 
 def channel_of(polynomial: ArrayLike) -> NDArray[np.int64]:
-    """Channel (1 to 16) that sends LFSR ``polynomial`` (0 to 31, any shape)."""
+    """Return the channel (1 to 16) that sends LFSR ``polynomial`` (0 to 31, any shape)."""
     return (np.asarray(polynomial) >> 1) + 1
 
 
 def slow_bit_of(polynomial: ArrayLike) -> NDArray[np.int64]:
-    """OOTX bit (0 or 1) that a sweep with ``polynomial`` carries."""
+    """Return the slow (OOTX) bit, 0 or 1, that a sweep with ``polynomial`` carries."""
     return np.asarray(polynomial) & 1

@@ -1,4 +1,4 @@
-"""Rigid devices with several photodiodes of known place."""
+"""Layout of the photodiodes of a rigid device."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Receiver:
-    """Where the photodiodes of a device sit.
+    """Positions and normals of the photodiodes of a device.
 
     Attributes
     ----------
     position_m : (k, 3) ndarray
-        Of each photodiode in the device's axes, in metres; row i is sensor i of
+        Position of each photodiode in the device frame, in metres; row i is sensor i of
         :class:`~locatk.core.lighthouse.recording.Sweeps`.
     normal : (k, 3) ndarray, optional
-        Unit vectors in which the photodiodes look; light from behind does not reach them.
+        Unit vector along the optical axis of each photodiode. Light from behind is not received.
     name : str
-        Of the kind of device, as in ``"lighthouse-deck"``; "" where nobody tells.
+        Type of the device, as in ``"lighthouse-deck"``; "" if unknown.
     """
 
     position_m: Array
@@ -40,4 +40,5 @@ DECK = Receiver(
     np.tile([0.0, 0.0, 1.0], (4, 1)),
     "lighthouse-deck",
 )
-"""Bitcraze's Lighthouse deck: four photodiodes that look up (facts/lighthouse.md 2.7)."""
+"""Bitcraze's Lighthouse deck: four photodiodes that face upwards (positions: crazyflie-firmware
+``lighthouse_position_est.c``)."""

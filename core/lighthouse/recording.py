@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +20,20 @@ class Edges:
     Attributes
     ----------
     tick : (n,) int64 ndarray
-        When each change was, strictly ascending, in ticks of the recorder's clock since
-        its start; the level changes with each.
+        Time of each change, strictly ascending, in ticks of the recorder's clock since
+        its start. The level changes with each.
     rate_hz : float
-        Ticks a second: the sampling rate of a logic analyser, 1e9 where times are given in
+        Ticks per second: the sampling rate of a logic analyser, or 1e9 if times are given in
         nanoseconds.
     resolution_hz : float
-        What the times resolve, at most ``rate_hz``: an analyser that samples at 24 MHz and
-        tells nanoseconds resolves 24 MHz.
+        Resolution of the times, at most ``rate_hz``. An analyser that samples at 24 MHz and
+        exports nanoseconds resolves 24 MHz.
     rises : bool
-        Whether the first change is from low to high.
+        True if the first change is from low to high.
     end_tick : int
-        End of the recording; a tick after the last edge, or later.
+        End of the recording: a tick after the last edge, or later.
     start_ns : int
-        Tick 0, in nanoseconds since the epoch; 0 where the recording does not tell.
+        Time of tick 0, in nanoseconds since the Unix epoch; 0 if the recording has no date.
     """
 
     tick: NDArray[np.int64]
@@ -47,24 +48,25 @@ class Edges:
 
     @property
     def duration_s(self) -> float:
-        """Length of the recording in seconds, from tick 0 or the first edge before it."""
+        """Duration of the recording in seconds, from tick 0 or from the first edge before it."""
         first = min(0, int(self.tick[0])) if len(self.tick) else 0
         return (self.end_tick - first) / self.rate_hz
 
 
-UNKNOWN = -1
+UNKNOWN: Final = -1
+"""Value of a polynomial, plane or slow bit that the source of a recording does not report."""
 
 
 @dataclass(frozen=True)
 class Sweeps:
-    """Times at which sweeping light planes crossed photodiodes, in no special order.
+    """Times at which sweeping light planes crossed photodiodes, in any order.
 
     Attributes
     ----------
     devices : tuple of str
-        Names to which ``device`` points.
+        Names that ``device`` indexes.
     time_ns : (n,) int64 ndarray
-        When each sweep was received, nanoseconds since the epoch.
+        Time of reception, nanoseconds since the Unix epoch.
     device : (n,) int ndarray
         Index into ``devices``.
     sensor : (n,) int ndarray
@@ -72,13 +74,13 @@ class Sweeps:
     channel : (n,) int ndarray
         Channel of the base station, 1 to 16 (also called mode).
     polynomial : (n,) int ndarray
-        LFSR polynomial 0 to 31, or -1 where the source does not tell.
+        LFSR polynomial 0 to 31, or -1 if the source does not report it.
     sweep : (n,) int ndarray
-        0 for the first plane of a rotation, 1 for the second, -1 where the source
-        does not tell: the two are then told apart by their counts.
+        0 for the first plane of a rotation, 1 for the second, -1 if the source does not
+        report it. The planes are then distinguished by their counts.
     count : (n,) float64 ndarray
         LFSR index: steps of the 6 MHz bit clock since the rotor's zero. Fractional
-        where timing refines it.
+        if it was refined by timing.
     """
 
     devices: tuple[str, ...]
@@ -94,14 +96,14 @@ class Sweeps:
         return len(self.time_ns)
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Sweeps:
-        """The chosen sweeps, of the same devices."""
+        """Select sweeps by a mask or by indices; ``devices`` stays the same."""
         columns = (f.name for f in fields(self) if f.name != "devices")
         return replace(self, **{name: getattr(self, name)[chosen] for name in columns})
 
 
 @dataclass(frozen=True)
 class StationReport:
-    """A base station as one recording heard it.
+    """Base station as observed in one recording.
 
     Attributes
     ----------
@@ -110,17 +112,18 @@ class StationReport:
     id : int, optional
         Serial number, from its factory data (OOTX).
     period_ticks : float, optional
-        Measured length of a rotation, in ticks of 48 MHz of the recorder's clock.
+        Measured duration of a rotation, in ticks of 48 MHz of the recorder's clock.
     sweeps : int
-        Sweeps that were decoded.
+        Number of decoded sweeps.
     missed : int, optional
-        Sweeps of it that were received and not decoded; None where the source does not tell.
+        Number of sweeps that were received and not decoded; None if the source does not
+        report it.
     calibration : Calibration, optional
-        From its own factory data, where a frame arrived whole.
+        Calibration from the station's own factory data, if a complete frame was received.
     frames : int
-        Frames of factory data whose checksum was right.
+        Number of frames of factory data with a valid checksum.
     damaged : int
-        Frames whose checksum was wrong; they are never used.
+        Number of frames with a wrong checksum. They are never used.
     """
 
     channel: int
@@ -134,7 +137,7 @@ class StationReport:
 
     @property
     def decode_rate(self) -> float | None:
-        """Share of the received sweeps that were decoded, 0 to 1."""
+        """Fraction of the received sweeps that were decoded, 0 to 1; None if unknown."""
         if self.missed is None or self.sweeps + self.missed == 0:
             return None
         return self.sweeps / (self.sweeps + self.missed)

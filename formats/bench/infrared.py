@@ -17,22 +17,27 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.demodulation import bursts as light_bursts
-from locatk.core.lighthouse.demodulation import weak_bursts as weak
-from locatk.core.lighthouse.demodulation.burst_validation import ValidatedBursts
+from locatk.core.lighthouse.demodulation.burst_validation import ValidatedBursts, match_fragments
 from locatk.core.lighthouse.demodulation.identification import (
     SequenceMatches,
     identify_sequences,
+    read_windows,
 )
 from locatk.core.lighthouse.demodulation.pipeline import (
-    SHORTEST_S,
+    MIN_BURST_S,
     DemodulatedRecording,
     demodulate_recording,
 )
-from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
-from locatk.core.lighthouse.demodulation.windows import read_windows
-from locatk.core.lighthouse.published import light_decoding as paper_light
-from locatk.core.lighthouse.published.light_receiver import WINDOW_START_S
+from locatk.core.lighthouse.demodulation.soft_bits import (
+    demodulate_bursts,
+    split_bursts,
+    split_windows,
+)
+from locatk.core.lighthouse.published.light_decoding import (
+    WINDOW_START_S,
+    decode_windows,
+    sample_windows,
+)
 from locatk.core.lighthouse.recording import Edges
 from locatk.formats.bench import Figure
 from locatk.formats.bench.infrared_places import figures as place_figures
@@ -101,14 +106,14 @@ def capture(folder: Path, name: str) -> Edges:
 
 def _demodulation(folder: Path) -> list[Figure]:
     reception = demodulate_recording([capture(folder, CAPTURES[0])])
-    (reading,) = reception.readings
-    by_itself = reading.read & (np.abs(reading.off_s) <= ROTOR_S)
-    rims = reading.beside >= 0
-    rims[rims] = by_itself[reading.beside[rims]]
+    (reading,) = reception.photodiodes
+    by_itself = reading.is_accepted & (np.abs(reading.rotor_residual_s) <= ROTOR_S)
+    rims = reading.continued_burst >= 0
+    rims[rims] = by_itself[reading.continued_burst[rims]]
     n = len(reading.bursts)
-    certain = reading.matches.certain()
+    certain = reading.matches.is_certain()
     strange = certain & ~np.isin(reading.matches.polynomial, POLYNOMIALS)
-    wrong = ~np.isin(reading.matches.polynomial[reading.read], POLYNOMIALS)
+    wrong = ~np.isin(reading.matches.polynomial[reading.is_accepted], POLYNOMIALS)
     how = (
         f"{n:,} bursts of more than 5 us on the data line of demodulation_code, 54 s; "
         f"{np.count_nonzero(by_itself):,} were read and are within 1 us of their rotor"
@@ -142,10 +147,16 @@ def _wrong_rims(reading: ValidatedBursts) -> float:
     """Share of unread bursts that are taken for light of a place where nothing was sent."""
     m = reading.matches
     elsewhere = SequenceMatches(
-        m.polynomial, (m.index + 20_000) % 131_071, m.evidence, m.begin, m.end, m.known, m.wrong
+        m.polynomial,
+        (m.index + 20_000) % 131_071,
+        m.evidence_bits,
+        m.begin,
+        m.end,
+        m.known_bits,
+        m.wrong_bits,
     )
-    beside = weak.match_fragments(reading.bursts, reading.bits, elsewhere, reading.read)
-    return float(np.mean(beside[~reading.read] >= 0))
+    beside = match_fragments(reading.bursts, reading.bits, elsewhere, reading.is_accepted)
+    return float(np.mean(beside[~reading.is_accepted] >= 0))
 
 
 def _decode_rate(reception: DemodulatedRecording) -> float:
@@ -168,7 +179,7 @@ def _stations(reception: DemodulatedRecording) -> list[Figure]:
     ]  # fmt: skip
     for channel, known in PPM.items():
         rotor = reception.rotors[channel]
-        ppm = rotor.ppm(reception.readings[0].bursts.rate_hz)
+        ppm = rotor.period_deviation_ppm(reception.photodiodes[0].bursts.rate_hz)
         rows.append(
             Figure(f"period of channel {channel}, off the fitted one", abs(ppm - known), "ppm",
                    f"{ppm:.3f} ppm of nominal; a line through all zeros gives {known}", 0.05)
@@ -182,9 +193,9 @@ def _stations(reception: DemodulatedRecording) -> list[Figure]:
 def _windows(folder: Path) -> list[Figure]:
     windows = published_windows(folder)
     matches = read_windows(windows).matches
-    good = matches.certain()
+    good = matches.is_certain()
     strange = good & ~np.isin(matches.polynomial, POLYNOMIALS)
-    paper = paper_light.decode(windows)
+    paper = decode_windows(windows)
     read = paper.polynomial >= 0
     false = read & ~np.isin(paper.polynomial, POLYNOMIALS)
     how = "64 bytes at 32 MS/s, from 9 us after a burst's first edge: the peer's best window"
@@ -208,8 +219,8 @@ def _others(folder: Path) -> list[Figure]:
     rows = []
     for name in CAPTURES[1:]:
         reception = demodulate_recording([capture(folder, name)])
-        (reading,) = reception.readings
-        decoded = _percent(reading.read | (reading.beside >= 0))
+        (reading,) = reception.photodiodes
+        decoded = _percent(reading.is_accepted | (reading.continued_burst >= 0))
         rows.append(
             Figure(f"bursts decoded, {name.split('/')[0]}", decoded, "%",
                    f"of {len(reading.bursts):,}; nothing was chosen by what is scored here but "
@@ -222,9 +233,9 @@ def _fpga(folder: Path) -> list[Figure]:
     rows = []
     for name, (target, peer) in FPGA.items():
         reception = demodulate_recording(read_light(folder / "fpga" / f"{name}.csv"))
-        (reading,) = reception.readings
-        right = reading.read & np.isin(reading.matches.polynomial, (12, 13))
-        sigma = next(iter(reception.rotors.values())).sigma / reading.bursts.rate_hz
+        (reading,) = reception.photodiodes
+        right = reading.is_accepted & np.isin(reading.matches.polynomial, (12, 13))
+        sigma = next(iter(reception.rotors.values())).sigma_tick / reading.bursts.rate_hz
         rows.append(
             Figure(f"bursts read, {name}", float(np.sum(right)), "of 103",
                    f"Bitcraze's recording, channel 7; within 2 us of the rotor, of which they "
@@ -236,10 +247,10 @@ def _fpga(folder: Path) -> list[Figure]:
 def published_windows(folder: Path) -> NDArray[np.uint8]:
     """The peer's windows of the demodulation capture, (11136, 64)."""
     edges = capture(folder, CAPTURES[0])
-    bursts = light_bursts.split_bursts(edges)
-    bursts = bursts.take(bursts.duration_s > SHORTEST_S)
-    start = bursts.start + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
-    return paper_light.windows_of(edges, start)
+    bursts = split_bursts(edges)
+    bursts = bursts.take(bursts.duration_s > MIN_BURST_S)
+    start = bursts.start_tick + round(WINDOW_START_S * edges.rate_hz) + PHASE_TICKS
+    return sample_windows(edges, start)
 
 
 # ---- speed
@@ -281,7 +292,7 @@ def measure_speed(data: str) -> list[float]:
     folder = Path(data) / "lighthouse"
     windows = np.concatenate([published_windows(folder)] * SPEED_BATCH_COPIES)
     whole = cpu_seconds(lambda: read_windows(windows), SPEED_REPEATS)
-    bits = soft_bits(light_bursts.bursts_of_windows(windows))
+    bits = demodulate_bursts(split_windows(windows))
     index = cpu_seconds(lambda: identify_sequences(bits), SPEED_REPEATS)
     edges = capture(folder, CAPTURES[0])
     light = cpu_seconds(lambda: demodulate_recording([edges]), 3)

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError, MissingDataError
-from locatk.core.lighthouse.channels import POLYNOMIALS, channel_of
+from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers import dotbot_floor as floor
@@ -202,7 +202,7 @@ def _rows(table: Table, slots: tuple[_Slot, ...]) -> floor.Rows:
     for slot in slots:
         count.append(table.floats(slot.count, low=0))
         if slot.polynomial in table.columns:
-            polynomial.append(table.integers(slot.polynomial, 0, POLYNOMIALS - 1))
+            polynomial.append(table.integers(slot.polynomial, 0, POLYNOMIAL_COUNT - 1))
             channel.append(channel_of(polynomial[-1]))
         else:
             polynomial.append(np.full(n, UNKNOWN))

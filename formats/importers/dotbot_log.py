@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from locatk.core.clock_sync import TickClock
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.channels import POLYNOMIALS, channel_of
+from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
 from locatk.formats.artifacts import parse_time
 from locatk.formats.importers.sweeps import ImportedSession
@@ -276,7 +276,7 @@ def _add_processed(log: _Log, fields: _Fields, time_ns: int) -> None:
     if b"db_time" in fields and not 0 <= tick < 1 << ROBOT_BITS:
         raise _Damaged(f"db_time is {tick}")
     device = _device(log, fields)
-    if not (0 <= polynomial < POLYNOMIALS and 0 <= count < lfsr.LENGTH):
+    if not (0 <= polynomial < POLYNOMIAL_COUNT and 0 <= count < lfsr.SEQUENCE_LENGTH):
         log.marks += 1
         return
     log.add(time_ns, device, polynomial, count, tick, 0, UNKNOWN)
@@ -287,7 +287,7 @@ def _add_counts(log: _Log, fields: _Fields, time_ns: int) -> None:
     counts = [_number(fields, b"c0"), _number(fields, b"c1")]
     device = _device(log, fields)
     for count in counts:
-        if 0 <= count < lfsr.LENGTH:
+        if 0 <= count < lfsr.SEQUENCE_LENGTH:
             log.add(time_ns, device, UNKNOWN, count, UNKNOWN, 0, UNKNOWN)
         else:
             log.marks += 1
@@ -305,8 +305,8 @@ def _add_windows(log: _Log, fields: _Fields, time_ns: int) -> None:
     for polynomial, offset, bits in windows:
         if not 0 <= bits < 1 << WINDOW_BITS:
             raise _Damaged("bits that are no 64-bit number")
-        room = WINDOW_BITS - lfsr.BITS
-        if 0 <= polynomial < POLYNOMIALS and 0 <= offset <= room:
+        room = WINDOW_BITS - lfsr.REGISTER_BITS
+        if 0 <= polynomial < POLYNOMIAL_COUNT and 0 <= offset <= room:
             log.add(time_ns, device, polynomial, 0, UNKNOWN, bits, offset)
         else:
             log.marks += 1
@@ -328,7 +328,7 @@ def _rows(log: _Log, warnings: list[str]) -> Rows:
     known = rows[windows]
     index = lfsr.window_index(known["bits"], known["offset"], known["polynomial"])
     rows["count"][windows] = index
-    dark = np.flatnonzero(windows)[index == lfsr.NOWHERE]
+    dark = np.flatnonzero(windows)[index == lfsr.NO_INDEX]
     log.marks += len(dark)
     rows = np.delete(rows, dark)
     backwards = int(np.count_nonzero(np.diff(rows["time_ns"]) < 0))

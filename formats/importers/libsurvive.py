@@ -171,19 +171,19 @@ def _stations(
     told = []
     for channel in sorted({channel for h in heard for channel in h.rotors}):
         rotors = [rotor for h in heard for rotor in h.rotors.get(channel, ())]
-        longest = max(rotors, key=lambda rotor: len(rotor.zero))
-        frames = [frame for rotor in rotors for frame in ootx.frames(rotor.bits())]
-        data = _factory_data([f.payload for f in frames if f.right], channel + 1, warnings)
+        longest = max(rotors, key=lambda rotor: len(rotor.zero_tick))
+        frames = [frame for rotor in rotors for frame in ootx.decode_frames(rotor.slow_bits())]
+        data = _factory_data([f.payload for f in frames if f.is_valid], channel + 1, warnings)
         told.append(
             StationReport(
                 channel + 1,
                 None if data is None else data.id,
-                longest.period,
+                longest.period_tick,
                 int(np.count_nonzero(sweeps.channel == channel + 1)),
                 None,
                 None if data is None else data.calibration,
-                sum(frame.right for frame in frames),
-                sum(not frame.right for frame in frames),
+                sum(frame.is_valid for frame in frames),
+                sum(not frame.is_valid for frame in frames),
             )
         )
     return tuple(told)
@@ -196,7 +196,7 @@ def _factory_data(
     read: list[ootx.FactoryData] = []
     for payload in payloads:
         try:
-            data = ootx.factory_data(payload)
+            data = ootx.decode_factory_data(payload)
         except InputError as error:
             warnings.append(f"channel {channel}: {error.message}")
             continue

@@ -125,8 +125,8 @@ def _hear_run(
                 "heard do not fit one rotor; is there a second station on it?"
             )
         here = np.flatnonzero(sweep.channel == channel)
-        turn[here], bit[here] = rotor.turns(tick[here])
-        plane[here] = planes(turn[here], tick[here], rotor.period)
+        turn[here], bit[here] = rotor.phase_and_bit(tick[here])
+        plane[here] = planes(turn[here], tick[here], rotor.period_tick)
     kept = np.isfinite(turn)
     heard.rotorless += n - int(np.count_nonzero(kept))
     heard.repaired += run.repaired

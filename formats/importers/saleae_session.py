@@ -9,11 +9,11 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.channels import channel_of
-from locatk.core.lighthouse.demodulation.identification import false_rate
-from locatk.core.lighthouse.demodulation.pipeline import (
+from locatk.core.lighthouse.demodulation import (
     DecodedSweeps,
     DemodulatedRecording,
     demodulate_recording,
+    false_match_probability,
 )
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -73,18 +73,20 @@ def _session(
     capture: LightCapture, reception: DemodulatedRecording, device: str
 ) -> ImportedSession:
     facts = capture.facts()
-    bursts = sum(len(reading.bursts) for reading in reception.readings)
-    read = sum(int(np.count_nonzero(reading.read)) for reading in reception.readings)
-    rims = sum(int(np.count_nonzero(reading.beside >= 0)) for reading in reception.readings)
+    bursts = sum(len(reading.bursts) for reading in reception.photodiodes)
+    read = sum(int(np.count_nonzero(reading.is_accepted)) for reading in reception.photodiodes)
+    rims = sum(
+        int(np.count_nonzero(reading.continued_burst >= 0)) for reading in reception.photodiodes
+    )
     facts["bursts"] = f"{bursts:,}, of which {read:,} were read and {rims:,} are rims of those"
     facts["false polynomials"] = _false_polynomials(reception)
-    warnings = [*reception.notes]
+    warnings = [warning.message for warning in reception.warnings]
     for reason, words in REASONS.items():
-        number = sum(reading.rejected[reason] for reading in reception.readings)
+        number = sum(reading.rejected[reason] for reading in reception.photodiodes)
         if number:
             facts[reason] = f"{number:,}"
             warnings.append(f"{number:,} of {bursts:,} bursts {words}")
-    doubled = sum(reading.rejected["burst_of_doubled_channel"] for reading in reception.readings)
+    doubled = sum(reading.rejected["burst_of_doubled_channel"] for reading in reception.photodiodes)
     return ImportedSession(
         _sweeps(capture, reception.sweeps, device),
         _scene(reception.stations),
@@ -99,12 +101,14 @@ def _session(
 def _false_polynomials(reception: DemodulatedRecording) -> str:
     """How many bursts name a station that no rotor supports, and how many by chance would."""
     strange, alone, chance = 0, 0, 0.0
-    for reading in reception.readings:
-        certain = reading.matches.certain()
+    for reading in reception.photodiodes:
+        certain = reading.matches.is_certain()
         channel = channel_of(reading.matches.polynomial[certain])
         alone += len(channel)
         strange += int(np.count_nonzero(~np.isin(channel, list(reception.rotors))))
-        chance += float(np.sum([false_rate(e) for e in reading.matches.evidence[certain]]))
+        chance += float(
+            np.sum([false_match_probability(e) for e in reading.matches.evidence_bits[certain]])
+        )
     return (
         f"{strange:,} of {alone:,} bursts that stand on their own name a station without a rotor; "
         f"{chance:.1g} by chance"
@@ -112,9 +116,9 @@ def _false_polynomials(reception: DemodulatedRecording) -> str:
 
 
 def _as_paper(capture: LightCapture, device: str) -> ImportedSession:
-    from locatk.core.lighthouse.published import light_receiver as paper_receive
+    from locatk.core.lighthouse.published.light_decoding import decode_recording
 
-    caught, bursts = paper_receive.receive(capture.edges)
+    caught, bursts = decode_recording(capture.edges)
     facts = capture.facts()
     facts["method"] = "paper"
     facts["bursts"] = f"{bursts:,}, of which {len(caught):,} were decoded"

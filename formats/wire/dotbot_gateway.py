@@ -57,7 +57,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.channels import CHANNELS, POLYNOMIALS, channel_of
+from locatk.core.lighthouse.channels import CHANNELS, POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.formats.wire.decoder import Batch, Counts, Options, Stream, Ticks
 from locatk.formats.wire.hdlc import HdlcDecoder, packed
@@ -210,17 +210,17 @@ def _raw(content: Frames, frame: Index) -> list[_Rows]:
     windows = windows.ravel()
     bits, offset = windows["bits"], windows["offset"].astype(np.int64)
     polynomial = windows["polynomial"].astype(np.int64)
-    known = polynomial < POLYNOMIALS
+    known = polynomial < POLYNOMIAL_COUNT
     captures = {
         "sensor": np.zeros(len(bits), np.int32),
         "bits": bits,
         "polynomial": np.where(known, polynomial, UNKNOWN).astype(np.int32),
         "bit_offset": offset.astype(np.int32),
     }
-    good = known & (offset >= 0) & (offset <= 64 - lfsr.BITS)
-    count = np.full(len(bits), lfsr.NOWHERE)
+    good = known & (offset >= 0) & (offset <= 64 - lfsr.REGISTER_BITS)
+    count = np.full(len(bits), lfsr.NO_INDEX)
     count[good] = lfsr.window_index(bits[good], offset[good], polynomial[good])
-    good &= count != lfsr.NOWHERE
+    good &= count != lfsr.NO_INDEX
     sweeps = _sweeps(channel_of(polynomial[good]), polynomial[good], count[good])
     return [_Rows(CAPTURES, frame, captures), _Rows(SWEEPS, frame[good], sweeps)]
 
@@ -230,7 +230,7 @@ def _robot_data(content: Frames, frame: Index) -> list[_Rows]:
 
 
 def _processed(content: Frames, frame: Index) -> list[_Rows]:
-    good = (content["polynomial"] < POLYNOMIALS) & (content["index"] < lfsr.LENGTH)
+    good = (content["polynomial"] < POLYNOMIAL_COUNT) & (content["index"] < lfsr.SEQUENCE_LENGTH)
     content, polynomial = content[good], content["polynomial"][good]
     sweeps = _sweeps(channel_of(polynomial), polynomial, content["index"])
     return [_Rows(TIMED_SWEEPS, frame[good], sweeps, content["time"].astype(np.int64))]
@@ -293,7 +293,7 @@ def _layouts() -> dict[int, list[_Layout]]:
         for rest in ("V20", "V28"):
             add(header, [*fixed, kind(6)], [*_ADVERTISED, ("rest", rest)], _advertisement)
     places = [("station", 0, len(CHANNELS) - 1)]
-    places += [(name, 0, lfsr.LENGTH - 1) for name in ("first", "second")]
+    places += [(name, 0, lfsr.SEQUENCE_LENGTH - 1) for name in ("first", "second")]
     bare = [("station", "u1"), ("first", "<u4"), ("second", "<u4")]
     add([], places, bare, _calibration)
     return found
@@ -319,7 +319,7 @@ def encode(recording: Recording) -> Iterator[tuple[int, bytes]]:
     sweeps, usable = recording.sweeps, np.zeros(0, bool)
     if sweeps is not None:
         usable = (sweeps.sensor == 0) & np.isin(sweeps.channel, CHANNELS)
-        usable &= (sweeps.count >= 0) & (sweeps.count < lfsr.LENGTH - 0.5)
+        usable &= (sweeps.count >= 0) & (sweeps.count < lfsr.SEQUENCE_LENGTH - 0.5)
     if sweeps is None or not np.any(usable):
         raise InputError(
             "no sweeps that a DotBot could see", hint="give a session with sweeps of sensor 0"

@@ -281,7 +281,7 @@ def _locks(buffer: Bytes, pulse: Mask, sync: Mask) -> Index:
 def _stands(pulses: NDArray[np.void], polynomial: Index, count: NDArray[Any]) -> Mask:
     """Whether beam words stand in the sequence of a polynomial at a count."""
     index = lfsr.indices(pulses["word"], np.maximum(polynomial, 0))
-    return np.asarray((index != lfsr.NOWHERE) & (np.abs(index - count) <= SLACK))
+    return np.asarray((index != lfsr.NO_INDEX) & (np.abs(index - count) <= SLACK))
 
 
 def _pulses(rows: Bytes, ends: Index) -> NDArray[np.void]:
@@ -347,7 +347,7 @@ def encode(recording: Recording) -> Iterator[tuple[int, bytes]]:
     if sweeps is not None:
         usable = (sweeps.device == 0) & np.isin(sweeps.sensor, range(SENSORS))
         usable &= np.isin(sweeps.channel, CHANNELS)
-        usable &= (sweeps.count >= 0.5) & (sweeps.count <= lfsr.LENGTH - 1)
+        usable &= (sweeps.count >= 0.5) & (sweeps.count <= lfsr.SEQUENCE_LENGTH - 1)
     if sweeps is None or not np.any(usable):
         raise InputError(
             "no sweeps that a Lighthouse deck could see",

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from locatk.core.lighthouse.calibration import Calibration, predict_angles
-from locatk.core.lighthouse.demodulation.ootx import encode
+from locatk.core.lighthouse.demodulation.ootx import encode_frame
 from locatk.formats.observations import read_sweeps, read_trajectories
 from locatk.formats.session import Session
 
@@ -98,7 +98,7 @@ class Lamp:
             local = (where(zero[:, None] + turn * period) - self.position) @ self.rotation
             angle = predict_angles(local, self.calibration)[..., [0, 1], [0, 1]]
             turn = angle / (2 * np.pi) + [1 / 3, 2 / 3]
-        slow = np.resize(encode(self.payload), len(zero))
+        slow = np.resize(encode_frame(self.payload), len(zero))
         index = np.floor(turn * ticks / 8).astype(int) - bits // 2
         starts, edges = [], []
         for rotation, plane in itertools.product(range(len(zero)), (0, 1)):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from locatk.core.lighthouse.demodulation import identification as identify
+from locatk.core.lighthouse.demodulation import identification
 from locatk.formats.bench import Figure, infrared, infrared_places, infrared_survive
 from locatk.formats.importers.libsurvive import read_libsurvive
 
@@ -59,14 +59,14 @@ def test_stored_calibrations_are_told_from_wrong_ones(data: Path) -> None:
 
 def test_a_wrong_place_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert infrared_places.wrong_places(3) == 0
-    monkeypatch.setattr(identify, "FOLLOW", 50)  # more than 60 bits can show
+    monkeypatch.setattr(identification, "MIN_PREDICTED_BITS", 50)  # more than 60 bits can show
     assert infrared_places.wrong_places(3) == 131_071
 
 
 def test_noise_that_passes_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(infrared_places, "NOISE", 3_000)
     assert infrared_places.noise_share() < 0.005
-    monkeypatch.setattr(infrared_places, "ALONE", 10.0)
+    monkeypatch.setattr(infrared_places, "MIN_STANDALONE_EVIDENCE_BITS", 10.0)
     assert infrared_places.noise_share() > 0.05
 
 

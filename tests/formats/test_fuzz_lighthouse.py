@@ -33,8 +33,11 @@ from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.demodulation import ootx
 from locatk.core.lighthouse.demodulation.pipeline import demodulate_recording
-from locatk.core.lighthouse.published import light_decoding as paper_light
-from locatk.core.lighthouse.published import light_receiver as paper_receive
+from locatk.core.lighthouse.published.light_decoding import (
+    decode_recording,
+    decode_windows,
+    sample_windows,
+)
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Edges, StationReport
 from locatk.core.lighthouse.scene import Marker, Scene, Station
@@ -179,7 +182,7 @@ DEVICE = {
 
 def recording(seconds: float = 0.5) -> bytes:
     """A recording of libsurvive: two stations, a tracker of three photodiodes."""
-    bits, lines = ootx.encode(payload()), []
+    bits, lines = ootx.encode_frame(payload()), []
     for channel in (0, 3):
         period = 8 * float(period_counts(channel + 1)) / 48e6
         for n in range(int(seconds / period)):
@@ -232,7 +235,7 @@ LOGS = [
 ]
 
 
-FACTORY = ootx.factory_data(payload()).calibration
+FACTORY = ootx.decode_factory_data(payload()).calibration
 SCENE = Scene(
     stations=(Station(1, np.array([1.0, 2.0, 3.0]), np.eye(3), FACTORY, 0x4CC60647),),
     markers=(Marker("a", np.zeros(3)),),
@@ -418,28 +421,30 @@ def slow_bits(rng: np.random.Generator, folder: Path, further: bool) -> None:
     if further:
         for place in rng.integers(0, len(content), 3):
             content[place] = int(rng.integers(256))
-    one = ootx.encode(bytes(content))
+    one = ootx.encode_frame(bytes(content))
     bits = np.tile(one, 3)[int(rng.integers(len(one))) :][: int(rng.integers(1400))]
     wrong = rng.random(len(bits)) < 10 ** rng.uniform(-4, -1)
     bits = np.where(wrong, rng.integers(-1, 2, len(bits)), bits).astype(np.int8)
     if rng.random() < 0.3 and len(bits):
         at = int(rng.integers(len(bits)))
         bits = np.concatenate([bits[:at], bits[at : at + 40], bits[at:]])
-    for frame in ootx.frames(bits):
-        if frame.right:
+    for frame in ootx.decode_frames(bits):
+        if frame.is_valid:
             # Of a frame with a right checksum nothing else may come than was sent.
             assert frame.payload == content
-            ootx.factory_data(frame.payload)
-    ootx.factory_data(rng.bytes(int(rng.integers(40, 46))) if rng.random() < 0.1 else content)
+            ootx.decode_factory_data(frame.payload)
+    ootx.decode_factory_data(
+        rng.bytes(int(rng.integers(40, 46))) if rng.random() < 0.1 else content
+    )
 
 
 def windows(rng: np.random.Generator, folder: Path, further: bool) -> None:
     """Windows of 64 bytes as the paper's receiver samples them."""
     starts = np.array(LIGHT)[np.flatnonzero(np.diff(LIGHT, prepend=-99_999) > 2000)]
-    found = paper_light.windows_of(edges_of(np.array(LIGHT)), starts[:40])
+    found = sample_windows(edges_of(np.array(LIGHT)), starts[:40])
     data = damaged(found.tobytes(), [rng.bytes(64), bytes(64), b"\xff" * 64], rng)
     data = data[: len(data) // 64 * 64]
-    decodes = paper_light.decode(np.frombuffer(data, np.uint8).reshape(-1, 64))
+    decodes = decode_windows(np.frombuffer(data, np.uint8).reshape(-1, 64))
     assert len(decodes.index) == len(data) // 64
 
 
@@ -478,7 +483,7 @@ def edges(rng: np.random.Generator, folder: Path, further: bool) -> None:
     if rng.random() < 0.3:
         lines.append(edges_of(tick[: int(rng.integers(len(tick) + 1))], rate))
     if further:
-        paper_receive.receive(lines)
+        decode_recording(lines)
         return
     sweeps = demodulate_recording(lines).sweeps
     assert np.all(np.isfinite(sweeps.tick))

@@ -303,6 +303,6 @@ def test_damaged_logs_give_an_error_or_sweeps(
         found = read_dotbot_log([path])
     except LocatkError:
         return
-    assert np.all((found.sweeps.count >= 0) & (found.sweeps.count < lfsr.LENGTH))
+    assert np.all((found.sweeps.count >= 0) & (found.sweeps.count < lfsr.SEQUENCE_LENGTH))
     assert np.all((found.sweeps.channel >= 1) & (found.sweeps.channel <= 16))
     assert np.all(np.diff(found.sweeps.time_ns) >= 0)

@@ -19,7 +19,7 @@ from locatk.core.errors import FormatError, InputError, LocatkError, MissingData
 from locatk.core.geometry import matrix_from_quaternion
 from locatk.core.lighthouse.calibration import predict_angles
 from locatk.core.lighthouse.channels import period_counts, period_ticks
-from locatk.core.lighthouse.demodulation.ootx import encode
+from locatk.core.lighthouse.demodulation.ootx import encode_frame
 from locatk.core.lighthouse.demodulation.tracker_syncs import fit_rotor
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.recording import Sweeps
@@ -79,7 +79,7 @@ class Room:
         rng = np.random.default_rng(self.seed)
         rate = 48e6 * (1 + self.ppm * 1e-6)
         for channel in self.channels:
-            bits = encode(payload(0x10 + channel, self.says or channel))
+            bits = encode_frame(payload(0x10 + channel, self.says or channel))
             period = float(period_ticks(channel)) / 48e6 * (1 + 1e-6 * channel)
             zero = np.arange(int(self.seconds / period)) * period + 0.001 * channel
             slow = np.sin(np.arange(len(zero)) / 3.0 + channel) * self.wander / 48e6
@@ -384,7 +384,7 @@ def test_rotors_need_four_syncs_of_one_rhythm() -> None:
     assert fit_rotor(rng.uniform(0, 1e9, 50), bit, 959e3) is None
     rotor = fit_rotor(np.arange(4) * 959e3 + 5e12, bit[:4], 959e3)
     assert rotor is not None
-    turn, told = rotor.turns(5e12 + np.array([0.25, 1.5, 3.25, 60.0, -40.5, -60.0]) * 959e3)
+    turn, told = rotor.phase_and_bit(5e12 + np.array([0.25, 1.5, 3.25, 60.0, -40.5, -60.0]) * 959e3)
     assert turn[[0, 1, 2, 4]] == pytest.approx([0.25, 0.5, 0.25, 0.5], abs=1e-6)
     assert np.isnan(turn[[3, 5]]).all()
     assert told.tolist() == [0, 0, 0, -1, -1, -1]
@@ -394,7 +394,7 @@ def test_silence_between_syncs_is_of_unknown_bits(tmp_path: Path) -> None:
     number = np.r_[0:10, 20:30, 90_000:90_010]
     rotor = fit_rotor(number * 959_000.0, np.ones(30, np.int32), 959e3)
     assert rotor is not None
-    bits = rotor.bits()
+    bits = rotor.slow_bits()
     assert np.count_nonzero(bits == 1) == 30
     assert bits[:30].tolist() == [1] * 10 + [-1] * 10 + [1] * 10
     assert len(bits) < 1000

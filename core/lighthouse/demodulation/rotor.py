@@ -1,15 +1,14 @@
-"""The rotor of each station: its period, and its phase followed over time.
+"""Estimate the period and the phase over time of each base station's rotor.
 
-A decoded burst tells when the rotor was at its zero: its own time less the time that its
-index takes. A station's rotor turns with a crystal's constancy, wanders about it by some
-microseconds, and starts at another moment than any accident would name. So the bursts of a
-station must agree on one period, and from one to the next on one phase; those that do not were
-decoded wrong.
+An identified burst determines a time at which the rotor was at its zero: its own time minus the
+duration of its sequence index. The rotor of a station rotates with the constancy of a crystal and
+wanders about it by some microseconds. The bursts of a station must therefore agree on one period,
+and successive bursts on one phase. Bursts that do not were identified wrongly.
 
-Bursts of one phase, without a longer silence, are a stretch. A station that was out of sight
-for long, or was switched off and on, makes another one. Two stretches at the same time are two
-stations on one channel. No light tells them apart for good, so that all that is said of such a
-channel is that it happens.
+Bursts that agree on one phase, without a longer gap, form a segment. A station that was hidden for
+long, or was switched off and on, starts another segment. Two simultaneous segments are two
+stations on one channel. Their light cannot be separated reliably, so such a channel is reported
+and gets no rotor.
 """
 
 from __future__ import annotations
@@ -33,333 +32,361 @@ from locatk.core.lighthouse.channels import (
 
 Array = NDArray[np.float64]
 
-SEED = 28.0
-"""Evidence in bits from which on a burst may vote for a rotor: an accident alone, but not
-together."""
+MIN_VOTE_EVIDENCE_BITS = 28.0
+"""Evidence from which a burst may vote for a rotor. A single burst of it may be noise; several
+that agree are not."""
 
-LEAST_BURSTS = 4
-"""That agree make a stretch of a rotor."""
+MIN_SEGMENT_BURSTS = 4
+"""Number of agreeing bursts that form a segment."""
 
-CLOCKS_PPM = 200.0
-"""Clocks of station and recorder together are off by at most this."""
+MAX_CLOCK_ERROR_PPM = 200.0
+"""Largest relative deviation of a period from nominal: clocks of station and recorder together."""
 
-AGREE_S = 2e-6
-"""From the followed phase: a burst farther away was decoded wrong. Single bursts scatter by
-0.13 us at 1 m and by 0.5 us at 4 m (Bitcraze's recordings)."""
+MAX_ROTOR_RESIDUAL_S = 2e-6
+"""Largest distance of a burst from the estimated phase; beyond it, it was identified wrongly.
+Single bursts scatter by 0.13 us at 1 m and by 0.5 us at 4 m (recordings take1 and about_4m of
+Bitcraze lighthouse-fpga)."""
 
-LINK_S = 3e-6
-LINK_PPM = 2.0
-"""Slack between two bursts of one rotor, and what it grows by with the time between them."""
+MAX_LINK_ERROR_S = 3e-6
+"""Largest deviation of the time between two linked bursts from whole rotations."""
 
-NEIGHBOURS = 8
-"""Bursts before and after to which one may link."""
+MAX_LINK_DRIFT_PPM = 2.0
+"""Growth of :data:`MAX_LINK_ERROR_S` with the time between the bursts."""
 
-SILENCE = 50
-"""Rotations without a burst after which a stretch ends."""
+MAX_LINK_NEIGHBOURS = 8
+"""A burst is compared with this many bursts before and after it."""
 
-BASELINES = (4, SILENCE)
-"""Rotations over which the period is measured, in the steps in which it is found."""
+MAX_GAP_ROTATIONS = 50
+"""Rotations without a burst after which a segment ends."""
 
-RESTART_S = 20e-6
-"""A rotor that comes back farther than this from where it should be started again."""
+PERIOD_BASELINES_ROTATIONS = (4, MAX_GAP_ROTATIONS)
+"""Baselines over which the period is measured, in ascending order of precision."""
 
-KNOT_S = 0.5
-"""Between the knots of the followed phase."""
+MIN_RESTART_SHIFT_S = 20e-6
+"""Phase shift after a gap from which a rotor counts as restarted."""
 
-STIFFNESS = 3.0
-"""Weight of smoothness against agreement: with it a knot averages over some seconds."""
+KNOT_SPACING_S = 0.5
+"""Time between the knots of the phase curve."""
 
-SECOND_SHARE = 0.1
-"""Of a channel's bursts agree on another phase: a second station on it."""
+SMOOTHNESS_WEIGHT = 3.0
+"""Weight of the squared second differences of the phase curve, relative to the mean number of
+bursts per knot. With 3 a knot averages over some seconds."""
+
+SMOOTHING_ITERATIONS = 4
+"""Iterations of the reweighted least-squares fit of the phase curve."""
+
+HUBER_SIGMAS = 2.0
+"""Residual, in robust standard deviations, from which a burst gets less weight."""
+
+MAX_SECOND_ROTOR_FRACTION = 0.1
+"""If more than this fraction of a channel's bursts agrees on another phase at the same time, two
+stations send on the channel."""
 
 
 @dataclass(frozen=True)
 class Rotor:
-    """A station's rotor, followed over a recording.
+    """Rotation of a base station over a recording.
 
     Attributes
     ----------
     channel : int
         1 to 16.
-    period : float
-        Mean length of a rotation, in ticks of the recorder.
-    zero : float
-        When rotation 0 began, in ticks of the recorder.
-    knots : (k,) ndarray
-        Times, in ticks of the recorder, at which ``wander`` is given.
-    wander : (k,) ndarray
-        By how much the rotor's zero is later there than ``zero + k period``, in ticks. Over
-        silences it goes straight to where the rotor comes back.
-    bursts : int
-        That agree.
-    restarts : int
-        How often it came back from a silence with another phase.
-    sigma : float
-        Standard deviation of one of them, in ticks.
+    period_tick : float
+        Mean duration of a rotation, in ticks of the recorder.
+    zero_tick : float
+        Start of rotation 0, in ticks of the recorder.
+    knot_tick : (k,) ndarray
+        Times at which ``wander_tick`` is given, in ticks of the recorder.
+    wander_tick : (k,) ndarray
+        Delay of the rotor's zero relative to ``zero_tick + k period_tick``, in ticks. It is
+        interpolated linearly, over gaps too.
+    burst_count : int
+        Number of bursts that agree.
+    restart_count : int
+        Number of gaps after which the rotor had another phase.
+    sigma_tick : float
+        Standard deviation of a burst, in ticks.
     """
 
     channel: int
-    period: float
-    zero: float
-    knots: Array
-    wander: Array
-    bursts: int
-    restarts: int
-    sigma: float
+    period_tick: float
+    zero_tick: float
+    knot_tick: Array
+    wander_tick: Array
+    burst_count: int
+    restart_count: int
+    sigma_tick: float
 
     @property
     def ticks_per_bit(self) -> float:
-        """Length of a bit of its station, in ticks of the recorder."""
-        return self.period * TICKS_PER_COUNT / float(period_ticks(self.channel))
+        """Duration of a bit of this station, in ticks of the recorder."""
+        return self.period_tick * TICKS_PER_COUNT / float(period_ticks(self.channel))
 
-    def turn(self, tick: Array) -> tuple[NDArray[np.int64], Array]:
-        """Rotation and place in it, 0 to below 1, of times in ticks of the recorder."""
-        turns = (tick - self.zero - np.interp(tick, self.knots, self.wander)) / self.period
-        whole = np.floor(turns)
-        return whole.astype(np.int64), turns - whole
+    def rotation_and_phase(self, tick: Array) -> tuple[NDArray[np.int64], Array]:
+        """Return rotation number and phase (0 to below 1 rotation) at times in recorder ticks."""
+        wander = np.interp(tick, self.knot_tick, self.wander_tick)
+        rotations = (tick - self.zero_tick - wander) / self.period_tick
+        whole = np.floor(rotations)
+        return whole.astype(np.int64), rotations - whole
 
-    def start(self, rotation: NDArray[np.int64]) -> Array:
-        """When rotations began, in ticks of the recorder."""
-        tick = self.zero + rotation * self.period
-        return tick + np.interp(tick, self.knots, self.wander)
+    def start_tick(self, rotation: NDArray[np.int64]) -> Array:
+        """Return the start of rotations, in ticks of the recorder."""
+        tick = self.zero_tick + rotation * self.period_tick
+        return tick + np.interp(tick, self.knot_tick, self.wander_tick)
 
-    def period_ticks(self, rate_hz: float) -> float:
-        """Its period in ticks of 48 MHz of a recorder with ``rate_hz`` ticks a second."""
-        return self.period / rate_hz * TICK_HZ
+    def period_48mhz_ticks(self, rate_hz: float) -> float:
+        """Return the period in ticks of 48 MHz; the recorder has ``rate_hz`` ticks per second."""
+        return self.period_tick / rate_hz * TICK_HZ
 
-    def ppm(self, rate_hz: float) -> float:
-        """By how much its rotations last longer than nominal, in parts per million."""
-        return (self.period_ticks(rate_hz) / float(period_ticks(self.channel)) - 1) * 1e6
+    def period_deviation_ppm(self, rate_hz: float) -> float:
+        """Return the deviation of the period from nominal, in parts per million."""
+        return (self.period_48mhz_ticks(rate_hz) / float(period_ticks(self.channel)) - 1) * 1e6
 
 
 @dataclass(frozen=True)
 class RotorSet:
-    """The rotors of a recording.
+    """Rotors of all base stations of a recording.
 
     Attributes
     ----------
     rotors : dict of int to Rotor
         By channel.
-    doubled : tuple of int
-        Channels on which more than one station sends; they have no rotor.
+    doubled_channels : tuple of int
+        Channels on which more than one station sends. They have no rotor.
     """
 
     rotors: dict[int, Rotor]
-    doubled: tuple[int, ...]
+    doubled_channels: tuple[int, ...]
 
 
 def find_rotors(
     tick: Array,
     polynomial: NDArray[np.int32],
     index: NDArray[np.int64],
-    evidence: Array,
+    evidence_bits: Array,
     rate_hz: float,
 ) -> RotorSet:
-    """Rotors that bursts agree on.
+    """Find the rotors that bursts agree on.
 
     Parameters
     ----------
     tick : (n,) ndarray
-        When the first bit of each burst began, ascending, in ticks of the recorder.
+        Start of the first bit of each burst, ascending, in ticks of the recorder.
     polynomial, index : (n,) ndarray
-        As decoded; bursts with polynomial -1 are passed over.
-    evidence : (n,) ndarray
-        In bits (:class:`~locatk.core.lighthouse.demodulation.identification.SequenceMatches`).
+        As identified. Bursts with polynomial -1 are ignored.
+    evidence_bits : (n,) ndarray
+        See :class:`~locatk.core.lighthouse.demodulation.identification.SequenceMatches`.
     rate_hz : float
-        Ticks of the recorder a second.
+        Ticks of the recorder per second.
     """
     rotors: dict[int, Rotor] = {}
     doubled = []
-    votes = (polynomial >= 0) & (evidence >= SEED)
-    channel = np.where(votes, channel_of(polynomial), 0)
-    for number in CHANNELS:
-        mine = np.flatnonzero(channel == number)
-        if len(mine) < LEAST_BURSTS:
+    is_vote = (polynomial >= 0) & (evidence_bits >= MIN_VOTE_EVIDENCE_BITS)
+    channels = np.where(is_vote, channel_of(polynomial), 0)
+    for channel in CHANNELS:
+        rows = np.flatnonzero(channels == channel)
+        if len(rows) < MIN_SEGMENT_BURSTS:
             continue
-        period = _period(number, tick[mine], index[mine], rate_hz)
-        # Right ones ascend in time; wrong ones are anywhere.
-        start = zeros(tick[mine], index[mine], number, period)
-        order = np.argsort(start, kind="stable")
-        stretches, second = _apart(_stretches(start[order], period, rate_hz))
-        if not stretches:
+        period = _estimate_period(channel, tick[rows], index[rows], rate_hz)
+        # Zeros of right identifications ascend in time; those of wrong ones are arbitrary.
+        zero = rotor_zero_ticks(tick[rows], index[rows], channel, period)
+        order = np.argsort(zero, kind="stable")
+        segments, excluded = _select_disjoint(_link_segments(zero[order], period, rate_hz))
+        if not segments:
             continue
-        if second > SECOND_SHARE * sum(map(len, stretches)):
-            doubled.append(number)
+        if excluded > MAX_SECOND_ROTOR_FRACTION * sum(map(len, segments)):
+            doubled.append(channel)
             continue
-        mine = mine[order]
-        parts = [mine[rows] for rows in stretches]
-        rotors[number] = _followed(number, tick, index, parts, period, rate_hz)
+        rows = rows[order]
+        segment_rows = [rows[segment] for segment in segments]
+        rotors[channel] = _fit_rotor(channel, tick, index, segment_rows, period, rate_hz)
     return RotorSet(rotors, tuple(doubled))
 
 
-def zeros(tick: Array, index: NDArray[np.int64], channel: int, period: float) -> Array:
-    """When the rotor was at its zero, by each burst, in ticks of the recorder.
+def rotor_zero_ticks(
+    tick: Array, index: NDArray[np.int64], channel: int, period_tick: float
+) -> Array:
+    """Return the time of the rotor's zero according to each burst, in ticks of the recorder.
 
-    The station counts bits and rotations by one clock: ``index`` lasts as much longer than
-    nominal as the rotation does.
+    One clock of the station drives bits and rotations. The duration of ``index`` therefore
+    deviates from nominal by the same factor as the period.
     """
-    return tick - index * (period * TICKS_PER_COUNT / float(period_ticks(channel)))
+    return tick - index * (period_tick * TICKS_PER_COUNT / float(period_ticks(channel)))
 
 
-def _period(channel: int, tick: Array, index: NDArray[np.int64], rate_hz: float) -> float:
-    """The period on which most pairs of bursts agree, by ever longer baselines."""
+def _estimate_period(channel: int, tick: Array, index: NDArray[np.int64], rate_hz: float) -> float:
+    """Return the period on which most pairs of bursts agree, refined over longer baselines."""
     nominal = period = float(period_ticks(channel)) / TICK_HZ * rate_hz
-    for rotations in BASELINES:
-        start = np.sort(zeros(tick, index, channel, period))
-        far = np.searchsorted(start, start + (rotations + 0.5) * period) - 1
-        step = start[far] - start
-        turns = np.rint(step / period)
-        some = turns > 0
-        each = step[some] / turns[some]
-        each = each[np.abs(each - nominal) < CLOCKS_PPM * 1e-6 * nominal]
-        if len(each):
-            period = _densest(each, 2 * LINK_S * rate_hz / rotations)
+    for baseline in PERIOD_BASELINES_ROTATIONS:
+        zero = np.sort(rotor_zero_ticks(tick, index, channel, period))
+        partner = np.searchsorted(zero, zero + (baseline + 0.5) * period) - 1
+        interval = zero[partner] - zero
+        rotations = np.rint(interval / period)
+        is_pair = rotations > 0
+        candidates = interval[is_pair] / rotations[is_pair]
+        is_plausible = np.abs(candidates - nominal) < MAX_CLOCK_ERROR_PPM * 1e-6 * nominal
+        candidates = candidates[is_plausible]
+        if len(candidates):
+            period = _densest_median(candidates, 2 * MAX_LINK_ERROR_S * rate_hz / baseline)
     return period
 
 
-def _densest(values: Array, width: float) -> float:
-    """Median in the interval of a given width that holds most values."""
+def _densest_median(values: Array, width: float) -> float:
+    """Return the median of the values in the interval of a given width that contains most."""
     ordered = np.sort(values)
     number = np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered))
-    at = int(np.argmax(number))
-    return float(np.median(ordered[at : at + number[at]]))
+    first = int(np.argmax(number))
+    return float(np.median(ordered[first : first + number[first]]))
 
 
-def _stretches(start: Array, period: float, rate_hz: float) -> list[NDArray[np.int64]]:
-    """Rows of zeros (n,), ascending in time, that link one to the next by whole rotations; each
-    ascending, those with most rows first."""
+def _link_segments(zero: Array, period: float, rate_hz: float) -> list[NDArray[np.int64]]:
+    """Link zeros (n,), ascending, to segments if they differ by whole rotations.
+
+    Returns the rows of each segment, ascending; the longest segment comes first.
+    """
     pairs = [np.zeros((2, 0), np.int64)]
-    for ahead in range(1, min(NEIGHBOURS, len(start) - 1) + 1):
-        step = start[ahead:] - start[:-ahead]
-        off = np.abs(step - np.rint(step / period) * period)
-        near = off < LINK_S * rate_hz + LINK_PPM * 1e-6 * step
-        row = np.flatnonzero(near & (step < (SILENCE + 0.5) * period))
+    for ahead in range(1, min(MAX_LINK_NEIGHBOURS, len(zero) - 1) + 1):
+        interval = zero[ahead:] - zero[:-ahead]
+        error = np.abs(interval - np.rint(interval / period) * period)
+        agrees = error < MAX_LINK_ERROR_S * rate_hz + MAX_LINK_DRIFT_PPM * 1e-6 * interval
+        row = np.flatnonzero(agrees & (interval < (MAX_GAP_ROTATIONS + 0.5) * period))
         pairs.append(np.stack([row, row + ahead]))
     link = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(link.shape[1]), (link[0], link[1])), (len(start), len(start)))
-    _, of = connected_components(graph, directed=False)
-    order = np.argsort(of, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(of[order])) + 1)
-    return sorted((rows for rows in parts if len(rows) >= LEAST_BURSTS), key=len, reverse=True)
+    graph = coo_array((np.ones(link.shape[1]), (link[0], link[1])), (len(zero), len(zero)))
+    _, component = connected_components(graph, directed=False)
+    order = np.argsort(component, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(component[order])) + 1)
+    segments = (rows for rows in parts if len(rows) >= MIN_SEGMENT_BURSTS)
+    return sorted(segments, key=len, reverse=True)
 
 
-def _apart(stretches: list[NDArray[np.int64]]) -> tuple[list[NDArray[np.int64]], int]:
-    """Stretches, ascending, of which no two are at the same time, the long ones first taken; and
-    the number of rows in the others."""
-    taken: list[NDArray[np.int64]] = []
-    others = 0
-    for rows in stretches:
-        at = bisect_left(taken, rows[0], key=lambda each: int(each[0]))
-        before = at == 0 or taken[at - 1][-1] < rows[0]
-        if before and (at == len(taken) or rows[-1] < taken[at][0]):
-            taken.insert(at, rows)
+def _select_disjoint(segments: list[NDArray[np.int64]]) -> tuple[list[NDArray[np.int64]], int]:
+    """Select segments that do not overlap in time, long ones first.
+
+    Returns the selected segments, ascending, and the number of rows in the excluded ones.
+    """
+    selected: list[NDArray[np.int64]] = []
+    excluded = 0
+    for rows in segments:
+        k = bisect_left(selected, rows[0], key=lambda segment: int(segment[0]))
+        starts_after = k == 0 or selected[k - 1][-1] < rows[0]
+        if starts_after and (k == len(selected) or rows[-1] < selected[k][0]):
+            selected.insert(k, rows)
         else:
-            others += len(rows)
-    return taken, others
+            excluded += len(rows)
+    return selected, excluded
 
 
-def _followed(
+def _fit_rotor(
     channel: int,
     tick: Array,
     index: NDArray[np.int64],
-    stretches: list[NDArray[np.int64]],
+    segments: list[NDArray[np.int64]],
     period: float,
     rate_hz: float,
 ) -> Rotor:
-    """The rotor whose bursts the rows of ``stretches`` are."""
-    # One slope for all: a stretch may begin at any phase.
+    """Fit the mean period and the phase curve to the bursts of all segments of a rotor."""
+    # All segments share one period; each has its own phase.
     for _ in range(2):
-        above = below = 0.0
-        for rows in stretches:
-            turns, late = _late(zeros(tick[rows], index[rows], channel, period), period)
-            turns -= turns.mean()
-            above, below = above + float(turns @ late), below + float(turns @ turns)
-        if below > 0:
-            period += above / below
-    zero = float(zeros(tick[stretches[0][:1]], index[stretches[0][:1]], channel, period)[0])
+        numerator = denominator = 0.0
+        for rows in segments:
+            zero = rotor_zero_ticks(tick[rows], index[rows], channel, period)
+            rotation, delay = _unwrap_delay(zero, period)
+            rotation -= rotation.mean()
+            numerator += float(rotation @ delay)
+            denominator += float(rotation @ rotation)
+        if denominator > 0:
+            period += numerator / denominator
+    first = segments[0][:1]
+    zero_tick = float(rotor_zero_ticks(tick[first], index[first], channel, period)[0])
     knots: list[Array] = []
     wander: list[Array] = []
-    off: list[Array] = []
+    residuals: list[Array] = []
     restarts = 0
-    for rows in stretches:
-        start = zeros(tick[rows], index[rows], channel, period)
-        shift = start[0] - zero
-        late = shift - np.rint(shift / period) * period + _late(start, period)[1]
-        times, curve = _smooth(start, late, float(start[-1] + period), rate_hz)
-        off.append(late - np.interp(start, times, curve))
+    for rows in segments:
+        zero = rotor_zero_ticks(tick[rows], index[rows], channel, period)
+        shift = zero[0] - zero_tick
+        delay = shift - np.rint(shift / period) * period + _unwrap_delay(zero, period)[1]
+        times, curve = _smooth_delay(zero, delay, float(zero[-1] + period), rate_hz)
+        residuals.append(delay - np.interp(zero, times, curve))
         if knots:
             jump = curve[0] - wander[-1][-1]
             jump -= np.rint(jump / period) * period
-            slack = RESTART_S * rate_hz + LINK_PPM * 1e-6 * (times[0] - knots[-1][-1])
-            restarts += int(abs(jump) > slack)
+            gap = times[0] - knots[-1][-1]
+            max_jump = MIN_RESTART_SHIFT_S * rate_hz + MAX_LINK_DRIFT_PPM * 1e-6 * gap
+            restarts += int(abs(jump) > max_jump)
         knots.append(times)
         wander.append(curve)
-    far = np.concatenate(off)
-    near = far[np.abs(far) < AGREE_S * rate_hz]
+    residual = np.concatenate(residuals)
+    inliers = residual[np.abs(residual) < MAX_ROTOR_RESIDUAL_S * rate_hz]
     return Rotor(
         channel,
         period,
-        zero,
+        zero_tick,
         np.maximum.accumulate(np.concatenate(knots)),
         np.concatenate(wander),
-        bursts=len(near),
-        restarts=restarts,
-        sigma=float(np.sqrt(np.sum(near**2) / max(1, len(near)))),
+        burst_count=len(inliers),
+        restart_count=restarts,
+        sigma_tick=float(np.sqrt(np.sum(inliers**2) / max(1, len(inliers)))),
     )
 
 
-def _late(start: Array, period: float) -> tuple[Array, Array]:
-    """Rotation of each zero of a stretch from its first one, and by how much it is later than
-    a constant rotor says."""
-    turns = np.cumsum(np.rint(np.diff(start, prepend=start[0]) / period))
-    return turns, start - start[0] - turns * period
+def _unwrap_delay(zero: Array, period: float) -> tuple[Array, Array]:
+    """Return rotation number and delay relative to a constant rotor of a segment's zeros (n,)."""
+    rotation = np.cumsum(np.rint(np.diff(zero, prepend=zero[0]) / period))
+    return rotation, zero - zero[0] - rotation * period
 
 
-def _smooth(tick: Array, late: Array, last: float, rate_hz: float) -> tuple[Array, Array]:
-    """Knots of a smooth curve through ``late``, to the end of the last rotation: least squares
-    with a penalty on bends.
+def _smooth_delay(
+    tick: Array, delay: Array, end_tick: float, rate_hz: float
+) -> tuple[Array, Array]:
+    """Fit a smooth piecewise linear curve to delays (n,); return its knots and values.
 
-    Robust by Huber's weights, so that a wrong burst within reach does not pull.
+    Penalized least squares with Huber weights, so that a wrong burst has little influence. The
+    curve ends at ``end_tick``, the end of the last rotation.
     """
-    span = KNOT_S * rate_hz
+    spacing = KNOT_SPACING_S * rate_hz
     first = float(tick[0])
-    count = int(np.ceil((last - first) / span)) + 2
-    knots = first + span * np.arange(count)
-    place = (tick - first) / span
-    left = np.minimum(place.astype(np.int64), count - 2)
-    share = place - left
-    wander = np.zeros(count)
+    count = int(np.ceil((end_tick - first) / spacing)) + 2
+    knots = first + spacing * np.arange(count)
+    position = (tick - first) / spacing
+    left = np.minimum(position.astype(np.int64), count - 2)
+    fraction = position - left
+    curve = np.zeros(count)
     weight = np.ones(len(tick))
-    for _ in range(4):
+    for _ in range(SMOOTHING_ITERATIONS):
         band = np.zeros((3, count))
-        right = np.zeros(count)
-        np.add.at(band[2], left, weight * (1 - share) ** 2)
-        np.add.at(band[2], left + 1, weight * share**2)
-        np.add.at(band[1], left + 1, weight * share * (1 - share))
-        np.add.at(right, left, weight * (1 - share) * late)
-        np.add.at(right, left + 1, weight * share * late)
-        _bend_penalty(band, STIFFNESS * max(1.0, len(tick) / count))
-        wander = solveh_banded(band, right)
-        off = late - np.interp(tick, knots, wander)
-        scale = 1.4826 * float(np.median(np.abs(off))) + 1e-3
-        weight = np.minimum(1.0, 2 * scale / np.maximum(np.abs(off), 1e-12))
-    # Beyond, something else may follow.
-    end = np.interp(last, knots, wander)
-    inside = knots < last
-    return np.append(knots[inside], last), np.append(wander[inside], end)
+        right_side = np.zeros(count)
+        np.add.at(band[2], left, weight * (1 - fraction) ** 2)
+        np.add.at(band[2], left + 1, weight * fraction**2)
+        np.add.at(band[1], left + 1, weight * fraction * (1 - fraction))
+        np.add.at(right_side, left, weight * (1 - fraction) * delay)
+        np.add.at(right_side, left + 1, weight * fraction * delay)
+        _add_curvature_penalty(band, SMOOTHNESS_WEIGHT * max(1.0, len(tick) / count))
+        curve = solveh_banded(band, right_side)
+        residual = delay - np.interp(tick, knots, curve)
+        sigma = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
+        weight = np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(np.abs(residual), 1e-12))
+    # Another segment may follow after the end.
+    end = np.interp(end_tick, knots, curve)
+    is_inside = knots < end_tick
+    return np.append(knots[is_inside], end_tick), np.append(curve[is_inside], end)
 
 
-def _bend_penalty(band: Array, stiffness: float) -> None:
-    """Add ``stiffness`` times the squared second differences to upper bands (3, k); with fewer
-    than three knots, or no data at some, a little weight holds them at zero."""
+def _add_curvature_penalty(band: Array, weight: float) -> None:
+    """Add ``weight`` times the squared second differences to upper bands (3, k), in place.
+
+    A small diagonal keeps the system regular if there are fewer than three knots, or knots
+    without data.
+    """
     count = band.shape[1]
     band[2] += 1e-9 * (band[2].max() + 1.0)
     if count < 3:
         return
     middle = np.arange(1, count - 1)
-    np.add.at(band[2], middle - 1, stiffness)
-    np.add.at(band[2], middle, 4 * stiffness)
-    np.add.at(band[2], middle + 1, stiffness)
-    np.add.at(band[1], middle, -2 * stiffness)
-    np.add.at(band[1], middle + 1, -2 * stiffness)
-    np.add.at(band[0], middle + 1, stiffness)
+    np.add.at(band[2], middle - 1, weight)
+    np.add.at(band[2], middle, 4 * weight)
+    np.add.at(band[2], middle + 1, weight)
+    np.add.at(band[1], middle, -2 * weight)
+    np.add.at(band[1], middle + 1, -2 * weight)
+    np.add.at(band[0], middle + 1, weight)

@@ -1,12 +1,14 @@
-"""Where a rotor stood at each moment, from the syncs that a tracker decoded.
+"""Estimate the phase of a rotor over time from the syncs that a tracker decoded.
 
-A sync (``Y``) is when a rotor was at its zero, as the tracker's hardware computed it from
-the bits of a sweep: to some ticks, sometimes late, missing or wrong. libsurvive subtracts the
-last one from a sweep's timecode and divides by the last interval (``survive_process_gen2.c``).
-Here a line through all of them decides which belong to the rotor. But rotors do not turn
-evenly: their control loop lets them run ahead and fall behind by 10 to 20 ticks (0.1 mrad)
-within a few rotations. So the zeros are not put on the line but left where they were seen,
-smoothed over five rotations, and a sweep's turn is told by the zeros before and after it.
+A sync (line ``Y`` of a libsurvive recording) is the time at which a rotor was at its zero. The
+tracker's hardware computes it from the bits of a sweep. It is accurate to some ticks, and sometimes
+late, missing or wrong. libsurvive subtracts the latest one from the timecode of a sweep and divides
+by the latest interval (``survive_process_gen2.c``).
+
+Here a line through all syncs decides which are inliers. Rotors do not rotate uniformly: their
+control loop lets them wander by 10 to 20 ticks (0.1 mrad) within a few rotations. The zeros are
+therefore not replaced by the line. They are smoothed over five rotations, and the phase of a sweep
+is interpolated between the zeros before and after it.
 """
 
 from __future__ import annotations
@@ -16,97 +18,104 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse.demodulation.ootx import UNKNOWN
+from locatk.core.lighthouse.demodulation.ootx import MISSING_BIT
 
 Array = NDArray[np.float64]
 
-PPM_LIMIT = 300.0
-"""By how much a rotation may differ from nominal: resonators of station and tracker."""
+MAX_PERIOD_DEVIATION_PPM = 300.0
+"""Largest deviation of a rotation from nominal: resonators of station and tracker."""
 
-LAGS = 3
-STEPS = 5
-"""A sync and the next three, where they are up to five rotations apart, tell the length of
-one."""
+MAX_SYNC_LAG = 3
+"""The period is measured from a sync to each of this many next ones."""
 
-WINDOW = 500
-"""Rotations in which the phase is sought at once."""
+MAX_LAG_ROTATIONS = 5
+"""Longer intervals between syncs do not contribute to the period."""
 
-BINS = 64
+PHASE_WINDOW_ROTATIONS = 500
+"""Rotations over which the phase is estimated as a constant."""
 
-OFF_TICKS = 400.0
-"""A sync further than this from its window's phase is not of the rotor."""
+PHASE_HISTOGRAM_BINS = 64
+"""Number of bins of the histogram of phases."""
 
-LEAST = 4
+MAX_PHASE_OFFSET_TICKS = 400.0
+"""A sync farther from the phase of its window is an outlier, in ticks of 48 MHz."""
 
-JUMP_TICKS = 100.0
-"""A sync further than this from the median of its neighbours is wrong."""
+MIN_SYNCS = 4
+"""Number of inliers that a rotor needs."""
 
-SMOOTH = np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0
-"""Weights of a parabola through five rotations, at its middle (Savitzky and Golay 1964)."""
+MAX_JUMP_TICKS = 100.0
+"""A sync farther from the median of its neighbours is an outlier, in ticks of 48 MHz."""
 
-HOLD = 50
-"""Rotations after the last sync, or before the next, for which a rotor is known."""
+SMOOTHING_WEIGHTS = np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0
+"""Weights of a parabola through five rotations, at its middle (Savitzky and Golay, 1964)."""
 
-GAP = 600
-"""Longer gaps than a frame of factory data are of this many unknown bits."""
+MAX_SYNC_DISTANCE_ROTATIONS = 50
+"""The phase of a rotor is known for at most this long after a sync, or before the next."""
+
+MAX_BIT_GAP_ROTATIONS = 600
+"""Longer gaps are shortened to this number of missing slow bits, which is longer than a frame of
+factory data."""
 
 
 @dataclass(frozen=True)
 class TrackerRotor:
-    """One station's rotor, by one tracker's counter.
+    """Rotor of one station, in ticks of one tracker's counter.
 
     Attributes
     ----------
-    period : float
-        Mean length of a rotation in ticks.
-    zero : (n,) float64 ndarray
-        Ticks at which it was at its zero, ascending.
-    number : (n,) int64 ndarray
-        Rotation of each.
-    bit : (n,) int8 ndarray
-        Slow bit of each; -1 where two syncs differ.
+    period_tick : float
+        Mean duration of a rotation.
+    zero_tick : (n,) float64 ndarray
+        Times at which the rotor was at its zero, ascending.
+    rotation : (n,) int64 ndarray
+        Rotation number of each zero.
+    slow_bit : (n,) int8 ndarray
+        Slow bit of each rotation; -1 if two syncs differ.
     rejected : int
-        Syncs that were not of this rotor.
+        Number of syncs that are outliers.
     """
 
-    period: float
-    zero: Array
-    number: NDArray[np.int64]
-    bit: NDArray[np.int8]
+    period_tick: float
+    zero_tick: Array
+    rotation: NDArray[np.int64]
+    slow_bit: NDArray[np.int8]
     rejected: int
 
-    def turns(self, tick: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Turn since the rotor's zero, 0 to 1, and slow bit, at each of ``tick`` (n,).
+    def phase_and_bit(self, tick: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Return the phase (0 to 1 rotation) and the slow bit at each of ``tick`` (n,).
 
-        The turn is ``nan`` where no sync was near, the bit then and of rotations without
-        sync -1.
+        The phase is ``nan`` if no sync is near. The bit is -1 then, and in rotations without
+        sync.
         """
-        here = np.searchsorted(self.zero, tick, "right") - 1
-        before = np.clip(here, 0, len(self.zero) - 2)
-        zero, number = self.zero, self.number
-        length = (zero[before + 1] - zero[before]) / (number[before + 1] - number[before])
-        outside = (here < 0) | (here >= len(zero) - 1)
-        near = np.clip(here, 0, len(zero) - 1)
-        turn = (tick - zero[near]) / np.where(outside, self.period, length)
-        gap = np.minimum(
-            np.abs(tick - zero[near]), np.abs(zero[np.minimum(near + 1, len(zero) - 1)] - tick)
+        zero, rotation = self.zero_tick, self.rotation
+        preceding = np.searchsorted(zero, tick, "right") - 1
+        interval = np.clip(preceding, 0, len(zero) - 2)
+        period = (zero[interval + 1] - zero[interval]) / (
+            rotation[interval + 1] - rotation[interval]
         )
-        known = gap < HOLD * self.period
-        whole = np.floor(turn)
-        bit = np.where(known & (whole == 0), self.bit[near], UNKNOWN)
-        return np.where(known, turn - whole, np.nan), bit.astype(np.int64)
+        is_outside = (preceding < 0) | (preceding >= len(zero) - 1)
+        nearest = np.clip(preceding, 0, len(zero) - 1)
+        phase = (tick - zero[nearest]) / np.where(is_outside, self.period_tick, period)
+        distance = np.minimum(
+            np.abs(tick - zero[nearest]),
+            np.abs(zero[np.minimum(nearest + 1, len(zero) - 1)] - tick),
+        )
+        is_known = distance < MAX_SYNC_DISTANCE_ROTATIONS * self.period_tick
+        whole = np.floor(phase)
+        bit = np.where(is_known & (whole == 0), self.slow_bit[nearest], MISSING_BIT)
+        return np.where(is_known, phase - whole, np.nan), bit.astype(np.int64)
 
-    def bits(self) -> NDArray[np.int8]:
-        """Slow bits, one a rotation, -1 where it was missed."""
-        step = np.minimum(np.diff(self.number, prepend=self.number[:1]), GAP)
-        place = np.cumsum(step)
-        bits = np.full(int(place[-1]) + 1, UNKNOWN, np.int8)
-        bits[place] = self.bit
+    def slow_bits(self) -> NDArray[np.int8]:
+        """Return the slow bits, one per rotation, -1 if it is missing; long gaps are shortened."""
+        step = np.minimum(np.diff(self.rotation, prepend=self.rotation[:1]), MAX_BIT_GAP_ROTATIONS)
+        position = np.cumsum(step)
+        bits = np.full(int(position[-1]) + 1, MISSING_BIT, np.int8)
+        bits[position] = self.slow_bit
         return bits
 
 
-def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal: float) -> TrackerRotor | None:
-    """Find the rotor that most syncs of one channel agree on.
+def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal_tick: float) -> TrackerRotor | None:
+    """Fit the rotor that most syncs of one channel agree on.
 
     Parameters
     ----------
@@ -114,103 +123,105 @@ def fit_rotor(tick: Array, bit: NDArray[np.int32], nominal: float) -> TrackerRot
         Unwrapped ticks of the syncs, in any order.
     bit : (n,) int ndarray
         Slow bit of each, 0 or 1.
-    nominal : float
-        Length of a rotation in ticks, of the channel.
+    nominal_tick : float
+        Nominal duration of a rotation of the channel, in ticks.
 
     Returns
     -------
     TrackerRotor or None
-        None where fewer than four syncs agree.
+        None if fewer than four syncs agree.
     """
     order = np.argsort(tick, kind="stable")
     base = float(tick[order[0]]) if len(tick) else 0.0
-    x, bit = tick[order] - base, bit[order]
-    length = _rotation(x, nominal)
-    if length is None:
+    time, bit = tick[order] - base, bit[order]
+    period = _estimate_period(time, nominal_tick)
+    if period is None:
         return None
-    number, off = _number(x, length)
-    good = np.abs(off) * length < OFF_TICKS
-    if np.count_nonzero(good) < LEAST:
+    rotation, offset = _number_rotations(time, period)
+    is_inlier = np.abs(offset) * period < MAX_PHASE_OFFSET_TICKS
+    if np.count_nonzero(is_inlier) < MIN_SYNCS:
         return None
-    good &= _steady(x - number * length, good)
-    kept = np.flatnonzero(good)
-    kept, bit = _once(kept, number, bit)
-    later = np.diff(np.maximum.accumulate(x[kept]), prepend=-1.0) > 0
-    kept = kept[later]
-    if len(kept) < LEAST:
+    is_inlier &= _is_near_median(time - rotation * period, is_inlier)
+    kept = np.flatnonzero(is_inlier)
+    kept, bit = _merge_rotations(kept, rotation, bit)
+    is_later = np.diff(np.maximum.accumulate(time[kept]), prepend=-1.0) > 0
+    kept = kept[is_later]
+    if len(kept) < MIN_SYNCS:
         return None
-    number = number[kept]
-    line = np.polyfit(number, x[kept], 1)
-    wander = _smoothed(x[kept] - np.polyval(line, number), number)
-    zero = base + np.polyval(line, number) + wander
-    rejected = len(tick) - int(np.count_nonzero(good))
-    return TrackerRotor(float(line[0]), zero, number, bit[kept].astype(np.int8), rejected)
+    rotation = rotation[kept]
+    line = np.polyfit(rotation, time[kept], 1)
+    wander = _smooth_wander(time[kept] - np.polyval(line, rotation), rotation)
+    zero = base + np.polyval(line, rotation) + wander
+    rejected = len(tick) - int(np.count_nonzero(is_inlier))
+    return TrackerRotor(float(line[0]), zero, rotation, bit[kept].astype(np.int8), rejected)
 
 
-def _rotation(x: Array, nominal: float) -> float | None:
-    """Length of a rotation from syncs that follow each other."""
-    # Beyond the next one too: those of a second rotor, or wrong ones, may lie between.
-    step = np.concatenate([x[lag:] - x[:-lag] for lag in range(1, LAGS + 1)])
-    count = np.rint(step / nominal)
-    near = (count >= 1) & (count <= STEPS)
-    length = step[near] / count[near]
-    length = length[np.abs(length / nominal - 1) < PPM_LIMIT * 1e-6]
-    if len(length) < LEAST - 1:
+def _estimate_period(time: Array, nominal_tick: float) -> float | None:
+    """Return the mean duration of a rotation from nearby syncs; None if there are too few."""
+    # Intervals to later syncs are included, because a sync of a second rotor, or a wrong one, may
+    # be in between.
+    interval = np.concatenate([time[lag:] - time[:-lag] for lag in range(1, MAX_SYNC_LAG + 1)])
+    rotations = np.rint(interval / nominal_tick)
+    is_near = (rotations >= 1) & (rotations <= MAX_LAG_ROTATIONS)
+    period = interval[is_near] / rotations[is_near]
+    period = period[np.abs(period / nominal_tick - 1) < MAX_PERIOD_DEVIATION_PPM * 1e-6]
+    if len(period) < MIN_SYNCS - 1:
         return None
-    middle = np.median(length)
-    return float(np.mean(length[np.abs(length - middle) < JUMP_TICKS]))
+    return float(np.mean(period[np.abs(period - np.median(period)) < MAX_JUMP_TICKS]))
 
 
-def _number(x: Array, length: float) -> tuple[NDArray[np.int64], Array]:
-    """Rotation of each sync, and by how much of a turn it is off its window's phase."""
-    turn = x / length
-    window = (turn // WINDOW).astype(np.int64)
+def _number_rotations(time: Array, period: float) -> tuple[NDArray[np.int64], Array]:
+    """Return the rotation number of each sync, and its offset from the phase of its window."""
+    rotations = time / period
+    window = (rotations // PHASE_WINDOW_ROTATIONS).astype(np.int64)
     starts = np.flatnonzero(np.diff(window, prepend=-1))
-    phases = np.array([_phase(part % 1.0) for part in np.split(turn, starts[1:])])
-    size = np.diff(np.append(starts, len(x)))
-    # A window with a few wrong syncs must not turn the others: only well-filled ones lead.
-    full = size >= min(max(LEAST, int(np.median(size)) // 4), size.max())
-    middle = window[starts].astype(float)
-    smooth = np.interp(middle, middle[full], np.unwrap(phases[full], period=1.0))
+    phases = np.array([_dominant_phase(part % 1.0) for part in np.split(rotations, starts[1:])])
+    size = np.diff(np.append(starts, len(time)))
+    # Windows with a few wrong syncs have no reliable phase. It is interpolated between windows
+    # with many syncs.
+    is_full = size >= min(max(MIN_SYNCS, int(np.median(size)) // 4), size.max())
+    number = window[starts].astype(float)
+    smooth = np.interp(number, number[is_full], np.unwrap(phases[is_full], period=1.0))
     phase = np.repeat(smooth, size)
-    number = np.rint(turn - phase)
-    return number.astype(np.int64), turn - phase - number
+    rotation = np.rint(rotations - phase)
+    return rotation.astype(np.int64), rotations - phase - rotation
 
 
-def _phase(part: Array) -> float:
-    """Where in the turn most syncs are."""
-    counted = np.bincount((part * BINS).astype(np.int64) % BINS, minlength=BINS)
-    centre = (np.argmax(counted + np.roll(counted, -1)) + 1) / BINS
-    off = (part - centre + 0.5) % 1.0 - 0.5
-    return float(centre + np.median(off[np.abs(off) <= 1.01 / BINS]))
+def _dominant_phase(phase: Array) -> float:
+    """Return the phase (0 to 1) around which most syncs are."""
+    bins = PHASE_HISTOGRAM_BINS
+    histogram = np.bincount((phase * bins).astype(np.int64) % bins, minlength=bins)
+    centre = (np.argmax(histogram + np.roll(histogram, -1)) + 1) / bins
+    offset = (phase - centre + 0.5) % 1.0 - 0.5
+    return float(centre + np.median(offset[np.abs(offset) <= 1.01 / bins]))
 
 
-def _steady(residual: Array, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which syncs are near the median of the five about them."""
-    kept = np.flatnonzero(good)
+def _is_near_median(residual: Array, is_inlier: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask of the inliers that are near the median of the five around them."""
+    kept = np.flatnonzero(is_inlier)
     padded = np.pad(residual[kept], 2, mode="edge")
-    middle = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
-    steady = np.zeros(len(residual), bool)
-    steady[kept] = np.abs(residual[kept] - middle) < JUMP_TICKS
-    return steady
+    median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
+    is_near = np.zeros(len(residual), bool)
+    is_near[kept] = np.abs(residual[kept] - median) < MAX_JUMP_TICKS
+    return is_near
 
 
-def _once(
-    kept: NDArray[np.int64], number: NDArray[np.int64], bit: NDArray[np.int32]
+def _merge_rotations(
+    kept: NDArray[np.int64], rotation: NDArray[np.int64], bit: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """One sync a rotation; where two are of one, the bit is unknown if they differ."""
-    first, inverse = np.unique(number[kept], return_index=True, return_inverse=True)[1:]
-    differ = np.unique(kept[first][inverse[bit[kept] != bit[kept[first]][inverse]]])
+    """Keep one sync per rotation; if two of a rotation have different bits, the bit is missing."""
+    first, inverse = np.unique(rotation[kept], return_index=True, return_inverse=True)[1:]
+    conflicting = np.unique(kept[first][inverse[bit[kept] != bit[kept[first]][inverse]]])
     bit = bit.copy()
-    bit[differ] = UNKNOWN
+    bit[conflicting] = MISSING_BIT
     return kept[first], bit
 
 
-def _smoothed(wander: Array, number: NDArray[np.int64]) -> Array:
-    """Wander smoothed where the two rotations before and after are there too."""
-    if len(wander) < len(SMOOTH):
+def _smooth_wander(wander: Array, rotation: NDArray[np.int64]) -> Array:
+    """Smooth the wander of rotations whose two predecessors and two successors are present."""
+    if len(wander) < len(SMOOTHING_WEIGHTS):
         return wander
     smooth = wander.copy()
-    whole = number[4:] - number[:-4] == 4
-    smooth[2:-2][whole] = np.convolve(wander, SMOOTH, "valid")[whole]
+    has_neighbours = rotation[4:] - rotation[:-4] == 4
+    smooth[2:-2][has_neighbours] = np.convolve(wander, SMOOTHING_WEIGHTS, "valid")[has_neighbours]
     return smooth

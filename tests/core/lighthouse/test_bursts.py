@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from locatk.core.errors import InputError
-from locatk.core.lighthouse.demodulation.bursts import (
-    GAP_S,
-    bursts_of_windows,
+from locatk.core.lighthouse.demodulation.soft_bits import (
+    BURST_GAP_S,
+    Bursts,
     is_mocap_flash,
     split_bursts,
+    split_windows,
     window_edges_numpy,
 )
 from locatk.core.lighthouse.recording import Edges
@@ -29,12 +30,12 @@ def edges(*ticks: int, rate_hz: float = 40e6, rises: bool = True) -> Edges:
 
 
 def test_a_silence_divides() -> None:
-    gap = round(GAP_S * 40e6)
+    gap = round(BURST_GAP_S * 40e6)
     bursts = split_bursts(edges(5, 9, 9 + gap, 10 + 2 * gap, 20 + 2 * gap))
     assert bursts.first.tolist() == [0, 3, 5]
     # Three edges before it: the second burst begins downwards.
     assert bursts.rises.tolist() == [True, False]
-    assert bursts.start.tolist() == [5, 10 + 2 * gap]
+    assert bursts.start_tick.tolist() == [5, 10 + 2 * gap]
     assert bursts.duration_s.tolist() == [(4 + gap) / 40e6, 10 / 40e6]
     assert split_bursts(edges(1, 2, rises=False)).rises.tolist() == [False]
 
@@ -62,7 +63,7 @@ def test_a_coarse_recording_is_refused(rate_hz: float) -> None:
     with pytest.raises(InputError, match="too few"):
         split_bursts(edges(1, 2, rate_hz=rate_hz))
     with pytest.raises(InputError, match="too few"):
-        bursts_of_windows(np.zeros((1, 64), np.uint8), rate_hz)
+        split_windows(np.zeros((1, 64), np.uint8), rate_hz)
     # What counts is what the times resolve.
     with pytest.raises(InputError, match="too few"):
         split_bursts(Edges(np.arange(9), 1e9, rate_hz, True, 10))
@@ -87,7 +88,7 @@ def test_edges_that_go_back_are_refused() -> None:
     )
 )
 def test_edges_of_windows(windows: np.ndarray) -> None:
-    bursts = bursts_of_windows(windows)
+    bursts = split_windows(windows)
     assert len(bursts) == len(windows)
     width = 8 * windows.shape[1]
     for k, row in enumerate(np.unpackbits(windows, axis=1)):
@@ -105,7 +106,7 @@ def test_edges_of_windows(windows: np.ndarray) -> None:
 @pytest.mark.parametrize("windows", [np.zeros(64, np.uint8), np.zeros((2, 64))])
 def test_windows_of_another_kind(windows: Any) -> None:
     with pytest.raises(InputError, match="rows of bytes"):
-        bursts_of_windows(windows)
+        split_windows(windows)
 
 
 @pytest.mark.parametrize("rate_hz", [24e6, 40e6, 100e6])
@@ -138,3 +139,33 @@ def test_sweeps_are_no_flashes(light: Any, rate_hz: float) -> None:
 def test_no_published_sweep_is_a_flash(published: Callable[[str], Edges]) -> None:
     for name in (CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"):
         assert not is_mocap_flash(split_bursts(published(name))).any()
+
+
+def regular(periods: int, irregular: int = 0, steps: tuple[int, int] = (50, 50)) -> Bursts:
+    """A burst at 100 MHz of ``periods`` periods, the last ``irregular`` of which are short."""
+    step = np.resize(steps, periods + 1)
+    step[len(step) - irregular :] = 20
+    tick = np.concatenate([[1000], 1000 + np.cumsum(step)])
+    return Bursts(tick, np.array([0, len(tick)]), np.array([True]), 100e6)
+
+
+def test_a_flash_has_eight_periods_of_which_four_fifths_are_1_us() -> None:
+    assert is_mocap_flash(regular(8)).tolist() == [True]
+    assert is_mocap_flash(regular(7)).tolist() == [False]
+    assert is_mocap_flash(regular(20, irregular=4)).tolist() == [True]
+    assert is_mocap_flash(regular(20, irregular=5)).tolist() == [False]
+
+
+def test_periods_of_a_flash_deviate_by_six_per_cent_at_most() -> None:
+    for steps, is_flash in (
+        ((52, 53), True),
+        ((53, 54), False),
+        ((47, 48), True),
+        ((46, 47), False),
+    ):
+        assert is_mocap_flash(regular(20, steps=steps)).tolist() == [is_flash]
+
+
+@pytest.mark.parametrize(("silence_s", "number"), [(1.45e-6, 1), (1.55e-6, 2)])
+def test_a_silence_of_nine_bits_ends_a_burst(silence_s: float, number: int) -> None:
+    assert len(split_bursts(edges(0, 10, 10 + round(silence_s * 40e6), 80 + 10))) == number

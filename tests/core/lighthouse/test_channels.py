@@ -16,7 +16,7 @@ RECORDED_TICKS = {
     1: 958999, 3: 952992, 4: 948995, 7: 940992, 8: 938997, 9: 936993,
     11: 918989, 12: 910995, 16: 886993,
 }  # fmt: skip
-"""Median time between sync pulses in libsurvive's recordings (facts/lighthouse.md 2.2)."""
+"""Median time between sync pulses in the recordings of libsurvive-extras-data."""
 
 RP2040_US = (
     19979, 19938, 19854, 19771, 19729, 19646, 19604, 19563,
@@ -72,6 +72,6 @@ def test_a_rotation_fits_into_the_sequence() -> None:
 
 
 def test_polynomials_come_in_pairs() -> None:
-    polynomial = np.arange(channels.POLYNOMIALS)
+    polynomial = np.arange(channels.POLYNOMIAL_COUNT)
     np.testing.assert_array_equal(channels.channel_of(polynomial), np.repeat(range(1, 17), 2))
     np.testing.assert_array_equal(channels.slow_bit_of(polynomial), np.tile([0, 1], 16))

@@ -9,7 +9,7 @@ from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import PERIOD_TICKS, TICKS_PER_COUNT
 
 CHECKPOINTS = (1, 0b10000000000011010, 0b10000001010110001, 0b10111000000110000)
-"""Polynomial 0, of DotBot-firmware ``lh2.c`` (facts/lighthouse.md 2.1)."""
+"""Polynomial 0, of DotBot-firmware ``bsp/nrf/lh2.c``."""
 
 WINDOWS = (
     (0b1110000100011111111001110010111000000100001001100011001010001110, 3, 49341),
@@ -39,7 +39,7 @@ def run(polynomial: int, steps: int) -> list[int]:
 
 
 def test_all_polynomials_pass_through_every_state() -> None:
-    index = np.arange(lfsr.LENGTH)
+    index = np.arange(lfsr.SEQUENCE_LENGTH)
     for polynomial in range(32):
         states = lfsr.state_at(index, polynomial)
         assert np.array_equal(np.sort(states), index + 1)
@@ -52,9 +52,9 @@ def test_all_polynomials_pass_through_every_state() -> None:
 
 @pytest.mark.parametrize("polynomial", [0, 5, 31])
 def test_register_run_step_by_step(polynomial: int) -> None:
-    states = run(polynomial, lfsr.LENGTH)
+    states = run(polynomial, lfsr.SEQUENCE_LENGTH)
     assert states.pop() == 1
-    assert lfsr.indices(states, polynomial).tolist() == list(range(lfsr.LENGTH))
+    assert lfsr.indices(states, polynomial).tolist() == list(range(lfsr.SEQUENCE_LENGTH))
 
 
 def test_checkpoints_of_dotbot() -> None:
@@ -75,16 +75,16 @@ def test_offsets_of_the_deck(polynomial: int, word: int, offset: int) -> None:
 
 
 def test_state_without_place() -> None:
-    assert np.all(lfsr.indices(np.zeros(32, int), np.arange(32)) == lfsr.NOWHERE)
+    assert np.all(lfsr.indices(np.zeros(32, int), np.arange(32)) == lfsr.NO_INDEX)
 
 
 def test_no_index_comes_twice_in_a_turn() -> None:
-    assert PERIOD_TICKS.max() / TICKS_PER_COUNT < lfsr.LENGTH
+    assert PERIOD_TICKS.max() / TICKS_PER_COUNT < lfsr.SEQUENCE_LENGTH
 
 
 @pytest.mark.parametrize("length", [1, 16, 17, 18, 51, 63, 64])
 def test_bits_are_the_sequence(length: int) -> None:
-    index = np.array([0, 1, 77_777, lfsr.LENGTH - 1])
+    index = np.array([0, 1, 77_777, lfsr.SEQUENCE_LENGTH - 1])
     for polynomial in (0, 7, 30):
         # The sequence is the highest bit of each state.
         each = lfsr.state_at(index[:, None] + np.arange(length), polynomial) >> 16

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.demodulation import windows
-from locatk.core.lighthouse.demodulation.bursts import bursts_of_windows
-from locatk.core.lighthouse.demodulation.identification import identify_sequences
-from locatk.core.lighthouse.demodulation.soft_bits import soft_bits
-from locatk.core.lighthouse.demodulation.windows import read_windows
+from locatk.core.lighthouse.demodulation import identification
+from locatk.core.lighthouse.demodulation.identification import identify_sequences, read_windows
+from locatk.core.lighthouse.demodulation.soft_bits import demodulate_bursts, split_windows
 
 
 def sampled(
@@ -42,10 +40,10 @@ def test_each_window_tells_polynomial_index_and_where_its_first_bit_began() -> N
     late_ns = rng.uniform(0, 160, 300)
     rows = np.stack([sampled(*each) for each in zip(polynomial, index, late_ns, strict=True)])
     found = read_windows(rows)
-    assert found.matches.certain().all()
+    assert found.matches.is_certain().all()
     assert np.array_equal(found.matches.polynomial, polynomial)
     # The first bit that was read may be one of those before or after: its time says which.
-    began_ns = found.start / 32e6 * 1e9
+    began_ns = found.first_bit_sample / 32e6 * 1e9
     true_ns = late_ns + (found.matches.index - index) * 1e9 / 6e6
     assert np.max(np.abs(began_ns - true_ns)) < 30
 
@@ -54,23 +52,23 @@ def test_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = np.stack([sampled(5, 1000 + 37 * k, 40.0) for k in range(50)])
     rows[7] = 0
     whole = read_windows(rows)
-    monkeypatch.setattr(windows, "BLOCK", 7)
+    monkeypatch.setattr(identification, "WINDOWS_PER_BLOCK", 7)
     parts = read_windows(rows)
     assert np.array_equal(whole.matches.index, parts.matches.index)
-    assert np.allclose(whole.start, parts.start, atol=1e-6, equal_nan=True)
-    assert np.isnan(whole.start[7])
+    assert np.allclose(whole.first_bit_sample, parts.first_bit_sample, atol=1e-6, equal_nan=True)
+    assert np.isnan(whole.first_bit_sample[7])
     assert whole.matches.polynomial[7] == -1
 
 
 def test_no_windows_have_no_matches() -> None:
     found = read_windows(np.zeros((0, 64), np.uint8))
-    assert len(found.matches) == len(found.start) == 0
+    assert len(found.matches) == len(found.first_bit_sample) == 0
 
 
 def test_only_so_many_polynomials() -> None:
     rows = np.stack([sampled(9, 5000, 10.0)])
     assert read_windows(rows).matches.polynomial[0] == 9
-    assert not read_windows(rows, polynomials=8).matches.certain()[0]
+    assert not read_windows(rows, polynomials=8).matches.is_certain()[0]
 
 
 def test_too_low_a_rate_is_refused() -> None:
@@ -84,8 +82,8 @@ def test_published_windows_are_read(data: Path) -> None:
 
     rows = published_windows(data / "lighthouse")
     matches = read_windows(rows).matches
-    good = matches.certain()
+    good = matches.is_certain()
     assert np.mean(good) > 0.95
     assert set(np.unique(matches.polynomial[good])) == {0, 1, 2, 3}
-    again = identify_sequences(soft_bits(bursts_of_windows(rows)))
+    again = identify_sequences(demodulate_bursts(split_windows(rows)))
     assert np.array_equal(again.index, matches.index)

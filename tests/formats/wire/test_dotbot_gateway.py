@@ -130,7 +130,10 @@ def test_any_number_of_windows(header: Any, n: int) -> None:
 
 
 @given(
-    st.integers(0, lfsr.LENGTH - 1), st.integers(0, 31), st.integers(0, 47), st.integers(0, 2**64)
+    st.integers(0, lfsr.SEQUENCE_LENGTH - 1),
+    st.integers(0, 31),
+    st.integers(0, 47),
+    st.integers(0, 2**64),
 )
 def test_count_is_that_of_the_first_bit(
     count: int, polynomial: int, offset: int, noise: int
@@ -179,7 +182,9 @@ def test_processed_data(payload: bytes) -> None:
     assert sweeps.tick.tolist() == [0xFFFFFFF0]
 
 
-@pytest.mark.parametrize("marked", [(255, 1000, 0), (5, 0xFFFFFFFF, 0), (5, lfsr.LENGTH, 0)])
+@pytest.mark.parametrize(
+    "marked", [(255, 1000, 0), (5, 0xFFFFFFFF, 0), (5, lfsr.SEQUENCE_LENGTH, 0)]
+)
 def test_processed_data_that_a_robot_marks_as_wrong(marked: tuple[int, int, int]) -> None:
     found, decoder = decode(new(12, struct.pack("<BII", *marked)))
     assert found == {}

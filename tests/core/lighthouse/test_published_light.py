@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from locatk.core.lighthouse import lfsr
-from locatk.core.lighthouse.published import light_decoding as paper_light
-from locatk.core.lighthouse.published.light_decoding import decode, demodulate, identify, windows_of
+from locatk.core.lighthouse.published import light_decoding
+from locatk.core.lighthouse.published.light_decoding import (
+    decode_windows,
+    demodulate_windows,
+    identify_polynomials,
+    sample_windows,
+)
 from locatk.core.lighthouse.recording import Edges
 
 BIT_SAMPLES = 32 / 6
@@ -38,7 +43,7 @@ FIRMWARE = (
     (
         "15331552333325134582355475245322333563314231465234146515721354562423144743348313"
         "326231433234331923223262422535455476465547241464542535324456",
-        (0xCE882E79961C5DFB, -1, 0, lfsr.NOWHERE),
+        (0xCE882E79961C5DFB, -1, 0, lfsr.NO_INDEX),
     ),
 )
 """Runs of samples, and what the functions of DotBot-firmware's ``lh2.c``, compiled with gcc on
@@ -90,7 +95,7 @@ def test_clear_light(tried: int) -> None:
             for k, (p, i, a) in enumerate(zip(polynomial, index, ahead, strict=True))
         ]
     )
-    found = decode(windows, tried)
+    found = decode_windows(windows, tried)
     start = np.array([register(p, i, 9) for p, i in zip(polynomial, index, strict=True)])
     # Only a 0 is kept where the window starts, one of which 5 samples are seen, or 4 before
     # another; otherwise the first bit is the next one. Nine ones in a row are too many.
@@ -107,7 +112,7 @@ def test_clear_light(tried: int) -> None:
 
 @pytest.mark.parametrize(("runs", "expected"), FIRMWARE)
 def test_as_the_firmware_compiled(runs: str, expected: tuple[int, int, int, int]) -> None:
-    found = decode(window(runs))
+    found = decode_windows(window(runs))
     assert (
         int(found.bits[0]),
         int(found.polynomial[0]),
@@ -139,7 +144,7 @@ def test_as_the_firmware_compiled(runs: str, expected: tuple[int, int, int, int]
     ],
 )
 def test_rules_for_fuzzy_chips(runs: str, bits: str) -> None:
-    assert f"{int(demodulate(window(runs))[0]):064b}"[: len(bits)] == bits
+    assert f"{int(demodulate_windows(window(runs))[0]):064b}"[: len(bits)] == bits
 
 
 def test_mismatches_count_in_the_lower_half_only() -> None:
@@ -147,49 +152,49 @@ def test_mismatches_count_in_the_lower_half_only() -> None:
     state, ahead = np.uint64(0x1FFFF << 39), np.uint64(0x7F << 32)
     upper, four, five = bits ^ ahead, bits ^ np.uint64(0xF << 8), bits ^ np.uint64(0x1F << 8)
     for given, passed in ((bits, 8), (upper, 8), (four, 8)):
-        polynomial, offset = identify(given)
+        polynomial, offset = identify_polynomials(given)
         assert (polynomial[0], offset[0]) == (3, passed)
         assert lfsr.indices(int(given[0] & state) >> 39, 3) == 50_008
     # A fifth mismatch: found with bits 10 to 38 alone, of which three are wrong.
-    assert [int(x[0]) for x in identify(five)] == [3, 8]
+    assert [int(x[0]) for x in identify_polynomials(five)] == [3, 8]
     # Twelve in a row from bit 20 on: 22 bits do not fit, 12 do not.
-    assert identify(bits ^ np.uint64(0xFFF << 20))[0][0] != 3
+    assert identify_polynomials(bits ^ np.uint64(0xFFF << 20))[0][0] != 3
 
 
 def test_first_bit_of_the_state_wrong() -> None:
     # The state after 9 bits leaves it out; the index is still of the first of all bits.
     bits = lfsr.bits_at([70_000], 5) ^ (np.uint64(1) << np.uint64(55))
-    polynomial, offset = identify(bits)
+    polynomial, offset = identify_polynomials(bits)
     assert (polynomial[0], offset[0]) == (5, 9)
 
 
 def test_last_bits_wrong() -> None:
     bits = lfsr.bits_at(np.arange(20_000, 90_000, 1000), 6)
     for wrong, mask in ((10, 0x3FF), (20, 0xFFFFF)):
-        polynomial, offset = identify(bits ^ np.uint64(mask))
+        polynomial, offset = identify_polynomials(bits ^ np.uint64(mask))
         assert np.mean(polynomial == 6) == 1, wrong
         assert np.all(offset == 8)
 
 
 def test_number_of_polynomials() -> None:
     bits = lfsr.bits_at([40_000], 12)
-    assert identify(bits)[0][0] != 12
-    assert identify(bits, 12)[0][0] != 12
-    assert identify(bits, 13)[0][0] == 12
+    assert identify_polynomials(bits)[0][0] != 12
+    assert identify_polynomials(bits, 12)[0][0] != 12
+    assert identify_polynomials(bits, 13)[0][0] == 12
     for wrong in (0, 33):
         with pytest.raises(ValueError, match="polynomials"):
-            identify(bits, wrong)
+            identify_polynomials(bits, wrong)
 
 
 def test_no_light() -> None:
     dark = np.zeros((3, 64), np.uint8)
     dark[1] = 0xFF
     dark[2, :2] = 0x3C  # some noise and then nothing
-    found = decode(dark)
+    found = decode_windows(dark)
     assert found.polynomial.tolist() == [-1, -1, -1]
-    assert found.index.tolist() == [lfsr.NOWHERE] * 3
+    assert found.index.tolist() == [lfsr.NO_INDEX] * 3
     assert found.bit_offset.tolist() == [0, 0, 0]
-    assert len(decode(np.zeros((0, 64), np.uint8))) == 0
+    assert len(decode_windows(np.zeros((0, 64), np.uint8))) == 0
 
 
 def test_noise_never_fails() -> None:
@@ -197,20 +202,20 @@ def test_noise_never_fails() -> None:
     windows = rng.integers(0, 256, (3000, 64), dtype=np.uint8)
     windows[:1000] &= rng.integers(0, 256, (1000, 64), dtype=np.uint8)  # longer runs
     windows[1000:1500] = rng.choice(np.array([0x55, 0xAA, 0x33], np.uint8), (500, 64))
-    found = decode(windows, 32)
+    found = decode_windows(windows, 32)
     known = found.polynomial >= 0
-    assert np.array_equal(found.index >= 0, known & (found.index != lfsr.NOWHERE))
-    assert np.all(found.index[~known] == lfsr.NOWHERE)
+    assert np.array_equal(found.index >= 0, known & (found.index != lfsr.NO_INDEX))
+    assert np.all(found.index[~known] == lfsr.NO_INDEX)
     # As many as twelve bits with two mismatches are met by chance.
     assert 0.2 < known.mean() < 0.9
 
 
 def test_before_the_rotor_s_zero() -> None:
     # No light is there: the register starts anew at each turn. Its bits are drawn so.
-    windows = np.array([light(1, lfsr.LENGTH - 4, 0.0, 0), light(1, 0, 0.0, 0)])
-    found = decode(windows)
+    windows = np.array([light(1, lfsr.SEQUENCE_LENGTH - 4, 0.0, 0), light(1, 0, 0.0, 0)])
+    found = decode_windows(windows)
     assert found.polynomial.tolist() == [1, 1]
-    assert found.index[0] == lfsr.NOWHERE
+    assert found.index[0] == lfsr.NO_INDEX
     assert found.index[1] in (0, 1)
 
 
@@ -221,7 +226,7 @@ def test_windows_of_a_recording(rate_hz: float, rises: bool) -> None:
     tick = 1000 + np.cumsum(rng.integers(1, max(2, int(rate_hz * 3e-7)), 300))
     edges = Edges(tick, rate_hz, rate_hz, rises, int(tick[-1]) + 1)
     start = np.array([-5, 0, 990, 1000, tick[3], tick[3] - 1, tick[150], tick[-1], tick[-1] + 9])
-    windows = windows_of(edges, start)
+    windows = sample_windows(edges, start)
     for row, at in zip(np.unpackbits(windows, axis=1).tolist(), start.tolist(), strict=True):
         level, sampled, k = not rises, [], 0
         for sample in range(512):
@@ -242,7 +247,7 @@ def test_a_recording_is_decoded() -> None:
         now += 2 * half
     edges = Edges(np.rint(tick).astype(np.int64), 1e9, 1e9, True, int(now) + 1)
     start = 4000 + np.arange(0, 15_000, 7)
-    found = decode(windows_of(edges, start))
+    found = decode_windows(sample_windows(edges, start))
     assert np.all(found.polynomial == 2)
     assert np.all(np.abs(found.index - 60_000 - (start - 4000) / (2 * half)) <= 1.01)
 
@@ -250,9 +255,9 @@ def test_a_recording_is_decoded() -> None:
 def test_blocks_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     windows = rng.integers(0, 256, (50, 64), dtype=np.uint8)
-    whole = demodulate(windows)
-    monkeypatch.setattr(paper_light, "_BLOCK", 7)
-    assert np.array_equal(demodulate(windows), whole)
+    whole = demodulate_windows(windows)
+    monkeypatch.setattr(light_decoding, "_WINDOWS_PER_BLOCK", 7)
+    assert np.array_equal(demodulate_windows(windows), whole)
 
 
 # Published capture
@@ -279,11 +284,11 @@ def capture(data: Path) -> tuple[Edges, np.ndarray]:
 def test_published_capture(
     capture: tuple[Edges, np.ndarray], after_us: int, decoded: float, false: float
 ) -> None:
-    # Figures of the compiled firmware (facts/lighthouse.md 5; the last from the same run). It
+    # Figures of the compiled firmware (``lh2.c``, compiled natively and run on these windows). It
     # counts windows without light as found, up to 1 %. A sample at an edge's own tick had the
     # old level there: a window a tick earlier. That phase alone moves the yield by 2 to 3 %.
     edges, bursts = capture
-    found = decode(windows_of(edges, bursts + 40 * after_us - 1))
+    found = decode_windows(sample_windows(edges, bursts + 40 * after_us - 1))
     known = found.polynomial >= 0
     assert known.mean() == pytest.approx(decoded, abs=0.012)
     assert np.mean(found.polynomial[known] > 3) == pytest.approx(false, abs=0.005)

@@ -10,12 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.lighthouse.demodulation.bursts import Bursts, bursts_of_windows, split_bursts
 from locatk.core.lighthouse.demodulation.soft_bits import (
-    CERTAIN,
-    LONGEST_S,
-    soft_bits,
-    soft_bits_numpy,
+    MAX_BURST_S,
+    MAX_SOFT_BIT,
+    Bursts,
+    SoftBits,
+    _starts_at_second_chip,
+    demodulate_bursts,
+    demodulate_bursts_numpy,
+    split_bursts,
+    split_windows,
 )
 from locatk.core.lighthouse.recording import Edges
 
@@ -25,12 +29,12 @@ RATES = (24e6, 32e6, 40e6, 100e6, 500e6)
 
 def agree(bursts: Bursts) -> None:
     """Both twins say the same; values may differ by the last digit of a float."""
-    mine, twin = soft_bits(bursts), soft_bits_numpy(bursts)
+    mine, twin = demodulate_bursts(bursts), demodulate_bursts_numpy(bursts)
     assert np.array_equal(mine.first, twin.first)
-    assert np.allclose(mine.tick, twin.tick, rtol=0, atol=1e-6)
+    assert np.allclose(mine.start_tick, twin.start_tick, rtol=0, atol=1e-6)
     assert np.abs(mine.value.astype(int) - twin.value).max(initial=0) <= 1
     assert len(mine.value) == mine.first[-1]
-    assert np.abs(mine.value).max(initial=0) <= CERTAIN
+    assert np.abs(mine.value).max(initial=0) <= MAX_SOFT_BIT
 
 
 def read_back(light: Any, bits: np.ndarray, path: Any, start_s: float, seed: int = 0) -> int:
@@ -38,9 +42,9 @@ def read_back(light: Any, bits: np.ndarray, path: Any, start_s: float, seed: int
     noise = np.random.default_rng(seed + 1000)
     change = start_s + light.biphase(bits) / 6e6
     line = light.edges(light.as_received(change, path, noise), 1.0, path)
-    soft = soft_bits(split_bursts(line))
+    soft = demodulate_bursts(split_bursts(line))
     assert len(soft) == 1
-    begin = round((start_s * path.rate_hz - soft.tick[0]) / soft.ticks_per_bit)
+    begin = round((start_s * path.rate_hz - soft.start_tick[0]) / soft.ticks_per_bit)
     # The first pulse may be among the lost ones.
     got = np.pad(soft.value, 2)[begin + 2 : begin + 2 + len(bits)] > 0
     return int(np.count_nonzero(got[2:-2] != (bits[2:-2] > 0)))
@@ -91,8 +95,8 @@ def test_a_lost_pulse_is_no_lost_burst(light: Any) -> None:
     change = light.biphase(bits) / 6e6 + 1e-4
     for at in (20, 51, 100):
         (change_left,) = [np.delete(change, [at, at + 1])]
-        soft = soft_bits(split_bursts(light.edges(change_left, 1e-3)))
-        begin = round((1e-4 * 40e6 - soft.tick[0]) / soft.ticks_per_bit)
+        soft = demodulate_bursts(split_bursts(light.edges(change_left, 1e-3)))
+        begin = round((1e-4 * 40e6 - soft.start_tick[0]) / soft.ticks_per_bit)
         off = np.flatnonzero((soft.value[begin : begin + 128] > 0) != (bits > 0))
         # Only what is near the loss is wrong; a decoder of runs would slip from there on.
         assert len(off) <= 2
@@ -104,26 +108,26 @@ def test_dates_of_bits(light: Any) -> None:
     for _ in range(50):
         start = noise.uniform(1e-3, 2e-3)
         bits = noise.integers(0, 2, 100).astype(np.int8)
-        soft = soft_bits(split_bursts(light.edges(start + light.biphase(bits) / 6e6, 1.0)))
-        late = (soft.tick[0] + 0.5 - start * 40e6) / soft.ticks_per_bit
+        soft = demodulate_bursts(split_bursts(light.edges(start + light.biphase(bits) / 6e6, 1.0)))
+        late = (soft.start_tick[0] + 0.5 - start * 40e6) / soft.ticks_per_bit
         off.append(late - np.rint(late))
     # A sample of 25 ns is 0.15 bits; the phase averages over a hundred edges.
     assert np.abs(off).max() < 0.05
 
 
 def test_odd_bursts(light: Any) -> None:
-    none = soft_bits(split_bursts(Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 1)))
+    none = demodulate_bursts(split_bursts(Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 1)))
     assert len(none) == 0
     assert none.first.tolist() == [0]
     long = np.arange(0, 600e-6, 1.67e-7)
     edge = np.concatenate([[1e-3], [2e-3, 2.0001e-3], 3e-3 + long, 5e-3 + long[:200]])
     bursts = split_bursts(light.edges(edge, 0.01))
-    soft = soft_bits(bursts)
+    soft = demodulate_bursts(bursts)
     size = np.diff(soft.first)
     assert size[0] == 0  # a single edge
     assert 0 < size[1] < 5
     assert size[2] == 0  # longer than any sweep
-    assert bursts.duration_s[2] > LONGEST_S
+    assert bursts.duration_s[2] > MAX_BURST_S
     assert size[3] > 190
     agree(bursts)
 
@@ -154,13 +158,35 @@ def test_twins_on_any_edges(runs: list[int], rate_hz: float, rises: bool) -> Non
 @pytest.mark.parametrize("width", [1, 2, 7, 8, 9, 64, 100])
 def test_twins_on_windows(width: int) -> None:
     noise = np.random.default_rng(width)
-    agree(bursts_of_windows(noise.integers(0, 256, (400, width)).astype(np.uint8)))
-    agree(
-        bursts_of_windows(np.repeat(noise.integers(0, 2, (50, width)) * 255, 1, 1).astype(np.uint8))
-    )
-    agree(bursts_of_windows(np.zeros((0, width), np.uint8)))
+    agree(split_windows(noise.integers(0, 256, (400, width)).astype(np.uint8)))
+    agree(split_windows(np.repeat(noise.integers(0, 2, (50, width)) * 255, 1, 1).astype(np.uint8)))
+    agree(split_windows(np.zeros((0, width), np.uint8)))
 
 
 @pytest.mark.parametrize("name", [CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"])
 def test_twins_on_published_light(published: Callable[[str], Edges], name: str) -> None:
     agree(split_bursts(published(name)))
+
+
+@pytest.mark.parametrize(("excess", "is_second"), [(0.0, False), (5e-4, False), (2e-3, True)])
+def test_bits_start_at_the_second_chip_only_with_a_margin(excess: float, is_second: bool) -> None:
+    mean = np.array([1.0 + excess, -1.0, 1.0])
+    assert _starts_at_second_chip(mean, np.zeros(1, int), np.array([3])).tolist() == [is_second]
+
+
+@pytest.mark.parametrize(("duration_s", "has_bits"), [(499e-6, True), (501e-6, False)])
+def test_bursts_of_more_than_half_a_millisecond_have_no_bits(
+    duration_s: float, has_bits: bool
+) -> None:
+    tick = np.arange(0, round(duration_s * 40e6) + 1, 20)
+    bursts = split_bursts(Edges(tick, 40e6, 40e6, True, 10**6))
+    for demodulate in (demodulate_bursts, demodulate_bursts_numpy):
+        assert (len(demodulate(bursts).value) > 0) == has_bits
+
+
+def test_some_bursts_of_soft_bits() -> None:
+    bits = SoftBits(np.arange(6, dtype=np.int8), np.array([0, 1, 3, 6]), np.arange(3.0), 5.0)
+    some = bits.take(np.array([0, 2]))
+    assert some.value.tolist() == [0, 3, 4, 5]
+    assert some.first.tolist() == [0, 1, 4]
+    assert some.start_tick.tolist() == [0.0, 2.0]

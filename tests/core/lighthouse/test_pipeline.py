@@ -14,10 +14,22 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import PARAMETERS
 from locatk.core.lighthouse.demodulation import ootx
-from locatk.core.lighthouse.demodulation.pipeline import DemodulatedRecording, demodulate_recording
+from locatk.core.lighthouse.demodulation.pipeline import (
+    DemodulatedRecording,
+    _count_missed,
+    _latest_factory_data,
+    demodulate_recording,
+    slow_bits,
+)
+from locatk.core.lighthouse.demodulation.rotor import Rotor
 from locatk.core.lighthouse.recording import Edges
 
 CAPTURE = "benchmarks/demodulation_code/logic_analyser_capture.sal"
+
+
+def codes(got: DemodulatedRecording) -> list[str]:
+    """Codes of the warnings about a recording."""
+    return [warning.code for warning in got.warnings]
 
 
 def paired(got: DemodulatedRecording, passed: Any, path: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -42,7 +54,7 @@ def factory(channel: int, number: int) -> tuple[int, ...]:
     last = np.array([1.8, 2.3, -0.005, -0.006], "<f2").tobytes()
     payload = struct.pack("<HI", 0x0A08, number) + numbers + b"\1\x0f" + more + b"\2\x7f\xfe"
     payload += last + bytes([0x80 | channel - 1, 0]) + bytes(8) + b"\x46\x09"
-    return tuple(ootx.encode(payload).tolist())
+    return tuple(ootx.encode_frame(payload).tolist())
 
 
 @pytest.mark.parametrize(
@@ -75,7 +87,7 @@ def test_all_at_once(light: Any, rate_hz: float, resolution_hz: float | None) ->
     time = got.sweeps.tick[caught] / rate_hz / (1 + 20e-6)
     assert np.percentile(np.abs(time - passed.time_s[row]), 50) < 2.5e-7
     for sender in senders:
-        ppm = got.rotors[sender.channel].ppm(rate_hz)
+        ppm = got.rotors[sender.channel].period_deviation_ppm(rate_hz)
         assert ppm == pytest.approx(sender.ppm + 20, abs=0.15)
     for station in got.stations:
         rate = np.mean(~passed.spoiled[passed.channel == station.channel])
@@ -122,13 +134,16 @@ def test_factory_data_of_two_stations(light: Any) -> None:
         assert station.calibration.source == "factory"
         assert station.frames >= 1
         assert station.damaged == 0
-    assert got.notes == ()
+    assert got.warnings == ()
 
 
 def test_a_station_that_says_another_channel(light: Any) -> None:
     lines, _ = light.of([light.Sender(4, slow=factory(7, 5))], 10.0)
     got = demodulate_recording(lines)
-    assert any("channel 4" in note and "channel 7" in note for note in got.notes)
+    (warning,) = got.warnings
+    assert warning.code == "channel_mismatch"
+    assert "channel 4" in warning.message
+    assert "channel 7" in warning.message
 
 
 def test_missed_sweeps_are_counted(light: Any) -> None:
@@ -152,8 +167,8 @@ def test_motion_capture_is_dropped(light: Any) -> None:
     senders = [light.Sender(1), light.Sender(2, zero_s=0.0012)]
     lines, passed = light.of(senders, 3.0, others=[np.sort(other)])
     got = demodulate_recording(lines)
-    assert got.flashes == pytest.approx(len(flashes) / 2, rel=0.06)
-    assert any("flashes" in note for note in got.notes)
+    assert got.mocap_flashes == pytest.approx(len(flashes) / 2, rel=0.06)
+    assert codes(got) == ["mocap_flashes"]
     caught, row = paired(got, passed, light.Receiving())
     assert len(got.sweeps) <= len(caught) + 2
     # A sweep under a flash is lost; all others are not.
@@ -180,7 +195,8 @@ def test_two_stations_on_one_channel(light: Any) -> None:
     got = demodulate_recording(lines)
     assert set(got.sweeps.channel.tolist()) == {9}
     assert len(got.sweeps) > 0.97 * np.count_nonzero(passed.channel == 9)
-    assert any("more than one station sends on channel 3" in note for note in got.notes)
+    assert codes(got) == ["doubled_channel"]
+    assert "more than one station sends on channel 3" in got.warnings[0].message
     lines, _ = light.of(doubled, 5.0)
     with pytest.raises(InputError, match="more than one station sends on channel 3"):
         demodulate_recording(lines)
@@ -210,7 +226,8 @@ def test_a_station_that_is_switched_off_and_on(light: Any) -> None:
     assert len(caught) >= np.count_nonzero(~passed.spoiled)
     assert np.abs(got.sweeps.count[caught] - passed.count[row]).max() < 5
     assert np.array_equal(got.sweeps.plane[caught], passed.plane[row])
-    assert got.notes == ("the station on channel 3 started anew while recording",)
+    assert codes(got) == ["station_restarted"]
+    assert "channel 3" in got.warnings[0].message
 
 
 def test_a_silence_of_two_hours(light: Any) -> None:
@@ -257,7 +274,7 @@ def test_no_light_of_a_station(light: Any, seed: int) -> None:
 
 
 def test_nothing_to_read(light: Any) -> None:
-    with pytest.raises(InputError, match="no line"):
+    with pytest.raises(InputError, match="no data line"):
         demodulate_recording([])
     empty = Edges(np.zeros(0, np.int64), 40e6, 40e6, True, 100)
     with pytest.raises(InputError, match="among 0 bursts"):
@@ -283,19 +300,19 @@ def test_a_jump_of_a_clock_ends(light: Any) -> None:
 
 def test_the_published_capture(published: Callable[[str], Edges]) -> None:
     got = demodulate_recording([published(CAPTURE)])
-    (reading,) = got.readings
+    (reading,) = got.photodiodes
     assert len(reading.bursts) == 11_136
-    taken = reading.read | (reading.beside >= 0)
+    taken = reading.is_accepted | (reading.continued_burst >= 0)
     assert taken.mean() >= 0.985
-    assert np.all(reading.matches.polynomial[reading.read] < 4)
-    assert np.mean(np.abs(reading.off_s[reading.read]) < 1e-6) > 0.999
+    assert np.all(reading.matches.polynomial[reading.is_accepted] < 4)
+    assert np.mean(np.abs(reading.rotor_residual_s[reading.is_accepted]) < 1e-6) > 0.999
     first, second = got.stations
     assert (first.id, second.id) == (0x4CC60647, 0x0FF22226)
     assert first.frames >= 3
     assert second.frames >= 2
     assert (first.damaged, second.damaged) == (0, 0)
-    assert got.rotors[1].ppm(40e6) == pytest.approx(-15.49, abs=0.05)
-    assert got.rotors[2].ppm(40e6) == pytest.approx(-18.69, abs=0.05)
+    assert got.rotors[1].period_deviation_ppm(40e6) == pytest.approx(-15.49, abs=0.05)
+    assert got.rotors[2].period_deviation_ppm(40e6) == pytest.approx(-18.69, abs=0.05)
     assert first.calibration is not None
     names = ("phase", "tilt", "curve", "gibphase", "gibmag")
     columns = [first.calibration.sweeps[:, PARAMETERS.index(name)].tolist() for name in names]
@@ -310,11 +327,11 @@ def test_published_captures_of_the_deck(
     published: Callable[[str], Edges], name: str, least: int
 ) -> None:
     got = demodulate_recording([published(name)])
-    (reading,) = got.readings
+    (reading,) = got.photodiodes
     assert len(reading.bursts) == 103
-    assert reading.read.sum() >= least
+    assert reading.is_accepted.sum() >= least
     assert set(got.sweeps.channel.tolist()) == {7}
-    assert got.rotors[7].ppm(1e9) == pytest.approx(-12, abs=0.5)
+    assert got.rotors[7].period_deviation_ppm(1e9) == pytest.approx(-12, abs=0.5)
 
 
 @pytest.mark.parametrize(("rate_hz", "least"), [(24e6, 0.94), (32e6, 0.97)])
@@ -324,9 +341,9 @@ def test_the_published_capture_at_lower_rates(
     edges = published(CAPTURE)
     lower = light.edges(edges.tick[:800_000] / 40e6, 20.0, light.Receiving(rate_hz=rate_hz))
     got = demodulate_recording([lower])
-    (reading,) = got.readings
-    assert (reading.read | (reading.beside >= 0)).mean() > least
-    assert np.all(reading.matches.polynomial[reading.read] < 4)
+    (reading,) = got.photodiodes
+    assert (reading.is_accepted | (reading.continued_burst >= 0)).mean() > least
+    assert np.all(reading.matches.polynomial[reading.is_accepted] < 4)
 
 
 def test_a_rotor_that_wanders_within_seconds_does_not_move_a_standing_photodiode(
@@ -342,3 +359,54 @@ def test_a_rotor_that_wanders_within_seconds_does_not_move_a_standing_photodiode
         count = caught.count[caught.plane == plane]
         assert len(count) > 45
         assert 1.4826 * np.median(np.abs(count - np.median(count))) < limit
+
+
+# ---- stages
+
+
+def test_slow_bits_of_rotations() -> None:
+    rotor = Rotor(3, 100.0, 0.0, np.array([0.0, 1e6]), np.zeros(2), 9, 0, 1.0)
+    tick = np.array([10.0, 40.0, 110.0, 140.0, 310.0, 100_010.0])
+    bits = slow_bits(tick, np.array([4, 5, 5, 5, 4, 5], np.int32), rotor)
+    # Sweeps of rotation 0 disagree, rotation 2 has none, and 997 rotations become 500.
+    assert bits[:4].tolist() == [-1, 1, -1, 0]
+    assert len(bits) == 3 + 500 + 1
+    assert bits[-1] == 1
+    assert np.all(bits[4:-1] == -1)
+
+
+def test_the_latest_usable_factory_data() -> None:
+    valid = ootx.decode_frames(factory(4, 17))[0]
+    broken = bytearray(valid.payload)
+    broken[8:10] = struct.pack("<H", 0x7E00)
+    frames = [valid, replace(valid, payload=bytes(broken))]
+    data, warnings = _latest_factory_data(4, frames)
+    assert data is not None
+    assert data.id == 17
+    assert [warning.code for warning in warnings] == ["invalid_factory_data"]
+    data, warnings = _latest_factory_data(5, [valid])
+    assert data is not None
+    assert [warning.code for warning in warnings] == ["channel_mismatch"]
+    assert _latest_factory_data(4, []) == (None, [])
+
+
+def test_the_light_of_a_doubled_channel_alone_is_an_error_with_a_remedy(light: Any) -> None:
+    senders = [light.Sender(3), light.Sender(3, zero_s=0.011)]
+    lines, _ = light.of(senders, 2.0)
+    with pytest.raises(InputError, match="more than one station") as raised:
+        demodulate_recording(lines)
+    assert raised.value.hint == "Set each station to a channel of its own"
+
+
+def test_a_rejected_burst_beside_a_decoded_sweep_is_not_missed(light: Any) -> None:
+    (line,), _ = light.of([light.Sender(2)], 2.0)
+    got = demodulate_recording([line])
+    validated, rotor = got.photodiodes[0], got.rotors[2]
+    rows = np.arange(len(got.sweeps))
+    accepted = validated.is_accepted.copy()
+    accepted[20] = False
+    rejected = replace(validated, is_accepted=accepted)
+    # Its sweep was decoded, as from another burst; without that sweep it was missed.
+    assert _count_missed(0, rejected, got.sweeps, rows, rotor, line.rate_hz) == 0
+    others = np.delete(rows, 20)
+    assert _count_missed(0, rejected, got.sweeps, others, rotor, line.rate_hz) == 1
