@@ -21,3 +21,7 @@ INLIER_GATE_SIGMAS = 8.0
 MIN_INLIER_GATE_RAD = 1.5e-3
 """The gate follows the noise of the recording at this many standard deviations, but stays
 above what a generic calibration leaves unmodelled."""
+
+MAX_MARKER_MISFIT_M = 0.02
+"""Maximum rms distance of the markers from the positions that the scene assigns to them, in metres,
+above which a warning is given: ten times what hand measurement and a generic calibration leave."""
