@@ -6,7 +6,8 @@ Perspective-n-Point problem, which OpenCV solves by several methods:
 - SQPnP (Terzakis and Lourakis, ECCV 2020) from all rays;
 - IPPE (Collins and Bartoli, IJCV 109, 2014) from all rays of photodiodes on a plane, which returns
   both solutions of the planar ambiguity;
-- P3P from random sets of three rays, some of which contain no outlier.
+- P3P from random sets of three rays, some of which contain no outlier (see the note in
+  :func:`candidate_poses`).
 
 The candidates are rough. :func:`~locatk.core.lighthouse.devices.pose_fit.fit_poses` refines them
 and also uses the photodiodes with one plane only.
@@ -66,6 +67,12 @@ def candidate_poses(
     list of ((3,) ndarray, (3, 3) ndarray)
         Positions in metres and rotations, device to station. Empty if fewer than three
         photodiodes have both planes, or if four or more are collinear.
+
+    Notes
+    -----
+    ``cv2.solvePnPGeneric`` refuses three points with ``SOLVEPNP_P3P`` since OpenCV 4.5, so that
+    minimal sets, and devices with exactly three rays, yield no candidate at present.
+    ``cv2.solveP3P`` accepts them.
     """
     import cv2
 
@@ -87,7 +94,7 @@ def candidate_poses(
                 sensor_positions[rows], image_points[rows], np.eye(3), np.zeros(5), flags=method
             )
         except cv2.error:
-            return  # OpenCV refuses degenerate sets, as three collinear points.
+            return  # OpenCV refuses degenerate sets, and sets of three (see Notes).
         for rotation_vector, translation in zip(rotation_vectors, translations, strict=True):
             is_finite = np.all(np.isfinite(rotation_vector)) and np.all(np.isfinite(translation))
             # A station emits light forward only.
