@@ -5,15 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from locatk.core.errors import DegenerateError, InputError
-from locatk.core.lighthouse.devices.solver import rigid_devices, solve_devices
+from locatk.core.lighthouse.devices.solver import (
+    merge_solutions,
+    select_rigid_receivers,
+    solve_devices,
+)
 from locatk.core.lighthouse.epochs import group_epochs
 from locatk.core.lighthouse.job import Job
 from locatk.core.lighthouse.localization import photodiodes as poses
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning, from_json, to_json
 from locatk.core.trajectory import Trajectory
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
@@ -83,14 +90,49 @@ def solve(
     """
     scene = scene or Scene()
     options = options or SolveOptions()
-    rigid = rigid_devices(sweeps, receivers) if receivers else {}
+    rigid = select_rigid_receivers(sweeps, receivers) if receivers else {}
     if rigid and options.method == "bundle":
-        return solve_devices(sweeps, scene, options, rigid)
+        return _solve_with_devices(sweeps, scene, options, rigid)
     solution = _solve_points(sweeps, scene, options, odometry)
     if not rigid:
         return solution
     note = "the paper's method knows no rigid devices: each photodiode is solved by itself"
     return replace(solution, notes=(*solution.notes, note))
+
+
+def _solve_with_devices(
+    sweeps: Sweeps, scene: Scene, options: SolveOptions, rigid: Mapping[str, Receiver]
+) -> Solution:
+    """Solve the rigid devices, then the other photodiodes in the scene of the rigid devices."""
+    solution = solve_devices(sweeps, rigid, scene)
+    numbers = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
+    is_single = np.isin(sweeps.device, numbers)
+    if np.any(is_single):
+        photodiodes = solve(sweeps.take(is_single), solution.artifact, options)
+        solution = merge_solutions(solution, _typed(photodiodes))
+    return _untyped(solution)
+
+
+# At the merge with typed results: drop _typed and _untyped, their calls and their imports.
+
+
+def _typed(solution: Solution) -> Solution:
+    return replace(
+        solution,
+        detections=[from_json(StationDetection, row) for row in solution.detections],
+        facts=from_json(LighthouseFacts, solution.facts),
+        notes=(),
+        warnings=tuple(SolverWarning("", note) for note in solution.notes),
+    )
+
+
+def _untyped(solution: Solution) -> Solution:
+    return replace(
+        solution,
+        detections=to_json(solution.detections),
+        facts=to_json(solution.facts),
+        notes=tuple(warning.message for warning in solution.warnings),
+    )
 
 
 def _solve_points(

@@ -1,204 +1,313 @@
-"""Sweeps of one rigid device: planes told apart, angles, and windows of time around moments."""
+"""Sweeps of one rigid device: plane assignment, rotor angles, and windows around epochs.
+
+A rigid device carries several photodiodes at known positions (:class:`Receiver`). One rotation of
+a base station yields up to two sweeps of each photodiode, spread over some 20 ms. A pose is
+estimated from the sweeps of a window of time; its time is the epoch of the window.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.channels import CHANNELS, TICK_HZ, period_counts, period_ticks
 from locatk.core.lighthouse.devices.pose_fit import SweepObservations
 from locatk.core.lighthouse.epochs import MIN_PLANE_DELAY_TURNS
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.receiver import Receiver
-from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, UNKNOWN, Sweeps
 
-FIRST_ALONE = 0.40
-SECOND_ALONE = 0.60
-"""Parts of a rotation before and after which a sweep can only be of the first, or only of the
-second plane, within 70 degrees of straight ahead."""
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
-MOST_SWEEPS = 512
-"""Sweeps used of one moment; of more, every second or third: two rotations of four stations
-with 22 photodiodes each have 352."""
+MAX_LONE_FIRST_PLANE_TURNS = 0.40
+MIN_LONE_SECOND_PLANE_TURNS = 0.60
+"""Fractions of a rotation before and after which a lone sweep can only be of the first or of the
+second plane, for photodiodes within 70 degrees of the station's forward axis."""
+
+MAX_SWEEPS_PER_WINDOW = 512
+"""Maximum number of sweeps used of one window; of more, every second or third is used. Two
+rotations of four stations over 22 photodiodes each yield 352."""
+
+ROTATIONS_PER_WINDOW = 2.0
+"""Observations of one photodiode by one light plane in a window: one for each rotation before and
+after the epoch."""
+
+MIN_SWEEPS = 8
+"""Minimum number of sweeps for a pose: two more than its six unknowns, so that they check it."""
+
+MIN_SENSORS = 3
+"""Minimum number of different photodiodes for a pose; two leave a rotation about their line."""
 
 
 @dataclass(frozen=True)
 class DeviceSweeps:
-    """Sweeps of one device, by time.
+    """Sweeps of one device in ascending time.
 
     Attributes
     ----------
-    row : (n,) int ndarray
-        Where each is in the :class:`~locatk.core.lighthouse.recording.Sweeps` it comes from.
     time_ns : (n,) int64 ndarray
-        Ascending.
-    sensor, station, plane : (n,) int ndarray
-        ``station`` is a column of the stations of a recording.
+    sensor : (n,) int ndarray
+        Index of the photodiode in the receiver.
+    station : (n,) int ndarray
+        Index of the base station in the sequence of channels they were selected with.
+    plane : (n,) int ndarray
+        0 or 1.
     angle : (n,) ndarray
         Rotor angle in radians.
     """
 
-    row: NDArray[np.int64]
-    time_ns: NDArray[np.int64]
-    sensor: NDArray[np.int64]
-    station: NDArray[np.int64]
-    plane: NDArray[np.int64]
-    angle: NDArray[np.float64]
+    time_ns: IntArray
+    sensor: IntArray
+    station: IntArray
+    plane: IntArray
+    angle: Array
 
     def __len__(self) -> int:
         return len(self.time_ns)
 
-    def take(self, chosen: NDArray[np.int64] | NDArray[np.bool_]) -> DeviceSweeps:
-        """The chosen sweeps."""
-        return DeviceSweeps(*(getattr(self, f.name)[chosen] for f in fields(self)))
+    def take(self, rows: IntArray | Mask) -> DeviceSweeps:
+        """Return the selected sweeps."""
+        return DeviceSweeps(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+def received_channels(sweeps: Sweeps, devices: Iterable[str]) -> list[int]:
+    """Return the channels of the stations that named devices received, ascending.
+
+    Raises
+    ------
+    DegenerateError
+        None of the devices has a sweep with a valid channel.
+    """
+    names = list(devices)
+    numbers = [k for k, name in enumerate(sweeps.devices) if name in names]
+    is_selected = np.isin(sweeps.device, numbers)
+    channels = [int(c) for c in np.unique(sweeps.channel[is_selected]) if c in CHANNELS]
+    if not channels:
+        raise DegenerateError(
+            "no device with known photodiodes has a usable sweep",
+            hint="receivers are given for "
+            + (", ".join(names) or "no device")
+            + "; the recording contains "
+            + (", ".join(sweeps.devices) or "none"),
+        )
+    return channels
 
 
 def select_device_sweeps(
     sweeps: Sweeps, device: int, receiver: Receiver, channels: Sequence[int]
 ) -> tuple[DeviceSweeps, dict[str, int]]:
-    """Usable sweeps of one device, and how many are left out under which reason.
+    """Select the usable sweeps of one device.
 
     Parameters
     ----------
     sweeps : Sweeps
     device : int
-        Its index in ``sweeps.devices``.
+        Index in ``sweeps.devices``.
     receiver : Receiver
     channels : sequence of int
-        Of the stations; sweeps of others are left out.
+        Channels of the stations; sweeps of other stations are rejected.
+
+    Returns
+    -------
+    selected : DeviceSweeps
+    rejected : dict of str to int
+        Number of rejected sweeps by reason.
     """
     rejected: dict[str, int] = {}
-    mine = np.flatnonzero(sweeps.device == device)
+    rows = np.flatnonzero(sweeps.device == device)
 
-    def keep(good: NDArray[np.bool_], reason: str) -> None:
-        nonlocal mine
-        if not np.all(good):
-            rejected[reason] = int(np.count_nonzero(~good))
-            mine = mine[good]
+    def keep(is_usable: Mask, reason: str) -> None:
+        nonlocal rows
+        if not np.all(is_usable):
+            rejected[reason] = int(np.count_nonzero(~is_usable))
+            rows = rows[is_usable]
 
-    keep(np.isin(sweeps.channel[mine], CHANNELS), "unknown_channel")
-    sensor = sweeps.sensor[mine]
-    placed = np.append(np.isfinite(receiver.position_m).all(axis=1), False)
-    keep(placed[np.where((sensor >= 0) & (sensor < len(receiver)), sensor, -1)], "sensor_unknown")
-    keep(np.isin(sweeps.channel[mine], list(channels)), "station_not_in_scene")
-    counts = sweeps.count[mine]
+    keep(np.isin(sweeps.channel[rows], CHANNELS), "unknown_channel")
+    sensor = sweeps.sensor[rows]
+    # The appended False is the entry of all sensor numbers outside the receiver.
+    has_position = np.append(np.isfinite(receiver.position_m).all(axis=1), False)
+    is_in_receiver = (sensor >= 0) & (sensor < len(receiver))
+    keep(has_position[np.where(is_in_receiver, sensor, -1)], "sensor_unknown")
+    keep(np.isin(sweeps.channel[rows], list(channels)), "station_not_in_scene")
+    counts = sweeps.count[rows]
     with np.errstate(invalid="ignore"):
-        inside = (counts >= 0) & (counts < period_counts(sweeps.channel[mine]))
-    keep(inside, "count_above_period")
-    mine = mine[np.argsort(sweeps.time_ns[mine], kind="stable")]
-    plane = assign_planes(sweeps.time_ns[mine], sweeps.channel[mine], sweeps.count[mine])
-    plane = np.where(sweeps.sweep[mine] == UNKNOWN, plane, sweeps.sweep[mine])
-    known = (plane == 0) | (plane == 1)
-    plane = plane[known]
-    keep(known, "plane_unknown")
-    channel = sweeps.channel[mine]
-    turn = sweeps.count[mine] / period_counts(channel)
-    columns = np.zeros(CHANNELS.stop, np.int64)
-    columns[list(channels)] = np.arange(len(channels))
-    return DeviceSweeps(
-        mine,
-        sweeps.time_ns[mine],
-        sweeps.sensor[mine].astype(np.int64),
-        columns[channel],
+        is_in_period = (counts >= 0) & (counts < period_counts(sweeps.channel[rows]))
+    keep(is_in_period, "count_above_period")
+    rows = rows[np.argsort(sweeps.time_ns[rows], kind="stable")]
+    plane = assign_planes(sweeps.time_ns[rows], sweeps.channel[rows], sweeps.count[rows])
+    plane = np.where(sweeps.sweep[rows] == UNKNOWN, plane, sweeps.sweep[rows])
+    is_assigned = (plane == 0) | (plane == 1)
+    plane = plane[is_assigned]
+    keep(is_assigned, "plane_unknown")
+
+    channel = sweeps.channel[rows]
+    station_of_channel = np.zeros(CHANNELS.stop, np.int64)
+    station_of_channel[list(channels)] = np.arange(len(channels))
+    rotor_turns = sweeps.count[rows] / period_counts(channel)
+    selected = DeviceSweeps(
+        sweeps.time_ns[rows],
+        sweeps.sensor[rows].astype(np.int64),
+        station_of_channel[channel],
         plane.astype(np.int64),
-        2 * np.pi * turn + ROTOR_ZERO_RAD[plane],
-    ), rejected
+        2 * np.pi * rotor_turns + ROTOR_ZERO_RAD[plane],
+    )
+    return selected, rejected
 
 
-def assign_planes(
-    time_ns: NDArray[np.int64], channel: NDArray[np.int32], count: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Which plane each sweep of a device was: 0, 1 or -1 where nothing tells.
+def assign_planes(time_ns: IntArray, channel: NDArray[np.int32], count: Array) -> IntArray:
+    """Assign each sweep of a device to the first or second plane of its station.
 
-    In one rotation of a station the photodiodes of a device are met by the first plane
-    close together, and by the second about a third of a turn later. Where only one of the
-    two was received, its place in the rotation tells, unless it is in the middle.
+    In one rotation of a station the first plane crosses all photodiodes of a device within a
+    small angle, and the second plane follows about a third of a rotation later. The widest gap of
+    a rotation therefore separates the planes. If only one plane was received, its rotor angle
+    decides, except in the middle of the rotation.
+
+    Parameters
+    ----------
+    time_ns : (n,) int64 ndarray
+    channel : (n,) int ndarray
+        1 to 16.
+    count : (n,) ndarray
+        LFSR steps since the zero of the rotor.
+
+    Returns
+    -------
+    (n,) int ndarray
+        0, 1, or -1 if the plane is unknown.
     """
-    turn = count / period_counts(channel)
-    period_ns = period_ticks(channel) * (1e9 / TICK_HZ)
-    since = time_ns - (time_ns[0] if len(time_ns) else 0)
-    zero = since - turn * period_ns
-    order = np.lexsort((zero, channel))
-    apart = np.diff(zero[order]) > 0.5 * period_ns[order][1:]
-    fresh = np.r_[True, apart | (np.diff(channel[order]) != 0)][: len(order)]
-    rotation = np.empty(len(order), np.int64)
-    rotation[order] = np.cumsum(fresh) - 1
+    rotor_turns = count / period_counts(channel)
+    rotation = _number_rotations(time_ns, channel, rotor_turns)
+    lone_plane = np.where(
+        rotor_turns < MAX_LONE_FIRST_PLANE_TURNS,
+        0,
+        np.where(rotor_turns > MIN_LONE_SECOND_PLANE_TURNS, 1, UNKNOWN),
+    )
+    order = np.lexsort((rotor_turns, rotation))
+    turns, rotation_sorted = rotor_turns[order], rotation[order]
+    step = np.diff(turns)
+    step[np.diff(rotation_sorted) != 0] = 0.0
+    widest = np.zeros(int(np.max(rotation, initial=-1)) + 1)
+    np.maximum.at(widest, rotation_sorted[1:], step)
+    gap = np.flatnonzero((step > MIN_PLANE_DELAY_TURNS) & (step == widest[rotation_sorted[1:]]))
+    boundary = np.full(len(widest), np.nan)
+    boundary[rotation_sorted[gap]] = turns[gap] + step[gap] / 2
+    boundary = boundary[rotation]
+    return np.where(np.isnan(boundary), lone_plane, (rotor_turns > boundary).astype(np.int64))
 
-    plane = np.where(turn < FIRST_ALONE, 0, np.where(turn > SECOND_ALONE, 1, UNKNOWN))
-    order = np.lexsort((turn, rotation))
-    step = np.diff(turn[order])
-    step[np.diff(rotation[order]) != 0] = 0.0
-    # The widest gap of each rotation, where it is wide enough to part two planes.
-    widest = np.zeros(np.count_nonzero(fresh))
-    np.maximum.at(widest, rotation[order][1:], step)
-    gap = np.flatnonzero((step > MIN_PLANE_DELAY_TURNS) & (step == widest[rotation[order][1:]]))
-    limit = np.full(len(widest), np.nan)
-    limit[rotation[order][gap]] = turn[order][gap] + step[gap] / 2
-    split = limit[rotation]
-    return np.where(np.isnan(split), plane, (turn > split).astype(np.int64))
+
+def _number_rotations(
+    time_ns: IntArray, channel: NDArray[np.int32], rotor_turns: Array
+) -> IntArray:
+    """Number the rotations of all stations; (n,) with equal numbers for one rotation."""
+    period_ns = period_ticks(channel) * (NANOSECONDS_PER_S / TICK_HZ)
+    elapsed_ns = time_ns - (time_ns[0] if len(time_ns) else 0)
+    rotor_zero_ns = elapsed_ns - rotor_turns * period_ns
+    order = np.lexsort((rotor_zero_ns, channel))
+    is_new = np.diff(rotor_zero_ns[order]) > 0.5 * period_ns[order][1:]
+    is_new = np.r_[True, is_new | (np.diff(channel[order]) != 0)][: len(order)]
+    rotation = np.empty(len(order), np.int64)
+    rotation[order] = np.cumsum(is_new) - 1
+    return rotation
+
+
+def mean_angles(sweeps: DeviceSweeps, sensors: int) -> Array:
+    """Return the mean rotor angle (sensors, 2) of each photodiode and plane of one station.
+
+    Angles are in radians, ``nan`` for planes without a sweep.
+    """
+    total, number = np.zeros((sensors, 2)), np.zeros((sensors, 2))
+    np.add.at(total, (sweeps.sensor, sweeps.plane), sweeps.angle)
+    np.add.at(number, (sweeps.sensor, sweeps.plane), 1)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / number)
+
+
+# ---- windows
 
 
 @dataclass(frozen=True)
 class SweepWindows:
-    """Moments of a device, each with the sweeps around it.
+    """Epochs of a device, each with the sweeps around it.
 
     Attributes
     ----------
     time_ns : (m,) int64 ndarray
-        Ascending: the mean time of the sweeps, where pose and rates are least entangled.
+        Time of each epoch, ascending: the mean time of its sweeps, at which pose and rates are
+        least correlated.
     sweep : (m, n) int ndarray
-        Rows of :class:`DeviceSweeps`; -1 pads.
+        Rows of :class:`DeviceSweeps`; rows end with -1 as padding.
     """
 
-    time_ns: NDArray[np.int64]
-    sweep: NDArray[np.int64]
+    time_ns: IntArray
+    sweep: IntArray
 
     def __len__(self) -> int:
         return len(self.time_ns)
 
 
-def make_windows(mine: DeviceSweeps, every_ns: int, reach_ns: int) -> SweepWindows:
-    """A moment every ``every_ns`` wherever there are sweeps, with those up to ``reach_ns``
-    before and after it."""
-    if len(mine) == 0:
+def rotation_limits_ns(channels: ArrayLike) -> tuple[int, int]:
+    """Return the shortest and the longest rotation of stations on ``channels`` [ns]."""
+    periods_ns = period_ticks(channels) * NANOSECONDS_PER_S / TICK_HZ
+    return int(np.min(periods_ns)), int(np.max(periods_ns))
+
+
+def make_windows(sweeps: DeviceSweeps, interval_ns: int, half_width_ns: int) -> SweepWindows:
+    """Place a window in every interval of ``interval_ns`` that contains sweeps.
+
+    A window contains the sweeps up to ``half_width_ns`` before and after its centre.
+    """
+    if len(sweeps) == 0:
         return SweepWindows(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
-    since = mine.time_ns - mine.time_ns[0]
-    stretch, start = np.unique(since // every_ns, return_index=True)
-    # The middle of a stretch, or near its first sweep where it is longer than the reach.
-    first_in = since[start]
-    middle = stretch * every_ns + every_ns // 2
-    centre = np.clip(middle, first_in - reach_ns, first_in + reach_ns)
-    first = np.searchsorted(since, centre - reach_ns)
-    last = np.searchsorted(since, centre + reach_ns, side="right")
-    number = last - first
-    step = np.maximum(1, -(-number // MOST_SWEEPS))
-    column = np.arange(int(np.max(-(-number // step), initial=0)))
-    sweep = first[:, None] + column * step[:, None]
-    sweep[sweep >= last[:, None]] = -1
-    held = sweep >= 0
-    total = np.sum(np.where(held, since[sweep], 0.0), axis=1)
-    mean = np.rint(total / np.count_nonzero(held, axis=1)).astype(np.int64)
-    # Beside a pause two windows may hold the same sweeps.
-    fresh = np.r_[True, np.diff(np.maximum.accumulate(mean)) > 0]
-    return SweepWindows(mine.time_ns[0] + mean[fresh], sweep[fresh])
+    elapsed_ns = sweeps.time_ns - sweeps.time_ns[0]
+    interval, first_sweep = np.unique(elapsed_ns // interval_ns, return_index=True)
+    # The centre is that of the interval, moved to its first sweep if this is out of range.
+    first_ns = elapsed_ns[first_sweep]
+    middle_ns = interval * interval_ns + interval_ns // 2
+    centre_ns = np.clip(middle_ns, first_ns - half_width_ns, first_ns + half_width_ns)
+    start = np.searchsorted(elapsed_ns, centre_ns - half_width_ns)
+    stop = np.searchsorted(elapsed_ns, centre_ns + half_width_ns, side="right")
+    number = stop - start
+    stride = np.maximum(1, -(-number // MAX_SWEEPS_PER_WINDOW))
+    column = np.arange(int(np.max(-(-number // stride), initial=0)))
+    sweep = start[:, None] + column * stride[:, None]
+    sweep[sweep >= stop[:, None]] = -1
+    is_sweep = sweep >= 0
+    total_ns = np.sum(np.where(is_sweep, elapsed_ns[sweep], 0.0), axis=1)
+    mean_ns = np.rint(total_ns / np.count_nonzero(is_sweep, axis=1)).astype(np.int64)
+    # At a pause of the recording two windows may contain the same sweeps.
+    is_distinct = np.r_[True, np.diff(np.maximum.accumulate(mean_ns)) > 0]
+    return SweepWindows(sweeps.time_ns[0] + mean_ns[is_distinct], sweep[is_distinct])
+
+
+def has_enough_sweeps(sweeps: DeviceSweeps, window_sweeps: IntArray) -> Mask:
+    """Return for each window whether its sweeps (m, n) can determine a pose."""
+    is_sweep = window_sweeps >= 0
+    sensor = np.where(is_sweep, sweeps.sensor[window_sweeps] if len(sweeps) else 0, -1)
+    sensors = np.count_nonzero(np.diff(np.sort(sensor, axis=1), axis=1, prepend=-1), axis=1)
+    number = np.count_nonzero(is_sweep, axis=1)
+    return np.asarray((number >= MIN_SWEEPS) & (sensors >= MIN_SENSORS))
 
 
 def gather_observations(
-    mine: DeviceSweeps, around: SweepWindows, receiver: Receiver, moments: NDArray[np.int64]
+    sweeps: DeviceSweeps, windows: SweepWindows, receiver: Receiver, epochs: IntArray
 ) -> SweepObservations:
-    """The sweeps of the chosen moments."""
-    sweep = around.sweep[moments]
-    wide = int(np.max(np.count_nonzero(sweep >= 0, axis=1), initial=0))
-    sweep = sweep[:, :wide]
-    since = mine.time_ns[sweep] - around.time_ns[moments][:, None]
+    """Gather the sweeps of the selected windows in padded arrays for the pose fit."""
+    sweep = windows.sweep[epochs]
+    is_sweep = sweep >= 0
+    width = int(np.max(np.count_nonzero(is_sweep, axis=1), initial=0))
+    sweep, is_sweep = sweep[:, :width], is_sweep[:, :width]
+    offset_ns = sweeps.time_ns[sweep] - windows.time_ns[epochs][:, None]
     return SweepObservations(
-        receiver.position_m[mine.sensor[sweep]],
-        mine.station[sweep],
-        mine.plane[sweep],
-        mine.angle[sweep],
-        np.where(sweep >= 0, since * 1e-9, 0.0),
-        sweep >= 0,
+        receiver.position_m[sweeps.sensor[sweep]],
+        sweeps.station[sweep],
+        sweeps.plane[sweep],
+        sweeps.angle[sweep],
+        np.where(is_sweep, offset_ns * 1e-9, 0.0),
+        is_sweep,
     )

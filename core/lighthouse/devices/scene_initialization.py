@@ -1,15 +1,21 @@
-"""A scene solved from rigid devices alone: nothing else is measured, not even the scale.
+"""Scene estimated from rigid devices alone; their size gives the scale.
 
-Each station sees a device of known shape, so that one look gives the pose of the device
-under that station. Two stations that look at one device at one time know where they stand to
-each other; over many moments they agree on it, or are outvoted. All stations are then joined
-and adjusted together with the devices' poses.
+The sweeps of one station determine the pose of a device of known shape under that station. The
+scene follows in four steps:
+
+1. Poses of the devices under each single station, at epochs distributed over the recording
+   (:func:`estimate_station_poses`). A coplanar device can have two.
+2. Relative poses of pairs of stations from epochs at which both received a device
+   (:func:`estimate_links`). The epochs vote, since some of the poses are wrong.
+3. Poses of all linked stations in the frame of the first one, along the spanning tree of the
+   links with the most epochs (:func:`connect_stations`).
+4. Bundle adjustment of the stations and of the poses of the devices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,314 +24,648 @@ from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD, Calibration
 from locatk.core.lighthouse.devices.bundle_adjustment import adjust_devices
 from locatk.core.lighthouse.devices.device_sweeps import (
+    MIN_SWEEPS,
+    ROTATIONS_PER_WINDOW,
     DeviceSweeps,
     SweepWindows,
     gather_observations,
+    has_enough_sweeps,
     make_windows,
+    mean_angles,
+    rotation_limits_ns,
 )
-from locatk.core.lighthouse.devices.pnp import LOSS_SCALE_RAD
+from locatk.core.lighthouse.devices.pnp import candidate_poses
 from locatk.core.lighthouse.devices.pose_fit import (
     DeviceStates,
     Stations,
     SweepObservations,
     fit_poses,
 )
-from locatk.core.lighthouse.devices.station_links import (
-    StationLink,
-    StationViews,
-    join,
-    links_of,
-    views_of,
+from locatk.core.lighthouse.devices.tracking import (
+    LOSS_SCALE_RAD,
+    LOSS_SCALE_SIGMAS,
+    is_accepted,
+    rotations_differ,
 )
-from locatk.core.lighthouse.devices.tracking import REPEATS, rotation_ns
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.results import LighthouseFacts, StationPairLink
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.robust import robust_sigma
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
-MOMENTS_LOOKED_AT = 200
-"""Moments of a device that are located under each station, at most."""
+MAX_EPOCHS_PER_DEVICE = 200
+"""Maximum number of epochs of a device that are solved under each station."""
 
-MOMENTS_ADJUSTED = 160
-MOMENTS_OF_A_PLACE = 4
-"""A device that stands still repeats the same errors: of one place a few moments are enough,
-and together they weigh as one."""
+STATION_WEIGHT_SWEEPS = 1e4
+"""Number of sweeps that a further station of an epoch is worth: more than a window can contain,
+because epochs with several stations link these."""
 
-SAME_PLACE_M = 0.05
-SAME_TURN = 0.15
-"""DeviceStates (m, rad) nearer than this are one place."""
+MAX_STATION_HYPOTHESES = 2
+"""Poses of a device under one station that are kept; a coplanar device has two."""
 
-FEW_PLACES = 8
-"""Places below which a scene calls for a word."""
+MAX_HYPOTHESIS_COST = 50.0
+"""Maximum cost (half the sum of squares over the variance of an angle) by which the second pose may
+be worse than the first."""
+
+MIN_HYPOTHESIS_ROTATION_RAD = 0.15
+"""Minimum angle between two poses of a device under one station that count as different."""
+
+LINK_ROTATION_GATE_RAD = 0.15
+LINK_POSITION_GATE_FRACTION = 0.15
+"""Rotation (rad) and displacement (fraction of the sum of both distances to the device) by which
+the relative pose of two stations at one epoch may differ from that of the pair. The pose of a deck
+of 30 mm at two metres is off by a few degrees."""
+
+MAX_LINK_PROPOSALS = 200
+"""Maximum number of epochs whose relative pose is proposed for a pair of stations."""
+
+LINK_ITERATIONS = 5
+"""Number of times that the relative pose is averaged over the agreeing epochs."""
+
+MIN_RIVAL_FRACTION = 0.8
+"""Fraction of the votes for the best relative pose from which on another is as good."""
+
+MAX_ADJUSTED_EPOCHS = 160
+MAX_EPOCHS_PER_POSITION = 4
+"""Maximum number of epochs in the bundle adjustment, in all and at one position. A device at rest
+repeats the same errors, so that the epochs of a position together have the weight of one."""
+
+SAME_POSITION_M = 0.05
+SAME_ROTATION_RAD = 0.15
+"""Maximum distance and angle between epochs that count as one position of a device."""
+
+MIN_POSITIONS = 8
+"""Number of positions below which a warning is given."""
+
+INITIAL_LOSS_SCALE_RAD = 10 * LOSS_SCALE_RAD
+"""Scale of the Cauchy loss while the poses of the stations are rough."""
 
 
-@dataclass
-class SolvedScene:
-    """Stations with what is to be said about them."""
+@dataclass(frozen=True)
+class SceneEstimate:
+    """Scene estimated from rigid devices, with facts and warnings."""
 
     scene: Scene
-    facts: dict[str, object] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    facts: LighthouseFacts
+    warnings: tuple[SolverWarning, ...]
 
 
-def solve_scene(
-    devices: Sequence[tuple[DeviceSweeps, Receiver]],
-    channels: Sequence[int],
-    scene: Scene,
-) -> SolvedScene:
-    """Stations from what rigid devices saw of them.
+@dataclass(frozen=True)
+class StationPoses:
+    """Poses of devices under single stations, one row per hypothesis.
+
+    Attributes
+    ----------
+    epoch : (v,) int ndarray
+        Number of the epoch, over all devices.
+    station : (v,) int ndarray
+    position : (v, 3) ndarray
+        Of the device in the station's axes, in metres.
+    rotation : (v, 3, 3) ndarray
+        Device to station.
+    """
+
+    epoch: IntArray
+    station: IntArray
+    position: Array
+    rotation: Array
+
+    def __len__(self) -> int:
+        return len(self.epoch)
+
+
+@dataclass(frozen=True)
+class StationLink:
+    """Pose of a second station in the axes of a first one.
+
+    Attributes
+    ----------
+    first, second : int
+        Indices of the stations.
+    position : (3,) ndarray
+        In metres.
+    rotation : (3, 3) ndarray
+        Second to first.
+    epochs : int
+        Number of epochs that agree with it.
+    is_ambiguous : bool
+        Whether a quite different pose has about as many votes. A coplanar device that was not
+        moved has two poses under each station, and nothing decides between them.
+    """
+
+    first: int
+    second: int
+    position: Array
+    rotation: Array
+    epochs: int
+    is_ambiguous: bool = False
+
+
+def estimate_scene_from_devices(
+    devices: Sequence[tuple[DeviceSweeps, Receiver]], channels: Sequence[int], scene: Scene
+) -> SceneEstimate:
+    """Estimate the stations from the sweeps of rigid devices.
 
     Parameters
     ----------
     devices : sequence of (DeviceSweeps, Receiver)
-        Their ``station`` are columns of ``channels``.
+        Their ``station`` indexes ``channels``.
     channels : sequence of int
     scene : Scene
         Without stations; its calibrations and serial numbers are used.
 
+    Returns
+    -------
+    SceneEstimate
+        In the axes of the first station that is linked to others.
+
     Raises
     ------
     DegenerateError
-        No station sees enough of a device to tell its pose.
+        No station determines the pose of a device.
     """
     calibrations = tuple(scene.calibrations.get(c, GENERIC_CALIBRATION) for c in channels)
-    every_ns, reach_ns = rotation_ns(list(channels))
-    looks, views, number = [], [], 0
-    for mine, receiver in devices:
-        around = make_windows(mine, every_ns, reach_ns)
-        moments = _promising(mine, around)
-        if not len(moments):
+    interval_ns, half_width_ns = rotation_limits_ns(list(channels))
+    observations, station_poses, number = [], [], 0
+    for sweeps, receiver in devices:
+        windows = make_windows(sweeps, interval_ns, half_width_ns)
+        epochs = select_epochs(sweeps, windows)
+        if not len(epochs):
             continue
-        found = views_of(mine, receiver, around, moments, calibrations)
-        looks.append(gather_observations(mine, around, receiver, moments))
-        views.append((found, number))
-        number += len(moments)
-    if not views or not any(len(v.moment) for v, _ in views):
+        poses = estimate_station_poses(sweeps, receiver, windows, epochs, calibrations)
+        station_poses.append(replace(poses, epoch=poses.epoch + number))
+        observations.append(gather_observations(sweeps, windows, receiver, epochs))
+        number += len(epochs)
+    poses = _concatenate_poses(station_poses)
+    if not len(poses):
         raise DegenerateError(
-            "no station sees enough photodiodes of a device at a time to tell its pose",
-            hint="three or more must see both planes of one station; is the receiver's file of "
-            "this device?",
+            "no station sees enough photodiodes of a device at a time to determine its pose",
+            hint="three or more photodiodes must receive both planes of one station; does the "
+            "receiver's file describe this device?",
         )
-    every = StationViews(
-        np.concatenate([v.moment + n for v, n in views]),
-        np.concatenate([v.station for v, _ in views]),
-        np.concatenate([v.position for v, _ in views]),
-        np.concatenate([v.rotation for v, _ in views]),
-    )
-    links = links_of(every, len(channels))
-    joined, placed = join(links, every, len(channels))
+    links = estimate_links(poses, len(channels))
+    connected = connect_stations(links, poses, len(channels))
+    joined = list(connected)
     stations: Stations = (
-        np.stack([placed[i][0] for i in joined]),
-        np.stack([placed[i][1] for i in joined]),
+        np.stack([connected[i][0] for i in joined]),
+        np.stack([connected[i][1] for i in joined]),
         tuple(calibrations[i] for i in joined),
     )
-    return _adjusted(_stacked(looks), every, stations, joined, channels, scene, links)
+    return _adjust_scene(
+        _stack_observations(observations), poses, stations, joined, channels, scene, links
+    )
 
 
-# ---- single stations
+def select_epochs(sweeps: DeviceSweeps, windows: SweepWindows) -> IntArray:
+    """Select epochs distributed over the recording, with many stations and sweeps.
 
-
-def _promising(mine: DeviceSweeps, around: SweepWindows) -> NDArray[np.int64]:
-    """Moments spread over the recording, of each stretch that with the most looks."""
-    if not len(around):
+    The recording is divided into ``MAX_EPOCHS_PER_DEVICE`` parts; the best epoch of each part is
+    selected.
+    """
+    if not len(windows):
         return np.zeros(0, np.int64)
-    held = around.sweep >= 0
-    station = np.where(held, mine.station[around.sweep], -1)
-    # Stations first, then sweeps: what joins stations is worth more.
-    worth = np.count_nonzero(held, axis=1).astype(float)
-    for i in np.unique(mine.station):
-        worth += 1e4 * (np.count_nonzero(station == i, axis=1) >= 8)
-    stretch = np.arange(len(around)) * MOMENTS_LOOKED_AT // max(len(around), MOMENTS_LOOKED_AT)
-    order = np.lexsort((-worth, stretch))
-    first = np.r_[True, np.diff(stretch[order]) > 0]
-    return np.sort(order[first])
+    is_sweep = windows.sweep >= 0
+    station = np.where(is_sweep, sweeps.station[windows.sweep], -1)
+    value = np.count_nonzero(is_sweep, axis=1).astype(float)
+    for i in np.unique(sweeps.station):
+        is_received = np.count_nonzero(station == i, axis=1) >= MIN_SWEEPS
+        value += STATION_WEIGHT_SWEEPS * is_received
+    count = max(len(windows), MAX_EPOCHS_PER_DEVICE)
+    part = np.arange(len(windows)) * MAX_EPOCHS_PER_DEVICE // count
+    order = np.lexsort((-value, part))
+    is_best = np.r_[True, np.diff(part[order]) > 0]
+    return np.sort(order[is_best])
 
 
-# ---- all together
+# ---- poses under single stations
 
 
-def _stacked(parts: list[SweepObservations]) -> SweepObservations:
-    """Moments of several devices, padded to one width."""
-    wide = max(p.angle.shape[1] for p in parts)
+def estimate_station_poses(
+    sweeps: DeviceSweeps,
+    receiver: Receiver,
+    windows: SweepWindows,
+    epochs: IntArray,
+    calibrations: tuple[Calibration, ...],
+) -> StationPoses:
+    """Estimate the poses of a device at selected epochs under each station by itself.
 
-    def widened(values: NDArray[np.generic]) -> NDArray[np.generic]:
-        room = [(0, 0), (0, wide - values.shape[1])] + [(0, 0)] * (values.ndim - 2)
-        return np.pad(values, room)
+    The ``epoch`` of the result indexes ``epochs``.
+    """
+    parts = []
+    for i, calibration in enumerate(calibrations):
+        sweep = windows.sweep[epochs]
+        sweep = np.where((sweep >= 0) & (sweeps.station[sweep] == i), sweep, -1)
+        # The padding of a window follows its sweeps.
+        sweep = np.take_along_axis(sweep, np.argsort(sweep < 0, axis=1, kind="stable"), axis=1)
+        hypotheses: list[tuple[int, Array, Array]] = []
+        for k in np.flatnonzero(has_enough_sweeps(sweeps, sweep)):
+            angles = mean_angles(sweeps.take(sweep[k][sweep[k] >= 0]), len(receiver))
+            candidates = candidate_poses(angles, receiver, calibration, minimal_sets=False)
+            hypotheses.extend((int(k), *candidate) for candidate in candidates)
+        if not hypotheses:
+            continue
+        owners, positions, rotations = zip(*hypotheses, strict=True)
+        owner = np.array(owners)
+        station_windows = SweepWindows(windows.time_ns[epochs], sweep)
+        everything = np.arange(len(epochs))
+        observations = gather_observations(sweeps, station_windows, receiver, everything)
+        observations = observations.take(owner)
+        fit = fit_poses(
+            replace(observations, station=np.zeros_like(observations.station)),
+            (np.zeros((1, 3)), np.eye(3)[None], (calibration,)),
+            DeviceStates.at_rest(np.stack(positions), np.stack(rotations)),
+            sigma=ANGLE_SIGMA_RAD,
+            soft=LOSS_SCALE_RAD,
+            iterations=15,
+        )
+        is_in_front = fit.poses.position[:, 0] > 0
+        accepted = is_accepted(observations, fit.residual) & is_in_front
+        kept = select_hypotheses(owner, fit.cost, fit.poses.rotation, accepted)
+        poses = fit.poses.take(kept)
+        parts.append(
+            StationPoses(owner[kept], np.full(len(kept), i), poses.position, poses.rotation)
+        )
+    return _concatenate_poses(parts)
+
+
+def select_hypotheses(owner: IntArray, cost: Array, rotation: Array, accepted: Mask) -> IntArray:
+    """Select the distinct hypotheses of each epoch that are not much worse than its best.
+
+    Parameters
+    ----------
+    owner : (h,) int ndarray
+        Epoch of each hypothesis.
+    cost : (h,) ndarray
+    rotation : (h, 3, 3) ndarray
+    accepted : (h,) bool ndarray
+
+    Returns
+    -------
+    (k,) int ndarray
+        Rows, by epoch and cost.
+    """
+    kept: list[int] = []
+    kept_of_epoch: list[int] = []
+    for row in np.lexsort((cost, owner)):
+        if not accepted[row]:
+            continue
+        if kept_of_epoch and owner[kept_of_epoch[0]] != owner[row]:
+            kept_of_epoch = []
+        if len(kept_of_epoch) >= MAX_STATION_HYPOTHESES:
+            continue
+        if kept_of_epoch and cost[row] > cost[kept_of_epoch[0]] + MAX_HYPOTHESIS_COST:
+            continue
+        if all(
+            rotations_differ(rotation[row], rotation[k], MIN_HYPOTHESIS_ROTATION_RAD)
+            for k in kept_of_epoch
+        ):
+            kept_of_epoch.append(int(row))
+            kept.append(int(row))
+    return np.array(kept, np.int64)
+
+
+def _concatenate_poses(parts: Sequence[StationPoses]) -> StationPoses:
+    if not parts:
+        none = np.zeros(0, np.int64)
+        return StationPoses(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    return StationPoses(
+        np.concatenate([p.epoch for p in parts]),
+        np.concatenate([p.station for p in parts]),
+        np.concatenate([p.position for p in parts]),
+        np.concatenate([p.rotation for p in parts]),
+    )
+
+
+# ---- relative poses of stations
+
+
+def estimate_links(poses: StationPoses, stations: int) -> list[StationLink]:
+    """Estimate the relative poses of all pairs of stations that received a device together."""
+    pairs = [(i, j) for i in range(stations) for j in range(i + 1, stations)]
+    links = [estimate_link(poses, i, j) for i, j in pairs]
+    return [link for link in links if link is not None]
+
+
+def estimate_link(poses: StationPoses, first: int, second: int) -> StationLink | None:
+    """Estimate the pose of a second station in the axes of a first one.
+
+    Each epoch with poses under both stations yields a relative pose, or several if the poses are
+    ambiguous. The relative pose with the least truncated cost over all epochs is chosen and
+    averaged over the epochs that agree with it. None without a common epoch.
+    """
+    rows = [np.flatnonzero(poses.station == i) for i in (first, second)]
+    pair = np.nonzero(poses.epoch[rows[0]][:, None] == poses.epoch[rows[1]][None])
+    if not len(pair[0]):
+        return None
+    a, b = rows[0][pair[0]], rows[1][pair[1]]
+    # Second station to device, then device to first station.
+    rotation = poses.rotation[a] @ np.swapaxes(poses.rotation[b], -1, -2)
+    position = poses.position[a] - (rotation @ poses.position[b][..., None])[..., 0]
+    distance = np.linalg.norm(poses.position[a], axis=1) + np.linalg.norm(poses.position[b], axis=1)
+
+    def squared_misfit(pairs: IntArray, positions: Array, rotations: Array) -> Array:
+        """Return the misfit (h, p) of proposals (h) at pairs of poses (p); 1 at the gate."""
+        trace = np.einsum("hij,pij->hp", rotations, rotation[pairs])
+        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        displacement = np.linalg.norm(positions[:, None] - position[pairs], axis=2)
+        return (angle / LINK_ROTATION_GATE_RAD) ** 2 + (
+            displacement / (LINK_POSITION_GATE_FRACTION * distance[pairs])
+        ) ** 2
+
+    everything = np.arange(len(a))
+    count = min(len(a), MAX_LINK_PROPOSALS)
+    proposals = np.unique(np.linspace(0, len(a) - 1, count).astype(int))
+    misfit = squared_misfit(everything, position[proposals], rotation[proposals])
+    # At most one of the hypotheses of an epoch is right: the one with the least misfit counts.
+    epochs, epoch = np.unique(poses.epoch[a], return_inverse=True)
+    cost = np.ones((len(proposals), len(epochs)))
+    np.minimum.at(cost.T, epoch, np.minimum(misfit, 1.0).T)
+    best = int(proposals[np.argmin(cost.sum(axis=1))])
+    link_position, link_rotation = position[best], rotation[best]
+    for _ in range(LINK_ITERATIONS):
+        misfit = squared_misfit(everything, link_position[None], link_rotation[None])
+        inliers = np.flatnonzero(misfit[0] < 1.0)
+        if not len(inliers):
+            return None
+        link_position = np.median(position[inliers], axis=0)
+        link_rotation = _mean_rotation(rotation[inliers])
+    agreeing = len(np.unique(epoch[inliers]))
+    is_rival = squared_misfit(proposals, link_position[None], link_rotation[None])[0] >= 1.0
+    rival_votes = np.count_nonzero(cost[is_rival] < 1.0, axis=1)
+    is_ambiguous = bool(np.any(rival_votes >= MIN_RIVAL_FRACTION * agreeing))
+    return StationLink(first, second, link_position, link_rotation, agreeing, is_ambiguous)
+
+
+def _mean_rotation(rotations: Array) -> Array:
+    """Return the rotation (3, 3) closest to all of (n, 3, 3) (chordal mean)."""
+    u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+def connect_stations(
+    links: Sequence[StationLink], poses: StationPoses, stations: int
+) -> dict[int, tuple[Array, Array]]:
+    """Connect stations along the spanning tree of the links with the most epochs (Prim 1957).
+
+    Returns
+    -------
+    dict of int to ((3,) ndarray, (3, 3) ndarray)
+        Positions and rotations of the largest set of connected stations in the axes of the first
+        of them, by ascending station.
+    """
+    largest: dict[int, tuple[Array, Array]] = {}
+    for root in range(stations):
+        if root in largest or not np.any(poses.station == root):
+            continue
+        connected = {root: (np.zeros(3), np.eye(3))}
+        while True:
+            open_links = [k for k in links if (k.first in connected) != (k.second in connected)]
+            if not open_links:
+                break
+            link = max(open_links, key=lambda k: k.epochs)
+            if link.first in connected:
+                position, rotation = connected[link.first]
+                connected[link.second] = (
+                    position + rotation @ link.position,
+                    rotation @ link.rotation,
+                )
+            else:
+                position, rotation = connected[link.second]
+                first_rotation = rotation @ link.rotation.T
+                connected[link.first] = (position - first_rotation @ link.position, first_rotation)
+        if len(connected) > len(largest):
+            largest = connected
+    return dict(sorted(largest.items()))
+
+
+# ---- bundle adjustment
+
+
+def _stack_observations(parts: list[SweepObservations]) -> SweepObservations:
+    """Concatenate the epochs of several devices, padded to the same number of sweeps."""
+    width = max(p.angle.shape[1] for p in parts)
+
+    def pad(values: NDArray[np.generic]) -> NDArray[np.generic]:
+        padding = [(0, 0), (0, width - values.shape[1])] + [(0, 0)] * (values.ndim - 2)
+        return np.pad(values, padding)
 
     return SweepObservations(
         *(
-            np.concatenate([widened(getattr(p, name)) for p in parts])
+            np.concatenate([pad(getattr(p, name)) for p in parts])
             for name in ("place", "station", "plane", "angle", "since_s", "seen")
         )
     )
 
 
-def _adjusted(
-    looks: SweepObservations,
-    views: StationViews,
+def _adjust_scene(
+    observations: SweepObservations,
+    poses: StationPoses,
     stations: Stations,
     joined: list[int],
     channels: Sequence[int],
     scene: Scene,
     links: list[StationLink],
-) -> SolvedScene:
-    """Stations adjusted together with the devices' poses, in the first station's axes."""
-    columns = np.full(len(channels), -1)
-    columns[joined] = np.arange(len(joined))
-    looks = SweepObservations(
-        looks.place, columns[looks.station], looks.plane, looks.angle, looks.since_s,
-        looks.seen & (columns[looks.station] >= 0),
-    )  # fmt: skip
-    moments, poses, turned = _first_poses(looks, views, stations, columns)
-    looks = looks.take(moments)
-    place = _places(poses)
-    chosen = _spread_out(place, turned)
-    looks, poses, place = looks.take(chosen), poses.take(chosen), place[chosen]
-    size = np.bincount(place)
-    share = np.asarray(1.0 / (REPEATS * size[place]), np.float64)
+) -> SceneEstimate:
+    """Adjust stations and device poses together, in the axes of the first station.
 
-    guessed = np.array([c.source == "generic" for c in stations[2]])
-    sigma = MODEL_SIGMA_RAD if np.any(guessed) else 2 * ANGLE_SIGMA_RAD
-    done = adjust_devices(
-        looks, stations, poses, sigma=sigma, soft=LOSS_SCALE_RAD, share=share, calibrate=guessed
+    ``joined`` are the indices in ``channels`` of ``stations``.
+    """
+    column = np.full(len(channels), -1)
+    column[joined] = np.arange(len(joined))
+    observations = replace(
+        observations,
+        station=column[observations.station],
+        seen=observations.seen & (column[observations.station] >= 0),
     )
-    # Again with the noise that the recording shows.
-    sigma = max(ANGLE_SIGMA_RAD, robust_sigma(done.residual))
-    done = adjust_devices(
-        looks,
-        done.stations,
-        done.poses,
-        sigma=sigma,
-        soft=min(3 * sigma, LOSS_SCALE_RAD),
-        share=share,
-        calibrate=guessed,
+    epochs, states, station_count = _initial_states(observations, poses, stations, column)
+    observations = observations.take(epochs)
+    position = cluster_poses(states)
+    chosen = select_keyframes(position, station_count)
+    observations, states, position = (
+        observations.take(chosen),
+        states.take(chosen),
+        position[chosen],
     )
-    answer = SolvedScene(scene)
-    answer.facts = {
-        "moments_adjusted": len(looks),
-        "places_adjusted": len(size),
-        "scene_angle_sigma_rad": sigma,
-        "iterations": done.iterations,
-        "links": [
-            {"channels": [int(channels[k.first]), int(channels[k.second])], "moments": k.agreed}
+    epochs_at = np.bincount(position)
+    weight = np.asarray(1.0 / (ROTATIONS_PER_WINDOW * epochs_at[position]), np.float64)
+
+    is_generic = np.array([c.source == "generic" for c in stations[2]])
+    sigma = MODEL_SIGMA_RAD if np.any(is_generic) else 2 * ANGLE_SIGMA_RAD
+    adjusted = adjust_devices(
+        observations, stations, states,
+        sigma=sigma, soft=LOSS_SCALE_RAD, share=weight, calibrate=is_generic,
+    )  # fmt: skip
+    # A second adjustment uses the noise that the residuals of the first one show.
+    sigma = max(ANGLE_SIGMA_RAD, robust_sigma(adjusted.residual))
+    loss_scale = min(LOSS_SCALE_SIGMAS * sigma, LOSS_SCALE_RAD)
+    adjusted = adjust_devices(
+        observations, adjusted.stations, adjusted.poses,
+        sigma=sigma, soft=loss_scale, share=weight, calibrate=is_generic,
+    )  # fmt: skip
+    facts = LighthouseFacts(
+        adjusted_epochs=len(observations),
+        adjusted_positions=len(epochs_at),
+        scene_angle_sigma_rad=sigma,
+        iterations=adjusted.iterations,
+        links=tuple(
+            StationPairLink((int(channels[k.first]), int(channels[k.second])), k.epochs)
             for k in links
-        ],
-    }
-    answer.notes = _remarks(joined, channels, done.stations[2], len(size))
-    rivals = [f"{channels[k.first]} and {channels[k.second]}" for k in links if k.rivalled]
-    if rivals:
-        answer.notes.append(
-            f"how the stations on channels {', '.join(rivals)} stand to each other has two "
-            "answers of which neither is better: carry the device around, and turn it"
-        )
+        ),
+    )
+    warnings = _warnings(joined, channels, adjusted.stations[2], len(epochs_at), links)
+    positions, rotations, calibrations = adjusted.stations
     solved = tuple(
         Station(
             int(channels[i]),
-            done.stations[0][k],
-            done.stations[1][k],
-            done.stations[2][k],
+            positions[k],
+            rotations[k],
+            calibrations[k],
             scene.ids.get(int(channels[i])),
-            done.covariance[k],
+            adjusted.covariance[k],
         )
         for k, i in enumerate(joined)
     )
-    answer.scene = Scene(
-        solved,
-        scene.markers,
-        scene.distances,
-        False,
-        0.0,
-        "device",
-        f"station-{channels[joined[0]]}",
-        tuple(answer.notes),
-        scene.calibrations,
-        scene.ids,
+    estimated = replace(
+        scene,
+        stations=solved,
+        planar=False,
+        floor_z=0.0,
+        scale="device",
+        frame=f"station-{channels[joined[0]]}",
+        notes=tuple(warning.message for warning in warnings),
     )
-    return answer
+    return SceneEstimate(estimated, facts, warnings)
 
 
-def _first_poses(
-    looks: SweepObservations, views: StationViews, stations: Stations, columns: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], DeviceStates, NDArray[np.int64]]:
-    """Moments with a pose that all their stations accept; the poses; stations of each."""
-    known = np.flatnonzero(columns[views.station] >= 0)
-    column = columns[views.station[known]]
-    turn = stations[1][column]
+def _initial_states(
+    observations: SweepObservations, poses: StationPoses, stations: Stations, column: IntArray
+) -> tuple[IntArray, DeviceStates, IntArray]:
+    """Fit the poses of the devices to all stations, from the hypothesis that fits them best.
+
+    Returns
+    -------
+    epochs : (m,) int ndarray
+        Epochs with a pose.
+    states : DeviceStates
+    station_count : (m,) int ndarray
+        Number of stations of each epoch.
+    """
+    rows = np.flatnonzero(column[poses.station] >= 0)
+    station = column[poses.station[rows]]
+    positions, rotations = stations[0][station], stations[1][station]
     start = DeviceStates.at_rest(
-        stations[0][column] + (turn @ views.position[known][..., None])[..., 0],
-        turn @ views.rotation[known],
+        positions + (rotations @ poses.position[rows][..., None])[..., 0],
+        rotations @ poses.rotation[rows],
     )
-    whose = views.moment[known]
-    rough = fit_poses(
-        looks.take(whose),
+    epoch = poses.epoch[rows]
+    evaluated = fit_poses(
+        observations.take(epoch),
         stations,
         start,
         sigma=MODEL_SIGMA_RAD,
-        soft=10 * LOSS_SCALE_RAD,
+        soft=INITIAL_LOSS_SCALE_RAD,
         iterations=0,
     )
-    order = np.lexsort((rough.cost, whose))
-    first = order[np.r_[True, np.diff(whose[order]) > 0]]
-    seen = looks.take(whose[first])
-    found = fit_poses(
-        seen, stations, start.take(first), sigma=MODEL_SIGMA_RAD, soft=10 * LOSS_SCALE_RAD
+    order = np.lexsort((evaluated.cost, epoch))
+    best = order[np.r_[True, np.diff(epoch[order]) > 0]]
+    observations = observations.take(epoch[best])
+    fit = fit_poses(
+        observations,
+        stations,
+        start.take(best),
+        sigma=MODEL_SIGMA_RAD,
+        soft=INITIAL_LOSS_SCALE_RAD,
     )
-    number = np.zeros(len(first), np.int64)
+    station_count = np.zeros(len(best), np.int64)
     for i in range(len(stations[2])):
-        number += np.any(seen.seen & (seen.station == i), axis=1)
-    return whose[first], found.poses, number
+        station_count += np.any(observations.seen & (observations.station == i), axis=1)
+    return epoch[best], fit.poses, station_count
 
 
-def _places(poses: DeviceStates) -> NDArray[np.int64]:
-    """(m,) number of the place and orientation at which a device was; greedy, in order."""
-    at: list[int] = []
-    place = np.empty(len(poses), np.int64)
+def cluster_poses(poses: DeviceStates) -> IntArray:
+    """Return the number (m,) of the position and orientation of each pose.
+
+    Poses are assigned in order to the first cluster whose first pose is close.
+    """
+    first_poses: list[int] = []
+    cluster = np.empty(len(poses), np.int64)
     for i in range(len(poses)):
-        near = np.linalg.norm(poses.position[at] - poses.position[i], axis=1) < SAME_PLACE_M
-        overlap = np.einsum("kij,ij->k", poses.rotation[at], poses.rotation[i])
-        same = np.flatnonzero(near & (overlap > 1 + 2 * np.cos(SAME_TURN)))
+        distance = np.linalg.norm(poses.position[first_poses] - poses.position[i], axis=1)
+        is_rotated = rotations_differ(
+            poses.rotation[first_poses], poses.rotation[i], SAME_ROTATION_RAD
+        )
+        same = np.flatnonzero((distance < SAME_POSITION_M) & ~is_rotated)
         if not len(same):
-            at.append(i)
-        place[i] = same[0] if len(same) else len(at) - 1
-    return place
+            first_poses.append(i)
+        cluster[i] = same[0] if len(same) else len(first_poses) - 1
+    return cluster
 
 
-def _spread_out(place: NDArray[np.int64], stations: NDArray[np.int64]) -> NDArray[np.int64]:
-    """A few moments of each place, those with the most stations; of too many places those
-    spread over all."""
-    order = np.lexsort((-stations, place))
-    rank = np.arange(len(order)) - np.searchsorted(place[order], place[order])
-    order = order[rank < MOMENTS_OF_A_PLACE]
-    if len(order) > MOMENTS_ADJUSTED:
-        order = order[np.linspace(0, len(order) - 1, MOMENTS_ADJUSTED).astype(int)]
+def select_keyframes(position: IntArray, station_count: IntArray) -> IntArray:
+    """Select the epochs for the bundle adjustment.
+
+    At each position those with the most stations are selected, ``MAX_EPOCHS_PER_POSITION`` at
+    most. If these are more than ``MAX_ADJUSTED_EPOCHS``, a subset spread over all positions is.
+    """
+    order = np.lexsort((-station_count, position))
+    rank = np.arange(len(order)) - np.searchsorted(position[order], position[order])
+    order = order[rank < MAX_EPOCHS_PER_POSITION]
+    if len(order) > MAX_ADJUSTED_EPOCHS:
+        order = order[np.linspace(0, len(order) - 1, MAX_ADJUSTED_EPOCHS).astype(int)]
     return np.sort(order)
 
 
-def _remarks(
-    joined: list[int], channels: Sequence[int], calibrations: tuple[Calibration, ...], places: int
-) -> list[str]:
-    notes = []
-    left = [str(c) for i, c in enumerate(channels) if i not in joined]
-    if left:
-        notes.append(
-            f"station on channel {', '.join(left)} never saw a device together with the others "
-            "and is left out"
+def _warnings(
+    joined: list[int],
+    channels: Sequence[int],
+    calibrations: tuple[Calibration, ...],
+    positions: int,
+    links: Sequence[StationLink],
+) -> tuple[SolverWarning, ...]:
+    warnings = []
+    unlinked = [str(c) for i, c in enumerate(channels) if i not in joined]
+    if unlinked:
+        warnings.append(
+            SolverWarning(
+                "station_not_linked",
+                f"station on channel {', '.join(unlinked)} is left out: it never received a "
+                "device at the same time as the other stations",
+            )
         )
-    guessed = [
+    generic = [
         str(channels[i])
         for i, c in zip(joined, calibrations, strict=True)
         if c.source in ("generic", "estimated")
     ]
-    if guessed:
-        notes.append(
-            f"no factory calibration is known of channel {', '.join(guessed)}: the mean of "
-            "other units is used (generic), refined where the data tell"
+    if generic:
+        warnings.append(
+            SolverWarning(
+                "generic_calibration",
+                f"no factory calibration is known of channel {', '.join(generic)}: the mean of "
+                "other units is used (generic), refined where the data tell",
+            )
         )
-    if places < FEW_PLACES and len(joined) > 1:
-        notes.append(
-            f"the devices were at {places} place{'' if places == 1 else 's'} only: carry one "
-            "around, and turn it, so that the stations do not stand on the errors of a few looks"
+    if positions < MIN_POSITIONS and len(joined) > 1:
+        warnings.append(
+            SolverWarning(
+                "few_device_positions",
+                f"the scene depends on {positions} position{'' if positions == 1 else 's'} of the "
+                "devices only: move and rotate a device during the recording, so that single "
+                "errors average out",
+            )
         )
-    return notes
+    ambiguous = [f"{channels[k.first]} and {channels[k.second]}" for k in links if k.is_ambiguous]
+    if ambiguous:
+        warnings.append(
+            SolverWarning(
+                "ambiguous_station_pair",
+                f"the relative pose of the stations on channels {', '.join(ambiguous)} has two "
+                "solutions that fit equally well: move and rotate the device during the recording",
+            )
+        )
+    return tuple(warnings)

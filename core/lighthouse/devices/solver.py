@@ -1,11 +1,16 @@
-"""Recordings with rigid devices: their full poses, and the other devices in the same scene."""
+"""Solver for rigid devices: scene and trajectories from sweeps of several photodiodes per device.
+
+:func:`solve_devices` runs the pipeline: the scene is estimated from the devices if it has no
+stations, the devices are tracked in it, scene and trajectories are aligned with the markers, and
+every station is verified against the others. :func:`merge_solutions` adds the single photodiodes,
+which are solved by other modules in the scene of the rigid devices.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,197 +23,425 @@ from locatk.core.geometry import (
     umeyama,
 )
 from locatk.core.lighthouse.channels import period_ticks
-from locatk.core.lighthouse.devices.rigid_solver import DeviceSolution, solve_rigid_devices
+from locatk.core.lighthouse.devices.device_sweeps import (
+    MIN_SENSORS,
+    received_channels,
+    select_device_sweeps,
+)
+from locatk.core.lighthouse.devices.scene_initialization import (
+    SceneEstimate,
+    estimate_scene_from_devices,
+)
+from locatk.core.lighthouse.devices.tracking import (
+    MAX_FROM_BEHIND_FRACTION,
+    TrackedDevice,
+    track_devices,
+)
 from locatk.core.lighthouse.devices.verification import verify_devices
-from locatk.core.lighthouse.job import LARGEST_MISFIT_M
+from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD, MAX_MARKER_MISFIT_M
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.lighthouse.scene import MarkerVisit, Scene
+from locatk.core.lighthouse.results import (
+    LighthouseFacts,
+    SceneVerification,
+    StationDetection,
+    StationVerification,
+)
+from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
 from locatk.core.lighthouse.scene.frame import transform_covariance
-from locatk.core.lighthouse.scene.verification import StationCheck
 from locatk.core.robust import robust_sigma
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from locatk.core.lighthouse.solver import SolveOptions
 
 Array = NDArray[np.float64]
 
-LEAST_MARKERS = 3
-
-COUNTED = ("sweeps", "rejected")
-"""Of a detection: numbers that add up over devices."""
-
-LEAST_PHOTODIODES = 3
-"""Photodiodes of known place that fix an orientation."""
+MIN_MARKERS = 3
+"""Minimum number of visited markers that determine a frame."""
 
 
-def rigid_devices(sweeps: Sweeps, receivers: Mapping[str, Receiver]) -> dict[str, Receiver]:
-    """The receivers with which devices of a recording get full poses."""
+@dataclass(frozen=True)
+class MarkerAlignment:
+    """Similarity transform from the frame of an estimated scene to that of its markers.
+
+    Attributes
+    ----------
+    transform : Similarity
+    misfit_m : float
+        Rms distance of the markers from the transformed positions of the devices, in metres.
+    """
+
+    transform: Similarity
+    misfit_m: float
+
+
+def select_rigid_receivers(
+    sweeps: Sweeps, receivers: Mapping[str, Receiver]
+) -> dict[str, Receiver]:
+    """Return the receivers of devices in the recording with enough photodiodes for a full pose."""
     present = {sweeps.devices[k] for k in np.unique(sweeps.device)}
     return {
         name: receiver
         for name, receiver in receivers.items()
-        if len(receiver) >= LEAST_PHOTODIODES and name in present
+        if len(receiver) >= MIN_SENSORS and name in present
     }
 
 
 def solve_devices(
-    sweeps: Sweeps, scene: Scene, options: SolveOptions, rigid: Mapping[str, Receiver]
+    sweeps: Sweeps,
+    receivers: Mapping[str, Receiver],
+    scene: Scene | None = None,
+    *,
+    interval_s: float | None = None,
 ) -> Solution:
-    """Solve the rigid devices, then the others in the scene of the rigid ones.
+    """Solve the rigid devices of a recording.
 
     Parameters
     ----------
-    sweeps, scene, options
-        As for :func:`~locatk.core.lighthouse.solver.solve`.
-    rigid : mapping of str to Receiver
-        By device; of at least one device of the recording.
-    """
-    from locatk.core.lighthouse.solver import solve
+    sweeps : Sweeps
+        Sweeps of devices without a receiver are ignored.
+    receivers : mapping of str to Receiver
+        By device; photodiodes at known positions.
+    scene : Scene, optional
+        With stations: they are used unchanged. Without stations: these are estimated from the
+        devices, whose size gives the scale, with the scene's calibrations where it has them. The
+        markers on which a device rested then give frame and scale; without them, the frame is that
+        of the first station.
+    interval_s : float, optional
+        Time from pose to pose in seconds; by default, a rotation of the fastest station.
 
-    answer = solve_rigid_devices(sweeps, rigid, scene)
+    Returns
+    -------
+    Solution
+        With :class:`~locatk.core.lighthouse.results.LighthouseFacts`, and a
+        :class:`~locatk.core.lighthouse.results.StationDetection` per station. Its ``artifact`` is
+        the scene with stations. One trajectory per device with a receiver.
+
+    Raises
+    ------
+    DegenerateError
+        No device with a receiver has a sweep, the scene contains none of the stations of the
+        recording, or no station determines the pose of a device.
+    """
+    scene = scene or Scene()
+    estimate = SceneEstimate(scene, LighthouseFacts(), ())
+    if not scene.stations:
+        estimate = _estimate_scene(sweeps, receivers, scene)
+    tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
+    trajectories = tuple(device.trajectory for device in tracked)
+    detections = station_detections(tracked, estimate.scene)
+    facts = _tracking_facts(estimate.facts, tracked, estimate.scene, detections)
+    warnings = [
+        *estimate.warnings,
+        *device_warnings(tracked),
+        *contradiction_warnings(detections, trajectories),
+    ]
+
+    solved = estimate.scene
     if not scene.stations and scene.markers:
-        answer = _on_markers(answer, scene.frame)
-    if answer.scene.scale == "device" and not scene.stations:
-        answer.notes.append("the scale is that of the device's own photodiodes")
-        if scene.distances:
-            answer.notes.append("distances are not used")
-    checks = verify_devices(sweeps, rigid, answer)
-    if checks:
-        answer.facts["verification"] = {
-            "held_out": bool(scene.stations),
-            "moments": sum(check.moments for check in checks),
-            "stations": [check.as_facts() for check in checks],
-        }
-    own = _solution(answer, options, checks)
-    numbers = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
-    left = np.flatnonzero(np.isin(sweeps.device, numbers))
-    if len(left) == 0:
-        return own
-    others = solve(sweeps.take(left), answer.scene, options)
-    return _together(own, others, tuple(rigid))
+        alignment = align_to_markers(scene.markers, trajectories)
+        warnings.extend(_alignment_warnings(alignment))
+        if alignment is not None:
+            transform = alignment.transform
+            solved = _transform_scene(solved, transform, scene.frame)
+            trajectories = tuple(
+                _transform_trajectory(t, transform, scene.frame) for t in trajectories
+            )
+            facts = replace(facts, marker_misfit_m=alignment.misfit_m, marker_scale=transform.scale)
+    if not scene.stations and solved.scale == "device":
+        warnings.extend(_scale_warnings(scene))
+
+    verifications = verify_devices(sweeps, receivers, solved, trajectories)
+    if verifications:
+        verification = SceneVerification(
+            held_out=bool(scene.stations),
+            epochs=sum(v.epochs for v in verifications),
+            stations=verifications,
+        )
+        facts = replace(facts, verification=verification)
+        detections = _add_verifications(detections, verifications)
+    return Solution(
+        "lighthouse",
+        "bundle",
+        trajectories,
+        rejected=_total(device.rejected for device in tracked),
+        detections=detections,
+        artifact=solved,
+        facts=facts,
+        warnings=_distinct(warnings),
+    )
 
 
-def _on_markers(answer: DeviceSolution, frame: str) -> DeviceSolution:
-    """The scene and the poses moved onto the markers on which devices stood.
+def merge_solutions(rigid: Solution, photodiodes: Solution) -> Solution:
+    """Merge the solution of rigid devices with that of single photodiodes in the same scene.
 
-    Markers lie farther apart than photodiodes, so that they give the scale as well.
+    Both have typed detections, facts and warnings. Numbers of sweeps are added by station; the
+    facts of the rigid devices become ``LighthouseFacts.rigid``.
     """
-    known, seen = [], []
-    for marker in answer.scene.markers:
-        for sighting in marker.sightings:
-            place = _stood(sighting, answer.trajectories)
-            if place is not None:
-                known.append(marker.position)
-                seen.append(place)
-    try:
-        if len(known) < LEAST_MARKERS:
-            raise DegenerateError(f"{len(known)} were seen")
-        to = umeyama(np.stack(seen), np.stack(known))
-    except DegenerateError:
-        answer.notes.append(
-            f"fewer than {LEAST_MARKERS} markers, not on one line, were stood on by a device: they "
-            "fix no frame"
-        )
-        return answer
-    misfit = float(np.sqrt(np.mean(np.sum((to.apply(seen) - known) ** 2, axis=1))))
-    notes = [*answer.notes]
-    if misfit > LARGEST_MISFIT_M:
-        notes.append(
-            f"the markers are {1e3 * misfit:.0f} mm (rms) from where the device stood: a marker is "
-            "measured wrong, or the scene is"
-        )
-    stations = tuple(
-        replace(
-            station,
-            position=to.apply(station.position),
-            rotation=to.rotation @ station.rotation,
-            covariance=None
-            if station.covariance is None
-            else transform_covariance(station.covariance, to.scale, to.rotation),
-        )
-        for station in answer.scene.stations
-    )
-    framed = replace(answer.scene, stations=stations, frame=frame, scale="markers")
-    facts = {**answer.facts, "marker_misfit_m": misfit, "marker_scale": to.scale}
-    tracks = tuple(_moved(track, to, frame) for track in answer.trajectories)
-    return replace(answer, scene=framed, trajectories=tracks, facts=facts, notes=notes)
-
-
-def _moved(track: Trajectory, to: Similarity, frame: str) -> Trajectory:
-    """Poses in another frame. Their photodiodes keep their distances: scale differs by less
-    than a part in a hundred, or a note has told that the markers do not fit."""
+    rigid_devices = {trajectory.device for trajectory in rigid.trajectories}
+    single = [t for t in photodiodes.trajectories if t.device not in rigid_devices]
+    by_channel = {row.channel: row for row in photodiodes.detections}
+    for row in rigid.detections:
+        if row.channel in by_channel:
+            other = by_channel[row.channel]
+            row = replace(
+                other, sweeps=other.sweeps + row.sweeps, rejected=other.rejected + row.rejected
+            )
+        by_channel[row.channel] = row
     return replace(
-        track,
-        frame=frame,
-        position=to.apply(track.position),
-        quaternion=quaternion_multiply(quaternion_from_matrix(to.rotation), track.quaternion),
-        covariance=transform_covariance(track.covariance, to.scale, to.rotation),
+        photodiodes,
+        trajectories=(*rigid.trajectories, *single),
+        rejected=_total((rigid.rejected, photodiodes.rejected)),
+        detections=[
+            replace(by_channel[channel], station=k) for k, channel in enumerate(sorted(by_channel))
+        ],
+        facts=replace(photodiodes.facts, rigid=rigid.facts),
+        warnings=_distinct((*rigid.warnings, *photodiodes.warnings)),
     )
 
 
-def _stood(sighting: MarkerVisit, trajectories: tuple[Trajectory, ...]) -> Array | None:
-    """Median position (3,) of a device during a sighting; None where it has no pose."""
+def _estimate_scene(
+    sweeps: Sweeps, receivers: Mapping[str, Receiver], scene: Scene
+) -> SceneEstimate:
+    """Estimate the stations from the devices."""
+    channels = received_channels(sweeps, receivers)
+    devices = [
+        (select_device_sweeps(sweeps, k, receivers[name], channels)[0], receivers[name])
+        for k, name in enumerate(sweeps.devices)
+        if name in receivers
+    ]
+    return estimate_scene_from_devices(devices, channels, scene)
+
+
+def _total(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Return the sums of counts by reason."""
+    total: Counter[str] = Counter()
+    for each in counts:
+        total.update(each)
+    return dict(total)
+
+
+def _distinct(warnings: Sequence[SolverWarning]) -> tuple[SolverWarning, ...]:
+    """Return the warnings without repeated messages."""
+    by_message: dict[str, SolverWarning] = {}
+    for warning in warnings:
+        by_message.setdefault(warning.message, warning)
+    return tuple(by_message.values())
+
+
+# ---- detections and facts
+
+
+def station_detections(tracked: Sequence[TrackedDevice], scene: Scene) -> list[StationDetection]:
+    """Return the number and the residuals of the sweeps of each station, by ascending channel.
+
+    ``tracked`` are devices tracked in ``scene``.
+    """
+    station = np.concatenate([device.sweeps.station for device in tracked])
+    is_used = np.concatenate([device.is_used for device in tracked])
+    residual = np.concatenate([device.residual for device in tracked])
+    detections = []
+    for k, channel in enumerate(tracked[0].channels):
+        known = scene.station(channel)
+        assert known is not None
+        is_own = station == k
+        detections.append(
+            StationDetection(
+                station=k,
+                channel=channel,
+                id=None if known.id is None else f"{known.id:08x}",
+                period_ticks=int(period_ticks(channel)),
+                calibration=known.calibration.source,
+                sweeps=int(np.count_nonzero(is_own & is_used)),
+                rejected=int(np.count_nonzero(is_own & ~is_used)),
+                residual_rad=robust_sigma(residual[is_own & is_used]),
+            )
+        )
+    return detections
+
+
+def _add_verifications(
+    detections: Sequence[StationDetection], verifications: Sequence[StationVerification]
+) -> list[StationDetection]:
+    by_channel = {v.channel: v for v in verifications}
+    return [
+        replace(
+            row,
+            verification_rad=by_channel[row.channel].residual_rad,
+            verification_m=by_channel[row.channel].residual_m,
+        )
+        if row.channel in by_channel
+        else row
+        for row in detections
+    ]
+
+
+def _tracking_facts(
+    facts: LighthouseFacts,
+    tracked: Sequence[TrackedDevice],
+    scene: Scene,
+    detections: Sequence[StationDetection],
+) -> LighthouseFacts:
+    """Return ``facts`` with the noise of the tracked devices."""
+    is_generic = any(s.calibration.source in ("generic", "estimated") for s in scene.stations)
+    return replace(
+        facts,
+        angle_sigma_rad=max(device.sigma_rad for device in tracked),
+        lasting_angle_sigma_rad=max(device.lasting_sigma_rad for device in tracked),
+        calibration_sigma_rad=CALIBRATION_SIGMA_RAD if is_generic else None,
+        station_residual_rad={
+            str(row.channel): row.residual_rad for row in detections if row.residual_rad is not None
+        },
+    )
+
+
+# ---- markers
+
+
+def align_to_markers(
+    markers: Sequence[Marker], trajectories: Sequence[Trajectory]
+) -> MarkerAlignment | None:
+    """Estimate the transform from devices that rested on markers to the frame of the markers.
+
+    It includes the scale: markers are farther from each other than the photodiodes of a device.
+    None if fewer than ``MIN_MARKERS`` visits have a pose, or if they are collinear.
+    """
+    marker_positions, device_positions = [], []
+    for marker in markers:
+        for visit in marker.sightings:
+            position = _visit_position(visit, trajectories)
+            if position is not None:
+                marker_positions.append(marker.position)
+                device_positions.append(position)
+    if len(marker_positions) < MIN_MARKERS:
+        return None
+    try:
+        transform = umeyama(np.stack(device_positions), np.stack(marker_positions))
+    except DegenerateError:
+        return None
+    offset = transform.apply(device_positions) - marker_positions
+    return MarkerAlignment(transform, float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))))
+
+
+def _visit_position(visit: MarkerVisit, trajectories: Sequence[Trajectory]) -> Array | None:
+    """Return the median position (3,) of a device during a visit; None without a pose."""
     for trajectory in trajectories:
-        if trajectory.device == sighting.device:
-            start, end = sighting.start_ns or 0, sighting.end_ns or 0
-            inside = (trajectory.time_ns >= start) & (trajectory.time_ns <= end)
-            if np.any(inside):
-                place: Array = np.median(trajectory.position[inside], axis=0)
-                return place
+        if trajectory.device == visit.device:
+            start_ns, end_ns = visit.start_ns or 0, visit.end_ns or 0
+            is_inside = (trajectory.time_ns >= start_ns) & (trajectory.time_ns <= end_ns)
+            if np.any(is_inside):
+                return np.asarray(np.median(trajectory.position[is_inside], axis=0))
     return None
 
 
-def _solution(
-    answer: DeviceSolution, options: SolveOptions, checks: tuple[StationCheck, ...]
-) -> Solution:
-    """What the rigid devices alone say."""
-    checked = {check.channel: check for check in checks}
-    rows: list[dict[str, object]] = []
-    for k, channel in enumerate(sorted(answer.used)):
-        station = answer.scene.station(channel)
-        rows.append(
-            {
-                "station": k,
-                "channel": channel,
-                "id": None if station is None or station.id is None else f"{station.id:08x}",
-                "period_ticks": int(period_ticks(channel)),
-                "calibration": "none" if station is None else station.calibration.source,
-                "sweeps": answer.used[channel],
-                "rejected": answer.unused[channel],
-                "residual_rad": robust_sigma(answer.residuals[channel]),
-            }
+def _transform_scene(scene: Scene, transform: Similarity, frame: str) -> Scene:
+    """Transform the stations of a scene into the frame of its markers."""
+    stations = tuple(
+        replace(
+            station,
+            position=transform.apply(station.position),
+            rotation=transform.rotation @ station.rotation,
+            covariance=None
+            if station.covariance is None
+            else transform_covariance(station.covariance, transform.scale, transform.rotation),
         )
-        if channel in checked:
-            rows[-1]["verification_rad"] = checked[channel].residual_rad
-            rows[-1]["verification_m"] = checked[channel].residual_m
-    return Solution(
-        "lighthouse",
-        options.method,
-        answer.trajectories,
-        dict(answer.rejected),
-        rows,
-        answer.scene,
-        tuple(dict.fromkeys(answer.notes)),
-        dict(answer.facts),
+        for station in scene.stations
     )
+    return replace(scene, stations=stations, frame=frame, scale="markers")
 
 
-def _together(rigid: Solution, others: Solution, names: tuple[str, ...]) -> Solution:
-    """One solution of two over the same scene."""
-    rejected = dict(Counter(rigid.rejected) + Counter(others.rejected))
-    rows = {row["channel"]: dict(row) for row in others.detections}
-    for row in rigid.detections:
-        both = rows.setdefault(row["channel"], {**row, **dict.fromkeys(COUNTED, 0)})
-        both.update({name: both[name] + row[name] for name in COUNTED})
-    points = [t for t in others.trajectories if t.device not in names]
+def _transform_trajectory(trajectory: Trajectory, transform: Similarity, frame: str) -> Trajectory:
+    """Transform a trajectory into another frame.
+
+    The distances of the photodiodes on the device do not change: the scale differs from 1 by less
+    than 1 %, or a warning reports that the markers do not fit.
+    """
+    rotation = quaternion_from_matrix(transform.rotation)
     return replace(
-        others,
-        trajectories=(*rigid.trajectories, *points),
-        rejected=rejected,
-        detections=[{**rows[c], "station": k} for k, c in enumerate(sorted(rows))],
-        notes=tuple(dict.fromkeys((*rigid.notes, *others.notes))),
-        facts={**others.facts, "rigid": rigid.facts},
+        trajectory,
+        frame=frame,
+        position=transform.apply(trajectory.position),
+        quaternion=quaternion_multiply(rotation, trajectory.quaternion),
+        covariance=transform_covariance(trajectory.covariance, transform.scale, transform.rotation),
     )
+
+
+# ---- warnings
+
+
+def device_warnings(tracked: Sequence[TrackedDevice]) -> list[SolverWarning]:
+    """Return the doubts about each device."""
+    warnings = []
+    for device in tracked:
+        name = device.trajectory.device
+        if len(device.trajectory) == 0:
+            warnings.append(
+                SolverWarning(
+                    "no_device_pose",
+                    f"{name}: no pose was found. The receiver's file describes another device, "
+                    "the scene is that of another site, or too few photodiodes receive light at "
+                    "a time",
+                )
+            )
+            continue
+        if device.from_behind_fraction > MAX_FROM_BEHIND_FRACTION:
+            warnings.append(
+                SolverWarning(
+                    "light_from_behind",
+                    f"{name}: {device.from_behind_fraction:.0%} of the sweeps come from behind "
+                    "their photodiodes: positions or normals in the receiver's file are mirrored "
+                    "or in the wrong order",
+                )
+            )
+        if device.ambiguous_epochs:
+            warnings.append(
+                SolverWarning(
+                    "ambiguous_orientation",
+                    f"{name}: {device.ambiguous_epochs} poses may have the wrong one of two "
+                    "orientations, which explain the angles of a coplanar device under one "
+                    "station equally well",
+                )
+            )
+    return warnings
+
+
+def contradiction_warnings(
+    detections: Sequence[StationDetection], trajectories: Sequence[Trajectory]
+) -> list[SolverWarning]:
+    """Return a warning if most sweeps of some stations, but not of all, contradict the poses."""
+    wrong = [str(row.channel) for row in detections if row.sweeps < row.rejected]
+    if not wrong or len(wrong) == len(detections) or not any(len(t) for t in trajectories):
+        return []
+    return [
+        SolverWarning(
+            "station_contradicts_others",
+            f"most sweeps of the station on channel {', '.join(wrong)} contradict the other "
+            "stations: it was moved after the scene was estimated, or received by reflection",
+        )
+    ]
+
+
+def _alignment_warnings(alignment: MarkerAlignment | None) -> list[SolverWarning]:
+    if alignment is None:
+        return [
+            SolverWarning(
+                "too_few_markers",
+                f"a device rested on fewer than {MIN_MARKERS} markers that are not on one line: "
+                "the frame is not that of the markers",
+            )
+        ]
+    if alignment.misfit_m > MAX_MARKER_MISFIT_M:
+        return [
+            SolverWarning(
+                "marker_misfit",
+                f"the markers are {1e3 * alignment.misfit_m:.0f} mm (rms) from the positions of "
+                "the device on them: a marker was measured wrong, or the scene is wrong",
+            )
+        ]
+    return []
+
+
+def _scale_warnings(scene: Scene) -> list[SolverWarning]:
+    warnings = [SolverWarning("device_scale", "the scale comes from the size of the rigid devices")]
+    if scene.distances:
+        warnings.append(SolverWarning("distances_not_used", "distances are not used"))
+    return warnings

@@ -1,4 +1,4 @@
-"""Rigid devices and single photodiodes in one recording."""
+"""Rigid devices and single photodiodes in one recording, markers, verification."""
 
 from __future__ import annotations
 
@@ -8,94 +8,117 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.core.lighthouse.devices.solver import rigid_devices
+from locatk.core.lighthouse.devices.solver import select_rigid_receivers
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
+from locatk.core.solution import Solution, to_json
 
 SPAN = np.array([[-0.06, 0.04, 0.0], [-0.06, -0.04, 0.0], [0.06, 0.04, 0.0], [0.06, -0.04, 0.02]])
-BODY = Receiver(SPAN, np.tile([0.0, 0.0, 1.0], (4, 1)), "body")
+RIGID = Receiver(SPAN, np.tile([0.0, 0.0, 1.0], (4, 1)), "rigid")
 
 
-def where(t: Any) -> Any:
+def codes(solution: Solution) -> set[str]:
+    return {warning.code for warning in solution.warnings}
+
+
+def facts_of(solution: Solution) -> Any:
+    """Return the facts in their JSON form."""
+    return to_json(solution.facts)
+
+
+def detections_of(solution: Solution) -> Any:
+    """Return the detections in their JSON form."""
+    return to_json(solution.detections)
+
+
+def position_at(t: Any) -> Any:
     return np.stack([0.5 * np.cos(0.4 * t), 0.4 * np.sin(0.6 * t), 0.3 + 0.1 * np.sin(t)], axis=1)
 
 
 @pytest.fixture(scope="module")
 def mixed(world: Any) -> tuple[Any, Any, Scene]:
-    """Sweeps of a body and of a lone photodiode, and the scene in which they are."""
+    """Return sweeps of a rigid device and of a single photodiode, their stations and scene."""
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(200, flat=False))
     scene = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square))).artifact
-    body = world.stream(lamps, where, 4.0, sensors=SPAN)
-    lone = world.stream(lamps, where, 4.0, seed=2)
-    lone = replace(lone, device=np.ones(len(lone), np.int32))
-    both = world.join(body, lone)
-    return replace(both, devices=("body", "lone")), lamps, scene
+    rigid = world.stream(lamps, position_at, 4.0, sensors=SPAN)
+    single = world.stream(lamps, position_at, 4.0, seed=2)
+    single = replace(single, device=np.ones(len(single), np.int32))
+    both = world.join(rigid, single)
+    return replace(both, devices=("rigid", "single")), lamps, scene
 
 
-def test_rigid_are_devices_that_are_there_with_three_photodiodes(mixed: Any) -> None:
+def test_devices_in_the_recording_with_three_photodiodes_are_rigid(mixed: Any) -> None:
     sweeps, _, _ = mixed
     two = Receiver(SPAN[:2])
-    known = {"body": BODY, "lone": two, "absent": DECK}
-    assert rigid_devices(sweeps, known) == {"body": BODY}
+    known = {"rigid": RIGID, "single": two, "absent": DECK}
+    assert select_rigid_receivers(sweeps, known) == {"rigid": RIGID}
 
 
-def test_both_roads_share_a_scene(mixed: Any) -> None:
+def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any) -> None:
     sweeps, _, scene = mixed
-    solution = solve(sweeps, scene, receivers={"body": BODY})
+    solution = solve(sweeps, scene, receivers={"rigid": RIGID})
     tracks = {t.device: t for t in solution.trajectories}
-    assert set(tracks) == {"body", "lone"}
-    assert np.isfinite(tracks["body"].covariance).all()  # full pose
-    assert np.isnan(tracks["lone"].covariance[:, 3:, 3:]).all()
+    assert set(tracks) == {"rigid", "single"}
+    assert np.isfinite(tracks["rigid"].covariance).all()  # full pose
+    assert np.isnan(tracks["single"].covariance[:, 3:, 3:]).all()
     for track in tracks.values():
         assert len(track) > 50
-        true = where((track.time_ns - track.time_ns[0]) * 1e-9 + 0.0)
-        # Both were at the same places; the start of the clock is known to a rotation.
+        true = position_at((track.time_ns - track.time_ns[0]) * 1e-9 + 0.0)
+        # Both were at the same positions; the start of the clock is known to a rotation.
         assert np.median(np.linalg.norm(track.position - true, axis=1)) < 0.03
     assert solution.artifact is scene
-    told = sum(int(row["sweeps"]) + int(row["rejected"]) for row in solution.detections)
-    assert told <= len(sweeps)
-    assert [row["channel"] for row in solution.detections] == [1, 2, 5]
-    assert "verification" in solution.facts
-    assert solution.facts["rigid"]
+    rows = detections_of(solution)
+    assert sum(int(row["sweeps"]) + int(row["rejected"]) for row in rows) <= len(sweeps)
+    assert [row["channel"] for row in rows] == [1, 2, 5]
+    assert [row["station"] for row in rows] == [0, 1, 2]
+    assert "verification" in facts_of(solution)
+    assert facts_of(solution)["rigid"]
+    rigid_rows = detections_of(
+        solve(sweeps.take(sweeps.device == 0), scene, receivers={"rigid": RIGID})
+    )
+    single_rows = detections_of(solve(sweeps.take(sweeps.device == 1), scene))
+    for merged, first, second in zip(rows, rigid_rows, single_rows, strict=True):
+        assert merged["sweeps"] == first["sweeps"] + second["sweeps"]
+        assert merged["rejected"] == first["rejected"] + second["rejected"]
 
 
-def test_a_body_alone_needs_no_other(mixed: Any, world: Any) -> None:
+def test_a_rigid_device_needs_no_single_photodiode(mixed: Any, world: Any) -> None:
     sweeps, _, scene = mixed
     alone = world.take(sweeps, np.flatnonzero(sweeps.device == 0))
-    solution = solve(alone, scene, receivers={"body": BODY})
-    assert [t.device for t in solution.trajectories] == ["body"]
-    assert [row["station"] for row in solution.detections] == [0, 1, 2]
+    solution = solve(alone, scene, receivers={"rigid": RIGID})
+    assert [t.device for t in solution.trajectories] == ["rigid"]
+    assert [row["station"] for row in detections_of(solution)] == [0, 1, 2]
 
 
-def test_without_receivers_photodiodes_are_apart(mixed: Any) -> None:
+def test_without_receivers_each_photodiode_has_a_trajectory(mixed: Any) -> None:
     sweeps, _, scene = mixed
     names = {t.device for t in solve(sweeps, scene).trajectories}
-    assert names == {"body/0", "body/1", "body/2", "body/3", "lone/0"}
+    assert names == {"rigid/0", "rigid/1", "rigid/2", "rigid/3", "single/0"}
 
 
-def test_the_papers_method_says_that_it_knows_no_bodies(world: Any) -> None:
+def test_the_papers_method_warns_that_it_ignores_receivers(world: Any) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(150, flat=True))
     paper = SolveOptions(method="paper", scene="two-planar")
     markers = Scene(markers=world.markers_of(lamps, world.square))
-    solution = solve(drive.sweeps, markers, paper, receivers={"robot": BODY})
+    solution = solve(drive.sweeps, markers, paper, receivers={"robot": RIGID})
     assert any("knows no rigid devices" in note for note in solution.notes)
 
 
-PLACES = np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.2], [-0.5, -0.5, 0.0], [0.5, -0.5, 0.1]])
-STAND_S, ROUND_S = 1.5, 2.0
+POSITIONS = np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.2], [-0.5, -0.5, 0.0], [0.5, -0.5, 0.1]])
+REST_S, PERIOD_S = 1.5, 2.0
 
 
 def on_markers(t: Any) -> Any:
-    """Stands on each place for a while, goes on to the next, and drives a curve at last."""
+    """Return the path of a device that rests at each position, then moves along a curve."""
     t = np.asarray(t, float)
-    number = np.clip((t // ROUND_S).astype(int), 0, 3)
-    share = np.clip((t - ROUND_S * number - STAND_S) / (ROUND_S - STAND_S), 0, 1)[:, None]
-    ahead = PLACES[np.minimum(number + 1, 3)]
-    stood = PLACES[number] * (1 - share) + ahead * share
-    return np.where((t > 4 * ROUND_S)[:, None], where(t - 4 * ROUND_S), stood)
+    number = np.clip((t // PERIOD_S).astype(int), 0, 3)
+    fraction = np.clip((t - PERIOD_S * number - REST_S) / (PERIOD_S - REST_S), 0, 1)[:, None]
+    following = POSITIONS[np.minimum(number + 1, 3)]
+    position = POSITIONS[number] * (1 - fraction) + following * fraction
+    return np.where((t > 4 * PERIOD_S)[:, None], position_at(t - 4 * PERIOD_S), position)
 
 
 def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
@@ -105,12 +128,12 @@ def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
     markers = tuple(
         Marker(
             f"m{k}",
-            PLACES[k],
+            POSITIONS[k],
             (
                 MarkerVisit(
                     "robot",
-                    start + round((ROUND_S * k + 0.2) * 1e9),
-                    start + round((ROUND_S * k + 1.3) * 1e9),
+                    start + round((PERIOD_S * k + 0.2) * 1e9),
+                    start + round((PERIOD_S * k + 1.3) * 1e9),
                 ),
             ),
         )
@@ -119,41 +142,42 @@ def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
     return lamps, sweeps, markers
 
 
-def test_markers_give_frame_and_scale_of_a_scene_from_a_body(world: Any) -> None:
+def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> None:
     lamps, sweeps, markers = marked(world, 4)
-    solution = solve(sweeps, Scene(markers=markers), receivers={"robot": BODY})
+    solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     scene = solution.artifact
     assert (scene.scale, scene.frame) == ("markers", "floor")
-    assert float(solution.facts["marker_misfit_m"]) < 2e-3
+    assert facts_of(solution)["marker_misfit_m"] < 2e-3
     for lamp in lamps:
         station = scene.station(lamp.channel)
         assert np.linalg.norm(station.position - lamp.position) < 0.03
+    assert not {"too_few_markers", "marker_misfit", "device_scale"} & codes(solution)
     (track,) = solution.trajectories
     assert track.frame == "floor"
     first = (track.time_ns > markers[0].sightings[0].start_ns) & (
         track.time_ns < markers[0].sightings[0].end_ns
     )
-    assert np.linalg.norm(np.median(track.position[first], axis=0) - PLACES[0]) < 3e-3
+    assert np.linalg.norm(np.median(track.position[first], axis=0) - POSITIONS[0]) < 3e-3
 
 
-def test_two_markers_fix_no_frame_and_a_note_says_so(world: Any) -> None:
+def test_two_markers_determine_no_frame(world: Any) -> None:
     _, sweeps, markers = marked(world, 2)
-    solution = solve(sweeps, Scene(markers=markers), receivers={"robot": BODY})
+    solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     assert solution.artifact.scale == "device"
-    assert any("fix no frame" in note for note in solution.notes)
+    assert {"too_few_markers", "device_scale"} <= codes(solution)
 
 
-def test_a_marker_that_was_measured_wrong_is_told(world: Any) -> None:
+def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
     _, sweeps, markers = marked(world, 4)
     wrong = replace(markers[3], position=markers[3].position + [0.15, 0.0, 0.0])
-    solution = solve(sweeps, Scene(markers=(*markers[:3], wrong)), receivers={"robot": BODY})
-    assert any("measured wrong" in note for note in solution.notes)
+    solution = solve(sweeps, Scene(markers=(*markers[:3], wrong)), receivers={"robot": RIGID})
+    assert "marker_misfit" in codes(solution)
 
 
 def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps, where, 6.0, sensors=SPAN)
-    checks = solve(sweeps, scene, receivers={"robot": BODY}).facts["verification"]
+    sweeps = world.stream(lamps, position_at, 6.0, sensors=SPAN)
+    checks = facts_of(solve(sweeps, scene, receivers={"robot": RIGID}))["verification"]
     assert checks["held_out"]
     assert [check["channel"] for check in checks["stations"]] == [1, 2, 5]
     for check in checks["stations"]:
@@ -164,21 +188,21 @@ def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> 
 
 def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps, where, 6.0, sensors=SPAN)
+    sweeps = world.stream(lamps, position_at, 6.0, sensors=SPAN)
     first, second, third = scene.stations
     moved = replace(second, position=second.position + [0.0, 0.0, 0.08])
     solution = solve(
-        sweeps, replace(scene, stations=(first, moved, third)), receivers={"robot": BODY}
+        sweeps, replace(scene, stations=(first, moved, third)), receivers={"robot": RIGID}
     )
-    off = {row["channel"]: row["verification_m"] for row in solution.detections}
+    off = {row["channel"]: row["verification_m"] for row in detections_of(solution)}
     assert off[2] > 0.02
-    jumps = {c["channel"]: c["without_rad"] for c in solution.facts["verification"]["stations"]}
+    jumps = {c["channel"]: c["without_rad"] for c in facts_of(solution)["verification"]["stations"]}
     assert jumps[2] < 0.5 * min(jumps[1], jumps[5])
 
 
 def test_one_station_has_no_other_to_be_verified_against(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps[:1], where, 4.0, sensors=SPAN)
-    solution = solve(sweeps, scene, receivers={"robot": BODY})
-    assert "verification" not in solution.facts
-    assert "verification_rad" not in solution.detections[0]
+    sweeps = world.stream(lamps[:1], position_at, 4.0, sensors=SPAN)
+    solution = solve(sweeps, scene, receivers={"robot": RIGID})
+    assert "verification" not in facts_of(solution)
+    assert "verification_rad" not in detections_of(solution)[0]
