@@ -193,9 +193,11 @@ HOT static int soft_bits_of_chips(const int32_t *restrict mean, int chips, int *
     return bits;
 }
 
-/* Most chips of a burst: the sums of their changes fit into an int32. Longest burst [chips] whose
- * edges are converted to chips, which is far above any `max_chips`. */
+/* Most chips of a burst that are demodulated: the sums of their changes fit into an int32. */
 enum { MAX_CHIPS = 1 << 16 };
+
+/* Longest duration of a burst that is demodulated [chips]: its edges, in chips, fit into an int.
+ */
 #define MAX_BURST_CHIPS ((double)(1 << 30))
 
 /* Check the edges of the bursts that are demodulated. Return the largest number of edges. */
@@ -216,7 +218,7 @@ static int64_t check_bursts(Call *call, const int64_t *tick, const int64_t *firs
         if (descends)
             reject(call, "tick descends within burst %zd", i);
         else if (duration > INT64_MAX || (double)duration / ticks_per_chip > MAX_BURST_CHIPS)
-            reject(call, "readable[%zd] is set for a burst that is too long", i);
+            reject(call, "tick: burst %zd is too long to be demodulated", i);
         max_edges = edges > max_edges ? edges : max_edges;
     }
     return max_edges;
@@ -485,7 +487,8 @@ static int index_of_first_bit(const Tables *t, const BitWords *text, int polynom
     const uint64_t previous = k % 64 && k / 64 ? text->hard[k / 64 - 1] << k % 64 : 0;
     const int32_t index = t->index[(size_t)polynomial * (SEQUENCE_LENGTH + 1)
                                    + ((state | previous) & SEQUENCE_LENGTH)];
-    const int index_at_start = (index - (k - text->padding - REGISTER_BITS)) % SEQUENCE_LENGTH;
+    const int64_t steps = k - text->padding - REGISTER_BITS;
+    const int index_at_start = (int)((index - steps) % SEQUENCE_LENGTH);
     return index_at_start < 0 ? index_at_start + SEQUENCE_LENGTH : index_at_start;
 }
 
@@ -549,8 +552,7 @@ static void identify_burst(const Tables *t, const int8_t *value, int bits, BitWo
     if (longest_run(t, text, likely, middle, middle + 1, &begin)) {
         score_index(t, value, bits, expected, likely, index_of_first_bit(t, text, likely, begin),
                     row);
-        /* Each bit outside of the stretch adds at most one bit to the evidence of another index.
-         */
+        /* A bit outside of the stretch adds at most one bit to the evidence of another index. */
         const int outside = bits - (row[4] - row[3]);
         if (row[2] >= min_evidence && row[2] > outside * steps) return;
     }
