@@ -601,6 +601,7 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     check_range(&call, "min_dots", min_dots, 0, INT_MAX);
     check_range(&call, "splits", splits, 0, MAX_SPLITS);
     check_range(&call, "max_dots", max_dots, 0, INT_MAX);
+    if (call.failed) return NULL;
     const uint8_t *images = input(&call, images_array, "images", ITEM_UINT8, ITEMS(n, h, w));
     d.taps = input(&call, taps_array, "taps", ITEM_FLOAT32, 3);
     float *xy = output(&call, xy_array, "xy", ITEM_FLOAT32, ITEMS(n, max_dots, 2));
@@ -1043,6 +1044,7 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "seeds", seeds, 1, MAX_SEEDS);
     check_range(&call, "min_dots", min_dots, 1, INT_MAX);
+    if (call.failed) return NULL;
     Py_ssize_t rings;
     const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
     const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
@@ -1137,6 +1139,7 @@ static PyObject *soft_bits(PyObject *self, PyObject *args)
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "half_width", half_width, 1, MAX_HALF_WIDTH);
+    if (call.failed) return NULL;
     const long long length = 2 * half_width;
     const float *uv = input(&call, uv_array, "uv", ITEM_FLOAT32, ITEMS(n, m, 2));
     const float *cells = input(&call, cells_array, "cells", ITEM_FLOAT32, ITEMS(n, m, 2));
@@ -1380,6 +1383,7 @@ static void take_codec(Call *call, const CodecArrays *arrays, long long range,
 {
     check_range(call, "range", range, 1, MAX_POSITIONS);
     check_range(call, "smallest_shift", smallest_shift, 0, PERIOD);
+    if (call->failed) return;
     const int64_t *lengths = input(call, arrays->lengths, "lengths", ITEM_INT64, SEQUENCES);
     check_items(call, "lengths", lengths, ITEM_INT64, SEQUENCES, 1, MAX_SEQUENCE);
     const int64_t *weights = input(call, arrays->weights, "weights", ITEM_INT64, SEQUENCES);
@@ -1431,6 +1435,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
     Codec codec = {0};
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "length", length, 1, MAX_WINDOW_CELLS);
+    if (call.failed) return NULL;
     const float *x_bits = input(&call, x_array, "x_bits", ITEM_FLOAT32, ITEMS(n, length, length));
     const float *y_bits = input(&call, y_array, "y_bits", ITEM_FLOAT32, ITEMS(n, length, length));
     take_codec(&call, &arrays, range, smallest_shift, length, &codec);
@@ -1583,6 +1588,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "half_width", half_width, 1, MAX_WINDOW_CELLS / 2);
+    if (call.failed) return NULL;
     const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
     const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
     const float *uv = input(&call, uv_array, "uv", ITEM_FLOAT32, ITEMS(n, m, 2));
@@ -1674,6 +1680,7 @@ static PyObject *ddtw(PyObject *self, PyObject *args)
     check_range(&call, "n", n, 0, MAX_SERIES);
     check_range(&call, "length", length, 0, MAX_SERIES);
     check_range(&call, "count", count, 0, INT_MAX - DDTW_LANES);
+    if (call.failed) return NULL;
     const float *query = input(&call, query_array, "query", ITEM_FLOAT32, ITEMS(n, 3));
     const float *slopes =
         input(&call, slopes_array, "slopes", ITEM_FLOAT32, ITEMS(length, 3, count));

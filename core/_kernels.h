@@ -1,16 +1,17 @@
 /* Shared declarations of the C files of locatk.core._kernels.
  *
- * Every exported function has the same four parts:
- *   1. parse_arguments() takes the arguments, integers as long long and arrays as objects;
- *   2. check_range() checks each integer; input(), output() and input_rows() take the memory of
- *      each array and check its item type and its size against the integers; check_items() and
- *      check_offsets() check the contents that the loops use as an index;
- *   3. the loops run, only if `failed` is 0;
- *   4. finish_call() releases the memory and returns None or raises.
+ * Every exported function has the same parts:
+ *   1. parse_arguments() takes the arguments, integers as long long and arrays as objects.
+ *   2. check_range() and check_positive() check the numbers. On failure the function returns
+ * before it computes with them.
+ *   3. input(), output() and input_rows() take the memory of each array and check its item type,
+ *      layout and size against the numbers; check_items() and check_offsets() check the contents
+ *      that the loops use as an index. On failure the function returns before it reads an array.
+ *   4. The loops run.
+ *   5. finish_call() releases the memory and returns None or raises.
  *
- * The first check that fails sets the exception and `failed`. Later checks then return at once,
- * and input() and output() return NULL, so that a function needs to test `failed` only before it
- * reads an array.
+ * The first check that fails sets the exception and `failed`; later checks then return at once,
+ * and those that take memory return NULL.
  */
 #ifndef LOCATK_KERNELS_H
 #define LOCATK_KERNELS_H

@@ -58,6 +58,7 @@ PyObject *bar_fields(PyObject *self, PyObject *args)
                          &gradient, &field_array, &slope_array))
         return NULL;
     check_range(&call, "count", count, 0, PY_SSIZE_T_MAX);
+    if (call.failed) return NULL;
     const double *point = input(&call, points_array, "points", ITEM_FLOAT64, ITEMS(count, 3));
     double *field = output(&call, field_array, "field", ITEM_FLOAT64, ITEMS(count, 4));
     double *slope =
@@ -171,6 +172,7 @@ PyObject *scan_landmarks(PyObject *self, PyObject *args)
     check_range(&call, "size", size, 2, MAX_TABLE_SIZE);
     check_range(&call, "n_strengths", n_strengths, 0, INT_MAX);
     check_positive(&call, "step", scan.step);
+    if (call.failed) return NULL;
     scan.points = input(&call, points_array, "points", ITEM_FLOAT64, ITEMS(count, 2));
     scan.values = input(&call, values_array, "values", ITEM_FLOAT64, count);
     scan.weights = input(&call, weights_array, "weights", ITEM_FLOAT64, count);

@@ -60,6 +60,7 @@ PyObject *window_edges(PyObject *self, PyObject *args)
                          &first_array, &rises_array))
         return NULL;
     check_range(&call, "width", width, 1, MAX_WINDOW_BYTES);
+    if (call.failed) return NULL;
     Py_ssize_t rows;
     const uint8_t *windows =
         input_rows(&call, windows_array, "windows", ITEM_UINT8, (Py_ssize_t)width, &rows);
@@ -239,6 +240,7 @@ PyObject *light_bits(PyObject *self, PyObject *args)
     check_positive(&call, "ticks_per_chip", ticks_per_chip);
     check_positive(&call, "1 / ticks_per_chip", 1 / ticks_per_chip);
     check_range(&call, "max_chips", max_chips, 1, MAX_CHIPS);
+    if (call.failed) return NULL;
     Py_ssize_t ticks, bursts, capacity;
     const int64_t *tick = input_rows(&call, tick_array, "tick", ITEM_INT64, 1, &ticks);
     const uint8_t *rises = input_rows(&call, rises_array, "rises", ITEM_FLAG, 1, &bursts);

@@ -197,7 +197,8 @@ PyObject *search_map(PyObject *self, PyObject *args)
     check_range(&call, "n_weights", n_weights, 1, INT32_MAX);
     check_range(&call, "possible", possible, 1, MAX_WORDS);
     check_range(&call, "steps", steps, 0, LLONG_MAX);
-    const Py_ssize_t uses = call.failed ? 0 : ITEMS(items, length);
+    if (call.failed) return NULL;
+    const Py_ssize_t uses = ITEMS(items, length);
     Py_ssize_t rows;
     check_range(&call, "items * length", uses, 0, INT32_MAX);
     s.item_cells = input(&call, item_cells_array, "item_cells", ITEM_INT32, uses);
