@@ -1,22 +1,308 @@
-/* The hot loops of core/dots, frame by frame: dots of an image, their lattice, what they say,
- * where that is in the pattern, and the pose; and of core/polaris: the alignment of samples with
- * templates.
+/* The extension module locatk.core._kernels: hot loops in C, each with a twin in numpy.
  *
- * Each has a twin in numpy that says what it does and why (core/dots/blobs.py and others,
- * core/polaris/ddtw.py) and that is used where this module was not built; tests hold the two
- * against each other. Constants come in as arguments, so that they stand in one place.
- * Only the stable ABI of Python 3.11 is used, and buffers instead of numpy's own interface.
+ * This file holds the module, the checks of arguments that all kernels share, the loops of
+ * core/dots (detection of dots, lattice, soft bits, reading of windows, pose) and of core/polaris
+ * (dynamic time warping). The twins document the algorithms; they are used if the module was not
+ * built, and tests compare both. Constants are passed as arguments, so that each is defined once,
+ * in Python. Only the stable ABI of Python 3.11 is used, and the buffer protocol instead of
+ * numpy's own C API.
  */
 #include "_kernels.h"
 #include <float.h>
 #include <math.h>
-#include <stdint.h>
+#include <stdarg.h>
 #include <stdlib.h>
 #include <string.h>
 
+/* ---- Checks of arguments ---------------------------------------------------------------- */
+
+int parse_arguments(PyObject *args, const char *format, ...)
+{
+    va_list pointers;
+    va_start(pointers, format);
+    const int parsed = PyArg_VaParse(args, format, pointers);
+    va_end(pointers);
+    if (!parsed && PyErr_ExceptionMatches(PyExc_OverflowError))
+        PyErr_SetString(PyExc_ValueError, "an integer is outside of 64 bits");
+    return parsed;
+}
+
+void reject(Call *call, const char *format, ...)
+{
+    va_list values;
+    va_start(values, format);
+    PyErr_FormatV(PyExc_ValueError, format, values);
+    va_end(values);
+    call->failed = 1;
+}
+
+void check_range(Call *call, const char *name, long long value, long long low, long long high)
+{
+    if (!call->failed && (value < low || value > high))
+        reject(call, "%s is %lld, expected %lld to %lld", name, value, low, high);
+}
+
+void check_positive(Call *call, const char *name, double value)
+{
+    if (!call->failed && !(value > 0 && isfinite(value)))
+        reject(call, "%s is not a finite number above zero", name);
+}
+
+Py_ssize_t count_items(const long long *dimensions, int count)
+{
+    /* The widest items have 8 bytes: with this limit, sizes in bytes do not overflow either. */
+    const Py_ssize_t limit = PY_SSIZE_T_MAX / 8;
+    Py_ssize_t product = 1;
+    for (int k = 0; k < count; k++)
+        if (dimensions[k] == 0) return 0;
+    for (int k = 0; k < count; k++) {
+        if (dimensions[k] < 0 || dimensions[k] > limit / product) return -1;
+        product *= (Py_ssize_t)dimensions[k];
+    }
+    return product;
+}
+
+static Py_ssize_t item_size(ItemType type)
+{
+    switch (type) {
+    case ITEM_INT32:
+    case ITEM_UINT32:
+    case ITEM_FLOAT32:
+        return 4;
+    case ITEM_INT64:
+    case ITEM_UINT64:
+    case ITEM_FLOAT64:
+        return 8;
+    default:
+        return 1;
+    }
+}
+
+/* Struct codes that denote a type if their items have the right size. C's long, code l, has 32 or
+ * 64 bits by platform. */
+static const char *struct_codes(ItemType type)
+{
+    switch (type) {
+    case ITEM_FLAG:
+        return "?B";
+    case ITEM_INT32:
+        return "il";
+    case ITEM_UINT32:
+        return "IL";
+    case ITEM_INT64:
+        return "ql";
+    case ITEM_UINT64:
+        return "QL";
+    case ITEM_INT8:
+        return "b";
+    case ITEM_UINT8:
+        return "B";
+    case ITEM_FLOAT32:
+        return "f";
+    default:
+        return "d";
+    }
+}
+
+static const char *type_name(ItemType type)
+{
+    switch (type) {
+    case ITEM_FLAG:
+        return "bool or uint8";
+    case ITEM_INT8:
+        return "int8";
+    case ITEM_UINT8:
+        return "uint8";
+    case ITEM_INT32:
+        return "int32";
+    case ITEM_UINT32:
+        return "uint32";
+    case ITEM_INT64:
+        return "int64";
+    case ITEM_UINT64:
+        return "uint64";
+    case ITEM_FLOAT32:
+        return "float32";
+    default:
+        return "float64";
+    }
+}
+
+static int has_type(const Py_buffer *view, ItemType type)
+{
+    const uint16_t one = 1;
+    const char native = *(const char *)&one ? '<' : '>';
+    const char *format = view->format ? view->format : "B";
+    if (*format == '@' || *format == '=' || *format == native) format++;
+    return view->itemsize == item_size(type) && format[0] && strchr(struct_codes(type), format[0])
+           && !format[1];
+}
+
+/* Add an array to the call and check all but its size; its view, or NULL. */
+static const Py_buffer *take_array(Call *call, PyObject *array, const char *name, ItemType type,
+                                   int is_output)
+{
+    if (call->failed) return NULL;
+    if (call->count == MAX_ARRAYS) {
+        reject(call, "%s: a function takes %d arrays at most", name, MAX_ARRAYS);
+        return NULL;
+    }
+    Py_buffer *view = &call->views[call->count];
+    if (!PyObject_CheckBuffer(array)) {
+        PyErr_Format(PyExc_TypeError, "%s is no array: it has no buffer", name);
+        call->failed = 1;
+        return NULL;
+    }
+    if (PyObject_GetBuffer(array, view, PyBUF_FULL_RO) != 0) {
+        call->failed = 1;
+        return NULL;
+    }
+    call->names[call->count] = name;
+    call->is_output[call->count] = is_output;
+    call->count++;
+    if (!has_type(view, type))
+        reject(call, "%s has items of format '%s' (%zd bytes), expected %s (%zd)", name,
+               view->format ? view->format : "B", view->itemsize, type_name(type),
+               item_size(type));
+    else if (!PyBuffer_IsContiguous(view, 'C'))
+        reject(call, "%s is not contiguous in C order", name);
+    else if (view->len && (uintptr_t)view->buf % (uintptr_t)view->itemsize)
+        reject(call, "%s is not aligned to its items of %zd bytes", name, view->itemsize);
+    else if (is_output && view->readonly)
+        reject(call, "%s is read-only, but results are written to it", name);
+    for (int k = 0; k + 1 < call->count && !call->failed; k++) {
+        const Py_buffer *other = &call->views[k];
+        const uintptr_t begin = (uintptr_t)view->buf, other_begin = (uintptr_t)other->buf;
+        if ((is_output || call->is_output[k]) && view->len && other->len
+            && begin < other_begin + (uintptr_t)other->len
+            && other_begin < begin + (uintptr_t)view->len)
+            reject(call, "%s shares memory with %s", name, call->names[k]);
+    }
+    return call->failed ? NULL : view;
+}
+
+static void *take_items(Call *call, PyObject *array, const char *name, ItemType type,
+                        int is_output, Py_ssize_t items)
+{
+    const Py_buffer *view = take_array(call, array, name, type, is_output);
+    if (!view) return NULL;
+    if (items < 0)
+        reject(call, "%s: its dimensions are negative or too large", name);
+    else if (view->len != items * item_size(type))
+        reject(call, "%s has %zd items, expected %zd", name, view->len / item_size(type), items);
+    return call->failed ? NULL : view->buf;
+}
+
+const void *input(Call *call, PyObject *array, const char *name, ItemType type, Py_ssize_t items)
+{
+    return take_items(call, array, name, type, 0, items);
+}
+
+void *output(Call *call, PyObject *array, const char *name, ItemType type, Py_ssize_t items)
+{
+    return take_items(call, array, name, type, 1, items);
+}
+
+const void *input_rows(Call *call, PyObject *array, const char *name, ItemType type,
+                       Py_ssize_t row_items, Py_ssize_t *rows)
+{
+    *rows = 0;
+    const Py_buffer *view = take_array(call, array, name, type, 0);
+    if (!view) return NULL;
+    const Py_ssize_t items = view->len / item_size(type);
+    if (row_items < 1 || items % row_items) {
+        reject(call, "%s has %zd items, expected a multiple of %zd", name, items, row_items);
+        return NULL;
+    }
+    *rows = items / row_items;
+    return view->buf;
+}
+
+void *output_any(Call *call, PyObject *array, const char *name, ItemType type, Py_ssize_t *items)
+{
+    *items = 0;
+    const Py_buffer *view = take_array(call, array, name, type, 1);
+    if (!view) return NULL;
+    *items = view->len / item_size(type);
+    return view->buf;
+}
+
+/* Index of the first item outside of low to high, or -1. The first loop has no exit, so that it is
+ * compiled for wide registers. */
+#define DEFINE_FIND_OUTSIDE(TYPE)                                                                 \
+    HOT static Py_ssize_t find_outside_##TYPE(const TYPE *items, Py_ssize_t count, TYPE low,      \
+                                              TYPE high)                                          \
+    {                                                                                             \
+        int outside = 0;                                                                          \
+        for (Py_ssize_t k = 0; k < count; k++) outside |= (items[k] < low) | (items[k] > high);   \
+        if (!outside) return -1;                                                                  \
+        Py_ssize_t first = 0;                                                                     \
+        while (items[first] >= low && items[first] <= high) first++;                              \
+        return first;                                                                             \
+    }
+DEFINE_FIND_OUTSIDE(int8_t)
+DEFINE_FIND_OUTSIDE(uint8_t)
+DEFINE_FIND_OUTSIDE(int32_t)
+DEFINE_FIND_OUTSIDE(int64_t)
+
+void check_items(Call *call, const char *name, const void *items, ItemType type, Py_ssize_t count,
+                 long long low, long long high)
+{
+    if (call->failed || count == 0) return;
+    if (high < low) {
+        reject(call, "%s has %zd items, but no value is valid", name, count);
+        return;
+    }
+    /* Limits beyond those of the type are clamped, so that the conversions below are exact. */
+    const long long type_low = type == ITEM_INT8    ? INT8_MIN
+                               : type == ITEM_UINT8 ? 0
+                               : type == ITEM_INT32 ? INT32_MIN
+                                                    : INT64_MIN;
+    const long long type_high = type == ITEM_INT8    ? INT8_MAX
+                                : type == ITEM_UINT8 ? UINT8_MAX
+                                : type == ITEM_INT32 ? INT32_MAX
+                                                     : INT64_MAX;
+    low = low > type_low ? low : type_low;
+    high = high < type_high ? high : type_high;
+    Py_ssize_t index;
+    long long value;
+    if (type == ITEM_INT8) {
+        index = find_outside_int8_t(items, count, (int8_t)low, (int8_t)high);
+        value = index < 0 ? 0 : ((const int8_t *)items)[index];
+    } else if (type == ITEM_UINT8) {
+        index = find_outside_uint8_t(items, count, (uint8_t)low, (uint8_t)high);
+        value = index < 0 ? 0 : ((const uint8_t *)items)[index];
+    } else if (type == ITEM_INT32) {
+        index = find_outside_int32_t(items, count, (int32_t)low, (int32_t)high);
+        value = index < 0 ? 0 : ((const int32_t *)items)[index];
+    } else {
+        index = find_outside_int64_t(items, count, low, high);
+        value = index < 0 ? 0 : ((const int64_t *)items)[index];
+    }
+    if (index >= 0)
+        reject(call, "%s[%zd] is %lld, expected %lld to %lld", name, index, value, low, high);
+}
+
+void check_offsets(Call *call, const char *name, const int64_t *offsets, Py_ssize_t count,
+                   Py_ssize_t end)
+{
+    check_items(call, name, offsets, ITEM_INT64, count, 0, end);
+    for (Py_ssize_t k = 1; k < count && !call->failed; k++)
+        if (offsets[k] < offsets[k - 1])
+            reject(call, "%s[%zd] is less than its predecessor", name, k);
+}
+
+PyObject *finish_call(Call *call, int has_memory)
+{
+    for (int k = 0; k < call->count; k++) PyBuffer_Release(&call->views[k]);
+    if (call->failed) return NULL;
+    if (!has_memory) return PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
 /* ---- Sorting ---------------------------------------------------------------------------- */
 
-/* Shell sort, ascending; for the few hundred numbers of a frame. */
+/* Sort in ascending order by Shell's method, for the few hundred numbers of a frame. */
 static void sort_floats(float *values, int count)
 {
     static const int gaps[] = {301, 132, 57, 23, 10, 4, 1};
@@ -31,6 +317,7 @@ static void sort_floats(float *values, int count)
     }
 }
 
+/* Value of rank `rank` in ascending order (Hoare's selection); reorders `values`. */
 static float nth_smallest(float *values, int count, int rank)
 {
     int low = 0, high = count - 1;
@@ -56,46 +343,46 @@ static float nth_smallest(float *values, int count, int rank)
     return values[rank];
 }
 
-/* ---- Dots of an image ------------------------------------------------------------------- */
+/* ---- Detection of dots ------------------------------------------------------------------ */
 
-/* Index beyond the rim, mirrored at the outermost pixel. */
-static inline int mirrored(int i, int count)
+/* Reflect an index beyond the border at the outermost pixel. */
+static inline int mirror_index(int i, int count)
 {
     if (count == 1) return 0;
     while (i < 0 || i >= count) i = i < 0 ? -i : 2 * (count - 1) - i;
     return i;
 }
 
-static inline float smaller(float a, float b) { return a < b ? a : b; }
+static inline float lesser(float a, float b) { return a < b ? a : b; }
 
-/* Smoothed image by five taps each way (two outer, two inner, the middle). */
+/* Smooth an image with a separable, symmetric filter of five taps (outer, inner, centre). */
 HOT static void smooth_image(const uint8_t *restrict image, int h, int w, const float *taps,
                              float *restrict line, float *restrict smooth)
 {
-    const float outer = taps[0], inner = taps[1], middle = taps[2];
+    const float outer = taps[0], inner = taps[1], centre = taps[2];
     for (int y = 0; y < h; y++) {
-        const uint8_t *a = image + (size_t)mirrored(y - 2, h) * w;
-        const uint8_t *b = image + (size_t)mirrored(y - 1, h) * w;
+        const uint8_t *a = image + (size_t)mirror_index(y - 2, h) * w;
+        const uint8_t *b = image + (size_t)mirror_index(y - 1, h) * w;
         const uint8_t *c = image + (size_t)y * w;
-        const uint8_t *d = image + (size_t)mirrored(y + 1, h) * w;
-        const uint8_t *e = image + (size_t)mirrored(y + 2, h) * w;
+        const uint8_t *d = image + (size_t)mirror_index(y + 1, h) * w;
+        const uint8_t *e = image + (size_t)mirror_index(y + 2, h) * w;
         float *restrict in = line + 2;
         for (int x = 0; x < w; x++)
             in[x] =
-                outer * (float)(a[x] + e[x]) + inner * (float)(b[x] + d[x]) + middle * (float)c[x];
+                outer * (float)(a[x] + e[x]) + inner * (float)(b[x] + d[x]) + centre * (float)c[x];
         for (int k = 1; k <= 2; k++) {
-            in[-k] = in[mirrored(-k, w)];
-            in[w - 1 + k] = in[mirrored(w - 1 + k, w)];
+            in[-k] = in[mirror_index(-k, w)];
+            in[w - 1 + k] = in[mirror_index(w - 1 + k, w)];
         }
         float *restrict out = smooth + (size_t)y * w;
         for (int x = 0; x < w; x++)
             out[x] =
-                outer * (in[x - 2] + in[x + 2]) + inner * (in[x - 1] + in[x + 1]) + middle * in[x];
+                outer * (in[x - 2] + in[x + 2]) + inner * (in[x - 1] + in[x + 1]) + centre * in[x];
     }
 }
 
-/* Marks (1) where a pixel is the least of the 5 x 5 about it, and of equal ones the first; the
- * rim of two is not looked at. */
+/* Mark with 1 each pixel that is the minimum of the 5 x 5 pixels around it, and the first of equal
+ * ones. Marks within two pixels of the border are left unchanged. */
 HOT static void mark_minima(const float *restrict smooth, int h, int w, float *restrict across,
                             uint8_t *restrict marks)
 {
@@ -103,8 +390,7 @@ HOT static void mark_minima(const float *restrict smooth, int h, int w, float *r
         const float *restrict s = smooth + (size_t)y * w;
         float *restrict m = across + (size_t)y * w;
         for (int x = 2; x < w - 2; x++)
-            m[x] =
-                smaller(smaller(smaller(s[x - 2], s[x - 1]), smaller(s[x + 1], s[x + 2])), s[x]);
+            m[x] = lesser(lesser(lesser(s[x - 2], s[x - 1]), lesser(s[x + 1], s[x + 2])), s[x]);
     }
     for (int y = 2; y < h - 2; y++) {
         const float *restrict a = across + (size_t)(y - 2) * w, *restrict b = a + w;
@@ -112,28 +398,28 @@ HOT static void mark_minima(const float *restrict smooth, int h, int w, float *r
         const float *restrict s = smooth + (size_t)y * w;
         uint8_t *restrict mark = marks + (size_t)y * w;
         for (int x = 2; x < w - 2; x++) {
-            const float before = smaller(smaller(a[x], b[x]), smaller(s[x - 2], s[x - 1]));
-            const float after = smaller(smaller(d[x], e[x]), smaller(s[x + 1], s[x + 2]));
+            const float before = lesser(lesser(a[x], b[x]), lesser(s[x - 2], s[x - 1]));
+            const float after = lesser(lesser(d[x], e[x]), lesser(s[x + 1], s[x + 2]));
             mark[x] = (s[x] < before) & (s[x] <= after);
         }
     }
 }
 
-/* Moving sums over `reach` values of a line with a stride, mirrored at its ends. */
-static void moving_sum(const float *line, int count, int stride, int reach, float *out)
+/* Moving sums over `window` values of a line with a stride, mirrored at its ends. */
+static void moving_sum(const float *line, int count, int stride, int window, float *out)
 {
-    const int half = reach / 2;
+    const int half = window / 2;
     float sum = 0;
-    for (int k = -half; k <= half; k++) sum += line[mirrored(k, count) * stride];
+    for (int k = -half; k <= half; k++) sum += line[mirror_index(k, count) * stride];
     for (int k = 0; k < count; k++) {
         out[k * stride] = sum;
-        sum += line[mirrored(k + half + 1, count) * stride]
-               - line[mirrored(k - half, count) * stride];
+        sum += line[mirror_index(k + half + 1, count) * stride]
+               - line[mirror_index(k - half, count) * stride];
     }
 }
 
-/* Brightness of the paper: means of blocks, averaged over a square of blocks. */
-static void paper_image(const uint8_t *image, int w, int rows, int columns, int block, int reach,
+/* Brightness of the paper: means of blocks, averaged over squares of `window` blocks a side. */
+static void paper_image(const uint8_t *image, int w, int rows, int columns, int block, int window,
                         int *restrict sums, float *means, float *across, float *paper)
 {
     for (int r = 0; r < rows; r++) {
@@ -145,20 +431,21 @@ static void paper_image(const uint8_t *image, int w, int rows, int columns, int 
         for (int c = 0; c < columns; c++) {
             int sum = 0;
             for (int x = 0; x < block; x++) sum += sums[c * block + x];
-            /* Whole grey levels, as an 8-bit image has them. */
+            /* Rounded to whole grey levels like the 8-bit image of the numpy twin. */
             means[r * columns + c] = (float)((2 * sum + block * block) / (2 * block * block));
         }
     }
     for (int r = 0; r < rows; r++)
-        moving_sum(means + r * columns, columns, 1, reach, across + r * columns);
-    for (int c = 0; c < columns; c++) moving_sum(across + c, rows, columns, reach, paper + c);
-    const float share = 1.0f / (float)(reach * reach);
-    for (int k = 0; k < rows * columns; k++) paper[k] *= share;
+        moving_sum(means + r * columns, columns, 1, window, across + r * columns);
+    for (int c = 0; c < columns; c++) moving_sum(across + c, rows, columns, window, paper + c);
+    const float scale = 1.0f / (float)(window * window);
+    for (int k = 0; k < rows * columns; k++) paper[k] *= scale;
 }
 
-/* Contrast of the median dot: of those above the split that Otsu's criterion makes, once the
- * few that are darker than any dot were set aside as dirt. */
-static float median_dot(float *contrasts, int count, int fewest, int splits)
+/* Median contrast of the dots, which are the minima above the split by Otsu's criterion. If fewer
+ * than `min_dots` are above it, they are dirt, darker than any dot, and the rest is split again.
+ */
+static float median_contrast(float *contrasts, int count, int min_dots, int splits)
 {
     if (count == 0) return 0;
     sort_floats(contrasts, count);
@@ -175,105 +462,112 @@ static float median_dot(float *contrasts, int count, int fewest, int splits)
                 dots = above;
             }
         }
-        if (dots >= fewest) return contrasts[count - 1 - (dots - 1) / 2];
+        if (dots >= min_dots) return contrasts[count - 1 - (dots - 1) / 2];
         count -= dots;
     }
     return contrasts[count - 1 - (count - 1) / 2];
 }
 
-/* Slope of a plane through the paper's brightness, in grey levels a pixel along one axis. */
-static float slope_of(const float *paper, int count, int step, int across, int across_step,
-                      int block)
+/* Slope along one axis of the plane fitted to the paper's brightness [grey levels per pixel]. */
+static float paper_slope(const float *paper, int count, int step, int across, int across_step,
+                         int block)
 {
     double sum = 0, squares = 0;
     for (int k = 0; k < count; k++) {
-        const double from_middle = k - (count - 1) / 2.0;
+        const double from_centre = k - (count - 1) / 2.0;
         double line = 0;
         for (int j = 0; j < across; j++) line += paper[k * step + j * across_step];
-        sum += line / across * from_middle;
-        squares += from_middle * from_middle;
+        sum += line / across * from_centre;
+        squares += from_centre * from_centre;
     }
     return (float)(sum / (squares > 1 ? squares : 1) / block);
 }
 
-static float peak(const float *at, int step, float light, float slope, float contrast, float top)
+/* Offset of a minimum along one axis [pixels]: top of the Gaussian through it and its neighbours.
+ */
+static float minimum_offset(const float *minimum, int step, float brightness, float slope,
+                            float contrast, float top)
 {
-    const float least = 0.05f * contrast;
-    const float before = light - slope - at[-step], after = light + slope - at[step];
-    const float a = logf(before > least ? before : least);
-    const float b = logf(after > least ? after : least);
-    float bend = 2 * top - a - b;
-    bend = bend > 1e-6f ? bend : 1e-6f;
-    const float offset = 0.5f * (b - a) / bend;
+    const float floor = 0.05f * contrast;
+    const float before = brightness - slope - minimum[-step],
+                after = brightness + slope - minimum[step];
+    const float a = logf(before > floor ? before : floor);
+    const float b = logf(after > floor ? after : floor);
+    float curvature = 2 * top - a - b;
+    curvature = curvature > 1e-6f ? curvature : 1e-6f;
+    const float offset = 0.5f * (b - a) / curvature;
     return offset < -0.5f ? -0.5f : offset > 0.5f ? 0.5f : offset;
 }
 
 typedef struct {
-    float x, y, contrast, off; /* off: square distance from the middle */
+    float x, y, contrast, square_radius; /* square_radius: from the centre of the image */
 } Dot;
 
-static int middle_first(const void *a, const void *b)
+/* Order of dots from the centre outwards. NaN comes last: qsort requires a total order. */
+static int by_square_radius(const void *a, const void *b)
 {
-    const float x = ((const Dot *)a)->off, y = ((const Dot *)b)->off;
-    return (x > y) - (x < y);
+    const float x = ((const Dot *)a)->square_radius, y = ((const Dot *)b)->square_radius;
+    return isnan(x) || isnan(y) ? isnan(x) - isnan(y) : (x > y) - (x < y);
 }
 
 typedef struct {
-    int h, w, block, reach, fewest, splits, most, rows, columns;
-    float faintest, share;
+    int h, w, block, window, min_dots, splits, max_dots, rows, columns;
+    float min_contrast, contrast_fraction;
     const float *taps;
-    float *smooth, *across, *line, *means, *blurred, *paper, *contrasts, *lights;
+    float *smooth, *across, *line, *means, *blurred, *paper, *contrasts, *brightnesses;
     int *sums;
     uint8_t *marks;
     Dot *dots;
-} Finder;
+} Detector;
 
-/* Dots of an image to `xy`; how many there are. */
-static int dots_of(const Finder *f, const uint8_t *image, float *xy)
+/* Detect the dots of an image, write their positions to `xy` and return their number. */
+static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
 {
-    const int h = f->h, w = f->w;
-    Dot *dots = f->dots;
-    smooth_image(image, h, w, f->taps, f->line, f->smooth);
-    paper_image(image, w, f->rows, f->columns, f->block, f->reach, f->sums, f->means, f->blurred,
-                f->paper);
-    mark_minima(f->smooth, h, w, f->across, f->marks);
+    const int h = d->h, w = d->w;
+    Dot *dots = d->dots;
+    smooth_image(image, h, w, d->taps, d->line, d->smooth);
+    paper_image(image, w, d->rows, d->columns, d->block, d->window, d->sums, d->means, d->blurred,
+                d->paper);
+    mark_minima(d->smooth, h, w, d->across, d->marks);
     int minima = 0;
     for (int y = 2; y < h - 2; y++) {
-        const uint8_t *mark = f->marks + (size_t)y * w, *end = mark + w - 2;
-        const int row = y / f->block < f->rows ? y / f->block : f->rows - 1;
+        const uint8_t *mark = d->marks + (size_t)y * w, *end = mark + w - 2;
+        const int row = y / d->block < d->rows ? y / d->block : d->rows - 1;
         for (const uint8_t *at = mark + 2; (at = memchr(at, 1, (size_t)(end - at))); at++) {
             const int x = (int)(at - mark);
-            const int column = x / f->block < f->columns ? x / f->block : f->columns - 1;
-            const float light = f->paper[row * f->columns + column];
-            const float contrast = light - f->smooth[(size_t)y * w + x];
-            if (!(contrast > f->faintest)) continue;
-            f->lights[minima] = light;
-            f->contrasts[minima] = contrast / light;
+            const int column = x / d->block < d->columns ? x / d->block : d->columns - 1;
+            const float brightness = d->paper[row * d->columns + column];
+            const float contrast = brightness - d->smooth[(size_t)y * w + x];
+            if (!(contrast > d->min_contrast)) continue;
+            d->brightnesses[minima] = brightness;
+            d->contrasts[minima] = contrast / brightness;
             dots[minima].x = (float)x;
             dots[minima].y = (float)y;
             dots[minima++].contrast = contrast;
         }
     }
-    memcpy(f->across, f->contrasts, (size_t)minima * sizeof(float));
-    const float bar = f->share * median_dot(f->across, minima, f->fewest, f->splits);
-    const int rows = f->rows, columns = f->columns;
-    const float slope_x = slope_of(f->paper, columns, 1, rows, columns, f->block);
-    const float slope_y = slope_of(f->paper, rows, columns, columns, 1, f->block);
+    memcpy(d->across, d->contrasts, (size_t)minima * sizeof(float));
+    const float threshold =
+        d->contrast_fraction * median_contrast(d->across, minima, d->min_dots, d->splits);
+    const int rows = d->rows, columns = d->columns;
+    const float slope_x = paper_slope(d->paper, columns, 1, rows, columns, d->block);
+    const float slope_y = paper_slope(d->paper, rows, columns, columns, 1, d->block);
     int kept = 0;
     for (int k = 0; k < minima; k++) {
-        if (!(f->contrasts[k] > bar)) continue;
-        const float light = f->lights[k], contrast = dots[k].contrast, top = logf(contrast);
-        const float *at = f->smooth + (size_t)dots[k].y * w + (size_t)dots[k].x;
-        const float x = dots[k].x + peak(at, 1, light, slope_x, contrast, top);
-        const float y = dots[k].y + peak(at, w, light, slope_y, contrast, top);
+        if (!(d->contrasts[k] > threshold)) continue;
+        const float brightness = d->brightnesses[k], contrast = dots[k].contrast,
+                    top = logf(contrast);
+        const float *minimum = d->smooth + (size_t)dots[k].y * w + (size_t)dots[k].x;
+        const float x = dots[k].x + minimum_offset(minimum, 1, brightness, slope_x, contrast, top);
+        const float y = dots[k].y + minimum_offset(minimum, w, brightness, slope_y, contrast, top);
         const float dx = x - 0.5f * (float)(w - 1), dy = y - 0.5f * (float)(h - 1);
         dots[kept].x = x;
         dots[kept].y = y;
-        dots[kept++].off = dx * dx + dy * dy;
+        dots[kept++].square_radius = dx * dx + dy * dy;
     }
-    if (kept > f->most) {
-        qsort(dots, (size_t)kept, sizeof(Dot), middle_first);
-        kept = f->most;
+    if (kept > d->max_dots) {
+        qsort(dots, (size_t)kept, sizeof(Dot), by_square_radius);
+        kept = d->max_dots;
     }
     for (int k = 0; k < kept; k++) {
         xy[2 * k] = dots[k].x;
@@ -282,70 +576,101 @@ static int dots_of(const Finder *f, const uint8_t *image, float *xy)
     return kept;
 }
 
+/* Largest sides of images and blocks [pixels]. Below them, indices and sums of grey levels fit
+ * into an int: 2 * 255 * MAX_BLOCK^2 + MAX_BLOCK^2 < 2^31. */
+enum { MIN_SIDE = 5, MAX_SIDE = 1 << 15, MAX_BLOCK = 2048, MAX_WINDOW = 1023, MAX_SPLITS = 1000 };
+
 static PyObject *find_dots(PyObject *self, PyObject *args)
 {
-    enum { IMAGES, TAPS, XY, COUNTS, BUFFERS };
-    Py_buffer b[BUFFERS];
-    int n;
-    Finder f;
-    if (!PyArg_ParseTuple(args, "y*iiiy*iiffiiiw*w*", &b[IMAGES], &n, &f.h, &f.w, &b[TAPS],
-                          &f.block, &f.reach, &f.faintest, &f.share, &f.fewest, &f.splits, &f.most,
-                          &b[XY], &b[COUNTS]))
+    (void)self;
+    Call call = {0};
+    PyObject *images_array, *taps_array, *xy_array, *counts_array;
+    long long n, h, w, block, window, min_dots, splits, max_dots;
+    Detector d;
+    if (!parse_arguments(args, "OLLLOLLffLLLOO:find_dots", &images_array, &n, &h, &w, &taps_array,
+                         &block, &window, &d.min_contrast, &d.contrast_fraction, &min_dots,
+                         &splits, &max_dots, &xy_array, &counts_array))
         return NULL;
-    f.rows = f.h / f.block;
-    f.columns = f.w / f.block;
-    f.taps = b[TAPS].buf;
-    const size_t area = (size_t)f.h * f.w, blocks = (size_t)f.rows * f.columns;
-    f.smooth = malloc((4 * area + (size_t)f.w + 4 + 3 * blocks) * sizeof(float));
-    f.dots = malloc(area * sizeof(Dot));
-    f.sums = malloc((size_t)f.w * sizeof(int));
-    f.marks = malloc(area);
-    const int stored = f.smooth && f.dots && f.sums && f.marks;
-    if (stored) {
-        f.across = f.smooth + area;
-        f.contrasts = f.across + area;
-        f.lights = f.contrasts + area;
-        f.line = f.lights + area;
-        f.means = f.line + f.w + 4;
-        f.blurred = f.means + blocks;
-        f.paper = f.blurred + blocks;
-        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)((int64_t *)b[COUNTS].buf)[k] =
-            dots_of(&f, (const uint8_t *)b[IMAGES].buf + k * area,
-                    (float *)b[XY].buf + 2 * (size_t)k * f.most);
+    check_range(&call, "n", n, 0, INT_MAX);
+    check_range(&call, "height", h, MIN_SIDE, MAX_SIDE);
+    check_range(&call, "width", w, MIN_SIDE, MAX_SIDE);
+    /* At least one block fits into the image, since each pixel needs the brightness of one. */
+    check_range(&call, "block", block, 1, h < w ? h : w);
+    check_range(&call, "block", block, 1, MAX_BLOCK);
+    check_range(&call, "window", window, 1, MAX_WINDOW);
+    check_range(&call, "min_dots", min_dots, 0, INT_MAX);
+    check_range(&call, "splits", splits, 0, MAX_SPLITS);
+    check_range(&call, "max_dots", max_dots, 0, INT_MAX);
+    if (call.failed) return NULL;
+    const uint8_t *images = input(&call, images_array, "images", ITEM_UINT8, ITEMS(n, h, w));
+    d.taps = input(&call, taps_array, "taps", ITEM_FLOAT32, 3);
+    float *xy = output(&call, xy_array, "xy", ITEM_FLOAT32, ITEMS(n, max_dots, 2));
+    int64_t *counts = output(&call, counts_array, "counts", ITEM_INT64, n);
+    if (call.failed) return finish_call(&call, 1);
+    d.h = (int)h;
+    d.w = (int)w;
+    d.block = (int)block;
+    d.window = (int)window;
+    d.min_dots = (int)min_dots;
+    d.splits = (int)splits;
+    d.max_dots = (int)max_dots;
+    d.rows = d.h / d.block;
+    d.columns = d.w / d.block;
+    const size_t area = (size_t)d.h * (size_t)d.w, blocks = (size_t)d.rows * (size_t)d.columns;
+    d.smooth = malloc((4 * area + (size_t)d.w + 4 + 3 * blocks) * sizeof(float));
+    d.dots = malloc(area * sizeof(Dot));
+    d.sums = malloc((size_t)d.w * sizeof(int));
+    d.marks = malloc(area);
+    const int has_memory = d.smooth && d.dots && d.sums && d.marks;
+    if (has_memory) {
+        d.across = d.smooth + area;
+        d.contrasts = d.across + area;
+        d.brightnesses = d.contrasts + area;
+        d.line = d.brightnesses + area;
+        d.means = d.line + d.w + 4;
+        d.blurred = d.means + blocks;
+        d.paper = d.blurred + blocks;
+        Py_BEGIN_ALLOW_THREADS
+        for (size_t k = 0; k < (size_t)n; k++)
+            counts[k] = detect_dots(&d, images + k * area, xy + 2 * k * (size_t)d.max_dots);
         Py_END_ALLOW_THREADS
     }
-    free(f.smooth);
-    free(f.dots);
-    free(f.sums);
-    free(f.marks);
-    return done(b, BUFFERS, stored);
+    free(d.smooth);
+    free(d.dots);
+    free(d.sums);
+    free(d.marks);
+    return finish_call(&call, has_memory);
 }
 
-/* ---- The lattice of dots ---------------------------------------------------------------- */
+/* ---- Lattice of dots -------------------------------------------------------------------- */
 
 enum { A_U = 0, C_U = 2, A_V = 3, C_V = 5, PERSPECTIVE = 6, LENS = 8, PARAMETERS = 9 };
 
 typedef struct {
-    int seeds, fewest, rings;
-    const double *ring, *prior; /* radii; inverse squares of the parameters' deviations */
-    double nearest, farthest, gate, loose, tight, firm, bent_from, offset;
-} Rules;
+    int seeds, min_dots, rings;
+    const double *ring, *prior; /* radii; inverse variances of the parameters */
+    double min_neighbour,
+        max_neighbour; /* limits of the square distance of neighbours [square pitches] */
+    double cell_gate, cell_sigma;     /* gate and sigma of dots about cell centres [pitches] */
+    double symbol_gate, symbol_sigma; /* gate and sigma of dots about their symbols [pitches] */
+    double lens_radius, offset; /* radius from which the lens is fitted; of a symbol [pitches] */
+} LatticeOptions;
 
 enum { LANES = 8 };
 
-/* Dots of a frame, an array a quantity, filled up to whole groups of LANES. */
+/* Dots of a frame, one array per quantity, padded with zeros to a multiple of LANES. */
 typedef struct {
     int count;
-    float *x, *y, *valid;              /* p; 1 where there is such a dot */
-    float *u, *v, *bend, *over, *q[2]; /* |p|^2 / (1 + lens |p|^2), 1 / (1 + g q), q */
-    float *use, *miss[2];              /* 1 where it counts; by how much it misses */
+    float *x, *y, *valid;                     /* position p; 1 for a dot, 0 for padding */
+    float *u, *v, *lens_slope, *depth, *q[2]; /* |p|^2 / (1 + lens |p|^2), 1 / (1 + g q), q */
+    float *use, *residual[2];                 /* 1 for a dot in use; residuals */
 } Dots;
 
 static int new_dots(Dots *d, int m)
 {
     d->count = (m + LANES - 1) / LANES * LANES;
-    float **arrays[] = {&d->x,    &d->y,    &d->valid, &d->u,   &d->v,       &d->bend,
-                        &d->over, &d->q[0], &d->q[1],  &d->use, &d->miss[0], &d->miss[1]};
+    float **arrays[] = {&d->x,     &d->y,    &d->valid, &d->u,   &d->v,           &d->lens_slope,
+                        &d->depth, &d->q[0], &d->q[1],  &d->use, &d->residual[0], &d->residual[1]};
     const int number = (int)(sizeof(arrays) / sizeof(*arrays));
     float *store = calloc((size_t)number * (size_t)d->count, sizeof(float));
     for (int k = 0; store && k < number; k++) *arrays[k] = store + (size_t)k * d->count;
@@ -366,39 +691,41 @@ HOT static void project(const double *parameters, const Dots *d)
     float t[PARAMETERS];
     for (int k = 0; k < PARAMETERS; k++) t[k] = (float)parameters[k];
     const float *restrict px = d->x, *restrict py = d->y;
-    float *restrict us = d->u, *restrict vs = d->v, *restrict bends = d->bend;
-    float *restrict overs = d->over, *restrict q0 = d->q[0], *restrict q1 = d->q[1];
+    float *restrict us = d->u, *restrict vs = d->v, *restrict lens_slopes = d->lens_slope;
+    float *restrict depths = d->depth, *restrict q0 = d->q[0], *restrict q1 = d->q[1];
     for (int i = 0; i < d->count; i++) {
         const float x = px[i], y = py[i], square = x * x + y * y;
-        const float bend = 1 / (1 + t[LENS] * square), qx = x * bend, qy = y * bend;
-        const float over = 1 / (1 + t[PERSPECTIVE] * qx + t[PERSPECTIVE + 1] * qy);
-        us[i] = (t[A_U] * qx + t[A_U + 1] * qy + t[C_U]) * over;
-        vs[i] = (t[A_V] * qx + t[A_V + 1] * qy + t[C_V]) * over;
-        bends[i] = square * bend;
-        overs[i] = over;
+        const float lens_slope = 1 / (1 + t[LENS] * square), qx = x * lens_slope,
+                    qy = y * lens_slope;
+        const float depth = 1 / (1 + t[PERSPECTIVE] * qx + t[PERSPECTIVE + 1] * qy);
+        us[i] = (t[A_U] * qx + t[A_U + 1] * qy + t[C_U]) * depth;
+        vs[i] = (t[A_V] * qx + t[A_V + 1] * qy + t[C_V]) * depth;
+        lens_slopes[i] = square * lens_slope;
+        depths[i] = depth;
         q0[i] = qx;
         q1[i] = qy;
     }
 }
 
-/* Dots near their places within a ring count; whether there are dots beyond it. */
-HOT static int aim_at_places(const Dots *d, float ring, float gate)
+/* Use the dots that are near a cell centre and within a ring; return whether any are beyond it. */
+HOT static int match_cells(const Dots *d, float ring, float cell_gate)
 {
     const float *restrict us = d->u, *restrict vs = d->v, *restrict valid = d->valid;
-    float *restrict use = d->use, *restrict du = d->miss[0], *restrict dv = d->miss[1];
+    float *restrict use = d->use, *restrict du = d->residual[0], *restrict dv = d->residual[1];
     int beyond = 0;
     for (int i = 0; i < d->count; i++) {
         const float u = rintf(us[i]), v = rintf(vs[i]);
-        const int there = valid[i] > 0, near = u * u + v * v < ring;
+        const int is_dot = valid[i] > 0, near = u * u + v * v < ring;
         du[i] = us[i] - u;
         dv[i] = vs[i] - v;
-        beyond |= there & !near;
-        use[i] = there & near & (fabsf(du[i]) < gate) & (fabsf(dv[i]) < gate) ? 1.0f : 0.0f;
+        beyond |= is_dot & !near;
+        use[i] =
+            is_dot & near & (fabsf(du[i]) < cell_gate) & (fabsf(dv[i]) < cell_gate) ? 1.0f : 0.0f;
     }
     return beyond;
 }
 
-/* Where, about its place, the symbol stands that is nearest. */
+/* Displacement of the nearest symbol from the cell centre. */
 static inline void nearest_symbol(const float *rest, float offset, float *symbol)
 {
     const int along_x = fabsf(rest[0]) > fabsf(rest[1]);
@@ -406,23 +733,26 @@ static inline void nearest_symbol(const float *rest, float offset, float *symbol
     symbol[1] = along_x ? 0 : copysignf(offset, rest[1]);
 }
 
-/* Dots near where a symbol stands count. */
-HOT static void aim_at_symbols(const Dots *d, float offset, float tight)
+/* Use the dots that are near a symbol. */
+HOT static void match_symbols(const Dots *d, float offset, float symbol_gate)
 {
     const float *restrict us = d->u, *restrict vs = d->v, *restrict valid = d->valid;
-    float *restrict use = d->use, *restrict du = d->miss[0], *restrict dv = d->miss[1];
+    float *restrict use = d->use, *restrict du = d->residual[0], *restrict dv = d->residual[1];
     for (int i = 0; i < d->count; i++) {
         const float rest[2] = {us[i] - rintf(us[i]), vs[i] - rintf(vs[i])};
         float symbol[2];
         nearest_symbol(rest, offset, symbol);
         du[i] = rest[0] - symbol[0];
         dv[i] = rest[1] - symbol[1];
-        use[i] = (valid[i] > 0) & (fabsf(du[i]) < tight) & (fabsf(dv[i]) < tight) ? 1.0f : 0.0f;
+        use[i] = (valid[i] > 0) & (fabsf(du[i]) < symbol_gate) & (fabsf(dv[i]) < symbol_gate)
+                     ? 1.0f
+                     : 0.0f;
     }
 }
 
-/* Solves a x = b in place by Gauss with pivots, for `sides` columns b[k][side]. */
-static int solve(double a[PARAMETERS][PARAMETERS], double *b, int sides)
+/* Solve a x = b in place by Gaussian elimination with row pivots, for `sides` columns b[k][side].
+ * Return 0 if a is singular. */
+static int solve_linear(double a[PARAMETERS][PARAMETERS], double *b, int sides)
 {
     for (int k = 0; k < PARAMETERS; k++) {
         int pivot = k;
@@ -456,18 +786,18 @@ static int solve(double a[PARAMETERS][PARAMETERS], double *b, int sides)
     return 1;
 }
 
-static double total(const float *lanes)
+static double sum_lanes(const float *lanes)
 {
     double sum = 0;
     for (int l = 0; l < LANES; l++) sum += lanes[l];
     return sum;
 }
 
-/* Normal equations by which the dots in use are moved onto what they miss, and priors. Sums
- * run in LANES side by side, since a compiler may not reorder a single one. */
-HOT static void equations(const double *parameters, const Dots *d, double sigma, int lens,
-                          const double *prior, double normal[PARAMETERS][PARAMETERS],
-                          double *right)
+/* Normal equations of the residuals of the dots in use and of the priors. Sums run in LANES
+ * independent parts, since a compiler must not reorder a single floating-point sum. */
+HOT static void normal_equations(const double *parameters, const Dots *d, double sigma, int lens,
+                                 const double *prior, double normal[PARAMETERS][PARAMETERS],
+                                 double *right)
 {
     float s_shared[6][LANES] = {{0}}, s_cross[2][9][LANES] = {{{0}}}, s_corner[6][LANES] = {{0}};
     float s_right[PARAMETERS][LANES] = {{0}};
@@ -475,7 +805,7 @@ HOT static void equations(const double *parameters, const Dots *d, double sigma,
     for (int i = 0; i < d->count; i += LANES) {
         float o[LANES], b[2][LANES];
         for (int l = 0; l < LANES; l++) {
-            o[l] = d->over[i + l] * d->use[i + l];
+            o[l] = d->depth[i + l] * d->use[i + l];
             b[0][l] = d->q[0][i + l] * o[l];
             b[1][l] = d->q[1][i + l] * o[l];
         }
@@ -486,20 +816,20 @@ HOT static void equations(const double *parameters, const Dots *d, double sigma,
         for (int l = 0; l < LANES; l++) s_shared[4][l] += b[1][l] * o[l];
         for (int l = 0; l < LANES; l++) s_shared[5][l] += o[l] * o[l];
         for (int axis = 0; axis < 2; axis++) {
-            const float *value = (axis ? d->v : d->u) + i, *miss = d->miss[axis] + i;
-            const float *q0 = d->q[0] + i, *q1 = d->q[1] + i, *bend = d->bend + i;
+            const float *value = (axis ? d->v : d->u) + i, *residual = d->residual[axis] + i;
+            const float *q0 = d->q[0] + i, *q1 = d->q[1] + i, *lens_slope = d->lens_slope + i;
             const float a0 = (float)parameters[3 * axis], a1 = (float)parameters[3 * axis + 1];
             float c[3][LANES], w[LANES];
             for (int l = 0; l < LANES; l++) {
                 c[0][l] = -value[l] * b[0][l];
                 c[1][l] = -value[l] * b[1][l];
                 const float slope = a0 * q0[l] + a1 * q1[l] - value[l] * (g0 * q0[l] + g1 * q1[l]);
-                c[2][l] = lens ? -slope * bend[l] * o[l] : 0;
-                w[l] = -miss[l] * d->use[i + l];
+                c[2][l] = lens ? -slope * lens_slope[l] * o[l] : 0;
+                w[l] = -residual[l] * d->use[i + l];
             }
             for (int k = 0; k < 3; k++) {
                 const float *column = c[k];
-                float (*x)[LANES] = s_cross[axis];
+                float(*x)[LANES] = s_cross[axis];
                 for (int l = 0; l < LANES; l++) x[k][l] += b[0][l] * column[l];
                 for (int l = 0; l < LANES; l++) x[3 + k][l] += b[1][l] * column[l];
                 for (int l = 0; l < LANES; l++) x[6 + k][l] += o[l] * column[l];
@@ -518,13 +848,13 @@ HOT static void equations(const double *parameters, const Dots *d, double sigma,
     }
     double shared[6], cross[2][9], corner[6];
     for (int k = 0; k < 6; k++) {
-        shared[k] = total(s_shared[k]);
-        corner[k] = total(s_corner[k]);
+        shared[k] = sum_lanes(s_shared[k]);
+        corner[k] = sum_lanes(s_corner[k]);
     }
     for (int k = 0; k < 9; k++) {
-        cross[0][k] = total(s_cross[0][k]);
-        cross[1][k] = total(s_cross[1][k]);
-        right[k] = total(s_right[k]);
+        cross[0][k] = sum_lanes(s_cross[0][k]);
+        cross[1][k] = sum_lanes(s_cross[1][k]);
+        right[k] = sum_lanes(s_right[k]);
     }
     static const int packed[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
     memset(normal, 0, PARAMETERS * sizeof(*normal));
@@ -542,17 +872,19 @@ HOT static void equations(const double *parameters, const Dots *d, double sigma,
     }
 }
 
-/* One Gauss-Newton step; false where it cannot be made. */
-static int step(double *parameters, const Dots *d, double sigma, int lens, const double *prior)
+/* Take one Gauss-Newton step; return 0 if the equations are singular. */
+static int gauss_newton_step(double *parameters, const Dots *d, double sigma, int lens,
+                             const double *prior)
 {
     double normal[PARAMETERS][PARAMETERS], right[PARAMETERS];
-    equations(parameters, d, sigma, lens, prior, normal, right);
-    if (!solve(normal, right, 1)) return 0;
+    normal_equations(parameters, d, sigma, lens, prior, normal, right);
+    if (!solve_linear(normal, right, 1)) return 0;
     for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
     return 1;
 }
 
-/* Square distance of each point to its third nearest; no branch, since none could be foretold. */
+/* Square distance of each point to its third nearest neighbour. The loop has no branch, since none
+ * could be predicted. */
 HOT static void third_nearest(const float *restrict x, const float *restrict y, int count,
                               float *restrict first, float *restrict second, float *restrict third)
 {
@@ -562,41 +894,41 @@ HOT static void third_nearest(const float *restrict x, const float *restrict y, 
             const float dx = x[i] - x[j], dy = y[i] - y[j];
             const float square = i == j ? FLT_MAX : dx * dx + dy * dy;
             const float a = first[i], b = second[i], c = third[i];
-            third[i] = smaller(c, b > square ? b : square);
-            second[i] = smaller(b, a > square ? a : square);
-            first[i] = smaller(a, square);
+            third[i] = lesser(c, b > square ? b : square);
+            second[i] = lesser(b, a > square ? a : square);
+            first[i] = lesser(a, square);
         }
 }
 
-/* Pitch, direction and shift in the middle; false where there are too few dots. `scratch` is
- * for a float a dot, seven a seed, and two a pair of seeds. */
-static int seed(const float *points, const uint8_t *valid, int m, const Rules *rules,
-                float *scratch, double *parameters)
+/* Estimate pitch, direction and shift from the dots in the centre; return 0 if there are too few.
+ * `scratch` holds m + 1 floats, 7 for each seed, and seeds * (seeds + 1) for pairs. */
+static int estimate_seed(const float *points, const uint8_t *valid, int m,
+                         const LatticeOptions *options, float *scratch, double *parameters)
 {
-    float *squares = scratch, *x = squares + m + 1, *y = x + rules->seeds,
-          *work = y + rules->seeds;
-    float *dxs = work + 5 * rules->seeds, *dys = dxs + rules->seeds * (rules->seeds + 1) / 2;
-    int there = 0, count = 0;
+    float *squares = scratch, *x = squares + m + 1, *y = x + options->seeds,
+          *work = y + options->seeds;
+    float *dxs = work + 5 * options->seeds, *dys = dxs + options->seeds * (options->seeds + 1) / 2;
+    int dots = 0, count = 0;
     for (int i = 0; i < m; i++) {
         const float px = points[2 * i], py = points[2 * i + 1];
-        squares[there] = px * px + py * py;
-        there += valid[i] != 0;
+        squares[dots] = px * px + py * py;
+        dots += valid[i] != 0;
     }
-    if (there < rules->fewest) return 0;
-    const int wanted = there < rules->seeds ? there : rules->seeds;
-    const float bar = nth_smallest(squares, there, wanted - 1);
+    if (dots < options->min_dots) return 0;
+    const int wanted = dots < options->seeds ? dots : options->seeds;
+    const float threshold = nth_smallest(squares, dots, wanted - 1);
     for (int i = 0; i < m && count < wanted; i++) {
         const float px = points[2 * i], py = points[2 * i + 1];
-        if (!valid[i] || px * px + py * py > bar) continue;
+        if (!valid[i] || px * px + py * py > threshold) continue;
         x[count] = px;
         y[count++] = py;
     }
-    float *third = work + 2 * rules->seeds;
-    third_nearest(x, y, count, work, work + rules->seeds, third);
+    float *third = work + 2 * options->seeds;
+    third_nearest(x, y, count, work, work + options->seeds, third);
     sort_floats(third, count);
     const float pitch_square = 0.5f * (third[(count - 1) / 2] + third[count / 2]);
-    const float low = (float)rules->nearest * pitch_square;
-    const float high = (float)rules->farthest * pitch_square;
+    const float low = (float)options->min_neighbour * pitch_square;
+    const float high = (float)options->max_neighbour * pitch_square;
     int pairs = 0;
     for (int i = 0; i < count; i++)
         for (int j = 0; j < i; j++) {
@@ -624,41 +956,43 @@ static int seed(const float *points, const uint8_t *valid, int m, const Rules *r
     parameters[A_U] = parameters[A_V + 1] = c / pitch;
     parameters[A_U + 1] = s / pitch;
     parameters[A_V] = -s / pitch;
-    const double turn = 2 * 3.14159265358979323846;
+    const double two_pi = 2 * 3.14159265358979323846;
     for (int axis = 0; axis < 2; axis++) {
         const double *a = parameters + 3 * axis;
         double re = 0, im = 0;
         for (int i = 0; i < count; i++) {
-            const double phase = turn * (a[0] * x[i] + a[1] * y[i]);
+            const double phase = two_pi * (a[0] * x[i] + a[1] * y[i]);
             re += cos(phase);
             im += sin(phase);
         }
-        parameters[C_U + 3 * axis] = -atan2(im, re) / turn;
+        parameters[C_U + 3 * axis] = -atan2(im, re) / two_pi;
     }
     return 1;
 }
 
-/* Lattice of the dots; false where there is none. */
-static int fit(const Dots *d, const float *points, const uint8_t *valid, int m, int lens,
-               const Rules *rules, float *scratch, double *parameters, float *uv, float *place,
-               double *sigma)
+/* Fit the lattice of the dots of a frame; return 0 if there is none. */
+static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid, int m, int lens,
+                       const LatticeOptions *options, float *scratch, double *parameters,
+                       float *uv, float *cells, double *sigma)
 {
-    if (!seed(points, valid, m, rules, scratch, parameters)) return 0;
-    for (int r = 0, beyond = 1; r < rules->rings && beyond; r++) {
+    if (!estimate_seed(points, valid, m, options, scratch, parameters)) return 0;
+    for (int r = 0, beyond = 1; r < options->rings && beyond; r++) {
         project(parameters, d);
-        const double ring = rules->ring[r] * rules->ring[r];
-        beyond = aim_at_places(d, (float)ring, (float)rules->gate);
-        const int bent = lens && rules->ring[r] > rules->bent_from;
-        if (!step(parameters, d, rules->loose, bent, rules->prior)) return 0;
+        const double ring = options->ring[r] * options->ring[r];
+        beyond = match_cells(d, (float)ring, (float)options->cell_gate);
+        const int with_lens = lens && options->ring[r] > options->lens_radius;
+        if (!gauss_newton_step(parameters, d, options->cell_sigma, with_lens, options->prior))
+            return 0;
     }
-    for (int again = 0; again < 2; again++) {
+    for (int pass = 0; pass < 2; pass++) {
         project(parameters, d);
-        aim_at_symbols(d, (float)rules->offset, (float)rules->tight);
-        if (!step(parameters, d, rules->firm, lens, rules->prior)) return 0;
+        match_symbols(d, (float)options->offset, (float)options->symbol_gate);
+        if (!gauss_newton_step(parameters, d, options->symbol_sigma, lens, options->prior))
+            return 0;
     }
     project(parameters, d);
-    aim_at_symbols(d, (float)rules->offset, (float)rules->tight);
-    /* The place in the middle becomes the origin. */
+    match_symbols(d, (float)options->offset, (float)options->symbol_gate);
+    /* The central cell becomes the origin. */
     double shift[2];
     for (int axis = 0; axis < 2; axis++) {
         double *a = parameters + 3 * axis;
@@ -672,133 +1006,184 @@ static int fit(const Dots *d, const float *points, const uint8_t *valid, int m, 
     for (int i = 0; i < m; i++) {
         uv[2 * i] = d->u[i] - (float)shift[0];
         uv[2 * i + 1] = d->v[i] - (float)shift[1];
-        place[2 * i] = rintf(uv[2 * i]);
-        place[2 * i + 1] = rintf(uv[2 * i + 1]);
+        cells[2 * i] = rintf(uv[2 * i]);
+        cells[2 * i + 1] = rintf(uv[2 * i + 1]);
         if (d->use[i] > 0) {
             count++;
-            squares += (double)(d->miss[0][i] * d->miss[0][i] + d->miss[1][i] * d->miss[1][i]);
+            squares += (double)(d->residual[0][i] * d->residual[0][i]
+                                + d->residual[1][i] * d->residual[1][i]);
         }
     }
     *sigma = sqrt(squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1));
     for (int k = 0; k < PARAMETERS; k++)
         if (!isfinite(parameters[k])) return 0;
-    return count >= rules->fewest;
+    return count >= options->min_dots;
 }
+
+/* Largest numbers of dots of a frame and of dots that seed a lattice. Pairs of seeds are stored.
+ */
+enum { MAX_DOTS = 1 << 24, MAX_SEEDS = 4096 };
 
 static PyObject *fit_lattices(PyObject *self, PyObject *args)
 {
-    enum { POINTS, VALID, RING, PRIOR, FITTED, UV, PLACE, SIGMA, FOUND, BUFFERS };
-    Py_buffer b[BUFFERS];
-    int n, m, lens;
-    Rules rules;
-    if (!PyArg_ParseTuple(args, "y*y*iipy*y*iiddddddddw*w*w*w*w*", &b[POINTS], &b[VALID], &n, &m,
-                          &lens, &b[RING], &b[PRIOR], &rules.seeds, &rules.fewest, &rules.nearest,
-                          &rules.farthest, &rules.gate, &rules.loose, &rules.tight, &rules.firm,
-                          &rules.bent_from, &rules.offset, &b[FITTED], &b[UV], &b[PLACE],
-                          &b[SIGMA], &b[FOUND]))
+    (void)self;
+    Call call = {0};
+    PyObject *points_array, *valid_array, *ring_array, *prior_array, *parameters_array, *uv_array,
+        *cells_array, *sigma_array, *found_array;
+    long long n, m, seeds, min_dots;
+    int lens;
+    LatticeOptions options;
+    if (!parse_arguments(args, "OOLLpOOLLddddddddOOOOO:fit_lattices", &points_array, &valid_array,
+                         &n, &m, &lens, &ring_array, &prior_array, &seeds, &min_dots,
+                         &options.min_neighbour, &options.max_neighbour, &options.cell_gate,
+                         &options.cell_sigma, &options.symbol_gate, &options.symbol_sigma,
+                         &options.lens_radius, &options.offset, &parameters_array, &uv_array,
+                         &cells_array, &sigma_array, &found_array))
         return NULL;
-    rules.rings = (int)(b[RING].len / (Py_ssize_t)sizeof(double));
-    rules.ring = b[RING].buf;
-    rules.prior = b[PRIOR].buf;
+    check_range(&call, "n", n, 0, INT_MAX);
+    check_range(&call, "m", m, 0, MAX_DOTS);
+    check_range(&call, "seeds", seeds, 1, MAX_SEEDS);
+    check_range(&call, "min_dots", min_dots, 1, INT_MAX);
+    if (call.failed) return NULL;
+    Py_ssize_t rings;
+    const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
+    const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
+    options.ring = input_rows(&call, ring_array, "ring_radii", ITEM_FLOAT64, 1, &rings);
+    options.prior = input(&call, prior_array, "prior", ITEM_FLOAT64, PARAMETERS);
+    double *parameters =
+        output(&call, parameters_array, "parameters", ITEM_FLOAT64, ITEMS(n, PARAMETERS));
+    float *uv = output(&call, uv_array, "uv", ITEM_FLOAT32, ITEMS(n, m, 2));
+    float *cells = output(&call, cells_array, "cells", ITEM_FLOAT32, ITEMS(n, m, 2));
+    double *sigma = output(&call, sigma_array, "sigma", ITEM_FLOAT64, n);
+    uint8_t *found = output(&call, found_array, "found", ITEM_FLAG, n);
+    check_range(&call, "number of ring_radii", rings, 0, INT_MAX);
+    if (call.failed) return finish_call(&call, 1);
+    options.seeds = (int)seeds;
+    options.min_dots = (int)min_dots;
+    options.rings = (int)rings;
     Dots d;
-    const int made = new_dots(&d, m);
-    const size_t seeds = (size_t)rules.seeds;
-    float *scratch = malloc(((size_t)m + 1 + 7 * seeds + seeds * (seeds + 1)) * sizeof(float));
-    const int stored = made && scratch;
-    if (stored) {
-        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
-        {
-            const size_t at = (size_t)k * m;
-            const float *points = (const float *)b[POINTS].buf + 2 * at;
-            const uint8_t *valid = (const uint8_t *)b[VALID].buf + at;
-            load_dots(&d, points, valid, m);
-            ((uint8_t *)b[FOUND].buf)[k] = (uint8_t)fit(
-                &d, points, valid, m, lens, &rules, scratch,
-                (double *)b[FITTED].buf + (size_t)k * PARAMETERS, (float *)b[UV].buf + 2 * at,
-                (float *)b[PLACE].buf + 2 * at, (double *)b[SIGMA].buf + k);
+    const int has_dots = new_dots(&d, (int)m);
+    float *scratch =
+        malloc(((size_t)m + 1 + (size_t)(7 * seeds + seeds * (seeds + 1))) * sizeof(float));
+    const int has_memory = has_dots && scratch;
+    if (has_memory) {
+        Py_BEGIN_ALLOW_THREADS
+        for (size_t k = 0; k < (size_t)n; k++) {
+            const size_t dot = k * (size_t)m;
+            load_dots(&d, points + 2 * dot, valid + dot, (int)m);
+            found[k] = (uint8_t)fit_lattice(&d, points + 2 * dot, valid + dot, (int)m, lens,
+                                            &options, scratch, parameters + k * PARAMETERS,
+                                            uv + 2 * dot, cells + 2 * dot, sigma + k);
         }
         Py_END_ALLOW_THREADS
     }
-    if (made) free(d.x);
+    if (has_dots) free(d.x);
     free(scratch);
-    return done(b, BUFFERS, stored);
+    return finish_call(&call, has_memory);
 }
 
-/* Soft bits of a frame's dots on the square of places about the middle. */
-static void bits_of(const float *uv, const float *place, const uint8_t *valid, int m, int half,
-                    float sigma, float offset, float often, float *misses, float *x_bits,
-                    float *y_bits)
+/* ---- Soft bits -------------------------------------------------------------------------- */
+
+/* Soft bits of a frame's dots in the central square of 2 half_width cells a side. If several dots
+ * are in one cell, the one nearest to a symbol counts. */
+static void frame_soft_bits(const float *uv, const float *cells, const uint8_t *valid, int m,
+                            int half_width, float sigma, float offset, float likelihood_floor,
+                            float *distances, float *x_bits, float *y_bits)
 {
-    const int length = 2 * half;
-    const float spread = -0.25f / (sigma * sigma);
+    const int length = 2 * half_width;
+    const float exponent = -0.25f / (sigma * sigma);
     for (int k = 0; k < length * length; k++) {
-        misses[k] = FLT_MAX;
+        distances[k] = FLT_MAX;
         x_bits[k] = y_bits[k] = 0;
     }
     for (int i = 0; i < m; i++) {
         if (!valid[i]) continue;
-        const int column = (int)place[2 * i] + half, row = (int)place[2 * i + 1] + half;
+        const float u = cells[2 * i], v = cells[2 * i + 1];
+        /* Outside of the square, and for NaN, a conversion to int may be undefined. */
+        if (!(fabsf(u) <= (float)half_width && fabsf(v) <= (float)half_width)) continue;
+        const int column = (int)u + half_width, row = (int)v + half_width;
         if (column < 0 || column >= length || row < 0 || row >= length) continue;
-        const float rest[2] = {uv[2 * i] - place[2 * i], uv[2 * i + 1] - place[2 * i + 1]};
+        const float rest[2] = {uv[2 * i] - u, uv[2 * i + 1] - v};
         float symbol[2];
         nearest_symbol(rest, offset, symbol);
         const float a = fabsf(rest[0] - symbol[0]), b = fabsf(rest[1] - symbol[1]);
-        const float miss = a > b ? a : b;
+        const float distance = a > b ? a : b;
         const int cell = row * length + column;
-        if (miss >= misses[cell]) continue;
-        misses[cell] = miss;
+        if (distance >= distances[cell]) continue;
+        distances[cell] = distance;
         for (int axis = 0; axis < 2; axis++) {
             const float along = axis ? rest[1] + rest[0] : rest[1] - rest[0];
-            const float one = expf(spread * (along - offset) * (along - offset)) + often;
-            const float zero = expf(spread * (along + offset) * (along + offset)) + often;
+            const float one =
+                expf(exponent * (along - offset) * (along - offset)) + likelihood_floor;
+            const float zero =
+                expf(exponent * (along + offset) * (along + offset)) + likelihood_floor;
             (axis ? y_bits : x_bits)[cell] = logf(one / zero);
         }
     }
 }
 
+/* Largest half width of a window of cells; the number of its cells fits into an int. */
+enum { MAX_HALF_WIDTH = 8192 };
+
 static PyObject *soft_bits(PyObject *self, PyObject *args)
 {
-    enum { UV, PLACE, VALID, FOUND, SIGMA, X_BITS, Y_BITS, BUFFERS };
-    Py_buffer b[BUFFERS];
-    int n, m, half;
-    float offset, often;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iiiffw*w*", &b[UV], &b[PLACE], &b[VALID], &b[FOUND],
-                          &b[SIGMA], &n, &m, &half, &offset, &often, &b[X_BITS], &b[Y_BITS]))
+    (void)self;
+    Call call = {0};
+    PyObject *uv_array, *cells_array, *valid_array, *found_array, *sigma_array, *x_array, *y_array;
+    long long n, m, half_width;
+    float offset, likelihood_floor;
+    if (!parse_arguments(args, "OOOOOLLLffOO:soft_bits", &uv_array, &cells_array, &valid_array,
+                         &found_array, &sigma_array, &n, &m, &half_width, &offset,
+                         &likelihood_floor, &x_array, &y_array))
         return NULL;
-    const size_t size = 4 * (size_t)half * half;
-    float *misses = malloc(size * sizeof(float));
-    if (misses) {
-        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
-        {
-            const size_t at = (size_t)k * m;
-            bits_of((const float *)b[UV].buf + 2 * at, (const float *)b[PLACE].buf + 2 * at,
-                    (const uint8_t *)b[VALID].buf + at, ((const uint8_t *)b[FOUND].buf)[k] ? m : 0,
-                    half, (float)((const double *)b[SIGMA].buf)[k], offset, often, misses,
-                    (float *)b[X_BITS].buf + k * size, (float *)b[Y_BITS].buf + k * size);
+    check_range(&call, "n", n, 0, INT_MAX);
+    check_range(&call, "m", m, 0, MAX_DOTS);
+    check_range(&call, "half_width", half_width, 1, MAX_HALF_WIDTH);
+    if (call.failed) return NULL;
+    const long long length = 2 * half_width;
+    const float *uv = input(&call, uv_array, "uv", ITEM_FLOAT32, ITEMS(n, m, 2));
+    const float *cells = input(&call, cells_array, "cells", ITEM_FLOAT32, ITEMS(n, m, 2));
+    const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
+    const uint8_t *found = input(&call, found_array, "found", ITEM_FLAG, n);
+    const double *sigma = input(&call, sigma_array, "sigma", ITEM_FLOAT64, n);
+    float *x_bits = output(&call, x_array, "x_bits", ITEM_FLOAT32, ITEMS(n, length, length));
+    float *y_bits = output(&call, y_array, "y_bits", ITEM_FLOAT32, ITEMS(n, length, length));
+    if (call.failed) return finish_call(&call, 1);
+    const size_t size = (size_t)(length * length);
+    float *distances = malloc(size * sizeof(float));
+    if (distances) {
+        Py_BEGIN_ALLOW_THREADS
+        for (size_t k = 0; k < (size_t)n; k++) {
+            const size_t dot = k * (size_t)m;
+            frame_soft_bits(uv + 2 * dot, cells + 2 * dot, valid + dot, found[k] ? (int)m : 0,
+                            (int)half_width, (float)sigma[k], offset, likelihood_floor, distances,
+                            x_bits + k * size, y_bits + k * size);
         }
         Py_END_ALLOW_THREADS
     }
-    free(misses);
-    return done(b, BUFFERS, misses != NULL);
+    free(distances);
+    return finish_call(&call, distances != NULL);
 }
 
-/* ---- A first reading of windows ---------------------------------------------------------- */
+/* ---- First reading of windows ----------------------------------------------------------- */
 
 enum { PERIOD = 63, SEQUENCES = 4, BASE = 3 };
 
 typedef struct {
-    const int64_t *lengths, *weights, *prefixes, *crt; /* prefixes one after the other */
-    const float *signs;  /* the main sequence as -1 and 1, from 0 to its period and beyond */
-    const int8_t *digit; /* (4, 63) digit of each difference, -1 where there is none */
-    const float *masks;  /* (4, 3, widest) whether a place has a digit, repeated beyond the end */
-    int64_t range, smallest, widest;
-    double places;           /* logarithm of how many there are */
-    double free[PERIOD + 1]; /* what a line says of which so many phases are likely */
-} Code;
+    const int64_t *lengths, *weights, *crt; /* of the four secondary sequences */
+    const int64_t *prefixes; /* cumulative sums of the sequences, one after the other */
+    const float *signs;      /* main sequence as -1 and 1, repeated beyond its period */
+    const int8_t *digits;    /* (4, 63) digit of each phase difference; -1: none */
+    const float
+        *masks; /* (4, 3, widest) 1 where the sequence has a digit, repeated beyond its end */
+    int64_t range, smallest_shift, widest;
+    double log_hypotheses;             /* logarithm of the number of hypotheses per axis */
+    double phase_log_odds[PERIOD + 1]; /* log odds of a line by its number of likely phases */
+} Codec;
 
 typedef struct {
-    int64_t place, shift, wrong, first, last;
-    double odds, order, lead;
+    int64_t position, shift, wrong, first, last;
+    double log_odds, order_log_odds, margin;
 } Axis;
 
 static inline int64_t remainder_of(int64_t a, int64_t b)
@@ -807,22 +1192,24 @@ static inline int64_t remainder_of(int64_t a, int64_t b)
     return r < 0 ? r + b : r;
 }
 
-/* Index of the main sequence at the start of a column or row; Codec.phases. */
-static int64_t phase_at(const Code *code, int64_t place)
+/* Phase of the main sequence at the start of a column or row; see Codec.phases in Python. */
+static int64_t phase_at(const Codec *codec, int64_t position)
 {
-    int64_t total = code->smallest * place;
-    const int64_t *prefix = code->prefixes;
+    int64_t total = codec->smallest_shift * position;
+    const int64_t *prefix = codec->prefixes;
     for (int k = 0; k < SEQUENCES; k++) {
-        const int64_t length = code->lengths[k];
-        total += code->weights[k] * (place / length * prefix[length] + prefix[place % length]);
+        const int64_t length = codec->lengths[k];
+        total +=
+            codec->weights[k] * (position / length * prefix[length] + prefix[position % length]);
         prefix += length + 1;
     }
     return remainder_of(total, PERIOD);
 }
 
-/* Likeliest place and shift of one axis by the likeliest phase of each line. */
-HOT static void vote(const Code *code, const float *const *scores, int lines, float *votes,
-                     int *phase, float *margin, Axis *axis)
+/* Find the most likely position and shift of one axis by votes of the most likely phase of each
+ * line. */
+HOT static void vote_position(const Codec *codec, const float *const *scores, int lines,
+                              float *votes, int *phase, float *margin, Axis *axis)
 {
     for (int i = 0; i < lines; i++) {
         const float *s = scores[i];
@@ -839,18 +1226,18 @@ HOT static void vote(const Code *code, const float *const *scores, int lines, fl
         phase[i] = best;
         margin[i] = top - next;
     }
-    int64_t place = 0;
-    axis->lead = DBL_MAX;
+    int64_t position = 0;
+    axis->margin = DBL_MAX;
     for (int k = 0; k < SEQUENCES; k++) {
-        const int length = (int)code->lengths[k];
+        const int length = (int)codec->lengths[k];
         memset(votes, 0, (size_t)length * sizeof(float));
         for (int i = 0; i + 1 < lines; i++) {
-            const float weight = smaller(margin[i], margin[i + 1]);
+            const float weight = lesser(margin[i], margin[i + 1]);
             const int difference = (phase[i + 1] - phase[i] + PERIOD) % PERIOD;
-            const int digit = code->digit[k * PERIOD + difference];
-            if (digit < 0 || weight <= 0) continue;
+            const int digits = codec->digits[k * PERIOD + difference];
+            if (digits < 0 || weight <= 0) continue;
             const float *restrict mask =
-                code->masks + (k * BASE + digit) * code->widest + i % length;
+                codec->masks + (k * BASE + digits) * codec->widest + i % length;
             for (int q = 0; q < length; q++) votes[q] += weight * mask[q];
         }
         int best = 0;
@@ -862,62 +1249,63 @@ HOT static void vote(const Code *code, const float *const *scores, int lines, fl
             } else if (votes[q] > second)
                 second = votes[q];
         }
-        if (votes[best] - second < axis->lead) axis->lead = votes[best] - second;
-        place = (place + code->crt[k] * best) % code->range;
+        if (votes[best] - second < axis->margin) axis->margin = votes[best] - second;
+        position = (position + codec->crt[k] * best) % codec->range;
     }
-    axis->place = place;
-    float ballots[PERIOD] = {0};
+    axis->position = position;
+    float shift_votes[PERIOD] = {0};
     for (int i = 0; i < lines; i++) {
-        const int64_t ahead = phase_at(code, (place + i) % code->range);
-        ballots[remainder_of(phase[i] - ahead, PERIOD)] += margin[i];
+        const int64_t expected = phase_at(codec, (position + i) % codec->range);
+        shift_votes[remainder_of(phase[i] - expected, PERIOD)] += margin[i];
     }
     int best = 0;
     for (int k = 1; k < PERIOD; k++)
-        if (ballots[k] > ballots[best]) best = k;
+        if (shift_votes[k] > shift_votes[best]) best = k;
     axis->shift = best;
-    /* Against lines of the main sequence in any order, each at one of its likely phases. */
-    axis->order = -code->places;
+    /* The alternative hypothesis: lines in any order, each at one of its likely phases. */
+    axis->order_log_odds = -codec->log_hypotheses;
     for (int i = 0; i < lines; i++) {
         const float top = scores[i][phase[i]];
         if (top <= 0) continue;
         int likely = 0;
         for (int k = 0; k < PERIOD; k++) likely += scores[i][k] > top - 2;
-        const int64_t ahead = phase_at(code, (place + i) % code->range);
-        const float here = scores[i][remainder_of(ahead + best, PERIOD)];
-        axis->order += code->free[likely] - 0.5 * (double)(top - here);
+        const int64_t expected = phase_at(codec, (position + i) % codec->range);
+        const float score = scores[i][remainder_of(expected + best, PERIOD)];
+        axis->order_log_odds += codec->phase_log_odds[likely] - 0.5 * (double)(top - score);
     }
 }
 
-/* Evidence for the place: line i of the axis, dot j along it, at bits[start + i*a + j*b]. */
-static void compare(const Code *code, const float *bits, float sign, int start, int across,
-                    int along, int length, Axis *axis)
+/* Log odds of the position. Dot j of line i of the axis is at
+ * bits[start + i * across + j * along]. */
+static void score_position(const Codec *codec, const float *bits, float sign, int start,
+                           int across, int along, int length, Axis *axis)
 {
-    double odds = 0;
+    double log_odds = 0;
     axis->wrong = 0;
     axis->first = length;
     axis->last = -1;
     for (int i = 0; i < length; i++) {
         const float *line = bits + start + i * across;
-        const int64_t phase =
-            remainder_of(phase_at(code, (axis->place + i) % code->range) + axis->shift, PERIOD);
-        int seen = 0;
+        const int64_t phase = remainder_of(
+            phase_at(codec, (axis->position + i) % codec->range) + axis->shift, PERIOD);
+        int has_dots = 0;
         for (int j = 0; j < length; j++) {
             const float bit = line[j * along];
             if (bit == 0) continue;
-            seen = 1;
-            const float agreement = sign * bit * code->signs[phase + j];
+            has_dots = 1;
+            const float agreement = sign * bit * codec->signs[phase + j];
             axis->wrong += agreement < 0;
-            odds -= logf(0.5f + 0.5f * expf(-agreement));
+            log_odds -= logf(0.5f + 0.5f * expf(-agreement));
         }
-        if (seen) {
+        if (has_dots) {
             if (i < axis->first) axis->first = i;
             axis->last = i;
         }
     }
-    axis->odds = odds - code->places;
+    axis->log_odds = log_odds - codec->log_hypotheses;
 }
 
-/* Adds a bit, the step-th of a line, to the line's scores at all phases, read both ways. */
+/* Add a bit, number `step` of its line, to the line's scores at all phases in both directions. */
 static inline void correlate(float bit, const float *signs, int step, int length,
                              float *restrict forwards, float *restrict backwards)
 {
@@ -926,9 +1314,9 @@ static inline void correlate(float bit, const float *signs, int step, int length
     for (int k = 0; k < PERIOD; k++) backwards[k] -= bit * g[k];
 }
 
-HOT static void read_window(const Code *code, const float *x_bits, const float *y_bits, int length,
-                            float *scores, const float **lines, float *votes, int *phase,
-                            float *margin, int64_t *rotation, Axis *x, Axis *y)
+HOT static void read_window(const Codec *codec, const float *x_bits, const float *y_bits,
+                            int length, float *scores, const float **lines, float *votes,
+                            int *phase, float *margin, int64_t *rotation, Axis *x, Axis *y)
 {
     const size_t size = (size_t)length * PERIOD;
     float *table[4] = {scores, scores + size, scores + 2 * size, scores + 3 * size};
@@ -937,9 +1325,10 @@ HOT static void read_window(const Code *code, const float *x_bits, const float *
         for (int column = 0; column < length; column++) {
             const float a = x_bits[row * length + column], b = y_bits[row * length + column];
             const int down = row * PERIOD, right = column * PERIOD;
-            if (a != 0) correlate(a, code->signs, row, length, table[0] + right, table[1] + right);
+            if (a != 0)
+                correlate(a, codec->signs, row, length, table[0] + right, table[1] + right);
             if (b != 0)
-                correlate(b, code->signs, column, length, table[2] + down, table[3] + down);
+                correlate(b, codec->signs, column, length, table[2] + down, table[3] + down);
         }
     float sums[4] = {0};
     for (int t = 0; t < 4; t++)
@@ -949,9 +1338,9 @@ HOT static void read_window(const Code *code, const float *x_bits, const float *
             for (int k = 1; k < PERIOD; k++) top = top > s[k] ? top : s[k];
             sums[t] += top;
         }
-    /* Scores of columns and rows at each rotation, and whether they count backwards. */
+    /* Tables that hold the scores of columns and rows at each rotation, and their directions. */
     static const int column_table[4] = {0, 2, 1, 3}, row_table[4] = {2, 1, 3, 0};
-    static const int column_turned[4] = {0, 1, 1, 0}, row_turned[4] = {0, 0, 1, 1};
+    static const int column_reversed[4] = {0, 1, 1, 0}, row_reversed[4] = {0, 0, 1, 1};
     int best = 0;
     for (int r = 1; r < 4; r++)
         if (sums[column_table[r]] + sums[row_table[r]]
@@ -960,79 +1349,124 @@ HOT static void read_window(const Code *code, const float *x_bits, const float *
     *rotation = best;
     const int last = length - 1, width = length;
     for (int i = 0; i < length; i++)
-        lines[i] = table[column_table[best]] + (column_turned[best] ? last - i : i) * PERIOD;
-    vote(code, lines, length, votes, phase, margin, x);
+        lines[i] = table[column_table[best]] + (column_reversed[best] ? last - i : i) * PERIOD;
+    vote_position(codec, lines, length, votes, phase, margin, x);
     for (int i = 0; i < length; i++)
-        lines[i] = table[row_table[best]] + (row_turned[best] ? last - i : i) * PERIOD;
-    vote(code, lines, length, votes, phase, margin, y);
-    /* Steps in the seen window for a step in x and in y of the printed one. */
+        lines[i] = table[row_table[best]] + (row_reversed[best] ? last - i : i) * PERIOD;
+    vote_position(codec, lines, length, votes, phase, margin, y);
+    /* Steps in the observed window for a step along x and y of the printed pattern. */
     static const int sign_x[4] = {1, 1, -1, -1}, sign_y[4] = {1, -1, -1, 1};
     const int start[4] = {0, last * width, last * width + last, last};
     const int step_x[4] = {1, -width, -1, width}, step_y[4] = {width, 1, -width, -1};
     const float *columns = best % 2 ? y_bits : x_bits, *rows = best % 2 ? x_bits : y_bits;
-    compare(code, columns, (float)sign_x[best], start[best], step_x[best], step_y[best], length,
-            x);
-    compare(code, rows, (float)sign_y[best], start[best], step_y[best], step_x[best], length, y);
+    score_position(codec, columns, (float)sign_x[best], start[best], step_x[best], step_y[best],
+                   length, x);
+    score_position(codec, rows, (float)sign_y[best], start[best], step_y[best], step_x[best],
+                   length, y);
+}
+
+/* Limits of a codec. They bound the indices into its tables, and keep sums of phases in 64 bits.
+ */
+enum { MAX_SEQUENCE = 512, MAX_WINDOW_CELLS = 1024, MAX_WEIGHT = 1000 };
+#define MAX_POSITIONS (1LL << 40)
+#define MAX_COORDINATE (1LL << 60)
+
+/* Arrays of a codec as core/dots/reading.py passes them: lengths, weights, prefixes, crt, signs,
+ * digits and masks. */
+typedef struct {
+    PyObject *lengths, *weights, *prefixes, *crt, *signs, *digits, *masks;
+} CodecArrays;
+
+/* Check the tables of a codec for windows of `length` cells a side. */
+static void take_codec(Call *call, const CodecArrays *arrays, long long range,
+                       long long smallest_shift, long long length, Codec *codec)
+{
+    check_range(call, "range", range, 1, MAX_POSITIONS);
+    check_range(call, "smallest_shift", smallest_shift, 0, PERIOD);
+    if (call->failed) return;
+    const int64_t *lengths = input(call, arrays->lengths, "lengths", ITEM_INT64, SEQUENCES);
+    check_items(call, "lengths", lengths, ITEM_INT64, SEQUENCES, 1, MAX_SEQUENCE);
+    const int64_t *weights = input(call, arrays->weights, "weights", ITEM_INT64, SEQUENCES);
+    check_items(call, "weights", weights, ITEM_INT64, SEQUENCES, 0, MAX_WEIGHT);
+    Py_ssize_t longest = 0, prefix_items = 0, n_signs, widest;
+    for (int k = 0; k < SEQUENCES && !call->failed; k++) {
+        longest = lengths[k] > longest ? (Py_ssize_t)lengths[k] : longest;
+        prefix_items += (Py_ssize_t)lengths[k] + 1;
+    }
+    const int64_t *prefixes = input(call, arrays->prefixes, "prefixes", ITEM_INT64, prefix_items);
+    check_items(call, "prefixes", prefixes, ITEM_INT64, prefix_items, 0, BASE * MAX_SEQUENCE);
+    const int64_t *crt = input(call, arrays->crt, "crt", ITEM_INT64, SEQUENCES);
+    check_items(call, "crt", crt, ITEM_INT64, SEQUENCES, 0, range - 1);
+    const float *signs = input_rows(call, arrays->signs, "signs", ITEM_FLOAT32, 1, &n_signs);
+    check_range(call, "number of signs", n_signs, length + PERIOD - 1, PY_SSIZE_T_MAX);
+    const int8_t *digits = input(call, arrays->digits, "digits", ITEM_INT8, SEQUENCES * PERIOD);
+    check_items(call, "digits", digits, ITEM_INT8, SEQUENCES * PERIOD, -1, BASE - 1);
+    const float *masks =
+        input_rows(call, arrays->masks, "masks", ITEM_FLOAT32, SEQUENCES * BASE, &widest);
+    check_range(call, "width of masks", widest, 2 * longest - 1, INT_MAX);
+    if (call->failed) return;
+    *codec = (Codec){.lengths = lengths,
+                     .weights = weights,
+                     .prefixes = prefixes,
+                     .crt = crt,
+                     .signs = signs,
+                     .digits = digits,
+                     .masks = masks,
+                     .range = range,
+                     .smallest_shift = smallest_shift,
+                     .widest = widest};
+    for (int k = 1; k <= PERIOD; k++) codec->phase_log_odds[k] = log((double)PERIOD / k);
 }
 
 static PyObject *read_windows(PyObject *self, PyObject *args)
 {
-    enum {
-        X_BITS,
-        Y_BITS,
-        LENGTHS,
-        WEIGHTS,
-        PREFIXES,
-        CRT,
-        SIGNS,
-        DIGIT,
-        MASKS,
-        WHOLE,
-        ODDS,
-        BUFFERS
-    };
-    Py_buffer b[BUFFERS];
-    int n, length;
-    long long range, smallest;
-    Code code;
-    if (!PyArg_ParseTuple(args, "y*y*iiy*y*y*y*y*y*y*LLdw*w*", &b[X_BITS], &b[Y_BITS], &n, &length,
-                          &b[LENGTHS], &b[WEIGHTS], &b[PREFIXES], &b[CRT], &b[SIGNS], &b[DIGIT],
-                          &b[MASKS], &range, &smallest, &code.places, &b[WHOLE], &b[ODDS]))
+    (void)self;
+    enum { POSITION_COLUMNS = 11, EVIDENCE_COLUMNS = 6 };
+    Call call = {0};
+    PyObject *x_array, *y_array, *positions_array, *evidence_array;
+    CodecArrays arrays;
+    long long n, length, range, smallest_shift;
+    double log_hypotheses;
+    if (!parse_arguments(args, "OOLLOOOOOOOLLdOO:read_windows", &x_array, &y_array, &n, &length,
+                         &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
+                         &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
+                         &log_hypotheses, &positions_array, &evidence_array))
         return NULL;
-    code.lengths = b[LENGTHS].buf;
-    code.weights = b[WEIGHTS].buf;
-    code.prefixes = b[PREFIXES].buf;
-    code.crt = b[CRT].buf;
-    code.signs = b[SIGNS].buf;
-    code.digit = b[DIGIT].buf;
-    code.masks = b[MASKS].buf;
-    code.widest = b[MASKS].len / (Py_ssize_t)(SEQUENCES * BASE * sizeof(float));
-    code.range = range;
-    code.smallest = smallest;
-    code.free[0] = 0;
-    for (int k = 1; k <= PERIOD; k++) code.free[k] = log((double)PERIOD / k);
-    const size_t size = (size_t)length * length;
-    float *scores = malloc((4 * (size_t)length * PERIOD + (size_t)length + 512) * sizeof(float));
-    const float **lines = malloc((size_t)length * sizeof(float *));
-    int *phase = malloc((size_t)length * sizeof(int));
-    const int stored = scores && lines && phase;
-    if (stored) {
-        float *margin = scores + 4 * (size_t)length * PERIOD, *votes = margin + length;
-        int64_t *out = b[WHOLE].buf;
-        double *evidence = b[ODDS].buf;
-        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++, out += 11, evidence += 6)
-        {
+    Codec codec = {0};
+    check_range(&call, "n", n, 0, INT_MAX);
+    check_range(&call, "length", length, 1, MAX_WINDOW_CELLS);
+    if (call.failed) return NULL;
+    const float *x_bits = input(&call, x_array, "x_bits", ITEM_FLOAT32, ITEMS(n, length, length));
+    const float *y_bits = input(&call, y_array, "y_bits", ITEM_FLOAT32, ITEMS(n, length, length));
+    take_codec(&call, &arrays, range, smallest_shift, length, &codec);
+    int64_t *positions =
+        output(&call, positions_array, "positions", ITEM_INT64, ITEMS(n, POSITION_COLUMNS));
+    double *evidence =
+        output(&call, evidence_array, "evidence", ITEM_FLOAT64, ITEMS(n, EVIDENCE_COLUMNS));
+    if (call.failed) return finish_call(&call, 1);
+    codec.log_hypotheses = log_hypotheses;
+    const size_t lines_count = (size_t)length, size = lines_count * lines_count;
+    float *scores =
+        malloc((4 * lines_count * PERIOD + lines_count + MAX_SEQUENCE) * sizeof(float));
+    const float **lines = malloc(lines_count * sizeof(float *));
+    int *phase = malloc(lines_count * sizeof(int));
+    const int has_memory = scores && lines && phase;
+    if (has_memory) {
+        float *margin = scores + 4 * lines_count * PERIOD, *votes = margin + lines_count;
+        Py_BEGIN_ALLOW_THREADS
+        for (size_t k = 0; k < (size_t)n; k++) {
+            int64_t *position = positions + k * POSITION_COLUMNS;
+            double *odds = evidence + k * EVIDENCE_COLUMNS;
             Axis axes[2];
-            read_window(&code, (const float *)b[X_BITS].buf + k * size,
-                        (const float *)b[Y_BITS].buf + k * size, length, scores, lines, votes,
-                        phase, margin, out, axes, axes + 1);
+            read_window(&codec, x_bits + k * size, y_bits + k * size, (int)length, scores, lines,
+                        votes, phase, margin, position, axes, axes + 1);
             for (int axis = 0; axis < 2; axis++) {
                 const Axis *a = axes + axis;
-                const int64_t row[5] = {a->place, a->shift, a->wrong, a->first, a->last};
-                memcpy(out + 1 + 5 * axis, row, sizeof(row));
-                evidence[axis] = a->odds;
-                evidence[2 + axis] = a->order;
-                evidence[4 + axis] = a->lead;
+                const int64_t row[5] = {a->position, a->shift, a->wrong, a->first, a->last};
+                memcpy(position + 1 + 5 * axis, row, sizeof(row));
+                odds[axis] = a->log_odds;
+                odds[2 + axis] = a->order_log_odds;
+                odds[4 + axis] = a->margin;
             }
         }
         Py_END_ALLOW_THREADS
@@ -1040,82 +1474,89 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
     free(scores);
     free((void *)lines);
     free(phase);
-    return done(b, BUFFERS, stored);
+    return finish_call(&call, has_memory);
 }
 
-/* ---- From a place to a pose --------------------------------------------------------------- */
+/* ---- Poses ------------------------------------------------------------------------------ */
 
-/* Fits the lattice once more, to the dots that say what they should, and reads the pose off. */
-static int pose_of(const Code *code, const uint8_t *valid, const float *uv, const float *place,
-                   int m, int half, int lens, const double *prior, const int64_t *window,
-                   double offset, double tight, double finest, const Dots *d, int64_t *phases,
-                   double *parameters, double *pose, double *covariance)
+/* Refit the lattice to the dots that agree with the decoded pattern, and derive the pose and its
+ * covariance from it. Return 0 if the equations are singular. */
+static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *uv,
+                         const float *cells, int m, int half_width, int lens, const double *prior,
+                         const int64_t *window, double offset, double gate, double min_sigma,
+                         const Dots *d, int64_t *phases, double *parameters, double *pose,
+                         double *covariance)
 {
-    static const int turns[4][2][2] = {
+    static const int rotations[4][2][2] = {
         {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
     static const int corners[4][2] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
     const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
-    const int (*turn)[2] = turns[window[4]], *corner = corners[window[4]], length = 2 * half;
+    const int(*rotation)[2] = rotations[window[4]], *corner = corners[window[4]],
+          length = 2 * half_width;
     int64_t *columns = phases, *rows = phases + length;
     for (int k = 0; k < length; k++) {
-        const int64_t at_x = remainder_of(x + k, code->range);
-        const int64_t at_y = remainder_of(y + k, code->range);
-        columns[k] = remainder_of(phase_at(code, at_x) + section[0] + y, PERIOD);
-        rows[k] = remainder_of(phase_at(code, at_y) + section[1] + x, PERIOD);
+        const int64_t column_position = remainder_of(x + k, codec->range);
+        const int64_t row_position = remainder_of(y + k, codec->range);
+        columns[k] = remainder_of(phase_at(codec, column_position) + section[0] + y, PERIOD);
+        rows[k] = remainder_of(phase_at(codec, row_position) + section[1] + x, PERIOD);
     }
     int count = 0;
     double squares = 0;
     for (int i = 0; i < m; i++) {
         d->use[i] = 0;
         if (!valid[i]) continue;
-        const int a = (int)place[2 * i] + half, b = (int)place[2 * i + 1] + half;
-        const int column = turn[0][0] * a + turn[0][1] * b + corner[0] * (length - 1);
-        const int row = turn[1][0] * a + turn[1][1] * b + corner[1] * (length - 1);
+        /* Outside of the window, and for NaN, a conversion to int may be undefined. */
+        if (!(fabsf(cells[2 * i]) <= (float)half_width
+              && fabsf(cells[2 * i + 1]) <= (float)half_width))
+            continue;
+        const int a = (int)cells[2 * i] + half_width, b = (int)cells[2 * i + 1] + half_width;
+        const int column = rotation[0][0] * a + rotation[0][1] * b + corner[0] * (length - 1);
+        const int row = rotation[1][0] * a + rotation[1][1] * b + corner[1] * (length - 1);
         if (column < 0 || column >= length || row < 0 || row >= length) continue;
-        const int column_bit = code->signs[columns[column] + row] > 0;
-        const int row_bit = code->signs[rows[row] + column] > 0;
+        const int column_bit = codec->signs[columns[column] + row] > 0;
+        const int row_bit = codec->signs[rows[row] + column] > 0;
         /* Up 00, left 10, right 01, down 11 (column bit, row bit). */
         const int dx = row_bit - column_bit, dy = row_bit + column_bit - 1;
-        const float du =
-            uv[2 * i] - place[2 * i] - (float)offset * (float)(turn[0][0] * dx + turn[1][0] * dy);
-        const float dv = uv[2 * i + 1] - place[2 * i + 1]
-                         - (float)offset * (float)(turn[0][1] * dx + turn[1][1] * dy);
-        if (!(fabsf(du) < (float)tight && fabsf(dv) < (float)tight)) continue;
+        const float du = uv[2 * i] - cells[2 * i]
+                         - (float)offset * (float)(rotation[0][0] * dx + rotation[1][0] * dy);
+        const float dv = uv[2 * i + 1] - cells[2 * i + 1]
+                         - (float)offset * (float)(rotation[0][1] * dx + rotation[1][1] * dy);
+        if (!(fabsf(du) < (float)gate && fabsf(dv) < (float)gate)) continue;
         d->use[i] = 1;
-        d->miss[0][i] = du;
-        d->miss[1][i] = dv;
+        d->residual[0][i] = du;
+        d->residual[1][i] = dv;
         count++;
         squares += (double)(du * du + dv * dv);
     }
     double variance = squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1);
-    if (variance < finest * finest) variance = finest * finest;
+    if (variance < min_sigma * min_sigma) variance = min_sigma * min_sigma;
     project(parameters, d);
     double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], right[PARAMETERS];
-    equations(parameters, d, sqrt(variance), lens, prior, normal, right);
+    normal_equations(parameters, d, sqrt(variance), lens, prior, normal, right);
     memcpy(copy, normal, sizeof(normal));
-    if (!solve(copy, right, 1)) return 0;
+    if (!solve_linear(copy, right, 1)) return 0;
     for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
 
     const double *t = parameters;
-    const double centre[2] = {t[C_U] + half, t[C_V] + half};
+    const double centre[2] = {t[C_U] + half_width, t[C_V] + half_width};
     const double u = t[A_U] - t[C_U] * t[PERSPECTIVE], v = t[A_V] - t[C_V] * t[PERSPECTIVE];
     double right_of[2];
     for (int axis = 0; axis < 2; axis++) {
-        pose[axis] = turn[axis][0] * centre[0] + turn[axis][1] * centre[1]
+        pose[axis] = rotation[axis][0] * centre[0] + rotation[axis][1] * centre[1]
                      + corner[axis] * (length - 1) + (double)(axis ? y : x);
-        right_of[axis] = turn[axis][0] * u + turn[axis][1] * v;
+        right_of[axis] = rotation[axis][0] * u + rotation[axis][1] * v;
     }
     pose[2] = atan2(-right_of[1], right_of[0]);
     double jacobian[3][PARAMETERS] = {{0}}, solved[PARAMETERS * 3];
     for (int axis = 0; axis < 2; axis++) {
-        jacobian[axis][C_U] = turn[axis][0];
-        jacobian[axis][C_V] = turn[axis][1];
+        jacobian[axis][C_U] = rotation[axis][0];
+        jacobian[axis][C_V] = rotation[axis][1];
     }
     jacobian[2][A_U] = v / (u * u + v * v);
     jacobian[2][A_V] = -u / (u * u + v * v);
     for (int k = 0; k < PARAMETERS; k++)
         for (int side = 0; side < 3; side++) solved[3 * k + side] = jacobian[side][k];
-    if (!solve(normal, solved, 3)) return 0;
+    if (!solve_linear(normal, solved, 3)) return 0;
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) {
             double sum = 0;
@@ -1127,77 +1568,76 @@ static int pose_of(const Code *code, const uint8_t *valid, const float *uv, cons
 
 static PyObject *poses(PyObject *self, PyObject *args)
 {
-    enum {
-        POINTS,
-        VALID,
-        UV,
-        PLACE,
-        PRIOR,
-        WINDOWS,
-        FITTED,
-        POSE,
-        COVARIANCE,
-        LENGTHS,
-        WEIGHTS,
-        PREFIXES,
-        CRT,
-        SIGNS,
-        DIGIT,
-        MASKS,
-        BUFFERS
-    };
-    Py_buffer b[BUFFERS];
-    int n, m, half, lens;
-    long long range, smallest;
-    double offset, tight, finest;
-    Code code;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*iiipy*y*y*y*y*y*y*y*y*LLdddw*w*w*", &b[POINTS], &b[VALID],
-                          &b[UV], &b[PLACE], &n, &m, &half, &lens, &b[PRIOR], &b[WINDOWS],
-                          &b[LENGTHS], &b[WEIGHTS], &b[PREFIXES], &b[CRT], &b[SIGNS], &b[DIGIT],
-                          &b[MASKS], &range, &smallest, &offset, &tight, &finest, &b[FITTED],
-                          &b[POSE], &b[COVARIANCE]))
+    (void)self;
+    enum { WINDOW_COLUMNS = 5 };
+    Call call = {0};
+    PyObject *points_array, *valid_array, *uv_array, *cells_array, *prior_array, *windows_array,
+        *parameters_array, *pose_array, *covariance_array;
+    CodecArrays arrays;
+    long long n, m, half_width, range, smallest_shift;
+    int lens;
+    double offset, gate, min_sigma;
+    if (!parse_arguments(args, "OOOOLLLpOOOOOOOOOLLdddOOO:poses", &points_array, &valid_array,
+                         &uv_array, &cells_array, &n, &m, &half_width, &lens, &prior_array,
+                         &windows_array, &arrays.lengths, &arrays.weights, &arrays.prefixes,
+                         &arrays.crt, &arrays.signs, &arrays.digits, &arrays.masks, &range,
+                         &smallest_shift, &offset, &gate, &min_sigma, &parameters_array,
+                         &pose_array, &covariance_array))
         return NULL;
-    code.lengths = b[LENGTHS].buf;
-    code.weights = b[WEIGHTS].buf;
-    code.prefixes = b[PREFIXES].buf;
-    code.signs = b[SIGNS].buf;
-    code.range = range;
-    code.smallest = smallest;
+    Codec codec = {0};
+    check_range(&call, "n", n, 0, INT_MAX);
+    check_range(&call, "m", m, 0, MAX_DOTS);
+    check_range(&call, "half_width", half_width, 1, MAX_WINDOW_CELLS / 2);
+    if (call.failed) return NULL;
+    const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
+    const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
+    const float *uv = input(&call, uv_array, "uv", ITEM_FLOAT32, ITEMS(n, m, 2));
+    const float *cells = input(&call, cells_array, "cells", ITEM_FLOAT32, ITEMS(n, m, 2));
+    const double *prior = input(&call, prior_array, "prior", ITEM_FLOAT64, PARAMETERS);
+    const int64_t *windows =
+        input(&call, windows_array, "windows", ITEM_INT64, ITEMS(n, WINDOW_COLUMNS));
+    check_items(&call, "windows", windows, ITEM_INT64, (Py_ssize_t)n * WINDOW_COLUMNS,
+                -MAX_COORDINATE, MAX_COORDINATE);
+    for (Py_ssize_t k = 0; k < n && !call.failed; k++)
+        check_range(&call, "rotation in windows", windows[k * WINDOW_COLUMNS + 4], 0, 3);
+    take_codec(&call, &arrays, range, smallest_shift, 2 * half_width, &codec);
+    double *parameters =
+        output(&call, parameters_array, "parameters", ITEM_FLOAT64, ITEMS(n, PARAMETERS));
+    double *pose = output(&call, pose_array, "pose", ITEM_FLOAT64, ITEMS(n, 3));
+    double *covariance = output(&call, covariance_array, "covariance", ITEM_FLOAT64, ITEMS(n, 9));
+    if (call.failed) return finish_call(&call, 1);
     Dots d;
-    const int made = new_dots(&d, m);
-    int64_t *phases = malloc(4 * (size_t)half * sizeof(int64_t));
-    const int stored = made && phases;
-    if (stored) {
-        Py_BEGIN_ALLOW_THREADS for (int k = 0; k < n; k++)
-        {
-            const size_t at = (size_t)k * m;
-            const uint8_t *valid = (const uint8_t *)b[VALID].buf + at;
-            double *out = (double *)b[POSE].buf + 3 * k;
-            double *spread = (double *)b[COVARIANCE].buf + 9 * k;
-            load_dots(&d, (const float *)b[POINTS].buf + 2 * at, valid, m);
-            if (!pose_of(&code, valid, (const float *)b[UV].buf + 2 * at,
-                         (const float *)b[PLACE].buf + 2 * at, m, half, lens, b[PRIOR].buf,
-                         (const int64_t *)b[WINDOWS].buf + 5 * k, offset, tight, finest, &d,
-                         phases, (double *)b[FITTED].buf + (size_t)k * PARAMETERS, out, spread)) {
-                for (int i = 0; i < 3; i++) out[i] = NAN;
-                for (int i = 0; i < 9; i++) spread[i] = NAN;
+    const int has_dots = new_dots(&d, (int)m);
+    int64_t *phases = malloc(4 * (size_t)half_width * sizeof(int64_t));
+    const int has_memory = has_dots && phases;
+    if (has_memory) {
+        Py_BEGIN_ALLOW_THREADS
+        for (size_t k = 0; k < (size_t)n; k++) {
+            const size_t dot = k * (size_t)m;
+            load_dots(&d, points + 2 * dot, valid + dot, (int)m);
+            if (!estimate_pose(&codec, valid + dot, uv + 2 * dot, cells + 2 * dot, (int)m,
+                               (int)half_width, lens, prior, windows + k * WINDOW_COLUMNS, offset,
+                               gate, min_sigma, &d, phases, parameters + k * PARAMETERS,
+                               pose + 3 * k, covariance + 9 * k)) {
+                for (int i = 0; i < 3; i++) pose[3 * k + i] = NAN;
+                for (int i = 0; i < 9; i++) covariance[9 * k + i] = NAN;
             }
         }
         Py_END_ALLOW_THREADS
     }
-    if (made) free(d.x);
+    if (has_dots) free(d.x);
     free(phases);
-    return done(b, BUFFERS, stored);
+    return finish_call(&call, has_memory);
 }
 
 /* ---- Derivative dynamic time warping ---------------------------------------------------- */
 
-/* Templates that are compared at a time, one a lane: the cells of one template wait for each
- * other, those of its neighbours do not. */
+/* Templates that are compared at the same time, one per lane. The cells of one template depend on
+ * each other; those of different templates do not. */
 enum { DDTW_LANES = 32 };
 
-/* Costs of the cheapest paths through the matrices of one query (n, 3) and DDTW_LANES templates
- * (length, 3, DDTW_LANES). `column` (n, DDTW_LANES) holds the matrices' last column. */
+/* Costs of the cheapest warping paths between one query (n, 3) and DDTW_LANES templates
+ * (length, 3, DDTW_LANES). `column` (n, DDTW_LANES) is the last column of the cost matrices. */
 HOT static void ddtw_lanes(const float *restrict query, int n, const float *restrict slopes,
                            int length, float *restrict column, float *restrict cost)
 {
@@ -1212,75 +1652,133 @@ HOT static void ddtw_lanes(const float *restrict query, int n, const float *rest
         }
         for (int i = 0; i < n; i++) {
             const float a = query[3 * i], b = query[3 * i + 1], c = query[3 * i + 2];
-            float *restrict at = column + (size_t)i * DDTW_LANES;
+            float *restrict cost_so_far = column + (size_t)i * DDTW_LANES;
             for (int k = 0; k < DDTW_LANES; k++) {
                 const float dx = a - x[k], dy = b - y[k], dz = c - z[k];
-                const float before = smaller(at[k], corner[k]);
-                corner[k] = at[k];
-                above[k] = smaller(before, above[k]) + sqrtf(dx * dx + dy * dy + dz * dz);
-                at[k] = above[k];
+                const float previous = lesser(cost_so_far[k], corner[k]);
+                corner[k] = cost_so_far[k];
+                above[k] = lesser(previous, above[k]) + sqrtf(dx * dx + dy * dy + dz * dz);
+                cost_so_far[k] = above[k];
             }
         }
         memcpy(cost, above, sizeof(above));
     }
 }
 
+/* Largest length of query and templates, so that an index over their lanes fits into an int. */
+enum { MAX_SERIES = INT_MAX / (3 * DDTW_LANES) };
+
 static PyObject *ddtw(PyObject *self, PyObject *args)
 {
-    enum { QUERY, SLOPES, COST, BUFFERS };
-    Py_buffer b[BUFFERS];
-    int n, length, count;
-    if (!PyArg_ParseTuple(args, "y*y*iiiw*", &b[QUERY], &b[SLOPES], &n, &length, &count, &b[COST]))
+    (void)self;
+    Call call = {0};
+    PyObject *query_array, *slopes_array, *cost_array;
+    long long n, length, count;
+    if (!parse_arguments(args, "OOLLLO:ddtw", &query_array, &slopes_array, &n, &length, &count,
+                         &cost_array))
         return NULL;
+    check_range(&call, "n", n, 0, MAX_SERIES);
+    check_range(&call, "length", length, 0, MAX_SERIES);
+    check_range(&call, "count", count, 0, INT_MAX - DDTW_LANES);
+    if (call.failed) return NULL;
+    const float *query = input(&call, query_array, "query", ITEM_FLOAT32, ITEMS(n, 3));
+    const float *slopes =
+        input(&call, slopes_array, "slopes", ITEM_FLOAT32, ITEMS(length, 3, count));
+    float *cost = output(&call, cost_array, "cost", ITEM_FLOAT32, count);
+    if (call.failed) return finish_call(&call, 1);
     const size_t block = (size_t)length * 3 * DDTW_LANES;
-    float *slopes = calloc(block + (size_t)n * DDTW_LANES, sizeof(float));
-    if (slopes) {
-        Py_BEGIN_ALLOW_THREADS for (int first = 0; first < count; first += DDTW_LANES)
-        {
-            const size_t lanes = (size_t)(count - first < DDTW_LANES ? count - first : DDTW_LANES);
-            float cost[DDTW_LANES] = {0};
-            for (int row = 0; row < 3 * length; row++)
-                memcpy(slopes + (size_t)row * DDTW_LANES,
-                       (const float *)b[SLOPES].buf + (size_t)row * count + first,
-                       lanes * sizeof(float));
-            ddtw_lanes(b[QUERY].buf, n, slopes, length, slopes + block, cost);
-            memcpy((float *)b[COST].buf + first, cost, lanes * sizeof(float));
+    /* One byte more, since calloc may return NULL for a size of 0. */
+    float *lanes = calloc(block + (size_t)n * DDTW_LANES + 1, sizeof(float));
+    if (lanes) {
+        Py_BEGIN_ALLOW_THREADS
+        for (int first = 0; first < count; first += DDTW_LANES) {
+            const long long rest = count - first;
+            const size_t used = rest < DDTW_LANES ? (size_t)rest : DDTW_LANES;
+            float lane_cost[DDTW_LANES] = {0};
+            for (size_t row = 0; row < 3 * (size_t)length; row++)
+                memcpy(lanes + row * DDTW_LANES, slopes + row * (size_t)count + first,
+                       used * sizeof(float));
+            ddtw_lanes(query, (int)n, lanes, (int)length, lanes + block, lane_cost);
+            memcpy(cost + first, lane_cost, used * sizeof(float));
         }
         Py_END_ALLOW_THREADS
     }
-    free(slopes);
-    return done(b, BUFFERS, slopes != NULL);
+    free(lanes);
+    return finish_call(&call, lanes != NULL);
 }
 
+/* ---- Module ----------------------------------------------------------------------------- */
+
+/* The first line of a docstring is the signature that Python's inspect module reads. */
 static PyMethodDef methods[] = {
-    {"find_dots", find_dots, METH_VARARGS, "Twin of locatk.core.dots.blobs.find_dots_numpy."},
+    {"find_dots", find_dots, METH_VARARGS,
+     "find_dots($module, images, n, height, width, taps, block, window, min_contrast,"
+     " contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
+     "Detect the dots of images; twin of locatk.core.dots.blobs.find_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,
-     "Twin of locatk.core.dots.grid.fit_lattices_numpy."},
-    {"read_windows", read_windows, METH_VARARGS, "Twin of locatk.core.dots.reading.read_numpy."},
-    {"soft_bits", soft_bits, METH_VARARGS, "Twin of locatk.core.dots.softbits.soft_bits_numpy."},
-    {"poses", poses, METH_VARARGS, "Twin of locatk.core.dots.pose.poses_numpy."},
-    {"ddtw", ddtw, METH_VARARGS, "Twin of locatk.core.polaris.ddtw.distances_numpy."},
+     "fit_lattices($module, points, valid, n, m, lens, ring_radii, prior, seeds, min_dots,"
+     " min_neighbour, max_neighbour, cell_gate, cell_sigma, symbol_gate, symbol_sigma,"
+     " lens_radius, offset, parameters, uv, cells, sigma, found, /)\n--\n\n"
+     "Fit lattices to dots; twin of locatk.core.dots.grid.fit_lattices_numpy."},
+    {"soft_bits", soft_bits, METH_VARARGS,
+     "soft_bits($module, uv, cells, valid, found, sigma, n, m, half_width, offset,"
+     " likelihood_floor, x_bits, y_bits, /)\n--\n\n"
+     "Compute the soft bits of dots; twin of locatk.core.dots.softbits.soft_bits_numpy."},
+    {"read_windows", read_windows, METH_VARARGS,
+     "read_windows($module, x_bits, y_bits, n, length, lengths, weights, prefixes, crt, signs,"
+     " digits, masks, range, smallest_shift, log_hypotheses, positions, evidence, /)\n--\n\n"
+     "Read positions from windows of soft bits; twin of locatk.core.dots.reading.read_numpy."},
+    {"poses", poses, METH_VARARGS,
+     "poses($module, points, valid, uv, cells, n, m, half_width, lens, prior, windows, lengths,"
+     " weights, prefixes, crt, signs, digits, masks, range, smallest_shift, offset, gate,"
+     " min_sigma, parameters, pose, covariance, /)\n--\n\n"
+     "Estimate poses from decoded dots; twin of locatk.core.dots.pose.poses_numpy."},
+    {"ddtw", ddtw, METH_VARARGS,
+     "ddtw($module, query, slopes, n, length, count, cost, /)\n--\n\n"
+     "Compute distances by derivative dynamic time warping; twin of"
+     " locatk.core.polaris.ddtw.distances_numpy."},
     {"bar_fields", bar_fields, METH_VARARGS,
-     "Twin of locatk.core.landmarks.bars.evaluate_numpy."},
+     "bar_fields($module, points, count, half_length, half_width, height, radius, remanence,"
+     " min_distance, gradient, field, slope, /)\n--\n\n"
+     "Compute the fields of a landmark's four bars; twin of"
+     " locatk.core.landmarks.bars.evaluate_numpy."},
     {"scan_landmarks", scan_landmarks, METH_VARARGS,
-     "Twin of locatk.core.landmarks.scan.scan_numpy."},
-    {"window_edges", window_edges, METH_VARARGS,
-     "Twin of locatk.core.lighthouse.bursts.window_edges_numpy."},
-    {"light_bits", light_bits, METH_VARARGS,
-     "Twin of locatk.core.lighthouse.demodulate.soft_bits_numpy."},
-    {"light_places", light_places, METH_VARARGS,
-     "Twin of locatk.core.lighthouse.identify.identify_numpy."},
-    {"light_expected", light_expected, METH_VARARGS,
-     "Twin of locatk.core.lighthouse.identify.expect_numpy."},
+     "scan_landmarks($module, points, values, weights, count, centres, n_centres, headings,"
+     " n_headings, table, size, step, min_gain, max_gain, strengths, n_strengths, cost, /)"
+     "\n--\n\n"
+     "Compute the cost of candidate landmark poses; twin of"
+     " locatk.core.landmarks.scan.scan_numpy."},
     {"search_map", search_map, METH_VARARGS,
-     "Twin of locatk.core.landmarks.search.search_python."},
+     "search_map($module, item_cells, first, use_item, use_row, parts, weights, values, words,"
+     " conflicts, cells, items, length, letters, n_weights, possible, seed, steps, /)\n--\n\n"
+     "Search a map whose words all differ; twin of"
+     " locatk.core.landmarks.search.search_python."},
+    {"window_edges", window_edges, METH_VARARGS,
+     "window_edges($module, windows, width, tick, first, rises, /)\n--\n\n"
+     "Find the edges of packed windows of light samples; twin of window_edges_numpy in"
+     " locatk.core.lighthouse.demodulation."},
+    {"light_bits", light_bits, METH_VARARGS,
+     "light_bits($module, tick, first, rises, readable, ticks_per_chip, max_chips, value,"
+     " value_first, start, /)\n--\n\n"
+     "Demodulate bursts of light into soft bits; twin of soft_bits_numpy in"
+     " locatk.core.lighthouse.demodulation."},
+    {"light_places", light_places, METH_VARARGS,
+     "light_places($module, value, first, states, index, taps, polynomials, match, miss,"
+     " unknown, min_run, steps, min_evidence, rows, /)\n--\n\n"
+     "Identify the polynomial and index of bursts; twin of identify_numpy in"
+     " locatk.core.lighthouse.demodulation."},
+    {"light_expected", light_expected, METH_VARARGS,
+     "light_expected($module, value, first, states, polynomial, index, candidates,"
+     " search_range, match, miss, unknown, rows, /)\n--\n\n"
+     "Score expected polynomials and indices of bursts; twin of expect_numpy in"
+     " locatk.core.lighthouse.demodulation."},
     {NULL, NULL, 0, NULL},
 };
 
 static struct PyModuleDef module = {
     PyModuleDef_HEAD_INIT,
     "_kernels",
-    "Hot loops of locatk.core.",
+    "Hot loops of locatk.core, each with a twin in numpy.",
     -1,
     methods,
     NULL,

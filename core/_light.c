@@ -1,14 +1,13 @@
-/* The hot loops of core/lighthouse: edges of sampled light, its soft bits, and which station's
- * sequence they are. Their numpy twins say what they do and why: locatk.core.lighthouse.bursts,
- * .demodulate and .identify.
+/* Hot loops of core/lighthouse: edges of sampled light, soft bits of bursts, and the
+ * identification of their sequences. The numpy twins in locatk.core.lighthouse.demodulation
+ * document the methods.
  */
 #include "_kernels.h"
 #include <math.h>
-#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* ---- Edges of windows of samples --------------------------------------------------------- */
+/* ---- Edges of windows of samples -------------------------------------------------------- */
 
 static inline uint64_t big_endian(const uint8_t *bytes)
 {
@@ -17,130 +16,152 @@ static inline uint64_t big_endian(const uint8_t *bytes)
     return word;
 }
 
-/* window_edges(windows, width, tick, first, rises): packed rows of width bytes to edges. */
+/* Write the edges of one packed row of `width` bytes to `tick`; return their number. `base` is the
+ * tick of the first sample, and `first_level` receives its level. */
+static int64_t row_edges(const uint8_t *row, int width, int64_t base, int64_t *tick,
+                         int *first_level)
+{
+    const int words = (width + 7) / 8;
+    int64_t count = 0;
+    uint64_t last = row[0] >> 7;
+    *first_level = (int)last;
+    for (int w = 0; w < words; w++) {
+        uint8_t padded[8];
+        const uint8_t *bytes = row + 8 * w;
+        const int available = width - 8 * w < 8 ? width - 8 * w : 8;
+        if (available < 8) {
+            /* Beyond the end of the row the level does not change. */
+            memset(padded, row[width - 1] & 1 ? 0xFF : 0, 8);
+            memcpy(padded, bytes, (size_t)available);
+            bytes = padded;
+        }
+        const uint64_t word = big_endian(bytes);
+        uint64_t changed = word ^ (word >> 1 | last << 63);
+        last = word & 1;
+        while (changed) {
+            const int bit = __builtin_clzll(changed);
+            tick[count++] = base + 64 * w + bit;
+            changed &= ~(0x8000000000000000ull >> bit);
+        }
+    }
+    return count;
+}
+
+/* Largest number of bytes of a window, so that an index of its samples fits into an int. */
+enum { MAX_WINDOW_BYTES = INT_MAX / 64 };
+
 PyObject *window_edges(PyObject *self, PyObject *args)
 {
     (void)self;
-    Py_buffer b[4];
-    int width;
-    if (!PyArg_ParseTuple(args, "y*iw*w*w*", &b[0], &width, &b[1], &b[2], &b[3])) return NULL;
-    const uint8_t *windows = b[0].buf;
-    int64_t *tick = b[1].buf, *first = b[2].buf;
-    uint8_t *rises = b[3].buf;
-    const Py_ssize_t rows = b[0].len / (width ? width : 1);
-    const int words = (width + 7) / 8;
-    int64_t count = 0;
+    Call call = {0};
+    PyObject *windows_array, *tick_array, *first_array, *rises_array;
+    long long width;
+    if (!parse_arguments(args, "OLOOO:window_edges", &windows_array, &width, &tick_array,
+                         &first_array, &rises_array))
+        return NULL;
+    check_range(&call, "width", width, 1, MAX_WINDOW_BYTES);
+    if (call.failed) return NULL;
+    Py_ssize_t rows;
+    const uint8_t *windows =
+        input_rows(&call, windows_array, "windows", ITEM_UINT8, (Py_ssize_t)width, &rows);
+    /* A row of 8 * width samples has fewer edges than samples. */
+    int64_t *tick = output(&call, tick_array, "tick", ITEM_INT64, ITEMS(rows, width, 8));
+    int64_t *first = output(&call, first_array, "first", ITEM_INT64, rows + 1);
+    uint8_t *rises = output(&call, rises_array, "rises", ITEM_UINT8, rows);
+    if (call.failed) return finish_call(&call, 1);
     first[0] = 0;
     for (Py_ssize_t i = 0; i < rows; i++) {
-        const uint8_t *row = windows + i * width;
-        const int64_t begin = count, base = (int64_t)i * 8 * width;
-        uint64_t last = row[0] >> 7;
-        rises[i] = !last;
-        for (int w = 0; w < words; w++) {
-            uint8_t rest[8];
-            const uint8_t *at = row + 8 * w;
-            const int here = width - 8 * w < 8 ? width - 8 * w : 8;
-            if (here < 8) {
-                /* Beyond the end the level stays. */
-                memset(rest, row[width - 1] & 1 ? 0xFF : 0, 8);
-                memcpy(rest, at, (size_t)here);
-                at = rest;
-            }
-            const uint64_t word = big_endian(at);
-            uint64_t changed = word ^ (word >> 1 | last << 63);
-            last = word & 1;
-            while (changed) {
-                const int place = __builtin_clzll(changed);
-                tick[count++] = base + 64 * w + place;
-                changed &= ~(0x8000000000000000ull >> place);
-            }
-        }
-        if (count == begin) rises[i] = 0;
-        first[i + 1] = count;
+        int first_level;
+        const int64_t count = row_edges(windows + i * width, (int)width, (int64_t)i * 8 * width,
+                                        tick + first[i], &first_level);
+        rises[i] = count > 0 && !first_level;
+        first[i + 1] = first[i] + count;
     }
-    return done(b, 4, 1);
+    return finish_call(&call, 1);
 }
 
-/* ---- Soft bits ----------------------------------------------------------------------------- */
+/* ---- Soft bits -------------------------------------------------------------------------- */
 
-#define TURN 4096
-#define LONGEST_RUN 3.0
-#define EVEN 1e-3f
-#define FULL (1 << 20) /* a level, as a whole number: its sums are exact */
-static int32_t wave[TURN + TURN / 4]; /* sine, and a quarter turn later cosine */
+#define TURN_STEPS 4096      /* steps of a full turn in the table of sines */
+#define MAX_RUN_CHIPS 3.0    /* longer runs between edges are limited to this */
+#define MIN_ODD_EXCESS 1e-3f /* bits start at the second chip only beyond this evidence */
+#define FULL_LEVEL (1 << 20) /* a level as a whole number, so that sums are exact */
+static int32_t sines[TURN_STEPS + TURN_STEPS / 4]; /* sine; a quarter turn later cosine */
 
-static void make_wave(void)
+static void make_sines(void)
 {
-    if (wave[TURN / 4] != 0) return;
-    for (int k = 0; k < TURN + TURN / 4; k++)
-        wave[k] = (int32_t)rint(sin(2 * M_PI / TURN * k) * 16384);
+    if (sines[TURN_STEPS / 4] != 0) return;
+    for (int k = 0; k < TURN_STEPS + TURN_STEPS / 4; k++)
+        sines[k] = (int32_t)rint(sin(2 * M_PI / TURN_STEPS * k) * 16384);
 }
 
-/* The nearest whole number. Halves, which sampled times often are, go up for sure. */
-static inline double rounded(double value) { return floor(value + (0.5 + 1e-6)); }
+/* Round to the nearest whole number. Sampled times are often halves: these round up despite small
+ * numeric errors. */
+static inline double round_half_up(double value) { return floor(value + (0.5 + 1e-6)); }
 
-/* Where chips begin, one before the first edge, and by how much edges of the first edge's direction
- * come later than the others. time holds the edges in chips from the first one. */
-HOT static double grid_of(const double *time, int edges, double *skew)
+/* Start of the chip before the first edge, and the delay (skew) of edges in the first edge's
+ * direction relative to the others. `time` holds the edges [chips since the first edge]. */
+HOT static double fit_chip_grid(const double *time, int edges, double *skew)
 {
     int64_t sine[2] = {0, 0}, cosine[2] = {0, 0};
     double phase[2], run[2] = {0, 0};
-    /* Both directions in one pass, so that neither sum waits for the other. */
+    /* Both directions in one pass, so that their sums are computed in parallel. */
     for (int k = 0; k < edges; k += 2) {
         for (int kind = 0; kind < 2 && k + kind < edges; kind++) {
-            const double here = time[k + kind];
-            const int at = (int)((here - (double)(int)here) * TURN + 0.5) & (TURN - 1);
-            sine[kind] += wave[at];
-            cosine[kind] += wave[at + TURN / 4];
+            const double chips = time[k + kind];
+            const int step =
+                (int)((chips - (double)(int)chips) * TURN_STEPS + 0.5) & (TURN_STEPS - 1);
+            sine[kind] += sines[step];
+            cosine[kind] += sines[step + TURN_STEPS / 4];
             if (k + kind + 1 < edges) {
-                const double length = time[k + kind + 1] - here;
-                run[kind] += length < LONGEST_RUN ? length : LONGEST_RUN;
+                const double length = time[k + kind + 1] - chips;
+                run[kind] += length < MAX_RUN_CHIPS ? length : MAX_RUN_CHIPS;
             }
         }
     }
     for (int kind = 0; kind < 2; kind++)
         phase[kind] = atan2((double)sine[kind], (double)cosine[kind]) / (2 * M_PI);
-    /* Phases leave whole chips open, which the runs tell. */
-    double told = 0;
-    if (run[1] > 0) told = (run[1] / ((edges - 1) / 2) - run[0] / (edges / 2)) / 2;
-    told = told > 0.5 ? 0.5 : told < -0.5 ? -0.5 : told;
+    /* Phases are ambiguous by whole chips. The mean lengths of the runs resolve the ambiguity. */
+    double run_skew = 0;
+    if (run[1] > 0) run_skew = (run[1] / ((edges - 1) / 2) - run[0] / (edges / 2)) / 2;
+    run_skew = run_skew > 0.5 ? 0.5 : run_skew < -0.5 ? -0.5 : run_skew;
     *skew = phase[0] - phase[1];
-    *skew -= rounded(*skew - told);
+    *skew -= round_half_up(*skew - run_skew);
     return phase[0] - 0.5 * *skew - 1;
 }
 
-/* Mean levels of all chips of a burst; returns how many there are. sign is the first edge's
- * direction; begin answers where the first chip begins. */
-HOT static int chips_of(const double *time, int edges, int sign, int longest, double *begin,
-                    int32_t *mean)
+/* Compute the mean levels of all chips of a burst and return their number. `sign` is the direction
+ * of the first edge; `begin` receives the start of the first chip. */
+HOT static int chip_levels(const double *time, int edges, int sign, int max_chips, double *begin,
+                           int32_t *mean)
 {
     double skew;
-    *begin = grid_of(time, edges, &skew);
+    *begin = fit_chip_grid(time, edges, &skew);
     const double shift[2] = {-0.5 * skew, 0.5 * skew};
-    /* Times ascend, so that with their shifts the latest is one of the last two. */
+    /* Times ascend, so that the latest shifted edge is one of the last two. */
     const int final = edges - 1;
     double last = time[final] + shift[final & 1];
     const double other = time[final - 1] + shift[(final - 1) & 1];
     last = other > last ? other : last;
-    const double whole = rounded(last - *begin) + 1;
-    const int chips = whole < longest ? (int)whole : longest;
-    /* Each edge changes the mean of its own chip by a part, and of all later ones whole. */
+    const double whole = round_half_up(last - *begin) + 1;
+    const int chips = whole < max_chips ? (int)whole : max_chips;
+    /* An edge changes the mean of its own chip in part, and that of all later chips fully. */
     memset(mean, 0, (size_t)(chips + 2) * sizeof *mean);
-    int32_t turn = sign < 0 ? -1 : 0; /* all ones: x ^ turn, less turn, is -x */
+    int32_t negate = sign < 0 ? -1 : 0; /* (x ^ -1) - -1 is -x */
     last = time[0] + shift[0];
     for (int k = 0; k < edges; k++) {
         double t = time[k] + shift[k & 1];
         t = t > last ? t : last;
         last = t;
-        const double place = t - *begin;
-        const int chip = (int)place;
+        const double position = t - *begin;
+        const int chip = (int)position;
         if (chip >= chips) break;
-        const int32_t late = (int32_t)((place - chip) * FULL);
-        mean[chip] += (2 * (FULL - late) ^ turn) - turn;
-        mean[chip + 1] += (2 * late ^ turn) - turn;
-        turn = ~turn;
+        const int32_t late = (int32_t)((position - chip) * FULL_LEVEL);
+        mean[chip] += (2 * (FULL_LEVEL - late) ^ negate) - negate;
+        mean[chip + 1] += (2 * late ^ negate) - negate;
+        negate = ~negate;
     }
-    int32_t level = -sign * FULL;
+    int32_t level = -sign * FULL_LEVEL;
     for (int k = 0; k < chips; k++) {
         level += mean[k];
         mean[k] = level;
@@ -150,15 +171,15 @@ HOT static int chips_of(const double *time, int edges, int sign, int longest, do
 
 static inline int32_t magnitude(int32_t x) { return (x < 0 ? -x : x) >> 6; }
 
-/* Bits of a burst from its chips; odd answers whether the first chip is the second half of one.
- * change is room for as many numbers as there are chips. */
-HOT static int bits_of(const int32_t *restrict mean, int chips, int *odd,
-                       int32_t *restrict change, int8_t *restrict value)
+/* Compute the soft bits of a burst from its chips and return their number. `odd` receives 1 if the
+ * first chip is the second half of a bit. `change` is scratch memory for one number per chip. */
+HOT static int soft_bits_of_chips(const int32_t *restrict mean, int chips, int *odd,
+                                  int32_t *restrict change, int8_t *restrict value)
 {
     int32_t middles = 0, borders = 0;
     for (int k = 0; k + 1 < chips; k += 2) middles += magnitude(mean[k + 1] - mean[k]);
     for (int k = 1; k + 1 < chips; k += 2) borders += magnitude(mean[k + 1] - mean[k]);
-    *odd = middles > borders + (int32_t)(EVEN * FULL) / 64;
+    *odd = middles > borders + (int32_t)(MIN_ODD_EXCESS * FULL_LEVEL) / 64;
     const int32_t *m = mean + *odd;
     const int bits = (chips - *odd) / 2;
     if (bits < 1) return 0;
@@ -166,40 +187,80 @@ HOT static int bits_of(const int32_t *restrict mean, int chips, int *odd,
     for (int k = 1; k < bits; k++) change[k] = m[2 * k] - m[2 * k - 1];
     change[bits] = -2 * m[2 * bits - 1];
     for (int k = 0; k < bits; k++) {
-        float soft = (float)change[k] * (float)change[k + 1] * (16.0f / FULL / FULL);
+        float soft = (float)change[k] * (float)change[k + 1] * (16.0f / FULL_LEVEL / FULL_LEVEL);
         soft = soft > 64 ? 64 : soft < -64 ? -64 : soft;
         value[k] = (int8_t)(int32_t)rintf(soft);
     }
     return bits;
 }
 
-/* light_bits(tick, first, rises, readable, ticks_per_chip, longest, value, value_first, start) */
+/* Most chips of a burst that are demodulated: the sums of their changes fit into an int32. */
+enum { MAX_CHIPS = 1 << 16 };
+
+/* Longest duration of a burst that is demodulated [chips]: its edges, in chips, fit into an int.
+ */
+#define MAX_BURST_CHIPS ((double)(1 << 30))
+
+/* Check the edges of the bursts that are demodulated. Return the largest number of edges. */
+static int64_t check_bursts(Call *call, const int64_t *tick, const int64_t *first,
+                            const uint8_t *readable, Py_ssize_t bursts, double ticks_per_chip)
+{
+    int64_t max_edges = 1;
+    for (Py_ssize_t i = 0; i < bursts && !call->failed; i++) {
+        if (!readable[i]) continue;
+        const int64_t edges = first[i + 1] - first[i];
+        if (edges < 2 || edges > INT_MAX) {
+            reject(call, "readable[%zd] is set for a burst of %lld edges", i, (long long)edges);
+            return max_edges;
+        }
+        int descends = 0;
+        for (int64_t k = first[i] + 1; k < first[i + 1]; k++) descends |= tick[k] < tick[k - 1];
+        const uint64_t duration = (uint64_t)tick[first[i + 1] - 1] - (uint64_t)tick[first[i]];
+        if (descends)
+            reject(call, "tick descends within burst %zd", i);
+        else if (duration > INT64_MAX || (double)duration / ticks_per_chip > MAX_BURST_CHIPS)
+            reject(call, "tick: burst %zd is too long to be demodulated", i);
+        max_edges = edges > max_edges ? edges : max_edges;
+    }
+    return max_edges;
+}
+
 PyObject *light_bits(PyObject *self, PyObject *args)
 {
     (void)self;
-    Py_buffer b[7];
-    double chip;
-    int longest;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*diw*w*w*", &b[0], &b[1], &b[2], &b[3], &chip, &longest,
-                          &b[4], &b[5], &b[6]))
+    Call call = {0};
+    PyObject *tick_array, *first_array, *rises_array, *readable_array, *value_array,
+        *value_first_array, *start_array;
+    double ticks_per_chip;
+    long long max_chips;
+    if (!parse_arguments(args, "OOOOdLOOO:light_bits", &tick_array, &first_array, &rises_array,
+                         &readable_array, &ticks_per_chip, &max_chips, &value_array,
+                         &value_first_array, &start_array))
         return NULL;
-    const int64_t *tick = b[0].buf, *first = b[1].buf;
-    const uint8_t *rises = b[2].buf, *readable = b[3].buf;
-    int8_t *value = b[4].buf;
-    int64_t *value_first = b[5].buf;
-    double *start = b[6].buf;
-    const Py_ssize_t bursts = b[2].len;
-    int64_t most = 1;
-    for (Py_ssize_t i = 0; i < bursts; i++)
-        if (readable[i] && first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
-    double *time = malloc((size_t)most * sizeof *time);
-    int32_t *mean = malloc(2 * (size_t)(longest + 8) * sizeof *mean);
+    check_positive(&call, "ticks_per_chip", ticks_per_chip);
+    check_positive(&call, "1 / ticks_per_chip", 1 / ticks_per_chip);
+    check_range(&call, "max_chips", max_chips, 1, MAX_CHIPS);
+    if (call.failed) return NULL;
+    Py_ssize_t ticks, bursts, capacity;
+    const int64_t *tick = input_rows(&call, tick_array, "tick", ITEM_INT64, 1, &ticks);
+    const uint8_t *rises = input_rows(&call, rises_array, "rises", ITEM_FLAG, 1, &bursts);
+    const uint8_t *readable = input(&call, readable_array, "readable", ITEM_FLAG, bursts);
+    const int64_t *first = input(&call, first_array, "first", ITEM_INT64, bursts + 1);
+    int8_t *value = output_any(&call, value_array, "value", ITEM_INT8, &capacity);
+    int64_t *value_first = output(&call, value_first_array, "value_first", ITEM_INT64, bursts + 1);
+    double *start = output(&call, start_array, "start", ITEM_FLOAT64, bursts);
+    check_offsets(&call, "first", first, bursts + 1, ticks);
+    const int64_t max_edges =
+        check_bursts(&call, tick, first, readable, call.failed ? 0 : bursts, ticks_per_chip);
+    if (call.failed) return finish_call(&call, 1);
+    double *time = malloc((size_t)max_edges * sizeof *time);
+    int32_t *mean = malloc(2 * (size_t)(max_chips + 8) * sizeof *mean);
     if (!time || !mean) {
         free(time);
         free(mean);
-        return done(b, 7, 0);
+        return finish_call(&call, 0);
     }
-    make_wave();
+    make_sines();
     value_first[0] = 0;
     for (Py_ssize_t i = 0; i < bursts; i++) {
         const int64_t edges = first[i + 1] - first[i];
@@ -207,223 +268,264 @@ PyObject *light_bits(PyObject *self, PyObject *args)
         start[i] = 0;
         if (readable[i]) {
             const int64_t origin = tick[first[i]];
-            const double chips_per_tick = 1 / chip;
+            const double chips_per_tick = 1 / ticks_per_chip;
             for (int64_t k = 0; k < edges; k++)
                 time[k] = (double)(tick[first[i] + k] - origin) * chips_per_tick;
             double begin;
             int odd;
-            const int64_t room = 2 * (b[4].len - value_first[i]);
-            const int chips = chips_of(time, (int)edges, rises[i] ? 1 : -1,
-                                       room < longest ? (int)room : longest, &begin, mean);
-            bits = bits_of(mean, chips, &odd, mean + longest + 8, value + value_first[i]);
-            start[i] = (double)origin + (begin + odd) * chip;
+            /* Bits that the array has no memory for are dropped. */
+            const int64_t free_chips = 2 * (capacity - value_first[i]);
+            const int limit = free_chips < max_chips ? (int)free_chips : (int)max_chips;
+            const int chips =
+                chip_levels(time, (int)edges, rises[i] ? 1 : -1, limit, &begin, mean);
+            bits = soft_bits_of_chips(mean, chips, &odd, mean + max_chips + 8,
+                                      value + value_first[i]);
+            start[i] = (double)origin + (begin + odd) * ticks_per_chip;
         }
         value_first[i + 1] = value_first[i] + bits;
     }
     free(time);
     free(mean);
-    return done(b, 7, 1);
+    return finish_call(&call, 1);
 }
 
-/* ---- Polynomial and place ------------------------------------------------------------------ */
+/* ---- Polynomial and index --------------------------------------------------------------- */
 
-#define REGISTER 17
-#define LENGTH 131071
-#define CERTAIN 64
+#define REGISTER_BITS 17
+#define SEQUENCE_LENGTH 131071 /* also the mask of a register's bits */
+#define MAX_SOFT_BIT 64        /* magnitude of a soft bit that is certain */
+#define ROW_COLUMNS 7          /* polynomial, index, evidence, begin, end, known, wrong */
+
+/* Most bits of a burst, so that an index over them fits into an int. */
+#define MAX_BURST_BITS (INT_MAX / 64)
 
 typedef struct {
     const int32_t *states, *index, *taps;
-    int polynomials, unknown, follow;
-    int32_t gain[2][2 * CERTAIN + 1]; /* evidence of a soft bit where a zero, a one is expected */
+    int polynomials, unknown, min_run;
+    int32_t gain[2][2 * MAX_SOFT_BIT + 1]; /* evidence of a soft bit if 0 and if 1 is expected */
 } Tables;
 
-static void weigh(Tables *t, const int32_t *match, const int32_t *miss)
+/* Fill the table of gains from the evidence of a soft bit of each size that matches or misses. */
+static void fill_gains(Tables *t, const int32_t *match, const int32_t *miss)
 {
-    for (int v = -CERTAIN; v <= CERTAIN; v++) {
+    for (int v = -MAX_SOFT_BIT; v <= MAX_SOFT_BIT; v++) {
         const int size = v < 0 ? -v : v;
-        t->gain[0][v + CERTAIN] = v > 0 ? miss[size] : match[size];
-        t->gain[1][v + CERTAIN] = v > 0 ? match[size] : miss[size];
+        t->gain[0][v + MAX_SOFT_BIT] = v > 0 ? miss[size] : match[size];
+        t->gain[1][v + MAX_SOFT_BIT] = v > 0 ? match[size] : miss[size];
     }
 }
 
-static int64_t most_of(const int64_t *first, Py_ssize_t bursts)
+/* Soft bits of bursts: burst i has the values first[i] to first[i + 1]. */
+typedef struct {
+    const int8_t *value;
+    const int64_t *first;
+    Py_ssize_t bursts;
+    int64_t max_bits;
+} Bursts;
+
+/* Check soft bits and their offsets, and fill the table of gains. */
+static Bursts take_bursts(Call *call, PyObject *value_array, PyObject *first_array,
+                          PyObject *match_array, PyObject *miss_array, long long unknown,
+                          Tables *t)
 {
-    int64_t most = 1;
-    for (Py_ssize_t i = 0; i < bursts; i++)
-        if (first[i + 1] - first[i] > most) most = first[i + 1] - first[i];
-    return most;
+    const int sizes = MAX_SOFT_BIT + 1;
+    Bursts b = {.max_bits = 1};
+    Py_ssize_t values, offsets;
+    b.value = input_rows(call, value_array, "value", ITEM_INT8, 1, &values);
+    check_items(call, "value", b.value, ITEM_INT8, values, -MAX_SOFT_BIT, MAX_SOFT_BIT);
+    b.first = input_rows(call, first_array, "first", ITEM_INT64, 1, &offsets);
+    check_range(call, "number of first", offsets, 1, PY_SSIZE_T_MAX);
+    check_offsets(call, "first", b.first, offsets, values);
+    const int32_t *match = input(call, match_array, "match", ITEM_INT32, sizes);
+    const int32_t *miss = input(call, miss_array, "miss", ITEM_INT32, sizes);
+    check_range(call, "unknown", unknown, 0, MAX_SOFT_BIT);
+    if (call->failed) return b;
+    b.bursts = offsets - 1;
+    for (Py_ssize_t i = 0; i < b.bursts; i++) {
+        const int64_t bits = b.first[i + 1] - b.first[i];
+        b.max_bits = bits > b.max_bits ? bits : b.max_bits;
+    }
+    check_range(call, "number of bits of a burst", b.max_bits, 0, MAX_BURST_BITS);
+    /* The evidence of all bits of a burst fits into an int32. */
+    const long long max_gain = INT32_MAX / b.max_bits;
+    check_items(call, "match", match, ITEM_INT32, sizes, -max_gain, max_gain);
+    check_items(call, "miss", miss, ITEM_INT32, sizes, -max_gain, max_gain);
+    if (call->failed) return b;
+    t->unknown = (int)unknown;
+    fill_gains(t, match, miss);
+    return b;
 }
 
-/* The 17 tap places of a polynomial in three parts: for each of them, all sums of the words of
- * bits that came so many places before. A polynomial's sum is then three look-ups. */
+/* The 17 taps of a polynomial are divided into three parts. For each part, all sums (exclusive or)
+ * of delayed words are tabulated; the sum of a polynomial is then three table accesses. */
 #define PARTS 3
 #define PART_BITS 6
 typedef uint64_t Sums[PARTS][1 << PART_BITS];
 
-/* Bits of a burst as words, the first bit highest, with nothing before the first so that the last
- * word is full. */
+/* Bits of a burst as words, the first bit highest. The first word is padded so that the last is
+ * full. */
 typedef struct {
     uint64_t *hard;
-    uint64_t *open; /* bits that follow from nothing, as one of the 18 is unknown */
+    uint64_t *open; /* bits that cannot be predicted: one of the 18 involved is unknown */
     Sums *sums;
-    uint8_t *summed; /* words whose sums are there */
-    int bits, words, empty; /* empty: places of the first word before the first bit */
-} Text;
+    uint8_t *summed;          /* 1 for words whose sums are computed */
+    int bits, words, padding; /* padding: bits of the first word before the first bit */
+} BitWords;
 
-/* Bits of which all of the last count, with their own, are one; more holds those of the word
- * before, then the word's own. */
-static inline unsigned __int128 all_of_last(unsigned __int128 more, int count)
+/* Bits for which the last `count` bits, including their own, are all one. `bits` holds the
+ * previous word, then the word itself. */
+static inline unsigned __int128 all_of_last(unsigned __int128 bits, int count)
 {
-    int reach = 1;
-    for (; 2 * reach <= count; reach *= 2) more &= more >> reach;
-    return more & more >> (count - reach);
+    int span = 1;
+    for (; 2 * span <= count; span *= 2) bits &= bits >> span;
+    return bits & bits >> (count - span);
 }
 
-HOT static void write_text(const Tables *t, const int8_t *value, int bits, Text *text)
+HOT static void write_words(const Tables *t, const int8_t *value, int bits, BitWords *text)
 {
-    uint64_t sure_before = 0, zero_before = ~0ull;
+    uint64_t known_before = 0, zero_before = ~0ull;
     text->bits = bits;
     text->words = (bits + 63) / 64;
-    text->empty = 64 * text->words - bits;
+    text->padding = 64 * text->words - bits;
     for (int w = 0, next = 0; w < text->words; w++) {
-        const int to = 64 * (w + 1) - text->empty;
-        uint64_t hard = 0, sure = 0;
+        const int to = 64 * (w + 1) - text->padding;
+        uint64_t hard = 0, known = 0;
         for (; next < to; next++) {
             const int soft = value[next];
             hard = hard << 1 | (uint64_t)(soft > 0);
-            sure = sure << 1 | (uint64_t)(soft > t->unknown || soft < -t->unknown);
+            known = known << 1 | (uint64_t)(soft > t->unknown || soft < -t->unknown);
         }
-        /* Known are to be the bit and the 17 before it, which must hold a one: state 0 follows
-         * from itself. */
-        const unsigned __int128 known = (unsigned __int128)sure_before << 64 | sure;
-        const unsigned __int128 zeros = (unsigned __int128)zero_before << 64 | (uint64_t)~hard;
+        /* A bit is predicted if it and the 17 before it are known, and if these hold a one: state
+         * 0 is not part of the sequence. */
+        const unsigned __int128 known_pair = (unsigned __int128)known_before << 64 | known;
+        const unsigned __int128 zero_pair = (unsigned __int128)zero_before << 64 | (uint64_t)~hard;
         text->hard[w] = hard;
-        text->open[w] = ~(uint64_t)all_of_last(known, REGISTER + 1) |
-                        (uint64_t)(all_of_last(zeros, REGISTER) >> 1);
+        text->open[w] = ~(uint64_t)all_of_last(known_pair, REGISTER_BITS + 1)
+                        | (uint64_t)(all_of_last(zero_pair, REGISTER_BITS) >> 1);
         text->summed[w] = 0;
-        sure_before = sure;
+        known_before = known;
         zero_before = ~hard;
     }
 }
 
-HOT static void sum_word(const Text *text, int w)
+HOT static void sum_word(const BitWords *text, int w)
 {
-    const uint64_t hard = text->hard[w], last = w ? text->hard[w - 1] : 0;
+    const uint64_t hard = text->hard[w], previous = w ? text->hard[w - 1] : 0;
     for (int part = 0; part < PARTS; part++) {
         uint64_t *sums = text->sums[w][part];
         sums[0] = 0;
         for (int bit = 0; bit < PART_BITS; bit++) {
-            const int by = 1 + part * PART_BITS + bit;
-            const uint64_t before = hard >> by | last << (64 - by);
-            for (int k = 0; k < 1 << bit; k++) sums[(1 << bit) + k] = sums[k] ^ before;
+            const int delay = 1 + part * PART_BITS + bit;
+            const uint64_t delayed = hard >> delay | previous << (64 - delay);
+            for (int k = 0; k < 1 << bit; k++) sums[(1 << bit) + k] = sums[k] ^ delayed;
         }
     }
     text->summed[w] = 1;
 }
 
-/* Bits of a word, whose sums are there, that do not follow from the 17 before each. */
-static inline uint64_t strangers(const Text *text, uint32_t taps, int w)
+/* Bits of a word that do not follow from the 17 bits before them. The word's sums are computed. */
+static inline uint64_t mispredictions(const BitWords *text, uint32_t taps, int w)
 {
     const uint32_t part = (1 << PART_BITS) - 1;
-    const uint64_t sum = text->sums[w][0][taps & part] ^
-                         text->sums[w][1][taps >> PART_BITS & part] ^
-                         text->sums[w][2][taps >> 2 * PART_BITS];
+    const uint64_t sum = text->sums[w][0][taps & part] ^ text->sums[w][1][taps >> PART_BITS & part]
+                         ^ text->sums[w][2][taps >> 2 * PART_BITS];
     return (text->hard[w] ^ sum) | text->open[w];
 }
 
-/* The polynomial under which most bits of a word follow from those before, the first of equals. */
-HOT static int likeliest(const Tables *t, const Text *text, int w)
+/* First of the polynomials that predict the most bits of a word. */
+HOT static int best_polynomial(const Tables *t, const BitWords *text, int w)
 {
     int best = 0, fewest = 65;
     sum_word(text, w);
     for (int p = 0; p < t->polynomials; p++) {
-        const int number = __builtin_popcountll(strangers(text, (uint32_t)t->taps[p], w));
+        const int number = __builtin_popcountll(mispredictions(text, (uint32_t)t->taps[p], w));
         best = number < fewest ? p : best;
         fewest = number < fewest ? number : fewest;
     }
     return best;
 }
 
-/* Where the longest run of bits begins that follow from the 17 before each, the first of equals,
- * among the words from first to last; answers its length, or 0 where none is long enough. */
-static int longest_run(const Tables *t, const Text *text, int polynomial, int first, int last,
+/* Find the first of the longest runs of predicted bits in the words from `first` up to `last`.
+ * Return its length and write its start to `begin`; return 0 if it is shorter than min_run. */
+static int longest_run(const Tables *t, const BitWords *text, int polynomial, int first, int last,
                        int *begin)
 {
     const uint32_t taps = (uint32_t)t->taps[polynomial];
-    int longest = 0, from = 64 * first;
+    int max_run = 0, run_begin = 64 * first;
     for (int w = first; w < last; w++) {
         if (!text->summed[w]) sum_word(text, w);
-        uint64_t bad = strangers(text, taps, w);
-        if (!bad) continue;
-        /* A word without a long run, and that ends none, needs no look at each bit. */
-        uint64_t run = ~bad & ~bad >> 1;
+        uint64_t wrong = mispredictions(text, taps, w);
+        if (!wrong) continue;
+        /* A word that neither contains nor ends a long run is skipped. */
+        uint64_t run = ~wrong & ~wrong >> 1;
         run &= run >> 2;
-        if (t->follow >= 8) run &= run >> 4;
-        if (!run && t->follow >= 4 && 64 * w - from + __builtin_clzll(bad) < t->follow) {
-            from = 64 * w + 64 - __builtin_ctzll(bad);
+        if (t->min_run >= 8) run &= run >> 4;
+        if (!run && t->min_run >= 4 && 64 * w - run_begin + __builtin_clzll(wrong) < t->min_run) {
+            run_begin = 64 * w + 64 - __builtin_ctzll(wrong);
             continue;
         }
-        while (bad) {
-            const int place = __builtin_clzll(bad), at = 64 * w + place;
-            if (at - from > longest) {
-                longest = at - from;
-                *begin = from;
+        while (wrong) {
+            const int bit = __builtin_clzll(wrong), position = 64 * w + bit;
+            if (position - run_begin > max_run) {
+                max_run = position - run_begin;
+                *begin = run_begin;
             }
-            from = at + 1;
-            bad &= ~(0x8000000000000000ull >> place);
+            run_begin = position + 1;
+            wrong &= ~(0x8000000000000000ull >> bit);
         }
     }
-    if (64 * last - from > longest) {
-        longest = 64 * last - from;
-        *begin = from;
+    if (64 * last - run_begin > max_run) {
+        max_run = 64 * last - run_begin;
+        *begin = run_begin;
     }
-    return longest < t->follow ? 0 : longest;
+    return max_run < t->min_run ? 0 : max_run;
 }
 
-/* Place of the first bit, if the 17 bits before place k of the words stand in the sequence of a
- * polynomial. */
-static int place_of(const Tables *t, const Text *text, int polynomial, int k)
+/* Index of the first bit in the sequence of a polynomial, from the 17 bits before position k of
+ * the words. */
+static int index_of_first_bit(const Tables *t, const BitWords *text, int polynomial, int k)
 {
-    const uint64_t state =
-        k % 64 ? text->hard[k / 64] >> (64 - k % 64) : text->hard[k / 64 - 1];
-    const uint64_t more = k % 64 && k / 64 ? text->hard[k / 64 - 1] << k % 64 : 0;
-    const int32_t index =
-        t->index[(size_t)polynomial * (LENGTH + 1) + ((state | more) & LENGTH)];
-    const int place = (index - (k - text->empty - REGISTER)) % LENGTH;
-    return place < 0 ? place + LENGTH : place;
+    const uint64_t state = k % 64 ? text->hard[k / 64] >> (64 - k % 64) : text->hard[k / 64 - 1];
+    const uint64_t previous = k % 64 && k / 64 ? text->hard[k / 64 - 1] << k % 64 : 0;
+    const int32_t index = t->index[(size_t)polynomial * (SEQUENCE_LENGTH + 1)
+                                   + ((state | previous) & SEQUENCE_LENGTH)];
+    const int64_t steps = k - text->padding - REGISTER_BITS;
+    const int index_at_start = (int)((index - steps) % SEQUENCE_LENGTH);
+    return index_at_start < 0 ? index_at_start + SEQUENCE_LENGTH : index_at_start;
 }
 
-/* Row of one place: polynomial, place, score, begin, end, known, wrong. expected has room for the
- * bits of the burst and a register more. */
-HOT static void score_place(const Tables *t, const int8_t *value, int bits, uint8_t *expected,
-                        int polynomial, int place, int32_t *row)
+/* Score one index of a burst and write its row. `expected` is scratch memory for the bits of the
+ * burst and of one register. */
+HOT static void score_index(const Tables *t, const int8_t *value, int bits, uint8_t *expected,
+                            int polynomial, int index, int32_t *row)
 {
-    const int32_t *states = t->states + (size_t)polynomial * LENGTH;
-    for (int k = 0, at = place; k < bits; k += REGISTER) {
-        const int32_t ahead = states[at];
-        for (int j = 0; j < REGISTER; j++) expected[k + j] = ahead >> (REGISTER - 1 - j) & 1;
-        at += REGISTER;
-        if (at >= LENGTH) at -= LENGTH;
+    const int32_t *states = t->states + (size_t)polynomial * SEQUENCE_LENGTH;
+    for (int k = 0, state_index = index; k < bits; k += REGISTER_BITS) {
+        const int32_t next_bits = states[state_index];
+        for (int j = 0; j < REGISTER_BITS; j++)
+            expected[k + j] = next_bits >> (REGISTER_BITS - 1 - j) & 1;
+        state_index += REGISTER_BITS;
+        if (state_index >= SEQUENCE_LENGTH) state_index -= SEQUENCE_LENGTH;
     }
-    int32_t total = 0, low = 0, best = 0;
-    int low_at = 0, begin = 0, end = 0;
+    int32_t total = 0, lowest = 0, best = 0;
+    int lowest_at = 0, begin = 0, end = 0;
     for (int k = 0; k < bits; k++) {
-        total += t->gain[expected[k]][value[k] + CERTAIN];
-        low_at = total < low ? k + 1 : low_at;
-        low = total < low ? total : low;
-        const int higher = total - low > best;
-        best = higher ? total - low : best;
-        begin = higher ? low_at : begin;
-        end = higher ? k + 1 : end;
+        total += t->gain[expected[k]][value[k] + MAX_SOFT_BIT];
+        lowest_at = total < lowest ? k + 1 : lowest_at;
+        lowest = total < lowest ? total : lowest;
+        const int is_better = total - lowest > best;
+        best = is_better ? total - lowest : best;
+        begin = is_better ? lowest_at : begin;
+        end = is_better ? k + 1 : end;
     }
     int known = 0, wrong = 0;
     for (int k = begin; k < end; k++) {
-        const int sure = value[k] > t->unknown || value[k] < -t->unknown;
-        known += sure;
-        wrong += sure & ((value[k] > 0) ^ expected[k]);
+        const int is_known = value[k] > t->unknown || value[k] < -t->unknown;
+        known += is_known;
+        wrong += is_known & ((value[k] > 0) ^ expected[k]);
     }
     row[0] = polynomial;
-    row[1] = place;
+    row[1] = index;
     row[2] = best;
     row[3] = begin;
     row[4] = end;
@@ -431,95 +533,128 @@ HOT static void score_place(const Tables *t, const int8_t *value, int bits, uint
     row[6] = wrong;
 }
 
-/* light_places(value, first, states, index, taps, polynomials, match, miss, unknown, follow, steps,
- * fastest, rows) */
+/* Check the table of states and return its number of polynomials. */
+static Py_ssize_t take_states(Call *call, PyObject *states_array, Tables *t)
+{
+    Py_ssize_t polynomials;
+    t->states =
+        input_rows(call, states_array, "states", ITEM_INT32, SEQUENCE_LENGTH, &polynomials);
+    check_range(call, "number of polynomials in states", polynomials, 1, INT_MAX);
+    return polynomials;
+}
+
+/* Identify one burst: its polynomial, index and score as a row. */
+static void identify_burst(const Tables *t, const int8_t *value, int bits, BitWords *text,
+                           uint8_t *expected, int64_t steps, int64_t min_evidence, int32_t *row)
+{
+    write_words(t, value, bits, text);
+    /* The central word suffices for most bursts; for the others, all words are examined. */
+    const int middle = text->words / 2, likely = best_polynomial(t, text, middle);
+    int begin = 0;
+    if (longest_run(t, text, likely, middle, middle + 1, &begin)) {
+        score_index(t, value, bits, expected, likely, index_of_first_bit(t, text, likely, begin),
+                    row);
+        /* A bit outside of the stretch adds at most one bit to the evidence of another index. */
+        const int outside = bits - (row[4] - row[3]);
+        if (row[2] >= min_evidence && row[2] > outside * steps) return;
+    }
+    row[0] = row[1] = -1;
+    for (int k = 2; k < ROW_COLUMNS; k++) row[k] = 0;
+    for (int p = 0; p < t->polynomials; p++) {
+        int32_t trial[ROW_COLUMNS];
+        if (!longest_run(t, text, p, 0, text->words, &begin)) continue;
+        score_index(t, value, bits, expected, p, index_of_first_bit(t, text, p, begin), trial);
+        if (trial[2] > row[2]) memcpy(row, trial, sizeof trial);
+    }
+}
+
 PyObject *light_places(PyObject *self, PyObject *args)
 {
     (void)self;
-    Py_buffer b[8];
-    Tables t;
-    int steps, fastest;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iy*y*iiiiw*", &b[0], &b[1], &b[2], &b[3], &b[4],
-                          &t.polynomials, &b[5], &b[6], &t.unknown, &t.follow, &steps, &fastest,
-                          &b[7]))
+    Call call = {0};
+    PyObject *value_array, *first_array, *states_array, *index_array, *taps_array, *match_array,
+        *miss_array, *rows_array;
+    long long polynomials, unknown, min_run, steps, min_evidence;
+    if (!parse_arguments(args, "OOOOOLOOLLLLO:light_places", &value_array, &first_array,
+                         &states_array, &index_array, &taps_array, &polynomials, &match_array,
+                         &miss_array, &unknown, &min_run, &steps, &min_evidence, &rows_array))
         return NULL;
-    const int8_t *values = b[0].buf;
-    const int64_t *first = b[1].buf;
-    t.states = b[2].buf;
-    t.index = b[3].buf;
-    t.taps = b[4].buf;
-    weigh(&t, b[5].buf, b[6].buf);
-    int32_t *rows = b[7].buf;
-    const Py_ssize_t bursts = b[1].len / (Py_ssize_t)sizeof *first - 1;
-    const int64_t most = most_of(first, bursts);
-    const size_t words = (size_t)(most / 64 + 1);
-    Text text = {.hard = malloc(words * sizeof *text.hard),
-                 .open = malloc(words * sizeof *text.open),
-                 .sums = malloc(words * sizeof *text.sums),
-                 .summed = malloc(words)};
-    uint8_t *expected = malloc((size_t)most + REGISTER);
-    const int stored = text.hard && text.open && text.sums && text.summed && expected;
-    for (Py_ssize_t i = 0; stored && i < bursts; i++) {
-        const int8_t *value = values + first[i];
-        const int bits = (int)(first[i + 1] - first[i]);
-        int32_t *row = rows + 7 * i;
-        if (bits < REGISTER + t.follow) continue;
-        write_text(&t, value, bits, &text);
-        /* The word in the middle tells of most bursts; of the others each word is asked. */
-        const int middle = text.words / 2, likely = likeliest(&t, &text, middle);
-        int at = 0;
-        if (longest_run(&t, &text, likely, middle, middle + 1, &at)) {
-            score_place(&t, value, bits, expected, likely, place_of(&t, &text, likely, at), row);
-            /* A bit outside of its stretch can be worth one bit of evidence for another. */
-            const int outside = bits - (row[4] - row[3]);
-            if (row[2] >= fastest && row[2] > outside * steps) continue;
-        }
-        row[0] = row[1] = -1;
-        for (int k = 2; k < 7; k++) row[k] = 0;
-        for (int p = 0; p < t.polynomials; p++) {
-            int32_t trial[7];
-            if (!longest_run(&t, &text, p, 0, text.words, &at)) continue;
-            score_place(&t, value, bits, expected, p, place_of(&t, &text, p, at), trial);
-            if (trial[2] > row[2]) memcpy(row, trial, sizeof trial);
-        }
+    Tables t;
+    const Bursts b =
+        take_bursts(&call, value_array, first_array, match_array, miss_array, unknown, &t);
+    const Py_ssize_t known = take_states(&call, states_array, &t);
+    t.index = input(&call, index_array, "index", ITEM_INT32, ITEMS(known, SEQUENCE_LENGTH + 1));
+    t.taps = input(&call, taps_array, "taps", ITEM_INT32, known);
+    check_items(&call, "taps", t.taps, ITEM_INT32, known, 0, SEQUENCE_LENGTH);
+    check_range(&call, "polynomials", polynomials, 1, known);
+    check_range(&call, "min_run", min_run, 1, MAX_BURST_BITS);
+    check_range(&call, "steps", steps, 0, INT_MAX);
+    check_range(&call, "min_evidence", min_evidence, INT_MIN, INT_MAX);
+    int32_t *rows = output(&call, rows_array, "rows", ITEM_INT32, ITEMS(b.bursts, ROW_COLUMNS));
+    if (call.failed) return finish_call(&call, 1);
+    t.polynomials = (int)polynomials;
+    t.min_run = (int)min_run;
+    const size_t words = (size_t)(b.max_bits / 64 + 1);
+    BitWords text = {.hard = malloc(words * sizeof *text.hard),
+                     .open = malloc(words * sizeof *text.open),
+                     .sums = malloc(words * sizeof *text.sums),
+                     .summed = malloc(words)};
+    uint8_t *expected = malloc((size_t)b.max_bits + REGISTER_BITS);
+    const int has_memory = text.hard && text.open && text.sums && text.summed && expected;
+    for (Py_ssize_t i = 0; has_memory && i < b.bursts; i++) {
+        const int bits = (int)(b.first[i + 1] - b.first[i]);
+        if (bits >= REGISTER_BITS + t.min_run)
+            identify_burst(&t, b.value + b.first[i], bits, &text, expected, steps, min_evidence,
+                           rows + ROW_COLUMNS * i);
     }
     free(text.hard);
     free(text.open);
     free(text.sums);
     free(text.summed);
     free(expected);
-    return done(b, 8, stored);
+    return finish_call(&call, has_memory);
 }
 
-/* light_expected(value, first, states, polynomial, index, each, reach, match, miss, unknown, rows):
- * the best of each burst's places, and of those up to reach bits beside them. */
+/* Write the best score of each burst among its candidate indices and those up to `search_range`
+ * bits before and after them. */
 PyObject *light_expected(PyObject *self, PyObject *args)
 {
     (void)self;
-    Py_buffer b[8];
-    Tables t;
-    int each, reach;
-    if (!PyArg_ParseTuple(args, "y*y*y*y*y*iiy*y*iw*", &b[0], &b[1], &b[2], &b[3], &b[4], &each,
-                          &reach, &b[5], &b[6], &t.unknown, &b[7]))
+    Call call = {0};
+    PyObject *value_array, *first_array, *states_array, *polynomial_array, *index_array,
+        *match_array, *miss_array, *rows_array;
+    long long candidates, search_range, unknown;
+    if (!parse_arguments(args, "OOOOOLLOOLO:light_expected", &value_array, &first_array,
+                         &states_array, &polynomial_array, &index_array, &candidates,
+                         &search_range, &match_array, &miss_array, &unknown, &rows_array))
         return NULL;
-    const int8_t *values = b[0].buf;
-    const int64_t *first = b[1].buf, *index = b[4].buf;
-    const int32_t *polynomial = b[3].buf;
-    t.states = b[2].buf;
-    weigh(&t, b[5].buf, b[6].buf);
-    int32_t *rows = b[7].buf;
-    const Py_ssize_t bursts = b[1].len / (Py_ssize_t)sizeof *first - 1;
-    uint8_t *expected = malloc((size_t)most_of(first, bursts) + REGISTER);
-    for (Py_ssize_t i = 0; expected && i < bursts; i++)
-        for (int k = 0; k < each; k++)
-            for (int step = -reach; step <= reach; step++) {
-                int32_t trial[7];
-                const int64_t place = (index[i * each + k] + step) % LENGTH;
-                score_place(&t, values + first[i], (int)(first[i + 1] - first[i]), expected,
-                            polynomial[i * each + k], (int)(place < 0 ? place + LENGTH : place),
-                            trial);
-                if (trial[2] > rows[7 * i + 2]) memcpy(rows + 7 * i, trial, sizeof trial);
-            }
+    Tables t;
+    const Bursts b =
+        take_bursts(&call, value_array, first_array, match_array, miss_array, unknown, &t);
+    const Py_ssize_t known = take_states(&call, states_array, &t);
+    check_range(&call, "candidates", candidates, 0, INT_MAX);
+    check_range(&call, "search_range", search_range, 0, SEQUENCE_LENGTH);
+    const Py_ssize_t pairs = ITEMS(b.bursts, candidates);
+    const int32_t *polynomial = input(&call, polynomial_array, "polynomial", ITEM_INT32, pairs);
+    check_items(&call, "polynomial", polynomial, ITEM_INT32, pairs, 0, known - 1);
+    const int64_t *index = input(&call, index_array, "index", ITEM_INT64, pairs);
+    int32_t *rows = output(&call, rows_array, "rows", ITEM_INT32, ITEMS(b.bursts, ROW_COLUMNS));
+    if (call.failed) return finish_call(&call, 1);
+    uint8_t *expected = malloc((size_t)b.max_bits + REGISTER_BITS);
+    for (Py_ssize_t k = 0; expected && k < pairs; k++) {
+        const Py_ssize_t i = k / (Py_ssize_t)candidates;
+        const int64_t centre = index[k] % SEQUENCE_LENGTH;
+        int32_t *row = rows + ROW_COLUMNS * i;
+        for (int64_t step = -search_range; step <= search_range; step++) {
+            int32_t trial[ROW_COLUMNS];
+            const int64_t trial_index = (centre + step) % SEQUENCE_LENGTH;
+            score_index(&t, b.value + b.first[i], (int)(b.first[i + 1] - b.first[i]), expected,
+                        polynomial[k],
+                        (int)(trial_index < 0 ? trial_index + SEQUENCE_LENGTH : trial_index),
+                        trial);
+            if (trial[2] > row[2]) memcpy(row, trial, sizeof trial);
+        }
+    }
     free(expected);
-    return done(b, 8, expected != NULL);
+    return finish_call(&call, expected != NULL);
 }
