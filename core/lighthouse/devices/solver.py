@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,25 +18,23 @@ from locatk.core.geometry import (
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.devices.rigid_solver import DeviceSolution, solve_rigid_devices
 from locatk.core.lighthouse.devices.verification import verify_devices
-from locatk.core.lighthouse.job import LARGEST_MISFIT_M
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.results import (
+    LighthouseFacts,
+    SceneVerification,
+    StationDetection,
+    StationVerification,
+)
 from locatk.core.lighthouse.scene import MarkerVisit, Scene
-from locatk.core.lighthouse.scene.frame import transform_covariance
-from locatk.core.lighthouse.scene.verification import StationCheck
+from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M, transform_covariance
 from locatk.core.robust import robust_sigma
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning, from_json, to_json
 from locatk.core.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from locatk.core.lighthouse.solver import SolveOptions
 
 Array = NDArray[np.float64]
 
 LEAST_MARKERS = 3
-
-COUNTED = ("sweeps", "rejected")
-"""Of a detection: numbers that add up over devices."""
 
 LEAST_PHOTODIODES = 3
 """Photodiodes of known place that fix an orientation."""
@@ -54,20 +50,16 @@ def rigid_devices(sweeps: Sweeps, receivers: Mapping[str, Receiver]) -> dict[str
     }
 
 
-def solve_devices(
-    sweeps: Sweeps, scene: Scene, options: SolveOptions, rigid: Mapping[str, Receiver]
-) -> Solution:
-    """Solve the rigid devices, then the others in the scene of the rigid ones.
+def solve_devices(sweeps: Sweeps, scene: Scene, rigid: Mapping[str, Receiver]) -> Solution:
+    """Estimate the poses of the rigid devices of a recording, in a given scene or their own.
 
     Parameters
     ----------
-    sweeps, scene, options
+    sweeps, scene
         As for :func:`~locatk.core.lighthouse.solver.solve`.
     rigid : mapping of str to Receiver
         By device; of at least one device of the recording.
     """
-    from locatk.core.lighthouse.solver import solve
-
     answer = solve_rigid_devices(sweeps, rigid, scene)
     if not scene.stations and scene.markers:
         answer = _on_markers(answer, scene.frame)
@@ -77,18 +69,12 @@ def solve_devices(
             answer.notes.append("distances are not used")
     checks = verify_devices(sweeps, rigid, answer)
     if checks:
-        answer.facts["verification"] = {
-            "held_out": bool(scene.stations),
-            "moments": sum(check.moments for check in checks),
-            "stations": [check.as_facts() for check in checks],
-        }
-    own = _solution(answer, options, checks)
-    numbers = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
-    left = np.flatnonzero(np.isin(sweeps.device, numbers))
-    if len(left) == 0:
-        return own
-    others = solve(sweeps.take(left), answer.scene, options)
-    return _together(own, others, tuple(rigid))
+        answer.facts["verification"] = to_json(
+            SceneVerification(
+                bool(scene.stations), sum(check.epochs for check in checks), tuple(checks)
+            )
+        )
+    return _solution(answer, checks)
 
 
 def _on_markers(answer: DeviceSolution, frame: str) -> DeviceSolution:
@@ -98,7 +84,7 @@ def _on_markers(answer: DeviceSolution, frame: str) -> DeviceSolution:
     """
     known, seen = [], []
     for marker in answer.scene.markers:
-        for sighting in marker.sightings:
+        for sighting in marker.visits:
             place = _stood(sighting, answer.trajectories)
             if place is not None:
                 known.append(marker.position)
@@ -115,7 +101,7 @@ def _on_markers(answer: DeviceSolution, frame: str) -> DeviceSolution:
         return answer
     misfit = float(np.sqrt(np.mean(np.sum((to.apply(seen) - known) ** 2, axis=1))))
     notes = [*answer.notes]
-    if misfit > LARGEST_MISFIT_M:
+    if misfit > MAX_MARKER_MISFIT_M:
         notes.append(
             f"the markers are {1e3 * misfit:.0f} mm (rms) from where the device stood: a marker is "
             "measured wrong, or the scene is"
@@ -161,9 +147,7 @@ def _stood(sighting: MarkerVisit, trajectories: tuple[Trajectory, ...]) -> Array
     return None
 
 
-def _solution(
-    answer: DeviceSolution, options: SolveOptions, checks: tuple[StationCheck, ...]
-) -> Solution:
+def _solution(answer: DeviceSolution, checks: tuple[StationVerification, ...]) -> Solution:
     """What the rigid devices alone say."""
     checked = {check.channel: check for check in checks}
     rows: list[dict[str, object]] = []
@@ -186,29 +170,11 @@ def _solution(
             rows[-1]["verification_m"] = checked[channel].residual_m
     return Solution(
         "lighthouse",
-        options.method,
+        "bundle",
         answer.trajectories,
         dict(answer.rejected),
-        rows,
+        [from_json(StationDetection, row) for row in rows],
         answer.scene,
-        tuple(dict.fromkeys(answer.notes)),
-        dict(answer.facts),
-    )
-
-
-def _together(rigid: Solution, others: Solution, names: tuple[str, ...]) -> Solution:
-    """One solution of two over the same scene."""
-    rejected = dict(Counter(rigid.rejected) + Counter(others.rejected))
-    rows = {row["channel"]: dict(row) for row in others.detections}
-    for row in rigid.detections:
-        both = rows.setdefault(row["channel"], {**row, **dict.fromkeys(COUNTED, 0)})
-        both.update({name: both[name] + row[name] for name in COUNTED})
-    points = [t for t in others.trajectories if t.device not in names]
-    return replace(
-        others,
-        trajectories=(*rigid.trajectories, *points),
-        rejected=rejected,
-        detections=[{**rows[c], "station": k} for k, c in enumerate(sorted(rows))],
-        notes=tuple(dict.fromkeys((*rigid.notes, *others.notes))),
-        facts={**others.facts, "rigid": rigid.facts},
+        facts=from_json(LighthouseFacts, answer.facts),
+        warnings=tuple(SolverWarning("device", note) for note in answer.notes),
     )

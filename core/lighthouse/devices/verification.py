@@ -19,8 +19,8 @@ from locatk.core.lighthouse.devices.device_sweeps import select_device_sweeps
 from locatk.core.lighthouse.devices.rigid_solver import DeviceSolution, solve_rigid_devices
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.results import StationVerification
 from locatk.core.lighthouse.scene import Station
-from locatk.core.lighthouse.scene.verification import StationCheck
 from locatk.core.robust import robust_sigma
 from locatk.core.trajectory import Trajectory
 
@@ -37,7 +37,7 @@ NEAR_NS = 10_000_000
 
 def verify_devices(
     sweeps: Sweeps, receivers: Mapping[str, Receiver], answer: DeviceSolution
-) -> tuple[StationCheck, ...]:
+) -> tuple[StationVerification, ...]:
     """Check each station of a solved scene; empty where there is only one.
 
     Parameters
@@ -65,10 +65,10 @@ def _check(
     answer: DeviceSolution,
     channel: int,
     middles: NDArray[np.int64],
-) -> StationCheck:
+) -> StationVerification:
     """One station against the others."""
     others = tuple(s for s in answer.scene.stations if s.channel != channel)
-    none = StationCheck(channel, "others", 0, None, None, None, None, None)
+    none = StationVerification(channel, "others", 0, None, None, None, None, None)
     try:
         without = solve_rigid_devices(
             sweeps.take(sweeps.channel != channel),
@@ -95,7 +95,7 @@ def _check(
     known = np.isfinite(off)
     if not np.any(known):
         return none
-    return StationCheck(
+    return StationVerification(
         channel,
         "others",
         int(np.count_nonzero(known)),
