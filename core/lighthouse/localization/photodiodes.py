@@ -37,8 +37,8 @@ from locatk.core.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 MAX_RANGE_M = 20.0
-"""Largest distance at which a base station is received, in metres: three times the 7 m that Valve
-specifies for a play area of Lighthouse 2.0, with a margin for sensitive receivers."""
+"""Largest plausible distance from the nearest base station, in metres. A position beyond is one
+where light planes of wrong sweeps happen to intersect."""
 
 MAX_INCONSISTENT_FRACTION = 0.2
 """Fraction of epochs that contradict the scene from which a warning is given. Occlusions,
@@ -319,7 +319,7 @@ def restore_swapped_sweeps(
         trial = estimate_positions(
             angles_of(replace(epochs, counts=counts)), *stations, floor_z=floor_z
         )
-        # Half the gate, because an exchange must fit better than what it replaces only just.
+        # Half of the gate, because a wrong exchange can fit just within it by chance.
         is_right = np.isfinite(trial.position[:, 0])
         is_right &= trial.max_residual < INLIER_GATE_RAD / 2
         rows = wrong[is_right]

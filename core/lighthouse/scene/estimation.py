@@ -224,7 +224,7 @@ def select_stations(
 def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
     """Resect the station with the most markers on a floor."""
     known, observed = marker_angles(prior.markers, epochs, angles_of(epochs))
-    is_complete = np.isfinite(observed).all(axis=2)
+    is_complete = np.all(np.isfinite(observed), axis=2)
     column = int(np.argmax(np.count_nonzero(is_complete, axis=0)))
     epochs, rejected = select_stations(epochs, [column], "other_station")
     known, observed = known[is_complete[:, column]], observed[is_complete[:, column]][:, [column]]

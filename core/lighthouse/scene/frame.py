@@ -185,7 +185,7 @@ def _scale(
     odometry: Sequence[Trajectory],
 ) -> tuple[float, str, list[SolverWarning]]:
     """Return metres per unit of a state, their source, and warnings."""
-    warnings = []
+    warnings: list[SolverWarning] = []
     if prior.distances:
         scale = scale_from_distances(
             lambda observed: locate_with(state, planar, observed).position,

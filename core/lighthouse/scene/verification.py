@@ -197,7 +197,7 @@ def inconsistent_station_warnings(
         SolverWarning(
             "wrong_station",
             f"the station on channel {station.channel} disagrees with the others by "
-            f"{1e3 * station.residual_rad:.1f} mrad, and these agree without it: it was moved since "
-            "the scene was estimated, or is received by reflection",
+            f"{1e3 * station.residual_rad:.1f} mrad, and these agree without it: it was moved "
+            "since the scene was estimated, or is received by reflection",
         ),
     )

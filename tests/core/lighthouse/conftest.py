@@ -269,7 +269,7 @@ def join(*parts: Sweeps) -> Sweeps:
 
 
 def markers_of(world: tuple[Lamp, ...], places: Array) -> tuple[Marker, ...]:
-    """Markers whose sightings are the counts that the world shows there."""
+    """Markers whose visits are the counts that the world shows there."""
     found = []
     for k, place in enumerate(np.asarray(places, float)):
         counts = {

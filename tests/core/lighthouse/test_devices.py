@@ -81,7 +81,7 @@ def test_the_papers_method_says_that_it_knows_no_bodies(world: Any) -> None:
     paper = SolveOptions(method="paper", scene="two-planar")
     markers = Scene(markers=world.markers_of(lamps, world.square))
     solution = solve(drive.sweeps, markers, paper, receivers={"robot": BODY})
-    assert any("knows no rigid devices" in note for note in solution.notes)
+    assert any(w.code == "rigid_devices_ignored" for w in solution.warnings)
 
 
 PLACES = np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.2], [-0.5, -0.5, 0.0], [0.5, -0.5, 0.1]])
@@ -130,8 +130,8 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_body(world: Any) -> None
         assert np.linalg.norm(station.position - lamp.position) < 0.03
     (track,) = solution.trajectories
     assert track.frame == "floor"
-    first = (track.time_ns > markers[0].sightings[0].start_ns) & (
-        track.time_ns < markers[0].sightings[0].end_ns
+    first = (track.time_ns > markers[0].visits[0].start_ns) & (
+        track.time_ns < markers[0].visits[0].end_ns
     )
     assert np.linalg.norm(np.median(track.position[first], axis=0) - PLACES[0]) < 3e-3
 
