@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -160,6 +161,26 @@ def test_the_station_that_contradicts_is_left_out(world: Any) -> None:
     assert repaired.max_residual[20] > 2e-3
     others = np.delete(np.arange(50), [10, 20])
     np.testing.assert_array_equal(repaired.position[others], estimates.position[others])
+
+
+def test_a_repair_that_nothing_checks_is_none(world: Any) -> None:
+    """Without a third of the stations, two planes and a single one fit by themselves."""
+    plain = (world.Plane(tilt=-0.049), world.Plane(tilt=0.046))
+    lamps = tuple(replace(lamp, planes=plain) for lamp in world.lamps(1, 2, 5))
+    angles = np.stack([lamp.angles(world.curve(5, flat=False)) for lamp in lamps], axis=1)
+    angles[2, 1] += 0.05
+    stations = stack(factory_stations(world, lamps))
+    whole = leave_out_worst_station(
+        angles, estimate_positions(angles, *stations), stations, None, 2e-3
+    )
+    assert whole[1] == 1
+    # Six planes: redundancy 3. With the second plane of two stations missing, four are left after
+    # the repair of one, or three, which always intersect.
+    angles[2, 2, 1] = np.nan
+    estimates = estimate_positions(angles, *stations)
+    forced = replace(estimates, redundancy=estimates.redundancy + 1)
+    _, count = leave_out_worst_station(angles, forced, stations, None, 2e-3)
+    assert count == 0
 
 
 def test_two_stations_cannot_outvote_each_other(world: Any) -> None:

@@ -15,7 +15,6 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, MODEL_SIGMA_RA
 from locatk.core.lighthouse.scene.bundle_adjustment import BundleAdjustment, BundleState
 from locatk.core.lighthouse.scene.registration import (
     MAX_RELATIVE_SIGMA,
-    MAX_ROTATION_DISAGREEMENT_RAD,
     MIN_CROSSING_ANGLE_RAD,
     StationRegistration,
     consistent_median,
@@ -86,16 +85,15 @@ def test_two_pairs_that_agree_place_a_station(triangle: Triangle) -> None:
     np.testing.assert_allclose(registration.rotations[2], triangle.lamps[2].rotation, atol=1e-3)
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.2])
+@pytest.mark.parametrize(("rotated_deg", "is_combined"), [(4.0, True), (6.0, False)])
 def test_two_pairs_that_disagree_on_the_rotation_are_not_combined(
-    triangle: Triangle, factor: float
+    triangle: Triangle, rotated_deg: float, is_combined: bool
 ) -> None:
     """One of two pairs with another rotation is wrong, and so may its direction be."""
-    rotated = factor * MAX_ROTATION_DISAGREEMENT_RAD
     registration = triangle.registration()
-    failed = registration.register_all(triangle.pairs(rotated=rotated))
-    assert set(failed) == (set() if factor < 1 else {2})
-    assert registration.registered == ([0, 1, 2] if factor < 1 else [0, 1])
+    failed = registration.register_all(triangle.pairs(rotated=np.radians(rotated_deg)))
+    assert set(failed) == (set() if is_combined else {2})
+    assert registration.registered == ([0, 1, 2] if is_combined else [0, 1])
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
@@ -117,6 +115,22 @@ def test_a_distance_needs_three_keyframes(triangle: Triangle, count: int) -> Non
     assert set(failed) == (set() if count == 3 else {2})
     if failed:
         assert "distance is unknown" in failed[2]
+
+
+def test_keyframes_of_the_pair_alone_give_no_distance(triangle: Triangle) -> None:
+    """Two stations locate a keyframe in any scale if nothing checks its position."""
+    rows = np.arange(1, 31, 3)
+    triangle.angles[rows] = triangle.every_angle[rows]
+    triangle.rays[rows] = triangle.every_ray[rows]
+    registration = triangle.registration()
+    estimates = registration.estimate_keyframes()
+    pair = triangle.pair(0, 2)
+    distance = registration._distance(pair, 0, rows, estimates)
+    assert distance == pytest.approx(
+        np.linalg.norm(triangle.lamps[2].position - triangle.lamps[0].position), rel=1e-3
+    )
+    unchecked = replace(estimates, redundancy=np.zeros(90, np.int64))
+    assert registration._distance(pair, 0, rows, unchecked) is None
 
 
 def test_distances_that_disagree_give_none() -> None:
@@ -145,3 +159,19 @@ def test_an_intersection_behind_a_station_is_none() -> None:
     away = np.array([[0.0, -1.0, 0.0], [-np.sqrt(0.5), np.sqrt(0.5), 0.0]])
     assert intersect_lines(origins, away) is None
     assert intersect_lines(origins, away * [[1, -1, 1], [1, 1, 1]]) is not None
+
+
+@pytest.mark.parametrize(("size_m", "is_registered"), [(0.02, False), (0.5, True)])
+def test_keyframes_in_a_small_region_do_not_register_a_station(
+    triangle: Triangle, size_m: float, is_registered: bool
+) -> None:
+    """Keyframes of all three stations within 2 cm leave the position of the third uncertain."""
+    triangle.points = np.array([0.2, 0.1, 0.4]) + size_m * np.random.default_rng(0).uniform(
+        -0.5, 0.5, (30, 3)
+    )
+    angles = np.stack([lamp.angles(triangle.points) for lamp in triangle.lamps], axis=1)
+    local = [(triangle.points - lamp.position) @ lamp.rotation for lamp in triangle.lamps]
+    triangle.angles = angles
+    triangle.rays = np.stack([p / p[:, :1] for p in local], axis=1)
+    failed = triangle.registration().register_all(lambda i, j: None)
+    assert set(failed) == (set() if is_registered else {2})
