@@ -59,7 +59,7 @@ def dumps_scene(scene: Scene) -> str:
         {
             "name": marker.name,
             "position_mm": Shifted(marker.position, _MM),
-            "sightings": [_sighting_table(sighting) for sighting in marker.sightings] or None,
+            "sightings": [_sighting_table(sighting) for sighting in marker.visits] or None,
         }
         for marker in scene.markers
     ]
@@ -242,7 +242,7 @@ def _marker(table: Table) -> Marker:
     marker = Marker(
         name=table.text("name"),
         position=table.array("position_mm", (3,), shift=_METRES),
-        sightings=tuple(_sighting(sighting) for sighting in table.tables("sightings")),
+        visits=tuple(_sighting(sighting) for sighting in table.tables("sightings")),
     )
     table.end()
     return marker

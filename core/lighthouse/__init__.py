@@ -1,4 +1,4 @@
-"""Lighthouse V2: from the counts of sweeping light planes to poses."""
+"""Lighthouse V2: poses of photodiodes and rigid devices from sweeping light planes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["SolveOptions", "solve"]
 
 
 def __getattr__(name: str) -> Any:
-    # scipy-sized imports belong to the call, not to `import locatk.core.lighthouse`.
+    # The solver takes long to import, and many modules need only the data of this package.
     if name in __all__:
         from locatk.core.lighthouse import solver
 

@@ -36,7 +36,3 @@ MIN_INLIER_GATE_RAD = 1.5e-3
 """Smallest inlier gate [rad]: residuals up to this size are explained by what a generic
 calibration leaves unmodelled (see :data:`~locatk.core.lighthouse.calibration.MODEL_SIGMA_RAD`),
 also in a recording with little noise."""
-
-MAX_MARKER_MISFIT_M = 0.02
-"""Maximum rms distance of the markers from the positions that the scene assigns to them, in metres,
-above which a warning is given: ten times what hand measurement and a generic calibration leave."""

@@ -1,6 +1,6 @@
 """Typed results of the Lighthouse solver: detections per station, and facts of a run.
 
-The names of JSON keys are stable; where a field has another name, its key is declared beside it.
+The names of JSON keys are stable. If a field has another name, its key is declared with it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ class StationDetection:
     Attributes
     ----------
     station : int
-        Number of the station in the recording, from 0 in ascending order of the channel.
+        Index of the station in the recording, from 0 in ascending order of the channel.
     channel : int
         1 to 16.
     id : str or None
@@ -97,7 +97,7 @@ class SceneVerification:
 
 @dataclass(frozen=True)
 class TwoViewCandidate:
-    """One arrangement of two stations that a homography allows.
+    """Arrangement of two stations that a homography allows.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class LighthouseFacts:
         Its iterations.
     links : tuple of StationPairLink
     angle_sigma_rad : float
-        Standard deviation of a rotor angle, as the recording shows it.
+        Standard deviation of a rotor angle, estimated from the recording.
     lasting_angle_sigma_rad : float
         Its part that repeats from rotation to rotation.
     calibration_sigma_rad : float
@@ -178,11 +178,11 @@ class LighthouseFacts:
         Figures of the rigid devices, if single photodiodes were solved as well.
     """
 
-    planar_decided_by: str | None = None
     plane_fraction: float | None = field(default=None, metadata={"json": "plane_share"})
     plane_median_rad: float | None = None
-    candidates: tuple[TwoViewCandidate, ...] | None = None
+    planar_decided_by: str | None = None
     candidate_decided_by: str | None = field(default=None, metadata={"json": "reading_decided_by"})
+    candidates: tuple[TwoViewCandidate, ...] | None = None
     bundle_points: int | None = None
     bundle_iterations: int | None = None
     planar: bool | None = None
@@ -194,12 +194,12 @@ class LighthouseFacts:
     scene_angle_sigma_rad: float | None = None
     iterations: int | None = None
     links: tuple[StationPairLink, ...] | None = None
+    restored_swapped_epochs: int | None = field(
+        default=None, metadata={"json": "moments_with_swapped_sweeps_restored"}
+    )
     angle_sigma_rad: float | None = None
     lasting_angle_sigma_rad: float | None = None
     calibration_sigma_rad: float | None = None
     station_residual_rad: dict[str, float] | None = None
-    restored_swapped_epochs: int | None = field(
-        default=None, metadata={"json": "moments_with_swapped_sweeps_restored"}
-    )
     verification: SceneVerification | None = None
     rigid: LighthouseFacts | None = None

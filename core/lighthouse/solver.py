@@ -1,7 +1,8 @@
-"""From sweeps to poses: the road that a session of Lighthouse sweeps takes."""
+"""Pipeline of the Lighthouse solver, from sweeps to poses."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,32 +14,45 @@ from locatk.core.lighthouse.devices.solver import (
     select_rigid_receivers,
     solve_devices,
 )
-from locatk.core.lighthouse.epochs import group_epochs
-from locatk.core.lighthouse.job import Job
-from locatk.core.lighthouse.localization import photodiodes as poses
+from locatk.core.lighthouse.epochs import Epochs, group_epochs, rotor_angles
+from locatk.core.lighthouse.localization.photodiodes import detect_stations, track_photodiodes
+from locatk.core.lighthouse.published.scene import solve_published
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
+from locatk.core.lighthouse.results import LighthouseFacts
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.solution import Solution, SolverWarning, from_json, to_json
+from locatk.core.lighthouse.scene.estimation import (
+    SCENE_KINDS,
+    SceneEstimate,
+    estimate_scene,
+    resolve_scene_kind,
+    use_given_scene,
+)
+from locatk.core.lighthouse.scene.model import stack_stations
+from locatk.core.lighthouse.scene.verification import (
+    inconsistent_station_warnings,
+    select_verification_epochs,
+    verify_scene,
+)
+from locatk.core.solution import Solution, SolverWarning, to_json
 from locatk.core.trajectory import Trajectory
 
-SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 METHODS = ("bundle", "paper")
 
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """What the user may choose.
+    """Options of the solver.
 
     Attributes
     ----------
     method : str
-        ``"bundle"`` or ``"paper"``.
+        ``"bundle"`` or ``"paper"`` (the published method).
     scene : str
-        One of :data:`SCENES`; ``"auto"`` decides from stations and data.
+        One of :data:`~locatk.core.lighthouse.scene.estimation.SCENE_KINDS`; ``"auto"`` decides
+        from the stations and the data.
     seed : int
-        Of the random samples.
+        Seed of the random samples.
     """
 
     method: str = "bundle"
@@ -46,13 +60,13 @@ class SolveOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, value, known in (
+        for name, value, choices in (
             ("method", self.method, METHODS),
-            ("scene", self.scene, SCENES),
+            ("scene", self.scene, SCENE_KINDS),
         ):
-            if value not in known:
+            if value not in choices:
                 raise InputError(
-                    f"unknown {name} {value!r}", hint=f"choose one of {', '.join(known)}"
+                    f"unknown {name} {value!r}", hint=f"choose one of {', '.join(choices)}"
                 )
 
 
@@ -63,20 +77,20 @@ def solve(
     odometry: Sequence[Trajectory] = (),
     receivers: Mapping[str, Receiver] | None = None,
 ) -> Solution:
-    """Poses of all photodiodes and rigid devices in a recording.
+    """Estimate the poses of all photodiodes and rigid devices of a recording.
 
     Parameters
     ----------
     sweeps : Sweeps
     scene : Scene, optional
-        With stations: they are used as they are. Without: they are solved first; markers
+        With stations: they are used as they are. Without: they are estimated first; markers
         and distances then fix frame and scale.
     options : SolveOptions, optional
     odometry : sequence of Trajectory
-        For the scale, where the scene has neither markers nor distances.
+        Determines the scale if the scene has neither markers nor distances.
     receivers : mapping of str to Receiver, optional
-        By device. Devices with three photodiodes or more of known place get full poses, and
-        the scene comes from them where it has no stations; the others are located in it.
+        By device. Devices with three or more photodiodes of known position get full poses, and
+        a scene without stations is estimated from them. The others are located in that scene.
 
     Returns
     -------
@@ -86,77 +100,129 @@ def solve(
     Raises
     ------
     DegenerateError
-        The recording does not determine the scene; the message says what is missing.
+        The recording does not determine the scene. The message states what is missing.
+    InputError
+        The options contradict the scene, or a marker names an unknown device.
     """
     scene = scene or Scene()
     options = options or SolveOptions()
     rigid = select_rigid_receivers(sweeps, receivers) if receivers else {}
     if rigid and options.method == "bundle":
-        return _solve_with_devices(sweeps, scene, options, rigid)
-    solution = _solve_points(sweeps, scene, options, odometry)
-    if not rigid:
-        return solution
-    note = "the paper's method knows no rigid devices: each photodiode is solved by itself"
-    return replace(solution, notes=(*solution.notes, note))
+        solution = solve_devices(sweeps, rigid, scene)
+        others = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
+        rows = np.flatnonzero(np.isin(sweeps.device, others))
+        if len(rows):
+            photodiodes = _solve_photodiodes(sweeps.take(rows), solution.artifact, options)
+            solution = merge_solutions(solution, photodiodes)
+    else:
+        solution = _solve_photodiodes(sweeps, scene, options, odometry)
+        if rigid:
+            warning = SolverWarning(
+                "rigid_devices_ignored",
+                "the published method does not support rigid devices: each photodiode is solved "
+                "separately",
+            )
+            solution = replace(solution, warnings=(*solution.warnings, warning))
+    return _in_json_form(solution)
 
 
-def _solve_with_devices(
-    sweeps: Sweeps, scene: Scene, options: SolveOptions, rigid: Mapping[str, Receiver]
+def _solve_photodiodes(
+    sweeps: Sweeps, scene: Scene, options: SolveOptions, odometry: Sequence[Trajectory] = ()
 ) -> Solution:
-    """Solve the rigid devices, then the other photodiodes in the scene of the rigid devices."""
-    solution = solve_devices(sweeps, rigid, scene)
-    numbers = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
-    is_single = np.isin(sweeps.device, numbers)
-    if np.any(is_single):
-        photodiodes = solve(sweeps.take(is_single), solution.artifact, options)
-        solution = merge_solutions(solution, _typed(photodiodes))
-    return _untyped(solution)
-
-
-# At the merge with typed results: drop _typed and _untyped, their calls and their imports.
-
-
-def _typed(solution: Solution) -> Solution:
-    return replace(
-        solution,
-        detections=[from_json(StationDetection, row) for row in solution.detections],
-        facts=from_json(LighthouseFacts, solution.facts),
-        notes=(),
-        warnings=tuple(SolverWarning("", note) for note in solution.notes),
-    )
-
-
-def _untyped(solution: Solution) -> Solution:
-    return replace(
-        solution,
-        detections=to_json(solution.detections),
-        facts=to_json(solution.facts),
-        notes=tuple(warning.message for warning in solution.warnings),
-    )
-
-
-def _solve_points(
-    sweeps: Sweeps, scene: Scene, options: SolveOptions, odometry: Sequence[Trajectory]
-) -> Solution:
-    """Poses of photodiodes, each by itself."""
+    """Estimate the trajectory of each photodiode, in the given scene or an estimated one."""
     epochs = group_epochs(sweeps)
+    _require_sweeps(epochs)
+    if scene.stations:
+        estimate = use_given_scene(epochs, scene)
+        if options.method == "paper":
+            raise InputError(
+                "the published method estimates its own scene and takes none with stations",
+                hint="leave --artifact or --method paper out",
+            )
+    elif options.method == "paper":
+        kind = resolve_scene_kind(options.scene, scene, epochs)
+        return solve_published(epochs, scene, kind)
+    else:
+        estimate = estimate_scene(
+            epochs, scene, kind=options.scene, odometry=odometry, seed=options.seed
+        )
+    return _locate_and_verify(estimate, epochs.rejected, options.method)
+
+
+def _locate_and_verify(
+    estimate: SceneEstimate, rejected_sweeps: Mapping[str, int], method: str
+) -> Solution:
+    """Locate all epochs in a scene, and verify the scene."""
+    scene = estimate.scene
+    tracks = track_photodiodes(estimate.epochs, scene)
+    channels = tracks.epochs.channels.tolist()
+    stations = {c: s for c in channels if (s := scene.station(c)) is not None}
+    verification = None
+    # A floor homography has no pose to verify.
+    if not (len(stations) == 1 and stations[channels[0]].floor_map is not None):
+        angles, held_out = estimate.verification_angles, estimate.held_out
+        if angles is None:
+            angles = rotor_angles(tracks.epochs)
+            angles, held_out = angles[select_verification_epochs(angles)], True
+        verification = verify_scene(
+            angles,
+            channels,
+            stack_stations(list(stations.values())),
+            floor_z=scene.floor_z if scene.planar else None,
+            held_out=held_out,
+        )
+    return Solution(
+        "lighthouse",
+        method,
+        tracks.trajectories,
+        _add_counts(rejected_sweeps, estimate.rejected, tracks.rejected),
+        detect_stations(
+            tracks.epochs, stations, tracks.estimates.residual, tracks.is_accepted, verification
+        ),
+        scene,
+        facts=replace(
+            estimate.facts,
+            restored_swapped_epochs=tracks.restored_epochs or None,
+            angle_sigma_rad=tracks.angle_sigma_rad,
+            calibration_sigma_rad=tracks.calibration_sigma_rad,
+            verification=verification,
+        ),
+        warnings=(
+            *estimate.warnings,
+            *tracks.warnings,
+            *inconsistent_station_warnings(verification),
+        ),
+    )
+
+
+def _require_sweeps(epochs: Epochs) -> None:
+    """Raise an error if a recording has no usable sweep."""
     if len(epochs) == 0 or len(epochs.channels) == 0:
         raise DegenerateError(
             "the recording has no usable sweep",
-            hint="`locatk info` shows what it has; rejected: "
+            hint="`locatk info` shows its contents; rejected: "
             + (", ".join(f"{n} {r}" for r, n in epochs.rejected.items()) or "nothing"),
         )
-    job = Job(epochs, scene, options, odometry)
-    if scene.stations:
-        known = job.known_scene()
-        if options.method == "paper":
-            raise InputError(
-                "the paper's method solves its own scene and takes none with stations",
-                hint="leave --artifact or --method paper out",
-            )
-        return poses.answer(job, known)
-    if options.method == "paper":
-        from locatk.core.lighthouse.published.scene_solver import solve_as_paper
 
-        return solve_as_paper(job)
-    return poses.answer(job, job.solve_scene())
+
+def _add_counts(*tables: Mapping[str, int]) -> dict[str, int]:
+    """Add numbers by reason, and drop those that are zero."""
+    total: Counter[str] = Counter()
+    for table in tables:
+        total.update(table)
+    return {reason: count for reason, count in total.items() if count}
+
+
+def _in_json_form(solution: Solution) -> Solution:
+    """Return a solution with unique warnings, and with facts and detections in their JSON form.
+
+    Readers of a solution still expect tables instead of dataclasses, and notes beside warnings.
+    """
+    facts: LighthouseFacts = solution.facts
+    return replace(
+        solution,
+        facts=to_json(facts),
+        detections=[to_json(detection) for detection in solution.detections],
+        notes=tuple(dict.fromkeys(warning.message for warning in solution.warnings)),
+        warnings=tuple(dict.fromkeys(solution.warnings)),
+    )

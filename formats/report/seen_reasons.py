@@ -53,7 +53,7 @@ def _lighthouse() -> dict[str, Reason]:
         "moment_inconsistent": f"The planes of the moment miss their meeting point by more than "
         f"{noise.INLIER_GATE_SIGMAS:g} times the noise of the recording (at most "
         f"{1e3 * noise.INLIER_GATE_RAD:g} mrad).",
-        "moment_out_of_reach": f"The position would be farther than {poses.REACH_M:g} m from "
+        "moment_out_of_reach": f"The position would be farther than {poses.MAX_RANGE_M:g} m from "
         "every station, where none is received.",
         "moment_jumps": "No second measurement checks the position, and it leaves the path of its "
         "device.",

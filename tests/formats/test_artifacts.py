@@ -180,7 +180,7 @@ second.counts.1 = [48333, 88779]
     assert scene.scale == "unit"
     assert scene.planar is None
     assert scene.markers[0].position.tolist() == [0.4, 0.6005, 0.0]
-    (sighting,) = scene.markers[0].sightings
+    (sighting,) = scene.markers[0].visits
     assert sighting.start_ns == 1690472062_700963000
     assert sighting.end_ns == 1690472063_000000000
     assert scene.distances[0].distance == 0.8

@@ -38,7 +38,7 @@ from locatk.core.lighthouse.devices.tracking import (
     track_devices,
 )
 from locatk.core.lighthouse.devices.verification import verify_devices
-from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD, MAX_MARKER_MISFIT_M
+from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.results import (
@@ -48,7 +48,7 @@ from locatk.core.lighthouse.results import (
     StationVerification,
 )
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
-from locatk.core.lighthouse.scene.frame import transform_covariance
+from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M, transform_covariance
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -307,7 +307,7 @@ def align_to_markers(
     """
     marker_positions, device_positions = [], []
     for marker in markers:
-        for visit in marker.sightings:
+        for visit in marker.visits:
             position = _visit_position(visit, trajectories)
             if position is not None:
                 marker_positions.append(marker.position)

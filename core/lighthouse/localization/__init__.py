@@ -1,1 +1,1 @@
-"""Positions of single photodiodes in a known scene."""
+"""Localization of single photodiodes in a known scene."""

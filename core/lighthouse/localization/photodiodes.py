@@ -1,23 +1,24 @@
-"""Poses of all moments in a scene, and why some have none.
+"""Trajectories of single photodiodes in a scene, and the reasons for rejected epochs.
 
-Contradictions are resolved where the data allow it (swapped sweeps, a station that lies) and
-rejected where they do not; each is counted under its reason.
+Contradictions are resolved if the data allow it: sweeps of two stations that a report exchanged
+are restored, and a single station that contradicts all others is left out. Other epochs that
+contradict themselves or the trajectory of their device are rejected and counted by reason.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.epochs import Epochs, rotor_angles
-from locatk.core.lighthouse.localization.floor_map import estimate_floor_positions
-from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
+from locatk.core.lighthouse.localization.positions import (
+    PositionEstimates,
+    estimate_floor_positions,
+    estimate_positions,
+)
 from locatk.core.lighthouse.noise import (
     ANGLE_SIGMA_RAD,
     CALIBRATION_SIGMA_RAD,
@@ -25,285 +26,401 @@ from locatk.core.lighthouse.noise import (
     INLIER_GATE_SIGMAS,
     MIN_INLIER_GATE_RAD,
 )
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
+from locatk.core.lighthouse.results import SceneVerification, StationDetection
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.scene.selection import spread_evenly
-from locatk.core.lighthouse.scene.verification import MOST, StationCheck, verify, wrong_station
+from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
 from locatk.core.robust import robust_sigma
-from locatk.core.solution import Solution
+from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from locatk.core.lighthouse.job import Job
-
 Array = NDArray[np.float64]
-Stations = tuple[Array, Array, tuple[Calibration, ...]]
-"""Positions (s, 3), rotations (s, 3, 3) and calibrations of the stations of a recording."""
 
-REACH_M = 20.0
-"""Base stations are not received farther away, in metres."""
+MAX_RANGE_M = 20.0
+"""Largest plausible distance from the nearest base station, in metres. A position beyond is one
+where light planes of wrong sweeps happen to intersect."""
 
-FEW = 20_000
-"""Moments among which those to verify a known scene with are looked for, at most."""
+MAX_INCONSISTENT_FRACTION = 0.2
+"""Fraction of epochs that contradict the scene from which a warning is given. Occlusions,
+reflections and fast robots cost a few per cent."""
 
-CONTRADICTED = 0.2
-"""Share of moments that contradict the scene from which on it needs a word: occlusions,
-reflections and fast robots cost a few in a hundred."""
+SWAPPED_PLANES = ((0,), (1,), (0, 1))
+"""Planes that a report may have exchanged between two stations: one of them, or both."""
+
+JUMP_WINDOW_EPOCHS = 5
+"""Length of the window of the jump filter. Two wrong positions in a row stay a minority in it."""
+
+MAX_JUMP_RATIO = 5.0
+"""Deviation from the median of the window, relative to the usual step or deviation, from which a
+position is a jump."""
+
+MAX_JUMP_WINDOW_S = 2.0
+"""Longest window of the jump filter: after a pause of the recording a device may be anywhere."""
+
+USUAL_MOTION_PERCENTILE = 75
+"""Percentile of steps and deviations that counts as usual: above that of a device at a standstill
+for part of the recording, below the jumps."""
 
 
-def answer(job: Job, scene: Scene) -> Solution:
-    """Locate every moment in the scene, and say what was left out."""
-    stations = [s for c in job.epochs.channels if (s := scene.station(int(c))) is not None]
-    rig = (
-        np.stack([s.position for s in stations]),
-        np.stack([s.rotation for s in stations]),
-        tuple(s.calibration for s in stations),
-    )
-    floor = scene.floor_z if scene.planar else None
-    floor_map = stations[0].floor_map if len(stations) == 1 else None
+@dataclass(frozen=True)
+class PhotodiodeTracks:
+    """Trajectories of all photodiodes of a recording, with their figures.
+
+    Attributes
+    ----------
+    trajectories : tuple of Trajectory
+        One per device of the epochs; accepted positions only.
+    epochs : Epochs
+        Epochs with restored sweeps.
+    estimates : PositionEstimates
+        Of all m epochs.
+    is_accepted : (m,) bool ndarray
+    angle_sigma_rad : float
+        Standard deviation of a rotor angle, estimated from the redundancy.
+    calibration_sigma_rad : float or None
+        Additional standard deviation of generic calibrations; None if there is none.
+    restored_epochs : int
+        Number of epochs whose sweeps were restored.
+    rejected : dict of str to int
+        Number of epochs (or of contradicting stations) by reason.
+    warnings : tuple of SolverWarning
+    """
+
+    trajectories: tuple[Trajectory, ...]
+    epochs: Epochs
+    estimates: PositionEstimates
+    is_accepted: NDArray[np.bool_]
+    angle_sigma_rad: float
+    calibration_sigma_rad: float | None
+    restored_epochs: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+    warnings: tuple[SolverWarning, ...] = ()
+
+
+def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
+    """Estimate the position of every epoch in a scene, and reject outliers.
+
+    Parameters
+    ----------
+    epochs : Epochs
+        With sweeps of stations of the scene only, of at least one of them.
+    scene : Scene
+    """
+    channels = [int(c) for c in epochs.channels]
+    selected = [s for c in channels if (s := scene.station(c)) is not None]
+    stations = stack_stations(selected)
+    floor_z = scene.floor_z if scene.planar else None
+    floor_map = selected[0].floor_map if len(selected) == 1 else None
+
+    rejected: dict[str, int] = {}
+    restored = 0
     if floor_map is not None:
-        fixes = estimate_floor_positions(job.angles, rig[2][0], floor_map, scene.floor_z)
-    else:
-        fixes = estimate_positions(job.angles, *rig, floor_z=floor)
-        fixes = _swap_back(job, fixes, rig, floor)
-    gate = _gate(fixes)
-    if floor_map is None:
-        fixes = _without_worst_station(job, fixes, rig, floor, gate)
-
-    unsolved = ~np.isfinite(fixes.position[:, 0])
-    inconsistent = ~unsolved & (fixes.worst > gate)
-    distance = np.min(
-        np.linalg.norm(fixes.position[:, None] - rig[0], axis=2), axis=1, initial=np.inf
-    )
-    far = ~unsolved & ~inconsistent & (distance > REACH_M) & (scene.scale != "unit")
-    job.reject("moment_with_too_few_sweeps", np.count_nonzero(unsolved))
-    job.reject("moment_inconsistent", np.count_nonzero(inconsistent))
-    job.reject("moment_out_of_reach", np.count_nonzero(far))
-    share = np.count_nonzero(inconsistent) / max(1, int(np.count_nonzero(~unsolved)))
-    if share > CONTRADICTED:
-        job.notes.append(
-            f"{share:.0%} of the moments contradict the scene: a station was moved since, the "
-            "scene is of another place, or robots were faster than the sweeps"
+        (calibration,) = stations[2]
+        estimates = estimate_floor_positions(
+            rotor_angles(epochs), calibration, floor_map, scene.floor_z
         )
-    good = ~(unsolved | inconsistent | far)
-    jumps = _jumps(job.epochs, fixes, good)
-    job.reject("moment_jumps", np.count_nonzero(jumps))
-    good &= ~jumps
+        gate = inlier_gate(estimates)
+    else:
+        estimates = estimate_positions(rotor_angles(epochs), *stations, floor_z=floor_z)
+        epochs, estimates, restored = restore_swapped_sweeps(epochs, estimates, stations, floor_z)
+        gate = inlier_gate(estimates)
+        estimates, repaired = leave_out_worst_station(
+            rotor_angles(epochs), estimates, stations, floor_z, gate
+        )
+        rejected["station_contradicts_others"] = repaired
 
-    sigma = _noise(fixes, good)
-    job.facts["angle_sigma_rad"] = sigma
-    guessed = any(c.source in ("generic", "estimated") for c in rig[2])
-    if guessed and floor_map is None:
-        job.facts["calibration_sigma_rad"] = CALIBRATION_SIGMA_RAD
-        sigma = float(np.hypot(sigma, CALIBRATION_SIGMA_RAD))
-    checks = _verified(job, rig, floor) if floor_map is None else ()
-    covariance = fixes.covariance(sigma, floor is not None)
+    is_unsolved = ~np.isfinite(estimates.position[:, 0])
+    is_inconsistent = ~is_unsolved & (estimates.max_residual > gate)
+    distance = np.min(
+        np.linalg.norm(estimates.position[:, None] - stations[0], axis=2), axis=1, initial=np.inf
+    )
+    is_out_of_range = ~is_unsolved & ~is_inconsistent & (distance > MAX_RANGE_M)
+    # Without a known scale the distance is not in metres.
+    is_out_of_range &= scene.scale != "unit"
+    is_accepted = ~(is_unsolved | is_inconsistent | is_out_of_range)
+    is_jump = find_jumps(epochs, estimates, is_accepted)
+    is_accepted &= ~is_jump
+    for reason, is_rejected in (
+        ("moment_with_too_few_sweeps", is_unsolved),
+        ("moment_inconsistent", is_inconsistent),
+        ("moment_out_of_reach", is_out_of_range),
+        ("moment_jumps", is_jump),
+    ):
+        rejected[reason] = int(np.count_nonzero(is_rejected))
+
+    sigma = angle_sigma(estimates, is_accepted)
+    calibration_sigma = None
+    is_generic = any(c.source in ("generic", "estimated") for c in stations[2])
+    # A floor homography absorbs the errors of the calibration.
+    if is_generic and floor_map is None:
+        calibration_sigma = CALIBRATION_SIGMA_RAD
+    covariance = estimates.covariance(
+        float(np.hypot(sigma, calibration_sigma)) if calibration_sigma else sigma,
+        floor_z is not None,
+    )
+    return PhotodiodeTracks(
+        split_by_device(epochs, is_accepted, estimates.position, scene.frame, covariance),
+        epochs,
+        estimates,
+        is_accepted,
+        sigma,
+        calibration_sigma,
+        restored,
+        {reason: count for reason, count in rejected.items() if count},
+        (
+            *_restored_warnings(restored),
+            *_contradiction_warnings(
+                int(np.count_nonzero(is_inconsistent)), int(np.count_nonzero(~is_unsolved))
+            ),
+        ),
+    )
+
+
+def split_by_device(
+    epochs: Epochs,
+    is_accepted: NDArray[np.bool_],
+    position: Array,
+    frame: str,
+    covariance: Array | None = None,
+) -> tuple[Trajectory, ...]:
+    """Return a trajectory for each device of the epochs, of accepted positions (m, 3)."""
     trajectories = []
-    for k, name in enumerate(job.epochs.devices):
-        mine = np.flatnonzero(good & (job.epochs.device == k))
+    for k, name in enumerate(epochs.devices):
+        rows = np.flatnonzero(is_accepted & (epochs.device == k))
         trajectories.append(
             Trajectory.from_positions(
                 name,
-                scene.frame,
-                job.epochs.time_ns[mine],
-                fixes.position[mine],
-                covariance[mine],
+                frame,
+                epochs.time_ns[rows],
+                position[rows],
+                None if covariance is None else covariance[rows],
             )
         )
-    return Solution(
-        "lighthouse",
-        job.options.method,
-        tuple(trajectories),
-        job.rejected,
-        detections(job.epochs, {s.channel: s for s in stations}, fixes.residual, good, checks),
-        scene,
-        tuple(dict.fromkeys(job.notes)),
-        job.facts,
-    )
+    return tuple(trajectories)
 
 
-def _verified(job: Job, rig: Stations, floor: float | None) -> tuple[StationCheck, ...]:
-    """Check each station on what took no part in solving the scene, and name a wrong one."""
-    angles, held_out = job.verified, job.held_out
-    if angles is None:
-        # What is rejected may be what tells of a wrong station: any moment is a witness.
-        seen = _sights(job.angles)
-        rows = np.flatnonzero(np.count_nonzero(seen, axis=1) > 1)
-        rows = rows[:: 1 + len(rows) // FEW]
-        angles, held_out = job.angles[spread_evenly(seen, rows, MOST)], True
-    if angles.shape[1] < 2 or len(angles) == 0:
-        return ()
-    angles = angles[spread_evenly(_sights(angles), np.arange(len(angles)), MOST)]
-    checks = verify(angles, job.epochs.channels.tolist(), *rig, floor_z=floor)
-    job.facts["verification"] = {
-        "held_out": held_out,
-        "moments": len(angles),
-        "stations": [check.as_facts() for check in checks],
-    }
-    wrong = wrong_station(checks)
-    if wrong is not None and wrong.residual_rad is not None:
-        job.notes.append(
-            f"station on channel {wrong.channel} is {1e3 * wrong.residual_rad:.1f} mrad from where "
-            "the others see the photodiodes, and they agree without it: it was moved since, or is "
-            "seen by reflection"
+def _restored_warnings(restored: int) -> list[SolverWarning]:
+    if not restored:
+        return []
+    return [
+        SolverWarning(
+            "swapped_sweeps_restored",
+            f"{restored} epochs had swapped sweeps of the two stations, which were restored",
         )
-    return checks
+    ]
 
 
-def _sights(angles: Array) -> NDArray[np.bool_]:
-    """(m, s) whether each station was seen."""
-    return np.asarray(np.isfinite(angles).any(axis=2))
-
-
-def _gate(fixes: PositionEstimates) -> float:
-    """Angle by which a plane may miss its position, in radians: far out in what the
-    recording itself shows, and never more than :data:`INLIER_GATE_RAD`."""
-    noise = _noise(fixes, fixes.worst < INLIER_GATE_RAD)
-    return float(np.clip(INLIER_GATE_SIGMAS * noise, MIN_INLIER_GATE_RAD, INLIER_GATE_RAD))
-
-
-def _jumps(epochs: Epochs, fixes: PositionEstimates, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Moments that nothing checks and that leave the path of their device.
-
-    Compared is each position with the median of the five around it, which a steady motion
-    does not leave (Hampel's filter).
-    """
-    jumps = np.zeros(len(epochs), bool)
-    if np.all(fixes.freedom[good] > 0):
-        return jumps
-    for device in range(len(epochs.devices)):
-        mine = np.flatnonzero(good & (epochs.device == device))
-        if len(mine) < 5:
-            continue
-        path = fixes.position[mine]
-        first = np.clip(np.arange(len(mine)) - 2, 0, len(mine) - 5)
-        window = first[:, None] + np.arange(5)
-        away = np.linalg.norm(path - np.median(path[window], axis=1), axis=1)
-        step = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        usual = max(float(np.percentile(away, 75)), float(np.percentile(step, 75)))
-        # Over a pause in the recording a device may be anywhere.
-        span = epochs.time_ns[mine[first + 4]] - epochs.time_ns[mine[first]]
-        left = (away > 5 * usual) & (span < 2_000_000_000)
-        jumps[mine] = left & (fixes.freedom[mine] <= 0)
-    return jumps
-
-
-def _swap_back(
-    job: Job, fixes: PositionEstimates, rig: Stations, floor: float | None
-) -> PositionEstimates:
-    """Give sweeps back to their stations where a report without polynomials mixed them up.
-
-    Reports that sort all counts of two stations exchange a plane of theirs, or both,
-    whenever the stations' counts cross. Such a moment contradicts itself as it is, and fits
-    exactly with the exchange undone.
-    """
-    if job.epochs.labelled or len(job.epochs.channels) != 2:
-        return fixes
-    wrong = np.flatnonzero((fixes.worst > INLIER_GATE_RAD) & (fixes.freedom > 0))
-    restored = 0
-    for planes in ((0,), (1,), (0, 1)):
-        counts = job.epochs.counts[wrong].copy()
-        counts[:, :, planes] = counts[:, ::-1, planes]
-        trial = rotor_angles(replace(job.epochs, counts=counts))
-        fresh = estimate_positions(trial, *rig, floor_z=floor)
-        right = np.isfinite(fresh.position[:, 0]) & (fresh.worst < INLIER_GATE_RAD / 2)
-        rows = wrong[right]
-        job.correct(rows, counts[right])
-        fixes = _with(fixes, rows, fresh, right)
-        restored += len(rows)
-        wrong = wrong[~right]
-    if restored:
-        job.facts["moments_with_swapped_sweeps_restored"] = restored
-        job.notes.append(
-            f"{restored} moments had sweeps of the two stations swapped; they were given back"
+def _contradiction_warnings(inconsistent: int, solved: int) -> list[SolverWarning]:
+    """Return a warning if many of the solved epochs contradict the scene."""
+    fraction = inconsistent / max(1, solved)
+    if fraction <= MAX_INCONSISTENT_FRACTION:
+        return []
+    return [
+        SolverWarning(
+            "scene_contradicted",
+            f"{fraction:.0%} of the epochs contradict the scene: a station was moved since, the "
+            "scene is of another site, or robots moved too fast between sweeps",
         )
-    return fixes
+    ]
 
 
-def _without_worst_station(
-    job: Job,
-    fixes: PositionEstimates,
-    rig: Stations,
-    floor: float | None,
-    gate: float,
-) -> PositionEstimates:
-    """Where one of three or more stations contradicts the others, go on without it."""
-    if len(job.epochs.channels) < 3:
-        return fixes
-    wrong = np.flatnonzero((fixes.worst > gate) & (fixes.freedom > 2))
-    best = fixes.worst[wrong].copy()
-    repaired = np.zeros(len(wrong), bool)
-    for column in range(len(job.epochs.channels)):
-        trial = job.angles[wrong].copy()
-        trial[:, column] = np.nan
-        fresh = estimate_positions(trial, *rig, floor_z=floor)
-        better = (
-            np.isfinite(fresh.position[:, 0])
-            & (fresh.worst < np.minimum(best, gate))
-            & (fresh.freedom > 0)
-        )
-        best[better] = fresh.worst[better]
-        repaired |= better
-        fixes = _with(fixes, wrong[better], fresh, better)
-    job.reject("station_contradicts_others", np.count_nonzero(repaired))
-    return fixes
+# ---- noise and gates
 
 
-def _with(
-    fixes: PositionEstimates,
-    rows: NDArray[np.int64],
-    fresh: PositionEstimates,
-    chosen: NDArray[np.bool_],
-) -> PositionEstimates:
-    """``fixes`` with the chosen ones of ``fresh`` at ``rows``."""
-    changed = {}
-    for name in ("position", "information", "residual", "freedom"):
-        changed[name] = getattr(fixes, name).copy()
-        changed[name][rows] = getattr(fresh, name)[chosen]
-    return PositionEstimates(**changed)
+def angle_sigma(estimates: PositionEstimates, is_accepted: NDArray[np.bool_]) -> float:
+    """Estimate the standard deviation of an angle in radians from redundant epochs.
 
-
-def _noise(fixes: PositionEstimates, good: NDArray[np.bool_]) -> float:
-    """Standard deviation of an angle in radians, from what redundancy shows of it.
-
-    The sum of squares of a moment's residuals has a chi-square distribution; its median
-    (Wilson and Hilferty 1931) is compared, so that outliers do not count. Never below the
-    published noise of a standing receiver.
+    The sum of squared residuals of an epoch has a chi-square distribution. Its median is compared
+    (approximation of Wilson and Hilferty 1931), so that outliers do not count. The result is never
+    below :data:`~locatk.core.lighthouse.noise.ANGLE_SIGMA_RAD`.
     """
-    checked = good & (fixes.freedom > 0)
-    if not np.any(checked):
+    is_redundant = is_accepted & (estimates.redundancy > 0)
+    if not np.any(is_redundant):
         return ANGLE_SIGMA_RAD
-    freedom = fixes.freedom[checked]
-    squares = np.nansum(fixes.residual[checked] ** 2, axis=(1, 2))
-    median = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    redundancy = estimates.redundancy[is_redundant]
+    squares = np.nansum(estimates.residual[is_redundant] ** 2, axis=(1, 2))
+    median = redundancy * (1.0 - 2.0 / (9.0 * redundancy)) ** 3
     return max(ANGLE_SIGMA_RAD, float(np.sqrt(np.median(squares / median))))
 
 
-def detections(
+def inlier_gate(estimates: PositionEstimates) -> float:
+    """Return the largest residual of a consistent epoch, in radians.
+
+    :data:`~locatk.core.lighthouse.noise.INLIER_GATE_SIGMAS` times the noise of the recording,
+    between :data:`~locatk.core.lighthouse.noise.MIN_INLIER_GATE_RAD` and
+    :data:`~locatk.core.lighthouse.noise.INLIER_GATE_RAD`.
+    """
+    noise = angle_sigma(estimates, estimates.max_residual < INLIER_GATE_RAD)
+    return float(np.clip(INLIER_GATE_SIGMAS * noise, MIN_INLIER_GATE_RAD, INLIER_GATE_RAD))
+
+
+def find_jumps(
+    epochs: Epochs, estimates: PositionEstimates, is_accepted: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Find epochs without redundancy that leave the trajectory of their device.
+
+    Each position is compared with the median of the window around it, which a steady motion does
+    not leave (Hampel filter).
+
+    Returns
+    -------
+    (m,) bool ndarray
+    """
+    is_jump = np.zeros(len(epochs), bool)
+    if np.all(estimates.redundancy[is_accepted] > 0):
+        return is_jump
+    for device in range(len(epochs.devices)):
+        rows = np.flatnonzero(is_accepted & (epochs.device == device))
+        if len(rows) < JUMP_WINDOW_EPOCHS:
+            continue
+        path = estimates.position[rows]
+        last = JUMP_WINDOW_EPOCHS - 1
+        first = np.clip(np.arange(len(rows)) - last // 2, 0, len(rows) - JUMP_WINDOW_EPOCHS)
+        window = first[:, None] + np.arange(JUMP_WINDOW_EPOCHS)
+        deviation = np.linalg.norm(path - np.median(path[window], axis=1), axis=1)
+        step = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        usual = max(
+            float(np.percentile(deviation, USUAL_MOTION_PERCENTILE)),
+            float(np.percentile(step, USUAL_MOTION_PERCENTILE)),
+        )
+        span_ns = epochs.time_ns[rows[first + last]] - epochs.time_ns[rows[first]]
+        is_far = deviation > MAX_JUMP_RATIO * usual
+        is_far &= span_ns < round(MAX_JUMP_WINDOW_S * NANOSECONDS_PER_S)
+        is_jump[rows] = is_far & (estimates.redundancy[rows] <= 0)
+    return is_jump
+
+
+# ---- contradictions
+
+
+def restore_swapped_sweeps(
+    epochs: Epochs,
+    estimates: PositionEstimates,
+    stations: StationArrays,
+    floor_z: float | None,
+) -> tuple[Epochs, PositionEstimates, int]:
+    """Restore sweeps of two stations that a report without polynomials exchanged.
+
+    Reports that sort the counts of two stations exchange one plane of theirs, or both, whenever the
+    counts cross. Such an epoch contradicts itself, and fits exactly after the exchange is undone.
+
+    Returns
+    -------
+    epochs, estimates, count
+        With restored sweeps, and in how many epochs.
+    """
+    restored = 0
+    if epochs.labelled or len(epochs.channels) != 2:
+        return epochs, estimates, restored
+    wrong = np.flatnonzero((estimates.max_residual > INLIER_GATE_RAD) & (estimates.redundancy > 0))
+    for planes in SWAPPED_PLANES:
+        counts = epochs.counts[wrong].copy()
+        counts[:, :, planes] = counts[:, ::-1, planes]
+        trial = estimate_positions(
+            rotor_angles(replace(epochs, counts=counts)), *stations, floor_z=floor_z
+        )
+        # Half of the gate, because a wrong exchange can fit just within it by chance.
+        is_right = np.isfinite(trial.position[:, 0])
+        is_right &= trial.max_residual < INLIER_GATE_RAD / 2
+        rows = wrong[is_right]
+        corrected = epochs.counts.copy()
+        corrected[rows] = counts[is_right]
+        epochs = replace(epochs, counts=corrected)
+        estimates = estimates.replaced(rows, trial, is_right)
+        restored += len(rows)
+        wrong = wrong[~is_right]
+    return epochs, estimates, restored
+
+
+def leave_out_worst_station(
+    angles: Array,
+    estimates: PositionEstimates,
+    stations: StationArrays,
+    floor_z: float | None,
+    gate: float,
+) -> tuple[PositionEstimates, int]:
+    """Solve inconsistent epochs of three stations or more without the worst station.
+
+    Parameters
+    ----------
+    angles : (m, s, 2) ndarray
+    estimates : PositionEstimates
+    stations : StationArrays
+    floor_z : float, optional
+    gate : float
+        Largest residual of a consistent epoch, in radians.
+
+    Returns
+    -------
+    estimates, count
+        With consistent estimates where leaving out one station gives any, and their number.
+    """
+    if angles.shape[1] < 3:
+        return estimates, 0
+    wrong = np.flatnonzero((estimates.max_residual > gate) & (estimates.redundancy > 2))
+    best = estimates.max_residual[wrong].copy()
+    is_repaired = np.zeros(len(wrong), bool)
+    for column in range(angles.shape[1]):
+        trial_angles = angles[wrong].copy()
+        trial_angles[:, column] = np.nan
+        trial = estimate_positions(trial_angles, *stations, floor_z=floor_z)
+        is_better = (
+            np.isfinite(trial.position[:, 0])
+            & (trial.max_residual < np.minimum(best, gate))
+            & (trial.redundancy > 0)
+        )
+        best[is_better] = trial.max_residual[is_better]
+        is_repaired |= is_better
+        estimates = estimates.replaced(wrong[is_better], trial, is_better)
+    return estimates, int(np.count_nonzero(is_repaired))
+
+
+# ---- detections
+
+
+def detect_stations(
     epochs: Epochs,
     stations: dict[int, Station],
     residual: Array | None = None,
-    good: NDArray[np.bool_] | None = None,
-    checks: Sequence[StationCheck] = (),
-) -> list[dict[str, object]]:
-    """What was seen of each station, for ``--json`` (docs/formats.md)."""
-    seen = np.isfinite(epochs.counts)
-    rows = []
+    is_accepted: NDArray[np.bool_] | None = None,
+    verification: SceneVerification | None = None,
+) -> list[StationDetection]:
+    """Summarize the sweeps of each station of a recording.
+
+    Parameters
+    ----------
+    epochs : Epochs
+    stations : dict of int to Station
+        By channel; stations without pose are missing.
+    residual : (m, s, 2) ndarray, optional
+        Residuals of the estimated positions, in radians.
+    is_accepted : (m,) bool ndarray, optional
+        Accepted epochs; all if omitted.
+    verification : SceneVerification, optional
+        Of the stations of the epochs, in the same order.
+    """
+    is_observed = np.isfinite(epochs.counts)
+    detections = []
     for i, channel in enumerate(epochs.channels):
         station = stations.get(int(channel))
-        used = seen[:, i] if good is None else seen[:, i] & good[:, None]
-        row: dict[str, object] = {
-            "station": i,
-            "channel": int(channel),
-            "id": None if station is None or station.id is None else f"{station.id:08x}",
-            "period_ticks": int(period_ticks(int(channel))),
-            "calibration": "none" if station is None else station.calibration.source,
-            "sweeps": int(np.count_nonzero(used)),
-            "rejected": int(np.count_nonzero(seen[:, i]) - np.count_nonzero(used)),
-        }
-        if residual is not None and good is not None:
-            row["residual_rad"] = robust_sigma(residual[good][:, i])
-        if checks:
-            row["verification_rad"] = checks[i].residual_rad
-            row["verification_m"] = checks[i].residual_m
-        rows.append(row)
-    return rows
+        is_used = is_observed[:, i]
+        if is_accepted is not None:
+            is_used = is_used & is_accepted[:, None]
+        check = verification.stations[i] if verification else None
+        detections.append(
+            StationDetection(
+                station=i,
+                channel=int(channel),
+                id=None if station is None or station.id is None else f"{station.id:08x}",
+                period_ticks=int(period_ticks(int(channel))),
+                calibration="none" if station is None else station.calibration.source,
+                sweeps=int(np.count_nonzero(is_used)),
+                rejected=int(np.count_nonzero(is_observed[:, i]) - np.count_nonzero(is_used)),
+                residual_rad=None
+                if residual is None or is_accepted is None
+                else robust_sigma(residual[is_accepted][:, i]),
+                verification_rad=check.residual_rad if check else None,
+                verification_m=check.residual_m if check else None,
+            )
+        )
+    return detections

@@ -24,7 +24,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
+from locatk.core.geometry import Similarity, umeyama
+from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.channels import period_counts
+from locatk.core.lighthouse.epochs import Epochs, rotor_angles
+from locatk.core.lighthouse.light_planes import angles_to_counts
+from locatk.core.lighthouse.localization.photodiodes import detect_stations, split_by_device
+from locatk.core.lighthouse.results import LighthouseFacts
+from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene.estimation import require_two_stations, select_stations
+from locatk.core.lighthouse.scene.frame import MIN_MARKERS, marker_angles, scale_from_distances
+from locatk.core.lighthouse.scene.keyframes import require_distinct_positions
+from locatk.core.solution import Solution, SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -237,3 +248,133 @@ def _unit(p: float, q: float) -> tuple[float, float]:
     """Scale (p, q) to unit length."""
     length = float(np.hypot(p, q))
     return p / length, q / length
+
+
+# ---- a session
+
+
+def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
+    """Solve a session by the published method: positions without covariance.
+
+    One station: positions on the floor, by four or more markers. Two stations: the scale is from
+    markers or a distance, else the distance of the stations is 1.
+
+    Parameters
+    ----------
+    epochs : Epochs
+        At least one.
+    prior : Scene
+        Without stations; its markers and distances are used.
+    kind : str
+        ``"one-planar"``, ``"two-planar"`` or ``"two-3d"``; ``"two-auto"`` is taken as planar.
+
+    Raises
+    ------
+    DegenerateError
+        The recording does not determine the scene.
+    """
+    warnings = []
+    if kind == "two-auto":
+        kind = "two-planar"
+        warnings.append(
+            SolverWarning(
+                "plane_assumed",
+                "the published method cannot decide whether a scene is planar: planar is assumed",
+            )
+        )
+    if kind == "one-planar":
+        columns = [0]
+    else:
+        require_two_stations(kind, epochs)
+        columns = [0, 1]
+    left_out_before = dict(epochs.rejected)
+    epochs, left_out = select_stations(epochs, columns, "other_station")
+    angles = rotor_angles(epochs)
+    image = image_points(epochs, angles)
+    is_complete = np.isfinite(image).all(axis=(1, 2))
+    known, visited = marker_angles(prior.markers, epochs, angles)
+    is_visited = np.isfinite(visited).all(axis=(1, 2))
+    known, visited = known[is_visited], image_points(epochs, visited[is_visited])
+
+    if kind == "one-planar":
+        solved = one_planar(known[:, :2], visited[:, 0])
+        to_frame, scale = Similarity.identity(), "markers"
+    else:
+        first, second = (np.insert(image[is_complete, k], 0, 1.0, axis=1) for k in (0, 1))
+        require_distinct_positions(first, second, 4 if kind == "two-planar" else 8)
+        solved = (two_planar if kind == "two-planar" else two_3d)(image[is_complete])
+        to_frame, scale = _scene_frame(solved, known, visited, prior, epochs, angles)
+        if scale == "unit":
+            warnings.append(
+                SolverWarning("unit_scale", "unit scale: the distance of the two stations is 1")
+            )
+    position = np.full((len(image), 3), np.nan)
+    position[is_complete] = to_frame.apply(solved.locate(image[is_complete]))
+    is_accepted = np.isfinite(position).all(axis=1)
+    rejected = {
+        **left_out_before,
+        **left_out,
+        "moment_with_too_few_sweeps": int(np.count_nonzero(~is_accepted)),
+    }
+    scene = Scene(
+        tuple(
+            Station(
+                int(channel),
+                to_frame.apply(station_position),
+                to_frame.rotation @ rotation,
+                IDEAL_CALIBRATION,
+            )
+            for channel, (station_position, rotation) in zip(
+                epochs.channels, solved.stations, strict=False
+            )
+        ),
+        prior.markers,
+        prior.distances,
+        kind != "two-3d",
+        0.0,
+        scale,
+        prior.frame,
+        tuple(warning.message for warning in warnings),
+    )
+    return Solution(
+        "lighthouse",
+        "paper",
+        split_by_device(epochs, is_accepted, position, scene.frame),
+        {reason: count for reason, count in rejected.items() if count},
+        detect_stations(epochs, {s.channel: s for s in scene.stations}),
+        scene,
+        facts=LighthouseFacts(),
+        warnings=tuple(warnings),
+    )
+
+
+def image_points(epochs: Epochs, angles: Array) -> Array:
+    """Return the image points (m, s, 2) of the paper for rotor angles (m, s, 2)."""
+    image = np.empty_like(angles)
+    for i, channel in enumerate(epochs.channels):
+        counts = angles_to_counts(angles[:, i], int(channel))
+        image[:, i] = paper_image_points(counts, int(channel))
+    return image
+
+
+def _scene_frame(
+    solved: PaperScene,
+    known: Array,
+    visited: Array,
+    prior: Scene,
+    epochs: Epochs,
+    angles: Array,
+) -> tuple[Similarity, str]:
+    """Return the similarity to the frame of the markers, or to the known scale, and its source."""
+    if len(known) >= MIN_MARKERS:
+        return umeyama(solved.locate(visited), known), "markers"
+    unit = Similarity.identity()
+    if not prior.distances:
+        return unit, "unit"
+    scale = scale_from_distances(
+        lambda observed: solved.locate(image_points(epochs, observed)),
+        prior.distances,
+        epochs,
+        angles,
+    )
+    return Similarity(scale, unit.rotation, unit.translation), "distance"

@@ -1,4 +1,4 @@
-"""Scenes: base stations in a common frame, and their estimation from a recording."""
+"""Scenes of Lighthouse base stations: data model, estimation from a recording, verification."""
 
 from locatk.core.lighthouse.scene.model import Distance, Marker, MarkerVisit, Scene, Station
 

@@ -1,7 +1,8 @@
-"""A lighthouse scene: stations with pose and calibration, and what fixes its frame."""
+"""Data of a scene: base stations with pose and calibration, and the markers that fix its frame."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,28 +13,27 @@ from locatk.core.lighthouse.calibration import Calibration
 
 @dataclass(frozen=True)
 class Station:
-    """One base station in the scene's frame.
+    """Base station in the frame of a scene.
 
     Attributes
     ----------
     channel : int
         1 to 16.
     position : (3,) ndarray
-        Of the rotor's centre in the scene's frame, in metres (or units of the
-        scene where :attr:`Scene.scale` is ``"unit"``).
+        Centre of the rotor in metres (in the unit of the scene if its scale is ``"unit"``).
     rotation : (3, 3) ndarray
-        Station to scene. The station's x looks forward, y left, z up.
+        From station to scene. The axes of a station are x forward, y left and z up.
     calibration : Calibration
-        Parameters of its two light planes and where they come from.
+        Parameters of its two light planes and their source.
     id : int, optional
-        Serial number, from the factory's OOTX data.
+        Serial number, from the factory data (OOTX).
     covariance : (6, 6) ndarray, optional
-        Of position and rotation (a rotation vector in the scene's frame), as far as the
-        angles tell; errors of markers, scale and frame are not in it.
+        Covariance of position and rotation (a rotation vector in the frame of the scene) from the
+        noise of the angles. Errors of markers, scale and frame are not included.
     floor_map : (3, 3) ndarray, optional
-        Homography from its rays (1, y, z) to floor points (1, x, y) in metres, where it is
-        the only station over a floor with markers
-        (:mod:`locatk.core.lighthouse.localization.floor_map`).
+        Homography from its rays (1, y, z) to floor points (1, x, y) in metres, if it is the only
+        station and over a floor with markers
+        (:func:`~locatk.core.lighthouse.scene.registration.fit_floor_homography`).
     """
 
     channel: int
@@ -47,10 +47,10 @@ class Station:
 
 @dataclass(frozen=True)
 class MarkerVisit:
-    """A time during which a device stood on a marker, or the counts seen there.
+    """Time during which a device was on a marker, or the counts received there.
 
-    Either ``device``, ``start_ns`` and ``end_ns``, or ``counts``: for each channel
-    the LFSR indices of its two sweeps (any order).
+    Either ``device``, ``start_ns`` and ``end_ns`` are given, or ``counts``: by channel, the LFSR
+    indices of both sweeps in any order.
     """
 
     device: str | None = None
@@ -61,19 +61,24 @@ class MarkerVisit:
 
 @dataclass(frozen=True)
 class Marker:
-    """A place that was measured by hand: it fixes frame and scale.
+    """Point measured by hand. Three or more fix the frame and the scale of a scene.
 
-    ``position`` is (3,) in metres in the scene's frame; z is 0 for floor points.
+    Attributes
+    ----------
+    name : str
+    position : (3,) ndarray
+        In metres in the frame of the scene; z is 0 on the floor.
+    visits : tuple of MarkerVisit
     """
 
     name: str
     position: NDArray[np.float64]
-    sightings: tuple[MarkerVisit, ...] = ()
+    visits: tuple[MarkerVisit, ...] = ()
 
 
 @dataclass(frozen=True)
 class Distance:
-    """A known distance in metres between two sightings: it fixes the scale only."""
+    """Known distance in metres between two visited points. It fixes the scale only."""
 
     first: MarkerVisit
     second: MarkerVisit
@@ -87,24 +92,25 @@ class Scene:
     Attributes
     ----------
     stations : tuple of Station
-        Empty in a scene that has yet to be solved.
+        Empty if the scene has yet to be estimated.
     markers, distances
-        What is known of the place before solving.
+        Known points and lengths.
     planar : bool or None
-        True where all devices move on the plane z = ``floor_z``; None if not known.
+        True if all devices move on the plane z = ``floor_z``; None if unknown.
     floor_z : float
         Height of the photodiodes in a planar scene, in metres.
     scale : str
-        What fixed the scale: ``"markers"``, ``"distance"``, ``"odometry"``, ``"device"`` (of
-        known size) or ``"unit"`` (the distance of the first two stations is 1).
+        Source of the scale: ``"markers"``, ``"distance"``, ``"odometry"``, ``"device"`` (of known
+        size) or ``"unit"`` (the distance of the first two stations is 1).
     frame : str
         Name of the frame of positions.
     notes : tuple of str
-        Assumptions made when it was solved.
+        Assumptions of the estimation, one line each.
     calibrations : dict of int to Calibration
-        By channel, of stations that have yet to be solved; used as they are.
+        By channel, for stations that have yet to be estimated. Factory calibrations are used
+        unchanged.
     ids : dict of int to int
-        By channel, serial numbers of stations that have yet to be solved.
+        By channel, serial numbers of stations that have yet to be estimated.
     """
 
     stations: tuple[Station, ...] = ()
@@ -119,5 +125,18 @@ class Scene:
     ids: dict[int, int] = field(default_factory=dict)
 
     def station(self, channel: int) -> Station | None:
-        """The station on ``channel``, or None."""
+        """Return the station on ``channel``, or None."""
         return next((s for s in self.stations if s.channel == channel), None)
+
+
+StationArrays = tuple[NDArray[np.float64], NDArray[np.float64], tuple[Calibration, ...]]
+"""Positions (s, 3), rotations (s, 3, 3) and calibrations of s stations."""
+
+
+def stack_stations(stations: Sequence[Station]) -> StationArrays:
+    """Stack the poses of one or more stations."""
+    return (
+        np.stack([s.position for s in stations]),
+        np.stack([s.rotation for s in stations]),
+        tuple(s.calibration for s in stations),
+    )

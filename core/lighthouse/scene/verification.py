@@ -1,72 +1,102 @@
-"""How well a scene predicts what took no part in solving it, station by station.
+"""Verification of a scene: agreement of each station with the others on held-out epochs.
 
-Each station is compared with where the others see a photodiode, as far as these suffice;
-and each is left out in turn, to see by how far positions jump when it is hidden. A station
-without which the rest agree, and with which they do not, was moved or is seen by reflection.
+The angles of each station are compared with those predicted at positions from the other stations,
+if these determine any. In addition each station is left out, and the change of the positions is
+measured. If the others agree much better without a station, and it disagrees with them, it was
+moved or is received by reflection.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration, predict_angles
 from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
+from locatk.core.lighthouse.results import SceneVerification, StationVerification
+from locatk.core.lighthouse.scene.keyframes import spread_evenly
+from locatk.core.lighthouse.scene.model import StationArrays
 from locatk.core.robust import robust_sigma
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
-MOST = 500
-"""Moments that are verified, at most: a median needs no more."""
+MAX_VERIFICATION_EPOCHS = 500
+"""Number of epochs on which a scene is verified; the median of more is not more accurate."""
 
-WRONG_RAD = 1.5e-3
-"""Residual from which on a station can be wrong, in radians: above what a generic calibration
-leaves unmodelled."""
+MAX_CANDIDATE_EPOCHS = 20_000
+"""Number of epochs, evenly over the recording, among which those to verify a given scene are
+selected. It bounds the time of the selection."""
 
-WRONG_SHARE = 1 / 3
-"""The others agree by so much better without a wrong station than without any other."""
+MIN_INCONSISTENT_RESIDUAL_RAD = 1.5e-3
+"""Smallest residual of an inconsistent station: above the errors of a generic calibration."""
+
+INCONSISTENT_RESIDUAL_RATIO = 1 / 3
+"""Residual of the others without the inconsistent station, relative to that without any other
+station, at most."""
 
 
-@dataclass(frozen=True)
-class StationCheck:
-    """One station against the others.
+def verify_scene(
+    angles: Array,
+    channels: Sequence[int],
+    stations: StationArrays,
+    *,
+    floor_z: float | None = None,
+    held_out: bool = True,
+) -> SceneVerification | None:
+    """Verify all stations of a scene on up to :data:`MAX_VERIFICATION_EPOCHS` epochs.
 
-    Attributes
+    Parameters
     ----------
-    channel : int
-    against : str
-        ``"others"``: its angles against positions from all other stations; ``"joint"``:
-        against positions in which it took part, where the others do not suffice.
-    moments : int
-        That told.
-    residual_rad : float
-        Robust standard deviation of its angles from those predicted; None where none told.
-    residual_m : float
-        The same at the distance of each photodiode, across the ray, in metres.
-    jump_median_m, jump_95_m : float or None
-        How far positions move when it is left out: median and 95 % of the moments.
-    without_rad : float or None
-        What the other stations' angles disagree by among themselves when it is left out.
+    angles : (m, s, 2) ndarray
+        Rotor angles in radians, ``nan`` without a sweep.
+    channels : sequence of int
+    stations : StationArrays
+    floor_z : float, optional
+        Height of all photodiodes, if they move on a plane.
+    held_out : bool
+        Whether the epochs took no part in the estimation of the scene.
+
+    Returns
+    -------
+    SceneVerification or None
+        None for fewer than two stations or without epochs.
     """
-
-    channel: int
-    against: str
-    moments: int
-    residual_rad: float | None
-    residual_m: float | None
-    jump_median_m: float | None
-    jump_95_m: float | None
-    without_rad: float | None
-
-    def as_facts(self) -> dict[str, object]:
-        """For :attr:`~locatk.core.solution.Solution.facts`."""
-        return dict(vars(self))
+    if angles.shape[1] < 2 or len(angles) == 0:
+        return None
+    rows = spread_evenly(_is_received(angles), np.arange(len(angles)), MAX_VERIFICATION_EPOCHS)
+    checks = verify_stations(angles[rows], channels, *stations, floor_z=floor_z)
+    return SceneVerification(held_out, len(rows), checks)
 
 
-def verify(
+def select_verification_epochs(angles: Array) -> NDArray[np.int64]:
+    """Select epochs with two stations or more, to verify a given scene on.
+
+    Rejected epochs are included, because they can be the evidence of an inconsistent station.
+
+    Parameters
+    ----------
+    angles : (m, s, 2) ndarray
+
+    Returns
+    -------
+    (n,) int ndarray
+        Indices, ascending.
+    """
+    is_received = _is_received(angles)
+    rows = np.flatnonzero(np.count_nonzero(is_received, axis=1) > 1)
+    rows = rows[:: 1 + len(rows) // MAX_CANDIDATE_EPOCHS]
+    return spread_evenly(is_received, rows, MAX_VERIFICATION_EPOCHS)
+
+
+def _is_received(angles: Array) -> NDArray[np.bool_]:
+    """Return (m, s) whether any sweep of each station was received."""
+    return np.asarray(np.isfinite(angles).any(axis=2))
+
+
+def verify_stations(
     angles: Array,
     channels: Sequence[int],
     positions: Array,
@@ -74,74 +104,100 @@ def verify(
     calibrations: tuple[Calibration, ...],
     *,
     floor_z: float | None = None,
-) -> tuple[StationCheck, ...]:
-    """Check each station of a scene.
+) -> tuple[StationVerification, ...]:
+    """Verify each station of a scene against the others.
 
     Parameters
     ----------
     angles : (m, s, 2) ndarray
-        Rotor angles in radians, ``nan`` where not seen, of moments that took no part in
-        solving the scene.
+        Rotor angles in radians, ``nan`` without a sweep, of epochs that took no part in the
+        estimation of the scene.
     channels : sequence of int
     positions, rotations, calibrations
-        Of the stations, as for :func:`~locatk.core.lighthouse.localization.positions.estimate_positions`.
+        Of the stations, as for
+        :func:`~locatk.core.lighthouse.localization.positions.estimate_positions`.
     floor_z : float, optional
-        Height of all photodiodes, where they move on a plane.
+        Height of all photodiodes, if they move on a plane.
 
     Returns
     -------
-    tuple of StationCheck
+    tuple of StationVerification
         In the order of ``channels``.
     """
 
-    def where(seen: Array) -> PositionEstimates:
-        return estimate_positions(seen, positions, rotations, calibrations, floor_z=floor_z)
+    def locate(observed: Array) -> PositionEstimates:
+        return estimate_positions(observed, positions, rotations, calibrations, floor_z=floor_z)
 
-    joint = where(angles)
+    joint = locate(angles)
     checks = []
     for i, channel in enumerate(channels):
-        mine = np.isfinite(angles[:, i]).any(axis=1)
-        rest = angles[mine]
-        rest[:, i] = np.nan
-        without = where(rest)
-        told = np.isfinite(without.position[:, 0])
-        against = "others" if np.any(told) else "joint"
-        position = without.position if np.any(told) else joint.position[mine]
+        rows = np.isfinite(angles[:, i]).any(axis=1)
+        other_angles = angles[rows]
+        other_angles[:, i] = np.nan
+        others = locate(other_angles)
+        is_located = np.isfinite(others.position[:, 0])
+        against = "others" if np.any(is_located) else "joint"
+        position = others.position if np.any(is_located) else joint.position[rows]
         local = (position - positions[i]) @ rotations[i]
         with np.errstate(invalid="ignore"):
-            residual = predict_angles(local, calibrations[i]) - angles[mine, i]
-        away = np.linalg.norm(local, axis=1)[:, None]
-        number = int(np.count_nonzero(np.isfinite(residual).any(axis=1)))
-        jump = np.linalg.norm(without.position - joint.position[mine], axis=1)
+            residual = predict_angles(local, calibrations[i]) - angles[rows, i]
+        distance = np.linalg.norm(local, axis=1)[:, None]
+        count = int(np.count_nonzero(np.isfinite(residual).any(axis=1)))
+        jump = np.linalg.norm(others.position - joint.position[rows], axis=1)
         jump = jump[np.isfinite(jump)]
-        checked = without.freedom > 0
-        agreed = np.abs(without.residual[checked & told])
+        residual_of_others = np.abs(others.residual[(others.redundancy > 0) & is_located])
         checks.append(
-            StationCheck(
+            StationVerification(
                 int(channel),
                 against,
-                number,
-                robust_sigma(residual) if number else None,
-                robust_sigma(residual * away) if number else None,
+                count,
+                robust_sigma(residual) if count else None,
+                robust_sigma(residual * distance) if count else None,
                 float(np.median(jump)) if len(jump) else None,
                 float(np.percentile(jump, 95)) if len(jump) else None,
-                robust_sigma(agreed) if len(agreed) else None,
+                robust_sigma(residual_of_others) if len(residual_of_others) else None,
             )
         )
     return tuple(checks)
 
 
-def wrong_station(checks: Sequence[StationCheck]) -> StationCheck | None:
-    """The station that contradicts all others, which agree without it; None where there is
-    none, or where fewer than three are there to tell."""
-    told = sorted(
-        (c.without_rad, k)
-        for k, c in enumerate(checks)
-        if c.without_rad is not None and c.against == "others"
+def find_inconsistent_station(
+    checks: Sequence[StationVerification],
+) -> StationVerification | None:
+    """Find the station that disagrees with all others, which agree without it.
+
+    Returns None if there is none, or if fewer than three stations were verified against the
+    others.
+    """
+    ranked = sorted(
+        (check.without_rad, k)
+        for k, check in enumerate(checks)
+        if check.without_rad is not None and check.against == "others"
     )
-    if len(told) < 3:
+    if len(ranked) < 3:
         return None
-    (best, k), (second, _) = told[:2]
+    (best, k), (second, _) = ranked[:2]
     residual = checks[k].residual_rad
-    stands_out = best < WRONG_SHARE * second and residual is not None and residual > WRONG_RAD
-    return checks[k] if stands_out else None
+    is_inconsistent = (
+        best < INCONSISTENT_RESIDUAL_RATIO * second
+        and residual is not None
+        and residual > MIN_INCONSISTENT_RESIDUAL_RAD
+    )
+    return checks[k] if is_inconsistent else None
+
+
+def inconsistent_station_warnings(
+    verification: SceneVerification | None,
+) -> tuple[SolverWarning, ...]:
+    """Return a warning if one station of a scene disagrees with all others."""
+    station = find_inconsistent_station(verification.stations) if verification else None
+    if station is None or station.residual_rad is None:
+        return ()
+    return (
+        SolverWarning(
+            "wrong_station",
+            f"the station on channel {station.channel} disagrees with the others by "
+            f"{1e3 * station.residual_rad:.1f} mrad, and these agree without it: it was moved "
+            "since the scene was estimated, or is received by reflection",
+        ),
+    )

@@ -104,7 +104,7 @@ def test_the_papers_method_warns_that_it_ignores_receivers(world: Any) -> None:
     paper = SolveOptions(method="paper", scene="two-planar")
     markers = Scene(markers=world.markers_of(lamps, world.square))
     solution = solve(drive.sweeps, markers, paper, receivers={"robot": RIGID})
-    assert any("knows no rigid devices" in note for note in solution.notes)
+    assert any(w.code == "rigid_devices_ignored" for w in solution.warnings)
 
 
 POSITIONS = np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.2], [-0.5, -0.5, 0.0], [0.5, -0.5, 0.1]])
@@ -154,8 +154,8 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> No
     assert not {"too_few_markers", "marker_misfit", "device_scale"} & codes(solution)
     (track,) = solution.trajectories
     assert track.frame == "floor"
-    first = (track.time_ns > markers[0].sightings[0].start_ns) & (
-        track.time_ns < markers[0].sightings[0].end_ns
+    first = (track.time_ns > markers[0].visits[0].start_ns) & (
+        track.time_ns < markers[0].visits[0].end_ns
     )
     assert np.linalg.norm(np.median(track.position[first], axis=0) - POSITIONS[0]) < 3e-3
 

@@ -14,7 +14,7 @@ from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
 from locatk.core.lighthouse.epochs import group_epochs, rotor_angles
 from locatk.core.lighthouse.localization.positions import estimate_positions
-from locatk.core.lighthouse.scene import Distance, MarkerVisit, frame
+from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene, frame
 from locatk.core.lighthouse.scene.bundle_adjustment import BundleState
 from locatk.core.trajectory import Trajectory
 
@@ -57,7 +57,7 @@ def recorded(world: Any) -> Recorded:
 
 def test_sighting_by_time_is_the_median_of_its_time(recorded: Recorded) -> None:
     for k in range(4):
-        seen = frame.sighted_angles(recorded.stay(k), recorded.epochs, recorded.angles)
+        seen = frame.visit_angles(recorded.stay(k), recorded.epochs, recorded.angles)
         np.testing.assert_allclose(
             seen, np.median(recorded.angles[30 * k : 30 * k + 30], axis=0), atol=1e-12
         )
@@ -65,8 +65,8 @@ def test_sighting_by_time_is_the_median_of_its_time(recorded: Recorded) -> None:
 
 def test_sighting_by_counts_takes_either_order(recorded: Recorded) -> None:
     counts = {1: (80_000.0, 41_000.0), 9: (1.0, 2.0)}
-    seen = frame.sighted_angles(MarkerVisit(counts=counts), recorded.epochs, recorded.angles)
-    same = frame.sighted_angles(
+    seen = frame.visit_angles(MarkerVisit(counts=counts), recorded.epochs, recorded.angles)
+    same = frame.visit_angles(
         MarkerVisit(counts={1: (41_000.0, 80_000.0)}), recorded.epochs, recorded.angles
     )
     np.testing.assert_array_equal(seen, same)
@@ -77,20 +77,20 @@ def test_sighting_by_counts_takes_either_order(recorded: Recorded) -> None:
 
 def test_a_sighting_outside_the_recording_shows_nothing(recorded: Recorded) -> None:
     early = MarkerVisit("robot", 0, 10)
-    assert np.isnan(frame.sighted_angles(early, recorded.epochs, recorded.angles)).all()
+    assert np.isnan(frame.visit_angles(early, recorded.epochs, recorded.angles)).all()
 
 
 def test_an_unknown_device_is_named(recorded: Recorded) -> None:
     with pytest.raises(InputError, match="'green'") as refused:
-        frame.sighted_angles(MarkerVisit("green", 0, 1), recorded.epochs, recorded.angles)
+        frame.visit_angles(MarkerVisit("green", 0, 1), recorded.epochs, recorded.angles)
     assert "robot" in str(refused.value.hint)
 
 
 def test_markers_bring_the_rig_home(recorded: Recorded, world: Any) -> None:
     markers = world.markers_of(recorded.lamps, recorded.places)
-    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
+    known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
     np.testing.assert_array_equal(known, recorded.places)
-    to = frame.place_on_markers(recorded.rig, True, known, seen)
+    to = frame.align_to_markers(recorded.rig, True, known, seen)
     assert to is not None
     home = frame.transform_state(recorded.rig, to)
     for k, lamp in enumerate(recorded.lamps):
@@ -100,13 +100,13 @@ def test_markers_bring_the_rig_home(recorded: Recorded, world: Any) -> None:
 
 
 def test_several_markers_average_the_error_of_one(recorded: Recorded, world: Any) -> None:
-    # facts/lighthouse.md 4.4: a frame from one origin sample is the peers' largest error.
+    # A frame from a single origin sample would shift by the whole error of that sample.
     places = np.array([[x, y, 0.0] for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)])
     markers = world.markers_of(recorded.lamps, places)
-    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
+    known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
     moved = known.copy()
     moved[0, 0] += 0.03  # measured badly
-    to = frame.place_on_markers(recorded.rig, True, moved, seen)
+    to = frame.align_to_markers(recorded.rig, True, moved, seen)
     assert to is not None
     home = frame.transform_state(recorded.rig, to)
     assert np.max(np.abs(home.points - recorded.places)) < 0.012
@@ -114,8 +114,8 @@ def test_several_markers_average_the_error_of_one(recorded: Recorded, world: Any
 
 def test_two_markers_fix_no_frame(recorded: Recorded, world: Any) -> None:
     markers = world.markers_of(recorded.lamps, world.square[:2])
-    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
-    assert frame.place_on_markers(recorded.rig, True, known, seen) is None
+    known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
+    assert frame.align_to_markers(recorded.rig, True, known, seen) is None
 
 
 @pytest.mark.parametrize("kind", ["line", "one place"])
@@ -125,14 +125,14 @@ def test_markers_on_a_line_are_refused(recorded: Recorded, world: Any, kind: str
         "one place": np.zeros((4, 3)),
     }[kind]
     markers = world.markers_of(recorded.lamps, places)
-    known, seen = frame.sighted_markers(markers, recorded.epochs, recorded.angles)
+    known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
     with pytest.raises(DegenerateError, match="marker") as refused:
-        frame.place_on_markers(recorded.rig, True, known, seen)
+        frame.align_to_markers(recorded.rig, True, known, seen)
     assert refused.value.hint
 
 
 def test_no_sighting_is_no_marker(recorded: Recorded) -> None:
-    known, seen = frame.sighted_markers([], recorded.epochs, recorded.angles)
+    known, seen = frame.marker_angles([], recorded.epochs, recorded.angles)
     assert known.shape == (0, 3)
     assert seen.shape == (0, 2, 2)
 
@@ -149,7 +149,7 @@ def seen_on_floor(recorded: Recorded) -> Any:
 
 def test_distances_give_the_scale(recorded: Recorded) -> None:
     def scale(*distances: Distance) -> float:
-        return frame.scale_of_distances(
+        return frame.scale_from_distances(
             seen_on_floor(recorded), distances, recorded.epochs, recorded.angles
         )
 
@@ -165,7 +165,7 @@ def test_distances_give_the_scale(recorded: Recorded) -> None:
 def test_distances_nobody_saw_are_refused(recorded: Recorded) -> None:
     unseen = Distance(recorded.stay(0), MarkerVisit("robot", 0, 1), 1.0)
     with pytest.raises(DegenerateError) as refused:
-        frame.scale_of_distances(
+        frame.scale_from_distances(
             seen_on_floor(recorded), [unseen], recorded.epochs, recorded.angles
         )
     assert refused.value.hint
@@ -190,7 +190,7 @@ def test_odometry_gives_the_scale_in_spite_of_drift(world: Any, seed: int) -> No
     track = Trajectory.from_positions("robot", "odom", when + 7_000_000, drift(points, seed))
     # The heading has wandered far by the end; the metres have not.
     assert np.linalg.norm(track.position[-1] - (points[-1] - points[0])) > 0.02
-    found = frame.scale_of_odometry(points / 5, when, np.zeros(300, np.int64), ["robot"], [track])
+    found = frame.scale_from_odometry(points / 5, when, np.zeros(300, np.int64), ["robot"], [track])
     assert found == pytest.approx(5, rel=0.02)
 
 
@@ -199,17 +199,17 @@ def test_odometry_of_another_or_of_no_motion_says_nothing(world: Any) -> None:
     when = world.start_ns + np.arange(100) * SECOND // 10
     device = np.zeros(100, np.int64)
     track = Trajectory.from_positions("blue", "odom", when, points)
-    assert frame.scale_of_odometry(points, when, device, ["robot"], [track]) is None
+    assert frame.scale_from_odometry(points, when, device, ["robot"], [track]) is None
     still = Trajectory.from_positions("robot", "odom", when, np.zeros((100, 3)))
-    assert frame.scale_of_odometry(points, when, device, ["robot"], [still]) is None
+    assert frame.scale_from_odometry(points, when, device, ["robot"], [still]) is None
     short = Trajectory.from_positions("robot", "odom", when[:1], points[:1])
-    assert frame.scale_of_odometry(points, when, device, ["robot"], [short]) is None
-    assert frame.scale_of_odometry(points, when, device, ["robot"], []) is None
+    assert frame.scale_from_odometry(points, when, device, ["robot"], [short]) is None
+    assert frame.scale_from_odometry(points, when, device, ["robot"], []) is None
 
 
 def test_a_rig_of_its_own_stands_at_its_first_station(recorded: Recorded) -> None:
     for planar in (True, False):
-        to = frame.at_first_station(recorded.rig, planar, 5.0)
+        to = frame.first_station_frame(recorded.rig, planar, 5.0)
         home = frame.transform_state(recorded.rig, to)
         true = np.stack([s.position for s in recorded.lamps])
         np.testing.assert_allclose(
@@ -226,3 +226,67 @@ def test_a_rig_of_its_own_stands_at_its_first_station(recorded: Recorded) -> Non
         else:
             np.testing.assert_allclose(home.positions[0], 0, atol=1e-9)
             np.testing.assert_allclose(home.rotations[0], np.eye(3), atol=1e-9)
+
+
+# ---- guards
+
+
+def test_three_markers_give_a_frame_but_no_misfit(recorded: Recorded, world: Any) -> None:
+    for count, is_known in ((3, False), (4, True)):
+        markers = world.markers_of(recorded.lamps, world.square[:count])
+        prior = Scene(markers=tuple(markers))
+        framed = frame.fix_gauge(
+            recorded.rig, np.zeros((2, 10, 10)), True, prior, recorded.epochs, recorded.angles, ()
+        )
+        assert framed.scale == "markers"
+        assert (framed.marker_misfit_m is not None) is is_known
+        assert framed.warnings == ()
+
+
+@pytest.mark.parametrize(("error_m", "warned"), [(0.03, False), (0.06, True)])
+def test_markers_that_misfit_are_named(
+    recorded: Recorded, world: Any, error_m: float, warned: bool
+) -> None:
+    # One corner of a square moved off: a third of it is the rms misfit of the best similarity.
+    first, *others = world.markers_of(recorded.lamps, world.square)
+    wrong = replace(first, position=first.position + [error_m, error_m, 0.0])
+    framed = frame.fix_gauge(
+        recorded.rig,
+        np.zeros((2, 10, 10)),
+        True,
+        Scene(markers=(wrong, *others)),
+        recorded.epochs,
+        recorded.angles,
+        (),
+    )
+    assert ("marker_misfit" in {w.code for w in framed.warnings}) is warned
+
+
+@pytest.mark.parametrize(("intervals", "is_known"), [(4, False), (5, True)])
+def test_odometry_needs_five_intervals_with_motion(intervals: int, is_known: bool) -> None:
+    when = np.arange(intervals + 1) * SECOND
+    points = np.stack([0.3 * np.arange(intervals + 1.0), *np.zeros((2, intervals + 1))], axis=1)
+    track = Trajectory.from_positions("robot", "odom", when, points)
+    device = np.zeros(len(when), np.int64)
+    scale = frame.scale_from_odometry(points / 5, when, device, ["robot"], [track])
+    assert scale == (pytest.approx(5) if is_known else None)
+
+
+def test_odometry_over_a_gap_is_not_compared() -> None:
+    when = np.arange(10) * 2 * SECOND
+    points = np.stack([0.3 * np.arange(10.0), *np.zeros((2, 10))], axis=1)
+    track = Trajectory.from_positions("robot", "odom", when, points)
+    device = np.zeros(10, np.int64)
+    assert frame.scale_from_odometry(points, when, device, ["robot"], [track]) is None
+
+
+def test_slow_intervals_do_not_give_the_scale() -> None:
+    """In them the noise of the positions is as long as the path."""
+    when = np.arange(40) * SECOND
+    step = np.where(np.arange(40) < 30, 0.02, 0.3)
+    x = np.cumsum(step)
+    noisy = x / 5 + np.where(np.arange(40) % 2 == 0, 0.01, -0.01) * (np.arange(40) < 30)
+    track = Trajectory.from_positions("robot", "odom", when, np.c_[x, 0 * x, 0 * x])
+    device = np.zeros(40, np.int64)
+    scale = frame.scale_from_odometry(np.c_[noisy, 0 * x, 0 * x], when, device, ["robot"], [track])
+    assert scale == pytest.approx(5, rel=0.02)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, GENERIC_CALIBRATION, MODEL_SIGMA_RAD
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.scene.assembly import Assembly, estimate_stations
+from locatk.core.lighthouse.scene.estimation import StationsEstimate, estimate_stations
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.core.lighthouse.solver import solve
 
@@ -69,7 +69,7 @@ def nearest(lamps: Any, points: Array, angles: Array, number: int) -> Array:
     return np.where((rank < number)[..., None], angles, np.nan)
 
 
-def run(angles: Array, planar: bool | None = None) -> Assembly:
+def run(angles: Array, planar: bool | None = None) -> StationsEstimate:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return estimate_stations(
@@ -77,7 +77,7 @@ def run(angles: Array, planar: bool | None = None) -> Assembly:
         )
 
 
-def check(found: Assembly, lamps: Any, points: Array, mean_m: float) -> None:
+def check(found: StationsEstimate, lamps: Any, points: Array, mean_m: float) -> None:
     """Places and stations are right, after the similarity of the places."""
     rig = found.adjustment.rig
     true = points[found.chosen]
@@ -228,9 +228,9 @@ def test_what_is_left_out_is_named_by_channel_and_reason(world: Any) -> None:
     solution = solve(drive.sweeps, Scene(markers=world.markers_of(lamps[:2], world.square)))
     left = [s for s in (1, 5) if solution.artifact.station(s) is None]
     assert len(left) == 1
-    (note,) = [n for n in solution.notes if "left out" in n]
-    assert f"channel {left[0]} " in note
-    assert "distance is unknown" in note
+    (warning,) = [w for w in solution.warnings if w.code == "stations_left_out"]
+    assert f"channel {left[0]} " in warning.message
+    assert "distance is unknown" in warning.message
 
 
 def test_serial_numbers_that_were_heard_are_kept(world: Any) -> None:
@@ -262,7 +262,7 @@ def test_recorded_stations_predict_each_other(tracker: Any) -> None:
         assert station["residual_rad"] < 1e-3
         assert station["jump_median_m"] < 1.5e-3
         assert station["jump_95_m"] < 2.5e-3
-    assert not any("agree without it" in note for note in solution.notes)
+    assert all(w.code != "wrong_station" for w in solution.warnings)
 
 
 def test_a_recorded_station_that_is_moved_in_the_scene_is_named(tracker: Any) -> None:
@@ -271,5 +271,5 @@ def test_a_recorded_station_that_is_moved_in_the_scene_is_named(tracker: Any) ->
         for s in tracker.scene.stations
     )
     solution = solve(tracker.sweeps, replace(tracker.scene, stations=stations))
-    (note,) = [n for n in solution.notes if "agree without it" in n]
-    assert "channel 8 " in note
+    (warning,) = [w for w in solution.warnings if w.code == "wrong_station"]
+    assert "channel 8 " in warning.message

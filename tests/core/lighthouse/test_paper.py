@@ -162,8 +162,8 @@ def test_an_unknown_kind_of_scene_is_assumed_planar(world: Any) -> None:
     lamps = ideal(world, 2, 16)
     recording = world.drive(lamps, world.curve(100, flat=True))
     solution = solve(recording.sweeps, None, SolveOptions(method="paper"))
-    assert any("planar" in note for note in solution.notes)
-    assert any("unit scale" in note for note in solution.notes)
+    assert "plane_assumed" in {w.code for w in solution.warnings}
+    assert "unit_scale" in {w.code for w in solution.warnings}
     first, second = (s.position for s in solution.artifact.stations)
     assert np.linalg.norm(second - first) == pytest.approx(1, abs=1e-3)
 

@@ -1,6 +1,7 @@
 """The figures of the published recordings, computed here and not by the bench.
 
-Peers and protocols: facts/lighthouse.md 1.5 and 1.6 (the authors' own scripts, run again).
+Peers and protocols: the scripts that the authors of the Lighthouse paper published with their
+recordings (github.com/DotBots/alvarado23lighthouse), run again.
 """
 
 from __future__ import annotations

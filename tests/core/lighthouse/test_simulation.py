@@ -167,7 +167,7 @@ def test_factory_planes_cross_moving_robots_at_the_times_of_their_sweeps() -> No
 def test_standing_robots_obey_the_forward_model(calibration: str) -> None:
     session = simulate(replace(NOISELESS, calibration=calibration, stations=4))
     for marker in session.scene.markers:
-        [visit] = marker.sightings
+        [visit] = marker.visits
         for station in session.true_scene.stations:
             rotations = find_rotations(session, 0, station.channel)
             still = (rotations.time_s[:, 0] * 1e9 + START_NS > visit.start_ns) & (
@@ -218,7 +218,7 @@ def test_noise_is_that_of_the_angle_and_of_whole_counts() -> None:
     for channel in (1, 2):
         rotations = find_rotations(session, 0, channel)
         for marker in session.scene.markers:
-            [visit] = marker.sightings
+            [visit] = marker.visits
             span = (np.array([visit.start_ns, visit.end_ns]) - START_NS) * 1e-9
             still = (rotations.time_s[:, 0] > span[0]) & (rotations.time_s[:, 1] < span[1])
             counts = rotations.count[still]
@@ -398,7 +398,7 @@ def test_the_first_robot_rests_on_the_markers(planar: bool) -> None:
     assert session.true_scene.markers == session.scene.markers
     truth = session.truth[0]
     for marker, position in zip(session.scene.markers, known, strict=True):
-        [visit] = marker.sightings
+        [visit] = marker.visits
         assert visit.device == truth.device == session.sweeps.devices[0]
         assert (visit.end_ns - visit.start_ns) * 1e-9 == pytest.approx(2.0)
         at_rest = (truth.time_ns >= visit.start_ns) & (truth.time_ns <= visit.end_ns)
@@ -411,7 +411,7 @@ def test_the_first_robot_rests_on_the_markers(planar: bool) -> None:
     assert spread[2] < 1e-12 if planar else spread[2] > 0.3
     # While it is carried between markers it has neither sweeps nor ground truth.
     gaps = [
-        (a.sightings[0].end_ns, b.sightings[0].start_ns)
+        (a.visits[0].end_ns, b.visits[0].start_ns)
         for a, b in zip(session.scene.markers, session.scene.markers[1:], strict=False)
     ]
     received_ns = session.sweeps.time_ns[session.sweeps.device == 0]

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.lighthouse.scene.resection import resect_in_space, resect_on_plane
+from locatk.core.lighthouse.scene.registration import resect_in_space, resect_on_plane
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD
-from locatk.core.lighthouse.scene.assembly import Assembly, estimate_stations
+from locatk.core.lighthouse.epochs import group_epochs
+from locatk.core.lighthouse.scene import MarkerVisit, Scene
+from locatk.core.lighthouse.scene.estimation import (
+    StationsEstimate,
+    estimate_scene,
+    estimate_stations,
+    largest_group,
+)
 
 Array = NDArray[np.float64]
 
@@ -24,16 +31,16 @@ def angles_of(lamps: Any, points: Array, noise: float = 1e-4, seed: int = 0) -> 
     return exact + np.random.default_rng(seed).normal(0, noise, exact.shape)
 
 
-def run(angles: Array, planar: bool | None = None, seed: int = 0) -> Assembly:
+def run(angles: Array, planar: bool | None = None, seed: int = 0) -> StationsEstimate:
     generic = (GENERIC_CALIBRATION,) * angles.shape[1]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return estimate_stations(angles, generic, sigma=MODEL_SIGMA_RAD, planar=planar, seed=seed)
 
 
-def off(assembly: Assembly, points: Array) -> float:
+def off(estimate: StationsEstimate, points: Array) -> float:
     """Mean error of the places after the best similarity, in metres."""
-    found, true = assembly.adjustment.rig.points, points[assembly.chosen]
+    found, true = estimate.adjustment.rig.points, points[estimate.chosen]
     return float(np.mean(np.linalg.norm(umeyama(found, true).apply(found) - true, axis=1)))
 
 
@@ -46,7 +53,7 @@ def test_the_scene_and_its_kind_are_found(
     points = world.curve(150, flat=flat)
     found = run(angles_of(lamps, points))
     assert found.planar is flat
-    assert found.facts["planar_decided_by"] == "data"
+    assert found.facts.planar_decided_by == "data"
     assert found.stations == tuple(range(len(channels)))
     assert off(found, points) < 6e-3
     rig = found.adjustment.rig
@@ -144,13 +151,13 @@ def test_stations_are_linked_through_others(world: Any) -> None:
 
 REFUSED = {
     "still": (None, "stood still"),
-    "three places": (None, "places"),
+    "three places": (None, "positions"),
     "a long line": (None, "line"),
     "a short line": (None, "line"),
     "a wobbly line": (None, "line"),
-    "never together": (None, "seen by two stations at once"),
+    "never together": (None, "observed by two stations at once"),
     "flat, as space": (False, "plane"),
-    "five places, as space": (False, "places"),
+    "five places, as space": (False, "positions"),
 }
 
 
@@ -194,9 +201,68 @@ def test_of_two_readings_of_a_floor_the_upright_one_is_taken(world: Any) -> None
     )
     points = world.curve(150, flat=True)
     found = run(angles_of(lamps, points), planar=True)
-    readings = found.facts["candidates"]
-    assert isinstance(readings, list)
-    assert [r["fits"] for r in readings] == [True, True]
-    (chosen,) = [r for r in readings if r["chosen"]]
-    assert chosen["roll_deg"] < 10 < max(r["roll_deg"] for r in readings)
+    candidates = found.facts.candidates
+    assert candidates is not None
+    assert [c.fits for c in candidates] == [True, True]
+    (chosen,) = [c for c in candidates if c.chosen]
+    assert chosen.roll_deg < 10 < max(c.roll_deg for c in candidates)
     assert off(found, points) < 0.03
+
+
+# ---- groups and warnings
+
+
+def test_the_largest_group_has_the_most_stations_then_keyframes() -> None:
+    shared = np.zeros((5, 5), np.int64)
+
+    def link(i: int, j: int, count: int) -> None:
+        shared[i, j] = shared[j, i] = count
+
+    link(0, 1, 900)
+    link(2, 3, 4)
+    link(3, 4, 4)
+    assert largest_group(shared) == (2, 3, 4)
+    link(3, 4, 3)  # Too few keyframes to be a link.
+    assert largest_group(shared) == (0, 1)
+    with pytest.raises(DegenerateError, match="two stations at once"):
+        largest_group(np.zeros((3, 3), np.int64))
+
+
+@pytest.mark.parametrize(("off_plane", "warned"), [(0.02, False), (0.08, True)])
+def test_positions_off_the_plane_are_named(world: Any, off_plane: float, warned: bool) -> None:
+    lamps = world.lamps(1, 2)
+    points = world.curve(300, flat=True)
+    points[: int(300 * off_plane), 2] = 0.4
+    drive = world.drive(lamps, points)
+    estimate = estimate_scene(group_epochs(drive.sweeps), Scene(), kind="two-planar")
+    codes = {warning.code for warning in estimate.warnings}
+    assert ("plane_contradicted" in codes) is warned
+
+
+def test_two_arrangements_that_fit_alike_are_named(world: Any) -> None:
+    first, second = world.lamps(1, 2)
+    side = np.array([2.5, 0.6, 2.0]), np.array([2.5, 0.9, 2.4])
+    lamps = tuple(
+        replace(lamp, position=position, rotation=world.look(position, np.zeros(3)))
+        for lamp, position in zip((first, second), side, strict=True)
+    )
+    epochs = group_epochs(world.drive(lamps, world.curve(150, flat=True)).sweeps)
+    codes = {w.code for w in estimate_scene(epochs, Scene(), kind="two-planar").warnings}
+    assert "two_candidates" in codes
+    around = group_epochs(world.drive((first, second), world.curve(150, flat=True)).sweeps)
+    codes = {w.code for w in estimate_scene(around, Scene(), kind="two-planar").warnings}
+    assert "two_candidates" not in codes
+
+
+def test_a_single_station_is_that_with_the_most_markers(world: Any) -> None:
+    lamps = world.lamps(1, 2)
+    markers = [*world.markers_of(lamps, world.square)]
+    markers[0] = replace(
+        markers[0], visits=(MarkerVisit(counts={2: markers[0].visits[0].counts[2]}),)
+    )
+    epochs = group_epochs(world.drive(lamps, world.curve(40, flat=True, size=0.5)).sweeps)
+    estimate = estimate_scene(epochs, Scene(markers=tuple(markers)), kind="one-planar")
+    (station,) = estimate.scene.stations
+    assert station.channel == 2
+    assert estimate.rejected == {"other_station": 80}
+    assert estimate.epochs.channels.tolist() == [2]

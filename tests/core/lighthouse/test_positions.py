@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, Calibration
 from locatk.core.lighthouse.localization.positions import (
-    BLOCK,
+    EPOCHS_PER_BLOCK,
     PositionEstimates,
     estimate_positions,
 )
@@ -43,20 +43,20 @@ def angles_of(lamps: Any, points: Array) -> Array:
 def test_exact_angles_give_exact_places(world: Any, channels: tuple[int, ...]) -> None:
     lamps = world.lamps(*channels)
     points = world.curve(80, flat=False)
-    fixes = estimate_positions(angles_of(lamps, points), *factory(lamps))
-    np.testing.assert_allclose(fixes.position, points, atol=3e-6)
-    assert np.max(np.abs(fixes.residual)) < 1e-6
-    np.testing.assert_array_equal(fixes.freedom, 2 * len(channels) - 3)
+    estimates = estimate_positions(angles_of(lamps, points), *factory(lamps))
+    np.testing.assert_allclose(estimates.position, points, atol=3e-6)
+    assert np.max(np.abs(estimates.residual)) < 1e-6
+    np.testing.assert_array_equal(estimates.redundancy, 2 * len(channels) - 3)
 
 
 @pytest.mark.parametrize("channels", [(1,), (1, 5)])
 def test_on_a_floor_one_station_is_enough(world: Any, channels: tuple[int, ...]) -> None:
     lamps = world.lamps(*channels)
     points = world.curve(80, flat=True) + [0, 0, 0.07]
-    fixes = estimate_positions(angles_of(lamps, points), *factory(lamps), floor_z=0.07)
-    np.testing.assert_allclose(fixes.position, points, atol=1e-5)
-    np.testing.assert_array_equal(fixes.freedom, 2 * len(channels) - 2)
-    assert np.all(fixes.position[:, 2] == 0.07)
+    estimates = estimate_positions(angles_of(lamps, points), *factory(lamps), floor_z=0.07)
+    np.testing.assert_allclose(estimates.position, points, atol=1e-5)
+    np.testing.assert_array_equal(estimates.redundancy, 2 * len(channels) - 2)
+    assert np.all(estimates.position[:, 2] == 0.07)
 
 
 def test_a_single_plane_helps_where_others_see_too(world: Any) -> None:
@@ -66,10 +66,10 @@ def test_a_single_plane_helps_where_others_see_too(world: Any) -> None:
     points = world.curve(10, flat=False)
     angles = angles_of(lamps, points)
     angles[:, 1, 0] = np.nan
-    fixes = estimate_positions(angles, *factory(lamps))
-    np.testing.assert_allclose(fixes.position, points, atol=1e-6)
-    np.testing.assert_array_equal(fixes.freedom, 0)
-    assert np.isnan(fixes.residual[:, 1, 0]).all()
+    estimates = estimate_positions(angles, *factory(lamps))
+    np.testing.assert_allclose(estimates.position, points, atol=1e-6)
+    np.testing.assert_array_equal(estimates.redundancy, 0)
+    assert np.isnan(estimates.residual[:, 1, 0]).all()
 
 
 def test_a_bent_plane_alone_is_left_out_and_not_counted(world: Any) -> None:
@@ -77,10 +77,10 @@ def test_a_bent_plane_alone_is_left_out_and_not_counted(world: Any) -> None:
     points = world.curve(10, flat=False)
     angles = angles_of(lamps, points)
     angles[:, 1, 0] = np.nan
-    fixes = estimate_positions(angles, *factory(lamps))
-    np.testing.assert_allclose(fixes.position, points, atol=1e-3)
-    counted = np.count_nonzero(np.isfinite(fixes.residual), axis=(1, 2))
-    np.testing.assert_array_equal(fixes.freedom, counted - 3)
+    estimates = estimate_positions(angles, *factory(lamps))
+    np.testing.assert_allclose(estimates.position, points, atol=1e-3)
+    counted = np.count_nonzero(np.isfinite(estimates.residual), axis=(1, 2))
+    np.testing.assert_array_equal(estimates.redundancy, counted - 3)
 
 
 def test_the_unit_does_not_matter(world: Any) -> None:
@@ -104,7 +104,7 @@ def test_places_are_least_squares_of_the_angles(world: Any, flat: bool) -> None:
     points = world.curve(12, flat=flat)
     rng = np.random.default_rng(2)
     angles = angles_of(lamps, points) + rng.normal(0, 1e-3, (12, 3, 2))
-    fixes = estimate_positions(angles, *factory(lamps), floor_z=0.0 if flat else None)
+    estimates = estimate_positions(angles, *factory(lamps), floor_z=0.0 if flat else None)
     dims = 2 if flat else 3
     for k in range(12):
 
@@ -113,11 +113,11 @@ def test_places_are_least_squares_of_the_angles(world: Any, flat: bool) -> None:
             return (angles_of(lamps, point)[0] - angles[k]).ravel()
 
         best = least_squares(miss, points[k, :dims], xtol=1e-14, ftol=1e-14, gtol=1e-14)
-        np.testing.assert_allclose(fixes.position[k, :dims], best.x, atol=1e-4)
-        np.testing.assert_allclose(fixes.residual[k].ravel(), best.fun, atol=3e-5)
+        np.testing.assert_allclose(estimates.position[k, :dims], best.x, atol=1e-4)
+        np.testing.assert_allclose(estimates.residual[k].ravel(), best.fun, atol=3e-5)
         stated = np.linalg.inv(best.jac.T @ best.jac)
         np.testing.assert_allclose(
-            np.linalg.inv(fixes.information[k, :dims, :dims]), stated, rtol=0.03, atol=0.01
+            np.linalg.inv(estimates.information[k, :dims, :dims]), stated, rtol=0.03, atol=0.01
         )
 
 
@@ -128,12 +128,12 @@ def test_covariance_is_that_of_noise_draws(world: Any, flat: bool) -> None:
     rng = np.random.default_rng(0)
     sigma, draws = 3e-4, 2000
     angles = angles_of(lamps, points)[:, None] + rng.normal(0, sigma, (8, draws, 2, 2))
-    fixes = estimate_positions(
+    estimates = estimate_positions(
         angles.reshape(-1, 2, 2), *factory(lamps), floor_z=0.0 if flat else None
     )
     dims = 2 if flat else 3
-    error = (fixes.position.reshape(8, draws, 3) - points[:, None])[..., :dims]
-    stated = fixes.covariance(sigma, flat).reshape(8, draws, 3, 3)[:, 0, :dims, :dims]
+    error = (estimates.position.reshape(8, draws, 3) - points[:, None])[..., :dims]
+    stated = estimates.covariance(sigma, flat).reshape(8, draws, 3, 3)[:, 0, :dims, :dims]
     for k in range(8):
         found = np.cov(error[k].T)
         np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(stated[k])), rtol=0.06)
@@ -148,8 +148,8 @@ def test_residuals_measure_the_noise(world: Any) -> None:
     points = world.curve(3000, flat=False)
     rng = np.random.default_rng(0)
     angles = angles_of(lamps, points) + rng.normal(0, 5e-4, (3000, 3, 2))
-    fixes = estimate_positions(angles, *factory(lamps))
-    squares = np.sum(fixes.residual**2, axis=(1, 2)) / fixes.freedom
+    estimates = estimate_positions(angles, *factory(lamps))
+    squares = np.sum(estimates.residual**2, axis=(1, 2)) / estimates.redundancy
     assert np.sqrt(squares.mean()) == pytest.approx(5e-4, rel=0.03)
 
 
@@ -162,14 +162,14 @@ def test_no_place_where_planes_do_not_meet_in_one(world: Any) -> None:
     angles[2, 1] = angles[2, 0, 0] = np.nan  # one plane
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fixes = estimate_positions(angles, *factory(lamps))
-        covariance = fixes.covariance(1e-4, False)
-    np.testing.assert_array_equal(np.isnan(fixes.position).all(axis=1), [1, 1, 1, 0, 0, 0])
-    np.testing.assert_array_equal(fixes.freedom, [-3, -1, fixes.freedom[2], 1, 1, 1])
-    assert fixes.freedom[2] < 0
+        estimates = estimate_positions(angles, *factory(lamps))
+        covariance = estimates.covariance(1e-4, False)
+    np.testing.assert_array_equal(np.isnan(estimates.position).all(axis=1), [1, 1, 1, 0, 0, 0])
+    np.testing.assert_array_equal(estimates.redundancy, [-3, -1, estimates.redundancy[2], 1, 1, 1])
+    assert estimates.redundancy[2] < 0
     assert np.isnan(covariance[:3]).all()
     assert np.isfinite(covariance[3:]).all()
-    assert np.all(fixes.worst[:3] == 0)
+    assert np.all(estimates.max_residual[:3] == 0)
 
 
 def test_no_place_behind_a_station(world: Any) -> None:
@@ -178,8 +178,8 @@ def test_no_place_behind_a_station(world: Any) -> None:
     up = lamp.position + lamp.rotation @ [-2.0, 0.3, 0.1]
     ahead = lamp.position + lamp.rotation @ [2.0, -0.3, -0.1]
     rig = factory((lamp,))
-    fixes = estimate_positions(lamp.angles(ahead[None])[None], *rig, floor_z=float(up[2]))
-    assert np.isnan(fixes.position).all()
+    estimates = estimate_positions(lamp.angles(ahead[None])[None], *rig, floor_z=float(up[2]))
+    assert np.isnan(estimates.position).all()
 
 
 def test_a_ray_along_the_floor_meets_it_nowhere_near(world: Any) -> None:
@@ -187,25 +187,25 @@ def test_a_ray_along_the_floor_meets_it_nowhere_near(world: Any) -> None:
     angles = level.angles(np.array([[2.0, 0.0, 0.5]]))[None]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fixes = estimate_positions(angles, *factory((level,)), floor_z=0.0)
-    assert np.isnan(fixes.position[0]).all() or abs(fixes.position[0, 0]) > 100
+        estimates = estimate_positions(angles, *factory((level,)), floor_z=0.0)
+    assert np.isnan(estimates.position[0]).all() or abs(estimates.position[0, 0]) > 100
 
 
 def test_blocks_do_not_show(world: Any) -> None:
     lamps = world.lamps(1, 2)
-    points = np.tile(world.curve(9, flat=False), (BLOCK // 9 + 3, 1))
+    points = np.tile(world.curve(9, flat=False), (EPOCHS_PER_BLOCK // 9 + 3, 1))
     angles = angles_of(lamps, points)
-    fixes = estimate_positions(angles, *factory(lamps))
+    estimates = estimate_positions(angles, *factory(lamps))
     alone = estimate_positions(angles[-5:], *factory(lamps))
-    for name in ("position", "information", "residual", "freedom"):
-        assert len(getattr(fixes, name)) == len(points)
-        np.testing.assert_allclose(getattr(fixes, name)[-5:], getattr(alone, name), atol=1e-9)
+    for name in ("position", "information", "residual", "redundancy"):
+        assert len(getattr(estimates, name)) == len(points)
+        np.testing.assert_allclose(getattr(estimates, name)[-5:], getattr(alone, name), atol=1e-9)
 
 
 def test_nothing_seen_is_nothing_found(world: Any) -> None:
     lamps = world.lamps(1, 2)
-    fixes = estimate_positions(np.zeros((0, 2, 2)), *factory(lamps))
-    assert isinstance(fixes, PositionEstimates)
-    assert fixes.position.shape == (0, 3)
-    assert fixes.worst.shape == (0,)
-    assert fixes.covariance(1e-4, False).shape == (0, 3, 3)
+    estimates = estimate_positions(np.zeros((0, 2, 2)), *factory(lamps))
+    assert isinstance(estimates, PositionEstimates)
+    assert estimates.position.shape == (0, 3)
+    assert estimates.max_residual.shape == (0,)
+    assert estimates.covariance(1e-4, False).shape == (0, 3, 3)

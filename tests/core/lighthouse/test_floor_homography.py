@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, ideal_angles, predict_angles
 from locatk.core.lighthouse.light_planes import rays as rays_of
-from locatk.core.lighthouse.localization.floor_map import (
-    estimate_floor_positions,
-    fit_floor_homography,
-)
+from locatk.core.lighthouse.localization.positions import estimate_floor_positions
+from locatk.core.lighthouse.scene.registration import fit_floor_homography
 
 Array = NDArray[np.float64]
 
@@ -100,16 +98,18 @@ def test_positions_and_their_covariance(world: Any, lamp: Any) -> None:
     sigma = 2e-4
     angles = lamp.angles(places)
     draws = angles[:, None] + rng.normal(0, sigma, (6, 3000, 2))
-    fixes = estimate_floor_positions(draws.reshape(-1, 1, 2), GENERIC_CALIBRATION, floor_map, 0.03)
-    position = fixes.position.reshape(6, 3000, 3)
+    estimates = estimate_floor_positions(
+        draws.reshape(-1, 1, 2), GENERIC_CALIBRATION, floor_map, 0.03
+    )
+    position = estimates.position.reshape(6, 3000, 3)
     np.testing.assert_array_equal(position[..., 2], 0.03)
-    stated = fixes.covariance(sigma, True).reshape(6, 3000, 3, 3)[:, 0]
+    stated = estimates.covariance(sigma, True).reshape(6, 3000, 3, 3)[:, 0]
     for k in range(6):
         spread = np.cov(position[k, :, :2].T)
         np.testing.assert_allclose(stated[k, :2, :2], spread, rtol=0.15, atol=0.05 * spread.max())
         assert stated[k, 2, 2] == 0
-    assert np.all(fixes.freedom == 0)
-    assert np.all(fixes.residual == 0)
+    assert np.all(estimates.redundancy == 0)
+    assert np.all(estimates.residual == 0)
 
 
 def test_an_unseen_plane_gives_no_place(world: Any, lamp: Any) -> None:
@@ -119,11 +119,11 @@ def test_an_unseen_plane_gives_no_place(world: Any, lamp: Any) -> None:
     angles[1] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fixes = estimate_floor_positions(angles, GENERIC_CALIBRATION, floor_map, 0.0)
-        fixes.covariance(1e-4, True)
-    assert np.isnan(fixes.position[:2]).all()
-    assert np.isfinite(fixes.position[2:]).all()
-    assert fixes.freedom.tolist() == [-1, -2, 0, 0]
+        estimates = estimate_floor_positions(angles, GENERIC_CALIBRATION, floor_map, 0.0)
+        estimates.covariance(1e-4, True)
+    assert np.isnan(estimates.position[:2]).all()
+    assert np.isfinite(estimates.position[2:]).all()
+    assert estimates.redundancy.tolist() == [-1, -2, 0, 0]
 
 
 def test_generic_planes_are_what_the_map_was_fitted_to(lamp: Any) -> None:
