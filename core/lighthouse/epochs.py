@@ -369,7 +369,7 @@ def _reject_spikes(epochs: Epochs) -> None:
     The neighbours must agree with each other, so that motion is not taken for a spike.
     """
     limits = SPIKE_RAD / (2 * np.pi) * period_counts(epochs.channels)
-    rejected = 0
+    spikes = 0
     for station, plane in np.ndindex(epochs.counts.shape[1:]):
         rows = np.flatnonzero(np.isfinite(epochs.counts[:, station, plane]))
         count, limit = epochs.counts[rows, station, plane], limits[station]
@@ -384,8 +384,8 @@ def _reject_spikes(epochs: Epochs) -> None:
             & (np.abs(following - previous) < limit)
         )
         epochs.counts[rows[1:-1][is_spike], station, plane] = np.nan
-        rejected += int(np.count_nonzero(is_spike))
-    _add_rejected(epochs.rejected, "spike", rejected)
+        spikes += int(np.count_nonzero(is_spike))
+    _add_rejected(epochs.rejected, "spike", spikes)
 
 
 def _add_rejected(rejected: dict[str, int], reason: str, number: int | np.signedinteger) -> None:

@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 ARGUMENTS = {
     "reject": 0,
-    "_note": 1,
+    "_add_rejected": 1,
     "keep": 1,
     "keep_stations": 1,
     "_refusal": 2,
