@@ -17,6 +17,7 @@ from locatk.core.evaluation import (
     Statistics,
     TimeOffset,
     associate,
+    coarse_offset,
     estimate_coarse_offset,
     estimate_held_out_offset,
     estimate_offset,
@@ -164,6 +165,13 @@ def test_held_out_poses_are_not_scored_and_counted_once() -> None:
     assert held_out == pytest.approx(len(estimate) / 2, abs=2)
     assert evaluation.time_ns.min() >= estimate.time_ns[held_out]
     assert evaluation.n + sum(evaluation.unscored.values()) == len(estimate)
+
+
+def test_a_pose_that_is_matched_repeatedly_counts_once() -> None:
+    estimate = trajectory(np.array([0.0, 10.0, 20.0, 30.0]))
+    truth = trajectory(np.array([0.0, 0.001, 0.002]))
+    evaluation = evaluate_pair(estimate, truth, match="nearest")
+    assert (evaluation.n, evaluation.unscored["no truth"]) == (3, 3)
 
 
 def test_hints_for_unmatched_poses() -> None:
@@ -394,6 +402,12 @@ def test_parts_at_rest_are_the_last_resort() -> None:
 
 
 def test_the_error_is_that_of_the_first_part() -> None:
+    """The first quarter moves with an offset beyond the span; the others are at rest."""
+    phase = np.minimum(TIME_S, 10.0)
+    truth = trajectory(TIME_S, path(phase))
+    estimate = trajectory(TIME_S[40:-40] + 0.7, path(phase[40:-40]))
+    with pytest.raises(InputError, match="end of the span"):
+        estimate_held_out_offset([(estimate, truth)], span_s=0.5)
     rest = trajectory(TIME_S, np.zeros((len(TIME_S), 3)))
     with pytest.raises(DegenerateError, match="does not depend"):
         estimate_held_out_offset([(rest, rest)])
@@ -438,6 +452,12 @@ def test_motions_must_agree_by_half(common_fraction: float, method: str) -> None
     coarse = estimate_coarse_offset([(late, TRUTH)], align="se2", span_s=2.0)
     assert coarse.method == method
     assert (coarse.span_s == 2.0) == (method == "first stamps")
+
+
+@pytest.mark.parametrize(("dip", "peaks"), [(4.5e-4, 1), (1e-3, 2)])
+def test_noise_does_not_split_a_peak(dip: float, peaks: int) -> None:
+    common = np.array([0.2, 0.5, 1.0, 1.0 - dip, 1.0, 0.5, 0.2, 0.99, 0.2])
+    assert coarse_offset._count_peaks(common) == peaks
 
 
 def test_a_part_that_overlaps_by_less_than_half_is_not_considered() -> None:
