@@ -26,10 +26,10 @@ from locatk.core.evaluation import (
 )
 from locatk.core.evaluation.association import require_ascending
 from locatk.core.evaluation.coarse_offset import clocks_agree
-from locatk.core.evaluation.consistency import summarize_nees
+from locatk.core.evaluation.consistency import compute_nees, summarize_nees
 from locatk.core.evaluation.coverage import compute_coverage
 from locatk.core.evaluation.pose_errors import MatchedPoses, select_pairs
-from locatk.core.geometry import quaternion_from_heading
+from locatk.core.geometry import Similarity, quaternion_from_heading
 from locatk.core.trajectory import Trajectory, has_orientation
 
 Array = NDArray[np.float64]
@@ -257,6 +257,17 @@ def test_consistency_of_one_known_pose() -> None:
     assert consistency is not None
     assert (consistency.n, consistency.mean, consistency.dof) == (1, 1.0, 3.0)
     assert summarize_nees(np.array([np.nan, 1.0]), np.array([1, 0])) is None
+
+
+@pytest.mark.parametrize(("excess", "dof"), [(1e-13, 1), (1e-10, 2)])
+def test_a_component_that_the_others_determine_does_not_count(excess: float, dof: int) -> None:
+    """y is twice x, but for a variance that is rounding."""
+    covariance = np.full((1, 6, 6), np.nan)
+    covariance[0, :2, :2] = 1e-4 * np.array([[1.0, 2.0], [2.0, 4.0 * (1 + excess)]])
+    residuals = np.array([[0.01, 0.02 + 1e-6, 0.0]])
+    nees, nees_dof = compute_nees(residuals, None, covariance, Similarity.identity())
+    assert nees_dof.tolist() == [dof]
+    assert (nees[0] == pytest.approx(1.0)) == (dof == 1)
 
 
 def test_gaps_of_estimate_and_truth_do_not_count_as_covered() -> None:
