@@ -17,6 +17,7 @@ from locatk.core.evaluation import (
     Statistics,
     TimeOffset,
     associate,
+    coarse_offset,
     estimate_coarse_offset,
     estimate_held_out_offset,
     estimate_offset,
@@ -25,10 +26,10 @@ from locatk.core.evaluation import (
 )
 from locatk.core.evaluation.association import require_ascending
 from locatk.core.evaluation.coarse_offset import clocks_agree
-from locatk.core.evaluation.consistency import summarize_nees
+from locatk.core.evaluation.consistency import compute_nees, summarize_nees
 from locatk.core.evaluation.coverage import compute_coverage
 from locatk.core.evaluation.pose_errors import MatchedPoses, select_pairs
-from locatk.core.geometry import quaternion_from_heading
+from locatk.core.geometry import Similarity, quaternion_from_heading
 from locatk.core.trajectory import Trajectory, has_orientation
 
 Array = NDArray[np.float64]
@@ -166,6 +167,13 @@ def test_held_out_poses_are_not_scored_and_counted_once() -> None:
     assert evaluation.n + sum(evaluation.unscored.values()) == len(estimate)
 
 
+def test_a_pose_that_is_matched_repeatedly_counts_once() -> None:
+    estimate = trajectory(np.array([0.0, 10.0, 20.0, 30.0]))
+    truth = trajectory(np.array([0.0, 0.001, 0.002]))
+    evaluation = evaluate_pair(estimate, truth, match="nearest")
+    assert (evaluation.n, evaluation.unscored["no truth"]) == (3, 3)
+
+
 def test_hints_for_unmatched_poses() -> None:
     def hint(shift_s: float, offset_s: float = 0.0) -> str:
         with pytest.raises(InputError, match="truth at its time") as error:
@@ -249,6 +257,17 @@ def test_consistency_of_one_known_pose() -> None:
     assert consistency is not None
     assert (consistency.n, consistency.mean, consistency.dof) == (1, 1.0, 3.0)
     assert summarize_nees(np.array([np.nan, 1.0]), np.array([1, 0])) is None
+
+
+@pytest.mark.parametrize(("excess", "dof"), [(1e-13, 1), (1e-10, 2)])
+def test_a_component_that_the_others_determine_does_not_count(excess: float, dof: int) -> None:
+    """y is twice x, but for a variance that is rounding."""
+    covariance = np.full((1, 6, 6), np.nan)
+    covariance[0, :2, :2] = 1e-4 * np.array([[1.0, 2.0], [2.0, 4.0 * (1 + excess)]])
+    residuals = np.array([[0.01, 0.02 + 1e-6, 0.0]])
+    nees, nees_dof = compute_nees(residuals, None, covariance, Similarity.identity())
+    assert nees_dof.tolist() == [dof]
+    assert (nees[0] == pytest.approx(1.0)) == (dof == 1)
 
 
 def test_gaps_of_estimate_and_truth_do_not_count_as_covered() -> None:
@@ -394,6 +413,12 @@ def test_parts_at_rest_are_the_last_resort() -> None:
 
 
 def test_the_error_is_that_of_the_first_part() -> None:
+    """The first quarter moves with an offset beyond the span; the others are at rest."""
+    phase = np.minimum(TIME_S, 10.0)
+    truth = trajectory(TIME_S, path(phase))
+    estimate = trajectory(TIME_S[40:-40] + 0.7, path(phase[40:-40]))
+    with pytest.raises(InputError, match="end of the span"):
+        estimate_held_out_offset([(estimate, truth)], span_s=0.5)
     rest = trajectory(TIME_S, np.zeros((len(TIME_S), 3)))
     with pytest.raises(DegenerateError, match="does not depend"):
         estimate_held_out_offset([(rest, rest)])
@@ -438,6 +463,12 @@ def test_motions_must_agree_by_half(common_fraction: float, method: str) -> None
     coarse = estimate_coarse_offset([(late, TRUTH)], align="se2", span_s=2.0)
     assert coarse.method == method
     assert (coarse.span_s == 2.0) == (method == "first stamps")
+
+
+@pytest.mark.parametrize(("dip", "peaks"), [(4.5e-4, 1), (1e-3, 2)])
+def test_noise_does_not_split_a_peak(dip: float, peaks: int) -> None:
+    common = np.array([0.2, 0.5, 1.0, 1.0 - dip, 1.0, 0.5, 0.2, 0.99, 0.2])
+    assert coarse_offset._count_peaks(common) == peaks
 
 
 def test_a_part_that_overlaps_by_less_than_half_is_not_considered() -> None:
