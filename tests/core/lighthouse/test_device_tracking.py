@@ -323,7 +323,7 @@ def test_the_covariance_contains_lasting_noise_calibration_and_unmodelled_motion
 
 @pytest.mark.parametrize(("scale", "is_determined"), [(1.0, True), (0.1, False)])
 def test_poses_with_a_large_covariance_are_rejected(scale: float, is_determined: bool) -> None:
-    receiver = Receiver(scale * np.vstack([FLAT, [[0.0, 0.0, 0.05]]]))
+    receiver = Receiver(scale * FLAT)
     problem = problem_at_rest(ONE_STATION, [15.0, 0, 0], TILT, receiver=receiver)
     tracked = track_device("a", "floor", problem.sweeps, receiver, ONE_STATION, (1,))
     number = len(tracked.trajectory) + tracked.rejected.get("pose_not_determined", 0)
