@@ -549,14 +549,11 @@ def resolve_conflicts(problem: TrackingProblem, states: EpochStates) -> None:
     while (seed := find_conflicting_seed(time_ns, states, resolved)) is not None:
         resolved.add(seed)
         epochs = np.flatnonzero(states.seed == seed)
-        previous = states.poses.take(epochs)
         states.status[epochs] = UNSOLVED
         propagate(problem, states)
-        # Epochs that the other seed does not explain keep their poses.
-        is_unexplained = states.status[epochs] != SOLVED
-        kept = epochs[is_unexplained]
-        states.status[kept], states.seed[kept] = SOLVED, seed
-        states.poses.put(kept, previous.take(is_unexplained))
+        # Epochs that the other seed does not explain keep their poses, which the propagation
+        # replaces by accepted ones only.
+        states.status[epochs[states.status[epochs] != SOLVED]] = SOLVED
 
 
 def find_conflicting_seed(time_ns: IntArray, states: EpochStates, resolved: set[int]) -> int | None:
@@ -581,6 +578,12 @@ def find_conflicting_seed(time_ns: IntArray, states: EpochStates, resolved: set[
     weaker = np.where(margin[seeds[0]] < margin[seeds[1]], *seeds)
     weaker = weaker[~np.isin(weaker, list(resolved))]
     return int(weaker[np.argmin(margin[weaker])]) if len(weaker) else None
+
+
+def is_ambiguous(states: EpochStates, epochs: IntArray) -> Mask:
+    """Return which solved epochs were propagated from a seed with a margin below the minimum."""
+    margin = np.array(states.seed_margin, float)
+    return np.asarray(margin[states.seed[epochs]] < MIN_SEED_MARGIN)
 
 
 # ---- second pass: refinement
@@ -611,8 +614,8 @@ def _refine(
     with np.errstate(invalid="ignore"):
         is_used = np.abs(residual) < gate
         inliers = np.where(np.abs(fit.residual) < gate, sweep, -1)
-    sigma, lasting_sigma = _angle_noise(problem.sweeps, residual, is_used, sweep)
-    covariance = _pose_covariance(problem, solved, fit, noise, sigma, lasting_sigma)
+    sigma, lasting_sigma = angle_noise(problem.sweeps, residual, is_used, sweep)
+    covariance = pose_covariance(problem, solved, fit, noise, sigma, lasting_sigma)
 
     has_too_few = ~has_enough_sweeps(problem.sweeps, inliers)
     is_undetermined = np.any(
@@ -633,7 +636,6 @@ def _refine(
         quaternion_from_matrix(poses.rotation),
         covariance[is_good],
     )
-    is_ambiguous = np.array(states.seed_margin, float) < MIN_SEED_MARGIN
     sampled = accepted[:: max(1, len(accepted) // EPOCHS_PER_BATCH)]
     behind = from_behind_fraction(problem, sampled, states.poses.take(sampled))
     return TrackedDevice(
@@ -646,7 +648,7 @@ def _refine(
         lasting_sigma,
         dict(+rejected),
         float(np.mean(behind)) if len(sampled) else 0.0,
-        int(np.count_nonzero(is_ambiguous[states.seed[accepted]])),
+        int(np.count_nonzero(is_ambiguous(states, accepted))),
     )
 
 
@@ -703,7 +705,7 @@ def _closest_residuals(problem: TrackingProblem, epochs: IntArray, residual: Arr
     return closest
 
 
-def _angle_noise(
+def angle_noise(
     sweeps: DeviceSweeps, residual: Array, is_used: Mask, window_sweeps: IntArray
 ) -> tuple[float, float]:
     """Estimate the standard deviation of an angle in radians: in all, and its lasting part.
@@ -734,7 +736,7 @@ def _angle_noise(
     return total, float(np.sqrt(max(0.0, total**2 - passing**2)))
 
 
-def _pose_covariance(
+def pose_covariance(
     problem: TrackingProblem,
     epochs: IntArray,
     fit: PoseFit,
@@ -752,13 +754,13 @@ def _pose_covariance(
     variance = sigma**2 + (ROTATIONS_PER_WINDOW - 1.0) * lasting_sigma**2
     variance += ROTATIONS_PER_WINDOW * CALIBRATION_SIGMA_RAD**2 if is_generic else 0.0
     covariance = np.linalg.inv(fit.information)[:, :6, :6] * variance / fit_sigma**2
-    unmodelled = _unmodelled_motion(
+    unmodelled = unmodelled_motion(
         problem.windows.time_ns[epochs], fit.poses.rate, problem.half_width_ns
     )
     return np.asarray(covariance + unmodelled[:, :, None] * unmodelled[:, None, :])
 
 
-def _unmodelled_motion(time_ns: IntArray, rate: Array, half_width_ns: int) -> Array:
+def unmodelled_motion(time_ns: IntArray, rate: Array, half_width_ns: int) -> Array:
     """Return the displacement (m, 6) by acceleration that constant rates do not describe.
 
     It is half the acceleration times the mean square of time in a window. The acceleration is

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
-from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
+from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, Calibration, predict_angles
 from locatk.core.lighthouse.devices import tracking
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, make_windows
-from locatk.core.lighthouse.devices.pose_fit import DeviceStates, SweepObservations
+from locatk.core.lighthouse.devices.pose_fit import DeviceStates, PoseFit, SweepObservations
 from locatk.core.lighthouse.devices.tracking import (
     FAILED,
     MAX_SEED_MARGIN,
@@ -20,14 +21,18 @@ from locatk.core.lighthouse.devices.tracking import (
     UNSOLVED,
     EpochStates,
     TrackingProblem,
+    angle_noise,
     choose_hypothesis,
     estimate_initial_poses,
     find_conflicting_seed,
     from_behind_fraction,
     is_accepted,
+    is_ambiguous,
+    pose_covariance,
     propagate,
     resolve_conflicts,
     solve_seeds,
+    track_device,
     truncated_cost,
 )
 from locatk.core.lighthouse.devices.verification import (
@@ -36,6 +41,7 @@ from locatk.core.lighthouse.devices.verification import (
     select_inner_poses,
     select_segments,
 )
+from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.trajectory import Trajectory
@@ -249,6 +255,98 @@ def test_a_seed_that_is_lit_from_behind_ranks_last() -> None:
     assert seeds["none"] == pytest.approx(TILT, abs=1e-3)
     assert seeds["front"] == pytest.approx(TILT, abs=1e-3)
     assert np.trace(seeds["behind"].T @ TILT) < 1 + 2 * np.cos(0.5)
+
+
+def test_epochs_of_a_seed_with_little_margin_are_ambiguous() -> None:
+    states = states_of(JUMP, [0, 1, 1, 2], [9.9, 10.1, MAX_SEED_MARGIN])
+    assert is_ambiguous(states, np.arange(4)).tolist() == [True, False, False, False]
+
+
+# ---- noise and covariance
+
+
+def test_the_noise_that_repeats_from_rotation_to_rotation_is_separated() -> None:
+    rng = np.random.default_rng(0)
+    rotations, sensors = 400, 20
+    time_ns, sensor = (
+        v.ravel() for v in np.meshgrid(np.arange(rotations) * PERIOD_NS, np.arange(sensors))
+    )
+    order = np.argsort(time_ns, kind="stable")
+    time_ns, sensor = time_ns[order], sensor[order]
+    zero = np.zeros(len(time_ns), np.int64)
+    lasting, passing = 4e-4 * rng.choice([-1.0, 1.0], sensors), 3e-4
+    residual = lasting[sensor] + rng.normal(0, passing, len(sensor))
+    sweeps = DeviceSweeps(time_ns, sensor, zero, zero, zero * 0.0)
+    windows = np.arange(len(sensor)).reshape(-1, 4 * sensors)
+    total, repeated = angle_noise(sweeps, residual, np.ones(len(sensor), bool), windows)
+    inflation = np.sqrt(4 * sensors / (4 * sensors - 12))
+    # The median absolute value of the sum of a constant of either sign and Gaussian noise.
+    expected = 1.4826 * np.median(np.abs(residual)) * inflation
+    assert total == pytest.approx(expected, rel=1e-9)
+    assert repeated == pytest.approx(np.sqrt(total**2 - passing**2), rel=0.03)
+    # Only sweeps of consecutive rotations are compared.
+    sparse = DeviceSweeps(time_ns * 2, sensor, zero, zero, zero * 0.0)
+    assert angle_noise(sparse, residual, np.ones(len(sensor), bool), windows) == (total, total)
+
+
+def covariance_of(
+    calibration: Calibration, lasting_sigma: float, acceleration: float = 0.0
+) -> Array:
+    """Return the covariance of three epochs with unit information."""
+    problem = problem_at_rest(
+        (np.zeros((1, 3)), np.eye(3)[None], (calibration,)), [2.0, 0, 0], np.eye(3), rotations=3
+    )
+    m = len(problem.windows)
+    rate = np.zeros((m, 6))
+    rate[:, 0] = acceleration * problem.windows.time_ns * 1e-9
+    poses = DeviceStates(np.zeros((m, 3)), np.tile(np.eye(3), (m, 1, 1)), rate)
+    information = np.tile(np.eye(12), (m, 1, 1))
+    fit = PoseFit(poses, np.zeros((m, 1)), information, np.zeros(m))
+    return pose_covariance(problem, np.arange(m), fit, 2e-4, 3e-4, lasting_sigma)
+
+
+def test_the_covariance_contains_lasting_noise_calibration_and_unmodelled_motion() -> None:
+    factory = replace(IDEAL_CALIBRATION, source="factory")
+    generic = replace(IDEAL_CALIBRATION, source="generic")
+    variance = covariance_of(factory, 0.0)[1]
+    assert variance == pytest.approx(np.eye(6) * 3e-4**2 / 2e-4**2)
+    # A window contains two rotations, in both of which lasting errors are the same.
+    with_lasting = covariance_of(factory, 2e-4)[1] - variance
+    assert with_lasting == pytest.approx(np.eye(6) * 2e-4**2 / 2e-4**2)
+    with_calibration = covariance_of(generic, 0.0)[1] - variance
+    assert with_calibration == pytest.approx(np.eye(6) * 2 * CALIBRATION_SIGMA_RAD**2 / 2e-4**2)
+    accelerated = covariance_of(factory, 0.0, acceleration=5.0)
+    displacement = 0.5 * 5.0 * (PERIOD_NS * 1e-9) ** 2 / 3
+    assert accelerated[1, 0, 0] - variance[0, 0] == pytest.approx(displacement**2, rel=1e-6)
+    assert accelerated[1, 1, 1] == pytest.approx(variance[1, 1])
+
+
+@pytest.mark.parametrize(("scale", "is_determined"), [(1.0, True), (0.1, False)])
+def test_poses_with_a_large_covariance_are_rejected(scale: float, is_determined: bool) -> None:
+    receiver = Receiver(scale * FLAT)
+    problem = problem_at_rest(ONE_STATION, [15.0, 0, 0], TILT, receiver=receiver)
+    tracked = track_device("a", "floor", problem.sweeps, receiver, ONE_STATION, (1,))
+    number = len(tracked.trajectory) + tracked.rejected.get("pose_not_determined", 0)
+    assert number >= 29
+    assert (len(tracked.trajectory) == number) == is_determined
+    assert (len(tracked.trajectory) == 0) == (not is_determined)
+
+
+def test_epochs_with_too_few_sweeps_within_the_final_gate_are_rejected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = problem_at_rest(TWO_STATIONS, [0.1, 0.0, 0.3], np.eye(3))
+
+    def has_enough(sweeps: DeviceSweeps, window_sweeps: NDArray[np.int64]) -> NDArray[np.bool_]:
+        calls.append(window_sweeps)
+        return np.arange(len(window_sweeps)) >= (0 if len(calls) == 1 else 4)
+
+    calls: list[NDArray[np.int64]] = []
+    monkeypatch.setattr(tracking, "has_enough_sweeps", has_enough)
+    tracked = track_device("a", "floor", problem.sweeps, problem.receiver, TWO_STATIONS, (1, 2))
+    assert len(calls) == 2
+    assert len(tracked.trajectory) == len(calls[1]) - 4
+    assert tracked.rejected == {"moment_with_too_few_sweeps": 4}
 
 
 # ---- verification
