@@ -533,8 +533,9 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
     for (int y = 2; y < h - 2; y++) {
         const uint8_t *mark = d->marks + (size_t)y * w, *end = mark + w - 2;
         const int row = y / d->block < d->rows ? y / d->block : d->rows - 1;
-        for (const uint8_t *at = mark + 2; (at = memchr(at, 1, (size_t)(end - at))); at++) {
-            const int x = (int)(at - mark);
+        for (const uint8_t *pixel = mark + 2; (pixel = memchr(pixel, 1, (size_t)(end - pixel)));
+             pixel++) {
+            const int x = (int)(pixel - mark);
             const int column = x / d->block < d->columns ? x / d->block : d->columns - 1;
             const float brightness = d->paper[row * d->columns + column];
             const float contrast = brightness - d->smooth[(size_t)y * w + x];
@@ -648,11 +649,10 @@ enum { A_U = 0, C_U = 2, A_V = 3, C_V = 5, PERSPECTIVE = 6, LENS = 8, PARAMETERS
 
 typedef struct {
     int seeds, min_dots, rings;
-    const double *ring, *prior; /* radii; inverse variances of the parameters */
-    double min_neighbour,
-        max_neighbour; /* limits of the square distance of neighbours [square pitches] */
-    double cell_gate, cell_sigma;     /* gate and sigma of dots about cell centres [pitches] */
-    double symbol_gate, symbol_sigma; /* gate and sigma of dots about their symbols [pitches] */
+    const double *ring, *prior;          /* radii; inverse variances of the parameters */
+    double min_neighbour, max_neighbour; /* of square distances of neighbours [square pitches] */
+    double cell_gate, cell_sigma;        /* gate and sigma of dots about cell centres [pitches] */
+    double symbol_gate, symbol_sigma;    /* gate and sigma of dots about their symbols [pitches] */
     double lens_radius, offset; /* radius from which the lens is fitted; of a symbol [pitches] */
 } LatticeOptions;
 
@@ -1365,8 +1365,7 @@ HOT static void read_window(const Codec *codec, const float *x_bits, const float
                    length, y);
 }
 
-/* Limits of a codec. They bound the indices into its tables, and keep sums of phases in 64 bits.
- */
+/* Limits of a codec. They bound indices into its tables and keep sums of phases within 64 bits. */
 enum { MAX_SEQUENCE = 512, MAX_WINDOW_CELLS = 1024, MAX_WEIGHT = 1000 };
 #define MAX_POSITIONS (1LL << 40)
 #define MAX_COORDINATE (1LL << 60)

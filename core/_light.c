@@ -435,12 +435,12 @@ static inline uint64_t mispredictions(const BitWords *text, uint32_t taps, int w
 /* First of the polynomials that predict the most bits of a word. */
 HOT static int best_polynomial(const Tables *t, const BitWords *text, int w)
 {
-    int best = 0, fewest = 65;
+    int best = 0, min_mispredictions = 65;
     sum_word(text, w);
     for (int p = 0; p < t->polynomials; p++) {
         const int number = __builtin_popcountll(mispredictions(text, (uint32_t)t->taps[p], w));
-        best = number < fewest ? p : best;
-        fewest = number < fewest ? number : fewest;
+        best = number < min_mispredictions ? p : best;
+        min_mispredictions = number < min_mispredictions ? number : min_mispredictions;
     }
     return best;
 }
@@ -548,7 +548,7 @@ static void identify_burst(const Tables *t, const int8_t *value, int bits, BitWo
                            uint8_t *expected, int64_t steps, int64_t min_evidence, int32_t *row)
 {
     write_words(t, value, bits, text);
-    /* The central word suffices for most bursts; for the others, all words are examined. */
+    /* The central word is usually sufficient; otherwise all words are examined. */
     const int middle = text->words / 2, likely = best_polynomial(t, text, middle);
     int begin = 0;
     if (longest_run(t, text, likely, middle, middle + 1, &begin)) {
