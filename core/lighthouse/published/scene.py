@@ -10,6 +10,7 @@ poses: the image points of Eq. 1 and 3 have one factor 1/cos(theta), not two
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -215,7 +216,7 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
     else:
         require_two_stations(kind, epochs)
         columns = [0, 1]
-    left_out_before = dict(epochs.rejected)
+    rejected = Counter(epochs.rejected)
     epochs, left_out = select_stations(epochs, columns, "other_station")
     angles = angles_of(epochs)
     image = image_points(epochs, angles)
@@ -239,11 +240,8 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
     position = np.full((len(image), 3), np.nan)
     position[is_complete] = to_frame.apply(solved.locate(image[is_complete]))
     is_accepted = np.isfinite(position).all(axis=1)
-    rejected = {
-        **left_out_before,
-        **left_out,
-        "moment_with_too_few_sweeps": int(np.count_nonzero(~is_accepted)),
-    }
+    rejected.update(left_out)
+    rejected["moment_with_too_few_sweeps"] += int(np.count_nonzero(~is_accepted))
     scene = Scene(
         tuple(
             Station(
