@@ -251,7 +251,7 @@ def test_an_exchange_must_fit_well_to_be_undone(
     estimates = estimate_positions(angles_of(epochs), *stations, floor_z=0.0)
     _, restored, count = restore_swapped_sweeps(epochs, estimates, stations, 0.0)
     assert count == int(is_restored)
-    # The correct assignment is within the gate in both cases, but not within half of it.
+    # The correct assignment is within the gate in both cases, and within half of it in the first.
     exact = estimate_positions(
         angles_of(epochs_of(drive.counts, labelled=False)), *stations, floor_z=0.0
     )
