@@ -7,6 +7,7 @@ contradict themselves or the trajectory of their device are rejected and counted
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -112,7 +113,7 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
     floor_z = scene.floor_z if scene.planar else None
     floor_map = selected[0].floor_map if len(selected) == 1 else None
 
-    rejected: dict[str, int] = {}
+    rejected: Counter[str] = Counter()
     restored = 0
     if floor_map is not None:
         (calibration,) = stations[2]
@@ -127,7 +128,7 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
         estimates, repaired = leave_out_worst_station(
             rotor_angles(epochs), estimates, stations, floor_z, gate
         )
-        rejected["station_contradicts_others"] = repaired
+        rejected["station_contradicts_others"] += repaired
 
     is_unsolved = ~np.isfinite(estimates.position[:, 0])
     is_inconsistent = ~is_unsolved & (estimates.max_residual > gate)
@@ -140,13 +141,10 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
     is_accepted = ~(is_unsolved | is_inconsistent | is_out_of_range)
     is_jump = find_jumps(epochs, estimates, is_accepted)
     is_accepted &= ~is_jump
-    for reason, is_rejected in (
-        ("moment_with_too_few_sweeps", is_unsolved),
-        ("moment_inconsistent", is_inconsistent),
-        ("moment_out_of_reach", is_out_of_range),
-        ("moment_jumps", is_jump),
-    ):
-        rejected[reason] = int(np.count_nonzero(is_rejected))
+    rejected["moment_with_too_few_sweeps"] += int(np.count_nonzero(is_unsolved))
+    rejected["moment_inconsistent"] += int(np.count_nonzero(is_inconsistent))
+    rejected["moment_out_of_reach"] += int(np.count_nonzero(is_out_of_range))
+    rejected["moment_jumps"] += int(np.count_nonzero(is_jump))
 
     sigma = angle_sigma(estimates, is_accepted)
     calibration_sigma = None

@@ -17,6 +17,7 @@ authors' scripts (DotBots/alvarado23lighthouse).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -287,7 +288,7 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
     else:
         require_two_stations(kind, epochs)
         columns = [0, 1]
-    left_out_before = dict(epochs.rejected)
+    rejected = Counter(epochs.rejected)
     epochs, left_out = select_stations(epochs, columns, "other_station")
     angles = rotor_angles(epochs)
     image = image_points(epochs, angles)
@@ -311,11 +312,8 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
     position = np.full((len(image), 3), np.nan)
     position[is_complete] = to_frame.apply(solved.locate(image[is_complete]))
     is_accepted = np.isfinite(position).all(axis=1)
-    rejected = {
-        **left_out_before,
-        **left_out,
-        "moment_with_too_few_sweeps": int(np.count_nonzero(~is_accepted)),
-    }
+    rejected.update(left_out)
+    rejected["moment_with_too_few_sweeps"] += int(np.count_nonzero(~is_accepted))
     scene = Scene(
         tuple(
             Station(

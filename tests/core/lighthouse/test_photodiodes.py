@@ -235,3 +235,25 @@ def test_the_range_is_limited_in_metres_only(world: Any, factor: float, scale: s
     tracks = track_photodiodes(epochs_of(counts), scene)
     is_rejected = factor > 1 and scale == "markers"
     assert tracks.rejected == ({"moment_out_of_reach": 1} if is_rejected else {})
+
+
+@pytest.mark.parametrize(("error_rad", "is_restored"), [(3e-3, True), (1.5e-2, False)])
+def test_an_exchange_must_fit_well_to_be_undone(
+    world: Any, error_rad: float, is_restored: bool
+) -> None:
+    lamps = world.lamps(1, 2)
+    drive = world.drive(lamps, world.curve(30, flat=True), noise_rad=0.0)
+    drive.turned(np.array([7]), 0, 0, np.array([error_rad]))
+    counts = drive.counts.copy()
+    counts[7] = drive.counts[7, ::-1]
+    epochs = epochs_of(counts, labelled=False)
+    stations = stack(factory_stations(world, lamps))
+    estimates = estimate_positions(angles_of(epochs), *stations, floor_z=0.0)
+    _, restored, count = restore_swapped_sweeps(epochs, estimates, stations, 0.0)
+    assert count == int(is_restored)
+    # The correct assignment is within the gate in both cases, and within half of it in the first.
+    exact = estimate_positions(
+        angles_of(epochs_of(drive.counts, labelled=False)), *stations, floor_z=0.0
+    )
+    assert exact.max_residual[7] < INLIER_GATE_RAD
+    assert (restored.max_residual[7] < INLIER_GATE_RAD / 2) is np.bool_(is_restored)

@@ -16,9 +16,10 @@ from locatk.core.geometry import Similarity, rotation_exp, umeyama
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.localization.photodiodes import MAX_RANGE_M
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
-from locatk.core.lighthouse.solver import SolveOptions, solve
-from locatk.core.solution import Solution
+from locatk.core.lighthouse.solver import SolveOptions, _merge, solve
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -796,3 +797,34 @@ def test_a_marker_on_an_unknown_device_is_named(world: Any) -> None:
     with pytest.raises(InputError, match="green") as refused:
         strict(drive.sweeps, Scene(markers=(wrong,)))
     assert "robot" in str(refused.value.hint)
+
+
+def test_solutions_of_devices_and_photodiodes_are_merged() -> None:
+    def detection(station: int, channel: int, sweeps: int, rejected: int) -> StationDetection:
+        return StationDetection(station, channel, None, 959000, "generic", sweeps, rejected, 1e-4)
+
+    devices = Solution(
+        "lighthouse",
+        "bundle",
+        (),
+        {"plane_unknown": 3, "sweep_contradicts_pose": 2},
+        [detection(0, 1, 10, 1), detection(1, 2, 20, 2)],
+        facts=LighthouseFacts(iterations=7),
+        warnings=(SolverWarning("device", "of a device"),),
+    )
+    photodiodes = Solution(
+        "lighthouse",
+        "bundle",
+        (),
+        {"plane_unknown": 4, "moment_jumps": 5},
+        [detection(0, 2, 100, 30)],
+        facts=LighthouseFacts(angle_sigma_rad=1e-4),
+    )
+    merged = _merge(devices, photodiodes, ("robot",))
+    assert merged.rejected == {"plane_unknown": 7, "sweep_contradicts_pose": 2, "moment_jumps": 5}
+    assert [(d.station, d.channel, d.sweeps, d.rejected) for d in merged.detections] == [
+        (0, 1, 10, 1),
+        (1, 2, 120, 32),
+    ]
+    assert merged.facts == LighthouseFacts(angle_sigma_rad=1e-4, rigid=devices.facts)
+    assert merged.warnings == devices.warnings

@@ -28,7 +28,7 @@ ARGUMENTS = {
     "reject": 0,
     "_add_rejected": 1,
     "keep": 1,
-    "keep_stations": 1,
+    "select_stations": 2,
     "_refusal": 2,
     "_answer": 2,
     "Seen": 3,
