@@ -491,8 +491,8 @@ def _adjust_scene(
         states.take(chosen),
         position[chosen],
     )
-    epochs_at = np.bincount(position)
-    weight = np.asarray(1.0 / (ROTATIONS_PER_WINDOW * epochs_at[position]), np.float64)
+    position_count = int(np.max(position)) + 1
+    weight = epoch_weights(position)
 
     is_generic = np.array([c.source == "generic" for c in stations[2]])
     sigma = MODEL_SIGMA_RAD if np.any(is_generic) else 2 * ANGLE_SIGMA_RAD
@@ -509,7 +509,7 @@ def _adjust_scene(
     )  # fmt: skip
     facts = LighthouseFacts(
         adjusted_epochs=len(observations),
-        adjusted_positions=len(epochs_at),
+        adjusted_positions=position_count,
         scene_angle_sigma_rad=sigma,
         iterations=adjusted.iterations,
         links=tuple(
@@ -517,7 +517,7 @@ def _adjust_scene(
             for k in links
         ),
     )
-    warnings = _warnings(joined, channels, adjusted.stations[2], len(epochs_at), links)
+    warnings = _warnings(joined, channels, adjusted.stations[2], position_count, links)
     positions, rotations, calibrations = adjusted.stations
     solved = tuple(
         Station(
@@ -618,6 +618,16 @@ def select_keyframes(position: IntArray, station_count: IntArray) -> IntArray:
     if len(order) > MAX_ADJUSTED_EPOCHS:
         order = order[np.linspace(0, len(order) - 1, MAX_ADJUSTED_EPOCHS).astype(int)]
     return np.sort(order)
+
+
+def epoch_weights(position: IntArray) -> Array:
+    """Return the weight (m,) of each epoch in the bundle adjustment.
+
+    The epochs of a position together have the weight of one rotation, because both rotations of a
+    window and all epochs of a device at rest repeat the same errors.
+    """
+    epochs_at_position = np.bincount(position)
+    return np.asarray(1.0 / (ROTATIONS_PER_WINDOW * epochs_at_position[position]), np.float64)
 
 
 def _warnings(

@@ -19,6 +19,7 @@ from locatk.core.lighthouse.devices.scene_initialization import (
     StationPoses,
     cluster_poses,
     connect_stations,
+    epoch_weights,
     estimate_link,
     estimate_links,
     select_epochs,
@@ -185,6 +186,10 @@ def test_a_few_epochs_of_each_position_with_the_most_stations_are_selected() -> 
     assert many[0] == 0
     assert many[-1] == 999
     assert len(select_keyframes(np.zeros(9, int), np.ones(9, int))) == MAX_EPOCHS_PER_POSITION
+
+
+def test_the_epochs_of_a_position_together_weigh_as_one_rotation() -> None:
+    assert epoch_weights(np.array([0, 0, 1, 0, 0])).tolist() == [0.125, 0.125, 0.5, 0.125, 0.125]
 
 
 # ---- solver

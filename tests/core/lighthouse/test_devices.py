@@ -148,6 +148,8 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> No
     scene = solution.artifact
     assert (scene.scale, scene.frame) == ("markers", "floor")
     assert facts_of(solution)["marker_misfit_m"] < 2e-3
+    # The scene was estimated from the same sweeps.
+    assert not facts_of(solution)["verification"]["held_out"]
     for lamp in lamps:
         station = scene.station(lamp.channel)
         assert np.linalg.norm(station.position - lamp.position) < 0.03
