@@ -174,6 +174,8 @@ def check_scene(sessions: Sequence[str]) -> None:
 
 def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, Any]:
     """One session of ``--json`` (ARCHITECTURE 4; docs/commands.md)."""
+    from locatk.core.solution import to_json
+
     solution = solved.solution
     return {
         "session": session,
@@ -183,8 +185,8 @@ def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, 
         "poses": solution.poses,
         "rejected": solution.rejected,
         "solve_s": solved.solve_s,
-        "detections": solution.detections,
-        **({"facts": solution.facts} if solution.system == "landmarks" else {}),
+        "detections": to_json(solution.detections),
+        **({"facts": to_json(solution.facts)} if solution.system == "landmarks" else {}),
     }
 
 
@@ -214,7 +216,7 @@ def text(session: str | Path, output: str | Path, solved: Solved) -> str:
 
 def notes(session: str | Path, solved: Solved) -> list[str]:
     """What must be known to use the poses; said with ``--json`` too, on stderr."""
-    return [f"{Path(session).name}: {note}" for note in solved.solution.notes]
+    return [f"{Path(session).name}: {each.message}" for each in solved.solution.warnings]
 
 
 def _spread(sigma: Any) -> list[str]:

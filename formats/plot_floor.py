@@ -85,7 +85,7 @@ def floor_of(solution: Solution) -> Floor | None:
     if not isinstance(floor, FloorMap):
         return None
     cells = cells_near(floor, [t.position for t in solution.trajectories])
-    met = {tuple(found["cell"]) for found in solution.detections if found["cell"] is not None}
+    met = {found.cell for found in solution.detections if found.cell is not None}
     north, south, weak = _bars(floor, cells)
     seen, refused = _sightings(solution, floor)
     return Floor(
@@ -141,12 +141,12 @@ def _sightings(solution: Solution, floor: FloorMap) -> tuple[Array, Array]:
     used: list[Array] = []
     refused: list[Array] = []
     for found in solution.detections:
-        place = _on_path(paths.get(found["device"]), round(1e9 * found["time_s"]))
-        if place is None and found["cell"] is not None and found["x_m"] is not None:
-            x, y = floor.place(tuple(found["cell"]))
-            place = np.array([x + found["x_m"], y + found["y_m"]])
+        place = _on_path(paths.get(found.device), round(1e9 * found.time_s))
+        if place is None and found.cell is not None and found.x_m is not None:
+            x, y = floor.place(found.cell)
+            place = np.array([x + found.x_m, y + found.y_m])
         if place is not None:
-            (refused if found["refused"] else used).append(place)
+            (refused if found.refused else used).append(place)
     return _flat(used), _flat(refused)
 
 

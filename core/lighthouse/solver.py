@@ -13,7 +13,7 @@ from locatk.core.lighthouse.localization import photodiodes as poses
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
@@ -90,7 +90,8 @@ def solve(
     if not rigid:
         return solution
     note = "the paper's method knows no rigid devices: each photodiode is solved by itself"
-    return replace(solution, notes=(*solution.notes, note))
+    warnings = (*solution.warnings, SolverWarning("unspecified", note))
+    return replace(solution, warnings=warnings)
 
 
 def _solve_points(

@@ -121,19 +121,19 @@ def read_runs(folder: Path) -> dict[str, list[Samples]]:
     }
 
 
-def solve_run(samples: Samples, method: str) -> list[dict[str, Any]]:
+def solve_run(samples: Samples, method: str) -> tuple[TagDetection, ...]:
     """Detections of one recording. The published algorithm is told the speed."""
     speed = SPEED_MPS if method == "paper" else None
     return solve([samples], PUBLISHED_TAGS, SolveOptions(method, speed)).detections
 
 
-def as_run(detections: Sequence[Mapping[str, Any]], tag_id: int) -> Run:
+def as_run(detections: Sequence[TagDetection], tag_id: int) -> Run:
     """What detections of one pass over ``tag_id`` say of it."""
     cells = layout_of(PUBLISHED_TAGS, tag_id).cells
-    ids = [found["tag_id"] for found in detections if found["tag_id"] is not None]
+    ids = [found.tag_id for found in detections if found.tag_id is not None]
     wrong = sum((one ^ tag_id).bit_count() for one in ids)
     for found in detections:
-        by_cell = {tuple(m["cell"]): m for m in found["magnets"] if m["cell"] is not None}
+        by_cell = {m.cell: m for m in found.magnets if m.cell is not None}
         if set(by_cell) != set(cells):
             continue
         magnets = [by_cell[cell] for cell in cells]
@@ -141,11 +141,11 @@ def as_run(detections: Sequence[Mapping[str, Any]], tag_id: int) -> Run:
             tag_id,
             bool(ids),
             wrong,
-            np.array([[magnet["x_m"], magnet["y_m"]] for magnet in magnets]),
-            np.array([magnet["angle_rad"] for magnet in magnets]),
-            found["heading_rad"],
-            found["scale"],
-            found["residual_sigma"],
+            np.array([[magnet.x_m, magnet.y_m] for magnet in magnets]),
+            np.array([magnet.angle_rad for magnet in magnets]),
+            found.heading_rad,
+            found.scale,
+            found.residual_sigma,
         )
     nowhere = np.full((len(cells), 2), np.nan)
     return Run(tag_id, bool(ids), wrong, nowhere, nowhere[:, 0], math.nan, math.nan, math.nan)

@@ -23,11 +23,12 @@ from locatk.core.lighthouse.devices.verification import verify_devices
 from locatk.core.lighthouse.job import LARGEST_MISFIT_M
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import MarkerVisit, Scene
 from locatk.core.lighthouse.scene.frame import transform_covariance
 from locatk.core.lighthouse.scene.verification import StationCheck
 from locatk.core.robust import robust_sigma
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning, from_json, to_json
 from locatk.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -189,18 +190,18 @@ def _solution(
         options.method,
         answer.trajectories,
         dict(answer.rejected),
-        rows,
+        tuple(from_json(StationDetection, row) for row in rows),
         answer.scene,
-        tuple(dict.fromkeys(answer.notes)),
-        dict(answer.facts),
+        tuple(SolverWarning("unspecified", text) for text in dict.fromkeys(answer.notes)),
+        from_json(LighthouseFacts, answer.facts),
     )
 
 
 def _together(rigid: Solution, others: Solution, names: tuple[str, ...]) -> Solution:
     """One solution of two over the same scene."""
     rejected = dict(Counter(rigid.rejected) + Counter(others.rejected))
-    rows = {row["channel"]: dict(row) for row in others.detections}
-    for row in rigid.detections:
+    rows = {row.channel: to_json(row) for row in others.detections}
+    for row in map(to_json, rigid.detections):
         both = rows.setdefault(row["channel"], {**row, **dict.fromkeys(COUNTED, 0)})
         both.update({name: both[name] + row[name] for name in COUNTED})
     points = [t for t in others.trajectories if t.device not in names]
@@ -208,7 +209,10 @@ def _together(rigid: Solution, others: Solution, names: tuple[str, ...]) -> Solu
         others,
         trajectories=(*rigid.trajectories, *points),
         rejected=rejected,
-        detections=[{**rows[c], "station": k} for k, c in enumerate(sorted(rows))],
-        notes=tuple(dict.fromkeys((*rigid.notes, *others.notes))),
-        facts={**others.facts, "rigid": rigid.facts},
+        detections=tuple(
+            from_json(StationDetection, {**rows[c], "station": k})
+            for k, c in enumerate(sorted(rows))
+        ),
+        warnings=tuple(dict.fromkeys((*rigid.warnings, *others.warnings))),
+        facts=replace(others.facts, rigid=rigid.facts),
     )

@@ -25,11 +25,12 @@ from locatk.core.lighthouse.noise import (
     INLIER_GATE_SIGMAS,
     MIN_INLIER_GATE_RAD,
 )
+from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.selection import spread_evenly
 from locatk.core.lighthouse.scene.verification import MOST, StationCheck, verify, wrong_station
 from locatk.core.robust import robust_sigma
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning, from_json
 from locatk.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -114,10 +115,15 @@ def answer(job: Job, scene: Scene) -> Solution:
         job.options.method,
         tuple(trajectories),
         job.rejected,
-        detections(job.epochs, {s.channel: s for s in stations}, fixes.residual, good, checks),
+        tuple(
+            from_json(StationDetection, row)
+            for row in detections(
+                job.epochs, {s.channel: s for s in stations}, fixes.residual, good, checks
+            )
+        ),
         scene,
-        tuple(dict.fromkeys(job.notes)),
-        job.facts,
+        tuple(SolverWarning("unspecified", text) for text in dict.fromkeys(job.notes)),
+        from_json(LighthouseFacts, job.facts),
     )
 
 

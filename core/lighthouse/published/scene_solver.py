@@ -14,10 +14,11 @@ from locatk.core.lighthouse.epochs import Epochs
 from locatk.core.lighthouse.light_planes import angles_to_counts, paper_image_points
 from locatk.core.lighthouse.localization.photodiodes import detections
 from locatk.core.lighthouse.published import scene as paper
+from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene import frame as frames
 from locatk.core.lighthouse.scene.keyframes import require_distinct_positions
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning, from_json
 from locatk.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -97,10 +98,13 @@ def solve_as_paper(job: Job) -> Solution:
         "paper",
         trajectories,
         job.rejected,
-        detections(job.epochs, {s.channel: s for s in scene.stations}),
+        tuple(
+            from_json(StationDetection, row)
+            for row in detections(job.epochs, {s.channel: s for s in scene.stations})
+        ),
         scene,
-        tuple(dict.fromkeys(job.notes)),
-        job.facts,
+        tuple(SolverWarning("unspecified", text) for text in dict.fromkeys(job.notes)),
+        from_json(LighthouseFacts, job.facts),
     )
 
 
