@@ -74,9 +74,7 @@ def _not_localised(solution: Solution) -> list[str]:
     return losses
 
 
-def _refused(
-    seen: Sequence[TagDetection | LandmarkDetection], what: str, how: str
-) -> list[str]:
+def _refused(seen: Sequence[TagDetection | LandmarkDetection], what: str, how: str) -> list[str]:
     """How many were refused, and why."""
     reasons = Counter(found.refused or "?" for found in seen)
     return [
@@ -89,10 +87,11 @@ def seen(solution: Solution) -> str | None:
     """A table of what the system saw; None where it saw nothing, or has no such table."""
     from locatk.formats import seen_text
 
-    tables = {"polaris": seen_text.tags, "landmarks": seen_text.landmarks}
-    if solution.system not in tables or not solution.detections:
+    if solution.system not in ("polaris", "landmarks") or not solution.detections:
         return None
-    most = MOST_LANDMARKS if solution.system == "landmarks" else None
-    found = tables[solution.system](solution.detections, most)
+    if solution.system == "polaris":
+        found = seen_text.tags(solution.detections)
+    else:
+        found = seen_text.landmarks(solution.detections, MOST_LANDMARKS)
     table = console.table(found.header, found.rows)
     return f"{table}\n... and {found.more} more: see --json" if found.more else table

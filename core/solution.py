@@ -146,7 +146,7 @@ def from_json(kind: type[Record], table: Mapping[str, Any]) -> Record:
     if kind is GenericRecord:
         return typing.cast(Record, GenericRecord(dict(table)))
     values = {}
-    for item in _layout(kind):
+    for item in _layout(kind):  # type: ignore[arg-type]
         if item.key in table:
             values[item.name] = _converted(item.kind, table[item.key])
         elif not item.has_default:
@@ -181,7 +181,7 @@ class _Field:
 
 
 @functools.cache
-def _layout(kind: type) -> tuple[_Field, ...]:
+def _layout(kind: Any) -> tuple[_Field, ...]:
     """Fields of a dataclass; resolving the types takes longer than building a record."""
     hints = typing.get_type_hints(kind)
     return tuple(

@@ -226,5 +226,10 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
         share = evaluation.coverage.share
         text += "" if share is None else f", {100 * share:.1f} % of the time solved"
         text += f" (alignment: {evaluation.align}, time offset: {evaluation.offset_source})"
-    notes = textwrap.wrap("; ".join(warning.message for warning in solution.warnings), 160, max_lines=2, placeholder=" ...")
+    notes = textwrap.wrap(
+        "; ".join(warning.message for warning in solution.warnings),
+        160,
+        max_lines=2,
+        placeholder=" ...",
+    )
     return plain("\n".join(textwrap.wrap(text, 160) + notes))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -141,7 +142,7 @@ def _sightings(solution: Solution, floor: FloorMap) -> tuple[Array, Array]:
     used: list[Array] = []
     refused: list[Array] = []
     for found in solution.detections:
-        place = _on_path(paths.get(found.device), round(1e9 * found.time_s))
+        place = _on_path(paths.get(found.device), found.time_s)
         if place is None and found.cell is not None and found.x_m is not None:
             x, y = floor.place(found.cell)
             place = np.array([x + found.x_m, y + found.y_m])
@@ -150,9 +151,10 @@ def _sightings(solution: Solution, floor: FloorMap) -> tuple[Array, Array]:
     return _flat(used), _flat(refused)
 
 
-def _on_path(path: Trajectory | None, time_ns: int) -> Array | None:
-    if path is None:
+def _on_path(path: Trajectory | None, time_s: float) -> Array | None:
+    if path is None or not math.isfinite(time_s):
         return None
+    time_ns = round(1e9 * time_s)
     nearest = int(np.argmin(np.abs(path.time_ns - time_ns)))
     late = abs(int(path.time_ns[nearest]) - time_ns) > LATE_NS
     return None if late else path.position[nearest, :2]

@@ -9,9 +9,9 @@ Visits are found as for the default method. Of each:
    the bars, the four voltages amend the pose (:mod:`.paper_pose`).
 
 A pass alone tells the paper neither pattern nor heading: such a visit is refused as
-``no_spin``, with the first centre in a warning (``first_step``). What the paper does not have: a reading
-whose bars explain less than half of the spin's field is refused as ``unexplained``. Farther
-than 8-10 mm from the centre valleys merge, and other patterns would be read silently.
+``no_spin``, with the first centre in a warning (``first_step``). What the paper does not have:
+a reading whose bars explain less than half of the spin's field is refused as ``unexplained``.
+Farther than 8-10 mm from the centre valleys merge, and other patterns would be read silently.
 """
 
 from __future__ import annotations

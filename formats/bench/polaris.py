@@ -18,10 +18,9 @@ is not told to it); rows "without the ruler" take that back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from locatk.core.errors import LocatkError
 from locatk.core.geometry import umeyama
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import places
 from locatk.formats.bench import Figure
@@ -136,6 +136,7 @@ def as_run(detections: Sequence[TagDetection], tag_id: int) -> Run:
         by_cell = {m.cell: m for m in found.magnets if m.cell is not None}
         if set(by_cell) != set(cells):
             continue
+        assert found.heading_rad is not None  # its magnets are on a grid
         magnets = [by_cell[cell] for cell in cells]
         return Run(
             tag_id,

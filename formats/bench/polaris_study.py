@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import heading_of
 from locatk.core.polaris.bound import magnet_covariance, pose_covariance
 from locatk.core.polaris.codec import capacity, layout_of
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.simulate import Simulated, SimulationOptions, simulate
 from locatk.core.polaris.simulate_options import CARS, usual_bar
 from locatk.core.polaris.solver import SolveOptions, solve
