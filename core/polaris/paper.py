@@ -74,8 +74,7 @@ def sightings(samples: Samples, tags: Tags, speed_mps: float | None) -> list[Sig
     """
     if speed_mps is None:
         raise InputError(
-            "no speed, which the paper's method needs,",
-            hint="Give it with --speed, in m/s",
+            "no speed, which the paper's method needs,", hint="Give it with --speed, in m/s"
         )
     bar, warnings = _living(samples)
     path = speed_mps * (bar.time_ns - bar.time_ns[0]) * 1e-9
@@ -350,8 +349,8 @@ def _living(samples: Samples) -> tuple[Samples, tuple[SolverWarning, ...]]:
             hint="The paper's method needs two adjacent sensors",
         )
     dead = ", ".join(str(k + 1) for k in np.flatnonzero(~alive))
-    message = f"without sensor {dead}, which gave no samples"
-    warnings = (SolverWarning("sensor_silent", message),) if dead else ()
+    silent = SolverWarning("sensor_silent", f"without sensor {dead}, which gave no samples")
+    warnings = (silent,) if dead else ()
     array = replace(samples.array, position_m=samples.array.position_m[kept])
     return Samples(samples.device, array, samples.time_ns, samples.field_t[:, kept]), warnings
 
