@@ -186,7 +186,7 @@ def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, 
         "rejected": solution.rejected,
         "solve_s": solved.solve_s,
         "detections": to_json(solution.detections),
-        **({"facts": to_json(solution.facts)} if solution.system == "landmarks" else {}),
+        **({"facts": to_json(solution.facts) or {}} if solution.system == "landmarks" else {}),
     }
 
 

@@ -200,7 +200,7 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
             or tags.attached_tags(session)
             or maps.attached_map(session),
             warnings=_warnings(said),
-            facts=from_json(facts_type, said["facts"]),
+            facts=from_json(facts_type, said["facts"]) if said["facts"] else None,
         )
     except LocatkError:
         raise
