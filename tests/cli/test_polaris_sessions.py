@@ -472,7 +472,10 @@ def test_a_pass_that_disagrees_is_named_and_left_out(
     locatk, solver: Solver, tmp_path: Path
 ) -> None:
     solver.seen = passes(5)
-    solver.seen[3][0]["magnets"][2]["x_m"] += 0.004
+    (found,) = solver.seen[3]
+    magnets = list(found.magnets)
+    magnets[2] = replace(magnets[2], x_m=magnets[2].x_m + 0.004)
+    solver.seen[3] = [replace(found, magnets=tuple(magnets))]
     sessions = [record(tmp_path / f"run{k}.mcap") for k in range(5)]
     out = tmp_path / "built.toml"
     result = locatk("calibrate", "tag", *sessions, "-o", out, "--json")

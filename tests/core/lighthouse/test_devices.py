@@ -54,11 +54,11 @@ def test_both_roads_share_a_scene(mixed: Any) -> None:
         # Both were at the same places; the start of the clock is known to a rotation.
         assert np.median(np.linalg.norm(track.position - true, axis=1)) < 0.03
     assert solution.artifact is scene
-    told = sum(int(row["sweeps"]) + int(row["rejected"]) for row in solution.detections)
+    told = sum(row.sweeps + row.rejected for row in solution.detections)
     assert told <= len(sweeps)
-    assert [row["channel"] for row in solution.detections] == [1, 2, 5]
-    assert "verification" in solution.facts
-    assert solution.facts["rigid"]
+    assert [row.channel for row in solution.detections] == [1, 2, 5]
+    assert solution.facts.verification is not None
+    assert solution.facts.rigid
 
 
 def test_a_body_alone_needs_no_other(mixed: Any, world: Any) -> None:
@@ -66,7 +66,7 @@ def test_a_body_alone_needs_no_other(mixed: Any, world: Any) -> None:
     alone = world.take(sweeps, np.flatnonzero(sweeps.device == 0))
     solution = solve(alone, scene, receivers={"body": BODY})
     assert [t.device for t in solution.trajectories] == ["body"]
-    assert [row["station"] for row in solution.detections] == [0, 1, 2]
+    assert [row.station for row in solution.detections] == [0, 1, 2]
 
 
 def test_without_receivers_photodiodes_are_apart(mixed: Any) -> None:
@@ -81,7 +81,7 @@ def test_the_papers_method_says_that_it_knows_no_bodies(world: Any) -> None:
     paper = SolveOptions(method="paper", scene="two-planar")
     markers = Scene(markers=world.markers_of(lamps, world.square))
     solution = solve(drive.sweeps, markers, paper, receivers={"robot": BODY})
-    assert any("knows no rigid devices" in note for note in solution.notes)
+    assert any("knows no rigid devices" in each.message for each in solution.warnings)
 
 
 PLACES = np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.2], [-0.5, -0.5, 0.0], [0.5, -0.5, 0.1]])
@@ -124,7 +124,7 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_body(world: Any) -> None
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": BODY})
     scene = solution.artifact
     assert (scene.scale, scene.frame) == ("markers", "floor")
-    assert float(solution.facts["marker_misfit_m"]) < 2e-3
+    assert solution.facts.marker_misfit_m < 2e-3
     for lamp in lamps:
         station = scene.station(lamp.channel)
         assert np.linalg.norm(station.position - lamp.position) < 0.03
@@ -140,26 +140,26 @@ def test_two_markers_fix_no_frame_and_a_note_says_so(world: Any) -> None:
     _, sweeps, markers = marked(world, 2)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": BODY})
     assert solution.artifact.scale == "device"
-    assert any("fix no frame" in note for note in solution.notes)
+    assert any("fix no frame" in each.message for each in solution.warnings)
 
 
 def test_a_marker_that_was_measured_wrong_is_told(world: Any) -> None:
     _, sweeps, markers = marked(world, 4)
     wrong = replace(markers[3], position=markers[3].position + [0.15, 0.0, 0.0])
     solution = solve(sweeps, Scene(markers=(*markers[:3], wrong)), receivers={"robot": BODY})
-    assert any("measured wrong" in note for note in solution.notes)
+    assert any("measured wrong" in each.message for each in solution.warnings)
 
 
 def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
     sweeps = world.stream(lamps, where, 6.0, sensors=SPAN)
-    checks = solve(sweeps, scene, receivers={"robot": BODY}).facts["verification"]
-    assert checks["held_out"]
-    assert [check["channel"] for check in checks["stations"]] == [1, 2, 5]
-    for check in checks["stations"]:
-        assert check["moments"] > 100
-        assert check["residual_m"] < 8e-3
-        assert check["jump_95_m"] < 0.02
+    checks = solve(sweeps, scene, receivers={"robot": BODY}).facts.verification
+    assert checks.held_out
+    assert [check.channel for check in checks.stations] == [1, 2, 5]
+    for check in checks.stations:
+        assert check.epochs > 100
+        assert check.residual_m < 8e-3
+        assert check.jump_95_m < 0.02
 
 
 def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: Any) -> None:
@@ -170,9 +170,9 @@ def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: A
     solution = solve(
         sweeps, replace(scene, stations=(first, moved, third)), receivers={"robot": BODY}
     )
-    off = {row["channel"]: row["verification_m"] for row in solution.detections}
+    off = {row.channel: row.verification_m for row in solution.detections}
     assert off[2] > 0.02
-    jumps = {c["channel"]: c["without_rad"] for c in solution.facts["verification"]["stations"]}
+    jumps = {c.channel: c.without_rad for c in solution.facts.verification.stations}
     assert jumps[2] < 0.5 * min(jumps[1], jumps[5])
 
 
@@ -180,5 +180,5 @@ def test_one_station_has_no_other_to_be_verified_against(mixed: Any, world: Any)
     _, lamps, scene = mixed
     sweeps = world.stream(lamps[:1], where, 4.0, sensors=SPAN)
     solution = solve(sweeps, scene, receivers={"robot": BODY})
-    assert "verification" not in solution.facts
-    assert "verification_rad" not in solution.detections[0]
+    assert solution.facts.verification is None
+    assert solution.detections[0].verification_rad is None

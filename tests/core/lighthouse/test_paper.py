@@ -150,8 +150,8 @@ def test_the_paper_must_be_told_of_the_plane(world: Any) -> None:
     lamps = ideal(world, 2, 16)
     recording = world.drive(lamps, world.curve(100, flat=True))
     solution = solve(recording.sweeps, None, SolveOptions(method="paper"))
-    assert any("planar" in note for note in solution.notes)
-    assert any("unit scale" in note for note in solution.notes)
+    assert any("planar" in each.message for each in solution.warnings)
+    assert any("unit scale" in each.message for each in solution.warnings)
     first, second = (s.position for s in solution.artifact.stations)
     assert np.linalg.norm(second - first) == pytest.approx(1, abs=1e-3)
 
