@@ -111,12 +111,6 @@ def to_json(record: Any) -> Any:
     """
     if type(record) in _PLAIN_TYPES:
         return record
-    if isinstance(record, np.generic | np.ndarray):
-        return record.tolist()
-    if isinstance(record, list | tuple):
-        return [to_json(value) for value in record]
-    if isinstance(record, Mapping):
-        return {str(key): to_json(value) for key, value in record.items()}
     if isinstance(record, GenericRecord):
         return to_json(record.values)
     if is_dataclass(record) and not isinstance(record, type):
@@ -124,8 +118,15 @@ def to_json(record: Any) -> Any:
         for item in _layout(type(record)):
             value = getattr(record, item.name)
             if value is not None or not item.is_optional:
-                table[item.key] = to_json(value)
+                # There may be a million numbers; a call for each would take most of the time.
+                table[item.key] = value if type(value) in _PLAIN_TYPES else to_json(value)
         return table
+    if isinstance(record, np.generic | np.ndarray):
+        return record.tolist()
+    if isinstance(record, list | tuple):
+        return [to_json(value) for value in record]
+    if isinstance(record, Mapping):
+        return {str(key): to_json(value) for key, value in record.items()}
     return record
 
 
@@ -148,7 +149,9 @@ def from_json(kind: type[Record], table: Mapping[str, Any]) -> Record:
     values = {}
     for item in _layout(kind):  # type: ignore[arg-type]
         if item.key in table:
-            values[item.name] = _converted(item.kind, table[item.key])
+            value = table[item.key]
+            is_as_declared = type(value) is item.kind
+            values[item.name] = value if is_as_declared else _converted(item.kind, value)
         elif not item.has_default:
             raise KeyError(item.key)
     return kind(**values)
