@@ -5,8 +5,8 @@ Detections and facts are dataclasses, one type of each per system (``core/<syste
 docs/formats.md. The JSON form follows from the declaration of a field:
 
 - its key is the name of the field, or ``metadata["json"]`` if the stable key is another one;
-- a field that is None by default is left out if it is None; a field without default is always
-  written, None as null;
+- a field that is None by default is left out if it is None, unless ``metadata["json_null"]`` is
+  true; every other field is always written, None as null;
 - nan stands for an unknown number. JSON has no nan: null is read as nan if the field is declared
   as ``float``, and as None if it is declared as ``float | None``.
 """
@@ -173,7 +173,7 @@ class _Field:
         As declared.
     has_default : bool
     is_optional : bool
-        None by default, and left out if it is None.
+        Left out if it is None.
     """
 
     name: str
@@ -193,7 +193,7 @@ def _layout(kind: Any) -> tuple[_Field, ...]:
             item.metadata.get("json", item.name),
             hints[item.name],
             item.default is not MISSING or item.default_factory is not MISSING,
-            item.default is None,
+            item.default is None and not item.metadata.get("json_null", False),
         )
         for item in fields(kind)
     )

@@ -69,9 +69,7 @@ def solve(
             )
         found = paper.sightings(recording, driven, geometry)
         located = _located(found, floor) if floor is not None else {}
-        robots[device] = RobotFacts(
-            localised=bool(located), landmarks_seen=len(found), landmarks_to_localise=None
-        )
+        robots[device] = RobotFacts(localised=bool(located), landmarks_seen=len(found))
         if located and floor is not None:
             trajectories.append(_driven(device, found, located, driven, floor))
         elif floor is not None:

@@ -84,7 +84,8 @@ class RobotFacts:
     landmarks_seen : int
         Landmarks that were read.
     landmarks_to_localise : int or None
-        Number of the landmark at which the cell became certain; None if it never did.
+        Number of the landmark at which the cell became certain; None if it never did, or with
+        ``--method paper``. Written as null; earlier versions left it out with that method.
     misfit_sigma : float, optional
         Rms residual of all fields after smoothing, in standard deviations.
     """
@@ -92,7 +93,7 @@ class RobotFacts:
     localised: bool
     probability: float | None = None
     landmarks_seen: int
-    landmarks_to_localise: int | None
+    landmarks_to_localise: int | None = field(default=None, metadata={"json_null": True})
     misfit_sigma: float | None = None
 
 
