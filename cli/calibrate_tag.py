@@ -108,7 +108,7 @@ def _passes(
             if not solution.detections:
                 left_out[str(path)] = "no tag was seen"
             for detection in solution.detections:
-                name = f"{path} at {detection['time_s']:.3f} s"
+                name = f"{path} at {detection.time_s:.3f} s"
                 found = pass_of(design, detection, name)
                 if isinstance(found, str):
                     left_out[name] = found

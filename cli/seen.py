@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from locatk.cli import console
 
 if TYPE_CHECKING:
+    from locatk.core.landmarks.results import LandmarkDetection, RobotFacts
+    from locatk.core.polaris.results import TagDetection
     from locatk.core.solution import Solution
 
 MOST_LANDMARKS = 40
@@ -22,12 +25,12 @@ def lost(solution: Solution) -> list[str]:
     if not losses and not solution.trajectories:
         losses = ["no pose at all"]
     if solution.system == "polaris":
-        unread = [seen for seen in solution.detections if seen["tag_id"] is None]
+        unread = [seen for seen in solution.detections if seen.tag_id is None]
         losses += _refused(unread, "tag", "not read")
     elif solution.system == "landmarks":
-        said = [seen for seen in solution.detections if seen["refused"]]
-        misread = [seen for seen in said if seen["refused"] == "misread"]
-        refused = [seen for seen in said if seen["refused"] != "misread"]
+        said = [seen for seen in solution.detections if seen.refused]
+        misread = [seen for seen in said if seen.refused == "misread"]
+        refused = [seen for seen in said if seen.refused != "misread"]
         losses += _refused(refused, "sighting", "refused")
         if misread:
             what = "landmark is not that" if len(misread) == 1 else "landmarks are not those"
@@ -55,24 +58,25 @@ def _most(solution: Solution) -> list[str]:
 def _not_localised(solution: Solution) -> list[str]:
     """Robots that do not know where on the map they are, and why."""
     losses = []
-    for device, told in solution.facts.get("robots", {}).items():
-        if told["localised"]:
+    robots: dict[str, RobotFacts] = {} if solution.facts is None else solution.facts.robots
+    for device, facts in robots.items():
+        if facts.localised:
             continue
         if solution.artifact is None:
             why = ": no map of the floor"
-        elif not told["landmarks_seen"]:
+        elif not facts.landmarks_seen:
             why = ": no landmark was seen"
-        elif told.get("probability") is not None:
-            why = f": the likeliest place has a probability of {told['probability']:.2g}"
+        elif facts.probability is not None:
+            why = f": the likeliest place has a probability of {facts.probability:.2g}"
         else:
             why = ""
         losses.append(f"{device} is not localised{why}")
     return losses
 
 
-def _refused(seen: list[dict[str, Any]], what: str, how: str) -> list[str]:
+def _refused(seen: Sequence[TagDetection | LandmarkDetection], what: str, how: str) -> list[str]:
     """How many were refused, and why."""
-    reasons = Counter(found["refused"] or "?" for found in seen)
+    reasons = Counter(found.refused or "?" for found in seen)
     return [
         f"{n} {what}{'' if n == 1 else 's'} {how} ({why.replace('_', ' ')})"
         for why, n in reasons.items()
@@ -83,10 +87,11 @@ def seen(solution: Solution) -> str | None:
     """A table of what the system saw; None where it saw nothing, or has no such table."""
     from locatk.formats import seen_text
 
-    tables = {"polaris": seen_text.tags, "landmarks": seen_text.landmarks}
-    if solution.system not in tables or not solution.detections:
+    if solution.system not in ("polaris", "landmarks") or not solution.detections:
         return None
-    most = MOST_LANDMARKS if solution.system == "landmarks" else None
-    found = tables[solution.system](solution.detections, most)
+    if solution.system == "polaris":
+        found = seen_text.tags(solution.detections)
+    else:
+        found = seen_text.landmarks(solution.detections, MOST_LANDMARKS)
     table = console.table(found.header, found.rows)
     return f"{table}\n... and {found.more} more: see --json" if found.more else table

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, Any]:
     """Return the object of one session in ``--json`` (docs/commands.md)."""
+    from locatk.core.solution import to_json
+
     solution = solved.solution
     return {
         "session": session,
@@ -23,8 +25,8 @@ def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, 
         "poses": solution.poses,
         "rejected": solution.rejected,
         "solve_s": solved.solve_s,
-        "detections": solution.detections,
-        **({"facts": solution.facts} if solution.system == "landmarks" else {}),
+        "detections": to_json(solution.detections),
+        **({"facts": to_json(solution.facts) or {}} if solution.system == "landmarks" else {}),
     }
 
 
@@ -54,7 +56,7 @@ def text(session: str | Path, output: str | Path, solved: Solved) -> str:
 
 def notes(session: str | Path, solved: Solved) -> list[str]:
     """Return the remarks that a user of the poses needs; with ``--json`` too, on stderr."""
-    return [f"{Path(session).name}: {note}" for note in solved.solution.notes]
+    return [f"{Path(session).name}: {each.message}" for each in solved.solution.warnings]
 
 
 def _spread(sigma: Any) -> list[str]:

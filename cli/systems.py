@@ -47,6 +47,7 @@ def lighthouse(session: Session, request: Request) -> Solved:
     """Solve a session of Lighthouse sweeps."""
     from locatk.core import lighthouse
     from locatk.core.lighthouse.scene import Scene
+    from locatk.core.solution import SolverWarning
     from locatk.formats import artifacts, heard, observations
 
     _check(request, "lighthouse", methods=("bundle", "paper"), refused=("camera", "speed"))
@@ -62,8 +63,11 @@ def lighthouse(session: Session, request: Request) -> Solved:
     start = time.perf_counter()
     solution = lighthouse.solve(sweeps, scene, options, odometry=odometry, **more)
     solve_s = time.perf_counter() - start
-    notes = (*heard.strangers(scene, sent), *solution.notes)
-    return Solved(replace(solution, notes=notes), solve_s)
+    other_stations = [
+        SolverWarning("other_station_id", message) for message in heard.strangers(scene, sent)
+    ]
+    warnings = (*other_stations, *solution.warnings)
+    return Solved(replace(solution, warnings=warnings), solve_s)
 
 
 def _rigid(sweeps: Sweeps, receivers: Mapping[str, Receiver]) -> dict[str, Receiver]:

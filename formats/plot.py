@@ -227,5 +227,10 @@ def _title(solution: Solution, evaluation: Evaluation | None) -> str:
         text += "" if fraction is None else f", {100 * fraction:.1f} % of the time solved"
         offset = evaluation.time_offset.describe()
         text += f" (alignment: {evaluation.align}, time offset: {offset})"
-    notes = textwrap.wrap("; ".join(solution.notes), 160, max_lines=2, placeholder=" ...")
+    notes = textwrap.wrap(
+        "; ".join(warning.message for warning in solution.warnings),
+        160,
+        max_lines=2,
+        placeholder=" ...",
+    )
     return plain("\n".join(textwrap.wrap(text, 160) + notes))

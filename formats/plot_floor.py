@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -85,7 +86,7 @@ def floor_of(solution: Solution) -> Floor | None:
     if not isinstance(floor, FloorMap):
         return None
     cells = cells_near(floor, [t.position for t in solution.trajectories])
-    met = {tuple(found["cell"]) for found in solution.detections if found["cell"] is not None}
+    met = {found.cell for found in solution.detections if found.cell is not None}
     north, south, weak = _bars(floor, cells)
     seen, refused = _sightings(solution, floor)
     return Floor(
@@ -141,18 +142,19 @@ def _sightings(solution: Solution, floor: FloorMap) -> tuple[Array, Array]:
     used: list[Array] = []
     refused: list[Array] = []
     for found in solution.detections:
-        place = _on_path(paths.get(found["device"]), round(1e9 * found["time_s"]))
-        if place is None and found["cell"] is not None and found["x_m"] is not None:
-            x, y = floor.place(tuple(found["cell"]))
-            place = np.array([x + found["x_m"], y + found["y_m"]])
+        place = _on_path(paths.get(found.device), found.time_s)
+        if place is None and found.cell is not None and found.x_m is not None:
+            x, y = floor.place(found.cell)
+            place = np.array([x + found.x_m, y + found.y_m])
         if place is not None:
-            (refused if found["refused"] else used).append(place)
+            (refused if found.refused else used).append(place)
     return _flat(used), _flat(refused)
 
 
-def _on_path(path: Trajectory | None, time_ns: int) -> Array | None:
-    if path is None:
+def _on_path(path: Trajectory | None, time_s: float) -> Array | None:
+    if path is None or not math.isfinite(time_s):
         return None
+    time_ns = round(1e9 * time_s)
     nearest = int(np.argmin(np.abs(path.time_ns - time_ns)))
     late = abs(int(path.time_ns[nearest]) - time_ns) > LATE_NS
     return None if late else path.position[nearest, :2]

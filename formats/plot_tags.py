@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import Similarity
 from locatk.core.polaris import codec
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.tag import Placed, Tags, built_magnets
 from locatk.core.solution import Solution
 from locatk.formats.viewers import tags_in_frames
@@ -64,18 +64,19 @@ def tags_of(solution: Solution) -> tuple[Tag, ...]:
     for number, frame, on in tags_in_frames(tags, solution.trajectories):
         place, angle = built_magnets(tags, number, codec.layout_of(tags, number))
         found = tuple(
-            _found(seen, length, on) for seen in solution.detections if seen["tag_id"] == number
+            _found(seen, length, on) for seen in solution.detections if seen.tag_id == number
         )
         drawn.append(Tag(f"tag {number}", frame, Arrows.of(place, angle, length, on), found))
     return tuple(drawn)
 
 
-def _found(seen: dict[str, Any], length: float, on: Placed) -> Arrows:
-    """Magnets of one detection, which are in the array's frame."""
-    array, magnets = seen["array"], seen["magnets"]
-    place = np.array([[m["x_m"], m["y_m"]] for m in magnets])
-    angle = np.array([m["angle_rad"] for m in magnets])
-    at = Placed(array["x_m"], array["y_m"], array["heading_rad"])
+def _found(seen: TagDetection, length: float, on: Placed) -> Arrows:
+    """Return the magnets of one detection, which are in the array's frame."""
+    array, magnets = seen.array_pose, seen.magnets
+    assert array is not None  # of a tag that was read
+    place = np.array([[m.x_m, m.y_m] for m in magnets])
+    angle = np.array([m.angle_rad for m in magnets])
+    at = Placed(array.x_m, array.y_m, array.heading_rad)
     in_tag = Arrows.of(place, angle, length, at)
     heading = np.arctan2(*(in_tag.tip - in_tag.tail).T[1::-1])
     return Arrows.of(in_tag.tail[:, :2], heading, length, on)

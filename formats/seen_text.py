@@ -6,7 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+
+from locatk.core.landmarks.results import LandmarkDetection
+from locatk.core.polaris.results import TagDetection
 
 DEGREES = math.degrees(1)
 
@@ -24,22 +26,21 @@ class Seen:
 
 
 def tags(
-    detections: Sequence[dict[str, Any]], most: int | None = None, *, compact: bool = False
+    detections: Sequence[TagDetection], most: int | None = None, *, compact: bool = False
 ) -> Seen:
     """Tags as arrays saw them, in the array's frame.
 
     Parameters
     ----------
-    detections : sequence of dict
-        Of a solution of ``polaris``.
+    detections : sequence of TagDetection
     most : int, optional
         Rows; all by default.
     compact : bool
         Standard deviations stand behind the values, not in columns of their own.
     """
     shown = detections[:most]
-    arrays = len({found.get("device") for found in detections}) > 1
-    refused = any(found.get("refused") for found in shown)
+    arrays = len({found.device for found in detections}) > 1
+    refused = any(found.refused for found in shown)
     header = (
         *(["array"] if arrays else []),
         "tag",
@@ -51,12 +52,12 @@ def tags(
     )
     rows = [
         (
-            *([str(found.get("device"))] if arrays else []),
-            "-" if found["tag_id"] is None else str(found["tag_id"]),
-            number(found["margin"], 1, ".2f"),
-            str(len(found["magnets"])),
+            *([found.device] if arrays else []),
+            "-" if found.tag_id is None else str(found.tag_id),
+            number(found.margin, 1, ".2f"),
+            str(len(found.magnets)),
             *_pose(found, compact),
-            *([words(found.get("refused"))] if refused else []),
+            *([words(found.refused)] if refused else []),
         )
         for found in shown
     ]
@@ -64,12 +65,12 @@ def tags(
 
 
 def landmarks(
-    detections: Sequence[dict[str, Any]], most: int | None = None, *, compact: bool = False
+    detections: Sequence[LandmarkDetection], most: int | None = None, *, compact: bool = False
 ) -> Seen:
     """Landmarks, and the robot in the frame of each; parameters as of :func:`tags`."""
     shown = detections[:most]
-    robots = len({found["device"] for found in detections}) > 1
-    refused = any(found["refused"] for found in shown)
+    robots = len({found.device for found in detections}) > 1
+    refused = any(found.refused for found in shown)
     header = (
         "time (UTC)",
         *(["robot"] if robots else []),
@@ -82,23 +83,23 @@ def landmarks(
     )
     rows = [
         (
-            clock(found["time_s"]),
-            *([found["device"]] if robots else []),
-            cell(found["cell"]) or "-",
-            found["pattern"] or "-",
-            sure(found["probability"]),
+            clock(found.time_s),
+            *([found.device] if robots else []),
+            cell(found.cell) or "-",
+            found.pattern or "-",
+            sure(found.probability),
             *_pose(found, compact),
-            *([words(found["refused"])] if refused else []),
+            *([words(found.refused)] if refused else []),
         )
         for found in shown
     ]
     return Seen(header, rows, len(detections) - len(shown))
 
 
-def _pose(found: dict[str, Any], compact: bool) -> tuple[str, ...]:
+def _pose(found: TagDetection | LandmarkDetection, compact: bool) -> tuple[str, ...]:
     scales = {"x_m": 1e3, "y_m": 1e3, "heading_rad": DEGREES}
-    values = [number(found[key], scale, ".2f") for key, scale in scales.items()]
-    sigmas = [number(found[f"sigma_{key}"], scale, ".2g") for key, scale in scales.items()]
+    values = [number(getattr(found, key), scale, ".2f") for key, scale in scales.items()]
+    sigmas = [number(getattr(found, f"sigma_{key}"), scale, ".2g") for key, scale in scales.items()]
     if not compact:
         return (*values, *sigmas)
     return tuple(

@@ -11,12 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from locatk.core.dots.results import DotDetection, DotFacts
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.results import LandmarkDetection, LandmarkFacts
+from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.polaris.results import PolarisFacts, TagDetection
 from locatk.core.polaris.tag import Tags
-from locatk.core.solution import Solution
+from locatk.core.solution import GenericRecord, Solution, SolverWarning, from_json, to_json
 from locatk.core.trajectory import Trajectory
 from locatk.formats import artifacts, maps, sheets, tags, viewer_points, viewers
 from locatk.formats.session import Session
@@ -41,6 +45,17 @@ ARTIFACTS: tuple[tuple[type, str, Callable[[Any], str]], ...] = (
     (FloorMap, maps.MAP_FILE, maps.dumps_map),
 )
 """What a solution may stand on, and as what it is attached."""
+
+RESULT_TYPES: dict[str, tuple[type, type]] = {
+    "lighthouse": (StationDetection, LighthouseFacts),
+    "dots": (DotDetection, DotFacts),
+    "polaris": (TagDetection, PolarisFacts),
+    "landmarks": (LandmarkDetection, LandmarkFacts),
+}
+"""Types of the detections and of the facts of each system."""
+
+UNSPECIFIED = "unspecified"
+"""Code of a warning of which the file has the message only (before ``warnings`` was written)."""
 
 # Tuples, not unions, which isinstance takes twice as long for: there are a million values.
 _PLAIN, _LISTS, _ARRAYS = (str, int), (list, tuple), (np.ndarray, np.generic)
@@ -109,9 +124,10 @@ def _statement(solution: Solution, source: str) -> dict[str, Any]:
             {"device": t.device, "frame": t.frame, "poses": len(t)} for t in solution.trajectories
         ],
         "rejected": solution.rejected,
-        "notes": solution.notes,
-        "facts": solution.facts,
-        "detections": solution.detections,
+        "notes": [warning.message for warning in solution.warnings],
+        "warnings": to_json(solution.warnings),
+        "facts": {} if solution.facts is None else to_json(solution.facts),
+        "detections": to_json(solution.detections),
     }
 
 
@@ -139,8 +155,8 @@ def _once(solution: Solution, start: int) -> list[Timed]:
             said.append((start, f"/path/{t.device}", viewers.path(t, start)))
             points = viewer_points.path_points(t, number, start)
             said.append((start, f"/path_points/{t.device}", points))
-    for note in solution.notes:
-        said.append((start, "/log", viewers.log(note, start)))
+    for warning in solution.warnings:
+        said.append((start, "/log", viewers.log(warning.message, start)))
     for reason, count in solution.rejected.items():
         if count:
             line = viewers.log(f"rejected {count}: {reason}", start, warning=True)
@@ -171,23 +187,32 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
                 where=SOLUTION_FILE,
                 hint="Update locatk",
             )
+        system = str(said["system"])
+        detection_type, facts_type = RESULT_TYPES.get(system, (GenericRecord, GenericRecord))
         return Solution(
-            system=str(said["system"]),
+            system=system,
             method=str(said["method"]),
             trajectories=_trajectories(session, said["devices"]),
             rejected={str(key): int(count) for key, count in said["rejected"].items()},
-            detections=list(said["detections"]),
+            detections=tuple(from_json(detection_type, each) for each in said["detections"]),
             artifact=artifacts.attached_scene(session)
             or sheets.attached_manifest(session)
             or tags.attached_tags(session)
             or maps.attached_map(session),
-            notes=tuple(said["notes"]),
-            facts=dict(said["facts"]),
+            warnings=_warnings(said),
+            facts=from_json(facts_type, said["facts"]) if said["facts"] else None,
         )
     except LocatkError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError):
         raise FormatError("damaged solution", file=path, where=SOLUTION_FILE) from None
+
+
+def _warnings(statement: Mapping[str, Any]) -> tuple[SolverWarning, ...]:
+    """Return the warnings of ``solution.json``; earlier versions have their messages only."""
+    if "warnings" not in statement:
+        return tuple(SolverWarning(UNSPECIFIED, str(note)) for note in statement["notes"])
+    return tuple(from_json(SolverWarning, each) for each in statement["warnings"])
 
 
 def _trajectories(session: Session, devices: list[dict[str, Any]]) -> tuple[Trajectory, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,11 @@ from locatk.core.dots.frames import Frames
 from locatk.core.dots.locate import FEW_DOTS, locate
 from locatk.core.dots.located import Located, nothing
 from locatk.core.dots.paper import locate_paper
+from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 METHODS = ("lattice", "paper")
@@ -73,8 +73,8 @@ def solve(
             f"no method {options.method!r} for dots", hint=f"Known: {', '.join(METHODS)}"
         )
     code = codec(manifest.codec)
-    outcomes: list[dict[str, Any]] = []
-    detections: list[dict[str, Any]] = []
+    outcomes: list[FrameOutcome] = []
+    detections: list[DotDetection] = []
     trajectories: list[Trajectory] = []
     astray: list[NDArray[np.float64]] = []
     for camera_frames in frames:
@@ -91,16 +91,16 @@ def solve(
         outcomes += _outcomes(camera_frames, located)
         detections += _detections(camera_frames, located, sheet, poses, manifest)
         trajectories += _trajectories(camera_frames, sheet, poses, manifest)
-    rejected = Counter(frame["rejected"] for frame in outcomes if frame["rejected"])
+    rejected = Counter(frame.rejected for frame in outcomes if frame.rejected)
     return Solution(
         system="dots",
         method=options.method,
         trajectories=tuple(trajectories),
         rejected=dict(sorted(rejected.items())),
-        detections=detections,
+        detections=tuple(detections),
         artifact=manifest,
-        notes=_notes(options, manifest, rejected, astray),
-        facts={"frames": outcomes},
+        warnings=_warnings(options, manifest, rejected, astray),
+        facts=DotFacts(tuple(outcomes)),
     )
 
 
@@ -177,16 +177,16 @@ def _poses(located: Located, sheet: NDArray[np.intp], manifest: Manifest) -> _Po
     return poses
 
 
-def _outcomes(frames: Frames, located: Located) -> list[dict[str, Any]]:
+def _outcomes(frames: Frames, located: Located) -> list[FrameOutcome]:
     return [
-        {
-            "time_s": frames.time_ns[k] * 1e-9,
-            "frame": frames.names[k],
-            "dots": int(located.dots[k]),
-            "corrected_bits": int(located.corrected[k]),
-            "confidence": float(located.confidence[k]),
-            "rejected": located.rejected[k] or None,
-        }
+        FrameOutcome(
+            time_s=frames.time_ns[k] * 1e-9,
+            frame=frames.names[k],
+            dots=int(located.dots[k]),
+            corrected_bits=int(located.corrected[k]),
+            confidence=float(located.confidence[k]),
+            rejected=located.rejected[k] or None,
+        )
         for k in range(len(frames))
     ]
 
@@ -197,21 +197,21 @@ def _detections(
     sheet: NDArray[np.intp],
     poses: _Poses,
     manifest: Manifest,
-) -> list[dict[str, Any]]:
+) -> list[DotDetection]:
     return [
-        {
-            "time_s": frames.time_ns[k] * 1e-9,
-            "frame": frames.names[k],
-            "x_m": float(poses.position[k, 0]),
-            "y_m": float(poses.position[k, 1]),
-            "heading_rad": float(poses.heading[k]),
-            "confidence": float(located.confidence[k]),
-            "corrected_bits": int(located.corrected[k]),
-            "dots": int(located.dots[k]),
-            "grid_x": float(located.grid[k, 0]),
-            "grid_y": float(located.grid[k, 1]),
-            "sheet": manifest.sheets[sheet[k]].id,
-        }
+        DotDetection(
+            time_s=frames.time_ns[k] * 1e-9,
+            frame=frames.names[k],
+            x_m=float(poses.position[k, 0]),
+            y_m=float(poses.position[k, 1]),
+            heading_rad=float(poses.heading[k]),
+            confidence=float(located.confidence[k]),
+            corrected_bits=int(located.corrected[k]),
+            dots=int(located.dots[k]),
+            grid_x=float(located.grid[k, 0]),
+            grid_y=float(located.grid[k, 1]),
+            sheet=manifest.sheets[sheet[k]].id,
+        )
         for k in np.flatnonzero(sheet >= 0)
     ]
 
@@ -237,30 +237,43 @@ def _trajectories(
         )
 
 
-def _notes(
+def _warnings(
     options: SolveOptions,
     manifest: Manifest,
     rejected: Counter[str],
     astray: list[NDArray[np.float64]],
-) -> tuple[str, ...]:
-    notes = []
+) -> tuple[SolverWarning, ...]:
+    warnings = []
     if options.method == "paper":
-        notes.append("the published method knows no uncertainty: its confidence is a quality")
+        warnings.append(
+            SolverWarning(
+                "no_uncertainty",
+                "the published method knows no uncertainty: its confidence is a quality",
+            )
+        )
     if options.camera is None:
-        notes.append(
-            "no camera model: poses are of the middle of the frame, its lens estimated anew in each"
-            if options.method != "paper"
-            else "no camera model: poses are of the middle of the frame, its lens taken as flat"
+        lens = "estimated anew in each" if options.method != "paper" else "taken as flat"
+        warnings.append(
+            SolverWarning(
+                "no_camera_model",
+                f"no camera model: poses are of the middle of the frame, its lens {lens}",
+            )
         )
     if rejected[OFF_SHEET]:
         x, y = astray[0]
-        notes.append(
-            f"{rejected[OFF_SHEET]} frames show the pattern off all sheets of the manifest, the "
-            f"first at {x:.1f}, {y:.1f}: is it the manifest of another sheet?"
+        warnings.append(
+            SolverWarning(
+                "frames_off_sheet",
+                f"{rejected[OFF_SHEET]} frames show the pattern off all sheets of the manifest, "
+                f"the first at {x:.1f}, {y:.1f}: is it the manifest of another sheet?",
+            )
         )
     if rejected["no_code"] > max(3, sum(rejected.values()) // 2):
-        notes.append(
-            f"{rejected['no_code']} frames show no place of the codec {manifest.codec!r}: no "
-            "pattern in sight, or a sheet printed with another codec"
+        warnings.append(
+            SolverWarning(
+                "frames_without_code",
+                f"{rejected['no_code']} frames show no place of the codec {manifest.codec!r}: no "
+                "pattern in sight, or a sheet printed with another codec",
+            )
         )
-    return tuple(notes)
+    return tuple(warnings)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.halls import HallSamples
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -26,8 +27,8 @@ DEAD = 1e-3
 """A sensor that varies less than this share of the others is dead."""
 
 
-def cleaned(samples: HallSamples) -> tuple[Array, list[str]]:
-    """Fields (n, N) in which nothing but readings is left, ``nan`` elsewhere, and notes.
+def cleaned(samples: HallSamples) -> tuple[Array, list[SolverWarning]]:
+    """Fields (n, N) in which nothing but readings is left, ``nan`` elsewhere, and warnings.
 
     Raises
     ------
@@ -35,22 +36,25 @@ def cleaned(samples: HallSamples) -> tuple[Array, list[str]]:
         No sensor is left.
     """
     field = samples.field_t.copy()
-    notes = []
+    warnings = []
     jumps = _jumps(field)
     field[jumps] = np.nan
     if jumps.any():
-        notes.append(f"{int(jumps.sum())} single readings jump; left out")
+        message = f"{int(jumps.sum())} single readings jump; left out"
+        warnings.append(SolverWarning("spikes", message))
     limit = samples.sensors.range_t
     plateau = _plateau(field)
     if not np.isfinite(limit) and plateau is not None:
         limit = plateau
-        notes.append(f"readings end at {1e3 * limit:.3g} mT, which is taken for the sensors' range")
+        message = f"readings end at {1e3 * limit:.3g} mT, which is taken for the sensors' range"
+        warnings.append(SolverWarning("range_from_data", message))
     saturated = np.abs(field) >= FULL * limit
     field[saturated] = np.nan
     if saturated.any():
-        notes.append(f"{100 * saturated.mean():.2g} % of the readings saturated")
-    notes += _silenced(samples, field)
-    return field, [f"{samples.device}: {note}" for note in notes]
+        message = f"{100 * saturated.mean():.2g} % of the readings saturated"
+        warnings.append(SolverWarning("saturated", message))
+    warnings += _silenced(samples, field)
+    return field, [each.about(samples.device) for each in warnings]
 
 
 def _jumps(field: Array) -> NDArray[np.bool_]:
@@ -75,7 +79,7 @@ def _plateau(field: Array) -> float | None:
     return largest if (size > (1 - 1e-9) * largest).sum() >= PLATEAU else None
 
 
-def _silenced(samples: HallSamples, field: Array) -> list[str]:
+def _silenced(samples: HallSamples, field: Array) -> list[SolverWarning]:
     """Takes dead sensors out of ``field``, and says which they are."""
     names = samples.sensors.names
     spread = np.array(
@@ -87,8 +91,12 @@ def _silenced(samples: HallSamples, field: Array) -> list[str]:
             hint="All are dead or saturated: check wiring and range",
         )
     nothing = np.isnan(samples.field_t).all(axis=0)
-    notes = [f"the {names[k]} sensor gave nothing" for k in np.flatnonzero(nothing)]
+    warnings = [
+        SolverWarning("sensor_silent", f"the {names[k]} sensor gave nothing")
+        for k in np.flatnonzero(nothing)
+    ]
     for number in np.flatnonzero(spread < DEAD * np.nanmax(spread)).tolist():
         field[:, number] = np.nan
-        notes.append(f"the {names[number]} sensor never moved; left out")
-    return notes
+        message = f"the {names[number]} sensor never moved; left out"
+        warnings.append(SolverWarning("sensor_constant", message))
+    return warnings

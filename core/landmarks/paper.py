@@ -9,9 +9,9 @@ Visits are found as for the default method. Of each:
    the bars, the four voltages amend the pose (:mod:`.paper_pose`).
 
 A pass alone tells the paper neither pattern nor heading: such a visit is refused as
-``no_spin``, with the first centre in its notes. What the paper does not have: a reading
-whose bars explain less than half of the spin's field is refused as ``unexplained``. Farther
-than 8-10 mm from the centre valleys merge, and other patterns would be read silently.
+``no_spin``, with the first centre in a warning (``first_step``). What the paper does not have:
+a reading whose bars explain less than half of the spin's field is refused as ``unexplained``.
+Farther than 8-10 mm from the centre valleys merge, and other patterns would be read silently.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from locatk.core.landmarks.paper_valleys import Recognised, profile, recognise, 
 from locatk.core.landmarks.sighting import Hypothesis, Sighting
 from locatk.core.landmarks.trace import Drift, relative, sensor_places
 from locatk.core.landmarks.voting import voted_centre
+from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -175,7 +176,11 @@ class _Visit:
         self.lever = run.samples.sensors.position_m
         self.place = sensor_places(self.pose, self.lever)
         self.spins = spins(self.pose)
-        self.notes: list[str] = []
+        self.warnings: list[SolverWarning] = []
+
+    def warn(self, code: str, message: str) -> None:
+        """Add a warning on this visit."""
+        self.warnings.append(SolverWarning(code, message))
 
     def first_step(self) -> FirstStep:
         stop = self._end_of_pass()
@@ -192,7 +197,8 @@ class _Visit:
         if np.isfinite(step.centre_m).all():
             x, y = step.centre_m * 1e3
             grazed = ", by a grazing pass" if step.grazed else ""
-            self.notes.append(f"first step: centre at {x:.1f}, {y:.1f} mm of the odometry{grazed}")
+            message = f"first step: centre at {x:.1f}, {y:.1f} mm of the odometry{grazed}"
+            self.warn("first_step", message)
         refused = "no_spin"
         for start, stop in reversed(self.spins):
             found = self._second_step(start, stop)
@@ -203,9 +209,8 @@ class _Visit:
             left = self._unexplained(at, hypothesis, start, stop)
             if left > UNEXPLAINED:
                 refused = "unexplained"
-                self.notes.append(
-                    f"{name(hypothesis.code)} leaves {100 * left:.0f} % of the spin's field"
-                )
+                message = f"{name(hypothesis.code)} leaves {100 * left:.0f} % of the spin's field"
+                self.warn("spin_unexplained", message)
                 continue
             return self._answer(at, (hypothesis,), "")
         nearest = len(self.pose) // 2
@@ -231,15 +236,14 @@ class _Visit:
         middle = np.median(self.pose[turning, :2], axis=0)
         around = profile(self.place[turning], self.field[turning], middle)
         if np.isnan(around).any():
-            self.notes.append("a spin whose circle was not seen all around")
+            self.warn("spin_incomplete", "a spin whose circle was not seen all around")
             return None
         seen = valleys(around, HYSTERESIS * self.geometry.threshold_t)
         radius = float(np.mean(np.hypot(*self.lever.T)))
         found = recognise(seen, radius)
         if found is None:
-            self.notes.append(
-                f"a spin with {len(seen.angle_rad)} valleys fits no landmark near its centre"
-            )
+            message = f"a spin with {len(seen.angle_rad)} valleys fits no landmark near its centre"
+            self.warn("spin_without_pattern", message)
             return None
         return Recognised(found.centre_m + middle, found.bar_rad, found.north)
 
@@ -253,7 +257,7 @@ class _Visit:
         good = (distance <= NEAR_M) & (np.abs(aside) <= NEAR_RAD)
         good &= np.isfinite(self.field[start:]).sum(axis=1) >= 3
         if not good.any():
-            self.notes.append("never stood over the bars: by the valleys alone")
+            self.warn("never_over_bars", "never stood over the bars: by the valleys alone")
             return self._posed(stop - 1, found)
         cost = np.where(good, distance + self.geometry.circle_m * np.abs(aside), np.inf)
         at = start + int(cost.argmin())
@@ -264,10 +268,13 @@ class _Visit:
         try:
             pose = compensate(self.geometry, code, self.lever[whole], field)
         except DegenerateError as error:
-            self.notes.append(f"{error}: by the valleys alone")
+            self.warn("voltages_undetermined", f"{error}: by the valleys alone")
             return self._posed(at, found)
         if np.hypot(*pose[:2]) > 2 * NEAR_M or abs(pose[2]) > 2 * NEAR_RAD:
-            self.notes.append("the voltages contradict the valleys: by these alone")
+            self.warn(
+                "voltages_contradict_valleys",
+                "the voltages contradict the valleys: by these alone",
+            )
             return self._posed(at, found)
         return at, _hypothesis(code, pose)
 
@@ -306,7 +313,7 @@ class _Visit:
             odometry=self.pose[at].copy(),
             hypotheses=hypotheses,
             refused=refused,
-            notes=tuple(self.notes),
+            warnings=tuple(self.warnings),
         )
 
 

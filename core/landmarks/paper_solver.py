@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +16,21 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks import paper
-from locatk.core.landmarks.detections import detection
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.globalize import HALF_PI, Located
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.paper_route import locate, sequence
+from locatk.core.landmarks.remarks import NO_MAP
+from locatk.core.landmarks.results import (
+    LandmarkDetection,
+    LandmarkFacts,
+    RobotFacts,
+    describe_visit,
+)
 from locatk.core.landmarks.sighting import Sighting
 from locatk.core.landmarks.trace import compose, relative
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -51,9 +56,9 @@ def solve(
     """
     geometry = floor.geometry if floor is not None else Geometry()
     trajectories: list[Trajectory] = []
-    detections: list[dict[str, Any]] = []
-    notes: list[str] = []
-    robots: dict[str, Any] = {}
+    detections: list[LandmarkDetection] = []
+    warnings: list[SolverWarning] = []
+    robots: dict[str, RobotFacts] = {}
     for recording in samples:
         device = recording.device
         driven = next((t for t in odometry if t.device == device), None)
@@ -64,29 +69,31 @@ def solve(
             )
         found = paper.sightings(recording, driven, geometry)
         located = _located(found, floor) if floor is not None else {}
-        robots[device] = {"localised": bool(located), "landmarks_seen": len(found)}
+        robots[device] = RobotFacts(localised=bool(located), landmarks_seen=len(found))
         if located and floor is not None:
             trajectories.append(_driven(device, found, located, driven, floor))
         elif floor is not None:
-            notes.append(
-                f"{device}: not localised; no {IN_A_ROW} landmarks in a row were read that "
-                "the map has only once"
+            message = (
+                f"not localised; no {IN_A_ROW} landmarks in a row were read that the map has only "
+                "once"
             )
+            warnings.append(SolverWarning("not_localised", message).about(device))
         else:
-            notes.append(f"{device}: no map, so that its landmarks have no cells")
+            warnings.append(NO_MAP.about(device))
         for n, one in enumerate(found):
-            detections.append(detection(one, located.get(n), floor))
-            notes += [f"{device}: {note}" for note in one.notes if one.refused]
-    refused = Counter(seen["refused"] for seen in detections if seen["refused"])
+            detections.append(describe_visit(one, located.get(n), floor))
+            if one.refused:
+                warnings += [each.about(device) for each in one.warnings]
+    refused = Counter(seen.refused for seen in detections if seen.refused)
     return Solution(
         system="landmarks",
         method="paper",
         trajectories=tuple(trajectories),
         rejected=dict(refused),
-        detections=detections,
+        detections=tuple(detections),
         artifact=floor,
-        notes=tuple(notes),
-        facts={"robots": robots},
+        warnings=tuple(warnings),
+        facts=LandmarkFacts(robots),
     )
 
 

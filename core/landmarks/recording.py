@@ -9,13 +9,13 @@ import numpy as np
 from locatk.core.errors import InputError
 from locatk.core.landmarks import globalize
 from locatk.core.landmarks.built import laid_code
-from locatk.core.landmarks.detections import LIKELY
 from locatk.core.landmarks.estimate import Explanation
 from locatk.core.landmarks.fit import Priors
 from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.globalize import Located
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.results import MIN_CELL_PROBABILITY
 from locatk.core.landmarks.sighting import Sighting
 from locatk.core.landmarks.sightings import check_gains, check_sensors, sighting
 from locatk.core.landmarks.visits import Driven, Visit, check_way, driven, find, joined
@@ -99,8 +99,8 @@ def read(
     pitch = floor.pitch_m if floor is not None else 0.2
     check_way(run, geometry)
     seen = sightings_of(run, geometry, priors, pitch)
-    notes = check_gains([one.explanations[0] for one in seen if one.explanations], run, priors)
-    run = replace(run, notes=(*run.notes, *notes))
+    gains = check_gains([one.explanations[0] for one in seen if one.explanations], run, priors)
+    run = replace(run, warnings=(*run.warnings, *gains))
     faulty = check_sensors(
         [one.visit for one in seen],
         [one.sighting.residual_sigma for one in seen],
@@ -147,6 +147,6 @@ def on_map(found: Recording, floor: FloorMap) -> list[Seen]:
         one
         for one in found.seen
         if one.located is not None
-        and one.located.probability >= LIKELY
+        and one.located.probability >= MIN_CELL_PROBABILITY
         and laid_code(floor, one.located.cell) != HOLE
     ]

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from locatk.core.landmarks import globalize, smooth
-from locatk.core.landmarks.detections import detection
 from locatk.core.landmarks.floor import Cell, FloorMap
 from locatk.core.landmarks.recording import Recording, Seen
+from locatk.core.landmarks.results import describe_visit
+from locatk.core.solution import SolverWarning
 
 CERTAIN = 0.99999
 """Probability from which on a place on the map needs no remark."""
@@ -28,18 +29,22 @@ FEWEST_WRONG = 2
 MOST_WRONG = 1 / 3
 """Share of misread and unexplained landmarks from which on a map is not believed."""
 
+NO_MAP = SolverWarning("no_map", "no map, so that its landmarks have no cells")
 
-def doubt(sure: float, first: int | None) -> str | None:
-    """What to say of a place that has the probability ``sure``; None of a certain one.
+
+def doubt(sure: float, first: int | None) -> SolverWarning | None:
+    """Warn of a place that has the probability ``sure``; None if it is certain.
 
     ``first`` is the number of the landmark at which it was certain, None where at none.
     """
     if sure >= CERTAIN:
         return None
     if sure >= SURE:
-        return f"its place on the map is all but certain ({sure:.5f})"
-    end = "; one more landmark would settle it" if first is None else " at one landmark"
-    return f"its place on the map has a probability of {sure:.5f}{end}"
+        message = f"its place on the map is all but certain ({sure:.5f})"
+    else:
+        end = "; one more landmark would settle it" if first is None else " at one landmark"
+        message = f"its place on the map has a probability of {sure:.5f}{end}"
+    return SolverWarning("localization_uncertain", message)
 
 
 def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict[Cell, float]:
@@ -57,30 +62,33 @@ def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict
 def contradicted(found: Recording, usable: list[Seen], floor: FloorMap) -> bool:
     """Whether map and recording differ as often as those of one floor cannot."""
     misread = sum(
-        detection(one.sighting, one.located, floor)["refused"] == "misread" for one in usable
+        describe_visit(one.sighting, one.located, floor).refused == "misread" for one in usable
     )
     unexplained = sum(one.sighting.refused == "not_explained" for one in found.seen)
     wrong = misread + unexplained
     return wrong >= FEWEST_WRONG and wrong > MOST_WRONG * (len(usable) + unexplained)
 
 
-def why_not(found: Recording, sure: float) -> list[str]:
-    """Why a robot is not localised."""
+def why_not(found: Recording, sure: float) -> SolverWarning:
+    """Explain why a robot is not localised."""
     device = found.run.samples.device
     explained = [one for one in found.seen if not one.sighting.refused]
     if explained:
-        return [f"{device}: not localised; the likeliest place has a probability of {sure:.2g}"]
+        message = f"not localised; the likeliest place has a probability of {sure:.2g}"
+        return SolverWarning("not_localised", message).about(device)
     if found.seen:
-        return [
-            f"{device}: {len(found.seen)} visits, but no landmark explains one of them; check "
-            "the landmarks' geometry, the sensors and the odometry"
-        ]
+        message = (
+            f"{len(found.seen)} visits, but no landmark explains one of them; check the "
+            "landmarks' geometry, the sensors and the odometry"
+        )
+        return SolverWarning("visits_unexplained", message).about(device)
     largest = 1e3 * float(np.nanmax(np.abs(found.run.samples.field_t)))
-    return [f"{device}: no landmark was met; the strongest field is {largest:.2g} mT"]
+    message = f"no landmark was met; the strongest field is {largest:.2g} mT"
+    return SolverWarning("no_landmark", message).about(device)
 
 
-def exchanged(found: Recording, floor: FloorMap, misread: float) -> list[str]:
-    """A remark where the map fits what was seen if all fields had the other sign."""
+def exchanged(found: Recording, floor: FloorMap, misread: float) -> list[SolverWarning]:
+    """Warn if the map would fit what was seen with all fields of the other sign."""
     turned = [
         replace(
             one.sighting,
@@ -94,7 +102,8 @@ def exchanged(found: Recording, floor: FloorMap, misread: float) -> list[str]:
     told = globalize.locate(turned, floor, misread=misread, drift=found.priors.drift)
     if max(one.probability for one in told) < CERTAIN:
         return []
-    return [
-        f"{found.run.samples.device}: with N and S exchanged it would be localised; are the "
-        "sensors or all bars the other way up?"
-    ]
+    message = (
+        "with N and S exchanged it would be localised; are the sensors or all bars the other way "
+        "up?"
+    )
+    return [SolverWarning("polarity_exchanged", message).about(found.run.samples.device)]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.landmark import CODES
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -66,7 +67,8 @@ class Sighting:
         ``nan`` where the method has no model of the samples.
     refused : str
         Why it is not used, ``""`` where it is: ``"too_weak"``, ``"too_short"``, ...
-    notes : tuple of str
+    warnings : tuple of SolverWarning
+        Without the name of the device.
     """
 
     device: str
@@ -77,7 +79,7 @@ class Sighting:
     hypotheses: tuple[Hypothesis, ...]
     residual_sigma: float = float("nan")
     refused: str = ""
-    notes: tuple[str, ...] = ()
+    warnings: tuple[SolverWarning, ...] = ()
 
     @property
     def best(self) -> Hypothesis:

@@ -15,6 +15,7 @@ from locatk.core.landmarks.fit import POSE, Priors
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.sighting import Hypothesis, Sighting
 from locatk.core.landmarks.visits import Driven, Visit
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -75,8 +76,8 @@ def sighting(
     return done, found
 
 
-def check_gains(found: list[Explanation], run: Driven, priors: Priors) -> list[str]:
-    """Notes on sensors whose gain is another one than was told.
+def check_gains(found: list[Explanation], run: Driven, priors: Priors) -> list[SolverWarning]:
+    """Warn of sensors whose gain differs from the one that was given.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def check_gains(found: list[Explanation], run: Driven, priors: Priors) -> list[s
     names, device = run.samples.sensors.names, run.samples.device
     span = slice(POSE, POSE + len(names))
     gain = 1 + priors.gain * np.median([one.parameters[span] for one in found], axis=0)
-    notes = []
+    warnings = []
     for name, value in zip(names, gain.tolist(), strict=True):
         if value < 0:
             raise InputError(
@@ -103,8 +104,9 @@ def check_gains(found: list[Explanation], run: Driven, priors: Priors) -> list[s
                 hint="Turn it round, or its column's sign",
             )
         if abs(value - 1) > GAIN_SIGMAS * priors.gain:
-            notes.append(f"{device}: the {name} sensor reads {value:.2f} of what the others do")
-    return notes
+            message = f"the {name} sensor reads {value:.2f} of what the others do"
+            warnings.append(SolverWarning("sensor_gain", message).about(device))
+    return warnings
 
 
 def check_sensors(

@@ -6,13 +6,11 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks import neighbours, route, smooth
-from locatk.core.landmarks.detections import detection
 from locatk.core.landmarks.estimate import FAULTY, GONE
 from locatk.core.landmarks.fit import Priors
 from locatk.core.landmarks.floor import Cell, FloorMap
@@ -24,14 +22,21 @@ from locatk.core.landmarks.recording import Recording, Seen, on_map, read
 from locatk.core.landmarks.recording import SolveOptions as SolveOptions
 from locatk.core.landmarks.remarks import (
     CERTAIN,
+    NO_MAP,
     contradicted,
     displaced,
     doubt,
     exchanged,
     why_not,
 )
+from locatk.core.landmarks.results import (
+    LandmarkDetection,
+    LandmarkFacts,
+    RobotFacts,
+    describe_visit,
+)
 from locatk.core.landmarks.trace import compose
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -88,23 +93,22 @@ def solve(
 
         return paper_solver.solve(samples, floor, odometry=odometry)
     trajectories: list[Trajectory] = []
-    detections: list[dict[str, Any]] = []
-    notes: list[str] = []
+    detections: list[LandmarkDetection] = []
+    warnings: list[SolverWarning] = []
     rejected: Counter[str] = Counter()
-    facts: dict[str, Any] = {"robots": {}}
+    robots: dict[str, RobotFacts] = {}
     for recording in samples:
         driven_by = next((t for t in odometry if t.device == recording.device), None)
         found = read(recording, driven_by, floor, options)
-        notes += found.run.notes
+        warnings += found.run.warnings
         if floor is None:
-            notes.append(f"{recording.device}: no map, so that its landmarks have no cells")
-        solved, remarks, told = placed(found, floor, options.misread)
+            warnings.append(NO_MAP.about(recording.device))
+        solved, remarks, robots[recording.device] = placed(found, floor, options.misread)
         trajectories += solved
-        notes += remarks
-        facts["robots"][recording.device] = told
+        warnings += remarks
         for item in found.seen:
-            detections.append(detection(item.sighting, item.located, floor))
-            why = detections[-1]["refused"]
+            detections.append(describe_visit(item.sighting, item.located, floor))
+            why = detections[-1].refused
             if why and why != "misread":  # that one is used, as it was read
                 rejected[why] += 1
     return Solution(
@@ -112,17 +116,17 @@ def solve(
         method=options.method,
         trajectories=tuple(trajectories),
         rejected=dict(rejected),
-        detections=detections,
+        detections=tuple(detections),
         artifact=floor,
-        notes=tuple(notes),
-        facts=facts,
+        warnings=tuple(warnings),
+        facts=LandmarkFacts(robots),
     )
 
 
 def placed(
     found: Recording, floor: FloorMap | None, misread: float
-) -> tuple[list[Trajectory], list[str], dict[str, Any]]:
-    """Poses on the map, remarks, and what is told of one robot's localization."""
+) -> tuple[list[Trajectory], list[SolverWarning], RobotFacts]:
+    """Return the poses of one robot on the map, warnings, and facts of its localization."""
     device = found.run.samples.device
     usable = on_map(found, floor) if floor is not None else []
     located = [one.located for one in found.seen if one.located is not None]
@@ -131,24 +135,25 @@ def placed(
     if not usable:
         sure = max((one.probability for one in located), default=0.0)
     first = next((n for n, one in enumerate(located, 1) if one.so_far >= CERTAIN), None)
-    told = {
-        "localised": bool(usable),
-        "probability": sure,
-        "landmarks_seen": len(located),
-        "landmarks_to_localise": first,
-    }
+    facts = RobotFacts(
+        localised=bool(usable),
+        probability=sure,
+        landmarks_seen=len(located),
+        landmarks_to_localise=first,
+    )
     if floor is not None and contradicted(found, usable, floor):
-        remarks = [
-            f"{device}: not localised; too many of its landmarks are not those of the map: is "
-            "it the map of this floor, and the odometry the right way round?"
-        ]
-        return [], remarks, told | {"localised": False}
+        message = (
+            "not localised; too many of its landmarks are not those of the map: is it the map of "
+            "this floor, and the odometry the right way round?"
+        )
+        warnings = [SolverWarning("map_contradicted", message).about(device)]
+        return [], warnings, replace(facts, localised=False)
     if floor is None:
-        return [], [], told
+        return [], [], facts
     if not usable:
-        return [], [*why_not(found, sure), *exchanged(found, floor, misread)], told
-    said = doubt(sure, first)
-    remarks = [] if said is None else [f"{device}: {said}"]
+        return [], [why_not(found, sure), *exchanged(found, floor, misread)], facts
+    uncertain = doubt(sure, first)
+    warnings = [] if uncertain is None else [uncertain.about(device)]
     marks = expected(usable, floor, found.priors)
     alone = replace(found.priors, floor_t=ALONE_T)
     run = as_run(usable, found, floor)
@@ -156,23 +161,25 @@ def placed(
     if off := displaced(marks, smoothed):
         for cell, shift in off.items():
             marks[cell] = replace(marks[cell], sigma=np.array([ASTRAY_M, ASTRAY_M, ASTRAY_RAD]))
-            remarks.append(
-                f"{device}: the landmark at {cell[0]},{cell[1]} lies {1e3 * shift:.2g} mm or more "
-                "off its place; `locatk calibrate map` would tell how far"
+            message = (
+                f"the landmark at {cell[0]},{cell[1]} lies {1e3 * shift:.2g} mm or more off its "
+                "place; `locatk calibrate map` would tell how far"
             )
+            warnings.append(SolverWarning("landmark_displaced", message).about(device))
         smoothed = smooth.smooth([run], marks, floor.geometry, alone)
-    told["misfit_sigma"] = smoothed.misfit
+    facts = replace(facts, misfit_sigma=smoothed.misfit)
     if smoothed.misfit > MISFIT:
-        remarks.append(
-            f"{device}: fields miss the model by {smoothed.misfit:.2g} standard deviations; check "
-            "clocks and scale of the odometry, the sensors and the landmarks' geometry"
+        message = (
+            f"fields miss the model by {smoothed.misfit:.2g} standard deviations; check clocks and "
+            "scale of the odometry, the sensors and the landmarks' geometry"
         )
+        warnings.append(SolverWarning("field_misfit", message).about(device))
     if smoothed.misfit > IMPOSSIBLE:
-        return [], remarks, told | {"localised": False}
+        return [], warnings, replace(facts, localised=False)
     path = route.poses(
         device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
     )
-    return [path], remarks, told
+    return [path], warnings, facts
 
 
 def expected(usable: Sequence[Seen], floor: FloorMap, priors: Priors) -> dict[Cell, smooth.Mark]:

@@ -14,6 +14,7 @@ from locatk.core.landmarks.clean import cleaned
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.trace import Drift, Trace, corrections, relative, sensor_places
+from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -69,23 +70,24 @@ class Driven:
         Of each sensor, as far as it shows in the recording.
     noise_t : float
         Standard deviation of a sample.
-    notes : tuple of str
+    warnings : tuple of SolverWarning
     """
 
     samples: HallSamples
     pose: Array
     offset_t: Array
     noise_t: float
-    notes: tuple[str, ...] = ()
+    warnings: tuple[SolverWarning, ...] = ()
 
     def lacking(self, sensor: int) -> Driven:
-        """The same without one sensor, which is noted."""
+        """Return the recording without one sensor, and with a warning of it."""
         field = self.samples.field_t.copy()
         field[:, sensor] = np.nan
         name = self.samples.sensors.names[sensor]
-        note = f"{self.samples.device}: the {name} sensor fits no landmark; left out"
+        message = f"the {name} sensor fits no landmark; left out"
+        warning = SolverWarning("sensor_left_out", message).about(self.samples.device)
         samples = replace(self.samples, field_t=field)
-        return replace(self, samples=samples, notes=(*self.notes, note))
+        return replace(self, samples=samples, warnings=(*self.warnings, warning))
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,11 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
             f"the odometry of {samples.device} covers none of its samples",
             hint="Check that both clocks are the same",
         )
-    notes = []
+    warnings = []
     without = int((~covered).sum())
     if without > UNTOLD * len(time):
-        notes.append(f"{samples.device}: {without} samples without odometry left out")
+        message = f"{without} samples without odometry left out"
+        warnings.append(SolverWarning("samples_without_odometry", message).about(samples.device))
     field, faults = cleaned(samples)
     field, time = field[covered], time[covered]
     heading = np.unwrap(heading_from_quaternion(odometry.quaternion))
@@ -141,7 +144,7 @@ def driven(samples: HallSamples, odometry: Trajectory | None) -> Driven:
     pose = _interpolated(time, odometry.time_ns, way)
     offset = _offsets(field)
     kept = HallSamples(samples.device, samples.sensors, time, field)
-    return Driven(kept, pose, offset, _noise(samples, field), (*notes, *faults))
+    return Driven(kept, pose, offset, _noise(samples, field), (*warnings, *faults))
 
 
 def check_way(run: Driven, geometry: Geometry) -> None:

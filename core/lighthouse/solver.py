@@ -19,7 +19,6 @@ from locatk.core.lighthouse.localization.photodiodes import detect_stations, tra
 from locatk.core.lighthouse.published.scene import solve_published
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.lighthouse.results import LighthouseFacts
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.estimation import (
     SCENE_KINDS,
@@ -34,7 +33,7 @@ from locatk.core.lighthouse.scene.verification import (
     select_verification_epochs,
     verify_scene,
 )
-from locatk.core.solution import Solution, SolverWarning, to_json
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 METHODS = ("bundle", "paper")
@@ -123,7 +122,7 @@ def solve(
                 "separately",
             )
             solution = replace(solution, warnings=(*solution.warnings, warning))
-    return _in_json_form(solution)
+    return replace(solution, warnings=tuple(dict.fromkeys(solution.warnings)))
 
 
 def _solve_photodiodes(
@@ -211,18 +210,3 @@ def _add_counts(*tables: Mapping[str, int]) -> dict[str, int]:
     for table in tables:
         total.update(table)
     return {reason: count for reason, count in total.items() if count}
-
-
-def _in_json_form(solution: Solution) -> Solution:
-    """Return a solution with unique warnings, and with facts and detections in their JSON form.
-
-    Readers of a solution still expect tables instead of dataclasses, and notes beside warnings.
-    """
-    facts: LighthouseFacts = solution.facts
-    return replace(
-        solution,
-        facts=to_json(facts),
-        detections=[to_json(detection) for detection in solution.detections],
-        notes=tuple(dict.fromkeys(warning.message for warning in solution.warnings)),
-        warnings=tuple(dict.fromkeys(solution.warnings)),
-    )

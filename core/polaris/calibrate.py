@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.tag import AsBuilt, Layout, Tags, angles, places
 
 Array = NDArray[np.float64]
@@ -114,20 +114,19 @@ class CalibrationReport:
     notes: tuple[str, ...]
 
 
-def pass_of(tags: Tags, detection: Mapping[str, Any], name: str) -> Pass | str:
+def pass_of(tags: Tags, detection: TagDetection, name: str) -> Pass | str:
     """A detection of a solution as a pass, or why it is none."""
-    tag_id = detection["tag_id"]
+    tag_id = detection.tag_id
     if tag_id is None:
-        return f"not read: {detection['refused'] or 'no reason given'}".replace("_", " ")
+        return f"not read: {detection.refused or 'no reason given'}".replace("_", " ")
     cells = layout_of(tags, tag_id).cells
     seen, sigma = np.full((2, len(cells), 3), np.nan)
-    for magnet in detection["magnets"]:
-        if magnet["cell"] is None or tuple(magnet["cell"]) not in cells:
+    for magnet in detection.magnets:
+        if magnet.cell is None or magnet.cell not in cells:
             continue
-        number = cells.index(tuple(magnet["cell"]))
-        seen[number] = [magnet[key] for key in ("x_m", "y_m", "angle_rad")]
-        known = [magnet[f"sigma_{key}"] for key in ("x_m", "y_m", "angle_rad")]
-        sigma[number] = [np.nan if value is None else value for value in known]
+        number = cells.index(magnet.cell)
+        seen[number] = magnet.x_m, magnet.y_m, magnet.angle_rad
+        sigma[number] = magnet.sigma_x_m, magnet.sigma_y_m, magnet.sigma_angle_rad
     count = int(np.isfinite(seen[:, 0]).sum())
     if count < LEAST_MAGNETS:
         return f"only {count} magnets were seen"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.polaris.array import Samples
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,7 @@ BESIDE = 2
 """Neighbours on each side."""
 
 
-def cleaned(samples: Samples, noise_t: Array) -> tuple[Samples, tuple[str, ...]]:
+def cleaned(samples: Samples, noise_t: Array) -> tuple[Samples, tuple[SolverWarning, ...]]:
     """The samples without what was stuck, spiked or not finite, and what was left out.
 
     A sensor that repeats the same triple is stuck (a bus that hangs); a value far from
@@ -30,17 +31,19 @@ def cleaned(samples: Samples, noise_t: Array) -> tuple[Samples, tuple[str, ...]]
     published bar has no sync word), and one of them outweighs a whole pass.
     """
     field = np.where(np.isfinite(samples.field_t), samples.field_t, np.nan)
-    notes = []
+    warnings = []
     stuck = _stuck(field)
     for sensor in np.flatnonzero(stuck.any(axis=0)):
         share = 100 * stuck[:, sensor].mean()
-        notes.append(f"{samples.device}: sensor {sensor + 1} was stuck ({share:.0f} % of the time)")
+        message = f"sensor {sensor + 1} was stuck ({share:.0f} % of the time)"
+        warnings.append(SolverWarning("sensor_stuck", message).about(samples.device))
     field = np.where(stuck[..., None], np.nan, field)
     spikes = _spikes(field, noise_t)
     if spikes.any():
-        notes.append(f"{samples.device}: {int(spikes.sum())} values were spikes")
+        message = f"{int(spikes.sum())} values were spikes"
+        warnings.append(SolverWarning("spikes", message).about(samples.device))
         field = np.where(spikes, np.nan, field)
-    return replace(samples, field_t=field), tuple(notes)
+    return replace(samples, field_t=field), tuple(warnings)
 
 
 def _stuck(field: Array) -> NDArray[np.bool_]:

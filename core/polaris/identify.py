@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.joint import WHITE
 from locatk.core.polaris.match import FAIR, Match, matches, refitted, ruled
 from locatk.core.polaris.reading import Reading, read
+from locatk.core.polaris.results import MagnetDetection, PlanarPose, TagDetection
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Tags, built_magnets, places
 
@@ -63,38 +63,36 @@ class Seen:
         x, y = self.match.x_m, self.match.y_m
         return -(cos * x + sin * y), sin * x - cos * y, -self.match.heading_rad
 
-    def detection(self, device: str, time_ns: NDArray[np.int64]) -> dict[str, Any]:
-        """The JSON form of docs/formats.md."""
+    def detection(self, device: str, time_ns: NDArray[np.int64]) -> TagDetection:
+        """Return the detection that reports it; ``time_ns`` (n,) are those of the samples."""
         sighting, match, reading = self.sighting, self.match, self.reading
         first, last = sighting.first, min(sighting.stop, len(time_ns)) - 1
         seconds = (time_ns[last] - time_ns[first]) * 1e-9
         sigma = np.full(3, np.nan) if match is None else np.sqrt(np.diag(match.covariance))
-        return {
-            "time_s": sighting.time_ns * 1e-9,
-            "device": device,
-            "tag_id": self.tag_id,
-            "margin": None if reading is None else reading.margin,
-            "refused": self.refused or None,
-            "x_m": None if match is None else match.x_m,
-            "y_m": None if match is None else match.y_m,
-            "heading_rad": None if match is None else match.heading_rad,
-            "sigma_x_m": sigma[0],
-            "sigma_y_m": sigma[1],
-            "sigma_heading_rad": sigma[2],
-            "array": None
-            if match is None
-            else dict(zip(("x_m", "y_m", "heading_rad"), self.array_pose, strict=True)),
-            "magnets": self._magnets(),
-            "residual_sigma": sighting.residual_sigma,
-            "height_m": sighting.height_m,
-            "speed_mps": float(np.ptp(sighting.path_m) / seconds) if seconds > 0 else None,
-            "scale": 1.0 if match is None else match.scale,
-            "corrected": None if reading is None else reading.corrected,
-            "erased": None if reading is None else reading.erased,
-            "other_sources": sighting.others,
-        }
+        return TagDetection(
+            time_s=sighting.time_ns * 1e-9,
+            device=device,
+            tag_id=self.tag_id,
+            margin=None if reading is None else reading.margin,
+            refused=self.refused or None,
+            x_m=None if match is None else match.x_m,
+            y_m=None if match is None else match.y_m,
+            heading_rad=None if match is None else match.heading_rad,
+            sigma_x_m=sigma[0],
+            sigma_y_m=sigma[1],
+            sigma_heading_rad=sigma[2],
+            array_pose=None if match is None else PlanarPose(*self.array_pose),
+            magnets=self._magnets(),
+            residual_sigma=sighting.residual_sigma,
+            height_m=sighting.height_m,
+            speed_mps=float(np.ptp(sighting.path_m) / seconds) if seconds > 0 else None,
+            scale=1.0 if match is None else match.scale,
+            corrected=None if reading is None else reading.corrected,
+            erased=None if reading is None else reading.erased,
+            other_sources=sighting.others,
+        )
 
-    def _magnets(self) -> list[dict[str, Any]]:
+    def _magnets(self) -> tuple[MagnetDetection, ...]:
         sighting = self.sighting
         cells = {}
         if self.match is not None and self.reading is not None:
@@ -104,20 +102,20 @@ class Seen:
             )
         order = list(cells) if self.tag_id is not None else range(len(sighting))
         sigma = np.sqrt(np.diag(sighting.covariance)).reshape(-1, 3)
-        return [
-            {
-                "x_m": sighting.place_m[k, 0],
-                "y_m": sighting.place_m[k, 1],
-                "angle_rad": sighting.angle_rad[k],
-                "symbol": cells[k][1] if k in cells else None,
-                "cell": list(cells[k][0]) if k in cells else None,
-                "sigma_x_m": sigma[k, 0],
-                "sigma_y_m": sigma[k, 1],
-                "sigma_angle_rad": sigma[k, 2],
-                "moment_am2": sighting.moment_am2[k],
-            }
+        return tuple(
+            MagnetDetection(
+                x_m=sighting.place_m[k, 0],
+                y_m=sighting.place_m[k, 1],
+                angle_rad=sighting.angle_rad[k],
+                symbol=cells[k][1] if k in cells else None,
+                cell=cells[k][0] if k in cells else None,
+                sigma_x_m=sigma[k, 0],
+                sigma_y_m=sigma[k, 1],
+                sigma_angle_rad=sigma[k, 2],
+                moment_am2=sighting.moment_am2[k],
+            )
             for k in order
-        ]
+        )
 
 
 def identify(sighting: Sighting, recording: Samples, tags: Tags | None) -> list[Seen]:

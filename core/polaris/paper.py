@@ -32,6 +32,7 @@ from locatk.core.polaris.peaks import Peak, Signals, find_peaks, ground, peak_ne
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Cell, Tags
 from locatk.core.polaris.templates import POINTS, template_set
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -73,10 +74,9 @@ def sightings(samples: Samples, tags: Tags, speed_mps: float | None) -> list[Sig
     """
     if speed_mps is None:
         raise InputError(
-            "no speed, which the paper's method needs,",
-            hint="Give it with --speed, in m/s",
+            "no speed, which the paper's method needs,", hint="Give it with --speed, in m/s"
         )
-    bar, notes = _living(samples)
+    bar, warnings = _living(samples)
     path = speed_mps * (bar.time_ns - bar.time_ns[0]) * 1e-9
     step = float(np.median(np.diff(path))) if len(path) > 1 else math.inf
     if step * FEWEST_POINTS > tags.spacing_m:
@@ -95,7 +95,7 @@ def sightings(samples: Samples, tags: Tags, speed_mps: float | None) -> list[Sig
     for first, stop in _passes(find_peaks(signal, reach), tags, step, len(path)):
         magnets = pipeline.magnets(signal.part(first, stop), path[first:stop])
         if magnets:
-            found.append(_sighting(magnets, bar, path, (first, stop), tags.clearance_m, notes))
+            found.append(_sighting(magnets, bar, path, (first, stop), tags.clearance_m, warnings))
     return found
 
 
@@ -338,7 +338,7 @@ def _direction(angle_rad: float) -> Array:
     return np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
 
 
-def _living(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
+def _living(samples: Samples) -> tuple[Samples, tuple[SolverWarning, ...]]:
     """The sensors that gave more than half of their samples, from right to left."""
     order = np.argsort(samples.array.position_m[:, 1], kind="stable")
     alive = np.isfinite(samples.field_t).all(axis=2).mean(axis=0) > 0.5
@@ -349,9 +349,10 @@ def _living(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
             hint="The paper's method needs two adjacent sensors",
         )
     dead = ", ".join(str(k + 1) for k in np.flatnonzero(~alive))
-    notes = (f"without sensor {dead}, which gave no samples",) if dead else ()
+    silent = SolverWarning("sensor_silent", f"without sensor {dead}, which gave no samples")
+    warnings = (silent,) if dead else ()
     array = replace(samples.array, position_m=samples.array.position_m[kept])
-    return Samples(samples.device, array, samples.time_ns, samples.field_t[:, kept]), notes
+    return Samples(samples.device, array, samples.time_ns, samples.field_t[:, kept]), warnings
 
 
 def _passes(
@@ -377,7 +378,7 @@ def _sighting(
     path: Array,
     span: tuple[int, int],
     clearance_m: float,
-    notes: tuple[str, ...],
+    warnings: tuple[SolverWarning, ...],
 ) -> Sighting:
     ways = np.array([magnet.way_m for magnet in magnets])
     middle = int(np.abs(path - (ways.min() + ways.max()) / 2).argmin())
@@ -395,5 +396,5 @@ def _sighting(
         covariance=np.full((3 * len(chosen), 3 * len(chosen)), np.nan),
         path_sigma_m=np.full(stop - first, np.nan),
         height_m=clearance_m,
-        notes=notes,
+        warnings=warnings,
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,9 @@ from numpy.typing import NDArray
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.identify import Seen
+from locatk.core.polaris.results import HeadingCorrection
 from locatk.core.polaris.tag import Placed, Tags
+from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -45,7 +46,7 @@ def along(driven: Trajectory, time_ns: NDArray[np.int64]) -> Array:
 
 def tag_poses(
     recording: Samples, read: Sequence[Seen], tags: Tags | None
-) -> tuple[list[Trajectory], list[str]]:
+) -> tuple[list[Trajectory], list[SolverWarning]]:
     """Poses of the array while it was over tags that were read.
 
     In the frame of the site where tags have places on it, else in that of the first tag.
@@ -54,7 +55,7 @@ def tag_poses(
     -------
     poses : list of Trajectory
         One or none.
-    notes : list of str
+    warnings : list of SolverWarning
         Tags whose place is not known.
     """
     if tags is None or not read:
@@ -63,17 +64,18 @@ def tag_poses(
     if not site:
         assert read[0].tag_id is not None
         frame, site = f"tag-{read[0].tag_id}", {read[0].tag_id: Placed(0.0, 0.0, 0.0)}
-    parts, notes = [], []
+    parts, warnings = [], []
     for seen in read:
         assert seen.tag_id is not None
         placed = site.get(seen.tag_id)
         if placed is None:
             where = "on the site" if frame == "site" else f"in the frame of {frame}"
-            notes.append(f"{recording.device}: tag {seen.tag_id} has no place {where}")
+            message = f"tag {seen.tag_id} has no place {where}"
+            warnings.append(SolverWarning("tag_not_on_site", message).about(recording.device))
         else:
             parts.append(_over(recording, seen, placed))
     if not parts:
-        return [], notes
+        return [], warnings
     time, position, heading, covariance = (
         np.concatenate([part[k] for part in parts]) for k in range(4)
     )
@@ -86,7 +88,7 @@ def tag_poses(
         quaternion_from_heading(heading[first]),
         covariance[first],
     )
-    return [poses], notes
+    return [poses], warnings
 
 
 def _over(
@@ -198,7 +200,7 @@ def _filled(poses: Trajectory, driven: Trajectory) -> Trajectory:
 
 def corrections(
     recording: Samples, read: Sequence[Seen], tags: Tags | None
-) -> list[dict[str, Any]]:
+) -> list[HeadingCorrection]:
     """What to turn by at each tag so as to come straight to the next one (paper 8.3.7).
 
     One entry for each two tags in a row that have places on the site: by how much the
@@ -224,14 +226,14 @@ def corrections(
         change = np.array([way[1], -way[0], -(distance**2)]) / distance**2
         spread = covariance[-1][np.ix_([0, 1, 5], [0, 1, 5])]
         found.append(
-            {
-                "device": recording.device,
-                "time_s": float(time[-1]) * 1e-9,
-                "from": here.tag_id,
-                "to": there.tag_id,
-                "turn_rad": float(np.remainder(turn + np.pi, 2 * np.pi) - np.pi),
-                "sigma_turn_rad": float(np.sqrt(change @ spread @ change)),
-                "distance_m": distance,
-            }
+            HeadingCorrection(
+                device=recording.device,
+                time_s=float(time[-1]) * 1e-9,
+                from_tag=here.tag_id,
+                to_tag=there.tag_id,
+                rotation_rad=float(np.remainder(turn + np.pi, 2 * np.pi) - np.pi),
+                sigma_rotation_rad=float(np.sqrt(change @ spread @ change)),
+                distance_m=distance,
+            )
         )
     return found

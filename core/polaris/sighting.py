@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.solution import SolverWarning
+
 Array = NDArray[np.float64]
 
 
@@ -51,7 +53,8 @@ class Sighting:
         Where the array was at ``time_ns``, in the coordinates of the fit.
     others : int
         Further sources that are no magnets of a tag (debris).
-    notes : tuple of str
+    warnings : tuple of SolverWarning
+        Without the name of the device.
     """
 
     time_ns: int
@@ -71,7 +74,7 @@ class Sighting:
     usual_sigma: float = np.nan
     origin_m: Array = field(default_factory=lambda: np.zeros(2))
     others: int = 0
-    notes: tuple[str, ...] = field(default=())
+    warnings: tuple[SolverWarning, ...] = ()
 
     def __len__(self) -> int:
         return len(self.place_m)

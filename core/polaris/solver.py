@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,11 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.clean import cleaned
 from locatk.core.polaris.fit import Fitted
 from locatk.core.polaris.identify import Seen, identify
+from locatk.core.polaris.results import HeadingCorrection, PolarisFacts, TagDetection
 from locatk.core.polaris.route import along, corrections, joined, tag_poses
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Tags, places
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -37,7 +37,9 @@ ALIKE = 1.2
 FEWEST_LAID = 5
 """Magnets on cells from which a grid is worth to be tried whole."""
 
-NOT_THE_WAY = "the speed or odometry given does not explain the samples of a pass"
+PATH_CONTRADICTED = SolverWarning(
+    "path_contradicted", "the speed or odometry given does not explain the samples of a pass"
+)
 
 
 @dataclass(frozen=True)
@@ -97,16 +99,16 @@ def solve(
     """
     options = options or SolveOptions()
     trajectories: list[Trajectory] = []
-    detections: list[dict[str, Any]] = []
-    notes: list[str] = []
+    detections: list[TagDetection] = []
+    warnings: list[SolverWarning] = []
     rejected: Counter[str] = Counter()
-    turns: list[dict[str, Any]] = []
+    heading_corrections: list[HeadingCorrection] = []
     for recording in samples:
         _check(recording)
         noise = passes.noise(recording)
         recording, faults = cleaned(recording, noise)
         noise = passes.noise(recording)  # a stuck sensor seems to have none
-        notes += faults
+        warnings += faults
         driven = next((t for t in odometry if t.device == recording.device), None)
         seen, empty = _seen(recording, noise, tags, options, driven)
         if empty:
@@ -116,26 +118,27 @@ def solve(
             if item.refused:
                 rejected[item.refused] += 1
         read = [item for item in seen if item.tag_id is not None]
-        poses, said = tag_poses(recording, read, tags)
-        notes += said
+        poses, without_place = tag_poses(recording, read, tags)
+        warnings += without_place
         if poses and driven is not None:
             poses = joined(poses, driven)
         trajectories += poses
-        turns += corrections(recording, read, tags)
-        remarks = dict.fromkeys(note for item in seen for note in item.sighting.notes)
-        notes += [f"{recording.device}: {remark}" for remark in remarks]
+        heading_corrections += corrections(recording, read, tags)
+        of_passes = dict.fromkeys(each for item in seen for each in item.sighting.warnings)
+        warnings += [each.about(recording.device) for each in of_passes]
         lost = np.isnan(recording.field_t).any(axis=2).mean()
         if lost > 0:
-            notes.append(f"{recording.device}: {100 * lost:.2g} % of the sensors' samples missing")
+            message = f"{100 * lost:.2g} % of the sensors' samples missing"
+            warnings.append(SolverWarning("samples_missing", message).about(recording.device))
     return Solution(
         system="polaris",
         method=options.method,
         trajectories=tuple(trajectories),
         rejected=dict(rejected),
-        detections=detections,
+        detections=tuple(detections),
         artifact=tags,
-        notes=tuple(notes),
-        facts={"heading_corrections": turns},
+        warnings=tuple(warnings),
+        facts=PolarisFacts(tuple(heading_corrections)),
     )
 
 
@@ -217,7 +220,7 @@ def _solved(
             except DegenerateError:
                 continue
             if way is None and path is not None:
-                sighting = replace(sighting, notes=(NOT_THE_WAY,))
+                sighting = replace(sighting, warnings=(PATH_CONTRADICTED,))
             found = sighting, identify(sighting, recording, tags)
             white = sighting.residual_sigma < joint.WHITE
             # Debris leaves peaks that no other start would explain.
@@ -258,7 +261,7 @@ def _on_grid(
     laid[:, 0] /= match.scale
     try:
         again = joint.seeded(prepared, fitted, laid + sighting.origin_m)
-        sighting = replace(joint.sighting(recording, prepared, again), notes=found[0].notes)
+        sighting = replace(joint.sighting(recording, prepared, again), warnings=found[0].warnings)
     except DegenerateError:
         return None
     read = identify(sighting, recording, tags)

@@ -241,9 +241,9 @@ def _by_solve(images: NDArray[np.uint8], manifest: Manifest, method: str) -> Loc
     solution = solve([frames], manifest, SolveOptions(method))
     located = nothing(n, "rejected")
     for found in solution.detections:
-        k = int(found["frame"])
-        located.grid[k] = found["grid_x"], found["grid_y"]
-        located.heading[k] = found["heading_rad"]
+        k = int(found.frame)
+        located.grid[k] = found.grid_x, found.grid_y
+        located.heading[k] = found.heading_rad
         located.rejected[k] = ""
     return located
 

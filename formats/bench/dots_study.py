@@ -66,10 +66,10 @@ def _study(manifest: Manifest, spots: Array, heading: Array, method: str) -> Arr
     solution = solve([simulated.frames], manifest, SolveOptions(method, simulated.camera))
     errors = np.full((n, 3), np.nan)
     for found in solution.detections:
-        k = int(found["frame"])
-        errors[k, 0] = 1e3 * (found["x_m"] - position[k, 0])
-        errors[k, 1] = 1e3 * (found["y_m"] - position[k, 1])
-        away = math.remainder(found["heading_rad"] - turned[k], math.tau)
+        k = int(found.frame)
+        errors[k, 0] = 1e3 * (found.x_m - position[k, 0])
+        errors[k, 1] = 1e3 * (found.y_m - position[k, 1])
+        away = math.remainder(found.heading_rad - turned[k], math.tau)
         errors[k, 2] = math.degrees(away)
     far = np.abs(errors[:, :2]).max(axis=1) >= RIGHT_MM
     errors[far | (np.abs(errors[:, 2]) >= RIGHT_DEG)] = np.nan

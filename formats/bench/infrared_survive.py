@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -91,10 +90,10 @@ def _poses(session: ImportedSession) -> list[Figure]:
 
 def _switches(solution: Solution) -> Figure:
     """How far poses move when a station is hidden."""
-    checks = cast("dict[str, list[dict[str, float]]]", solution.facts["verification"])["stations"]
+    checks = solution.facts.verification.stations
     return Figure(
         "libsurvive: jump when a station is hidden, 95 %",
-        1e3 * max(check["jump_95_m"] for check in checks),
+        1e3 * max(check.jump_95_m for check in checks),
         "mm",
         f"largest of {len(checks)} stations left out in turn; users of peers report 50 to 100 mm "
         "(facts/lighthouse.md 4.3)",

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks import globalize
-from locatk.core.landmarks.detections import LIKELY
 from locatk.core.landmarks.floor import STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.landmark import CODES, PATTERNS, code_of, rotated
 from locatk.core.landmarks.recording import SolveOptions
 from locatk.core.landmarks.remarks import CERTAIN
+from locatk.core.landmarks.results import MIN_CELL_PROBABILITY
 from locatk.core.landmarks.sighting import Hypothesis, Sighting
 from locatk.core.landmarks.simulate_options import Errors
 from locatk.core.landmarks.simulate_sensors import odometry
@@ -231,7 +231,7 @@ def perfect_figures(floor: FloorMap, which: str) -> list[Figure]:
         right.append([(cell, quarters) for cell, quarters, _ in places] == true)
         probability.append(places[-1][2])
     least, mean = min(probability), float(np.mean(probability))
-    given = [r and p >= LIKELY for r, p in zip(right, probability, strict=True)]
+    given = [r and p >= MIN_CELL_PROBABILITY for r, p in zip(right, probability, strict=True)]
     how = (
         f"{len(walks)} starts (cell, heading) with an L, {which}; the filter alone, perfect reads, "
         "nominal odometry"
@@ -241,8 +241,9 @@ def perfect_figures(floor: FloorMap, which: str) -> list[Figure]:
                f"{how}: cell and heading of all three", 100.0, "higher",
                "paper: three landmarks", 100.0),
         Figure("24x24, 16/L: right and poses given after three",
-               100 * float(np.mean(given)), "%", f"the same, at a probability of {LIKELY} or "
-               f"more; least {least:.4f}, mean {mean:.4f}",
+               100 * float(np.mean(given)), "%",
+               f"the same, at a probability of {MIN_CELL_PROBABILITY} or more; "
+               f"least {least:.4f}, mean {mean:.4f}",
                100.0, "higher"),
     ]  # fmt: skip
 
@@ -265,7 +266,7 @@ def misread_figures(floor: FloorMap, which: str) -> list[Figure]:
         if wrong >= CERTAIN:
             certain += 1
             failed.append(number)
-        likely += LIKELY <= wrong < CERTAIN
+        likely += MIN_CELL_PROBABILITY <= wrong < CERTAIN
         first = (n for n, (_, _, p) in enumerate(so_far, 1) if p >= CERTAIN)
         needed.append(next(first, math.inf))
     done = [n for n in needed if math.isfinite(n)]
@@ -280,7 +281,8 @@ def misread_figures(floor: FloorMap, which: str) -> list[Figure]:
                f"{how}: a wrong cell or heading at a probability of {CERTAIN} or more, after any "
                f"of the landmarks or in the end{seeds}", 0.0),
         Figure("5 % misread: wrong with a remark", 100 * likely / len(walks), "%",
-               f"the same, at {LIKELY} to {CERTAIN}: poses are given, with the probability said"),
+               f"the same, at {MIN_CELL_PROBABILITY} to {CERTAIN}: poses are given, with the "
+               "probability said"),
         Figure("5 % misread: landmarks needed", float(np.mean(done)) if done else math.nan,
                "landmarks", f"mean until {CERTAIN} is reached; 99 % within "
                f"{np.quantile(done, 0.99) if done else math.nan:.0f}", peer="paper, no fault",

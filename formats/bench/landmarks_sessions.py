@@ -85,15 +85,15 @@ def judged(made: Simulated, solution: Solution) -> Session:
 
     wrong, known_ns = 0, []
     for found in solution.detections:
-        if found["cell"] is None:
+        if found.cell is None:
             continue
-        known_ns.append(round(found["time_s"] * 1e9))
+        known_ns.append(round(found.time_s * 1e9))
         here = true_at(np.array(known_ns[-1:]))[0]
-        mark = here[:2] - [found["x_m"], found["y_m"]]
-        wrong += bool(np.hypot(*(mark - made.floor.place(found["cell"]))) > made.floor.pitch_m / 2)
+        mark = here[:2] - [found.x_m, found.y_m]
+        wrong += bool(np.hypot(*(mark - made.floor.place(found.cell))) > made.floor.pitch_m / 2)
     none = np.empty(0)
-    (facts,) = solution.facts["robots"].values()
-    silent = facts.get("probability", 1.0) >= CERTAIN  # the paper has none
+    (facts,) = solution.facts.robots.values()
+    silent = facts.probability is None or facts.probability >= CERTAIN  # the paper has none
     if not solution.trajectories:
         return Session(False, silent, wrong, none, none, none)
     track = solution.trajectories[0]

@@ -18,10 +18,9 @@ is not told to it); rows "without the ruler" take that back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from locatk.core.errors import LocatkError
 from locatk.core.geometry import umeyama
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import places
 from locatk.formats.bench import Figure
@@ -121,31 +121,32 @@ def read_runs(folder: Path) -> dict[str, list[Samples]]:
     }
 
 
-def solve_run(samples: Samples, method: str) -> list[dict[str, Any]]:
+def solve_run(samples: Samples, method: str) -> tuple[TagDetection, ...]:
     """Detections of one recording. The published algorithm is told the speed."""
     speed = SPEED_MPS if method == "paper" else None
     return solve([samples], PUBLISHED_TAGS, SolveOptions(method, speed)).detections
 
 
-def as_run(detections: Sequence[Mapping[str, Any]], tag_id: int) -> Run:
+def as_run(detections: Sequence[TagDetection], tag_id: int) -> Run:
     """What detections of one pass over ``tag_id`` say of it."""
     cells = layout_of(PUBLISHED_TAGS, tag_id).cells
-    ids = [found["tag_id"] for found in detections if found["tag_id"] is not None]
+    ids = [found.tag_id for found in detections if found.tag_id is not None]
     wrong = sum((one ^ tag_id).bit_count() for one in ids)
     for found in detections:
-        by_cell = {tuple(m["cell"]): m for m in found["magnets"] if m["cell"] is not None}
+        by_cell = {m.cell: m for m in found.magnets if m.cell is not None}
         if set(by_cell) != set(cells):
             continue
+        assert found.heading_rad is not None  # its magnets are on a grid
         magnets = [by_cell[cell] for cell in cells]
         return Run(
             tag_id,
             bool(ids),
             wrong,
-            np.array([[magnet["x_m"], magnet["y_m"]] for magnet in magnets]),
-            np.array([magnet["angle_rad"] for magnet in magnets]),
-            found["heading_rad"],
-            found["scale"],
-            found["residual_sigma"],
+            np.array([[magnet.x_m, magnet.y_m] for magnet in magnets]),
+            np.array([magnet.angle_rad for magnet in magnets]),
+            found.heading_rad,
+            found.scale,
+            found.residual_sigma,
         )
     nowhere = np.full((len(cells), 2), np.nan)
     return Run(tag_id, bool(ids), wrong, nowhere, nowhere[:, 0], math.nan, math.nan, math.nan)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris.bound import magnet_covariance, pose_covariance
 from locatk.core.polaris.codec import capacity, layout_of
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.simulate import Simulated, SimulationOptions, simulate
 from locatk.core.polaris.simulate_options import CARS, usual_bar
 from locatk.core.polaris.solver import SolveOptions, solve
@@ -102,7 +103,7 @@ def drive(tags: Tags, tag_id: int, *, known_speed: bool = False, **options: Any)
     return judged(made, solve([made.samples], tags, SolveOptions(speed_mps=speed)).detections)
 
 
-def judged(made: Simulated, detections: Sequence[Mapping[str, Any]]) -> Outcome:
+def judged(made: Simulated, detections: Sequence[TagDetection]) -> Outcome:
     """Compare the detections of a pass over one tag with the truth."""
     tag_id = made.magnets.tag_id[0]
     count = len(made.magnets)
@@ -110,19 +111,19 @@ def judged(made: Simulated, detections: Sequence[Mapping[str, Any]]) -> Outcome:
     near = made.tags.spacing_m / 2
     seen = np.zeros(count, bool)
     for found in detections:
-        true, lies = _true(made, found["time_s"])
-        each = np.array([[m["x_m"], m["y_m"], m["angle_rad"]] for m in found["magnets"]])
+        true, lies = _true(made, found.time_s)
+        each = np.array([[m.x_m, m.y_m, m.angle_rad] for m in found.magnets])
         each = each.reshape(-1, 3)
         apart = np.linalg.norm(true[:, None, :2] - each[None, :, :2], axis=2)
         seen |= apart.min(axis=1, initial=np.inf) < near
-        if found["tag_id"] == tag_id:
+        if found.tag_id == tag_id:
             magnets = each[apart.argmin(axis=1)] - true
-            pose = np.array([found[name] for name in POSE]) - lies
-            sigma = np.array([found[f"sigma_{name}"] for name in POSE])
+            pose = np.array([getattr(found, name) for name in POSE]) - lies
+            sigma = np.array([getattr(found, f"sigma_{name}") for name in POSE])
     for errors in (magnets, pose):
         errors[..., 2] = np.angle(np.exp(1j * errors[..., 2]))
-    reasons = tuple(found["refused"] for found in detections if found["refused"])
-    read = {found["tag_id"] for found in detections} - {None}
+    reasons = tuple(found.refused for found in detections if found.refused)
+    read = {found.tag_id for found in detections} - {None}
     verdict: Verdict
     if read - {tag_id}:
         verdict = "wrong"

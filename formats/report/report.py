@@ -76,7 +76,9 @@ def _article(subject: Subject, ident: str) -> Iterator[str]:
     yield page.paragraph(_what(subject), "sub")
     yield page.paragraph(judgement.verdict(subject), "verdict")
     yield page.tiles(judgement.key_figures(subject))
-    yield page.notes("What the poses stand on", subject.solution.notes)
+    yield page.notes(
+        "What the poses stand on", [each.message for each in subject.solution.warnings]
+    )
     for k, panel in enumerate(panels(subject), start=1):
         yield page.panel(panel, f"{ident}-{k}")
     line = subject.facts.get("command")

@@ -9,7 +9,7 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.tag import Tags
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, to_json
 from locatk.formats import describe
 from locatk.formats.plot_clock import span, when
 from locatk.formats.plot_units import digits
@@ -36,7 +36,7 @@ _UNITS = {
 def run_panels(subject: Subject) -> list[Panel]:
     """Tables of the run, of what the solver tells, and of the artifact."""
     panels = [Panel("The run", table=Table(("", ""), _run(subject)))]
-    told = list(_flat(subject.solution.facts))
+    told = list(_flat(to_json(subject.solution.facts) or {}))
     if told:
         panels.append(Panel("What the solver tells", table=_table(told)))
     found = artifact(subject.solution)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.dots.results import FrameOutcome
+from locatk.core.lighthouse.results import StationDetection
 from locatk.core.solution import Solution
 from locatk.formats import seen_text
 from locatk.formats.plot_ground import COLORS
@@ -34,17 +36,10 @@ BINS = 40
 BAR_PX = 46
 """Height of the bar of a reason with its name."""
 
-MALFORMED = (KeyError, TypeError, ValueError, AttributeError)
-"""What detections raise that are not as docs/formats.md has them: other tools write files too."""
-
 
 def panels(solution: Solution) -> list[Panel]:
     """What was seen, and what was rejected and why; two panels for every system."""
-    try:
-        seen = _seen(solution)
-    except MALFORMED:
-        seen = Panel(SEEN, "The detections of the solution are damaged.")
-    return [seen, _rejected(solution)]
+    return [_seen(solution), _rejected(solution)]
 
 
 # ---- what was seen
@@ -66,17 +61,18 @@ def _seen(solution: Solution) -> Panel:
 
 
 def _stations(solution: Solution) -> Panel:
+    detections: tuple[StationDetection, ...] = solution.detections
     rows = [
         (
-            str(found["channel"]),
-            str(found["id"] or "-"),
-            str(found["period_ticks"]),
-            str(found["calibration"]),
-            str(found["sweeps"]),
-            str(found["rejected"]),
-            seen_text.number(found.get("residual_rad"), 1e3, ".3f"),
+            str(found.channel),
+            found.id or "-",
+            str(found.period_ticks),
+            found.calibration,
+            str(found.sweeps),
+            str(found.rejected),
+            seen_text.number(found.residual_rad, 1e3, ".3f"),
         )
-        for found in solution.detections
+        for found in detections
     ]
     header = ("channel", "id", "period [ticks]", "calibration", "sweeps", "rejected")
     return Panel(
@@ -90,7 +86,7 @@ def _stations(solution: Solution) -> Panel:
 
 def _tags(solution: Solution) -> Panel:
     table = seen_text.tags(solution.detections, MOST_ROWS, compact=True)
-    margins = [number(each["margin"]) for each in solution.detections if not each.get("refused")]
+    margins = [number(each.margin) for each in solution.detections if not each.refused]
     note = (
         f"{len(margins)} of {counted(len(solution.detections), 'passes')} over magnets "
         f"{'was' if len(margins) == 1 else 'were'} read as a tag. Tags are told in the frame of "
@@ -105,14 +101,14 @@ def _tags(solution: Solution) -> Panel:
 
 def _landmarks(solution: Solution) -> Panel:
     table = seen_text.landmarks(solution.detections, MOST_ROWS, compact=True)
-    refused = sum(bool(each["refused"]) for each in solution.detections)
+    refused = sum(bool(each.refused) for each in solution.detections)
     note = (
         f"{counted(len(solution.detections), 'visits')} to landmarks, {refused} refused. The robot "
         "is told in the frame of the landmark, with the standard deviation."
     )
     figure = None
     if len(solution.detections) > MOST_ROWS:
-        left = [number(each.get("residual_sigma")) for each in solution.detections]
+        left = [each.residual_sigma for each in solution.detections]
         figure = _histogram([("residual [sigma]", [("visits", left)])], "visits")
     return _listed(note, table, figure)
 
@@ -124,11 +120,11 @@ def _listed(note: str, table: Seen, figure: Figure | None) -> Panel:
 
 
 def _frames(solution: Solution) -> Panel:
-    frames = list(solution.facts.get("frames") or ())
+    frames: tuple[FrameOutcome, ...] = () if solution.facts is None else solution.facts.frames
     if not frames:
         return Panel(SEEN, f"{len(solution.detections)} frames with a place.")
-    decoded = [each for each in frames if not each.get("rejected")]
-    others = [each for each in frames if each.get("rejected")]
+    decoded = [each for each in frames if not each.rejected]
+    others = [each for each in frames if each.rejected]
     groups = (("decoded", decoded), ("rejected", others))
     rows = [
         (
@@ -146,7 +142,7 @@ def _frames(solution: Solution) -> Panel:
     series = [
         (
             what,
-            [(name, [scale * number(each.get(key)) for each in group]) for name, group in groups],
+            [(name, [scale * getattr(each, key) for each in group]) for name, group in groups],
         )
         for what, key, scale in (
             ("confidence [%]", "confidence", 100.0),
@@ -162,8 +158,8 @@ def _frames(solution: Solution) -> Panel:
     )
 
 
-def _median(group: list[Mapping[str, Any]], key: str, scale: float, form: str) -> str:
-    values = np.array([number(each.get(key)) for each in group])
+def _median(group: list[FrameOutcome], key: str, scale: float, form: str) -> str:
+    values = np.array([getattr(each, key) for each in group], float)
     known = values[np.isfinite(values)]
     return seen_text.number(float(np.median(known)), scale, form) if len(known) else "-"
 
@@ -214,10 +210,7 @@ def _rejected(solution: Solution) -> Panel:
     if not counts:
         return Panel(REJECTED, "Nothing was rejected.")
     known = {why: meaning(solution.system, why) for why in counts}
-    try:
-        totals = _totals(solution, known)
-    except MALFORMED:
-        totals = {}
+    totals = _totals(solution, known)
     order = sorted(counts, key=lambda why: (_unit(known[why]), -counts[why]))
     rows = []
     for why in order:
@@ -263,7 +256,7 @@ def _totals(solution: Solution, known: Mapping[str, Reason | None]) -> dict[str,
     if solution.system == "lighthouse":
         used = solution.rejected.get("station_contradicts_others", 0)  # has a pose all the same
         return {
-            "sweeps": left["sweeps"] + sum(e.get("sweeps", 0) + e.get("rejected", 0) for e in seen),
+            "sweeps": left["sweeps"] + sum(each.sweeps + each.rejected for each in seen),
             "moments": left["moments"] - used + solution.poses,
         }
     if solution.system == "polaris":

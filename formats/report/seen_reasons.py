@@ -122,13 +122,13 @@ def _polaris() -> dict[str, Reason]:
 
 
 def _landmarks() -> dict[str, Reason]:
-    from locatk.core.landmarks import detections, sightings
+    from locatk.core.landmarks import results, sightings
 
     return _of(
         "visits",
         {
             "not_localised": "The landmark was read, but the likeliest place on the map has a "
-            f"probability below {detections.LIKELY:g}.",
+            f"probability below {results.MIN_CELL_PROBABILITY:g}.",
             "misread": "The place is known, and the map has another landmark there: it is laid "
             "wrongly or was misread. It is used all the same, as it was read.",
             "off_map": "By odometry the landmark lies where the map has none.",

@@ -8,7 +8,6 @@ from importlib import import_module
 from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats.report.panel import Panel
-from locatk.formats.report.seen import MALFORMED
 from locatk.formats.session import Session
 
 MODULES = {
@@ -43,10 +42,6 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
         found = draw(session, solution)
     except LocatkError as error:
         return [Panel(TITLE, f"The recording cannot be drawn: {error.message}.")]
-    except MALFORMED:
-        return [
-            Panel(TITLE, "The recording cannot be drawn: the solution's detections are damaged.")
-        ]
     if found:
         return found
     recorded = session.facts.get("system")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec
 from locatk.core.dots.frames import Frames
+from locatk.core.dots.results import DotDetection, FrameOutcome
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError, LocatkError
 from locatk.core.solution import Solution
-from locatk.formats import captured, sheets
+from locatk.formats import captured, seen_text, sheets
 from locatk.formats import frames as camera_frames
 from locatk.formats.plot_clock import origin_ns
 from locatk.formats.plot_ground import COLORS
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel, Picture
-from locatk.formats.report.signals_drawing import number, one_a_pixel, told
+from locatk.formats.report.signals_drawing import one_a_pixel
 from locatk.formats.seen_text import words
 from locatk.formats.session import Session
 
@@ -37,8 +38,6 @@ WIDTH_PX = 376
 RED, BLUE = (0, 94, 213), (178, 114, 0)
 """As OpenCV has them: blue, green, red."""
 
-Outcome = Mapping[str, Any]
-
 
 def panels(session: Session, solution: Solution) -> list[Panel]:
     """Some frames of each camera, and how all of them were decoded."""
@@ -49,7 +48,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     )
     if not topics:
         return []
-    outcomes: list[Outcome] = list(solution.facts.get("frames") or ())
+    outcomes: tuple[FrameOutcome, ...] = () if solution.facts is None else solution.facts.frames
     notes = drawing.strangers(
         solution, [topic.removeprefix(camera_frames.TOPIC) for topic in topics]
     )
@@ -70,14 +69,16 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
     return found
 
 
-def _by_camera(frames: Sequence[Frames], outcomes: Sequence[Outcome]) -> list[list[Outcome | None]]:
+def _by_camera(
+    frames: Sequence[Frames], outcomes: Sequence[FrameOutcome]
+) -> list[list[FrameOutcome | None]]:
     """What became of each frame of each camera, by its name and time."""
-    known: dict[tuple[str, int], list[Outcome]] = {}
+    known: dict[tuple[str, int | None], list[FrameOutcome]] = {}
     for each in reversed(outcomes):
-        known.setdefault((str(each["frame"]), _ms(number(each["time_s"]))), []).append(each)
-    found: list[list[Outcome | None]] = []
+        known.setdefault((each.frame, _ms(each.time_s)), []).append(each)
+    found: list[list[FrameOutcome | None]] = []
     for camera in frames:
-        mine: list[Outcome | None] = []
+        mine: list[FrameOutcome | None] = []
         for name, time_ns in zip(camera.names, camera.time_ns.tolist(), strict=True):
             alike = known.get((name, _ms(time_ns * 1e-9)))
             mine.append(alike.pop() if alike else None)
@@ -85,8 +86,9 @@ def _by_camera(frames: Sequence[Frames], outcomes: Sequence[Outcome]) -> list[li
     return found
 
 
-def _ms(time_s: float) -> int:
-    return round(1e3 * time_s)
+def _ms(time_s: float) -> int | None:
+    """Time in milliseconds; None if a file of another tool has none."""
+    return round(1e3 * time_s) if math.isfinite(time_s) else None
 
 
 # ---- pictures
@@ -96,7 +98,7 @@ def _pictures(
     session: Session,
     solution: Solution,
     frames: Frames,
-    outcomes: Sequence[Outcome | None],
+    outcomes: Sequence[FrameOutcome | None],
     most: int,
 ) -> Panel:
     name = f"Frames of {frames.device}"
@@ -117,7 +119,7 @@ def _pictures(
             unreadable.append(error.message)
             continue
         outcome = outcomes[k]
-        decoded = outcome is not None and not outcome.get("rejected")
+        decoded = outcome is not None and not outcome.rejected
         png = _png(image, codec if decoded else None, camera)
         seconds = (int(frames.time_ns[k]) - origin_ns(session, solution)) * 1e-9
         caption = f"frame {frames.names[k]}, {seconds:.2f} s: {_caption(outcome, solution)}"
@@ -138,9 +140,9 @@ def _codec(manifest: Manifest) -> Codec:
     return codec(manifest.codec)
 
 
-def _chosen(outcomes: Sequence[Outcome | None], most: int) -> list[int]:
+def _chosen(outcomes: Sequence[FrameOutcome | None], most: int) -> list[int]:
     """Frames to show: one of each reason of rejection, then some that are spread over the rest."""
-    reasons = [None if each is None else each.get("rejected") for each in outcomes]
+    reasons = [None if each is None else each.rejected for each in outcomes]
     rejected = [k for k, why in enumerate(reasons) if why and why not in reasons[:k]]
     if len(reasons) > 1 and len(rejected) > min(REJECTED_SHOWN, most - 1):
         rejected = rejected[: min(REJECTED_SHOWN, most - 1)]
@@ -176,29 +178,28 @@ def _png(image: NDArray[np.uint8], codec: Codec | None, camera: Camera | None) -
     return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1])
 
 
-def _caption(outcome: Outcome | None, solution: Solution) -> str:
+def _caption(outcome: FrameOutcome | None, solution: Solution) -> str:
     if outcome is None:
         return "not in the solution"
-    if outcome.get("rejected"):
-        return f"rejected, {words(outcome['rejected'])}; {outcome.get('dots', 0)} dots"
-    key = outcome["frame"], outcome["time_s"]
-    found = next((e for e in solution.detections if (e["frame"], e["time_s"]) == key), None)
+    if outcome.rejected:
+        return f"rejected, {words(outcome.rejected)}; {outcome.dots} dots"
+    key = outcome.frame, outcome.time_s
+    detections: tuple[DotDetection, ...] = solution.detections
+    found = next((each for each in detections if (each.frame, each.time_s) == key), None)
     place = (
         ""
         if found is None
-        else f"at {told(found, 'x_m', 1e3, '.2f')}, {told(found, 'y_m', 1e3, '.2f')} mm, "
-        f"{np.degrees(number(found['heading_rad'])):.1f} deg; "
+        else f"at {seen_text.number(found.x_m, 1e3, '.2f')}, "
+        f"{seen_text.number(found.y_m, 1e3, '.2f')} mm, {np.degrees(found.heading_rad):.1f} deg; "
     )
-    return (
-        f"{place}{outcome.get('dots', 0)} dots, {outcome.get('corrected_bits', 0)} bits corrected"
-    )
+    return f"{place}{outcome.dots} dots, {outcome.corrected_bits} bits corrected"
 
 
 # ---- numbers
 
 
 def _over_time(
-    session: Session, solution: Solution, outcomes: Sequence[Outcome], notes: list[str]
+    session: Session, solution: Solution, outcomes: Sequence[FrameOutcome], notes: list[str]
 ) -> Panel:
     """Confidence, corrected bits and dots of all frames."""
     from plotly.subplots import make_subplots
@@ -207,8 +208,8 @@ def _over_time(
     if not outcomes:
         return Panel(title, " ".join(["The solution does not tell of single frames.", *notes]))
     start = origin_ns(session, solution)
-    time_s = np.array([number(each["time_s"]) for each in outcomes]) - start * 1e-9
-    reason = np.array([each.get("rejected") or "" for each in outcomes], object)
+    time_s = np.array([each.time_s for each in outcomes]) - start * 1e-9
+    reason = np.array([each.rejected or "" for each in outcomes], object)
     series = (
         ("confidence", "confidence [%]", 100.0),
         ("corrected_bits", "bits corrected", 1.0),
@@ -218,7 +219,7 @@ def _over_time(
     figure = make_subplots(3, 1, shared_xaxes=True, vertical_spacing=0.05)
     thinned, traces = False, []
     for row, (key, what, scale) in enumerate(series, 1):
-        value = scale * np.array([number(each.get(key)) for each in outcomes])
+        value = scale * np.array([getattr(each, key) for each in outcomes], float)
         for k, why in enumerate(reasons):
             mine = np.flatnonzero((reason == why) & np.isfinite(value))
             if not len(mine):

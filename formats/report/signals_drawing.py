@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -247,9 +247,3 @@ def listed(names: Sequence[str], most: int = 5) -> str:
     """Names in a sentence."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
-
-
-def told(found: Mapping[str, Any], key: str, scale: float, form: str) -> str:
-    """A number of a detection for people, "-" where it is not known."""
-    value = number(found.get(key))
-    return format(value * scale, form) if math.isfinite(value) else "-"

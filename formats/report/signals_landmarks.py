@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
+from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import Solution
 from locatk.formats import seen_text
 from locatk.formats.halls import KIND
@@ -17,7 +18,7 @@ from locatk.formats.plot_clock import origin_ns
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
-from locatk.formats.report.signals_drawing import Event, envelope, number, told
+from locatk.formats.report.signals_drawing import Event, envelope
 from locatk.formats.report.signals_fields import Fields, each_device
 from locatk.formats.session import Session
 
@@ -42,7 +43,8 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
         time_s = drawing.seconds(samples.time_ns, start_ns)
         field_mt = 1e3 * samples.field_t
         names = _names(session, device, field_mt.shape[1])
-        seen = [each for each in solution.detections if each.get("device") == device]
+        detections: tuple[LandmarkDetection, ...] = solution.detections
+        seen = [each for each in detections if each.device == device]
         events = [_event(each, start_ns) for each in seen]
         whole = _whole(name, time_s, field_mt, names, events, start_ns, notes)
         return [whole, *_near(device, time_s, field_mt, names, seen, events)]
@@ -61,21 +63,21 @@ def _names(session: Session, device: str, count: int) -> list[str]:
     return [label(name) for name in sensors.names]
 
 
-def _event(found: Mapping[str, Any], start_ns: int) -> Event:
+def _event(found: LandmarkDetection, start_ns: int) -> Event:
     """The time at which a sighting stands, with what was read."""
-    at = number(found["time_s"]) - start_ns * 1e-9
-    refused = label(seen_text.words(found.get("refused")))
-    cell = seen_text.cell(found.get("cell"))
-    what = " ".join(filter(None, (cell, label(found.get("pattern") or ""))))
+    at = found.time_s - start_ns * 1e-9
+    refused = label(seen_text.words(found.refused))
+    cell = seen_text.cell(found.cell)
+    what = " ".join(filter(None, (cell, label(found.pattern or ""))))
     hover = "<br>".join(
         [
             f"landmark {what}" if what else "nothing read",
-            f"{seen_text.sure(found.get('probability'))} % sure",
-            f"residual {told(found, 'residual_sigma', 1, '.2g')} sigma",
+            f"{seen_text.sure(found.probability)} % sure",
+            f"residual {seen_text.number(found.residual_sigma, 1, '.2g')} sigma",
             *([f"refused: {refused}"] if refused else []),
         ]
     )
-    name = "<br>".join(filter(None, (refused, cell, label(found.get("pattern") or ""))))
+    name = "<br>".join(filter(None, (refused, cell, label(found.pattern or ""))))
     return Event(at - MARK_S, at + MARK_S, name, hover, refused)
 
 
@@ -125,7 +127,7 @@ def _near(
     time_s: Array,
     field_mt: NDArray[Any],
     names: list[str],
-    seen: list[dict[str, Any]],
+    seen: list[LandmarkDetection],
     events: list[Event],
 ) -> list[Panel]:
     """Some visits, sample by sample."""
@@ -137,7 +139,7 @@ def _near(
     seen, events = [seen[k] for k in there], [events[k] for k in there]
     chosen = drawing.telling(
         [each.refused for each in events],
-        [number(each.get("probability")) for each in seen],
+        [each.probability for each in seen],
         MOST_VISITS,
     )
     if not chosen:

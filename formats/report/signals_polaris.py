@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
+from locatk.core.polaris.results import TagDetection
 from locatk.core.solution import Solution
+from locatk.formats import seen_text
 from locatk.formats.arrays import KIND
 from locatk.formats.plot_clock import origin_ns
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
-from locatk.formats.report.signals_drawing import Event, envelope, number, short, told
+from locatk.formats.report.signals_drawing import Event, envelope, number, short
 from locatk.formats.report.signals_fields import Fields, each_device
 from locatk.formats.seen_text import words
 from locatk.formats.session import Session
@@ -43,7 +45,8 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
 
     def drawn(device: str, name: str, samples: Fields, notes: Sequence[str]) -> list[Panel]:
         bar = _Bar(session, device, samples, origin_ns(session, solution))
-        seen = [each for each in solution.detections if each.get("device") == device]
+        detections: tuple[TagDetection, ...] = solution.detections
+        seen = [each for each in detections if each.device == device]
         return [_whole(name, bar, seen, notes), *_near(device, bar, seen)]
 
     return each_device(session, solution, KIND, "Magnetic field along", drawn)
@@ -97,38 +100,39 @@ def _across_mm(session: Session, device: str, count: int) -> Array | None:
     return None if array is None or len(array) != count else 1e3 * array.position_m[:, 1]
 
 
-def _event(found: Mapping[str, Any], start_ns: int) -> Event:
+def _event(found: TagDetection, start_ns: int) -> Event:
     """When a tag was passed, as the mean speed of the pass tells."""
-    at = number(found["time_s"]) - start_ns * 1e-9
+    at = found.time_s - start_ns * 1e-9
     times = [at, *(_passed_s(found, at))]
-    speed = number(found.get("speed_mps"))
+    speed = number(found.speed_mps)
     reach = REACH_M / speed if speed > 0 else 0.0
-    refused = label(words(found.get("refused")))
-    tag = f"tag {found['tag_id']}" if found.get("tag_id") is not None else f"not read: {refused}"
+    refused = label(words(found.refused))
+    tag = f"tag {found.tag_id}" if found.tag_id is not None else f"not read: {refused}"
+    margin = seen_text.number(found.margin, 1, ".2f")
     hover = "<br>".join(
         [
             tag,
-            f"margin {told(found, 'margin', 1, '.2f')} steps",
-            f"{len(found.get('magnets') or ())} magnets",
-            f"residual {told(found, 'residual_sigma', 1, '.2g')} sigma",
-            f"speed {told(found, 'speed_mps', 1e3, '.0f')} mm/s",
+            f"margin {margin} steps",
+            f"{len(found.magnets)} magnets",
+            f"residual {seen_text.number(found.residual_sigma, 1, '.2g')} sigma",
+            f"speed {seen_text.number(found.speed_mps, 1e3, '.0f')} mm/s",
         ]
     )
     name = refused
-    if found.get("tag_id") is not None:
-        name = f"{found['tag_id']} ({told(found, 'margin', 1, '.2f')})"
+    if found.tag_id is not None:
+        name = f"{found.tag_id} ({margin})"
     return Event(min(times) - reach, max(times) + reach, name, hover, refused)
 
 
-def _passed_s(found: Mapping[str, Any], at: float) -> list[float]:
+def _passed_s(found: TagDetection, at: float) -> list[float]:
     """When each magnet was passed."""
-    speed = number(found.get("speed_mps"))
+    speed = number(found.speed_mps)
     if not speed > 0:
         return []
-    return [at + number(each["x_m"]) / speed for each in found.get("magnets") or ()]
+    return [at + each.x_m / speed for each in found.magnets]
 
 
-def _whole(name: str, bar: _Bar, seen: list[dict[str, Any]], notes: Sequence[str]) -> Panel:
+def _whole(name: str, bar: _Bar, seen: list[TagDetection], notes: Sequence[str]) -> Panel:
     """The whole recording of one array: what was read, sensors over time, lines."""
     from plotly.subplots import make_subplots
 
@@ -168,7 +172,7 @@ def _whole(name: str, bar: _Bar, seen: list[dict[str, Any]], notes: Sequence[str
     return Panel(name, " ".join([*said, *notes]), figure)
 
 
-def _add_map(figure: Any, bar: _Bar, strength: NDArray[Any], seen: list[dict[str, Any]]) -> bool:
+def _add_map(figure: Any, bar: _Bar, strength: NDArray[Any], seen: list[TagDetection]) -> bool:
     """Sensors over time; whether columns had to be taken together."""
     assert bar.across_mm is not None
     n = len(bar.time_s)
@@ -189,14 +193,12 @@ def _add_map(figure: Any, bar: _Bar, strength: NDArray[Any], seen: list[dict[str
         col=1,
     )
     for refused, color in ((False, drawing.USED), (True, drawing.REFUSED)):
-        mine = [each for each in seen if (each.get("tag_id") is None) == refused]
+        mine = [each for each in seen if (each.tag_id is None) == refused]
         marks = [
-            (at, 1e3 * number(magnet["y_m"]))
+            (at, 1e3 * magnet.y_m)
             for each in mine
             for at, magnet in zip(
-                _passed_s(each, number(each["time_s"]) - bar.start_ns * 1e-9),
-                each.get("magnets") or (),
-                strict=False,
+                _passed_s(each, each.time_s - bar.start_ns * 1e-9), each.magnets, strict=False
             )
         ]
         x, y = np.array(marks or np.zeros((0, 2))).T
@@ -233,14 +235,14 @@ def _with_gaps(time_s: Array, columns: NDArray[Any]) -> tuple[Array, NDArray[Any
     return np.insert(time_s, at, edges), np.insert(columns, at, np.nan, axis=0)
 
 
-def _near(device: str, bar: _Bar, seen: list[dict[str, Any]]) -> list[Panel]:
+def _near(device: str, bar: _Bar, seen: list[TagDetection]) -> list[Panel]:
     """Some passes, each axis by itself, sample by sample."""
     from plotly.subplots import make_subplots
 
     seen = [each for each in seen if _is_in(bar, _event(each, bar.start_ns))]
     chosen = drawing.telling(
-        [str(each.get("refused") or "") for each in seen],
-        [number(each.get("margin")) for each in seen],
+        [each.refused or "" for each in seen],
+        [number(each.margin) for each in seen],
         MOST_PASSES,
     )
     if not chosen:

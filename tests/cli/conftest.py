@@ -20,8 +20,9 @@ from locatk.cli import systems
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.results import StationDetection
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import observations
 from locatk.formats.session import Session
@@ -116,19 +117,19 @@ def requests(monkeypatch: pytest.MonkeyPatch) -> list[systems.Request]:
                 for device in devices
             ),
             rejected={"jump": 3},
-            detections=[
-                {
-                    "station": 0,
-                    "channel": 1,
-                    "id": None,
-                    "period_ticks": 959000,
-                    "calibration": "generic",
-                    "sweeps": np.int64(40),
-                    "rejected": 3,
-                }
-            ],
+            detections=(
+                StationDetection(
+                    station=0,
+                    channel=1,
+                    id=None,
+                    period_ticks=959000,
+                    calibration="generic",
+                    sweeps=np.int64(40),
+                    rejected=3,
+                ),
+            ),
             artifact=SCENE,
-            notes=("generic calibration",),
+            warnings=(SolverWarning("generic_calibration", "generic calibration"),),
         )
         return systems.Solved(solution, 0.25)
 

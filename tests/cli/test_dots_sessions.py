@@ -373,10 +373,10 @@ def test_from_frames_to_poses(locatk, session: Path, tmp_path: Path) -> None:
 
     solution = observations.read_solution(out)
     assert solution.artifact == MANIFEST
-    outcomes = solution.facts["frames"]
-    assert [outcome["frame"] for outcome in outcomes] == [f"frame{n}.png" for n in range(1, 13)]
-    assert all(outcome["rejected"] is None for outcome in outcomes[::2])
-    assert all(outcome["rejected"] for outcome in outcomes[1::2])
+    outcomes = solution.facts.frames
+    assert [outcome.frame for outcome in outcomes] == [f"frame{n}.png" for n in range(1, 13)]
+    assert all(outcome.rejected is None for outcome in outcomes[::2])
+    assert all(outcome.rejected for outcome in outcomes[1::2])
     (trajectory,) = solution.trajectories
     assert (trajectory.device, trajectory.frame) == ("camera", "7f3a-1")
     assert locatk("export", out, "--format", "csv", "-o", table).exit_code == 0

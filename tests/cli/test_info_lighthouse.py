@@ -14,6 +14,7 @@ import pytest
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import StationReport
+from locatk.core.lighthouse.results import StationDetection
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.solution import Solution
 from locatk.formats import artifacts, captured, observations, receivers
@@ -134,9 +135,9 @@ def test_another_station_than_that_of_the_scene(locatk, write, tmp_path: Path) -
 def test_a_solution_tells_what_it_used(locatk, tmp_path: Path, placed: bool) -> None:
     """The paper's method has no stations in its scene."""
     path = tmp_path / "solved.mcap"
-    used = {"station": 0, "channel": 9, "sweeps": np.int64(38), "rejected": 2}
+    used = StationDetection(0, 9, None, 959000, "factory", sweeps=np.int64(38), rejected=2)
     scene = KNOWN if placed else None
-    solution = Solution("lighthouse", "bundle", (), detections=[used], artifact=scene)
+    solution = Solution("lighthouse", "bundle", (), detections=(used,), artifact=scene)
     write_solution(path, solution, source="run.mcap")
     station = facts(locatk, path)["stations"][-1]
     assert (station["channel"], station["sweeps"], station["rejected"]) == (9, 38, 2)

@@ -18,7 +18,8 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.landmarks.floor import AsBuilt, FloorMap
 from locatk.core.landmarks.halls import NAMES, HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import code_of
-from locatk.core.solution import Solution
+from locatk.core.landmarks.results import LandmarkDetection, LandmarkFacts, RobotFacts
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import halls, maps, observations, solutions
 from locatk.formats.session import Session
@@ -265,28 +266,32 @@ def test_info_of_a_damaged_session(locatk, tmp_path: Path) -> None:
 
 def detection(
     cell: tuple[int, int] | None, refused: str = "", time_s: float = 0.1
-) -> dict[str, Any]:
+) -> LandmarkDetection:
     """What a solver says of one visit."""
-    return {
-        "time_s": START_NS * 1e-9 + time_s,
-        "device": "robot",
-        "cell": None if cell is None else list(cell),
-        "pattern": "NNNS",
-        "code": 7,
-        "probability": 0.9876,
-        "x_m": 0.001,
-        "y_m": -0.002,
-        "heading_rad": 0.5,
-        "sigma_x_m": 1e-4,
-        "sigma_y_m": 2e-4,
-        "sigma_heading_rad": 1e-3,
-        "refused": refused,
-    }
+    return LandmarkDetection(
+        time_s=START_NS * 1e-9 + time_s,
+        device="robot",
+        cell=cell,
+        pattern="NNNS",
+        code=7,
+        probability=0.9876,
+        x_m=0.001,
+        y_m=-0.002,
+        heading_rad=0.5,
+        sigma_x_m=1e-4,
+        sigma_y_m=2e-4,
+        sigma_heading_rad=1e-3,
+        strength=(1.0, -1.0, 1.0, 1.0),
+        residual_sigma=1.1,
+        refused=refused,
+    )
 
 
-def told(localised: bool = True, **more: Any) -> dict[str, Any]:
-    said = {"localised": localised, "probability": 0.4, "landmarks_seen": 2, **more}
-    return {"robots": {"robot": said}}
+def told(localised: bool = True, **more: Any) -> LandmarkFacts:
+    robot = RobotFacts(
+        localised=localised, probability=0.4, landmarks_seen=2, landmarks_to_localise=None
+    )
+    return LandmarkFacts({"robot": replace(robot, **more)})
 
 
 class Solver:
@@ -295,7 +300,7 @@ class Solver:
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
         self.seen = [detection((0, 0)), detection((1, 0), time_s=0.3)]
-        self.facts = told()
+        self.facts: LandmarkFacts | None = told()
         self.poses = 5
 
     def solve(
@@ -314,7 +319,14 @@ class Solver:
         refused = {"too_short": 1}
         paths = (path,) if n else ()
         return Solution(
-            "landmarks", wanted.method, paths, refused, self.seen, floor, ("a note",), self.facts
+            "landmarks",
+            wanted.method,
+            paths,
+            refused,
+            tuple(self.seen),
+            floor,
+            (SolverWarning("test", "a note"),),
+            self.facts,
         )
 
 
@@ -349,7 +361,8 @@ def test_a_solution_holds_map_landmarks_and_poses(locatk, solver: Solver, tmp_pa
 
     solution = solutions.read_solution(out)
     assert maps.dumps_map(solution.artifact) == maps.dumps_map(FLOOR)
-    assert solution.detections == solver.seen
+    assert solution.detections == tuple(solver.seen)
+    assert solution.facts == solver.facts
     facts = json.loads(locatk("info", out, "--json").stdout)
     assert (facts["kind"], facts["system"], facts["landmarks"]) == ("solution", "landmarks", 5)
     assert locatk("export", out, "--format", "csv", "-o", tmp_path / "poses.csv").exit_code == 0
@@ -358,7 +371,7 @@ def test_a_solution_holds_map_landmarks_and_poses(locatk, solver: Solver, tmp_pa
 
 def test_people_see_a_table_of_landmarks(locatk, solver: Solver, tmp_path: Path) -> None:
     session = record(tmp_path / "run.mcap")
-    solver.seen[1]["probability"] = 0.99999
+    solver.seen[1] = replace(solver.seen[1], probability=0.99999)
     result = locatk("solve", session, "-o", tmp_path / "solved.mcap")
     assert result.exit_code == 0
     first, second = (line.split() for line in result.stdout.splitlines() if "NNNS" in line)
@@ -382,7 +395,7 @@ def test_a_long_drive_is_not_listed_whole(locatk, solver: Solver, tmp_path: Path
         (told(False), [detection(None)], 0, "not localised: the likeliest place has a probability"),
         (told(False, landmarks_seen=0), [], 0, "robot is not localised: no landmark was seen"),
         (told(False, probability=None), [], 0, "robot is not localised."),
-        ({}, [], 0, "no pose at all"),
+        (None, [], 0, "no pose at all"),
         (told(), [detection((0, 0), "misread")] * 2, 5, "2 landmarks are not those of the map"),
         (told(), [detection(None, "no_landmark")], 5, "1 sighting refused (no landmark)"),
     ],

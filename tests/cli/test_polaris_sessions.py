@@ -16,8 +16,9 @@ import pytest
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.results import MagnetDetection, PlanarPose, TagDetection
 from locatk.core.polaris.tag import AsBuilt, Placed, Tags, angles, built_magnets, places
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import arrays, observations, solutions, tags
 from locatk.formats.session import Session
@@ -215,46 +216,50 @@ def record(path: Path, known: Tags | None = TAGS) -> Path:
 
 def detection(
     known: Tags, tag_id: int | None, pose: tuple[float, float, float], time_s: float = 1.0
-) -> dict[str, Any]:
+) -> TagDetection:
     """What a solver says of the tag ``tag_id`` of ``known``, seen at ``pose``."""
     layout = layout_of(known, ID if tag_id is None else tag_id)
     place, angle = built_magnets(known, -1 if tag_id is None else tag_id, layout)
     x, y, heading = pose
     c, s = math.cos(heading), math.sin(heading)
     place = place @ np.array([[c, s], [-s, c]]) + [x, y]
-    return {
-        "time_s": time_s,
-        "device": "bar",
-        "tag_id": tag_id,
-        "margin": None if tag_id is None else 3.5,
-        "x_m": x,
-        "y_m": y,
-        "heading_rad": heading,
-        "sigma_x_m": 1e-4,
-        "sigma_y_m": 2e-4,
-        "sigma_heading_rad": 1e-3,
-        "refused": "magnet_missing" if tag_id is None else "",
-        "residual_sigma": 1.1,
-        "height_m": 0.01,
-        "speed_mps": 0.1,
-        "array": {"x_m": -c * x - s * y, "y_m": s * x - c * y, "heading_rad": -heading},
-        "magnets": [
-            {
-                "x_m": px,
-                "y_m": py,
-                "angle_rad": a + heading,
-                "symbol": symbol,
-                "cell": list(cell),
-                "sigma_x_m": 1e-4,
-                "sigma_y_m": 1e-4,
-                "sigma_angle_rad": 1e-2,
-                "moment_am2": 1.2e-3,
-            }
+    return TagDetection(
+        time_s=time_s,
+        device="bar",
+        tag_id=tag_id,
+        margin=None if tag_id is None else 3.5,
+        refused="magnet_missing" if tag_id is None else None,
+        x_m=x,
+        y_m=y,
+        heading_rad=heading,
+        sigma_x_m=1e-4,
+        sigma_y_m=2e-4,
+        sigma_heading_rad=1e-3,
+        array_pose=PlanarPose(-c * x - s * y, s * x - c * y, -heading),
+        magnets=tuple(
+            MagnetDetection(
+                x_m=px,
+                y_m=py,
+                angle_rad=a + heading,
+                symbol=symbol,
+                cell=cell,
+                sigma_x_m=1e-4,
+                sigma_y_m=1e-4,
+                sigma_angle_rad=1e-2,
+                moment_am2=1.2e-3,
+            )
             for (px, py), a, symbol, cell in zip(
                 place.tolist(), angle.tolist(), layout.symbols, layout.cells, strict=True
             )
-        ],
-    }
+        ),
+        residual_sigma=1.1,
+        height_m=0.01,
+        speed_mps=0.1,
+        scale=1.0,
+        corrected=0,
+        erased=0,
+        other_sources=0,
+    )
 
 
 class Solver:
@@ -262,26 +267,27 @@ class Solver:
 
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
-        self.seen: list[list[dict[str, Any]]] = []
+        self.seen: list[list[TagDetection]] = []
 
     def solve(
         self, samples: Any, known: Tags | None, wanted: Any, *, odometry: Any = ()
     ) -> Solution:
         self.asked.append((known, wanted.method, wanted.speed_mps))
         seen = self.seen[min(len(self.asked), len(self.seen)) - 1]
-        read = [found for found in seen if found["tag_id"] is not None]
+        read = [found for found in seen if found.tag_id is not None]
         n = 5 if read else 0
         time_ns = START_NS + 10_000_000 * np.arange(n)
         track = Trajectory(
             "bar",
-            f"tag-{read[0]['tag_id']}" if read else "array",
+            f"tag-{read[0].tag_id}" if read else "array",
             time_ns,
             np.column_stack([np.linspace(-0.1, 0.1, n), np.zeros(n), np.full(n, 0.01)]),
             quaternion_from_heading(np.zeros(n)),
             np.broadcast_to(np.eye(6) * 1e-8, (n, 6, 6)),
         )
+        warnings = (SolverWarning("test", "a note"),)
         return Solution(
-            "polaris", wanted.method, (track,), {"debris": 2}, seen, known, ("a note",), {}
+            "polaris", wanted.method, (track,), {"debris": 2}, tuple(seen), known, warnings
         )
 
 
@@ -316,7 +322,7 @@ def test_a_solution_holds_tags_and_poses(locatk, solver: Solver, tmp_path: Path)
 
     solution = solutions.read_solution(out)
     assert solution.artifact == TAGS
-    assert solution.detections == solver.seen[0]
+    assert solution.detections == tuple(solver.seen[0])
     facts = json.loads(locatk("info", out, "--json").stdout)
     assert (facts["kind"], facts["system"], facts["codec"]) == ("solution", "polaris", "mosk")
 
@@ -410,7 +416,7 @@ BUILT = AsBuilt(
 )
 
 
-def passes(count: int = 4) -> list[list[dict[str, Any]]]:
+def passes(count: int = 4) -> list[list[TagDetection]]:
     """Detections of one tag that lies there as built, from several sides."""
     real = replace(TAGS, built={ID: BUILT})
     return [[detection(real, ID, (0.01 * k, -0.002 * k, 1.1 * k))] for k in range(count)]
@@ -466,7 +472,10 @@ def test_a_pass_that_disagrees_is_named_and_left_out(
     locatk, solver: Solver, tmp_path: Path
 ) -> None:
     solver.seen = passes(5)
-    solver.seen[3][0]["magnets"][2]["x_m"] += 0.004
+    (found,) = solver.seen[3]
+    magnets = list(found.magnets)
+    magnets[2] = replace(magnets[2], x_m=magnets[2].x_m + 0.004)
+    solver.seen[3] = [replace(found, magnets=tuple(magnets))]
     sessions = [record(tmp_path / f"run{k}.mcap") for k in range(5)]
     out = tmp_path / "built.toml"
     result = locatk("calibrate", "tag", *sessions, "-o", out, "--json")

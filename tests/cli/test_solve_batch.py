@@ -58,9 +58,9 @@ def solve(session, request):
         raise DegenerateError("one robot standing still", hint="Drive it around")
     if name == "broken":
         raise ZeroDivisionError("by nought")
-    # Notes are walked through while the solution is written: the file is half there.
-    notes = {"deadly": Deadly, "slow": Slow}.get(name, tuple)()
-    return Solved(Solution("sonar", "echo", tuple(read_truth(session)), notes=notes), 0.5)
+    # Warnings are walked through while the solution is written: the file is half there.
+    warnings = {"deadly": Deadly, "slow": Slow}.get(name, tuple)()
+    return Solved(Solution("sonar", "echo", tuple(read_truth(session)), warnings=warnings), 0.5)
 '''
 
 

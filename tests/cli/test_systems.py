@@ -15,9 +15,11 @@ from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Marker, Scene
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.formats import artifacts, observations
 from locatk.formats.session import Session
+
+OF_SOLVER = SolverWarning("test", "of the solver")
 
 
 @pytest.fixture
@@ -27,7 +29,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def solve(sweeps: Any, scene: Scene, options: Any, **more: Any) -> Solution:
         last.update(more, scene=scene)
-        return Solution("lighthouse", "bundle", (), notes=("of the solver",))
+        return Solution("lighthouse", "bundle", (), warnings=(OF_SOLVER,))
 
     monkeypatch.setattr(lighthouse, "solve", solve, raising=False)
     return last
@@ -43,7 +45,7 @@ def test_a_plain_session(session: Path, given: dict[str, Any]) -> None:
     solution = solve_session(session, Request()).solution
     assert [marker.name for marker in given["scene"].markers] == ["corner"]
     assert "receivers" not in given
-    assert solution.notes == ("of the solver",)
+    assert solution.warnings == (OF_SOLVER,)
 
 
 @pytest.mark.parametrize(("sensors", "rigid"), [(1, False), (2, True), (4, True)])
@@ -87,6 +89,7 @@ def test_receivers_and_what_stations_sent(
     }
     assert scene.ids == {1: 0xA, 2: 0xC}
     assert given["receivers"].keys() == {"red"}
-    first, second = solution.notes
-    assert first.startswith("on channel 2 the scene has the station 0000000c")
-    assert second == "of the solver"
+    first, second = solution.warnings
+    assert first.code == "other_station_id"
+    assert first.message.startswith("on channel 2 the scene has the station 0000000c")
+    assert second == OF_SOLVER

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -147,13 +148,18 @@ def test_the_study_tells_errors_and_scatter(monkeypatch: pytest.MonkeyPatch) -> 
 
     def worse(*args: Any) -> Any:
         solution = solve(*args)
-        for k, found in enumerate(solution.detections):
-            found["x_m"] += 1e-4
-            found["y_m"] += 5e-5 * (-1) ** k
-            found["heading_rad"] += 2 * np.pi - 0.01
-        if args[0][0].names[0] == "0" and len(solution.detections) == 8:
-            solution.detections[0]["x_m"] += 1.0  # an unrelated place
-        return solution
+        detections = [
+            replace(
+                found,
+                x_m=found.x_m + 1e-4,
+                y_m=found.y_m + 5e-5 * (-1) ** k,
+                heading_rad=found.heading_rad + 2 * np.pi - 0.01,
+            )
+            for k, found in enumerate(solution.detections)
+        ]
+        if args[0][0].names[0] == "0" and len(detections) == 8:
+            detections[0] = replace(detections[0], x_m=detections[0].x_m + 1.0)  # elsewhere
+        return replace(solution, detections=tuple(detections))
 
     monkeypatch.setattr(dots_study, "solve", worse)
     found = {figure.name: figure.value for figure in dots_study.study_figures()}
@@ -168,9 +174,7 @@ def test_nothing_read_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
     solve = dots_study.solve
 
     def blind(*args: Any) -> Any:
-        solution = solve(*args)
-        solution.detections.clear()
-        return solution
+        return replace(solve(*args), detections=())
 
     monkeypatch.setattr(dots_study, "solve", blind)
     for figure in dots_study.study_figures():

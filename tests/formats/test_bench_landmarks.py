@@ -343,12 +343,13 @@ def test_a_solved_session_is_compared_with_the_truth(solved: tuple[Simulated, So
 
 def test_a_wrong_cell_is_seen(solved: tuple[Simulated, Solution]) -> None:
     made, solution = solved
-    told = [dict(found) for found in solution.detections]
-    row, column = told[-1]["cell"]
-    told[-1]["cell"] = [row, column + 1]
-    assert landmarks_sessions.judged(made, replace(solution, detections=told)).wrong == 1
-    told[-1]["cell"] = None
-    one = landmarks_sessions.judged(made, replace(solution, detections=told, trajectories=()))
+    *others, last = solution.detections
+    row, column = last.cell
+    detections = (*others, replace(last, cell=(row, column + 1)))
+    assert landmarks_sessions.judged(made, replace(solution, detections=detections)).wrong == 1
+    detections = (*others, replace(last, cell=None))
+    unlocalised = replace(solution, detections=detections, trajectories=())
+    one = landmarks_sessions.judged(made, unlocalised)
     assert (one.given, one.lost, one.wrong) == (False, False, 0)
 
 

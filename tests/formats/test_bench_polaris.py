@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris import codec
 from locatk.core.polaris.ddtw import distances, prepare
+from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.polaris.simulate import Simulated, SimulationOptions, simulate
 from locatk.core.polaris.tag import Tags, places
 from locatk.formats.bench import Figure, polaris, polaris_speed, polaris_study
@@ -158,16 +160,43 @@ def test_scatter_is_about_each_magnets_own_mean() -> None:
     assert polaris.scatter(angle) == pytest.approx(math.sqrt(5 / 3))
 
 
-def detection(tag_id: int | None, cells: Any, **more: Any) -> dict[str, Any]:
+DETECTION = TagDetection(
+    time_s=1.0,
+    device="bar",
+    tag_id=None,
+    margin=1.0,
+    refused=None,
+    x_m=0.0,
+    y_m=0.0,
+    heading_rad=0.02,
+    sigma_x_m=1e-4,
+    sigma_y_m=1e-4,
+    sigma_heading_rad=1e-3,
+    array_pose=None,
+    magnets=(),
+    residual_sigma=1.5,
+    height_m=0.01,
+    speed_mps=0.1,
+    scale=2.0,
+    corrected=0,
+    erased=0,
+    other_sources=0,
+)
+
+
+def magnet(
+    x_m: float, y_m: float, angle_rad: float, cell: tuple[int, int] | None = None
+) -> MagnetDetection:
+    return MagnetDetection(x_m, y_m, angle_rad, None, cell, 1e-4, 1e-4, 1e-2, 1e-3)
+
+
+def detection(tag_id: int | None, cells: Any) -> TagDetection:
     """As a solver would tell it; magnets the other way round than in the layout."""
     magnets = [
-        {"x_m": 2 * x, "y_m": y, "angle_rad": 0.1 * k, "cell": list(cell)}
+        magnet(2 * x, y, 0.1 * k, cell)
         for k, (cell, (x, y)) in enumerate(zip(cells, places(RELEASED, cells), strict=True))
     ]
-    return {
-        "tag_id": tag_id, "magnets": magnets[::-1], "heading_rad": 0.02, "scale": 2.0,
-        "residual_sigma": 1.5, **more,
-    }  # fmt: skip
+    return replace(DETECTION, tag_id=tag_id, magnets=tuple(magnets[::-1]))
 
 
 def test_a_run_is_what_its_detections_say() -> None:
@@ -197,38 +226,37 @@ def made() -> Simulated:
     return simulate(Tags(), options)
 
 
-def told(made: Simulated, tag_id: int | None, refused: str | None = None) -> dict[str, Any]:
+def told(made: Simulated, tag_id: int | None, refused: str | None = None) -> TagDetection:
     """The truth at some sample, as a detection."""
     at = 150
     heading = heading_from_quaternion(made.truth.quaternion[at : at + 1])[0]
     magnets = turned(made.magnets.place_m - made.truth.position[at, :2], -heading)
     x, y = turned(-made.truth.position[at, :2][None], -heading)[0]
-    return {
-        "time_s": made.truth.time_ns[at] * 1e-9,
-        "tag_id": tag_id,
-        "refused": refused,
-        "x_m": x,
-        "y_m": y,
-        "heading_rad": -heading + math.tau,
-        "sigma_x_m": 1e-4,
-        "sigma_y_m": 1e-4,
-        "sigma_heading_rad": 1e-3,
-        "magnets": [
-            {"x_m": a, "y_m": b, "angle_rad": angle - heading - math.tau}
+    return replace(
+        DETECTION,
+        time_s=made.truth.time_ns[at] * 1e-9,
+        tag_id=tag_id,
+        refused=refused,
+        x_m=x,
+        y_m=y,
+        heading_rad=-heading + math.tau,
+        magnets=tuple(
+            magnet(a, b, angle - heading - math.tau)
             for (a, b), angle in zip(magnets, made.magnets.angle_rad, strict=True)
-        ],
-    }
+        ),
+    )
 
 
 def test_the_truth_has_no_errors_in_any_order(made: Simulated) -> None:
     found = told(made, 1234)
-    found["magnets"] = found["magnets"][::-1]
+    found = replace(found, magnets=found.magnets[::-1])
     outcome = polaris_study.judged(made, [found])
     assert (outcome.verdict, outcome.missed, outcome.reasons) == ("right", 0, ())
     assert outcome.magnets == pytest.approx(np.zeros((5, 3)), abs=1e-9)
     assert outcome.pose == pytest.approx(np.zeros(3), abs=1e-9)
-    found["magnets"][0]["x_m"] += 2e-3
-    found["y_m"] -= 0.9e-3
+    first, *others = found.magnets
+    moved = replace(first, x_m=first.x_m + 2e-3)
+    found = replace(found, magnets=(moved, *others), y_m=found.y_m - 0.9e-3)
     outcome = polaris_study.judged(made, [found])
     assert polaris_study.rms(outcome.magnets)[0] == pytest.approx(2e-3 / math.sqrt(5))
     assert outcome.pose == pytest.approx([0, -0.9e-3, 0], abs=1e-9)
@@ -236,18 +264,18 @@ def test_the_truth_has_no_errors_in_any_order(made: Simulated) -> None:
 
 def test_a_right_id_at_another_place_is_misplaced(made: Simulated) -> None:
     found = told(made, 1234)
-    found["x_m"] += 2e-3
+    found = replace(found, x_m=found.x_m + 2e-3)
     assert polaris_study.judged(made, [found]).verdict == "misplaced"
-    found["sigma_x_m"] = 1e-3
+    found = replace(found, sigma_x_m=1e-3)
     assert polaris_study.judged(made, [found]).verdict == "right"
-    found["heading_rad"] += math.radians(2)
+    found = replace(found, heading_rad=found.heading_rad + math.radians(2))
     assert polaris_study.judged(made, [found]).verdict == "misplaced"
 
 
 def test_a_pass_is_right_wrong_refused_or_silent(made: Simulated) -> None:
     right, wrong = told(made, 1234), told(made, 1235)
     refused = told(made, None, "tie")
-    refused["magnets"] = refused["magnets"][:3]
+    refused = replace(refused, magnets=refused.magnets[:3])
     cases = (
         ([right], "right", 0),
         ([wrong], "wrong", 0),
@@ -272,9 +300,7 @@ def test_nothing_read_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
     solve = polaris_study.solve
 
     def blind(*args: Any) -> Any:
-        solution = solve(*args)
-        solution.detections.clear()
-        return solution
+        return replace(solve(*args), detections=())
 
     monkeypatch.setattr(polaris_study, "solve", blind)
     faults = {"offsets": {"offset_t": 1e-4}}

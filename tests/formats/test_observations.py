@@ -17,8 +17,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from locatk.core.errors import FormatError, InputError, OutputExistsError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import observations
 from locatk.formats.messages import SWEEPS, BatchError
@@ -367,10 +368,12 @@ def solution() -> Solution:
             Trajectory.from_positions("none", "floor", np.zeros(0, np.int64), np.zeros((0, 3))),
         ),
         rejected={"jump of 2 degrees": 3, "unknown channel": 0},
-        detections=[{"station": 1, "sweeps": np.int64(7), "calibration": "factory"}],
+        detections=(
+            StationDetection(1, 2, None, 959000, "factory", sweeps=np.int64(7), rejected=0),
+        ),
         artifact=SCENE,
-        notes=("generic calibration of station 16",),
-        facts={"rms_rad": np.float64(1e-4), "nothing": float("nan"), "sizes": np.arange(2)},
+        warnings=(SolverWarning("generic_calibration", "generic calibration of station 16"),),
+        facts=LighthouseFacts(angle_sigma_rad=np.float64(1e-4), plane_median_rad=float("nan")),
     )
 
 
@@ -383,9 +386,9 @@ def test_solution_round_trip(tmp_path: Path) -> None:
         same(a, b)
     assert (found.system, found.method, found.poses) == ("lighthouse", "bundle", 6003)
     assert found.rejected == wanted.rejected
-    assert found.notes == wanted.notes
-    assert found.detections == [{"station": 1, "sweeps": 7, "calibration": "factory"}]
-    assert found.facts == {"rms_rad": 1e-4, "nothing": None, "sizes": [0, 1]}
+    assert found.warnings == wanted.warnings
+    assert found.detections == wanted.detections
+    assert found.facts == LighthouseFacts(angle_sigma_rad=1e-4)
     np.testing.assert_array_equal(found.artifact.stations[0].position, SCENE.stations[0].position)
     facts = Session.open(path).facts
     assert (facts["kind"], facts["source"]) == ("solution", "run.mcap")

@@ -19,7 +19,7 @@ from locatk.core.evaluation import EvaluationOptions, evaluate
 from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plot import SUFFIXES, draw, plot_solution
 
@@ -47,6 +47,7 @@ SCENE = Scene(
     scale="markers",
 )
 TRUTH = (track("red"), track("blue"))
+LONG_WARNING = SolverWarning("test", "a note that goes on and on " * 30)
 
 
 def solution(names: tuple[str, ...] = ("red", "blue"), scene: object = SCENE) -> Solution:
@@ -55,7 +56,12 @@ def solution(names: tuple[str, ...] = ("red", "blue"), scene: object = SCENE) ->
         "bundle",
         tuple(track(name, off_m=2e-3 * (k + 1)) for k, name in enumerate(names)),
         artifact=scene,
-        notes=("no factory calibration is known: the mean of other units is used",),
+        warnings=(
+            SolverWarning(
+                "generic_calibration",
+                "no factory calibration is known: the mean of other units is used",
+            ),
+        ),
     )
 
 
@@ -255,7 +261,7 @@ LONG = tuple(f"robot-with-a-very-long-name-{k}" for k in range(30))
         (solution(scene=None), TRUTH),
         (solution(names=LONG), ()),
         (solution(names=("_hidden", "$5 and $6")), ()),
-        (replace(solution(), notes=("a note that goes on and on " * 30,)), TRUTH),
+        (replace(solution(), warnings=(LONG_WARNING,)), TRUTH),
         (Solution("lighthouse", "bundle", (), artifact=SCENE), ()),
         (Solution("lighthouse", "bundle", ()), ()),
         (Solution("lighthouse", "bundle", (track("red", n=0),), artifact=SCENE), TRUTH),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from locatk.core.geometry import Similarity, quaternion_from_heading
 from locatk.core.landmarks.drawing import bar_outlines
 from locatk.core.landmarks.floor import AsBuilt, FloorMap
 from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.floor_bars import MOST_LANDMARKS, bars_on_floor, cells_near
@@ -27,20 +27,28 @@ FLOOR = FloorMap(np.array([[7, -1], [12, 5]]), origin_m=(1.0, -2.0))
 START_NS = 1_000_000_000
 
 
-def seen(cell: tuple[int, int] | None, refused: str = "", time_s: float = 1.0) -> dict[str, Any]:
-    return {
-        "time_s": time_s,
-        "device": "robot",
-        "cell": None if cell is None else list(cell),
-        "pattern": "NNNS",
-        "x_m": 0.004,
-        "y_m": -0.003,
-        "refused": refused,
-    }
+def seen(cell: tuple[int, int] | None, refused: str = "", time_s: float = 1.0) -> LandmarkDetection:
+    return LandmarkDetection(
+        time_s=time_s,
+        device="robot",
+        cell=cell,
+        pattern="NNNS",
+        code=7,
+        probability=1.0,
+        x_m=0.004,
+        y_m=-0.003,
+        heading_rad=0.0,
+        sigma_x_m=1e-4,
+        sigma_y_m=1e-4,
+        sigma_heading_rad=1e-3,
+        strength=None,
+        residual_sigma=1.0,
+        refused=refused,
+    )
 
 
 def solution(
-    floor: FloorMap | None, detections: list[dict[str, Any]], n: int = 21, y: float = -2.0
+    floor: FloorMap | None, detections: list[LandmarkDetection], n: int = 21, y: float = -2.0
 ) -> Solution:
     """A drive of 0.2 s along x, 1 m to 1.2 m, at ``y``; no pose at all where ``n`` is 0."""
     track = Trajectory(
@@ -51,7 +59,7 @@ def solution(
         quaternion_from_heading(np.zeros(n)),
         np.broadcast_to(np.eye(6) * 1e-6, (n, 6, 6)),
     )
-    return Solution("landmarks", "field", (track,) if n else (), {}, detections, floor)
+    return Solution("landmarks", "field", (track,) if n else (), {}, tuple(detections), floor)
 
 
 @settings(max_examples=30, deadline=None)

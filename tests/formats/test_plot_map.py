@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from matplotlib.text import Text
 
 from locatk.core.geometry import Similarity, quaternion_from_heading
 from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.results import MagnetDetection, PlanarPose, TagDetection
 from locatk.core.polaris.tag import AsBuilt, Placed, Tags, built_magnets
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -23,17 +23,37 @@ ID = 4711
 BUILT = Tags(built={ID: AsBuilt(np.full((5, 2), 1e-3), np.full(5, 0.1), 3)})
 
 
-def detection(tags: Tags, x: float, y: float, heading: float) -> dict[str, Any]:
+def detection(tags: Tags, x: float, y: float, heading: float) -> TagDetection:
     """The tag seen at that pose, without error."""
     place, angle = built_magnets(tags, ID, layout_of(tags, ID))
     c, s = math.cos(heading), math.sin(heading)
     place = place @ np.array([[c, s], [-s, c]]) + [x, y]
-    magnets = [
-        {"x_m": px, "y_m": py, "angle_rad": a}
+    magnets = tuple(
+        MagnetDetection(px, py, a, 0, (0, 0), 1e-4, 1e-4, 1e-2, 1e-3)
         for (px, py), a in zip(place.tolist(), (angle + heading).tolist(), strict=True)
-    ]
-    array = {"x_m": -c * x - s * y, "y_m": s * x - c * y, "heading_rad": -heading}
-    return {"tag_id": ID, "array": array, "magnets": magnets}
+    )
+    return TagDetection(
+        time_s=1.0,
+        device="bar",
+        tag_id=ID,
+        margin=1.0,
+        refused=None,
+        x_m=x,
+        y_m=y,
+        heading_rad=heading,
+        sigma_x_m=1e-4,
+        sigma_y_m=1e-4,
+        sigma_heading_rad=1e-3,
+        array_pose=PlanarPose(-c * x - s * y, s * x - c * y, -heading),
+        magnets=magnets,
+        residual_sigma=1.0,
+        height_m=0.01,
+        speed_mps=0.1,
+        scale=1.0,
+        corrected=0,
+        erased=0,
+        other_sources=0,
+    )
 
 
 def solution(tags: Tags, frame: str, n: int = 20) -> Solution:
@@ -45,9 +65,9 @@ def solution(tags: Tags, frame: str, n: int = 20) -> Solution:
         quaternion_from_heading(np.zeros(n)),
         np.broadcast_to(np.eye(6) * 1e-8, (n, 6, 6)),
     )
-    unread = {**detection(tags, 9.0, 9.0, 0.0), "tag_id": None}
+    unread = replace(detection(tags, 9.0, 9.0, 0.0), tag_id=None)
     return Solution(
-        "polaris", "joint", (track,), {}, [detection(tags, 0.02, -0.01, 0.7), unread], tags
+        "polaris", "joint", (track,), {}, (detection(tags, 0.02, -0.01, 0.7), unread), tags
     )
 
 
@@ -90,7 +110,7 @@ def test_the_map_shows_all_magnets() -> None:
 
 
 def test_a_solution_without_poses_shows_the_site() -> None:
-    empty = replace(solution(BUILT, "site", n=0), trajectories=(), detections=[])
+    empty = replace(solution(BUILT, "site", n=0), trajectories=(), detections=())
     assert tags_of(empty) == ()
     site = replace(empty, artifact=replace(BUILT, site={ID: Placed(3.0, 4.0, 0.0)}))
     ground = draw(site).axes[0]

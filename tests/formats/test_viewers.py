@@ -26,7 +26,7 @@ from locatk.core.landmarks.floor import FloorMap
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris.tag import Placed, Tags
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import frames, viewer_points, viewers
 from locatk.formats.solutions import write_solution
@@ -127,9 +127,9 @@ def solved(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
         method="paper",
         trajectories=(track("red", frame), track("blue", frame, shift_s=0.7)),
         rejected={"jump": 3},
-        detections=[],
+        detections=(),
         artifact=artifact,
-        notes=("an assumption",),
+        warnings=(SolverWarning("test", "an assumption"),),
     )
     path = tmp_path / "solved.mcap"
     write_solution(path, solution, source="run.mcap")
@@ -259,7 +259,7 @@ def test_sheets_whose_places_are_not_known_are_frames_apart() -> None:
 def test_without_poses_the_artifact_is_there(tmp_path: Path) -> None:
     path = tmp_path / "solved.mcap"
     nothing = Trajectory.from_positions("red", "floor", np.zeros(0, np.int64), np.zeros((0, 3)))
-    write_solution(path, Solution("lighthouse", "paper", (nothing,), {}, [], SCENE), source="run")
+    write_solution(path, Solution("lighthouse", "paper", (nothing,), {}, (), SCENE), source="run")
     assert {seen.topic for seen in look(path)} == {"/scene", "/artifact_points/floor"}
 
 

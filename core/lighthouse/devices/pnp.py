@@ -6,8 +6,7 @@ Perspective-n-Point problem, which OpenCV solves by several methods:
 - SQPnP (Terzakis and Lourakis, ECCV 2020) from all rays;
 - IPPE (Collins and Bartoli, IJCV 109, 2014) from all rays of photodiodes on a plane, which returns
   both solutions of the planar ambiguity;
-- P3P from random sets of three rays, some of which contain no outlier (see the note in
-  :func:`candidate_poses`).
+- P3P from random sets of three rays, some of which contain no outlier.
 
 The candidates are rough. :func:`~locatk.core.lighthouse.devices.pose_fit.fit_poses` refines them
 and also uses the photodiodes with one plane only.
@@ -67,12 +66,6 @@ def candidate_poses(
     list of ((3,) ndarray, (3, 3) ndarray)
         Positions in metres and rotations, device to station. Empty if fewer than three
         photodiodes have both planes, or if four or more are collinear.
-
-    Notes
-    -----
-    ``cv2.solvePnPGeneric`` refuses three points with ``SOLVEPNP_P3P`` since OpenCV 4.5, so that
-    minimal sets, and devices with exactly three rays, yield no candidate at present.
-    ``cv2.solveP3P`` accepts them.
     """
     import cv2
 
@@ -89,12 +82,15 @@ def candidate_poses(
     poses: list[tuple[Array, Array]] = []
 
     def solve(rows: NDArray[np.int64], method: int) -> None:
+        points = (sensor_positions[rows], image_points[rows], np.eye(3), np.zeros(5))
         try:
-            _, rotation_vectors, translations, _ = cv2.solvePnPGeneric(
-                sensor_positions[rows], image_points[rows], np.eye(3), np.zeros(5), flags=method
-            )
+            # The generic function refuses sets of three.
+            if method == cv2.SOLVEPNP_P3P:
+                _, rotation_vectors, translations = cv2.solveP3P(*points, flags=method)
+            else:
+                _, rotation_vectors, translations, _ = cv2.solvePnPGeneric(*points, flags=method)
         except cv2.error:
-            return  # OpenCV refuses degenerate sets, and sets of three (see Notes).
+            return  # OpenCV refuses degenerate sets.
         for rotation_vector, translation in zip(rotation_vectors, translations, strict=True):
             is_finite = np.all(np.isfinite(rotation_vector)) and np.all(np.isfinite(translation))
             # A station emits light forward only.

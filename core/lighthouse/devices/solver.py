@@ -191,9 +191,9 @@ def merge_solutions(rigid: Solution, photodiodes: Solution) -> Solution:
         photodiodes,
         trajectories=(*rigid.trajectories, *single),
         rejected=_total((rigid.rejected, photodiodes.rejected)),
-        detections=[
+        detections=tuple(
             replace(by_channel[channel], station=k) for k, channel in enumerate(sorted(by_channel))
-        ],
+        ),
         facts=replace(photodiodes.facts, rigid=rigid.facts),
         warnings=_distinct((*rigid.warnings, *photodiodes.warnings)),
     )
@@ -231,7 +231,9 @@ def _distinct(warnings: Sequence[SolverWarning]) -> tuple[SolverWarning, ...]:
 # ---- detections and facts
 
 
-def station_detections(tracked: Sequence[TrackedDevice], scene: Scene) -> list[StationDetection]:
+def station_detections(
+    tracked: Sequence[TrackedDevice], scene: Scene
+) -> tuple[StationDetection, ...]:
     """Return the number and the residuals of the sweeps of each station, by ascending channel.
 
     ``tracked`` are devices tracked in ``scene``.
@@ -256,14 +258,14 @@ def station_detections(tracked: Sequence[TrackedDevice], scene: Scene) -> list[S
                 residual_rad=robust_sigma(residual[is_own & is_used]),
             )
         )
-    return detections
+    return tuple(detections)
 
 
 def _add_verifications(
     detections: Sequence[StationDetection], verifications: Sequence[StationVerification]
-) -> list[StationDetection]:
+) -> tuple[StationDetection, ...]:
     by_channel = {v.channel: v for v in verifications}
-    return [
+    return tuple(
         replace(
             row,
             verification_rad=by_channel[row.channel].residual_rad,
@@ -272,7 +274,7 @@ def _add_verifications(
         if row.channel in by_channel
         else row
         for row in detections
-    ]
+    )
 
 
 def _tracking_facts(

@@ -382,7 +382,7 @@ def detect_stations(
     residual: Array | None = None,
     is_accepted: NDArray[np.bool_] | None = None,
     verification: SceneVerification | None = None,
-) -> list[StationDetection]:
+) -> tuple[StationDetection, ...]:
     """Summarize the sweeps of each station of a recording.
 
     Parameters
@@ -421,4 +421,4 @@ def detect_stations(
                 verification_m=check.residual_m if check else None,
             )
         )
-    return detections
+    return tuple(detections)

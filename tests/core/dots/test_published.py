@@ -89,8 +89,8 @@ def test_metres_on_its_sheet(frame: NDArray[np.uint8], method: str) -> None:
     frames = Frames("camera", np.array([5 * 10**9]), ("frame.bmp",), [frame])
     solution = solve([frames], Manifest((sheet,), codec="libdots"), SolveOptions(method))
     (pose,) = solution.detections
-    assert pose["x_m"] * 1e3 == pytest.approx(10 + 129.168 * 0.508, abs=0.04)
-    assert pose["y_m"] * 1e3 == pytest.approx(297 - 13.5 - 224.506 * 0.508, abs=0.04)
-    assert turned_by(pose["heading_rad"], HEADING_DEG) < 0.5
-    assert (pose["sheet"], pose["frame"], pose["time_s"]) == ("libdots", "frame.bmp", 5.0)
+    assert pose.x_m * 1e3 == pytest.approx(10 + 129.168 * 0.508, abs=0.04)
+    assert pose.y_m * 1e3 == pytest.approx(297 - 13.5 - 224.506 * 0.508, abs=0.04)
+    assert turned_by(pose.heading_rad, HEADING_DEG) < 0.5
+    assert (pose.sheet, pose.frame, pose.time_s) == ("libdots", "frame.bmp", 5.0)
     assert solution.rejected == {}

@@ -40,8 +40,8 @@ def test_a_pose_is_in_metres_on_the_paper(shoot: Shoot) -> None:
     assert np.isfinite(sigma[[0, 1, 5]]).all()
     assert np.isnan(sigma[[2, 3, 4]]).all()
     (detection,) = solution.detections
-    assert detection["grid_x"] == pytest.approx(at[0], abs=3e-3)
-    assert (detection["sheet"], detection["frame"]) == ("A4-0001", "000.png")
+    assert detection.grid_x == pytest.approx(at[0], abs=3e-3)
+    assert (detection.sheet, detection.frame) == ("A4-0001", "000.png")
     assert solution.rejected == {}
 
 
@@ -105,7 +105,7 @@ def test_sizes_may_differ_without_a_camera(shoot: Shoot) -> None:
     solution = solve([seen([small, large, small])], Manifest((A4,)))
     x = solution.trajectories[0].position[:, 0]
     np.testing.assert_allclose(np.diff(x) / 0.508e-3, [20, -20], atol=0.01)
-    assert any("no camera model" in note for note in solution.notes)
+    assert [each.code for each in solution.warnings] == ["no_camera_model"]
 
 
 def test_nothing_to_solve() -> None:

@@ -103,7 +103,7 @@ def test_which_of_two_neighbouring_sheets(shoot: Shoot) -> None:
     images = [shoot(at=(x, 2050.0)) for x in (1092.0, 1098.0, 1101.0, 1106.0, 1111.0)]
     for sheets in ((first, second), (second, first)):
         solution = solve([frames_of(images)], Manifest(sheets))
-        on = [pose["sheet"] for pose in solution.detections]
+        on = [pose.sheet for pose in solution.detections]
         assert on == ["first", "first", "second", "second", "second"]
 
 
@@ -146,32 +146,30 @@ def test_every_frame_has_an_outcome(shoot: Shoot, method: str) -> None:
     images = Damaged([good[0], None, good[1], blank, None, elsewhere, good[2], good[3], None])
     frames = frames_of(images)
     solution = solve([frames], Manifest((sheet,)), SolveOptions(method))
-    outcomes = solution.facts["frames"]
-    assert [one["frame"] for one in outcomes] == list(frames.names)
-    assert [one["time_s"] for one in outcomes] == (frames.time_ns / 1e9).tolist()
-    reasons = [one["rejected"] for one in outcomes]
+    outcomes = solution.facts.frames
+    assert [one.frame for one in outcomes] == list(frames.names)
+    assert [one.time_s for one in outcomes] == (frames.time_ns / 1e9).tolist()
+    reasons = [one.rejected for one in outcomes]
     assert [k for k, reason in enumerate(reasons) if reason is None] == [0, 2, 6, 7]
     assert [reasons[k] for k in (1, 4, 8)] == ["unreadable_frame"] * 3
     assert reasons[5] == "off_sheet"
     assert solution.rejected == Counter(reason for reason in reasons if reason)
     track = only(solution)
     assert track.time_ns.tolist() == frames.time_ns[[0, 2, 6, 7]].tolist()
-    assert [pose["frame"] for pose in solution.detections] == [
-        frames.names[k] for k in (0, 2, 6, 7)
-    ]
+    assert [pose.frame for pose in solution.detections] == [frames.names[k] for k in (0, 2, 6, 7)]
     for pose, one in zip(solution.detections, [outcomes[k] for k in (0, 2, 6, 7)], strict=True):
         for key in ("confidence", "corrected_bits", "dots", "time_s"):
-            assert pose[key] == one[key]
+            assert getattr(pose, key) == getattr(one, key)
     np.testing.assert_allclose(
-        track.position[:, 0], [pose["x_m"] for pose in solution.detections], atol=1e-12
+        track.position[:, 0], [pose.x_m for pose in solution.detections], atol=1e-12
     )
     assert solution.poses == 4
     if method == "lattice":
-        assert (np.array([one["confidence"] for one in solution.detections]) > 0.999).all()
+        assert (np.array([one.confidence for one in solution.detections]) > 0.999).all()
         assert np.isfinite(track.covariance[0][np.ix_([0, 1, 5], [0, 1, 5])]).all()
     else:
         assert np.isnan(track.covariance).all()
-        assert any("no uncertainty" in note for note in solution.notes)
+        assert "no_uncertainty" in [each.code for each in solution.warnings]
 
 
 def test_the_manifest_of_another_codec(shoot: Shoot) -> None:
@@ -193,7 +191,7 @@ def test_cameras_by_themselves(shoot: Shoot) -> None:
         [frames_of(left, "left"), frames_of(right, "right", start_s=50)], Manifest((sheet,))
     )
     assert [(t.device, len(t)) for t in solution.trajectories] == [("left", 2), ("right", 1)]
-    assert [one["frame"] for one in solution.facts["frames"]] == ["left0", "left1", "right0"]
+    assert [one.frame for one in solution.facts.frames] == ["left0", "left1", "right0"]
     both = np.concatenate([t.position[:, 0] for t in solution.trajectories]) * 1e3
     np.testing.assert_allclose(both, 8 + np.array([60, 61, 130]) * 0.508, atol=0.003)
 

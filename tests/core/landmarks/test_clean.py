@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.clean import FULL, cleaned
 from locatk.core.landmarks.halls import HallSamples, HallSensors
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -28,21 +29,21 @@ def test_single_jumps_are_left_out_and_counted() -> None:
     at = [(50, 0), (51, 2), (200, 3), (333, 0)]
     for row, column in at:
         field[row, column] += 0.06 if field[row, column] > 0 else -0.06
-    kept, notes = cleaned(recorded(field))
+    kept, warnings = cleaned(recorded(field))
     assert [tuple(where) for where in np.argwhere(np.isnan(kept))] == at
-    assert notes == ["robot: 4 single readings jump; left out"]
+    assert warnings == [SolverWarning("spikes", "robot: 4 single readings jump; left out")]
 
 
 def test_good_readings_stay_as_they_are() -> None:
     field = waves()
-    kept, notes = cleaned(recorded(field))
+    kept, warnings = cleaned(recorded(field))
     assert (kept == field).all()
-    assert notes == []
+    assert warnings == []
 
 
 def test_the_end_of_a_range_that_was_not_told_is_found() -> None:
     field = np.clip(waves(), -0.02, 0.02)
-    kept, notes = cleaned(recorded(field))
+    kept, warnings = cleaned(recorded(field))
     assert (np.isnan(kept) == (np.abs(field) >= FULL * 0.02)).all()
-    assert "readings end at 20 mT" in notes[0]
-    assert "saturated" in notes[1]
+    assert [each.code for each in warnings] == ["range_from_data", "saturated"]
+    assert "readings end at 20 mT" in warnings[0].message

@@ -40,7 +40,7 @@ def test_an_l_is_a_place_or_a_note(published: FloorMap) -> None:
         one, found = solved(published, seed, published)
         assert found.method == "paper"
         if not found.trajectories:
-            assert any("not localised" in note for note in found.notes)
+            assert "not_localised" in [each.code for each in found.warnings]
             continue
         located += 1
         told, truth = found.trajectories[0], one.truth[0]
@@ -50,7 +50,7 @@ def test_an_l_is_a_place_or_a_note(published: FloorMap) -> None:
         assert away.max() < 0.03
         assert np.median(away) < 0.01
         cells = {event.cell for event in one.events}
-        told_cells = {tuple(s["cell"]) for s in found.detections if s["cell"]}
+        told_cells = {s.cell for s in found.detections if s.cell}
         assert len(told_cells & cells) >= 3
         np.testing.assert_array_equal(told.time_ns, one.odometry[0].time_ns)
         assert np.isnan(told.covariance).all()
@@ -60,8 +60,8 @@ def test_an_l_is_a_place_or_a_note(published: FloorMap) -> None:
 def test_without_a_map_there_is_a_note_and_no_place(published: FloorMap) -> None:
     _, found = solved(published, 0, None)
     assert not found.trajectories
-    assert all(seen["cell"] is None for seen in found.detections)
-    assert any("no map" in note for note in found.notes)
+    assert all(seen.cell is None for seen in found.detections)
+    assert "no_map" in [each.code for each in found.warnings]
 
 
 def test_no_odometry_is_an_error(published: FloorMap) -> None:
@@ -74,5 +74,5 @@ def test_a_map_that_has_not_these_three_is_told(published: FloorMap) -> None:
     other = FloorMap(np.zeros((24, 24), np.int64))
     _, found = solved(published, 1, other)
     assert not found.trajectories
-    assert not found.facts["robots"]["robot"]["localised"]
-    assert any("not localised" in note for note in found.notes)
+    assert not found.facts.robots["robot"].localised
+    assert "not_localised" in [each.code for each in found.warnings]

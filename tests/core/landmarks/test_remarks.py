@@ -12,7 +12,7 @@ from locatk.core.landmarks import remarks
 from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.simulate import Faults, Simulated, SimulationOptions, simulate
 from locatk.core.landmarks.solver import solve
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 
 CODES = np.random.default_rng(11).integers(0, 16, (12, 12))
 
@@ -43,7 +43,7 @@ def test_a_sensor_of_the_other_sign_is_named(sensor: int) -> None:
 def test_a_landmark_off_its_place_is_named_and_does_not_pull_the_others() -> None:
     one = drive(faults=Faults(displaced=(((3, 5), (0.012, 0.0)),)))
     found = solved(one)
-    named = [note for note in found.notes if "off its place" in note]
+    named = [each.message for each in found.warnings if each.code == "landmark_displaced"]
     assert len(named) == 1
     assert "landmark at 3,5 lies" in named[0]
 
@@ -55,7 +55,7 @@ def test_a_map_that_is_often_wrong_is_not_believed(wrong: int, believed: bool) -
         codes[cell] = (codes[cell] + 5) % 16
     found = solved(drive(), FloorMap(codes))
     assert bool(found.trajectories) == believed
-    assert any("are not those of the map" in note for note in found.notes) != believed
+    assert ("map_contradicted" in [each.code for each in found.warnings]) != believed
 
 
 @pytest.mark.parametrize(
@@ -73,4 +73,8 @@ def test_a_map_that_is_often_wrong_is_not_believed(wrong: int, believed: bool) -
 def test_what_is_not_certain_is_said_as_loud_as_it_deserves(
     sure: float, first: int | None, said: str | None
 ) -> None:
-    assert remarks.doubt(sure, first) == said
+    warning = remarks.doubt(sure, first)
+    if said is None:
+        assert warning is None
+    else:
+        assert warning == SolverWarning("localization_uncertain", said)

@@ -54,6 +54,10 @@ def session() -> Simulated:
     return drive()
 
 
+def warning_codes(solution: Solution) -> list[str]:
+    return [warning.code for warning in solution.warnings]
+
+
 def solved(
     one: Simulated, floor: FloorMap | None = FLOOR, **change: Callable[[Array], Array]
 ) -> Solution:
@@ -75,25 +79,25 @@ def farthest(one: Simulated, found: Solution) -> float:
 
 def test_a_session_without_faults() -> None:
     found = solved(session())
-    assert [tuple(seen["cell"]) for seen in found.detections] == CELLS
+    assert [seen.cell for seen in found.detections] == CELLS
     for seen in found.detections:
-        assert seen["code"] == CODES[tuple(seen["cell"])]
-        assert seen["pattern"] == pattern(seen["code"])
-        assert seen["refused"] == ""
+        assert seen.code == CODES[seen.cell]
+        assert seen.pattern == pattern(seen.code)
+        assert seen.refused == ""
     assert farthest(session(), found) < 3e-3
-    assert found.notes == ()
+    assert found.warnings == ()
     assert found.rejected == {}
-    told = found.facts["robots"]["robot"]
-    assert told["localised"]
-    assert told["landmarks_to_localise"] in (3, 4, 5)
-    assert told["probability"] > 0.9999
+    told = found.facts.robots["robot"]
+    assert told.localised
+    assert told.landmarks_to_localise in (3, 4, 5)
+    assert told.probability > 0.9999
 
 
 def test_the_least_pitch() -> None:
     floor = FloorMap(CODES, pitch_m=0.16)
     one = drive(floor)
     found = solved(one, floor)
-    assert [tuple(seen["cell"]) for seen in found.detections] == CELLS
+    assert [seen.cell for seen in found.detections] == CELLS
     assert farthest(one, found) < 3e-3
 
 
@@ -101,10 +105,10 @@ def test_places_of_detections_are_beside_their_landmarks() -> None:
     one = session()
     truth = one.truth[0]
     for seen in solved(one).detections:
-        at = np.argmin(np.abs(truth.time_ns * 1e-9 - seen["time_s"]))
-        away = truth.position[at, :2] - FLOOR.place(tuple(seen["cell"]))
-        assert seen["x_m"] == pytest.approx(away[0], abs=4e-3)
-        assert seen["y_m"] == pytest.approx(away[1], abs=4e-3)
+        at = np.argmin(np.abs(truth.time_ns * 1e-9 - seen.time_s))
+        away = truth.position[at, :2] - FLOOR.place(seen.cell)
+        assert seen.x_m == pytest.approx(away[0], abs=4e-3)
+        assert seen.y_m == pytest.approx(away[1], abs=4e-3)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -112,15 +116,15 @@ def test_another_map_is_not_believed(seed: int) -> None:
     other = FloorMap(np.random.default_rng(100 + seed).integers(0, 16, (12, 12)))
     found = solved(session(), other)
     assert not found.trajectories
-    assert any("not localised" in note for note in found.notes)
+    assert "not_localised" in warning_codes(found)
 
 
 def test_without_a_map_landmarks_are_told() -> None:
     found = solved(session(), None)
     assert not found.trajectories
     assert len(found.detections) == len(CELLS)
-    assert {pattern(CODES[c]) for c in CELLS} == {s["pattern"] for s in found.detections}
-    assert any("no map" in note for note in found.notes)
+    assert {pattern(CODES[c]) for c in CELLS} == {s.pattern for s in found.detections}
+    assert "no_map" in warning_codes(found)
 
 
 def test_part_of_a_floor_as_the_map() -> None:
@@ -128,9 +132,9 @@ def test_part_of_a_floor_as_the_map() -> None:
     part = FloorMap(CODES[:, :5])
     found = solved(session(), part)
     for seen in found.detections:
-        if seen["cell"] is not None:
-            assert seen["cell"][1] < 5
-    assert any(seen["refused"] for seen in found.detections)
+        if seen.cell is not None:
+            assert seen.cell[1] < 5
+    assert any(seen.refused for seen in found.detections)
     if found.trajectories:
         assert farthest(session(), found) < 4 * found.trajectories[0].sigma[:, :2].max()
 
@@ -176,22 +180,25 @@ def test_no_order_of_sensors_leads_astray() -> None:
         message = str(error)
     else:
         assert not found.trajectories
-        assert found.notes
+        assert found.warnings
     assert not message or "order" in message
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "code", "subject"),
     [
-        ({"field": lambda f: -f}, "exchanged"),
-        ({"field": lambda f: f / 1000}, "no landmark was met"),
-        ({"field": lambda f: np.where(np.arange(4) == 1, np.nan, f)}, "left sensor"),
-        ({"field": lambda f: np.where(np.arange(4) == 1, 1e-3, f)}, "left sensor"),
+        ({"field": lambda f: -f}, "polarity_exchanged", "robot"),
+        ({"field": lambda f: f / 1000}, "no_landmark", "robot"),
+        ({"field": lambda f: np.where(np.arange(4) == 1, np.nan, f)}, "sensor_silent", "left"),
+        ({"field": lambda f: np.where(np.arange(4) == 1, 1e-3, f)}, "sensor_constant", "left"),
     ],
 )
-def test_what_is_wrong_is_told(change: dict[str, Callable[[Array], Array]], words: str) -> None:
+def test_what_is_wrong_is_told(
+    change: dict[str, Callable[[Array], Array]], code: str, subject: str
+) -> None:
     found = solved(session(), **change)
-    assert any(words in note for note in found.notes)
+    (warning,) = [each for each in found.warnings if each.code == code]
+    assert subject in warning.message
     if found.trajectories:
         assert farthest(session(), found) < 4e-3
 
@@ -201,8 +208,8 @@ def test_late_odometry_is_told() -> None:
     one = spinning()
     late = replace(one.odometry[0], time_ns=one.odometry[0].time_ns + 50_000_000)
     found = solve(one.samples, FLOOR, odometry=[late])
-    assert any("miss the model" in note for note in found.notes) or not found.trajectories
-    assert found.notes
+    assert "field_misfit" in warning_codes(found) or not found.trajectories
+    assert found.warnings
 
 
 def test_no_odometry_is_an_error() -> None:
@@ -223,7 +230,7 @@ def test_a_landmark_that_the_floor_lacks() -> None:
     codes[2, 4] = HOLE
     one = drive(FloorMap(codes))
     found = solved(one, FLOOR)
-    assert [tuple(seen["cell"]) for seen in found.detections] == [c for c in CELLS if c != (2, 4)]
+    assert [seen.cell for seen in found.detections] == [c for c in CELLS if c != (2, 4)]
     assert farthest(one, found) < 4e-3
 
 
@@ -233,9 +240,9 @@ def test_a_landmark_laid_wrongly_is_told() -> None:
     one = drive(FloorMap(codes))
     found = solved(one, FLOOR)
     assert found.rejected == {}  # it is used, as it was read
-    assert sum(seen["refused"] == "misread" for seen in found.detections) == 1
-    assert found.detections[2]["refused"] == "misread"
-    assert found.detections[2]["code"] == codes[2, 4]
+    assert sum(seen.refused == "misread" for seen in found.detections) == 1
+    assert found.detections[2].refused == "misread"
+    assert found.detections[2].code == codes[2, 4]
     assert farthest(one, found) < 4e-3
 
 
@@ -243,7 +250,7 @@ def test_missing_bars_do_not_mislead() -> None:
     one = drive(faults=Faults(missing=(((2, 4), 1), ((4, 5), 0))))
     found = solved(one)
     assert farthest(one, found) < 4e-3
-    assert [tuple(seen["cell"]) for seen in found.detections] == CELLS
+    assert [seen.cell for seen in found.detections] == CELLS
 
 
 @pytest.mark.parametrize("count", [2, 8])
@@ -275,14 +282,14 @@ def test_robots_of_one_session_keep_apart() -> None:
     assert [t.device for t in found.trajectories] == ["b", "robot"]
     alone = solved(one).trajectories[0]
     np.testing.assert_allclose(found.trajectories[1].position, alone.position, atol=1e-9)
-    assert {seen["device"] for seen in found.detections} == {"b", "robot"}
+    assert {seen.device for seen in found.detections} == {"b", "robot"}
 
 
 def test_too_few_landmarks_are_no_place() -> None:
     one = drive(cells=((2, 2), (2, 3)))
     found = solved(one)
     assert not found.trajectories
-    assert any("not localised" in note for note in found.notes)
+    assert "not_localised" in warning_codes(found)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -291,8 +298,8 @@ def test_misread_landmarks_are_never_silent(seed: int) -> None:
     one = drive(seed=seed, faults=Faults(misread_rate=0.2), errors=Errors())
     found = solved(one)
     if found.trajectories and farthest(one, found) > 0.05:
-        assert found.facts["robots"]["robot"]["probability"] < 0.9999
-        assert any("probability" in note for note in found.notes)
+        assert found.facts.robots["robot"].probability < 0.9999
+        assert {"localization_uncertain", "not_localised"} & set(warning_codes(found))
 
 
 def test_options_out_of_range_are_refused() -> None:

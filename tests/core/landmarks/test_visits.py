@@ -105,7 +105,7 @@ def test_saturated_readings_are_taken_out_and_told() -> None:
     run = driven(clipped, one.odometry[0])
     gone = np.isnan(run.samples.field_t).sum()
     assert gone == (np.abs(clipped.field_t) >= 0.999 * limit)[: len(run.samples)].sum()
-    assert any("saturated" in note for note in run.notes)
+    assert "saturated" in [each.code for each in run.warnings]
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e-3])
@@ -116,7 +116,10 @@ def test_dead_sensors_are_taken_out_and_named(value: float) -> None:
     run = driven(replace(one.samples[0], field_t=field), one.odometry[0])
     assert np.isnan(run.samples.field_t[:, 2]).all()
     assert not np.isnan(run.samples.field_t[:, :2]).any()
-    assert any("rear" in note for note in run.notes)
+    assert any(
+        each.code in ("sensor_silent", "sensor_constant") and "rear" in each.message
+        for each in run.warnings
+    )
 
 
 def test_no_sensor_at_all_is_an_error() -> None:
@@ -148,7 +151,8 @@ def test_samples_beyond_odometry_are_left_out_and_told() -> None:
     run = driven(one.samples[0], short)
     assert run.samples.time_ns[-1] <= short.time_ns[-1]
     left = len(one.samples[0]) - len(run.samples)
-    assert any(f"{left} samples without odometry" in note for note in run.notes)
+    (warning,) = [each for each in run.warnings if each.code == "samples_without_odometry"]
+    assert f"{left} samples without odometry" in warning.message
 
 
 @pytest.mark.parametrize("factor", [1000, 100])

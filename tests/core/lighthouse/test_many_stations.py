@@ -213,11 +213,11 @@ def test_hiding_a_station_moves_poses_by_millimetres(planar: bool) -> None:
     session = simulate(
         SimulationOptions(stations=4, planar=planar, duration_s=60, occlusion=0.2, seed=3)
     )
-    for station in solve(session.sweeps, session.scene).facts["verification"]["stations"]:
-        assert station["against"] == "others"
-        assert station["residual_rad"] < 5e-4
-        assert station["jump_median_m"] < 1e-3
-        assert station["jump_95_m"] < 3e-3
+    for station in solve(session.sweeps, session.scene).facts.verification.stations:
+        assert station.against == "others"
+        assert station.residual_rad < 5e-4
+        assert station.jump_median_m < 1e-3
+        assert station.jump_95_m < 3e-3
 
 
 def test_what_is_left_out_is_named_by_channel_and_reason(world: Any) -> None:
@@ -238,7 +238,7 @@ def test_serial_numbers_that_were_heard_are_kept(world: Any) -> None:
     drive = world.drive(lamps, world.curve(120, flat=True))
     solution = solve(drive.sweeps, Scene(ids={2: 0x0FF22226}))
     assert [s.id for s in solution.artifact.stations] == [None, 0x0FF22226]
-    assert [row["id"] for row in solution.detections] == [None, "0ff22226"]
+    assert [row.id for row in solution.detections] == [None, "0ff22226"]
 
 
 # ---- published: four stations and a tracker, poses of the stations by libsurvive
@@ -255,13 +255,13 @@ def tracker(recordings: Path) -> Any:
 def test_recorded_stations_predict_each_other(tracker: Any) -> None:
     """Stations, calibrations and sweeps of four real units agree, in our model."""
     solution = solve(tracker.sweeps, tracker.scene)
-    stations = solution.facts["verification"]["stations"]
-    assert [s["channel"] for s in stations] == [1, 4, 8, 12]
+    stations = solution.facts.verification.stations
+    assert [s.channel for s in stations] == [1, 4, 8, 12]
     for station in stations:
-        assert station["against"] == "others"
-        assert station["residual_rad"] < 1e-3
-        assert station["jump_median_m"] < 1.5e-3
-        assert station["jump_95_m"] < 2.5e-3
+        assert station.against == "others"
+        assert station.residual_rad < 1e-3
+        assert station.jump_median_m < 1.5e-3
+        assert station.jump_95_m < 2.5e-3
     assert all(w.code != "wrong_station" for w in solution.warnings)
 
 

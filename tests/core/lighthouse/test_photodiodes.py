@@ -248,12 +248,12 @@ def test_an_exchange_must_fit_well_to_be_undone(
     counts[7] = drive.counts[7, ::-1]
     epochs = epochs_of(counts, labelled=False)
     stations = stack(factory_stations(world, lamps))
-    estimates = estimate_positions(angles_of(epochs), *stations, floor_z=0.0)
+    estimates = estimate_positions(rotor_angles(epochs), *stations, floor_z=0.0)
     _, restored, count = restore_swapped_sweeps(epochs, estimates, stations, 0.0)
     assert count == int(is_restored)
     # The correct assignment is within the gate in both cases, and within half of it in the first.
     exact = estimate_positions(
-        angles_of(epochs_of(drive.counts, labelled=False)), *stations, floor_z=0.0
+        rotor_angles(epochs_of(drive.counts, labelled=False)), *stations, floor_z=0.0
     )
     assert exact.max_residual[7] < INLIER_GATE_RAD
     assert (restored.max_residual[7] < INLIER_GATE_RAD / 2) is np.bool_(is_restored)

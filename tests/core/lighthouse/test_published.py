@@ -193,7 +193,7 @@ def test_floor_by_the_authors_alignment(floor: Any) -> None:
 def test_floor_swapped_sweeps_are_given_back(floor: Any) -> None:
     sweeps, truths, _ = floor
     solution = solve(sweeps)
-    restored = solution.facts["moments_with_swapped_sweeps_restored"]
+    restored = solution.facts.restored_swapped_epochs
     assert 650 < restored < 800
     # Between experiments robots are carried, off the floor; within them few moments are lost.
     seen = lost = 0

@@ -160,22 +160,22 @@ def test_solutions_carry_it(world: Any) -> None:
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(400, flat=True))
     solution = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square)))
-    found = solution.facts["verification"]
-    assert found["held_out"]
-    assert found["moments"] == 80  # every fifth
-    assert solution.facts["bundle_points"] == 320
-    assert [s["channel"] for s in found["stations"]] == [1, 2, 5]
-    for row, station in zip(solution.detections, found["stations"], strict=True):
-        assert row["verification_rad"] == station["residual_rad"] < 5e-4
-        assert row["verification_m"] == station["residual_m"] < 2e-3
+    found = solution.facts.verification
+    assert found.held_out
+    assert found.epochs == 80  # every fifth
+    assert solution.facts.bundle_points == 320
+    assert [s.channel for s in found.stations] == [1, 2, 5]
+    for row, station in zip(solution.detections, found.stations, strict=True):
+        assert row.verification_rad == station.residual_rad < 5e-4
+        assert row.verification_m == station.residual_m < 2e-3
 
 
 def test_few_places_are_all_needed_and_that_is_told(world: Any) -> None:
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(60, flat=True))
     found = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square))).facts
-    assert not found["verification"]["held_out"]
-    assert found["bundle_points"] == found["verification"]["moments"] == 60
+    assert not found.verification.held_out
+    assert found.bundle_points == found.verification.epochs == 60
 
 
 @pytest.mark.parametrize("flat", [True, False])

@@ -26,9 +26,9 @@ def changed(before: Samples, after: Samples) -> NDArray[np.bool_]:
 
 
 def test_a_magnet_is_no_spike() -> None:
-    found, notes = cleaned(samples(), NOISE)
+    found, warnings = cleaned(samples(), NOISE)
     np.testing.assert_array_equal(found.field_t, samples().field_t)
-    assert notes == ()
+    assert warnings == ()
 
 
 @pytest.mark.parametrize("at", [30, 100])
@@ -36,31 +36,33 @@ def test_a_misframed_row_goes(at: int) -> None:
     """At rest, and at the peak of a magnet."""
     made = samples()
     made.field_t[at] += 1e-3
-    found, notes = cleaned(made, NOISE)
+    found, warnings = cleaned(made, NOISE)
     gone = changed(made, found)
     assert gone[at].all()
     assert gone.sum() == 15
-    assert "15 values were spikes" in notes[0]
+    assert [each.code for each in warnings] == ["spikes"]
+    assert "15 values" in warnings[0].message
 
 
 def test_a_stuck_sensor_goes_while_it_is_stuck() -> None:
     made = samples()
     made.field_t[60:140, 2] = made.field_t[60, 2]
-    found, notes = cleaned(made, NOISE)
+    found, warnings = cleaned(made, NOISE)
     gone = changed(made, found)
     assert gone[60:140, 2].all()
     assert not gone[:60].any()
     assert not gone[140:].any()
     assert not gone[:, [0, 1, 3, 4]].any()
-    assert "sensor 3 was stuck (40 % of the time)" in notes[0]
+    assert warnings[0].code == "sensor_stuck"
+    assert "sensor 3 was stuck (40 % of the time)" in warnings[0].message
 
 
 def test_a_bar_without_noise_is_not_stuck() -> None:
     made = samples()
     made.field_t[:] = 1e-5
-    found, notes = cleaned(made, NOISE)
+    found, warnings = cleaned(made, NOISE)
     assert np.isfinite(found.field_t).all()
-    assert notes == ()
+    assert warnings == ()
 
 
 def test_what_is_not_finite_is_missing() -> None:

@@ -70,14 +70,14 @@ def test_reads(heading: float, world: Any) -> None:
     found = one(identify(seen(tag), recording(), TAGS))
     assert (found.tag_id, found.refused) == (id_of(), "")
     said = found.detection("bar", recording().time_ns)
-    assert said["tag_id"] == id_of()
-    assert said["refused"] is None
-    assert (said["x_m"], said["y_m"]) == pytest.approx((0.02, -0.01), abs=1e-9)
-    assert said["heading_rad"] == pytest.approx(heading)
-    assert said["margin"] == pytest.approx(1.0)
-    assert said["time_s"] == 2.0
-    assert said["speed_mps"] == pytest.approx(0.2)
-    pairs = {tuple(m["cell"]): m["symbol"] for m in said["magnets"]}
+    assert said.tag_id == id_of()
+    assert said.refused is None
+    assert (said.x_m, said.y_m) == pytest.approx((0.02, -0.01), abs=1e-9)
+    assert said.heading_rad == pytest.approx(heading)
+    assert said.margin == pytest.approx(1.0)
+    assert said.time_s == 2.0
+    assert said.speed_mps == pytest.approx(0.2)
+    pairs = {m.cell: m.symbol for m in said.magnets}
     assert pairs == dict(zip(CELLS, SYMBOLS, strict=True))
 
 
@@ -95,7 +95,7 @@ def test_array_in_the_tags_frame(world: Any) -> None:
 def test_no_tag_given(world: Any) -> None:
     found = one(identify(seen(world.Tag(CELLS, SYMBOLS)), recording(), None))
     assert found.refused == "no_tag_given"
-    assert found.detection("bar", recording().time_ns)["x_m"] is None
+    assert found.detection("bar", recording().time_ns).x_m is None
 
 
 @pytest.mark.parametrize(

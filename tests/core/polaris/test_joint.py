@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import Layout, Magnet, Tags
 from locatk.core.solution import Solution
@@ -25,32 +26,32 @@ SYMBOLS = (0, 3, 5, 2, 6)
 ID = codec.id_of(TAGS, Layout(CELLS, SYMBOLS))
 
 
-def the_tag(solution: Solution) -> dict[str, Any]:
+def the_tag(solution: Solution) -> TagDetection:
     """The one detection, which was read."""
     (found,) = solution.detections
-    assert found["tag_id"] is not None, found["refused"]
+    assert found.tag_id is not None, found.refused
     return found
 
 
-def pose_errors(world: Any, found: dict[str, Any], course: Any, tag: Any) -> Array:
+def pose_errors(world: Any, found: TagDetection, course: Any, tag: Any) -> Array:
     """Of the tag (x, y in m, heading in rad) against the truth at that time."""
-    truth = world.seen_from(course, round(found["time_s"] * 1e9), tag)
-    error = np.array([found["x_m"], found["y_m"], found["heading_rad"]]) - truth
+    truth = world.seen_from(course, round(found.time_s * 1e9), tag)
+    error = np.array([found.x_m, found.y_m, found.heading_rad]) - truth
     error[2] = world.turn(error[2])
     return error
 
 
-def magnet_errors(world: Any, found: dict[str, Any], course: Any, tag: Any) -> tuple[Array, Array]:
+def magnet_errors(world: Any, found: TagDetection, course: Any, tag: Any) -> tuple[Array, Array]:
     """Errors (M, 3) of the magnets' x, y, angle in the array's frame, and their sigmas."""
     rows, spread = [], []
-    for magnet in found["magnets"]:
-        k = tag.cells.index(tuple(magnet["cell"]))
+    for magnet in found.magnets:
+        k = tag.cells.index(magnet.cell)
         (x, y), angle = tag.places[k], tag.angles[k]
         alone = replace(tag, x=float(x), y=float(y), heading=float(angle))
-        truth = world.seen_from(course, round(found["time_s"] * 1e9), alone)
-        error = np.array([magnet["x_m"], magnet["y_m"], magnet["angle_rad"]]) - truth
+        truth = world.seen_from(course, round(found.time_s * 1e9), alone)
+        error = np.array([magnet.x_m, magnet.y_m, magnet.angle_rad]) - truth
         rows.append([error[0], error[1], float(world.turn(error[2]))])
-        spread.append([magnet["sigma_x_m"], magnet["sigma_y_m"], magnet["sigma_angle_rad"]])
+        spread.append([magnet.sigma_x_m, magnet.sigma_y_m, magnet.sigma_angle_rad])
     return np.array(rows), np.array(spread)
 
 
@@ -61,7 +62,7 @@ def magnet_errors(world: Any, found: dict[str, Any], course: Any, tag: Any) -> t
 class Round:
     """A tag passed over at headings 0 .. 345 degrees."""
 
-    found: list[dict[str, Any]]
+    found: list[TagDetection]
     pose: Array  # (24, 3) errors
     magnets: Array  # (24 * 5, 3) errors
     sigma: Array  # (24 * 5, 3)
@@ -84,10 +85,10 @@ def known_speed(world: Any) -> Round:
 
 
 def test_every_heading_is_read(known_speed: Round) -> None:
-    assert {found["tag_id"] for found in known_speed.found} == {ID}
-    assert min(found["margin"] for found in known_speed.found) > 0.9
+    assert {found.tag_id for found in known_speed.found} == {ID}
+    assert min(found.margin for found in known_speed.found) > 0.9
     for found in known_speed.found:
-        symbols = {tuple(m["cell"]): m["symbol"] for m in found["magnets"]}
+        symbols = {m.cell: m.symbol for m in found.magnets}
         assert symbols == dict(zip(CELLS, SYMBOLS, strict=True))
 
 
@@ -117,25 +118,25 @@ def test_sigma_of_the_angles(known_speed: Round) -> None:
 
 
 def test_white_residual(known_speed: Round) -> None:
-    residual = np.array([found["residual_sigma"] for found in known_speed.found])
+    residual = np.array([found.residual_sigma for found in known_speed.found])
     assert np.all(np.abs(residual - 1) < 0.1)
-    assert all(found["other_sources"] == 0 for found in known_speed.found)
+    assert all(found.other_sources == 0 for found in known_speed.found)
 
 
 def test_height_and_moments(known_speed: Round) -> None:
     for found in known_speed.found:
-        assert found["height_m"] == pytest.approx(0.010, abs=5e-5)
-        for magnet in found["magnets"]:
-            assert magnet["moment_am2"] == pytest.approx(Magnet().moment, rel=0.02)
+        assert found.height_m == pytest.approx(0.010, abs=5e-5)
+        for magnet in found.magnets:
+            assert magnet.moment_am2 == pytest.approx(Magnet().moment, rel=0.02)
 
 
 def test_array_in_the_tags_frame_is_the_inverse(world: Any, known_speed: Round) -> None:
     """There and back, with complex numbers."""
     for found in known_speed.found:
-        tag = complex(found["x_m"], found["y_m"])
-        array = complex(found["array"]["x_m"], found["array"]["y_m"])
-        assert abs(tag + np.exp(1j * found["heading_rad"]) * array) < 1e-12
-        assert abs(world.turn(found["array"]["heading_rad"] + found["heading_rad"])) < 1e-12
+        tag = complex(found.x_m, found.y_m)
+        array = complex(found.array_pose.x_m, found.array_pose.y_m)
+        assert abs(tag + np.exp(1j * found.heading_rad) * array) < 1e-12
+        assert abs(world.turn(found.array_pose.heading_rad + found.heading_rad)) < 1e-12
 
 
 # ---- nothing known, nothing straight
@@ -171,10 +172,10 @@ def hands(world: Any) -> Hands:
         profile = u + 0.3 / (2 * np.pi) * (np.sin(2 * np.pi * u + k) - np.sin(k))
         course = world.driven(course, 2.6 * u, profile)
         found = the_tag(solve([world.record([tag], course, seed=k)], TAGS))
-        ids.append(found["tag_id"])
+        ids.append(found.tag_id)
         error = pose_errors(world, found, course, tag)
         pose.append(error)
-        sigma = [found["sigma_x_m"], found["sigma_y_m"], found["sigma_heading_rad"]]
+        sigma = [found.sigma_x_m, found.sigma_y_m, found.sigma_heading_rad]
         z_pose.append(error / sigma)
         error, spread = magnet_errors(world, found, course, tag)
         z_magnets.append(error / spread)
@@ -230,7 +231,7 @@ def test_a_dense_tag_is_read_by_its_grid(world: Any) -> None:
     course = world.line(length=1.5 * 0.048 + 0.12)
     made = world.record([tag], course, array=world.bar(7), seed=0)
     found = the_tag(solve([made], tags))
-    assert found["tag_id"] == codec.id_of(tags, Layout(cells, symbols))
+    assert found.tag_id == codec.id_of(tags, Layout(cells, symbols))
 
 
 @pytest.mark.parametrize(
@@ -255,8 +256,8 @@ def test_every_bit_of_other_designs(
     tag = world.Tag(cells, symbols, heading=rng.uniform(-np.pi, np.pi), **shape)
     course = world.line(length=1.5 * side + 0.12)
     found = the_tag(solve([world.record([tag], course, array=bar, seed=1)], tags))
-    assert found["tag_id"] == codec.id_of(tags, Layout(cells, symbols))
-    assert len(found["magnets"]) == magnets
+    assert found.tag_id == codec.id_of(tags, Layout(cells, symbols))
+    assert len(found.magnets) == magnets
     assert np.all(np.abs(pose_errors(world, found, course, tag)) < [6e-4, 5e-5, 2e-3])
 
 
@@ -275,7 +276,7 @@ def test_mini_tag(world: Any) -> None:
             [tag], course, array=world.bar(3, 0.008), clearance=0.005, rate=17.0, seed=k
         )
         found = the_tag(solve([recording], tags))
-        assert found["tag_id"] == codec.id_of(tags, Layout(cells, symbols))
+        assert found.tag_id == codec.id_of(tags, Layout(cells, symbols))
         errors.append(pose_errors(world, found, course, tag))
     assert np.linalg.norm(np.array(errors)[:, :2], axis=1).max() < 0.58e-3
     assert np.abs(np.array(errors)[:, 2]).max() < np.radians(1.0)
@@ -290,8 +291,8 @@ def test_axes_that_are_converted_one_after_the_other(world: Any) -> None:
         course = world.line(length=0.26, speed=0.105)
         array = world.bar(delay=delay)
         found = the_tag(solve([world.record([tag], course, array=array, seed=k)], TAGS))
-        assert found["tag_id"] == ID
-        assert found["residual_sigma"] < 1.1
+        assert found.tag_id == ID
+        assert found.residual_sigma < 1.1
         error, _ = magnet_errors(world, found, course, tag)
         errors.append(error[:, 2])
     assert np.degrees(np.sqrt(np.mean(np.square(errors)))) < 0.09

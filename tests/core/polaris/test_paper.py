@@ -24,6 +24,7 @@ from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.peaks import find_peaks, signals
 from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Layout, Tags, angles, places
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -258,7 +259,8 @@ def test_lost_samples_and_a_dead_sensor_that_sees_nothing() -> None:
     field[:, 0] = np.nan
     (sighting,) = paper.sightings(replace(samples, field_t=field), TAGS, SPEED)
     assert compared(sighting, samples, truth)[:, 0].mean() < 2.4e-3
-    assert sighting.notes == ("without sensor 1, which gave no samples",)
+    (warning,) = sighting.warnings
+    assert warning == SolverWarning("sensor_silent", "without sensor 1, which gave no samples")
 
 
 def test_sensors_may_come_in_any_order() -> None:

@@ -10,7 +10,6 @@ import csv
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.mlx90393 import published_bar
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import Tags
 
@@ -58,7 +58,7 @@ class Run:
     angle_rad: Array
     heading_rad: float
     margin: float | None
-    detection: dict[str, Any]
+    detection: TagDetection
 
 
 def aligned(place_mm: NDArray[np.complex128]) -> float:
@@ -70,12 +70,12 @@ def aligned(place_mm: NDArray[np.complex128]) -> float:
 
 def solved(samples: Samples, options: SolveOptions) -> Run:
     (found,) = solve([samples], TAGS, options).detections
-    place = np.array([-m["y_m"] + 1j * m["x_m"] for m in found["magnets"]]) * 1e3
-    angle = np.array([m["angle_rad"] for m in found["magnets"]])
+    place = np.array([-m.y_m + 1j * m.x_m for m in found.magnets]) * 1e3
+    angle = np.array([m.angle_rad for m in found.magnets])
     assert len(place) == 5
     order = min(permutations(range(5)), key=lambda order: aligned(place[list(order)]))
     place, angle = place[list(order)], angle[list(order)]
-    return Run(found["tag_id"], place, angle, found["heading_rad"], found["margin"], found)
+    return Run(found.tag_id, place, angle, found.heading_rad, found.margin, found)
 
 
 @pytest.fixture(scope="module")
@@ -155,18 +155,18 @@ def test_uncertainty_is_of_the_size_of_the_errors(name: str, runs: dict[str, lis
     scatter by 0.3), nor where the tag lay: so much only."""
     for run in runs[name]:
         found = run.detection
-        assert 0.1 < np.degrees(found["sigma_heading_rad"]) < 1.0
-        assert 1e-4 < found["sigma_y_m"] < 1e-3
-        assert 0.8 < found["residual_sigma"] < 1.6
-    askew = [abs(run.heading_rad / run.detection["sigma_heading_rad"]) for run in runs[name]]
+        assert 0.1 < np.degrees(found.sigma_heading_rad) < 1.0
+        assert 1e-4 < found.sigma_y_m < 1e-3
+        assert 0.8 < found.residual_sigma < 1.6
+    askew = [abs(run.heading_rad / run.detection.sigma_heading_rad) for run in runs[name]]
     assert np.median(askew) < 2.5
 
 
 def test_height_and_magnets_are_those_of_the_facts(runs: dict[str, list[Run]]) -> None:
     """11.4 to 11.9 mm, 1.1 to 1.4 mA m^2 (facts 1, quirk 3)."""
     every = [run.detection for some in runs.values() for run in some]
-    assert 0.0105 < np.median([found["height_m"] for found in every]) < 0.0125
-    moments = [magnet["moment_am2"] for found in every for magnet in found["magnets"]]
+    assert 0.0105 < np.median([found.height_m for found in every]) < 0.0125
+    moments = [magnet.moment_am2 for found in every for magnet in found.magnets]
     assert 1.0e-3 < np.median(moments) < 1.5e-3
 
 

@@ -115,14 +115,18 @@ def test_without_a_site_the_first_tag_is_the_frame(world: Any, tour: tuple[Any, 
     assert np.abs(poses.position[:, :2] @ [1, 1j] - there).max() < 6e-4
     assert np.abs(headings(poses) - (0.02 - heading)).max() < 2e-3
     for other in IDS[1:]:
-        assert any(str(other) in note for note in solution.notes)
+        assert any(
+            each.code == "tag_not_on_site" and str(other) in each.message
+            for each in solution.warnings
+        )
 
 
 def test_a_tag_that_is_not_on_the_site_is_told(tour: tuple[Any, Samples]) -> None:
     _, recording = tour
     known = {i: SITE[i] for i in IDS[:2]}
     solution = solve([recording], replace(TAGS, site=known))
-    assert any(f"tag {IDS[2]} has no place on the site" in note for note in solution.notes)
+    (warning,) = [each for each in solution.warnings if each.code == "tag_not_on_site"]
+    assert f"tag {IDS[2]} has no place on the site" in warning.message
     assert solution.poses > 0
 
 
@@ -158,16 +162,14 @@ def test_odometry_of_another_device_is_not_used(world: Any, tour: tuple[Any, Sam
 def test_corrections_lead_to_the_next_tag(world: Any, tour: tuple[Any, Samples]) -> None:
     """Paper 8.3.7. Checked by driving them: turn, then go straight as far as is said."""
     course, recording = tour
-    turns = solve([recording], replace(TAGS, site=SITE)).facts["heading_corrections"]
-    assert [(turn["from"], turn["to"]) for turn in turns] == [IDS[:2], IDS[1:]]
+    turns = solve([recording], replace(TAGS, site=SITE)).facts.heading_corrections
+    assert [(turn.from_tag, turn.to_tag) for turn in turns] == [IDS[:2], IDS[1:]]
     for turn in turns:
-        x, y, heading = (
-            float(v) for v in course.at(np.array(turn["time_s"] - world.start_ns * 1e-9))
-        )
-        reached = x + 1j * y + turn["distance_m"] * np.exp(1j * (heading + turn["turn_rad"]))
-        goal = SITE[turn["to"]]
+        x, y, heading = (float(v) for v in course.at(np.array(turn.time_s - world.start_ns * 1e-9)))
+        reached = x + 1j * y + turn.distance_m * np.exp(1j * (heading + turn.rotation_rad))
+        goal = SITE[turn.to_tag]
         assert abs(reached - (goal.x_m + 1j * goal.y_m)) < 4e-3
-        assert 0 < turn["sigma_turn_rad"] < 0.02
+        assert 0 < turn.sigma_rotation_rad < 0.02
 
 
 def test_along_counts_backward_as_negative(world: Any) -> None:

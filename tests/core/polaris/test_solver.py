@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import Layout, Placed, Tags
 from locatk.core.solution import Solution
@@ -31,22 +32,22 @@ def id_of(symbols: tuple[int, ...], tags: Tags = TAGS) -> int:
     return codec.id_of(tags, Layout(CELLS, symbols))
 
 
-def the_tag(solution: Solution) -> dict[str, Any]:
+def the_tag(solution: Solution) -> TagDetection:
     """The one detection that was read."""
-    (found,) = [d for d in solution.detections if d["tag_id"] is not None]
+    (found,) = [d for d in solution.detections if d.tag_id is not None]
     return found
 
 
-def errors(world: Any, found: dict[str, Any], course: Any, tag: Any) -> Array:
+def errors(world: Any, found: TagDetection, course: Any, tag: Any) -> Array:
     """Of the pose (x, y in m, heading in rad) against the truth at that time."""
-    truth = world.seen_from(course, round(found["time_s"] * 1e9), tag)
-    seen = np.array([found["x_m"], found["y_m"], found["heading_rad"]]) - truth
+    truth = world.seen_from(course, round(found.time_s * 1e9), tag)
+    seen = np.array([found.x_m, found.y_m, found.heading_rad]) - truth
     seen[2] = world.turn(seen[2])
     return seen
 
 
-def sigmas(found: dict[str, Any]) -> Array:
-    return np.array([found["sigma_x_m"], found["sigma_y_m"], found["sigma_heading_rad"]])
+def sigmas(found: TagDetection) -> Array:
+    return np.array([found.sigma_x_m, found.sigma_y_m, found.sigma_heading_rad])
 
 
 # ---- what goes wrong on floors and in wires
@@ -104,7 +105,7 @@ def spoiled(kind: str, samples: Samples) -> Samples:
 def test_read_in_spite_of(kind: str, world: Any) -> None:
     tag, course, recording = passed(world, seed=8)
     found = the_tag(solve([spoiled(kind, recording)], TAGS))
-    assert found["tag_id"] == id_of(SYMBOLS)
+    assert found.tag_id == id_of(SYMBOLS)
     error = errors(world, found, course, tag)
     assert np.all(np.abs(error) < [6e-4, 2e-4, np.radians(0.3)])
     assert np.all(np.abs(error) < 4 * sigmas(found))
@@ -113,7 +114,8 @@ def test_read_in_spite_of(kind: str, world: Any) -> None:
 def test_missing_samples_are_told(world: Any) -> None:
     _, _, recording = passed(world)
     solution = solve([spoiled("dead sensor", recording)], TAGS)
-    assert any("missing" in note and "11 %" in note for note in solution.notes)
+    (warning,) = [each for each in solution.warnings if each.code == "samples_missing"]
+    assert "11 %" in warning.message
 
 
 def test_iron_debris_is_no_magnet(world: Any) -> None:
@@ -122,8 +124,8 @@ def test_iron_debris_is_no_magnet(world: Any) -> None:
     debris += [world.Debris(0.01, -0.055, 4e-3)]
     course = world.line(length=0.28)
     found = the_tag(solve([world.record([tag, *debris], course, seed=4)], TAGS))
-    assert found["tag_id"] == id_of(SYMBOLS)
-    assert len(found["magnets"]) == 5
+    assert found.tag_id == id_of(SYMBOLS)
+    assert len(found.magnets) == 5
     assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 2e-4, np.radians(0.3)])
 
 
@@ -131,16 +133,16 @@ def test_iron_debris_is_no_magnet(world: Any) -> None:
 def test_slow_and_fast(step_mm: float, world: Any) -> None:
     tag, course, recording = passed(world, course=world.line(length=0.26, speed=step_mm / 10))
     found = the_tag(solve([recording], TAGS))
-    assert found["tag_id"] == id_of(SYMBOLS)
+    assert found.tag_id == id_of(SYMBOLS)
     assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
-    assert found["speed_mps"] == pytest.approx(step_mm / 10, rel=0.06)
+    assert found.speed_mps == pytest.approx(step_mm / 10, rel=0.06)
 
 
 def test_backward(world: Any) -> None:
     course = world.driven(world.line(length=0.28), [0, 2.8], [1, 0])
     tag, _, recording = passed(world, course=course)
     found = the_tag(solve([recording], TAGS))
-    assert found["tag_id"] == id_of(SYMBOLS)
+    assert found.tag_id == id_of(SYMBOLS)
     assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
 
 
@@ -149,8 +151,8 @@ def test_standing_still_over_the_tag(world: Any) -> None:
     tag, _, recording = passed(world, course=course, heading=np.radians(33), seed=2)
     solution = solve([recording], TAGS)
     for found in solution.detections:
-        assert found["tag_id"] in (None, id_of(SYMBOLS))  # read, or refused; never wrong
-        if found["tag_id"] is not None:
+        assert found.tag_id in (None, id_of(SYMBOLS))  # read, or refused; never wrong
+        if found.tag_id is not None:
             error = errors(world, found, course, tag)
             assert np.all(np.abs(error) < np.maximum(4 * sigmas(found), [6e-4, 1e-4, 3e-3]))
 
@@ -163,7 +165,7 @@ def test_tag_beside_the_bar_is_partial(lateral: float, world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, heading=0.1)
     recording = world.record([tag], world.line(lateral=lateral, length=0.28), seed=5)
     solution = solve([recording], TAGS)
-    assert [d["tag_id"] for d in solution.detections] == [None]
+    assert [d.tag_id for d in solution.detections] == [None]
     assert solution.rejected == {"partial": 1}
     assert solution.trajectories == ()
 
@@ -182,9 +184,9 @@ def test_plain_tag_without_a_magnet_is_refused(gone: int, world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, heading=1.0, strength=strength)
     solution = solve([world.record([tag], world.line(length=0.28), seed=gone)], TAGS)
     (found,) = solution.detections
-    assert found["tag_id"] is None
-    assert found["refused"] in ("magnets_missing", "partial")  # four fit on more than one grid
-    assert len(found["magnets"]) == 4
+    assert found.tag_id is None
+    assert found.refused in ("magnets_missing", "partial")  # four fit on more than one grid
+    assert len(found.magnets) == 4
 
 
 @pytest.mark.parametrize(
@@ -201,7 +203,7 @@ def test_plain_tag_without_a_magnet_is_refused(gone: int, world: Any) -> None:
 def test_tag_of_another_design_is_refused(wrong: dict[str, Any], world: Any) -> None:
     _, _, recording = passed(world, seed=6)
     solution = solve([recording], replace(TAGS, **wrong))
-    assert [d["tag_id"] for d in solution.detections] == [None]
+    assert [d.tag_id for d in solution.detections] == [None]
     assert sum(solution.rejected.values()) == 1
 
 
@@ -209,7 +211,7 @@ def test_tag_of_another_design_is_refused(wrong: dict[str, Any], world: Any) -> 
 def test_slightly_wrong_spacing_is_never_a_surely_wrong_pose(spacing: float, world: Any) -> None:
     tag, course, recording = passed(world, heading=0.0)
     for found in solve([recording], replace(TAGS, spacing_m=spacing)).detections:
-        if found["tag_id"] is not None:
+        if found.tag_id is not None:
             assert np.all(np.abs(errors(world, found, course, tag)) < 4 * sigmas(found))
 
 
@@ -217,8 +219,8 @@ def test_wrong_clearance_does_not_matter(world: Any) -> None:
     tag, course, recording = passed(world)
     for clearance in (0.006, 0.015):
         found = the_tag(solve([recording], replace(TAGS, clearance_m=clearance)))
-        assert found["tag_id"] == id_of(SYMBOLS)
-        assert found["height_m"] == pytest.approx(0.010, abs=1e-4)
+        assert found.tag_id == id_of(SYMBOLS)
+        assert found.height_m == pytest.approx(0.010, abs=1e-4)
         assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
 
 
@@ -227,8 +229,8 @@ def test_without_a_tag_there_are_magnets_but_no_ids(world: Any) -> None:
     solution = solve([recording], None)
     assert solution.rejected == {"no_tag_given": 1}
     (found,) = solution.detections
-    assert found["tag_id"] is None
-    places = np.array([[m["x_m"], m["y_m"]] for m in found["magnets"]])
+    assert found.tag_id is None
+    places = np.array([[m.x_m, m.y_m] for m in found.magnets])
     apart = np.sort(np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(5, 1)])
     grid = tag.places
     expected = np.sort(np.linalg.norm(grid[:, None] - grid[None], axis=2)[np.triu_indices(5, 1)])
@@ -249,9 +251,9 @@ def test_two_tags(ahead: float, aside: float, world: Any) -> None:
     recording = world.record([first, second], course, array=array, seed=2)
     solution = solve([recording], TAGS)
     truth = {id_of(SYMBOLS): first, id_of(OTHER): second}
-    assert {d["tag_id"] for d in solution.detections} == set(truth)
+    assert {d.tag_id for d in solution.detections} == set(truth)
     for found in solution.detections:
-        error = errors(world, found, course, truth[found["tag_id"]])
+        error = errors(world, found, course, truth[found.tag_id])
         assert np.all(np.abs(error) < np.maximum([8e-4, 1e-4, 3e-3], 3 * sigmas(found)))
 
 
@@ -264,15 +266,15 @@ def test_order_is_that_of_time_and_the_site_places_the_array(world: Any) -> None
     site = {i: Placed(t.x, t.y, t.heading) for i, t in zip(ids, tags, strict=True)}
     course = world.line(length=0.9, past=(0.3, 0.0))
     solution = solve([world.record(tags, course, seed=9)], replace(TAGS, site=site))
-    assert [d["tag_id"] for d in solution.detections] == ids
+    assert [d.tag_id for d in solution.detections] == ids
     (poses,) = solution.trajectories
     assert poses.frame == "site"
     x, y, _ = course.at((poses.time_ns - world.start_ns) * 1e-9)
     error = poses.position[:, :2] - np.column_stack([x, y])
     assert np.sqrt(np.mean(error**2)) < 3e-4
     assert np.all(np.abs(error) < 4 * poses.sigma[:, :2] + 1e-4)
-    (turn,) = solution.facts["heading_corrections"]
-    assert (turn["from"], turn["to"]) == tuple(ids)
+    (turn,) = solution.facts.heading_corrections
+    assert (turn.from_tag, turn.to_tag) == tuple(ids)
 
 
 # ---- input that is none
@@ -317,7 +319,7 @@ def test_nothing_there_is_nothing_found(kind: str, world: Any) -> None:
         "earth only": b,
     }[kind]
     solution = solve([world.spoiled(recording, field)], TAGS)
-    assert solution.detections == []
+    assert solution.detections == ()
     assert solution.trajectories == ()
 
 
@@ -325,7 +327,7 @@ def test_devices_stay_apart(world: Any) -> None:
     tag, course, left = passed(world, device="left", seed=1)
     right = world.record([world.Tag(CELLS, OTHER)], course, device="right", seed=2)
     solution = solve([left, right], TAGS)
-    assert {(d["device"], d["tag_id"]) for d in solution.detections} == {
+    assert {(d.device, d.tag_id) for d in solution.detections} == {
         ("left", id_of(SYMBOLS)),
         ("right", id_of(OTHER)),
     }

@@ -16,7 +16,7 @@ import pytest
 from locatk.core.evaluation import evaluate
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.solution import Solution
+from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.report.report import write_report
 from locatk.formats.report.subject import Subject
@@ -91,7 +91,14 @@ def subject(name: str = "red", n: int = 200) -> Subject:
         scale="markers",
     )
     rejected = {"spike": 7, "jump": 2}
-    solution = Solution("lighthouse", "bundle", (solved,), rejected, artifact=scene, notes=(name,))
+    solution = Solution(
+        "lighthouse",
+        "bundle",
+        (solved,),
+        rejected,
+        artifact=scene,
+        warnings=(SolverWarning("test", name),),
+    )
     evaluation = evaluate([(solved, truth)])
     facts = {"command": f"locatk solve {name}", "source": name}
     return Subject(name, solution, facts, truth=(truth,), evaluation=evaluation)

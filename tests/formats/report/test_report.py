@@ -21,7 +21,7 @@ from locatk.core.errors import MissingDataError, OutputExistsError
 from locatk.core.evaluation import evaluate
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.solution import Solution
+from locatk.core.solution import GenericRecord, Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plot_ground import known
 from locatk.formats.report.figures import MOST_POINTS
@@ -53,7 +53,11 @@ def track(
 
 def solution(*names: str, n: int = 60, **more: Any) -> Solution:
     tracks = tuple(track(name, n, off_m=1e-3 * (k + 1)) for k, name in enumerate(names))
-    given: dict[str, Any] = {"artifact": SCENE, "notes": ("a note",), **more}
+    given: dict[str, Any] = {
+        "artifact": SCENE,
+        "warnings": (SolverWarning("test", "a note"),),
+        **more,
+    }
     return Solution("lighthouse", "bundle", tracks, **given)
 
 
@@ -137,8 +141,8 @@ def test_neither_matplotlib_nor_scipy_is_imported() -> None:
 
 def test_names_of_devices_do_no_harm() -> None:
     facts = {"command": f"locatk solve {EVIL}", "source": EVIL, "other": EVIL}
-    notes = (EVIL,)
-    subject = replace(judged(solution(EVIL, notes=notes), facts=facts), name=EVIL)
+    warnings = (SolverWarning("test", EVIL),)
+    subject = replace(judged(solution(EVIL, warnings=warnings), facts=facts), name=EVIL)
     page = render([subject, subject])
     assert "<img" not in page
     assert page.lower().count("</script>") == page.count("<script")
@@ -257,13 +261,15 @@ def test_devices_without_truth_are_named() -> None:
 
 def test_facts_have_units_and_no_lists_for_programs() -> None:
     facts = {"speed_mps": 0.5, "frames": [{"x": k} for k in range(200)], "robots": {"a": {"n": 1}}}
-    subject = Subject("a", solution("red", facts=facts), facts={"options_sha256": "00"})
+    subject = Subject(
+        "a", solution("red", facts=GenericRecord(facts)), facts={"options_sha256": "00"}
+    )
     assert dict(figure(subject, "What the solver tells").table.rows) == {
         "speed [m/s]": "0.5",
         "robots: a: n": "1",
     }
     assert "options" not in texts(subject)
-    only = Subject("a", solution("red", facts={"frames": [{}] * 200}))
+    only = Subject("a", solution("red", facts=GenericRecord({"frames": [{}] * 200})))
     assert "What the solver tells" not in [panel.title for panel in panels(only)]
 
 

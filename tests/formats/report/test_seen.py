@@ -15,9 +15,12 @@ import pytest
 
 pytest.importorskip("plotly")
 
-from locatk.core.landmarks.detections import detection
+from locatk.core.dots.results import DotFacts, FrameOutcome
+from locatk.core.landmarks.results import describe_visit
 from locatk.core.landmarks.sighting import Sighting
-from locatk.core.solution import Solution
+from locatk.core.lighthouse.results import StationDetection
+from locatk.core.polaris.results import MagnetDetection, TagDetection
+from locatk.core.solution import GenericRecord, Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import seen_text
 from locatk.formats.report import seen, seen_reasons
@@ -140,16 +143,9 @@ def path(device: str, poses: int) -> Trajectory:
     )
 
 
-def station(channel: int, **more: Any) -> dict[str, Any]:
-    return {
-        "station": channel - 1,
-        "channel": channel,
-        "id": None,
-        "period_ticks": 959000,
-        "calibration": "generic",
-        "sweeps": 90,
-        "rejected": 6,
-    } | more
+def station(channel: int, **more: Any) -> StationDetection:
+    known: dict[str, Any] = {"id": None, "period_ticks": 959000, "calibration": "generic"}
+    return StationDetection(channel - 1, channel, sweeps=90, rejected=6, **(known | more))
 
 
 LIGHTHOUSE = Solution(
@@ -157,7 +153,7 @@ LIGHTHOUSE = Solution(
     "bundle",
     (path("robot", 40),),
     {"spike": 8, "moment_inconsistent": 3, "station_contradicts_others": 5, "plane_unknown": 0},
-    [station(1), station(2, residual_rad=1.5e-4, id="0a0b0c0d")],
+    (station(1), station(2, residual_rad=1.5e-4, id="0a0b0c0d")),
 )
 
 
@@ -201,24 +197,24 @@ def test_reasons_of_other_systems_are_shown_without_a_sentence() -> None:
 
 
 def test_frames_are_counted_by_what_became_of_them() -> None:
-    frames = [
-        {
-            "time_s": k * 0.1,
-            "frame": str(k),
-            "dots": 100 + k,
-            "corrected_bits": k,
-            "confidence": 1.0 if k < 8 else float("nan"),
-            "rejected": None if k < 8 else "no_grid",
-        }
+    frames = tuple(
+        FrameOutcome(
+            time_s=k * 0.1,
+            frame=str(k),
+            dots=100 + k,
+            corrected_bits=k,
+            confidence=1.0 if k < 8 else float("nan"),
+            rejected=None if k < 8 else "no_grid",
+        )
         for k in range(10)
-    ]
+    )
     solution = Solution(
         "dots",
         "lattice",
         (path("camera", 8),),
         {"no_grid": 2},
         frames[:8],
-        facts={"frames": frames},
+        facts=DotFacts(frames),
     )
     saw, rejected = seen.panels(solution)
     assert saw.table is not None
@@ -233,25 +229,36 @@ def test_frames_are_counted_by_what_became_of_them() -> None:
     assert rejected.table.rows[0][2] == "20 % of 10 frames"
 
 
-def tag(**more: Any) -> dict[str, Any]:
-    return {
-        "time_s": 1.0,
-        "device": "bar",
-        "tag_id": 7,
-        "margin": 0.9,
-        "magnets": [{}] * 5,
-        "x_m": 0.0123,
-        "y_m": None,
-        "heading_rad": 0.1,
-        "sigma_x_m": float("nan"),
-        "sigma_y_m": 1e-4,
-        "sigma_heading_rad": 1e-3,
-        "refused": None,
-    } | more
+TAG = TagDetection(
+    time_s=1.0,
+    device="bar",
+    tag_id=7,
+    margin=0.9,
+    refused=None,
+    x_m=0.0123,
+    y_m=None,
+    heading_rad=0.1,
+    sigma_x_m=float("nan"),
+    sigma_y_m=1e-4,
+    sigma_heading_rad=1e-3,
+    array_pose=None,
+    magnets=(MagnetDetection(0.0, 0.0, 0.0, None, None, 1e-4, 1e-4, 1e-2, 1e-3),) * 5,
+    residual_sigma=1.0,
+    height_m=0.01,
+    speed_mps=0.1,
+    scale=1.0,
+    corrected=0,
+    erased=0,
+    other_sources=0,
+)
+
+
+def tag(**more: Any) -> TagDetection:
+    return replace(TAG, **more)
 
 
 def test_many_tags_are_listed_in_part() -> None:
-    found = [tag(tag_id=None, refused="magnets_missing", margin=None), *(tag() for _ in range(99))]
+    found = (tag(tag_id=None, refused="magnets_missing", margin=None), *(tag() for _ in range(99)))
     saw, rejected = seen.panels(Solution("polaris", "joint", (), {"magnets_missing": 1}, found))
     assert "99 of 100 passes" in saw.note
     assert f"The first {seen.MOST_ROWS} are listed" in saw.note
@@ -263,15 +270,15 @@ def test_many_tags_are_listed_in_part() -> None:
     assert saw.figure is not None
     assert rejected.table is not None
     assert rejected.table.rows[0][2] == "1 % of 100 passes"
-    few, _ = seen.panels(Solution("polaris", "joint", (), {}, [tag()]))
+    few, _ = seen.panels(Solution("polaris", "joint", (), {}, (tag(),)))
     assert few.figure is None
 
 
 def test_a_refused_visit_of_the_solver_is_listed() -> None:
-    told = detection(
+    told = describe_visit(
         Sighting("robot", 10**18, 0, 9, np.zeros(3), (), refused="too_weak"), None, None
     )
-    saw, rejected = seen.panels(Solution("landmarks", "field", (), {"too_weak": 1}, [told]))
+    saw, rejected = seen.panels(Solution("landmarks", "field", (), {"too_weak": 1}, (told,)))
     assert saw.table is not None
     assert saw.table.rows[0][:4] == ("01:46:40.000", "-", "-", "0.0")
     assert saw.table.rows[0][-1] == "too weak"
@@ -280,12 +287,11 @@ def test_a_refused_visit_of_the_solver_is_listed() -> None:
     assert rejected.table.rows[0][2] == "100 % of 1 visit"
 
 
-def test_detections_of_other_tools_are_no_traceback() -> None:
-    for system in seen_reasons.SYSTEMS:
-        for odd in ({"a": 1}, {"sweeps": "x", "rejected": []}):
-            saw, rejected = seen.panels(Solution(system, "x", (), {"spike": 1}, [odd]))
-            assert saw.note
-            assert rejected.note
+def test_detections_of_unknown_systems_are_counted() -> None:
+    detections = (GenericRecord({"a": 1}), GenericRecord({"sweeps": "x", "rejected": []}))
+    saw, rejected = seen.panels(Solution("sonar", "x", (), {"spike": 1}, detections))
+    assert saw.note == "2 detections of sonar."
+    assert rejected.note
 
 
 def test_words_of_tables() -> None:

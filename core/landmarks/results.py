@@ -1,0 +1,179 @@
+"""Typed results of the landmarks solver: detections of landmarks, and facts of a run.
+
+The names of JSON keys are stable (docs/formats.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from locatk.core.landmarks.built import laid_code
+from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.globalize import HALF_PI, Located
+from locatk.core.landmarks.landmark import pattern, rotated
+from locatk.core.landmarks.sighting import Sighting
+
+MIN_CELL_PROBABILITY = 0.8
+"""Posterior probability of a cell of the map from which on it is reported [1]."""
+
+
+@dataclass(frozen=True)
+class LandmarkDetection:
+    """One visit of a robot to one landmark.
+
+    Attributes
+    ----------
+    time_s : float
+        Last time at which the robot was within 5 mm of its closest approach.
+    device : str
+        Name of the robot.
+    cell : (row, column) or None
+        Cell of the map; None if it is not known.
+    pattern : str or None
+        One of the paper's six patterns; None if nothing was read.
+    code : int or None
+        0 to 15: orientation of the four bars as on the map if the cell is known, else in the
+        frame of the robot.
+    probability : float
+        Posterior probability of the code, from this visit alone.
+    x_m, y_m, heading_rad : float or None
+        Pose of the robot in the frame of the landmark at ``time_s``. Its axes are parallel to
+        those of the map if the cell is known, else rotated by quarter turns so that the heading
+        is nearest to 0. None if nothing was read.
+    sigma_x_m, sigma_y_m, sigma_heading_rad : float or None
+        Standard deviations; nan if the method does not estimate them.
+    strength : tuple of float, or None
+        Signed strengths of the four bars; 1 is nominal.
+    residual_sigma : float
+        Rms residual of the samples in standard deviations of the noise; nan if the method has
+        no model of the samples.
+    refused : str
+        Machine-readable reason for which the visit is not used; ``""`` if it is.
+    """
+
+    time_s: float
+    device: str
+    cell: Cell | None
+    pattern: str | None
+    code: int | None
+    probability: float
+    x_m: float | None
+    y_m: float | None
+    heading_rad: float | None
+    sigma_x_m: float | None
+    sigma_y_m: float | None
+    sigma_heading_rad: float | None
+    strength: tuple[float, ...] | None
+    residual_sigma: float
+    refused: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotFacts:
+    """Localization of one robot on the map.
+
+    Attributes
+    ----------
+    localised : bool
+        Whether the robot has poses on the map.
+    probability : float, optional
+        Posterior probability of the least certain cell that is reported, or of the most certain
+        one if none is; unknown with ``--method paper``.
+    landmarks_seen : int
+        Landmarks that were read.
+    landmarks_to_localise : int or None
+        Number of the landmark at which the cell became certain; None if it never did, or with
+        ``--method paper``. Written as null; earlier versions left it out with that method.
+    misfit_sigma : float, optional
+        Rms residual of all fields after smoothing, in standard deviations.
+    """
+
+    localised: bool
+    probability: float | None = None
+    landmarks_seen: int
+    landmarks_to_localise: int | None = field(default=None, metadata={"json_null": True})
+    misfit_sigma: float | None = None
+
+
+@dataclass(frozen=True)
+class LandmarkFacts:
+    """Figures of a run of the landmarks solver.
+
+    Attributes
+    ----------
+    robots : dict of str to RobotFacts
+        By device.
+    """
+
+    robots: dict[str, RobotFacts] = field(default_factory=dict)
+
+
+def describe_visit(
+    sighting: Sighting, located: Located | None, floor: FloorMap | None
+) -> LandmarkDetection:
+    """Return the detection that reports one visit.
+
+    Parameters
+    ----------
+    sighting : Sighting
+        Hypotheses of the visit, or the reason why there is none.
+    located : Located or None
+        Its cell on the map, if it is known.
+    floor : FloorMap or None
+        The map; it tells misread landmarks and cells without one.
+    """
+    unread = LandmarkDetection(
+        time_s=sighting.time_ns * 1e-9,
+        device=sighting.device,
+        cell=None,
+        pattern=None,
+        code=None,
+        probability=0.0,
+        x_m=None,
+        y_m=None,
+        heading_rad=None,
+        sigma_x_m=None,
+        sigma_y_m=None,
+        sigma_heading_rad=None,
+        strength=None,
+        residual_sigma=sighting.residual_sigma,
+        refused=sighting.refused,
+    )
+    if not sighting.hypotheses:
+        return unread
+    best, cell, quarters, refused = sighting.best, None, 0, sighting.refused
+    if located is not None and located.probability >= MIN_CELL_PROBABILITY:
+        best = sighting.hypotheses[located.hypothesis]
+        cell, quarters = located.cell, located.quarters
+        if floor is not None:
+            laid = laid_code(floor, located.cell)
+            if laid == HOLE:
+                cell = None
+                refused = "off_map"
+            elif laid != rotated(best.code, quarters):
+                refused = "misread"
+    elif floor is not None and not sighting.refused:
+        refused = "not_localised"
+    code = int(rotated(best.code, quarters))
+    rotation = quarters * HALF_PI
+    cos, sin = np.cos(rotation), np.sin(rotation)
+    x, y, heading = best.pose
+    sigma = np.sqrt(np.diag(best.covariance))
+    sigma_x, sigma_y = np.abs([[cos, -sin], [sin, cos]]) @ sigma[:2]
+    return replace(
+        unread,
+        cell=cell,
+        pattern=pattern(code),
+        code=code,
+        probability=sum(h.probability for h in sighting.hypotheses if h.code == best.code),
+        x_m=float(cos * x - sin * y),
+        y_m=float(sin * x + cos * y),
+        heading_rad=float(np.remainder(heading + rotation + np.pi, 2 * np.pi) - np.pi),
+        sigma_x_m=float(sigma_x),
+        sigma_y_m=float(sigma_y),
+        sigma_heading_rad=float(sigma[2]),
+        strength=tuple(float(v) for v in np.roll(best.strength, quarters)),
+        refused=refused,
+    )
