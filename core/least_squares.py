@@ -240,11 +240,20 @@ class DenseEquations:
         cls, residual: Array, jacobian: Array, weight: Array, cost: Array
     ) -> DenseEquations:
         """Build the equations from residuals (m, n), Jacobians (m, n, p) and weights (m, n)."""
-        root = np.sqrt(weight)[..., None]
-        weighted = jacobian * root
-        transposed = np.swapaxes(weighted, -1, -2)
-        gradient = (transposed @ (residual[..., None] * root))[..., 0]
-        return cls(cost, gradient, transposed @ weighted, residual)
+        root = np.sqrt(weight)
+        return cls.from_weighted(residual, residual * root, jacobian * root[..., None], cost)
+
+    @classmethod
+    def from_weighted(
+        cls, residual: Array, weighted: Array, jacobian: Array, cost: Array
+    ) -> DenseEquations:
+        """Build the equations from residuals and Jacobians times the roots of their weights.
+
+        ``residual`` (m, n) is kept as it is, before weighting.
+        """
+        transposed = np.swapaxes(jacobian, -1, -2)
+        gradient = (transposed @ weighted[..., None])[..., 0]
+        return cls(cost, gradient, transposed @ jacobian, residual)
 
     def add_prior(self, parameters: slice, deviation: Array, sigma: Array) -> None:
         """Add a Gaussian prior on some parameters.

@@ -16,7 +16,7 @@ from locatk.core.least_squares import Indices, SchurEquations, SchurStep, cauchy
 from locatk.core.lighthouse.calibration import predict_with_gradient
 from locatk.core.lighthouse.devices.pose_fit import (
     RATE,
-    SPEED_SIGMA,
+    RATE_SIGMA,
     UNREACHABLE_RESIDUAL,
     DeviceStates,
     Stations,
@@ -60,48 +60,48 @@ class DeviceAdjustment:
 
 
 def adjust_devices(
-    looks: SweepObservations,
+    observations: SweepObservations,
     stations: Stations,
     poses: DeviceStates,
     *,
-    sigma: float,
-    soft: float,
-    share: Array,
+    sigma_rad: float,
+    loss_scale_rad: float,
+    epoch_weight: Array,
     calibrate: NDArray[np.bool_],
-    iterations: int = 40,
+    max_iterations: int = 40,
 ) -> DeviceAdjustment:
     """Refine stations and device states so that they predict the observed angles.
 
     Parameters
     ----------
-    looks : SweepObservations
+    observations : SweepObservations
     stations : Stations
         Initial guess; the first station stays where it is.
     poses : DeviceStates
         Initial guess.
-    sigma : float
+    sigma_rad : float
         Standard deviation of an angle in radians.
-    soft : float
+    loss_scale_rad : float
         Residual in radians at which the weight of a sweep is one half (Cauchy loss).
-    share : (m,) ndarray
+    epoch_weight : (m,) ndarray
         Weight of each epoch, 0 to 1: epochs at one position repeat each other's errors.
     calibrate : (s,) bool ndarray
         Stations of which tilts and phases are estimated, with their spread over units as prior.
-    iterations : int
+    max_iterations : int
         Maximum number of iterations.
     """
     free = free_parameters(calibrate)
     free[0, :6] = False
-    problem = _DeviceBundle(looks, sigma, soft / sigma, share, free)
+    problem = _DeviceBundle(observations, sigma_rad, loss_scale_rad / sigma_rad, epoch_weight, free)
     minimum = minimize(
-        problem, _BundledDevices(stations, poses), damping=1e-4, max_iterations=iterations
+        problem, _BundledDevices(stations, poses), damping=1e-4, max_iterations=max_iterations
     )
     equations: SchurEquations = minimum.equations
     blocks = station_blocks(equations.covariance(), len(calibrate))
     return DeviceAdjustment(
         minimum.state.stations,
         minimum.state.poses,
-        np.where(looks.seen, equations.residual * sigma, np.nan),
+        np.where(observations.is_observed, equations.residual * sigma_rad, np.nan),
         blocks[:, :6, :6],
         int(minimum.iterations[0]),
     )
@@ -130,7 +130,7 @@ class _DeviceBundle:
     def linearize(self, state: _BundledDevices, _: Indices) -> SchurEquations:
         observations, weights = self.observations, self.epoch_weight
         residual, by_pose, by_station = self._residuals(state)
-        observed = observations.seen
+        observed = observations.is_observed
         unreachable = observed & ~np.isfinite(residual)
         residual = np.where(unreachable, UNREACHABLE_RESIDUAL, np.nan_to_num(residual))
         loss, weight = cauchy_loss(residual, self.loss_scale)
@@ -142,10 +142,10 @@ class _DeviceBundle:
         transposed = np.swapaxes(by_pose, -1, -2)
         block_hessian, block_gradient = transposed @ by_pose, (transposed @ weighted)[..., 0]
         rate_index = range(RATE.start, RATE.stop)
-        block_hessian[:, rate_index, rate_index] += weights[:, None] * SPEED_SIGMA**-2
-        block_gradient[:, RATE] += weights[:, None] * state.poses.rate / SPEED_SIGMA**2
+        block_hessian[:, rate_index, rate_index] += weights[:, None] * RATE_SIGMA**-2
+        block_gradient[:, RATE] += weights[:, None] * state.poses.rate / RATE_SIGMA**2
         epoch_cost = np.sum(loss, axis=1, where=observed)
-        epoch_cost = epoch_cost + 0.5 * np.sum((state.poses.rate / SPEED_SIGMA) ** 2, axis=1)
+        epoch_cost = epoch_cost + 0.5 * np.sum((state.poses.rate / RATE_SIGMA) ** 2, axis=1)
 
         m, s, n = len(observations), len(self.free), STATION_PARAMETERS
         hessian, gradient = np.zeros((s, n, s, n)), np.zeros((s, n))
@@ -182,7 +182,7 @@ class _DeviceBundle:
         residual, by_position = np.full(shape, np.nan), np.zeros((*shape, 3))
         by_station = np.zeros((*shape, STATION_PARAMETERS))
         for i, calibration in enumerate(calibrations):
-            of_station = observations.seen & (observations.station == i)
+            of_station = observations.is_observed & (observations.station == i)
             offset = position[of_station] - positions[i]
             angles, gradient, by_tilt = predict_with_gradient(offset @ rotations[i], calibration)
             rows, plane = np.arange(len(offset)), observations.plane[of_station]
@@ -192,7 +192,9 @@ class _DeviceBundle:
                 by_position[of_station], offset, by_tilt[rows, plane], plane
             )
         by_pose = np.concatenate([by_position, np.cross(lever_arm, by_position)], axis=-1)
-        by_pose = np.concatenate([by_pose, by_pose * observations.since_s[..., None]], axis=-1)
+        by_pose = np.concatenate(
+            [by_pose, by_pose * observations.time_offset_s[..., None]], axis=-1
+        )
         return residual / self.sigma_rad, by_pose / self.sigma_rad, by_station / self.sigma_rad
 
     def retract(self, state: _BundledDevices, step: SchurStep) -> _BundledDevices:

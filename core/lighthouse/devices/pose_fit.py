@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
 from locatk.core.least_squares import DenseEquations, Indices, cauchy_loss, minimize
-from locatk.core.lighthouse.calibration import Calibration, predict_with_gradient
+from locatk.core.lighthouse.calibration import Calibration, predict_angles, predict_with_gradient
 
 Array = NDArray[np.float64]
 Stations = tuple[Array, Array, tuple[Calibration, ...]]
 """Positions (s, 3), rotations (s, 3, 3) station to frame, and calibrations."""
 
-SPEED_SIGMA = np.repeat([2.0, 10.0], 3)
+RATE_SIGMA = np.repeat([2.0, 10.0], 3)
 """Standard deviations of the prior on velocity [m/s] and angular velocity [rad/s]: what a hand or
 a drone gives a device. They keep a velocity near zero that the sweeps do not determine."""
 
@@ -36,33 +36,34 @@ device over."""
 MIN_STEP = 1e-8
 """Norm of a step (m, rad, m/s, rad/s) below which a pose has converged."""
 
-POSE, RATE = slice(0, 6), slice(6, 12)
-"""Ranges of the twelve unknowns: translation and rotation vector; velocity and angular velocity."""
+RATE = slice(6, 12)
+"""Range of velocity and angular velocity in the twelve unknowns; before them are translation and
+rotation vector."""
 
 
 @dataclass(frozen=True)
 class SweepObservations:
-    """Sweeps by epoch: (m, n) each, padded where ``seen`` is False.
+    """Sweeps by epoch: (m, n) each, padded where ``is_observed`` is False.
 
     Attributes
     ----------
-    place : (m, n, 3) ndarray
+    sensor_position : (m, n, 3) ndarray
         Position of the photodiode in the device's axes, in metres.
     station, plane : (m, n) int ndarray
         Column of the station, and number of its light plane.
     angle : (m, n) ndarray
         Observed rotor angle in radians.
-    since_s : (m, n) ndarray
+    time_offset_s : (m, n) ndarray
         Time of the sweep minus the time of the epoch, in seconds.
-    seen : (m, n) bool ndarray
+    is_observed : (m, n) bool ndarray
     """
 
-    place: Array
+    sensor_position: Array
     station: NDArray[np.int64]
     plane: NDArray[np.int64]
     angle: Array
-    since_s: Array
-    seen: NDArray[np.bool_]
+    time_offset_s: Array
+    is_observed: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.angle)
@@ -145,54 +146,51 @@ class PoseFit:
 
 
 def fit_poses(
-    looks: SweepObservations,
+    observations: SweepObservations,
     stations: Stations,
     start: DeviceStates,
     *,
-    sigma: float,
-    soft: float | Array,
-    rates: bool = True,
-    iterations: int = 30,
-    settled: float = 1e-4,
-    lost: float = np.inf,
+    sigma_rad: float,
+    loss_scale_rad: float | Array,
+    max_iterations: int = 30,
+    tolerance: float = 1e-4,
+    cutoff_rad: float = np.inf,
 ) -> PoseFit:
     """Fit the state of a device at each epoch to the angles of its sweeps.
 
     Parameters
     ----------
-    looks : SweepObservations
+    observations : SweepObservations
     stations : Stations
     start : DeviceStates
         Initial guess.
-    sigma : float
+    sigma_rad : float
         Standard deviation of an angle in radians.
-    soft : float or (m,) ndarray
+    loss_scale_rad : float or (m,) ndarray
         Residual in radians at which the weight of a sweep is one half (Cauchy loss).
-    rates : bool
-        Estimate velocities. False for devices at rest, and for epochs too short to tell.
-    iterations : int
+    max_iterations : int
         Maximum number of iterations.
-    settled : float
+    tolerance : float
         A pose has converged when a step lowers its cost by less than this fraction. The next
         step would gain about the square of it.
-    lost : float
+    cutoff_rad : float
         Residual in radians beyond which a sweep has no weight at all: a hundred sweeps of a
         displaced station bias a pose, however small the weight of each. The initial guess must
         be better than this.
     """
-    width = np.broadcast_to(np.asarray(soft) / sigma, len(looks))[:, None]
-    problem = _PoseProblem(looks, stations, sigma, width, rates, lost / sigma)
+    width = np.broadcast_to(np.asarray(loss_scale_rad) / sigma_rad, len(observations))[:, None]
+    problem = _PoseProblem(observations, stations, sigma_rad, width, cutoff_rad / sigma_rad)
     minimum = minimize(
         problem,
         start,
-        len(looks),
+        len(observations),
         damping=1e-4,
-        max_iterations=iterations,
-        min_gain=settled,
+        max_iterations=max_iterations,
+        min_gain=tolerance,
         min_step=MIN_STEP,
     )
     equations: DenseEquations = minimum.equations
-    residual = np.where(looks.seen, equations.residual * sigma, np.nan)
+    residual = np.where(observations.is_observed, equations.residual * sigma_rad, np.nan)
     return PoseFit(minimum.state, residual, equations.hessian, equations.cost)
 
 
@@ -207,34 +205,26 @@ class _PoseProblem:
     stations: Stations
     sigma_rad: float
     loss_scale: Array
-    estimate_rates: bool
     cutoff: float
 
     def linearize(self, state: DeviceStates, epochs: Indices) -> DenseEquations:
         everything = len(epochs) == len(self.observations)
         observations = self.observations if everything else self.observations.take(epochs)
         residual, by_pose = linearize(observations, self.stations, state)
-        residual, by_pose = residual / self.sigma_rad, by_pose / self.sigma_rad
-        observed = observations.seen
+        observed = observations.is_observed
         unreachable = observed & ~np.isfinite(residual)
-        residual = np.where(unreachable, UNREACHABLE_RESIDUAL, np.nan_to_num(residual))
+        residual = np.nan_to_num(residual) / self.sigma_rad
+        residual[unreachable] = UNREACHABLE_RESIDUAL
         loss, weight = cauchy_loss(residual, self.loss_scale[epochs], self.cutoff)
-        weight = np.where(observed & ~unreachable, weight, 0.0)
+        root = np.where(observed & ~unreachable, np.sqrt(weight), 0.0)
         cost = np.sum(loss, axis=1, where=observed)
-        by_pose = np.nan_to_num(by_pose)
-        if self.estimate_rates:
-            by_rate = by_pose * observations.since_s[..., None]
-            jacobian = np.concatenate([by_pose, by_rate], axis=-1)
-            equations = DenseEquations.from_residuals(residual, jacobian, weight, cost)
-            equations.add_prior(RATE, state.rate, SPEED_SIGMA)
-            return equations
-        equations = DenseEquations.from_residuals(residual, by_pose, weight, cost)
-        # The rates stay at zero: an identity block keeps the equations solvable.
-        hessian = np.tile(np.eye(12), (len(epochs), 1, 1))
-        hessian[:, POSE, POSE] = equations.hessian
-        gradient = np.zeros((len(epochs), 12))
-        gradient[:, POSE] = equations.gradient
-        return DenseEquations(cost, gradient, hessian, residual)
+        by_pose = np.nan_to_num(by_pose) * (root / self.sigma_rad)[..., None]
+        weighted = residual * root
+        by_rate = by_pose * observations.time_offset_s[..., None]
+        jacobian = np.concatenate([by_pose, by_rate], axis=-1)
+        equations = DenseEquations.from_weighted(residual, weighted, jacobian, cost)
+        equations.add_prior(RATE, state.rate, RATE_SIGMA)
+        return equations
 
     def retract(self, state: DeviceStates, step: Array) -> DeviceStates:
         angle = np.linalg.norm(step[:, 3:6], axis=1, keepdims=True)
@@ -243,8 +233,26 @@ class _PoseProblem:
         )
 
 
+def angle_residuals(
+    observations: SweepObservations, stations: Stations, poses: DeviceStates
+) -> Array:
+    """Return predicted minus observed angles (m, n) in radians.
+
+    They are ``nan`` if not observed, or if no light plane meets the photodiode.
+    """
+    _, position = photodiode_positions(observations, poses)
+    residual = np.full(observations.angle.shape, np.nan)
+    for i, calibration in enumerate(stations[2]):
+        of_station = observations.is_observed & (observations.station == i)
+        local = (position[of_station] - stations[0][i]) @ stations[1][i]
+        angles = predict_angles(local, calibration)
+        plane = observations.plane[of_station]
+        residual[of_station] = angles[np.arange(len(local)), plane] - observations.angle[of_station]
+    return residual
+
+
 def linearize(
-    looks: SweepObservations, stations: Stations, poses: DeviceStates
+    observations: SweepObservations, stations: Stations, poses: DeviceStates
 ) -> tuple[Array, Array]:
     """Return residuals and their derivatives by the pose of the device.
 
@@ -257,24 +265,26 @@ def linearize(
         for those at the epoch: a device rotates little within a rotation of the station, and the
         derivatives only have to point downhill.
     """
-    lever_arm, position = photodiode_positions(looks, poses)
-    residual = np.full(looks.angle.shape, np.nan)
-    by_position = np.full((*looks.angle.shape, 3), np.nan)
+    lever_arm, position = photodiode_positions(observations, poses)
+    residual = np.full(observations.angle.shape, np.nan)
+    by_position = np.full((*observations.angle.shape, 3), np.nan)
     for i, calibration in enumerate(stations[2]):
-        of_station = looks.seen & (looks.station == i)
+        of_station = observations.is_observed & (observations.station == i)
         if not np.any(of_station):
             continue
         rotation = stations[1][i]
         local = (position[of_station] - stations[0][i]) @ rotation
         angles, gradient, _ = predict_with_gradient(local, calibration)
-        rows, plane = np.arange(len(local)), looks.plane[of_station]
-        residual[of_station] = angles[rows, plane] - looks.angle[of_station]
+        rows, plane = np.arange(len(local)), observations.plane[of_station]
+        residual[of_station] = angles[rows, plane] - observations.angle[of_station]
         by_position[of_station] = gradient[rows, plane] @ rotation.T
     by_rotation = np.cross(lever_arm, by_position)
     return residual, np.concatenate([by_position, by_rotation], axis=-1)
 
 
-def photodiode_positions(looks: SweepObservations, poses: DeviceStates) -> tuple[Array, Array]:
+def photodiode_positions(
+    observations: SweepObservations, poses: DeviceStates
+) -> tuple[Array, Array]:
     """Return the photodiodes at the times of their sweeps.
 
     Returns
@@ -282,8 +292,8 @@ def photodiode_positions(looks: SweepObservations, poses: DeviceStates) -> tuple
     lever_arm, position : (m, n, 3) ndarray
         From the device to the photodiode, and in the frame; both in the frame's axes.
     """
-    lever_arm = looks.place @ np.swapaxes(poses.rotation, -1, -2)
-    since = looks.since_s[..., None]
+    lever_arm = observations.sensor_position @ np.swapaxes(poses.rotation, -1, -2)
+    since = observations.time_offset_s[..., None]
     if np.any(poses.rate):
         lever_arm = _rotated(lever_arm, poses.rate[:, None, 3:] * since)
     return lever_arm, poses.position[:, None] + poses.rate[:, None, :3] * since + lever_arm

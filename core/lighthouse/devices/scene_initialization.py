@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
+from locatk.core.least_squares import cauchy_loss
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD, Calibration
 from locatk.core.lighthouse.devices.bundle_adjustment import adjust_devices
 from locatk.core.lighthouse.devices.device_sweeps import (
@@ -36,9 +37,11 @@ from locatk.core.lighthouse.devices.device_sweeps import (
 )
 from locatk.core.lighthouse.devices.pnp import candidate_poses
 from locatk.core.lighthouse.devices.pose_fit import (
+    UNREACHABLE_RESIDUAL,
     DeviceStates,
     Stations,
     SweepObservations,
+    angle_residuals,
     fit_poses,
 )
 from locatk.core.lighthouse.devices.tracking import (
@@ -279,9 +282,9 @@ def estimate_station_poses(
             replace(observations, station=np.zeros_like(observations.station)),
             (np.zeros((1, 3)), np.eye(3)[None], (calibration,)),
             DeviceStates.at_rest(np.stack(positions), np.stack(rotations)),
-            sigma=ANGLE_SIGMA_RAD,
-            soft=LOSS_SCALE_RAD,
-            iterations=15,
+            sigma_rad=ANGLE_SIGMA_RAD,
+            loss_scale_rad=LOSS_SCALE_RAD,
+            max_iterations=15,
         )
         is_in_front = fit.poses.position[:, 0] > 0
         accepted = is_accepted(observations, fit.residual) & is_in_front
@@ -457,7 +460,14 @@ def _stack_observations(parts: list[SweepObservations]) -> SweepObservations:
     return SweepObservations(
         *(
             np.concatenate([pad(getattr(p, name)) for p in parts])
-            for name in ("place", "station", "plane", "angle", "since_s", "seen")
+            for name in (
+                "sensor_position",
+                "station",
+                "plane",
+                "angle",
+                "time_offset_s",
+                "is_observed",
+            )
         )
     )
 
@@ -480,7 +490,7 @@ def _adjust_scene(
     observations = replace(
         observations,
         station=column[observations.station],
-        seen=observations.seen & (column[observations.station] >= 0),
+        is_observed=observations.is_observed & (column[observations.station] >= 0),
     )
     epochs, states, station_count = _initial_states(observations, poses, stations, column)
     observations = observations.take(epochs)
@@ -498,14 +508,14 @@ def _adjust_scene(
     sigma = MODEL_SIGMA_RAD if np.any(is_generic) else 2 * ANGLE_SIGMA_RAD
     adjusted = adjust_devices(
         observations, stations, states,
-        sigma=sigma, soft=LOSS_SCALE_RAD, share=weight, calibrate=is_generic,
+        sigma_rad=sigma, loss_scale_rad=LOSS_SCALE_RAD, epoch_weight=weight, calibrate=is_generic,
     )  # fmt: skip
     # A second adjustment uses the noise that the residuals of the first one show.
     sigma = max(ANGLE_SIGMA_RAD, robust_sigma(adjusted.residual))
     loss_scale = min(LOSS_SCALE_SIGMAS * sigma, LOSS_SCALE_RAD)
     adjusted = adjust_devices(
         observations, adjusted.stations, adjusted.poses,
-        sigma=sigma, soft=loss_scale, share=weight, calibrate=is_generic,
+        sigma_rad=sigma, loss_scale_rad=loss_scale, epoch_weight=weight, calibrate=is_generic,
     )  # fmt: skip
     facts = LighthouseFacts(
         adjusted_epochs=len(observations),
@@ -563,27 +573,23 @@ def _initial_states(
         rotations @ poses.rotation[rows],
     )
     epoch = poses.epoch[rows]
-    evaluated = fit_poses(
-        observations.take(epoch),
-        stations,
-        start,
-        sigma=MODEL_SIGMA_RAD,
-        soft=INITIAL_LOSS_SCALE_RAD,
-        iterations=0,
-    )
-    order = np.lexsort((evaluated.cost, epoch))
+    residual = angle_residuals(observations.take(epoch), stations, start) / MODEL_SIGMA_RAD
+    is_observed = observations.is_observed[epoch]
+    residual = np.where(np.isfinite(residual), residual, UNREACHABLE_RESIDUAL)
+    loss, _ = cauchy_loss(residual, INITIAL_LOSS_SCALE_RAD / MODEL_SIGMA_RAD)
+    order = np.lexsort((np.sum(loss, axis=1, where=is_observed), epoch))
     best = order[np.r_[True, np.diff(epoch[order]) > 0]]
     observations = observations.take(epoch[best])
     fit = fit_poses(
         observations,
         stations,
         start.take(best),
-        sigma=MODEL_SIGMA_RAD,
-        soft=INITIAL_LOSS_SCALE_RAD,
+        sigma_rad=MODEL_SIGMA_RAD,
+        loss_scale_rad=INITIAL_LOSS_SCALE_RAD,
     )
     station_count = np.zeros(len(best), np.int64)
     for i in range(len(stations[2])):
-        station_count += np.any(observations.seen & (observations.station == i), axis=1)
+        station_count += np.any(observations.is_observed & (observations.station == i), axis=1)
     return epoch[best], fit.poses, station_count
 
 

@@ -43,6 +43,7 @@ from locatk.core.lighthouse.devices.pose_fit import (
     PoseFit,
     Stations,
     SweepObservations,
+    angle_residuals,
     fit_poses,
     photodiode_positions,
 )
@@ -84,6 +85,10 @@ SECOND_SEED_SPACING_EPOCHS = 25
 
 MAX_SECOND_SEEDS = 200
 """Maximum number of seeds in such gaps; each takes some milliseconds."""
+
+MAX_STATION_CANDIDATES = 3
+"""Candidates of a seed from one station that are refined on that station: those of all rays, and
+the best of a minimal set."""
 
 MAX_SEED_HYPOTHESES = 4
 """Candidates of a seed that are refined on all stations."""
@@ -365,42 +370,38 @@ def _solve_seed_batch(
     if not hypotheses:
         return
     owners, stations, positions, rotations = zip(*hypotheses, strict=True)
-    owner = np.array(owners)
+    owner, station = np.array(owners), np.array(stations)
+    poses = DeviceStates.at_rest(np.stack(positions), np.stack(rotations))
     observations = problem.observations(epochs).take(owner)
-    # Each candidate is first fitted to the station it comes from, now with rates. The truncated
-    # cost over all stations then selects the few that are worth a fit to all of them.
-    is_own_station = observations.station == np.array(stations)[:, None]
-    poses = fit_poses(
-        replace(observations, seen=observations.seen & is_own_station),
-        problem.stations,
-        DeviceStates.at_rest(np.stack(positions), np.stack(rotations)),
-        sigma=ANGLE_SIGMA_RAD,
-        soft=LOSS_SCALE_RAD,
-        settled=INITIAL_TOLERANCE,
-    ).poses
-    evaluated = fit_poses(
-        observations,
-        problem.stations,
-        poses,
-        sigma=ANGLE_SIGMA_RAD,
-        soft=LOSS_SCALE_RAD,
-        iterations=0,
+    own_station = observations.station == station[:, None]
+    own_observations = replace(observations, is_observed=observations.is_observed & own_station)
+    # Of the candidates of an epoch and a station, the few best are fitted to this station, now
+    # with rates; of all candidates of an epoch, the few best are then fitted to all stations.
+    best = _lowest_costs(
+        _initial_cost(problem, own_observations, poses),
+        owner * len(problem.stations[2]) + station,
+        MAX_STATION_CANDIDATES,
     )
-    cost = truncated_cost(evaluated.residual, observations.seen, INLIER_GATE_RAD)
-    order = np.lexsort((cost, owner))
-    rank = np.arange(len(order)) - np.searchsorted(owner[order], owner[order])
-    best = order[rank < MAX_SEED_HYPOTHESES]
-
+    owner, observations = owner[best], observations.take(best)
+    poses = fit_poses(
+        own_observations.take(best),
+        problem.stations,
+        poses.take(best),
+        sigma_rad=ANGLE_SIGMA_RAD,
+        loss_scale_rad=LOSS_SCALE_RAD,
+        tolerance=INITIAL_TOLERANCE,
+    ).poses
+    best = _lowest_costs(_initial_cost(problem, observations, poses), owner, MAX_SEED_HYPOTHESES)
     owner, observations = owner[best], observations.take(best)
     fit = fit_poses(
         observations,
         problem.stations,
         poses.take(best),
-        sigma=ANGLE_SIGMA_RAD,
-        soft=LOSS_SCALE_RAD,
+        sigma_rad=ANGLE_SIGMA_RAD,
+        loss_scale_rad=LOSS_SCALE_RAD,
     )
     accepted = is_accepted(observations, fit.residual)
-    cost = truncated_cost(fit.residual, observations.seen, MIN_INLIER_GATE_RAD)
+    cost = truncated_cost(fit.residual, observations.is_observed, MIN_INLIER_GATE_RAD)
     behind = from_behind_fraction(problem, epochs[owner], fit.poses)
     cost += FROM_BEHIND_COST * (behind > MAX_FROM_BEHIND_FRACTION)
     for i in np.unique(owner[accepted]):
@@ -410,6 +411,21 @@ def _solve_seed_batch(
         states.poses.put(epoch, fit.poses.take(rows[[choice]]))
         states.status[epoch], states.seed[epoch] = SOLVED, len(states.seed_margin)
         states.seed_margin.append(margin)
+
+
+def _initial_cost(
+    problem: TrackingProblem, observations: SweepObservations, poses: DeviceStates
+) -> Array:
+    """Return the truncated cost (m,) of poses, without fitting them."""
+    residual = angle_residuals(observations, problem.stations, poses)
+    return truncated_cost(residual, observations.is_observed, INLIER_GATE_RAD)
+
+
+def _lowest_costs(cost: Array, group: IntArray, count: int) -> IntArray:
+    """Return the indices of the ``count`` lowest costs of each group, in the order of groups."""
+    order = np.lexsort((cost, group))
+    rank = np.arange(len(order)) - np.searchsorted(group[order], group[order])
+    return order[rank < count]
 
 
 def _scene_candidates(
@@ -484,8 +500,8 @@ def from_behind_fraction(problem: TrackingProblem, epochs: IntArray, poses: Devi
     normal = problem.receiver.normal[problem.sweeps.sensor[sweep]]
     normal = normal @ np.swapaxes(poses.rotation, -1, -2)
     direction = positions - problem.stations[0][observations.station]
-    is_behind = is_lit_from_behind(direction, normal) & observations.seen
-    return np.asarray(np.sum(is_behind, axis=1) / np.sum(observations.seen, axis=1))
+    is_behind = is_lit_from_behind(direction, normal) & observations.is_observed
+    return np.asarray(np.sum(is_behind, axis=1) / np.sum(observations.is_observed, axis=1))
 
 
 def propagate(problem: TrackingProblem, states: EpochStates) -> None:
@@ -524,10 +540,10 @@ def _solve_from(
             observations,
             problem.stations,
             start.take(rows),
-            sigma=ANGLE_SIGMA_RAD,
-            soft=LOSS_SCALE_RAD,
-            settled=INITIAL_TOLERANCE,
-            lost=OUTLIER_CUTOFF_RAD,
+            sigma_rad=ANGLE_SIGMA_RAD,
+            loss_scale_rad=LOSS_SCALE_RAD,
+            tolerance=INITIAL_TOLERANCE,
+            cutoff_rad=OUTLIER_CUTOFF_RAD,
         )
         accepted[rows] = is_accepted(observations, fit.residual)
         states.poses.put(epochs[rows[accepted[rows]]], fit.poses.take(accepted[rows]))
@@ -538,7 +554,7 @@ def is_accepted(observations: SweepObservations, residual: Array) -> Mask:
     """Return for each epoch (m,) whether enough of its sweeps agree with the pose."""
     with np.errstate(invalid="ignore"):
         inliers = np.count_nonzero(np.abs(residual) < INLIER_GATE_RAD, axis=1)
-    number = np.count_nonzero(observations.seen, axis=1)
+    number = np.count_nonzero(observations.is_observed, axis=1)
     return np.asarray((inliers >= MIN_SWEEPS) & (inliers >= MIN_INLIER_FRACTION * number))
 
 
@@ -598,11 +614,7 @@ def _refine(
 ) -> TrackedDevice:
     """Fit all solved epochs again with the noise and the inlier gate that the residuals show."""
     solved = np.flatnonzero(states.status == SOLVED)
-    evaluated = _fit_epochs(
-        problem, states.poses, solved[::NOISE_EPOCH_STRIDE], ANGLE_SIGMA_RAD, LOSS_SCALE_RAD,
-        iterations=0,
-    )  # fmt: skip
-    noise = max(ANGLE_SIGMA_RAD, robust_sigma(evaluated.residual))
+    noise = max(ANGLE_SIGMA_RAD, robust_sigma(_residuals(problem, states, solved)))
     fit = _fit_epochs(
         problem, states.poses, solved, noise, LOSS_SCALE_SIGMAS * noise, iterations=10
     )
@@ -670,11 +682,11 @@ def _fit_epochs(
             observations,
             problem.stations,
             poses.take(batch),
-            sigma=sigma,
-            soft=loss_scale,
-            iterations=iterations,
-            settled=REFINED_TOLERANCE,
-            lost=OUTLIER_CUTOFF_RAD,
+            sigma_rad=sigma,
+            loss_scale_rad=loss_scale,
+            max_iterations=iterations,
+            tolerance=REFINED_TOLERANCE,
+            cutoff_rad=OUTLIER_CUTOFF_RAD,
         )
         residual = np.full((len(batch), width), np.nan)
         residual[:, : observations.angle.shape[1]] = fit.residual
@@ -687,6 +699,19 @@ def _fit_epochs(
         for name in ("residual", "information", "cost")
     )
     return PoseFit(states, residual, information, cost)
+
+
+def _residuals(problem: TrackingProblem, states: EpochStates, epochs: IntArray) -> Array:
+    """Return the residuals of a part of the epochs, enough to estimate their noise."""
+    parts = [np.zeros(0)]
+    sampled = epochs[::NOISE_EPOCH_STRIDE]
+    for k in range(0, len(sampled), EPOCHS_PER_BATCH):
+        batch = sampled[k : k + EPOCHS_PER_BATCH]
+        residual = angle_residuals(
+            problem.observations(batch), problem.stations, states.poses.take(batch)
+        )
+        parts.append(residual.ravel())
+    return np.concatenate(parts)
 
 
 def _closest_residuals(problem: TrackingProblem, epochs: IntArray, residual: Array) -> Array:

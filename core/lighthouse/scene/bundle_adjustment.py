@@ -83,7 +83,7 @@ class BundleAdjustment:
 
     Attributes
     ----------
-    rig : BundleState
+    state : BundleState
     residuals : (m, s, 2) ndarray
         Predicted minus observed angle in radians; ``nan`` if not observed.
     weights : (m, s, 2) ndarray
@@ -95,7 +95,7 @@ class BundleAdjustment:
         Half the robust sum of squares at the minimum.
     """
 
-    rig: BundleState
+    state: BundleState
     residuals: Array
     weights: Array
     station_covariance: Array
@@ -105,15 +105,15 @@ class BundleAdjustment:
 
 def adjust_bundle(
     angles: Array,
-    rig: BundleState,
+    state: BundleState,
     *,
-    sigma: float,
+    sigma_rad: float,
     planar: bool = False,
     fixed_points: bool = False,
     calibrate: bool = True,
-    independent: int = INDEPENDENT_POINTS,
-    soft: float = LOSS_SCALE_RAD,
-    iterations: int = 50,
+    independent_points: int = INDEPENDENT_POINTS,
+    loss_scale_rad: float = LOSS_SCALE_RAD,
+    max_iterations: int = 50,
 ) -> BundleAdjustment:
     """Refine stations and points so that they predict the observed angles.
 
@@ -121,9 +121,9 @@ def adjust_bundle(
     ----------
     angles : (m, s, 2) ndarray
         Observed rotor angles in radians; ``nan`` if a station was not observed.
-    rig : BundleState
+    state : BundleState
         Initial guess.
-    sigma : float
+    sigma_rad : float
         Standard deviation of an angle in radians.
     planar : bool
         Keep the z coordinate of all points.
@@ -132,37 +132,37 @@ def adjust_bundle(
     calibrate : bool
         Estimate tilts and phases of the stations without a factory calibration, with their
         spread over units as prior. A factory calibration is never changed.
-    independent : int
+    independent_points : int
         Number of points that carry independent information, at most.
-    soft : float
+    loss_scale_rad : float
         Residual in radians at which the weight of an angle is one half.
-    iterations : int
+    max_iterations : int
         Maximum number of iterations.
     """
     observed = np.isfinite(angles)
-    sigma = sigma * float(np.sqrt(max(1.0, len(angles) / independent)))
-    calibrated = [calibrate and c.source in ("generic", "estimated") for c in rig.calibrations]
+    sigma_rad = sigma_rad * float(np.sqrt(max(1.0, len(angles) / independent_points)))
+    calibrated = [calibrate and c.source in ("generic", "estimated") for c in state.calibrations]
     problem = _PointBundle(
         angles=np.where(observed, angles, 0.0),
         observed=observed,
-        sigma_rad=sigma,
-        loss_scale=soft / sigma,
+        sigma_rad=sigma_rad,
+        loss_scale=loss_scale_rad / sigma_rad,
         free=free_parameters(calibrated),
         dims=0 if fixed_points else 2 if planar else 3,
     )
     minimum = minimize(
         problem,
-        rig,
+        state,
         damping=1e-3,
-        max_iterations=iterations,
+        max_iterations=max_iterations,
         inner_iterations_after=None if fixed_points else INNER_ITERATIONS_AFTER,
     )
     equations: SchurEquations = minimum.equations
     return BundleAdjustment(
         minimum.state,
-        np.where(observed, equations.residual * sigma, np.nan),
+        np.where(observed, equations.residual * sigma_rad, np.nan),
         np.where(observed, equations.weight, np.nan),
-        station_blocks(equations.covariance(), len(rig.positions)),
+        station_blocks(equations.covariance(), len(state.positions)),
         int(minimum.iterations[0]),
         float(equations.cost[0]),
     )

@@ -243,12 +243,12 @@ def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
     adjustment = adjust_bundle(
         observed,
         BundleState(position[None], rotation[None], (calibration,), on_floor),
-        sigma=MODEL_SIGMA_RAD,
+        sigma_rad=MODEL_SIGMA_RAD,
         planar=True,
         fixed_points=True,
         calibrate=False,
     )
-    state = adjustment.rig
+    state = adjustment.state
     raised = replace(state, positions=state.positions + np.array([0.0, 0.0, floor_z]))
     framed = FramedState(raised, adjustment.station_covariance, floor_z, "markers", prior.frame)
     warnings = generic_calibration_warnings(epochs.channels.tolist(), state.calibrations)
@@ -286,7 +286,7 @@ def _estimate_stations_of(
     stations = list(estimate.stations)
     kept, rejected = select_stations(epochs, stations, "station_not_solved")
     framed = fix_gauge(
-        estimate.adjustment.rig,
+        estimate.adjustment.state,
         estimate.adjustment.station_covariance,
         estimate.planar,
         prior,
@@ -565,7 +565,7 @@ def _adjust_all(
             tuple(calibrations[k] for k in registered),
             estimates.position[chosen],
         ),
-        sigma=registration.sigma,
+        sigma_rad=registration.sigma,
         planar=planar,
     )
     facts = LighthouseFacts(

@@ -191,16 +191,16 @@ class StationRegistration:
             adjust_bundle(
                 self.angles[rows][:, [index]],
                 BundleState(position[None], rotation[None], (self.calibrations[index],), points),
-                sigma=self.sigma,
+                sigma_rad=self.sigma,
                 fixed_points=True,
             )
             for position, rotation in poses
         ]
         best = min(adjustments, key=lambda adjustment: adjustment.cost)
-        distance = np.median(np.linalg.norm(points - best.rig.positions[0], axis=1))
+        distance = np.median(np.linalg.norm(points - best.state.positions[0], axis=1))
         sigma = np.sqrt(max(float(np.trace(best.station_covariance[0, :3, :3])), 0.0))
         agrees = np.nanmedian(np.abs(best.residuals)) < INLIER_GATE_TAN
-        return best.rig if agrees and sigma < MAX_RELATIVE_SIGMA * distance else None
+        return best.state if agrees and sigma < MAX_RELATIVE_SIGMA * distance else None
 
     def _register_by_pairs(
         self,
@@ -292,11 +292,11 @@ class StationRegistration:
                 tuple(self.calibrations[k] for k in self.registered),
                 estimates.position[rows],
             ),
-            sigma=self.sigma,
+            sigma_rad=self.sigma,
             planar=self.planar,
-            iterations=REFINEMENT_ITERATIONS,
+            max_iterations=REFINEMENT_ITERATIONS,
         )
-        self._set(self.registered, adjustment.rig)
+        self._set(self.registered, adjustment.state)
 
     def _failure_reason(self, index: int, pair_of: PairOf) -> str:
         """Return why a station cannot be registered, as the end of a sentence about it."""

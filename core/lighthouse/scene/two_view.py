@@ -140,7 +140,7 @@ class StationPair:
     @property
     def state(self) -> BundleState:
         """Both stations, in the order of ``columns``."""
-        return self.adjustment.rig
+        return self.adjustment.state
 
     @property
     def relative_sigma(self) -> float:
@@ -548,12 +548,12 @@ def _choose_candidate(
         adjustment = adjust_bundle(
             angles[rows],
             subset,
-            sigma=sigma,
+            sigma_rad=sigma,
             planar=planar,
-            soft=1.0,
-            iterations=MAX_CANDIDATE_ITERATIONS,
+            loss_scale_rad=1.0,
+            max_iterations=MAX_CANDIDATE_ITERATIONS,
         )
-        roll = _total_roll(adjustment.rig.rotations) if planar else 0.0
+        roll = _total_roll(adjustment.state.rotations) if planar else 0.0
         refined.append((adjustment.cost, roll, adjustment))
         # In space only one arrangement fits, and many keyframes do not fit to the noise by chance.
         is_exact = np.sqrt(np.nanmean(adjustment.residuals**2)) < EARLY_STOP_RMS_RAD
@@ -565,7 +565,7 @@ def _choose_candidate(
     _, _, chosen = min(fitting, key=lambda item: (item[1], item[0]))
     decided_by = None
     if planar and marker_misfit is not None and len(fitting) > 1:
-        misfits = [marker_misfit(adjustment.rig, columns) for _, _, adjustment in fitting]
+        misfits = [marker_misfit(adjustment.state, columns) for _, _, adjustment in fitting]
         order = np.argsort(misfits)
         if misfits[order[0]] < MAX_MARKER_MISFIT_RATIO * misfits[order[1]]:
             chosen = fitting[int(order[0])][2]

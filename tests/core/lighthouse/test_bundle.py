@@ -73,13 +73,17 @@ def test_exact_angles_lead_back_to_the_truth(
     truth = rig_of(lamps, world.curve(40, flat=planar))
     angles = angles_of(lamps, truth.points)
     done = adjust_bundle(
-        angles, shaken(truth, 0.05, planar=planar), sigma=1e-4, planar=planar, soft=1.0
+        angles,
+        shaken(truth, 0.05, planar=planar),
+        sigma_rad=1e-4,
+        planar=planar,
+        loss_scale_rad=1.0,
     )
-    assert gap(done.rig, truth) < 1e-4
+    assert gap(done.state, truth) < 1e-4
     assert np.max(np.abs(done.residuals)) < 2e-6
     assert done.cost < 1e-2
     if planar:
-        np.testing.assert_array_equal(done.rig.points[:, 2], 0)
+        np.testing.assert_array_equal(done.state.points[:, 2], 0)
 
 
 def test_same_optimum_as_a_general_solver(world: Any) -> None:
@@ -90,7 +94,7 @@ def test_same_optimum_as_a_general_solver(world: Any) -> None:
     sigma = 1e-3
     angles = angles_of(lamps, points) + rng.normal(0, sigma, (12, 2, 2))
     truth = rig_of(lamps, points)
-    ours = adjust_bundle(angles, truth, sigma=sigma, soft=1e3, iterations=200)
+    ours = adjust_bundle(angles, truth, sigma_rad=sigma, loss_scale_rad=1e3, max_iterations=200)
 
     second = lamps[1]
     base = np.linalg.norm(second.position - lamps[0].position)
@@ -115,7 +119,7 @@ def test_same_optimum_as_a_general_solver(world: Any) -> None:
         truth.calibrations,
         points + x[5:].reshape(-1, 3),
     )
-    assert gap(ours.rig, best) < 2e-4
+    assert gap(ours.state, best) < 2e-4
     np.testing.assert_allclose(ours.residuals.ravel() / sigma, theirs.fun, atol=5e-3)
 
 
@@ -131,9 +135,11 @@ def draws(world: Any, request: pytest.FixtureRequest) -> list[tuple[Array, Array
     errors, stated = [], []
     for _ in range(300):
         noisy = exact + rng.normal(0, sigma, exact.shape)
-        done = adjust_bundle(noisy, truth, sigma=sigma, planar=request.param, soft=1e3)
-        turn = rotation_log(done.rig.rotations @ np.swapaxes(truth.rotations, 1, 2))
-        errors.append(np.concatenate([done.rig.positions - truth.positions, turn], axis=1))
+        done = adjust_bundle(
+            noisy, truth, sigma_rad=sigma, planar=request.param, loss_scale_rad=1e3
+        )
+        turn = rotation_log(done.state.rotations @ np.swapaxes(truth.rotations, 1, 2))
+        errors.append(np.concatenate([done.state.positions - truth.positions, turn], axis=1))
         stated.append(done.station_covariance[:, :6, :6])
     result = []
     for i in range(2):
@@ -166,15 +172,15 @@ def test_known_points_fix_a_station_without_gauge(world: Any) -> None:
         done = adjust_bundle(
             exact + rng.normal(0, sigma, exact.shape),
             truth,
-            sigma=sigma,
+            sigma_rad=sigma,
             planar=True,
             fixed_points=True,
-            soft=1e3,
+            loss_scale_rad=1e3,
         )
-        turn = rotation_log(done.rig.rotations @ np.swapaxes(truth.rotations, 1, 2))
-        errors.append(np.r_[(done.rig.positions - truth.positions)[0], turn[0]])
+        turn = rotation_log(done.state.rotations @ np.swapaxes(truth.rotations, 1, 2))
+        errors.append(np.r_[(done.state.positions - truth.positions)[0], turn[0]])
         told.append(done.station_covariance[0, :6, :6])
-        np.testing.assert_array_equal(done.rig.points, truth.points)
+        np.testing.assert_array_equal(done.state.points, truth.points)
     found = np.cov(np.array(errors).T)
     stated = np.mean(told, axis=0)
     np.testing.assert_allclose(np.sqrt(np.diag(stated)), np.sqrt(np.diag(found)), rtol=0.3)
@@ -188,8 +194,8 @@ def test_tilt_and_phase_are_found_where_they_show(world: Any) -> None:
     points = world.curve(100, flat=False)
     angles = angles_of(lamps, points)
     start = rig_of(lamps, points, (GENERIC_CALIBRATION,) * 4)
-    done = adjust_bundle(angles, start, sigma=1e-3)
-    for lamp, calibration in zip(lamps, done.rig.calibrations, strict=True):
+    done = adjust_bundle(angles, start, sigma_rad=1e-3)
+    for lamp, calibration in zip(lamps, done.state.calibrations, strict=True):
         true = factory(lamp).sweeps[:, TILT]
         before = np.abs(GENERIC_CALIBRATION.sweeps[:, TILT] - true).max()
         after = np.abs(calibration.sweeps[:, TILT] - true).max()
@@ -209,10 +215,10 @@ def test_priors_hold_what_the_data_do_not_tell(world: Any) -> None:
     done = adjust_bundle(
         angles_of(lamps, points),
         rig_of(lamps, points, (GENERIC_CALIBRATION,) * 2),
-        sigma=1e-3,
+        sigma_rad=1e-3,
         planar=True,
     )
-    for calibration in done.rig.calibrations:
+    for calibration in done.state.calibrations:
         change = calibration.sweeps - GENERIC_CALIBRATION.sweeps
         assert np.all(np.abs(change[:, TILT]) < 3 * PHASE_TILT_SIGMA_RAD[:, 1])
         assert np.abs(change[1, PHASE]) < 3 * PHASE_TILT_SIGMA_RAD[1, 0]
@@ -222,13 +228,13 @@ def test_factory_calibration_is_never_touched(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = world.curve(30, flat=False)
     mixed = (factory(lamps[0]), GENERIC_CALIBRATION)
-    done = adjust_bundle(angles_of(lamps, points), rig_of(lamps, points, mixed), sigma=1e-3)
-    assert done.rig.calibrations[0] is mixed[0]
-    assert done.rig.calibrations[1].source == "estimated"
+    done = adjust_bundle(angles_of(lamps, points), rig_of(lamps, points, mixed), sigma_rad=1e-3)
+    assert done.state.calibrations[0] is mixed[0]
+    assert done.state.calibrations[1].source == "estimated"
     held = adjust_bundle(
-        angles_of(lamps, points), rig_of(lamps, points, mixed), sigma=1e-3, calibrate=False
+        angles_of(lamps, points), rig_of(lamps, points, mixed), sigma_rad=1e-3, calibrate=False
     )
-    assert held.rig.calibrations == mixed
+    assert held.state.calibrations == mixed
 
 
 def test_outliers_weigh_little(world: Any) -> None:
@@ -238,11 +244,11 @@ def test_outliers_weigh_little(world: Any) -> None:
     angles = angles_of(lamps, truth.points) + rng.normal(0, 1e-4, (100, 3, 2))
     wrong = rng.random(angles.shape) < 0.05
     angles[wrong] += rng.uniform(0.05, 0.17, np.count_nonzero(wrong))
-    done = adjust_bundle(angles, truth, sigma=1e-4)
+    done = adjust_bundle(angles, truth, sigma_rad=1e-4)
     clean = ~wrong.any(axis=(1, 2))
     assert np.median(done.weights[wrong]) < 0.05
     assert np.median(done.weights[clean]) > 0.95
-    some = replace(done.rig, points=done.rig.points[clean])
+    some = replace(done.state, points=done.state.points[clean])
     assert gap(some, replace(truth, points=truth.points[clean])) < 5e-3
 
 
@@ -256,10 +262,10 @@ def test_unseen_angles_take_no_part(world: Any) -> None:
     angles[hidden] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        done = adjust_bundle(angles, shaken(truth, 0.02), sigma=1e-4)
+        done = adjust_bundle(angles, shaken(truth, 0.02), sigma_rad=1e-4)
     np.testing.assert_array_equal(np.isnan(done.residuals), np.isnan(angles))
     np.testing.assert_array_equal(np.isnan(done.weights), np.isnan(angles))
-    assert gap(done.rig, truth) < 5e-4
+    assert gap(done.state, truth) < 5e-4
 
 
 def test_a_start_outside_the_cone_is_no_crash(world: Any) -> None:
@@ -270,9 +276,9 @@ def test_a_start_outside_the_cone_is_no_crash(world: Any) -> None:
     start[3] = lamps[0].position + lamps[0].rotation @ [0.05, 0, 1.0]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        done = adjust_bundle(angles_of(lamps, points), replace(truth, points=start), sigma=1e-4)
+        done = adjust_bundle(angles_of(lamps, points), replace(truth, points=start), sigma_rad=1e-4)
     others = np.delete(np.arange(30), 3)
-    some = replace(done.rig, points=done.rig.points[others])
+    some = replace(done.state, points=done.state.points[others])
     assert gap(some, replace(truth, points=points[others])) < 1e-3
 
 
@@ -283,13 +289,13 @@ def test_the_frame_does_not_matter(world: Any) -> None:
     rng = np.random.default_rng(8)
     angles = angles_of(lamps, points) + rng.normal(0, 3e-4, (25, 2, 2))
     rig = rig_of(lamps, points)
-    here = adjust_bundle(angles, rig, sigma=3e-4, soft=1e3)
+    here = adjust_bundle(angles, rig, sigma_rad=3e-4, loss_scale_rad=1e3)
     turn = rotation_exp(np.array([0.3, -0.2, 1.1]))
     there_rig = BundleState(
         5 * rig.positions @ turn.T + [1, 2, 3], turn @ rig.rotations, rig.calibrations,
         5 * rig.points @ turn.T + [1, 2, 3],
     )  # fmt: skip
-    there = adjust_bundle(angles, there_rig, sigma=3e-4, soft=1e3)
+    there = adjust_bundle(angles, there_rig, sigma_rad=3e-4, loss_scale_rad=1e3)
     assert there.cost == pytest.approx(here.cost, rel=1e-5)
     np.testing.assert_allclose(there.residuals, here.residuals, atol=2e-6)
 
@@ -299,13 +305,13 @@ def test_many_moments_share_the_error_of_the_model(world: Any) -> None:
     lamps = world.lamps(1, 2)
     few, many = (world.curve(n, flat=False) for n in (100, 400))
     a, b = (
-        adjust_bundle(angles_of(lamps, p), rig_of(lamps, p), sigma=1e-3).station_covariance
+        adjust_bundle(angles_of(lamps, p), rig_of(lamps, p), sigma_rad=1e-3).station_covariance
         for p in (few, many)
     )
     ratio = np.sqrt(np.trace(b[1, :3, :3]) / np.trace(a[1, :3, :3]))
     assert ratio == pytest.approx(1, abs=0.1)
     free = adjust_bundle(
-        angles_of(lamps, many), rig_of(lamps, many), sigma=1e-3, independent=10**6
+        angles_of(lamps, many), rig_of(lamps, many), sigma_rad=1e-3, independent_points=10**6
     ).station_covariance
     assert np.sqrt(np.trace(free[1, :3, :3]) / np.trace(a[1, :3, :3])) == pytest.approx(
         0.5, abs=0.06

@@ -40,7 +40,7 @@ def run(angles: Array, planar: bool | None = None, seed: int = 0) -> StationsEst
 
 def off(estimate: StationsEstimate, points: Array) -> float:
     """Mean error of the places after the best similarity, in metres."""
-    found, true = estimate.adjustment.rig.points, points[estimate.chosen]
+    found, true = estimate.adjustment.state.points, points[estimate.chosen]
     return float(np.mean(np.linalg.norm(umeyama(found, true).apply(found) - true, axis=1)))
 
 
@@ -56,7 +56,7 @@ def test_the_scene_and_its_kind_are_found(
     assert found.facts.planar_decided_by == "data"
     assert found.stations == tuple(range(len(channels)))
     assert off(found, points) < 6e-3
-    rig = found.adjustment.rig
+    rig = found.adjustment.state
     to = umeyama(rig.points, points[found.chosen])
     for k, lamp in enumerate(lamps):
         np.testing.assert_allclose(to.apply(rig.positions[k]), lamp.position, atol=0.08)
@@ -65,7 +65,7 @@ def test_the_scene_and_its_kind_are_found(
 
 def test_a_floor_is_z_zero_with_stations_above(world: Any) -> None:
     found = run(angles_of(world.lamps(1, 2, 5), world.curve(100, flat=True)))
-    rig = found.adjustment.rig
+    rig = found.adjustment.state
     np.testing.assert_array_equal(rig.points[:, 2], 0)
     assert np.all(rig.positions[:, 2] > 0)
     assert np.all(rig.rotations[:, 2, 2] > 0)  # upright
@@ -80,8 +80,8 @@ def test_the_order_of_stations_does_not_matter(world: Any, flat: bool) -> None:
     for order in ((1, 0, 2), (2, 1, 0)):
         other = run(angles[:, order])
         assert other.planar is flat
-        a = first.adjustment.rig.points
-        b = other.adjustment.rig.points
+        a = first.adjustment.state.points
+        b = other.adjustment.state.points
         np.testing.assert_array_equal(first.chosen, other.chosen)
         np.testing.assert_allclose(umeyama(b, a).apply(b), a, atol=2e-3 * np.ptp(a))
 
@@ -91,7 +91,7 @@ def test_the_seed_does_not_matter(world: Any, flat: bool) -> None:
     lamps = world.lamps(2, 5)
     points = world.curve(120, flat=flat)
     angles = angles_of(lamps, points)
-    rigs = [run(angles, seed=seed).adjustment.rig.points for seed in (0, 0, 1, 77)]
+    rigs = [run(angles, seed=seed).adjustment.state.points for seed in (0, 0, 1, 77)]
     np.testing.assert_array_equal(rigs[0], rigs[1])
     for other in rigs[2:]:
         np.testing.assert_allclose(

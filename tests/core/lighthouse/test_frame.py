@@ -35,7 +35,7 @@ class Recorded:
         self.angles = rotor_angles(self.epochs)
         self.to = Similarity(0.2, rotation_exp(np.array([0.0, 0.0, 0.7])), np.array([3.0, 1, 0]))
         ideal = replace(GENERIC_CALIBRATION, sweeps=np.zeros((2, 7)))
-        self.rig = frame.transform_state(
+        self.state = frame.transform_state(
             BundleState(
                 np.stack([s.position for s in self.lamps]),
                 np.stack([s.rotation for s in self.lamps]),
@@ -90,9 +90,9 @@ def test_markers_bring_the_rig_home(recorded: Recorded, world: Any) -> None:
     markers = world.markers_of(recorded.lamps, recorded.places)
     known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
     np.testing.assert_array_equal(known, recorded.places)
-    to = frame.align_to_markers(recorded.rig, True, known, seen)
+    to = frame.align_to_markers(recorded.state, True, known, seen)
     assert to is not None
-    home = frame.transform_state(recorded.rig, to)
+    home = frame.transform_state(recorded.state, to)
     for k, lamp in enumerate(recorded.lamps):
         np.testing.assert_allclose(home.positions[k], lamp.position, atol=1e-5)
         np.testing.assert_allclose(home.rotations[k], lamp.rotation, atol=1e-5)
@@ -106,16 +106,16 @@ def test_several_markers_average_the_error_of_one(recorded: Recorded, world: Any
     known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
     moved = known.copy()
     moved[0, 0] += 0.03  # measured badly
-    to = frame.align_to_markers(recorded.rig, True, moved, seen)
+    to = frame.align_to_markers(recorded.state, True, moved, seen)
     assert to is not None
-    home = frame.transform_state(recorded.rig, to)
+    home = frame.transform_state(recorded.state, to)
     assert np.max(np.abs(home.points - recorded.places)) < 0.012
 
 
 def test_two_markers_fix_no_frame(recorded: Recorded, world: Any) -> None:
     markers = world.markers_of(recorded.lamps, world.square[:2])
     known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
-    assert frame.align_to_markers(recorded.rig, True, known, seen) is None
+    assert frame.align_to_markers(recorded.state, True, known, seen) is None
 
 
 @pytest.mark.parametrize("kind", ["line", "one place"])
@@ -127,7 +127,7 @@ def test_markers_on_a_line_are_refused(recorded: Recorded, world: Any, kind: str
     markers = world.markers_of(recorded.lamps, places)
     known, seen = frame.marker_angles(markers, recorded.epochs, recorded.angles)
     with pytest.raises(DegenerateError, match="marker") as refused:
-        frame.align_to_markers(recorded.rig, True, known, seen)
+        frame.align_to_markers(recorded.state, True, known, seen)
     assert refused.value.hint
 
 
@@ -139,7 +139,7 @@ def test_no_sighting_is_no_marker(recorded: Recorded) -> None:
 
 def seen_on_floor(recorded: Recorded) -> Any:
     """Positions on the floor, in the rig's unit, of photodiodes that saw given angles."""
-    rig = recorded.rig
+    rig = recorded.state
     return lambda angles: (
         estimate_positions(
             angles, rig.positions, rig.rotations, rig.calibrations, floor_z=0.0
@@ -209,8 +209,8 @@ def test_odometry_of_another_or_of_no_motion_says_nothing(world: Any) -> None:
 
 def test_a_rig_of_its_own_stands_at_its_first_station(recorded: Recorded) -> None:
     for planar in (True, False):
-        to = frame.first_station_frame(recorded.rig, planar, 5.0)
-        home = frame.transform_state(recorded.rig, to)
+        to = frame.first_station_frame(recorded.state, planar, 5.0)
+        home = frame.transform_state(recorded.state, to)
         true = np.stack([s.position for s in recorded.lamps])
         np.testing.assert_allclose(
             np.linalg.norm(home.positions[1] - home.positions[0]),
@@ -236,7 +236,7 @@ def test_three_markers_give_a_frame_but_no_misfit(recorded: Recorded, world: Any
         markers = world.markers_of(recorded.lamps, world.square[:count])
         prior = Scene(markers=tuple(markers))
         framed = frame.fix_gauge(
-            recorded.rig, np.zeros((2, 10, 10)), True, prior, recorded.epochs, recorded.angles, ()
+            recorded.state, np.zeros((2, 10, 10)), True, prior, recorded.epochs, recorded.angles, ()
         )
         assert framed.scale == "markers"
         assert (framed.marker_misfit_m is not None) is is_known
@@ -251,7 +251,7 @@ def test_markers_that_misfit_are_named(
     first, *others = world.markers_of(recorded.lamps, world.square)
     wrong = replace(first, position=first.position + [error_m, error_m, 0.0])
     framed = frame.fix_gauge(
-        recorded.rig,
+        recorded.state,
         np.zeros((2, 10, 10)),
         True,
         Scene(markers=(wrong, *others)),

@@ -79,7 +79,7 @@ def run(angles: Array, planar: bool | None = None) -> StationsEstimate:
 
 def check(found: StationsEstimate, lamps: Any, points: Array, mean_m: float) -> None:
     """Places and stations are right, after the similarity of the places."""
-    rig = found.adjustment.rig
+    rig = found.adjustment.state
     true = points[found.chosen]
     to = umeyama(rig.points, true)
     assert np.mean(np.linalg.norm(to.apply(rig.points) - true, axis=1)) < mean_m

@@ -52,25 +52,34 @@ def world(
     )
     angle = np.zeros(shape)
     for m, n in np.ndindex(shape):
-        i, since = looks.station[m, n], looks.since_s[m, n]
+        i, since = looks.station[m, n], looks.time_offset_s[m, n]
         rotation = rotation_exp(poses.rate[m, 3:] * since) @ poses.rotation[m]
-        place = poses.position[m] + poses.rate[m, :3] * since + rotation @ looks.place[m, n]
+        place = (
+            poses.position[m] + poses.rate[m, :3] * since + rotation @ looks.sensor_position[m, n]
+        )
         local = (place - STATIONS[0][i]) @ STATIONS[1][i]
         angle[m, n] = predict_angles(local, STATIONS[2][i])[looks.plane[m, n]]
     angle += rng.normal(0, noise, shape) if noise else 0.0
-    angle[~looks.seen] = 99.0
+    angle[~looks.is_observed] = 99.0
     return SweepObservations(
-        looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen
+        looks.sensor_position,
+        looks.station,
+        looks.plane,
+        angle,
+        looks.time_offset_s,
+        looks.is_observed,
     ), poses
 
 
 def test_the_model_meets_its_own_world() -> None:
     looks, poses = world(3, 20)
     missed, _ = linearize(looks, STATIONS, poses)
-    assert np.abs(missed[looks.seen]).max() < 1e-12
-    assert np.all(np.isnan(missed[~looks.seen]))
+    assert np.abs(missed[looks.is_observed]).max() < 1e-12
+    assert np.all(np.isnan(missed[~looks.is_observed]))
     lever, _ = photodiode_positions(looks, poses)
-    assert np.linalg.norm(lever, axis=-1) == pytest.approx(np.linalg.norm(looks.place, axis=-1))
+    assert np.linalg.norm(lever, axis=-1) == pytest.approx(
+        np.linalg.norm(looks.sensor_position, axis=-1)
+    )
 
 
 def test_derivatives_are_those_of_small_steps() -> None:
@@ -83,9 +92,9 @@ def test_derivatives_are_those_of_small_steps() -> None:
         step[:, k] = 1e-5
         ahead, _ = linearize(looks, STATIONS, poses.stepped(step))
         behind, _ = linearize(looks, STATIONS, poses.stepped(-step))
-        numeric = ((ahead - behind) / 2e-5)[looks.seen]
-        analytic = gradient[..., k % 6] * (looks.since_s if k >= 6 else 1.0)
-        assert numeric == pytest.approx(analytic[looks.seen], abs=1e-7)
+        numeric = ((ahead - behind) / 2e-5)[looks.is_observed]
+        analytic = gradient[..., k % 6] * (looks.time_offset_s if k >= 6 else 1.0)
+        assert numeric == pytest.approx(analytic[looks.is_observed], abs=1e-7)
 
 
 def test_the_fit_comes_back_from_a_poor_start() -> None:
@@ -95,12 +104,12 @@ def test_the_fit_comes_back_from_a_poor_start() -> None:
         true.position + rng.normal(0, 0.05, (40, 3)),
         rotation_exp(rng.normal(0, 0.2, (40, 3))) @ true.rotation,
     )
-    found = fit_poses(looks, STATIONS, start, sigma=1e-4, soft=3e-3)
+    found = fit_poses(looks, STATIONS, start, sigma_rad=1e-4, loss_scale_rad=3e-3)
     assert np.abs(found.poses.position - true.position).max() < 2e-5
     turn = rotation_log(found.poses.rotation @ np.swapaxes(true.rotation, 1, 2))
     assert np.abs(turn).max() < 1e-3
     assert found.poses.rate == pytest.approx(true.rate, abs=0.1)
-    assert np.all(np.isnan(found.residual) == ~looks.seen)
+    assert np.all(np.isnan(found.residual) == ~looks.is_observed)
 
 
 def test_lost_sweeps_pull_nothing() -> None:
@@ -108,10 +117,15 @@ def test_lost_sweeps_pull_nothing() -> None:
     angle = looks.angle.copy()
     angle[:, ::3] += 0.05
     bent = SweepObservations(
-        looks.place, looks.station, looks.plane, angle, looks.since_s, looks.seen
+        looks.sensor_position,
+        looks.station,
+        looks.plane,
+        angle,
+        looks.time_offset_s,
+        looks.is_observed,
     )
-    pulled = fit_poses(bent, STATIONS, true, sigma=1e-4, soft=3e-3)
-    exact = fit_poses(bent, STATIONS, true, sigma=1e-4, soft=3e-3, lost=0.02)
+    pulled = fit_poses(bent, STATIONS, true, sigma_rad=1e-4, loss_scale_rad=3e-3)
+    exact = fit_poses(bent, STATIONS, true, sigma_rad=1e-4, loss_scale_rad=3e-3, cutoff_rad=0.02)
     assert np.abs(exact.poses.position - true.position).max() < 2e-5
     assert np.abs(pulled.poses.position - true.position).max() > 2e-5
 
@@ -161,9 +175,9 @@ def test_the_adjustment_finds_a_station_that_was_put_wrong() -> None:
         looks,
         (wrong, turned, STATIONS[2]),
         poses,
-        sigma=1e-4,
-        soft=3e-3,
-        share=np.ones(30),
+        sigma_rad=1e-4,
+        loss_scale_rad=3e-3,
+        epoch_weight=np.ones(30),
         calibrate=np.array([False, False]),
     )
     off = np.r_[

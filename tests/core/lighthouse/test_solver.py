@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError, InputError, LocatkError
 from locatk.core.geometry import Similarity, rotation_exp, umeyama
 from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.devices.solver import merge_solutions
 from locatk.core.lighthouse.localization.photodiodes import MAX_RANGE_M
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
-from locatk.core.lighthouse.solver import SolveOptions, _merge, solve
+from locatk.core.lighthouse.solver import SolveOptions, solve
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -809,7 +810,7 @@ def test_solutions_of_devices_and_photodiodes_are_merged() -> None:
         "bundle",
         (),
         {"plane_unknown": 3, "sweep_contradicts_pose": 2},
-        [detection(0, 1, 10, 1), detection(1, 2, 20, 2)],
+        (detection(0, 1, 10, 1), detection(1, 2, 20, 2)),
         facts=LighthouseFacts(iterations=7),
         warnings=(SolverWarning("device", "of a device"),),
     )
@@ -818,10 +819,10 @@ def test_solutions_of_devices_and_photodiodes_are_merged() -> None:
         "bundle",
         (),
         {"plane_unknown": 4, "moment_jumps": 5},
-        [detection(0, 2, 100, 30)],
+        (detection(0, 2, 100, 30),),
         facts=LighthouseFacts(angle_sigma_rad=1e-4),
     )
-    merged = _merge(devices, photodiodes, ("robot",))
+    merged = merge_solutions(devices, photodiodes)
     assert merged.rejected == {"plane_unknown": 7, "sweep_contradicts_pose": 2, "moment_jumps": 5}
     assert [(d.station, d.channel, d.sweeps, d.rejected) for d in merged.detections] == [
         (0, 1, 10, 1),
