@@ -372,7 +372,7 @@ def test_one_station_needs_a_floor(locatk, tmp_path: Path) -> None:
     source = capture(tmp_path / "run.sal", light(where, 2.0, LAMPS[:1]))
     run, solved = tmp_path / "run.mcap", tmp_path / "solved.mcap"
     answer(locatk("import", "saleae", source, "-o", run, "--json"))
-    refused(locatk("solve", run, "-o", solved), solved, "one station needs four sighted markers")
+    refused(locatk("solve", run, "-o", solved), solved, "one station needs 4 visited markers")
     scene = markers(tmp_path / "scene.toml", floor, leg_s, 0.3, planar=True)
     answer(locatk("solve", run, "-o", solved, "--artifact", scene, "--json"))
     assert np.quantile(errors(solved, where), 0.95) < 5e-3

@@ -47,7 +47,7 @@ def test_a_scene_of_another_room_is_status_3(locatk, simulated: Path, tmp_path: 
     out = tmp_path / "out.mcap"
     result = locatk("solve", simulated, "-o", out, "--artifact", scene)
     assert result.exit_code == 3, result.stderr
-    assert "of the moments contradict the scene: a station was moved since" in result.stderr
+    assert "of the epochs contradict the scene: a station was moved since" in result.stderr
 
 
 def test_frames_blurred_by_motion_are_status_3(locatk, tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_published_markers_are_the_counts_pydotbot_read(one: Path) -> None:
         scene = read_dotbot([one / "lighthouse" / f"{i}_lh2.csv"]).scene
         assert scene is not None
         assert [m.name for m in scene.markers] == list(CORNERS)
-        found.append([m.sightings[0].counts[1] for m in scene.markers])
+        found.append([m.visits[0].counts[1] for m in scene.markers])
     counts = np.array(found)
     assert np.ptp(counts, axis=0).max() < 1e-6
     expected = [[35273, 75582], [41104, 80565], [39998, 82486], [35214, 78358]]
@@ -101,7 +101,7 @@ def test_published_two_stations(two_session: ImportedSession) -> None:
     scene = two_session.scene
     assert scene is not None
     for marker in scene.markers:
-        (sighting,) = marker.sightings
+        (sighting,) = marker.visits
         assert sighting.device == "R"
         assert sighting.start_ns is not None
         assert sighting.end_ns is not None
@@ -157,14 +157,14 @@ def test_published_floor_has_z_up(one: Path, two_session: ImportedSession) -> No
     for channel in (1, 2):
         corners = []
         for marker in scene.markers:
-            (s,) = marker.sightings
+            (s,) = marker.visits
             keep = (sweeps.channel == channel) & (sweeps.device == sweeps.devices.index("R"))
             keep &= (sweeps.time_ns >= s.start_ns) & (sweeps.time_ns <= s.end_ns)
             corners.append(sweeps.count[keep].reshape(-1, 2).mean(axis=0))
         assert _side(paper_image_points(np.array(corners), channel)) == _side(floor)
     single = read_dotbot([one / "lighthouse" / "1_lh2.csv"]).scene
     assert single is not None
-    corners = [m.sightings[0].counts[1] for m in single.markers]
+    corners = [m.visits[0].counts[1] for m in single.markers]
     assert _side(paper_image_points(np.array(corners), 1)) == -1
 
 
@@ -432,8 +432,8 @@ def test_markers_name_the_device_that_stood_there(write: Write) -> None:
     write(json.dumps({"v": stays()}), "calibration.json")
     session = read_dotbot([write(TWO + ROW)])
     assert session.scene is not None
-    assert session.scene.markers[0].sightings[0].device == "R"
-    assert session.scene.markers[1].sightings == ()
+    assert session.scene.markers[0].visits[0].device == "R"
+    assert session.scene.markers[1].visits == ()
     both = read_dotbot([write(TWO + ROW + NEXT.replace(",R,", ",G,"))])
     assert both.scene is None
     assert "more than one device" in both.warnings[0]
@@ -509,7 +509,7 @@ def test_markers_are_recovered_whatever_the_order_of_counts(write: Write) -> Non
     write(json.dumps({"v": SQUARE}), "calibration.json")
     session = read_dotbot([write(text)])
     assert session.scene is not None
-    found = [m.sightings[0].counts[1] for m in session.scene.markers]
+    found = [m.visits[0].counts[1] for m in session.scene.markers]
     np.testing.assert_allclose(found, expected, atol=1e-5)
     np.testing.assert_allclose(session.scene.markers[0].position, [0.8, -0.8, 0])
     assert "homography of columns x" in session.facts["markers"]

@@ -202,7 +202,6 @@ def test_the_refinement_tolerates_outliers() -> None:
     assert np.max(np.abs(fit.residual[0])) > 0.1
 
 
-@pytest.mark.xfail(strict=True, reason="cv2.solvePnPGeneric refuses three points with P3P")
 def test_minimal_sets_yield_a_candidate_without_outliers() -> None:
     position, rotation = np.array([2.5, 0.2, 0.1]), rotation_exp([1.0, 0.3, -0.5])
     angles = observe(TRACKER, position, rotation, IDEAL_CALIBRATION)

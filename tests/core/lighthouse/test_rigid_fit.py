@@ -192,7 +192,7 @@ def test_the_adjustment_finds_a_station_that_was_put_wrong() -> None:
 
 def test_no_step_turns_a_device_over() -> None:
     looks, poses = world(2, 30)
-    problem = pose_fit._PoseProblem(looks, STATIONS, 1e-4, np.ones((2, 1)), True, np.inf)
+    problem = pose_fit._PoseProblem(looks, STATIONS, 1e-4, np.ones((2, 1)), np.inf)
     step = np.zeros((2, 12))
     step[0, :6] = [0.1, 0.0, 0.0, 0.0, 0.0, 2.8]
     step[1, :6] = [0.1, 0.0, 0.0, 0.0, 0.0, 0.3]

@@ -103,6 +103,8 @@ def _texts(value: ast.AST | None, constants: dict[str, Any]) -> set[str]:
         return {known} if isinstance(known, str) else set()
     if isinstance(value, ast.IfExp):
         return _texts(value.body, constants) | _texts(value.orelse, constants)
+    if isinstance(value, ast.Call) and getattr(value.func, "id", None) == "Counter":
+        return {each.arg for each in value.keywords if each.arg}
     if isinstance(value, ast.Tuple):
         return set().union(*(_texts(each, constants) for each in value.elts))
     return set()
