@@ -39,6 +39,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "html"
 
 
+@pytest.mark.slow
 def test_each_page_is_in_the_menu(site: Path) -> None:
     start = (site / "index.html").read_text(encoding="utf-8")
     (menu,) = re.findall(r'<div class="sidebar-tree">(.*?)</div>', start, re.S)
@@ -202,6 +203,7 @@ def same(one: str, other: str) -> bool:
     return fnmatchcase(one, other) or fnmatchcase(other, one)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", BENCHES)
 def test_each_figure_is_explained(system: str) -> None:
     told, given = explained(system), figure_names(system)

@@ -448,6 +448,7 @@ needs_terminals = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 @needs_terminals
 @pytest.mark.parametrize("page", pages())
 def test_commands_of_a_page_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -504,6 +505,7 @@ def test_a_page_is_read_as_by_its_reader(tmp_path: Path, monkeypatch: pytest.Mon
     assert (folder / "c.txt").read_text() == "three\nfour\n"
 
 
+@pytest.mark.slow
 @needs_terminals
 @pytest.mark.parametrize(
     ("block", "said"),

@@ -151,6 +151,7 @@ def test_a_diamond_is_not_a_cycle(tmp_path: Path) -> None:
     assert find_cycle(import_graph(root, ["core"])) is None
 
 
+@pytest.mark.slow
 def test_no_import_cycles(root: Path) -> None:
     graph = import_graph(root)
     # There are hundreds of modules: an empty graph would have no cycle either.
@@ -162,6 +163,7 @@ def test_no_import_cycles(root: Path) -> None:
 # ---- layers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer", LAYERS)
 def test_layers_import_only_layers_below(root: Path, layer: str) -> None:
     paths = find_modules(root, layer)
@@ -172,6 +174,7 @@ def test_layers_import_only_layers_below(root: Path, layer: str) -> None:
                 assert name.split(".")[1] in ALLOWED_IMPORTS[layer], f"{path} imports {name}"
 
 
+@pytest.mark.slow
 def test_core_is_pure_computation(root: Path) -> None:
     for path in find_modules(root, "core"):
         tree = ast.parse(path.read_text(encoding="utf-8"))

@@ -74,6 +74,7 @@ def test_table_agrees_with_commands(name: str) -> None:
     assert importlib.import_module(module).command.short_help == short
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("args", [["--help"], ["--version"], ["solve", "--help"], ["nonsense"]])
 def test_start_up_is_light(args: list[str]) -> None:
     code = (

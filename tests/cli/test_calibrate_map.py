@@ -59,6 +59,7 @@ def sound() -> Simulated:
     return drive(((0, 1), (0, 0), (1, 0), (2, 0)), 10)
 
 
+@pytest.mark.slow
 def test_sessions_in_a_map_as_built_out(locatk, runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "built.toml"
     result = locatk("calibrate", "map", *runs, "-o", out)
@@ -84,6 +85,7 @@ def test_sessions_in_a_map_as_built_out(locatk, runs: list[Path], tmp_path: Path
     assert all(len(line) <= 100 for line in lines[:9])
 
 
+@pytest.mark.slow
 def test_json_is_all_that_is_on_stdout(locatk, runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "built.toml"
     result = locatk("calibrate", "map", *runs, "-o", out, "--json")
@@ -113,6 +115,7 @@ def test_json_is_all_that_is_on_stdout(locatk, runs: list[Path], tmp_path: Path)
     assert laid[0, 0] == "NSNN"
 
 
+@pytest.mark.slow
 def test_later_sessions_are_solved_with_it(
     locatk, runs: list[Path], other: Simulated, tmp_path: Path
 ) -> None:
@@ -175,6 +178,7 @@ def test_one_session_that_cannot_be_used_is_an_error(
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_several_robots_of_one_session(locatk, sound: Simulated, tmp_path: Path) -> None:
     second = drive(((1, 0), (0, 0), (0, 1)), 11)
     both = replace(

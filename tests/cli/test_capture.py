@@ -189,6 +189,7 @@ def test_auto_of_noise_is_raw(locatk: Any, tmp_path: Path, raw_bytes: Any) -> No
     assert raw_bytes(path) == noise
 
 
+@pytest.mark.slow
 def test_a_port_that_is_silent(locatk: Any, tmp_path: Path, raw_bytes: Any) -> None:
     path = tmp_path / "run.mcap"
     given = ("--device", "raw", "-o", path, "--duration", "1.3s", "--silence", "200ms", "--json")
@@ -220,6 +221,7 @@ def test_the_wrong_device_is_told_by_the_status(capture: Any, tmp_path: Path) ->
     assert json.loads(result.stdout)["frames"] == 0
 
 
+@pytest.mark.slow
 def test_parts(capture: Any, tmp_path: Path, old: Path, raw_bytes: Any) -> None:
     """At 100 kB, of bytes that do not compress, 500 kB of them a second."""
     noise = np.random.default_rng(6).bytes(400_000)
@@ -526,6 +528,7 @@ def test_who_listens_may_go(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(heard) == 1
 
 
+@pytest.mark.slow
 def test_losses_of_the_line_are_in_the_json(
     locatk: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

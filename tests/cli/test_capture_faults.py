@@ -86,6 +86,7 @@ def facts(path: Path) -> dict[str, str]:
 # ---- every byte
 
 
+@pytest.mark.slow
 def test_megabytes_a_second(line: Any, process: Any, tmp_path: Path, raw_bytes: Any) -> None:
     port, path = line(), tmp_path / "run.mcap"
     capture = process("capture", port.path, "--device", "raw", "-o", path, "--json")
@@ -106,6 +107,7 @@ def test_megabytes_a_second(line: Any, process: Any, tmp_path: Path, raw_bytes: 
 # ---- killed
 
 
+@pytest.mark.slow
 def test_killed_it_loses_half_a_second(
     line: Any, process: Any, tmp_path: Path, raw_bytes: Any, locatk: Any
 ) -> None:
@@ -146,6 +148,7 @@ def test_killed_it_loses_half_a_second(
 # ---- asked to end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_finish_the_file(
     line: Any, process: Any, tmp_path: Path, raw_bytes: Any, number: signal.Signals
@@ -177,6 +180,7 @@ live_file.LiveFile.write = write
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_doubled_signals(
     line: Any, process: Any, tmp_path: Path, raw_bytes: Any, number: signal.Signals
@@ -214,6 +218,7 @@ serial_link.DescriptorLink.read = read
 """
 
 
+@pytest.mark.slow
 def test_a_second_interrupt_does_not_wait_for_a_driver_that_hangs(
     line: Any, process: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
@@ -242,6 +247,7 @@ def test_a_second_interrupt_does_not_wait_for_a_driver_that_hangs(
     assert "Traceback" not in capture.stderr
 
 
+@pytest.mark.slow
 def test_whoever_listens_to_the_talk_may_go(line: Any, tmp_path: Path, raw_bytes: Any) -> None:
     """`locatk capture ... 2>&1 | head -1` records on."""
     port, path = line(), tmp_path / "run.mcap"
@@ -261,6 +267,7 @@ def test_whoever_listens_to_the_talk_may_go(line: Any, tmp_path: Path, raw_bytes
 # ---- unplugged
 
 
+@pytest.mark.slow
 def test_unplugged_and_plugged_in_again(
     line: Any, process: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
@@ -294,6 +301,7 @@ def test_unplugged_and_plugged_in_again(
     assert f"Warning: {lines[0]}" in capture.stderr
 
 
+@pytest.mark.slow
 def test_it_does_not_come_back(line: Any, process: Any, tmp_path: Path, raw_bytes: Any) -> None:
     port, path = line(), tmp_path / "run.mcap"
     capture = process("capture", port.path, "--device", "raw", "-o", path, "--silence", "100ms")
@@ -322,6 +330,7 @@ ports.SerialPort.open = open
 """
 
 
+@pytest.mark.slow
 def test_a_port_that_is_not_there_yet_can_be_waited_for(
     line: Any, process: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
@@ -341,6 +350,7 @@ def test_a_port_that_is_not_there_yet_can_be_waited_for(
 # ---- one port, one owner
 
 
+@pytest.mark.slow
 def test_who_holds_the_port_is_said(line: Any, process: Any, tmp_path: Path) -> None:
     port = line()
     capture = process("capture", port.path, "--device", "raw", "-o", tmp_path / "run.mcap")
@@ -357,6 +367,7 @@ def test_who_holds_the_port_is_said(line: Any, process: Any, tmp_path: Path) -> 
 # ---- the disk
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills(line: Any, process: Any, small_disk: Path, raw_bytes: Any) -> None:
     port, path = line(), small_disk / "run.mcap"
     given = ("--device", "raw", "-o", path, "--reserve", "1.5MB", "--json")
@@ -422,6 +433,7 @@ def solved(locatk: Any, path: Path, *given: object) -> tuple[dict[str, Any], Sol
     return json.loads(result.stdout)["sessions"][0], read_solution(output)
 
 
+@pytest.mark.slow
 def test_tags_are_found_in_what_was_captured(captured: Path, locatk: Any) -> None:
     want, _ = solved(locatk, captured / "polaris.mcap")
     got, _ = solved(locatk, captured / "polaris-captured.mcap")
@@ -476,6 +488,7 @@ def test_lighthouse_is_solved_of_what_was_captured(captured: Path, locatk: Any) 
     assert np.abs(other.position[within, :2] - places[within]).max() < 0.02
 
 
+@pytest.mark.slow
 def test_what_was_captured_can_be_sent_again(
     captured: Path, process: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:

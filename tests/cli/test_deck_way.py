@@ -34,6 +34,7 @@ def session(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_poses_are_full_and_in_the_frame_of_the_markers(
     locatk: Run, session: Path, folder: Path
 ) -> None:

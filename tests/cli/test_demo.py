@@ -26,6 +26,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     return folder, CliRunner().invoke(app, ["demo", "--keep", str(folder), "--json"])
 
 
+@pytest.mark.slow
 def test_every_system_is_better_than_its_published_algorithm(demo) -> None:
     _, result = demo
     assert result.exit_code == 0, result.stderr
@@ -51,6 +52,7 @@ def test_keep_leaves_what_it_names(demo) -> None:
         assert path.read_bytes()[:14].lower().startswith(starts[path.suffix].lower())
 
 
+@pytest.mark.slow
 def test_what_to_try_next_works(demo, locatk, tmp_path: Path, monkeypatch) -> None:
     _, result = demo
     monkeypatch.chdir(tmp_path)
@@ -81,6 +83,7 @@ def test_nothing_is_replaced_unasked(demo, locatk) -> None:
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_alone_it_leaves_the_report_only(locatk, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     temporary = set(Path(gettempdir()).glob("locatk-demo-*"))
@@ -97,6 +100,7 @@ def test_alone_it_leaves_the_report_only(locatk, tmp_path: Path, monkeypatch) ->
     assert "report.html" in again.stderr
 
 
+@pytest.mark.slow
 def test_one_system_and_wrong_names(locatk, tmp_path: Path) -> None:
     report = tmp_path / "polaris.html"
     result = locatk("demo", "polaris", "-o", report)

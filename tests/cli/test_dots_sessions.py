@@ -231,6 +231,7 @@ def test_frames_of_another_camera_than_told(locatk, folder: Path, tmp_path: Path
     assert "188 x 120 px, where the camera has 640 x 480 px" in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0, 900, 4000])
 def test_a_bad_video_is_one_line(tmp_path: Path, length: int) -> None:
     """Run as a user runs it: the library under OpenCV talks to stderr past Python."""

@@ -133,6 +133,7 @@ def test_without_waiting(locatk: Callable, run: Path) -> None:
     assert not Path(first["port"]).parent.exists(), "nothing is left behind"
 
 
+@pytest.mark.slow
 def test_a_system_without_a_recording(
     locatk: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,6 +200,7 @@ def test_errors_are_one_line(
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_it_cleanly(run: Path, number: signal.Signals) -> None:
     """Also for a device that sends for ever; the totals are told nevertheless."""
@@ -228,6 +230,7 @@ def test_signals_end_it_cleanly(run: Path, number: signal.Signals) -> None:
     assert got == (DATA * (1 + len(got) // len(DATA)))[: len(got)]
 
 
+@pytest.mark.slow
 def test_a_killed_one_can_be_followed_at_the_same_path(
     locatk: Callable, run: Path, tmp_path: Path
 ) -> None:

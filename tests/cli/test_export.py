@@ -224,6 +224,7 @@ def test_poses_that_are_no_numbers_are_left_out_and_told(locatk, solved: Path) -
     assert not solved.with_name("none.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_is_no_error(locatk, solved: Path) -> None:
     for kind in ("csv", "tum"):
         done = subprocess.run(

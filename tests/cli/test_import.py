@@ -283,6 +283,7 @@ def test_a_crazyflie_config_becomes_a_scene(locatk, tmp_path: Path) -> None:
     assert artifacts.read_scene(out).station(1) is not None
 
 
+@pytest.mark.slow
 def test_published_recording_of_libsurvive(locatk, data: Path, tmp_path: Path) -> None:
     source = data / "lighthouse" / "libsurvive" / "tracker-cal-attempt.rec.gz"
     out = tmp_path / "run.mcap"

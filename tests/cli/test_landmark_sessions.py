@@ -502,6 +502,7 @@ def test_viewers_see_the_bars(locatk, solver: Solver, tmp_path: Path) -> None:
 # ---- the real thing
 
 
+@pytest.mark.slow
 def test_from_a_log_to_poses(locatk, tmp_path: Path) -> None:
     """Simulated, written as a table, imported again and solved: within 2 mm of the truth."""
     from locatk.core.landmarks.design import DesignOptions, design

@@ -457,6 +457,7 @@ def test_damaged_and_other_files(locatk, second: tuple[Array, Places], tmp_path:
     assert (result.exit_code, source.read_bytes()) == (1, whole)
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_nothing(process, second: tuple[Array, Places], tmp_path: Path) -> None:
     source, run = capture(tmp_path / "run.sal", second[0]), tmp_path / "run.mcap"
     endless = (
@@ -479,6 +480,7 @@ def test_an_interrupt_leaves_nothing(process, second: tuple[Array, Places], tmp_
 # ---- published recordings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ids", "sweeps"),
     [
@@ -512,6 +514,7 @@ def test_published_capture_of_a_photodiode_at_rest(locatk, data: Path, tmp_path:
     refused(locatk("solve", run, "-o", solved), solved, "stood still")
 
 
+@pytest.mark.slow
 def test_published_tracker_whole_and_cut(locatk, data: Path, tmp_path: Path) -> None:
     source = data / "lighthouse" / "libsurvive" / "tracker-cal-attempt.rec.gz"
     run, part = tmp_path / "run.mcap", tmp_path / "part.rec.gz"

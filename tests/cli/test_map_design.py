@@ -167,6 +167,7 @@ def test_nothing_is_overwritten_unasked(locatk, made: Path) -> None:
     assert read_map(made).shape == (5, 5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "status", "said"),
     [

@@ -187,6 +187,7 @@ def test_the_group_says_what_its_commands_say() -> None:
     assert group.get_command(context, "none") is None
 
 
+@pytest.mark.slow
 def test_a_large_floor(locatk, tmp_path: Path) -> None:
     codes = np.random.default_rng(1).integers(0, 16, (40, 40))
     write_map(tmp_path / "map.toml", replace(FLOOR, codes=codes, walls=frozenset(), built={}))

@@ -50,6 +50,7 @@ def margins(locatk, sessions: list[Path], folder: Path, *args: object) -> list[f
     return [one[0]["margin"] for one in found]
 
 
+@pytest.mark.slow
 def test_published_runs_teach_how_their_tag_was_built(
     locatk, published: list[Path], tmp_path: Path
 ) -> None:

@@ -57,6 +57,7 @@ def calibrate(*args: object) -> Result:
     return CliRunner().invoke(printer, [str(arg) for arg in args], prog_name="printer")
 
 
+@pytest.mark.slow
 def test_dots_are_whole_pixels_and_say_what_they_ought_to(locatk, tmp_path: Path) -> None:
     path = tmp_path / "test.pdf"
     result = locatk("print", "testsheet", "-o", path, "--size", "letter", "--dpi", 600, "--json")
@@ -104,6 +105,7 @@ def test_the_sheet_is_always_the_same_and_black_alone(locatk, paper: Path, tmp_p
                     assert [float(value) for value in operands] == [0, 0, 0, 1]
 
 
+@pytest.mark.slow
 def test_a_scan_tells_dots_and_scale(scan: Path, tmp_path: Path) -> None:
     out = tmp_path / "printer.toml"
     upright = Manifest((Sheet("a", (0, 0), (9, 9), (0, 0), (210.0, 297.0), (10.0, 10.0)),))
@@ -132,6 +134,7 @@ def test_a_scan_tells_dots_and_scale(scan: Path, tmp_path: Path) -> None:
     assert sheets.read_manifest(files[1]).scale == (y, x)
 
 
+@pytest.mark.slow
 def test_measured_rulers_count_and_words_are_for_people(scan: Path) -> None:
     result = calibrate(scan, "--measured-x", 100.3, "--measured-y", 99.5)
     assert result.exit_code == 0, result.output
@@ -140,6 +143,7 @@ def test_measured_rulers_count_and_words_are_for_people(scan: Path) -> None:
     assert len([line for line in result.stdout.splitlines() if " mm  " in line]) == 11
 
 
+@pytest.mark.slow
 def test_what_contradicts_itself_is_refused(scan: Path, tmp_path: Path) -> None:
     assert calibrate(scan, "--measured-x", 100).exit_code == 2
     assert (

@@ -39,6 +39,7 @@ def test_a_page_is_written(solution: Path, locatk: Locatk) -> None:
     assert page.stat().st_size < 12e6
 
 
+@pytest.mark.slow
 def test_pictures_are_written_beside_it(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--png", "--svg", "--json")
     assert done.exit_code == 0, done.stderr
@@ -47,6 +48,7 @@ def test_pictures_are_written_beside_it(solution: Path, locatk: Locatk, tmp_path
     assert all(Path(path).stat().st_size > 1000 for path in files)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".SVG"])
 def test_just_a_picture(solution: Path, locatk: Locatk, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"figure{suffix}"
@@ -55,6 +57,7 @@ def test_just_a_picture(solution: Path, locatk: Locatk, tmp_path: Path, suffix: 
     assert not list(tmp_path.glob("*.html"))
 
 
+@pytest.mark.slow
 def test_several_solutions_share_a_page(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     shutil.copy(solution, other)
@@ -165,6 +168,7 @@ def test_sessions_belong_to_solutions_by_name(
     assert "No solution was made of" in done.stderr
 
 
+@pytest.mark.slow
 def test_truth_that_fits_nothing_is_told(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
     (tmp_path / "old.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--truth", tmp_path / "old.tum")
@@ -173,6 +177,7 @@ def test_truth_that_fits_nothing_is_told(solution: Path, locatk: Locatk, tmp_pat
     assert "No pose has truth at its time" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_session_cut_short_does_not_stop_the_report(
     solution: Path, session: Path, locatk: Locatk, tmp_path: Path
 ) -> None:

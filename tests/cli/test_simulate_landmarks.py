@@ -57,6 +57,7 @@ def holds(path: Path, wanted: Simulated) -> Session:
     return session
 
 
+@pytest.mark.slow
 def test_a_session_holds_samples_map_odometry_and_truth(locatk, floor: Path) -> None:
     out = floor.with_name("run.mcap")
     result = locatk("simulate", "landmarks", floor, "-o", out, "--seed", 3, "--json")

@@ -207,6 +207,7 @@ def test_beside_the_sessions_by_default(
     assert locatk("solve", folder / "a-solved.mcap", "-o", tmp_path / "no.mcap").exit_code == 1
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_jobs(
     locatk: Run, tmp_path: Path, record: Callable[..., Path], sonar: Path
 ) -> None:
@@ -265,6 +266,7 @@ def test_the_solution_tells_what_made_it(
     assert facts.items() >= source_facts("my run.mcap").items()
 
 
+@pytest.mark.slow
 def test_a_deadly_session_does_not_stop_the_batch(
     day: Callable[..., list[Path]], tmp_path: Path, sonar: Path
 ) -> None:
@@ -381,6 +383,7 @@ def test_a_broken_artifact_is_one_error(
     assert calls(sonar) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_interrupt_leaves_what_is_whole(
     day: Callable[..., list[Path]], tmp_path: Path, sonar: Path, jobs: int
@@ -420,6 +423,7 @@ def test_an_interrupt_leaves_what_is_whole(
     assert [entry["resumed"] for entry in entries(done.stdout)] == resumed
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no groups of processes")
 @pytest.mark.parametrize("after_s", [0.0, 0.3])
 def test_an_interrupt_while_processes_start(
@@ -444,6 +448,7 @@ def test_an_interrupt_while_processes_start(
     assert "Traceback" not in stderr
 
 
+@pytest.mark.slow
 def test_a_long_temporary_folder(day: Callable[..., list[Path]], tmp_path: Path) -> None:
     """The path of a socket is short."""
     day("a", "b")
@@ -486,6 +491,7 @@ def cluster(tmp_path: Path, sonar: Path) -> Iterator[str]:
             process.wait()
 
 
+@pytest.mark.slow
 def test_a_cluster_loses_nothing_when_a_worker_is_killed(
     locatk: Run, cluster: str, day: Callable[..., list[Path]], tmp_path: Path, sonar: Path
 ) -> None:
@@ -520,6 +526,7 @@ def test_a_cluster_loses_nothing_when_a_worker_is_killed(
     assert contents(out) == contents(serial)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sonar")
 def test_who_does_not_answer_is_named(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -590,6 +597,7 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         s3fs.S3FileSystem.clear_instance_cache()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sonar")
 def test_s3_in_and_out(
     locatk: Run,
@@ -632,6 +640,7 @@ def test_s3_in_and_out(
     assert temporary(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sonar")
 def test_s3_places(
     locatk: Run, bucket: Any, day: Callable[..., list[Path]], tmp_path: Path

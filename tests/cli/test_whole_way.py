@@ -50,6 +50,7 @@ def test_a_scene_of_another_room_is_status_3(locatk, simulated: Path, tmp_path: 
     assert "of the epochs contradict the scene: a station was moved since" in result.stderr
 
 
+@pytest.mark.slow
 def test_frames_blurred_by_motion_are_status_3(locatk, tmp_path: Path) -> None:
     frames, out = tmp_path / "frames.mcap", tmp_path / "out.mcap"
     args = ("--frames", 12, "--motion", 13)
@@ -74,6 +75,7 @@ def test_the_session_does_not_give_the_answer_away(locatk, simulated: Path) -> N
     assert [station["position_m"] for station in answer["stations"]] == [None, None]
 
 
+@pytest.mark.slow
 def test_published_grid_is_solved(locatk, data: Path, tmp_path: Path) -> None:
     grid, out = tmp_path / "grid.mcap", tmp_path / "solved.mcap"
     source = data / "lighthouse" / "twoLH-3D_scene" / "dataset" / "data_all.csv"
@@ -85,6 +87,7 @@ def test_published_grid_is_solved(locatk, data: Path, tmp_path: Path) -> None:
     assert score["mae_m"] < 0.002
 
 
+@pytest.mark.slow
 def test_bench_without_data_lists_every_figure(locatk, tmp_path: Path) -> None:
     result = locatk("bench", "lighthouse", "--data", tmp_path, "--json")
     assert result.exit_code == 0, result.stderr

@@ -53,6 +53,7 @@ def sampled(rate: float, start: float, stop: float, seed: int = 5) -> Array:
     return start + (np.arange(n) + np.random.default_rng(seed).uniform(0, 0.2, n)) / rate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_late_by_the_least_delay_after_ten_seconds_and_within_a_ppm_after_a_minute(
     seed: int,
@@ -71,6 +72,7 @@ def test_late_by_the_least_delay_after_ten_seconds_and_within_a_ppm_after_a_minu
     assert 0.5e6 < median < most < 2e6
 
 
+@pytest.mark.slow
 def test_bursts_and_a_clock_that_warms_up() -> None:
     seconds = sampled(200, 0, 120)
     device = seconds * (1 + 50e-6) + 5e-6 * 20 * (1 - np.exp(-seconds / 20))
@@ -84,6 +86,7 @@ def test_bursts_and_a_clock_that_warms_up() -> None:
     assert clock.drift_ppm == pytest.approx(50, abs=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [-0.03, -0.005, 0.005, 0.03])
 def test_a_resonator_that_is_off_is_learnt(off: float) -> None:
     seconds = sampled(100, 0, 60)
@@ -96,6 +99,7 @@ def test_a_resonator_that_is_off_is_learnt(off: float) -> None:
     assert clock.restarts == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("silence", [0.0, 0.4, 2.0, 30.0, 600.0])
 def test_short_counters_start_again_and_host_time_tells_how_often(silence: float) -> None:
     seconds = np.concatenate([sampled(200, 0, 20), sampled(200, 20 + silence, 30 + silence)])
@@ -108,6 +112,7 @@ def test_short_counters_start_again_and_host_time_tells_how_often(silence: float
     assert clock.restarts == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bits", [32, 24])
 def test_what_arrives_late_together_is_not_new(bits: int) -> None:
     seconds = sampled(200, 0, 20)
@@ -130,6 +135,7 @@ def test_a_backlog_in_many_reads_is_late_and_not_new() -> None:
     assert clock.restarts == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("hz", "bits"), [(1e6, 64), (1e6, 32), (24e6, 24)])
 @pytest.mark.parametrize("boot", [0.1, 0.33, 0.5])
 def test_a_device_that_restarts_is_noticed(hz: float, bits: int, boot: float) -> None:
@@ -146,6 +152,7 @@ def test_a_device_that_restarts_is_noticed(hz: float, bits: int, boot: float) ->
     assert np.abs(error[soon]).max() < 3
 
 
+@pytest.mark.slow
 def test_a_clock_that_was_set_ahead_or_stood_still_is_noticed() -> None:
     for step in (-5.0, 3600.0):
         seconds = np.concatenate([sampled(200, 0, 20), sampled(200, 30, 50)])
@@ -209,6 +216,7 @@ def test_streams_that_share_the_clock_agree() -> None:
     assert clock.restarts == 0
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -99,6 +99,7 @@ def plain(value: object) -> object:
     return value
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(scenes())
 def test_every_scene_comes_back_to_the_last_bit(scene: Scene) -> None:

@@ -77,6 +77,7 @@ def test_absent_data_is_said_and_costs_no_other_figure(tmp_path: Path) -> None:
         assert str(tmp_path) in figure.how
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_every_promise_is_measured_and_accuracy_is_kept(data: Path) -> None:
     rows = lighthouse.figures(data)

@@ -17,6 +17,7 @@ def named(figures: Iterable[Figure]) -> dict[str, Figure]:
     return {figure.name: figure for figure in figures}
 
 
+@pytest.mark.slow
 def test_a_short_soak() -> None:
     found = named(capture_faults.soak_figures(1.0))
     assert found["soak: bytes lost or wrong"].value == 0
@@ -37,6 +38,7 @@ def test_what_is_wrong_is_counted(
     assert capture_faults.wrong_bytes(found, b"abcdefgh") == wrong
 
 
+@pytest.mark.slow
 def test_a_kill() -> None:
     found = named(capture_faults.kill_figures(1))
     assert found["kill -9: longest loss"].target == 0.5

@@ -82,6 +82,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
     return by_name
 
 
+@pytest.mark.slow
 def test_every_promise_has_its_row(rows: dict[str, Figure]) -> None:
     for name, target in PROMISED.items():
         assert rows[name].target == target, name

@@ -20,6 +20,7 @@ def missed(figures: Iterable[Figure]) -> list[str]:
     return [figure.name for figure in figures if figure.met is False]
 
 
+@pytest.mark.slow
 def test_the_demodulation_capture(data: Path) -> None:
     found = named(infrared._demodulation(data / "lighthouse"))
     assert missed(found.values()) == []
@@ -47,6 +48,7 @@ def test_strong_and_weak_recordings_of_the_deck(data: Path) -> None:
     assert missed(found) == []
 
 
+@pytest.mark.slow
 def test_stored_calibrations_are_told_from_wrong_ones(data: Path) -> None:
     path = data / "lighthouse" / "libsurvive" / infrared_survive.RECORDING
     session = read_libsurvive([path])

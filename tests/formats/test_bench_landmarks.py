@@ -102,6 +102,7 @@ def rows(quick: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Fig
     return by_name
 
 
+@pytest.mark.slow
 def test_every_promise_has_its_row(rows: dict[str, Figure]) -> None:
     for name, target in PROMISED.items():
         assert rows[name].target == pytest.approx(target), name
@@ -203,6 +204,7 @@ def test_a_visit_to_nothing_is_not_right() -> None:
     assert landmarks_study.log_loss([found]) == pytest.approx(-math.log(1e-9))
 
 
+@pytest.mark.slow
 def test_baselines_are_about_as_good_as_the_facts_say() -> None:
     made = landmarks_study.visited(40, "", 5)
     assert len(made) == 40

@@ -75,6 +75,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
     return by_name
 
 
+@pytest.mark.slow
 def test_every_promise_has_its_row(rows: dict[str, Figure]) -> None:
     for name, target in PROMISED.items():
         assert rows[name].target == pytest.approx(target), name
@@ -99,6 +100,7 @@ def test_absent_runs_are_said_and_cost_no_other_figure(rows: dict[str, Figure]) 
     assert rows["one dead sensor: wrong, or nothing said"].met
 
 
+@pytest.mark.slow
 def test_published_runs_are_as_promised(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polaris, "_times", lambda folder, absent: [])
     monkeypatch.setattr(polaris, "RUNS", {"default": 3, "varying": 3})

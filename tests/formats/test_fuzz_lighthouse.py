@@ -566,6 +566,7 @@ def is_refused(attempt: Attempt, rng: np.random.Generator, folder: Path, further
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARSERS)
 def test_damaged_input_is_an_error_of_ours_or_is_read(name: str, tmp_path: Path) -> None:
     attempt, number = PARSERS[name], FIRST
@@ -664,6 +665,7 @@ def bombs() -> dict[str, bytes]:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="Linux tells its memory there")
 def test_small_files_take_little_memory(tmp_path: Path) -> None:
     made = bombs()

@@ -60,6 +60,7 @@ def write(
     return Session.open(path)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(heard)
 def test_all_that_was_heard_comes_back(
@@ -144,6 +145,7 @@ def test_a_damaged_record_is_named(
     assert len(str(caught.value)) < 300
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(
     st.dictionaries(

@@ -288,6 +288,7 @@ WHOLE = (
 ).encode()
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_damaged_logs_give_an_error_or_sweeps(

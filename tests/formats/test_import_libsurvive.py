@@ -622,6 +622,7 @@ def test_stored_calibrations(tmp_path: Path) -> None:
         read_stored(tmp_path / "absent.json")
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_damage_of_any_kind_is_an_error_or_a_warning(tmp_path: Path, data: st.DataObject) -> None:
@@ -710,6 +711,7 @@ def published(data: Path) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_published_calibrations_are_those_that_libsurvive_stored(published: Path) -> None:
     session = read_libsurvive([published])
     stored = read_stored(published.with_name(published.name + ".json"))
@@ -730,6 +732,7 @@ def test_published_calibrations_are_those_that_libsurvive_stored(published: Path
         assert abs(station.period_ticks / period_ticks(station.channel) - 1) < 10e-6
 
 
+@pytest.mark.slow
 def test_published_angles_are_libsurvives_but_for_the_noise_of_single_syncs(
     published: Path,
 ) -> None:
@@ -751,6 +754,7 @@ def test_published_angles_are_libsurvives_but_for_the_noise_of_single_syncs(
     assert abs(np.mean(difference)) < 1e-6
 
 
+@pytest.mark.slow
 def test_published_poses_photodiodes_and_stations_are_of_one_frame(published: Path) -> None:
     session = read_libsurvive([published], stations=True)
     assert session.scene is not None

@@ -90,6 +90,7 @@ def fails(
 ascending = st.lists(st.integers(1, 10**8), min_size=1, max_size=25).map(np.cumsum)
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(
     st.tuples(ascending, ascending),
@@ -293,6 +294,7 @@ TABLES = [
 ]
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_damage_raises_nothing_but_what_it_should(

@@ -119,6 +119,7 @@ def test_a_ledger_that_changed_meanwhile_is_not_overwritten(tmp_path: Path) -> N
     assert held(path) == (FIRST,)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="locks of POSIX")
 def test_runs_at_once_take_different_areas(tmp_path: Path) -> None:
     code = (

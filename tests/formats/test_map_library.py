@@ -41,6 +41,7 @@ def wanted(entry: Entry, rows: int, columns: int, seed: int = 0) -> DesignOption
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.file)
 def test_maps_of_the_library_hold(entry: Entry) -> None:
     """By a count of words that shares nothing with the prover."""
@@ -73,6 +74,7 @@ def test_every_mode_has_a_map() -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.file)
 def test_cuts_hold_and_differ_by_seed(entry: Entry) -> None:
     rows, columns = max(1, min(9, entry.rows - 1)), min(7, entry.columns)

@@ -56,6 +56,7 @@ def back_from_lif(floor: FloorMap) -> FloorMap:
     return loads_lif(dumps_lif(floor, STAMP), file="map.json")
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(placed_floors())
 def test_a_map_as_designed_comes_back(floor: FloorMap) -> None:
@@ -67,6 +68,7 @@ def test_a_map_as_designed_comes_back(floor: FloorMap) -> None:
     assert back_from_lif(floor).walls == floor.walls
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(placed_floors(), st.data())
 def test_landmarks_as_built_come_back_where_they_lie(floor: FloorMap, data: st.DataObject) -> None:

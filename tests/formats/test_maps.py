@@ -96,6 +96,7 @@ def floors(draw: st.DrawFn) -> FloorMap:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(floors())
 def test_every_map_comes_back_to_the_last_bit(floor: FloorMap) -> None:

@@ -112,6 +112,7 @@ def test_zeros_are_named() -> None:
     assert found.losses == [Loss(len(data), len(data) + 100_000, "zeros")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0, 1, 2**31, 2**40 - 1, 2**62, 2**63, 2**64 - 1])
 def test_wild_lengths(value: int) -> None:
     """In the frame of each record, and in each place of a chunk, an attachment and metadata."""

@@ -377,6 +377,7 @@ def solution() -> Solution:
     )
 
 
+@pytest.mark.slow
 def test_solution_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "solved.mcap"
     wanted = solution()
@@ -397,6 +398,7 @@ def test_solution_round_trip(tmp_path: Path) -> None:
         observations.read_trajectories(path, "truth")
 
 
+@pytest.mark.slow
 def test_solution_as_others_see_it(tmp_path: Path) -> None:
     """With the stock reader and decoder: every topic of docs/formats.md."""
     path = tmp_path / "solved.mcap"

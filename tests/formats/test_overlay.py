@@ -323,6 +323,7 @@ NOTHING = Maker().written(b"")
 """A stamp without a dot."""
 
 
+@pytest.mark.slow
 @settings(
     deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -361,6 +362,7 @@ def test_a_colour_space_brings_its_black(tmp_path: Path) -> None:
     assert told == [("k", black), ("K", black), ("k", black), ("K", black), ("k", half)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotation", [0, 90, 180, 270])
 def test_a_stamp_lies_upright_on_what_is_seen(tmp_path: Path, rotation: int) -> None:
     path = drawing(tmp_path / "plain.pdf")

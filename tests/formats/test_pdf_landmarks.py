@@ -110,6 +110,7 @@ def measure(
     return errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("floor", "size", "code"),
     [
@@ -210,6 +211,7 @@ def check_rulers(data: bytes, number: int) -> None:
         assert (ticks == 1).sum() == 101
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", PARTS)
 def test_rulers_are_100_mm(part: str) -> None:
     check_rulers(render(pack(HALL, A4, parts=(part,)).pages, "t"), 0)
@@ -248,6 +250,7 @@ def all_words(pages: tuple[Page, ...]) -> list[Text]:
     ]
 
 
+@pytest.mark.slow
 def test_large_plans_are_cut_into_pages_that_hold_each_cell_once() -> None:
     floor = some_floor(70, 61)
     pages = pack(floor, A4, parts=("plan",)).pages
@@ -305,6 +308,7 @@ FLOORS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("floor", "name", "overlap"), FLOORS)
 def test_the_floor_at_true_size_is_whole(floor: FloorMap, name: str, overlap: float) -> None:
     tiles = floor_tiles(floor, paper(name), overlap_mm=overlap)
@@ -453,6 +457,7 @@ def nothing_drawn_over(pages: tuple[Page, ...], thin: float) -> float:
     return float(np.minimum(letters, rest).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("size", [A4, A3])
 def test_words_are_not_drawn_over(part: str, size: tuple[float, float]) -> None:
@@ -461,6 +466,7 @@ def test_words_are_not_drawn_over(part: str, size: tuple[float, float]) -> None:
         assert nothing_drawn_over(pages[:1], 0.07) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "part"),
     [
@@ -502,6 +508,7 @@ def test_what_does_not_fit_is_refused() -> None:
         floor_tiles(replace(HALL, pitch_m=0.03), paper("A4"))
 
 
+@pytest.mark.slow
 def test_same_input_same_bytes_in_one_ink() -> None:
     floor = replace(HALL, name="Лаборатория (1)")
     first, second = (render(pack(floor, A4).pages, "t") for _ in range(2))

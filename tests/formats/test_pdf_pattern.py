@@ -128,6 +128,7 @@ def box_px(layout: Layout, times: int = 1) -> tuple[slice, slice]:
     return slice(top, bottom), slice(left, right)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("printer", "dpi"), [(300, 300), (300, 600), (600, 600)])
 def test_a4_is_exact_to_the_pixel(printer: int, dpi: int) -> None:
     made = sheets(dpi=printer)
@@ -165,6 +166,7 @@ def test_papers_are_whole_numbers_of_pixels() -> None:
             assert found == tuple(side * dpi // 300 for side in layout.page), (size, dpi)
 
 
+@pytest.mark.slow
 def test_a0_is_exact_to_the_pixel() -> None:
     made = sheets("A0")
     data = pattern.render(made)
@@ -328,6 +330,7 @@ def floor_of_tiles() -> Manifest:
     return manifest(layout.raster, tiles.sheets("floor-1", (5000, 6000)), "libdots")
 
 
+@pytest.mark.slow
 def test_tiles_meet_at_their_registration_marks() -> None:
     made = floor_of_tiles()
     data = pattern.render(made, marks=False)
@@ -356,6 +359,7 @@ def test_tiles_meet_at_their_registration_marks() -> None:
     np.testing.assert_array_equal(shared, second[: shared.shape[0], : shared.shape[1]])
 
 
+@pytest.mark.slow
 def test_overlay_of_two_pages(tmp_path: Path) -> None:
     """On a document of the usual A4, which is no whole number of pixels, with black in it."""
     from reportlab.pdfgen.canvas import Canvas
@@ -415,6 +419,7 @@ def png(made: Manifest) -> tuple[bytes, Raster]:
     return data, cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "dpi", "margin"), [("A5", 300, 10.0), ("A5", 600, 0.0), ("60x80", 1200, 0.0)]
 )

@@ -126,6 +126,7 @@ def find_north(dark: Places, middle: Places, reach: tuple[float, float], dpi: fl
     return float((degrees[best] + off) % 360)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tags", "paper", "mirror", "reach", "dpi"),
     [
@@ -234,6 +235,7 @@ def test_tags_share_pages_without_touching(
     assert len(made.pages) < count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tags", [FULL, MINI, DENSE, EVEN])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_words_are_not_drawn_over(tags: Tags, mirror: bool) -> None:

@@ -72,6 +72,7 @@ def texts(figure: Figure) -> list[str]:
 # ---- files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".PNG"])
 def test_every_kind_of_picture_is_written_the_same_twice(tmp_path: Path, suffix: str) -> None:
     first, second = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
@@ -126,6 +127,7 @@ def test_nothing_is_left_behind_when_drawing_fails(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_users_settings_neither_change_the_picture_nor_are_changed(tmp_path: Path) -> None:
     plot_solution(tmp_path / "a.png", solution())
     with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "lines.linewidth": 9}):
@@ -134,6 +136,7 @@ def test_users_settings_neither_change_the_picture_nor_are_changed(tmp_path: Pat
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+@pytest.mark.slow
 def test_pyplot_is_never_imported() -> None:
     """It would choose a window system and keep every figure."""
     code = "import sys, locatk.formats.plot; print('matplotlib.pyplot' in sys.modules)"
@@ -217,6 +220,7 @@ def test_stations_are_in_view_or_named_at_the_margin() -> None:
         assert bottom < y < top
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("far_m", "said"), [(0.46, "ch 1\n460 mm"), (1.24, "ch 1\n1.2 m"), (87.3, "ch 1\n87 m")]
 )
@@ -252,6 +256,7 @@ def test_wild_poses_do_not_hide_the_others() -> None:
 LONG = tuple(f"robot-with-a-very-long-name-{k}" for k in range(30))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shown", "truth"),
     [

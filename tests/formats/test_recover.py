@@ -227,6 +227,7 @@ def flipped(data: bytes, noise: random.Random, bits: int, places: range | None =
     return bytes(changed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_random_cuts(good: Whole, tmp_path: Path, seed: int) -> None:
     noise = random.Random(seed)
@@ -242,6 +243,7 @@ def test_random_cuts(good: Whole, tmp_path: Path, seed: int) -> None:
         assert result.tail <= cut - last
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_random_flips(good: Whole, tmp_path: Path, seed: int) -> None:
     noise = random.Random(100 + seed)
@@ -254,6 +256,7 @@ def test_random_flips(good: Whole, tmp_path: Path, seed: int) -> None:
         check(good, flipped(good.data, noise, 20), tmp_path, one=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_random_flips_of_frames_and_heads(good: Whole, tmp_path: Path, seed: int) -> None:
     """Most bytes of a file are payload: what is hard to get right is between."""
@@ -272,6 +275,7 @@ def test_random_flips_of_frames_and_heads(good: Whole, tmp_path: Path, seed: int
         assert result.complete
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_zeros_holes_and_garbage(good: Whole, tmp_path: Path, seed: int) -> None:
     noise = random.Random(300 + seed)
@@ -438,6 +442,7 @@ def test_names_that_name_nothing(good: Whole, tmp_path: Path, names: dict[str, s
         recover(tmp_path / "a.mcap", tmp_path / "out.mcap")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

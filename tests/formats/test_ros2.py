@@ -96,6 +96,7 @@ def test_rosbags_reads_what_was_written(tmp_path: Path) -> None:
     assert all(len(m.transforms) == 1 for _, m in found["/tf"])
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)  # the first call imports rosbags
 @given(st.text(min_size=1, max_size=9), st.text(min_size=1, max_size=9))
 def test_strings_of_any_length_are_aligned(device: str, frame: str) -> None:

@@ -157,6 +157,7 @@ def lines(draw: st.DrawFn) -> tuple[list[int], list[int]]:
     return edges.tolist(), [start, *sorted(chosen - {start}), end]
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(lines(), st.integers(0, 1), st.sampled_from([1, 40, 1 << 17]))
 def test_every_edge_arrives_also_on_the_border_of_chunks(
@@ -371,6 +372,7 @@ def test_archives_that_are_none_or_lack_channels(tmp_path: Path) -> None:
         read_light(tmp_path / "none.sal")
 
 
+@pytest.mark.slow
 def test_a_bomb_takes_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     size = 1 << 20  # an edge at each of a million samples, packed a thousand times
     one = struct.pack("<6Q", 0, size, size, RATE, 1, size) + bytes(size) + struct.pack("<Q", 0)
@@ -412,6 +414,7 @@ FEW = channel(light(2, 20), borders_of(light(2, 20), 997))
 FEW_EXPORTED = export([tick / RATE for tick in light(2, 20)], span=(0, 1))
 
 
+@pytest.mark.slow
 @settings(max_examples=250, deadline=None)
 @given(st.data())
 def test_damage_raises_nothing_but_what_it_should(
@@ -573,6 +576,7 @@ CAPTURES = {
 """Edges inside chunks are 2,196,682 in the first; two more are right on a border."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAPTURES)
 def test_published_captures(data: Path, name: str) -> None:
     path = data / "lighthouse" / "benchmarks" / name

@@ -80,6 +80,7 @@ def cameras(draw: st.DrawFn) -> Camera:
     return Camera(size, focal, centre, draw(st.floats(-limit, limit)))
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(manifests())
 def test_every_manifest_comes_back_to_the_last_bit(manifest: Manifest) -> None:
@@ -88,6 +89,7 @@ def test_every_manifest_comes_back_to_the_last_bit(manifest: Manifest) -> None:
     assert dumps_manifest(loads_manifest(text)) == text
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(cameras())
 def test_every_camera_comes_back_to_the_last_bit(camera: Camera) -> None:

@@ -79,6 +79,7 @@ def tag_sets(draw: st.DrawFn) -> Tags:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(tag_sets())
 def test_all_tags_come_back_to_the_last_bit(tags: Tags) -> None:
@@ -103,6 +104,7 @@ def sensor_arrays(draw: st.DrawFn) -> SensorArray:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(sensor_arrays())
 def test_every_array_comes_back_to_the_last_bit(array: SensorArray) -> None:

@@ -56,6 +56,7 @@ def test_files(tmp_path: Path, artifact: Artifact[Any], value: Any) -> None:
         artifact.read(tmp_path / "none.toml")
 
 
+@pytest.mark.slow
 @every
 @given(text=st.text(max_size=80))
 def test_any_text_is_an_artifact_or_an_error(

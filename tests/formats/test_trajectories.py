@@ -68,6 +68,7 @@ def test_no_stamps(text: str) -> None:
         t.parse_time(text)
 
 
+@pytest.mark.slow
 @given(st.lists(poses(), max_size=3, unique_by=lambda p: p.device).filter(len))
 def test_csv_round_trip(tmp_path_factory: pytest.TempPathFactory, written: list) -> None:
     file = tmp_path_factory.mktemp("csv") / "poses.csv"
@@ -81,6 +82,7 @@ def test_csv_round_trip(tmp_path_factory: pytest.TempPathFactory, written: list)
         np.testing.assert_allclose(r.sigma, w.sigma, rtol=1e-12)
 
 
+@pytest.mark.slow
 @given(poses())
 def test_tum_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Trajectory) -> None:
     file = tmp_path_factory.mktemp("tum") / "poses.tum"
@@ -92,6 +94,7 @@ def test_tum_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Traje
     np.testing.assert_array_equal(read.quaternion, written.quaternion)
 
 
+@pytest.mark.slow
 @given(poses())
 def test_kitti_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Trajectory) -> None:
     file = tmp_path_factory.mktemp("kitti") / "poses.txt"

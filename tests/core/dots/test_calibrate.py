@@ -158,6 +158,7 @@ def test_the_simulators_camera_comes_back(tilted: simulate.Simulated) -> None:
     assert report.sigma_radial == pytest.approx(report.sigma_radial_px * report.camera.focal_px**2)
 
 
+@pytest.mark.slow
 def test_a_camera_of_opencv_comes_back() -> None:
     report = calibrate(drawn(25, division(TRUTH.radial_px)), MANIFEST)
     check_lens(report)
@@ -165,6 +166,7 @@ def test_a_camera_of_opencv_comes_back() -> None:
     assert report.rms_px < 0.1 < report.rms_before_px
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strength", [-0.4, 0.3])
 def test_a_lens_of_another_model(strength: float) -> None:
     """Its centre is where it is, whatever polynomial bends it about that."""
@@ -185,6 +187,7 @@ def test_frames_of_twice_the_size() -> None:
     assert report.camera.focal_px == pytest.approx(720.0, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner", [-0.2, 0.1])
 def test_a_strong_lens(corner: float) -> None:
     """With the lens known, frames and dots at the rim are told that were not before."""
@@ -230,6 +233,7 @@ def test_untilted_frames_tell_the_lens_but_not_the_focal_length(
     assert report.camera.focal_px == pytest.approx(calibration.USUAL_FOCAL * math.hypot(*SIZE))
 
 
+@pytest.mark.slow
 def test_a_focal_length_that_is_given_is_kept(
     upright: simulate.Simulated, tilted: simulate.Simulated
 ) -> None:
@@ -247,6 +251,7 @@ def test_a_focal_length_that_is_given_is_kept(
     assert agreed.notes == ()
 
 
+@pytest.mark.slow
 def test_an_earlier_focal_length_is_kept_where_nothing_tells_a_better_one(
     upright: simulate.Simulated, tilted: simulate.Simulated
 ) -> None:
@@ -272,6 +277,7 @@ def test_without_bend_and_tilt_the_centre_is_the_middle() -> None:
     assert any("do not tell the centre" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_a_scale_that_was_not_measured_is_told_and_does_no_harm() -> None:
     session = simulated(25, printer_scale=(1.003, 0.999), tilt_rad=math.radians(10))
     report = calibrate(session.frames, MANIFEST)
@@ -294,6 +300,7 @@ def test_dots_stand_where_the_manifest_has_them() -> None:
     assert calibrate(frames, MANIFEST).rms_px > 0.2
 
 
+@pytest.mark.slow
 def test_a_rolling_shutter_is_no_tilt() -> None:
     report = calibrate(drawn(20, division(TRUTH.radial_px), skew=0.02), MANIFEST)
     assert report.focal_from == "usual"

@@ -123,6 +123,7 @@ def test_without_noise_the_camera_comes_back_exactly(k: float) -> None:
     assert fit_flat(seen).rms > 0.3
 
 
+@pytest.mark.slow
 def test_sigmas_are_what_repetitions_scatter_by() -> None:
     found = []
     for seed in range(16):

@@ -208,6 +208,7 @@ def test_nothing_to_decode() -> None:
 # --- missing dots and wrong bits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("side", "share"), [(10, 0.1), (12, 0.3), (16, 0.5)])
 def test_missing_dots(side: int, share: float) -> None:
     rng = np.random.default_rng(6)
@@ -220,6 +221,7 @@ def test_missing_dots(side: int, share: float) -> None:
     np.testing.assert_array_equal(found.dots, (~gone).sum(axis=(1, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "least", "most"), [(1, 280, 0), (2, 200, 1), (3, 100, 1)])
 def test_a_few_wrong_bits_of_8_by_8(wrong: int, least: int, most: int) -> None:
     # py-microdots reads 44 % right and 43 % wrong at one wrong bit, 19 and 55 % at two. Strings
@@ -237,6 +239,7 @@ def test_a_few_wrong_bits_of_8_by_8(wrong: int, least: int, most: int) -> None:
     assert (found.corrected[took & right] == wrong).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "share", "least"), [(12, 0.03, 0.99), (16, 0.10, 0.9), (20, 0.15, 0.9)]
 )
@@ -248,6 +251,7 @@ def test_many_wrong_bits_of_larger_windows(side: int, share: float, least: float
     assert wrong == 0
 
 
+@pytest.mark.slow
 def test_bits_weigh_what_they_are_sure_of() -> None:
     # A quarter of all bits is wrong, but says itself that it hardly knows.
     rng = np.random.default_rng(8)
@@ -265,6 +269,7 @@ def test_bits_weigh_what_they_are_sure_of() -> None:
     assert (right, wrong) == (0, 0)
 
 
+@pytest.mark.slow
 def test_confidence_is_kept() -> None:
     """Fewer than 1 in 1,000 of what is accepted is wrong."""
     rng = np.random.default_rng(9)
@@ -281,6 +286,7 @@ def test_confidence_is_kept() -> None:
 # --- what cannot be told is not told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(17, 5), (40, 5), (40, 4), (10, 5), (5, 17), (5, 40)])
 @pytest.mark.parametrize("quarters", [0, 1])
 def test_five_lines_have_many_places(size: tuple[int, int], quarters: int) -> None:
@@ -290,6 +296,7 @@ def test_five_lines_have_many_places(size: tuple[int, int], quarters: int) -> No
     assert wrong == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [10, 12])
 def test_windows_that_are_half_hidden(side: int) -> None:
     # A straight edge in any direction, as a hand or the rim of a sheet; one line too few.
@@ -380,6 +387,7 @@ def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
         assert not accepted(found).any(), what
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "beyond"), [(8, 1), (12, 2), (16, 4), (16, 14), (20, 10), (20, 2)]
 )

@@ -121,6 +121,7 @@ def test_libdots_7x7_knows_all_but_one_string() -> None:
     agrees(found, ~twice, at, sections, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotation", range(4))
 @pytest.mark.parametrize("size", [(6, 6), (6, 9), (7, 6)])
 def test_small_windows_of_unknown_turn_are_right_or_not_read(

@@ -51,6 +51,7 @@ def as_points(dots: blobs.Dots) -> NDArray[np.float32]:
     return ((dots.xy - [93.5, 59.5]) / np.hypot(188, 120) * 2).astype(np.float32)
 
 
+@pytest.mark.slow
 @needs_kernels
 @pytest.mark.parametrize("seed", [1, 2])
 def test_dots_are_the_same(seed: int) -> None:
@@ -87,6 +88,7 @@ def test_images_too_small_for_a_dot_have_none(shape: tuple[int, int, int]) -> No
     assert blobs.find_dots(np.zeros(shape, np.uint8)).counts.tolist() == [0] * shape[0]
 
 
+@pytest.mark.slow
 @needs_kernels
 @pytest.mark.parametrize("lens", [True, False])
 def test_lattices_are_the_same(lens: bool) -> None:

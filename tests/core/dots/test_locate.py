@@ -101,6 +101,7 @@ def study(
 # --- the table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "least", "rms"),
     [
@@ -146,6 +147,7 @@ def test_a_known_camera(shot: Shots, lean: float) -> None:
     assert outcome.rms < 0.003
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "pitch", "count"),
     [
@@ -167,6 +169,7 @@ def test_other_cameras(shot: Shots, size: tuple[int, int], pitch: float, count: 
     assert outcome.rms < 0.003
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says(shot: Shots) -> None:
     for how in ({}, {"noise": 12.0}, {"dot": 1 / 6, "tilt": TILT_10}, {"jitter": 0.02}):
         shots = shots_of(shot, 50, 5, **how)
@@ -184,6 +187,7 @@ def test_errors_are_as_large_as_the_covariance_says(shot: Shots) -> None:
 # --- each frame stands alone
 
 
+@pytest.mark.slow
 def test_a_frames_answer_does_not_depend_on_its_company(shot: Shots) -> None:
     hows: list[dict[str, Any]] = [
         {},
@@ -267,6 +271,7 @@ def side(image: Image, rng: np.random.Generator, share: float) -> NDArray[np.boo
     return hidden
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cover", [textured, bare])
 @pytest.mark.parametrize(("share", "least"), [(0.25, 19), (0.5, 13), (0.65, 0), (0.75, 0)])
 def test_frames_that_are_half_covered(
@@ -278,6 +283,7 @@ def test_frames_that_are_half_covered(
     assert least == 0 or outcome.rms < 0.02
 
 
+@pytest.mark.slow
 def test_what_is_not_sure_is_rejected_and_says_so(shot: Shots) -> None:
     shots = shots_of(shot, 40, 21)
     rng = np.random.default_rng(21)
@@ -393,6 +399,7 @@ def lattice(shot: Shots, k: int, rng: np.random.Generator, kind: str) -> Image:
     return image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["random", "one symbol", "repeated"])
 def test_grids_without_the_code(shot: Shots, kind: str) -> None:
     rng = np.random.default_rng(14)
@@ -449,6 +456,7 @@ def other_things(rng: np.random.Generator, kind: str, size: tuple[int, int]) -> 
     return np.clip(np.rint(grey + rng.normal(0, spread, grey.shape)), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     ["text", "noise", "soft noise", "checkerboard", "halftone", "lines", "gradient", "black",

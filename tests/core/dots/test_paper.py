@@ -112,6 +112,7 @@ def study(count: int, seed: int, **how: Any) -> tuple[Counter[str], list[float],
 # --- whole frames
 
 
+@pytest.mark.slow
 def test_frames_of_the_papers_camera() -> None:
     # 94 % were read, none wrong, of 200 frames like these; the peer in C reads 78 %, cold.
     fate, off, turn_off = study(80, 1)

@@ -89,6 +89,7 @@ def losing(ink: Ink, area: int, share: float) -> Ink:
     return np.where(gone[labels], np.uint8(0), ink)
 
 
+@pytest.mark.slow
 def test_a_good_print_is_read_and_its_scale_measured(fine: Ink) -> None:
     image = scan(fine, 600, scale=(1.003, 0.996), turn_deg=1.3, scan_dpi=600)
     report = calibrate(image, (600, 600))
@@ -107,12 +108,14 @@ def test_a_good_print_is_read_and_its_scale_measured(fine: Ink) -> None:
     assert best.margin == max(f.margin for f in report.fields if f.pitch_mm == best.pitch_mm)
 
 
+@pytest.mark.slow
 def test_a_sheet_may_lie_across(coarse: Ink) -> None:
     report = calibrate(scan(coarse, 300, (1.003, 0.996), 90), (SCAN_DPI, SCAN_DPI))
     assert report.scale == pytest.approx((1.003, 0.996), abs=2e-4)
     assert all(field.right == 1 for field in report.fields)
 
 
+@pytest.mark.slow
 def test_lost_dots_cost_their_field_also_in_a_photo(coarse: Ink) -> None:
     spoilt = losing(losing(coarse, area=1, share=0.3), area=4, share=0.05)
     height, width = coarse.shape
@@ -131,6 +134,7 @@ def test_lost_dots_cost_their_field_also_in_a_photo(coarse: Ink) -> None:
     assert report.recommended.dot_px == 3
 
 
+@pytest.mark.slow
 def test_dots_that_grow_are_measured_and_smaller_ones_recommended(coarse: Ink) -> None:
     grown = cv2.dilate(coarse, np.ones((2, 2), np.uint8))
     plain, fat = (
@@ -146,6 +150,7 @@ def test_dots_that_grow_are_measured_and_smaller_ones_recommended(coarse: Ink) -
             assert by_name(plain)[field.name].gain == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_field_is_known_by_what_it_says(coarse: Ink) -> None:
     image = scan(coarse, 300)
     sheet = printer_sheet("A4", 300)
@@ -167,6 +172,7 @@ def test_a_picture_that_is_too_coarse_says_nothing_of_the_printer(coarse: Ink) -
     assert report.recommended is not None
 
 
+@pytest.mark.slow
 def test_a_wrong_resolution_is_noticed(coarse: Ink) -> None:
     image = scan(coarse, 300)
     doubt = calibrate(image, (1.1 * SCAN_DPI, 1.1 * SCAN_DPI)).doubt
@@ -182,6 +188,7 @@ def test_a_wrong_resolution_is_noticed(coarse: Ink) -> None:
     assert "no scan" in doubt
 
 
+@pytest.mark.slow
 def test_pictures_without_a_readable_sheet_are_refused(coarse: Ink) -> None:
     noise = np.random.default_rng(3).integers(0, 256, (900, 700), np.uint8)
     for image in (noise, np.full((900, 700), 255, np.uint8)):

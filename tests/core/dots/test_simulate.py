@@ -311,6 +311,7 @@ def test_a_dot_that_is_missing_is_missing_in_every_frame() -> None:
     assert np.abs(here.astype(int) - other).max() > 100
 
 
+@pytest.mark.slow
 def test_dots_stray_by_the_jitter_that_was_asked_for() -> None:
     manifest, ink = one_dot()
     options = replace(PLAIN, jitter_m=1e-4)

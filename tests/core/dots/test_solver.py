@@ -199,6 +199,7 @@ def test_cameras_by_themselves(shoot: Shoot) -> None:
 # --- covariance
 
 
+@pytest.mark.slow
 def test_covariance_in_metres(shoot: Shoot) -> None:
     """Errors in metres and radians are as the covariance says, on a turned and scaled tile."""
     tile = Sheet(

@@ -66,6 +66,7 @@ def test_each_bar_is_magpylibs(geometry: Geometry) -> None:
         assert (error <= 1e-12 * size + 2e-15 * geometry.remanence_t).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geometry", GEOMETRIES)
 def test_landmarks_are_magpylibs(geometry: Geometry) -> None:
     points = scattered(geometry, 1)

@@ -14,6 +14,7 @@ from locatk.core.landmarks.proof import prove
 from locatk.core.landmarks.windows import ALPHABET_CODES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("alphabet", "window", "shape"),
     [("6", "I3", (1, 3)), ("16", "I2", (1, 2)), ("6", "2x2", (2, 2)), ("6", "L", (2, 2))],

@@ -104,6 +104,7 @@ def off_frame(error: np.ndarray, place: np.ndarray, at: np.ndarray | None = None
     return -(shape(at) @ motion)
 
 
+@pytest.mark.slow
 def test_flags_are_exactly_the_faults(case: Case) -> None:
     flags = {one.cell: one.built.flags for one in case.report.found if one.built.flags}
     assert flags == {
@@ -144,6 +145,7 @@ def test_standard_deviations_are_those_of_the_errors(case: Case) -> None:
     assert 0.2 < np.mean((strength / sigma[:, 3:]) ** 2) < 4
 
 
+@pytest.mark.slow
 def test_later_drives_are_solved_better_with_the_floor_as_built(case: Case) -> None:
     later = drive(ROWS[::-1][:8], 77, floor_seed=case.floor_seed)
     errors = {}
@@ -166,6 +168,7 @@ def test_later_drives_are_solved_better_with_the_floor_as_built(case: Case) -> N
     assert errors[False].max() < errors[True].max()
 
 
+@pytest.mark.slow
 def test_what_an_earlier_calibration_says_is_no_evidence(case: Case) -> None:
     wrong = {
         cell: replace(built, x_m=built.x_m + 0.004, strength=0.9 * built.strength)
@@ -177,6 +180,7 @@ def test_what_an_earlier_calibration_says_is_no_evidence(case: Case) -> None:
         assert np.array_equal(again.floor.built[cell].strength, built.strength)
 
 
+@pytest.mark.slow
 def test_a_visit_that_was_read_wrongly_is_left_out(case: Case) -> None:
     """Its place is 15 mm off what odometry and the other visits say."""
     first, second = case.drives
@@ -198,6 +202,7 @@ def test_a_visit_that_was_read_wrongly_is_left_out(case: Case) -> None:
     assert set(count.values()) == {2}
 
 
+@pytest.mark.slow
 def test_parts_without_a_landmark_in_common_are_told() -> None:
     rows = [drive(tuple((r, c) for c in range(4)), 30 + r, faults=Faults()) for r in (0, 2)]
     report = calibrate(FLOOR, [taken(session) for session in rows])
@@ -219,6 +224,7 @@ def test_where_the_whole_floor_lies_cannot_be_seen() -> None:
         assert "displaced" not in one.built.flags
 
 
+@pytest.mark.slow
 def test_magnets_that_are_all_weaker_are_no_weak_bars() -> None:
     """A quarter off: gains and height take a part of it, the typical bar tells the rest."""
     strong = replace(FLOOR, geometry=replace(FLOOR.geometry, remanence_t=1.6))

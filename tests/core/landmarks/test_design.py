@@ -56,6 +56,7 @@ def test_maps_hold_what_they_promise(mode: Any, walked: Callable[[FloorMap], Any
         assert len(rest) == len(words)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(search.kernels is None, reason="in Python these take minutes")
 @pytest.mark.parametrize(
     "mode",

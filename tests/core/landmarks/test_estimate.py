@@ -66,6 +66,7 @@ def nominal() -> list[Read]:
     return [one for one in several if one is not None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", range(16))
 def test_every_code_is_read_without_errors(code: int) -> None:
     one = read(passes(1, code, errors=NONE, seed=5, start=(0.7 * code, 0.1))[0])
@@ -76,6 +77,7 @@ def test_every_code_is_read_without_errors(code: int) -> None:
     assert abs(one.error[2]) < 5e-3
 
 
+@pytest.mark.slow
 def test_one_pass_with_nominal_errors() -> None:
     """The figures of the project: 1.5 mm on average, 3 mm for 95 %, 92 % of the patterns."""
     errors = np.array([np.hypot(*one.error[:2]) for one in nominal()])
@@ -106,6 +108,7 @@ def test_covariances_are_honest() -> None:
     assert 1.2 < np.mean(squares) < 4.5
 
 
+@pytest.mark.slow
 def test_weak_magnets_are_doubted_not_misread() -> None:
     weak = Geometry(remanence_t=0.4, threshold_t=1.1e-3)
     for one in passes(15, geometry=weak, seed=22):
@@ -114,6 +117,7 @@ def test_weak_magnets_are_doubted_not_misread() -> None:
             assert got.found[0].code == got.right
 
 
+@pytest.mark.slow
 def test_after_a_spin_all_is_known() -> None:
     for one in passes(8, then="spin", seed=23):
         got = read(one)

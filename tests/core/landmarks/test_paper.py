@@ -41,6 +41,7 @@ def off(run: Pass, seen: Sighting) -> np.ndarray | None:
     raise AssertionError("no frame")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("letters", ["NSNS", "NNNS", "SSSN", "NNSS", "NNNN", "SSSS"])
 def test_spins_near_the_centre_are_read_right(letters: str) -> None:
     errors = []
@@ -63,6 +64,7 @@ def test_spins_near_the_centre_are_read_right(letters: str) -> None:
     assert np.sqrt((error[:, 2] ** 2).mean()) < math.radians(1.5)
 
 
+@pytest.mark.slow
 def test_spins_far_off_are_refused_and_not_misread() -> None:
     refused, read = [], 0
     for run in passes(30, None, then="spin", aim_m=0.014, seed=7):
@@ -93,6 +95,7 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
     assert np.sqrt((error[:, 2] ** 2).mean()) < math.radians(1)
 
 
+@pytest.mark.slow
 def test_a_pass_alone_gives_a_centre_only() -> None:
     errors = []
     for run in passes(40, code_of("NNNS"), seed=3):

@@ -89,6 +89,7 @@ def drive(codes: np.ndarray, row: int, column: int, q: int, turn: int) -> list[t
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [1, -1])
 def test_each_l_of_the_published_map_is_found(data: Path, turn: int) -> None:
     codes = published(data, "or16_L_24x24.txt")
@@ -165,6 +166,7 @@ def test_a_sequence_turns_codes_to_the_frames_of_arrival() -> None:
     assert sequence(seen[:1], 0.2) == ((int(rotated(laid[0], -1)),), ())
 
 
+@pytest.mark.slow
 def test_a_robot_finds_itself_on_the_published_map(data: Path) -> None:
     floor = FloorMap(published(data, "or16_L_24x24.txt"))
     found = 0

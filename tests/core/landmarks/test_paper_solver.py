@@ -34,6 +34,7 @@ def solved(floor: FloorMap, seed: int, told: FloorMap | None) -> tuple[Simulated
     return one, solve(one.samples, told, PAPER, odometry=one.odometry)
 
 
+@pytest.mark.slow
 def test_an_l_is_a_place_or_a_note(published: FloorMap) -> None:
     located = 0
     for seed in range(4):

@@ -55,6 +55,7 @@ def test_level_lines() -> None:
     assert np.allclose((found[:, 1] - found[:, 0]) / 2, half, atol=1e-6, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_the_papers_figures_are_reproduced() -> None:
     # Section 3.5.2: mean 7.28, SD 3.53, largest 17.9 mm; issue 5: mean within 0.5 mm, and
     # at most 0.5 % over 20 mm.
@@ -79,6 +80,7 @@ def test_the_literal_rule_fails_where_two_lines_hit() -> None:
     assert np.allclose(mean, [27.8, 8.1], atol=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "mean_mm", "over"),
     [("literal", 15.4, 0.26), ("corrected", 10.0, 0.044), ("voting", 9.4, 0.031)],

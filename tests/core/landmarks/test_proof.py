@@ -44,6 +44,7 @@ def published(folder: Path, name: str) -> FloorMap:
     return FloorMap(codes, alphabet=alphabet, window=window)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_maps_are_unique(data: Path, walked: Walk, name: str) -> None:
     """facts/landmarks.md 4: found and verified by other programs."""
@@ -59,6 +60,7 @@ def test_published_maps_are_unique(data: Path, walked: Walk, name: str) -> None:
     assert (proof.landmarks_worst or 99) <= 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["id6_S_17x17", "or16_L_24x24"])
 def test_a_changed_letter_is_found_with_both_places(data: Path, walked: Walk, name: str) -> None:
     floor = published(data, name)
@@ -77,6 +79,7 @@ def test_a_changed_letter_is_found_with_both_places(data: Path, walked: Walk, na
     assert found
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(deadline=None, max_examples=25)
 def test_as_slow_passes_say(

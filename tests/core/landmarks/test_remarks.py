@@ -30,6 +30,7 @@ def solved(one: Simulated, floor: FloorMap = FLOOR) -> Solution:
     return solve(one.samples, floor, odometry=one.odometry)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", range(4))
 def test_a_sensor_of_the_other_sign_is_named(sensor: int) -> None:
     one = drive(strategy="paper", cells=(), seed=3, landmarks=3)
@@ -40,6 +41,7 @@ def test_a_sensor_of_the_other_sign_is_named(sensor: int) -> None:
         solved(replace(one, samples=(replace(samples, field_t=field),)))
 
 
+@pytest.mark.slow
 def test_a_landmark_off_its_place_is_named_and_does_not_pull_the_others() -> None:
     one = drive(faults=Faults(displaced=(((3, 5), (0.012, 0.0)),)))
     found = solved(one)
@@ -48,6 +50,7 @@ def test_a_landmark_off_its_place_is_named_and_does_not_pull_the_others() -> Non
     assert "landmark at 3,5 lies" in named[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "believed"), [(1, True), (3, False)])
 def test_a_map_that_is_often_wrong_is_not_believed(wrong: int, believed: bool) -> None:
     codes = CODES.copy()

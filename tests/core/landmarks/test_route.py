@@ -6,6 +6,7 @@ import functools
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_from_quaternion
@@ -61,12 +62,14 @@ def errors_of(one: Simulated, told: Trajectory) -> tuple[Array, Array]:
     return off, np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
 
 
+@pytest.mark.slow
 def test_a_pose_for_each_pose_of_odometry() -> None:
     one, told = session(0)
     assert told.frame == "map"
     np.testing.assert_array_equal(told.time_ns, one.odometry[0].time_ns)
 
 
+@pytest.mark.slow
 def test_errors_are_a_millimetre() -> None:
     for seed in range(3):
         off = errors_of(*session(seed))[0]
@@ -74,6 +77,7 @@ def test_errors_are_a_millimetre() -> None:
         assert np.degrees(np.sqrt((off[:, 2] ** 2).mean())) < 0.5
 
 
+@pytest.mark.slow
 def test_without_errors_there_are_none() -> None:
     off = errors_of(*session(7, clean=True))[0]
     # Odometry and samples are interpolated.
@@ -81,6 +85,7 @@ def test_without_errors_there_are_none() -> None:
     assert np.abs(off[:, 2]).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_covariances_are_honest_all_the_way() -> None:
     squares = np.concatenate([errors_of(*session(seed))[1] for seed in range(4)])
     assert 0.3 < squares.mean() < 5
@@ -130,6 +135,7 @@ def test_what_lies_before_and_after_all_visits_is_told_less_sure() -> None:
     assert np.hypot(*off[-1, :2]) < 0.06
 
 
+@pytest.mark.slow
 def test_the_way_before_runs_odometry_backwards() -> None:
     """Constant errors that are known are taken off in both directions alike."""
     one = session(3, clean=True)[0]
@@ -151,6 +157,7 @@ def test_the_way_before_runs_odometry_backwards() -> None:
     np.testing.assert_allclose(off, off[0], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_odometry_in_another_frame_is_the_same() -> None:
     one, told = session(4)
     own = one.odometry[0]

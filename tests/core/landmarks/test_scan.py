@@ -47,6 +47,7 @@ def test_the_compiled_loop_is_its_twin() -> None:
     np.testing.assert_allclose(fast, slow, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", range(16))
 def test_the_truth_is_among_the_first(code: int) -> None:
     for one in passes(2, code, errors=NONE, seed=code, start=(0.3 * code, 0.2)):

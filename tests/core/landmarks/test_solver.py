@@ -77,6 +77,7 @@ def farthest(one: Simulated, found: Solution) -> float:
     return float(np.hypot(*(told.position - np.column_stack(true))[:, :2].T).max())
 
 
+@pytest.mark.slow
 def test_a_session_without_faults() -> None:
     found = solved(session())
     assert [seen.cell for seen in found.detections] == CELLS
@@ -93,6 +94,7 @@ def test_a_session_without_faults() -> None:
     assert told.probability > 0.9999
 
 
+@pytest.mark.slow
 def test_the_least_pitch() -> None:
     floor = FloorMap(CODES, pitch_m=0.16)
     one = drive(floor)
@@ -101,6 +103,7 @@ def test_the_least_pitch() -> None:
     assert farthest(one, found) < 3e-3
 
 
+@pytest.mark.slow
 def test_places_of_detections_are_beside_their_landmarks() -> None:
     one = session()
     truth = one.truth[0]
@@ -111,6 +114,7 @@ def test_places_of_detections_are_beside_their_landmarks() -> None:
         assert seen.y_m == pytest.approx(away[1], abs=4e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_another_map_is_not_believed(seed: int) -> None:
     other = FloorMap(np.random.default_rng(100 + seed).integers(0, 16, (12, 12)))
@@ -159,6 +163,7 @@ def spinning() -> Simulated:
     return drive(strategy="paper", cells=(), seed=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "words"),
     [
@@ -171,6 +176,7 @@ def test_the_right_order_of_sensors_is_named(order: list[int], words: str) -> No
         solved(spinning(), field=lambda f: f[:, order])
 
 
+@pytest.mark.slow
 def test_no_order_of_sensors_leads_astray() -> None:
     """A straight pass cannot tell left from right, nor then a mirrored landmark."""
     message = ""
@@ -184,6 +190,7 @@ def test_no_order_of_sensors_leads_astray() -> None:
     assert not message or "order" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "code", "subject"),
     [
@@ -203,6 +210,7 @@ def test_what_is_wrong_is_told(
         assert farthest(session(), found) < 4e-3
 
 
+@pytest.mark.slow
 def test_late_odometry_is_told() -> None:
     """Where the robot turns: straight on, to be late is to be behind."""
     one = spinning()
@@ -234,6 +242,7 @@ def test_a_landmark_that_the_floor_lacks() -> None:
     assert farthest(one, found) < 4e-3
 
 
+@pytest.mark.slow
 def test_a_landmark_laid_wrongly_is_told() -> None:
     codes = CODES.copy()
     codes[2, 4] = (codes[2, 4] + 5) % 16
@@ -246,6 +255,7 @@ def test_a_landmark_laid_wrongly_is_told() -> None:
     assert farthest(one, found) < 4e-3
 
 
+@pytest.mark.slow
 def test_missing_bars_do_not_mislead() -> None:
     one = drive(faults=Faults(missing=(((2, 4), 1), ((4, 5), 0))))
     found = solved(one)
@@ -253,6 +263,7 @@ def test_missing_bars_do_not_mislead() -> None:
     assert [seen.cell for seen in found.detections] == CELLS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 8])
 def test_any_number_of_sensors_anywhere(count: int) -> None:
     places = circle(0.03) @ np.array([[0.8, 0.6], [-0.6, 0.8]])
@@ -274,6 +285,7 @@ def test_gaps_and_missing_values() -> None:
     assert farthest(session(), found) < 5e-3
 
 
+@pytest.mark.slow
 def test_robots_of_one_session_keep_apart() -> None:
     one, other = session(), drive(seed=2, cells=((7, 7), (7, 9), (9, 9), (9, 8)))
     second = replace(other.samples[0], device="b")
@@ -292,6 +304,7 @@ def test_too_few_landmarks_are_no_place() -> None:
     assert "not_localised" in warning_codes(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_misread_landmarks_are_never_silent(seed: int) -> None:
     """One in five is laid otherwise than the map says."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from locatk.core.landmarks.paper_study import study
 from locatk.core.landmarks.voting import voted_centre
@@ -30,6 +31,7 @@ def test_without_circles_there_is_no_centre() -> None:
     assert np.isnan(voted_centre(np.array([[[0, 0], [0.2, 0]]]), NO_WAY)).all()
 
 
+@pytest.mark.slow
 def test_voting_beats_the_papers_rules_on_half_discs() -> None:
     # facts/landmarks.md 3: 6.18 against 6.94 mm, SD 2.38 against 3.09
     voted, ruled = (study(3, method=m).figures() for m in ("voting", "corrected"))

@@ -149,6 +149,7 @@ def draws(world: Any, request: pytest.FixtureRequest) -> list[tuple[Array, Array
     return result
 
 
+@pytest.mark.slow
 def test_covariance_of_stations_is_that_of_noise_draws(draws: Any) -> None:
     for _, found, told in draws:
         large = found > 0.1 * found[-1]

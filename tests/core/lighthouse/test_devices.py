@@ -56,6 +56,7 @@ def test_devices_in_the_recording_with_three_photodiodes_are_rigid(mixed: Any) -
     assert select_rigid_receivers(sweeps, known) == {"rigid": RIGID}
 
 
+@pytest.mark.slow
 def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any) -> None:
     sweeps, _, scene = mixed
     solution = solve(sweeps, scene, receivers={"rigid": RIGID})
@@ -84,6 +85,7 @@ def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any) -> None:
         assert merged["rejected"] == first["rejected"] + second["rejected"]
 
 
+@pytest.mark.slow
 def test_a_rigid_device_needs_no_single_photodiode(mixed: Any, world: Any) -> None:
     sweeps, _, scene = mixed
     alone = world.take(sweeps, np.flatnonzero(sweeps.device == 0))
@@ -142,6 +144,7 @@ def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
     return lamps, sweeps, markers
 
 
+@pytest.mark.slow
 def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> None:
     lamps, sweeps, markers = marked(world, 4)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
@@ -162,6 +165,7 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> No
     assert np.linalg.norm(np.median(track.position[first], axis=0) - POSITIONS[0]) < 3e-3
 
 
+@pytest.mark.slow
 def test_two_markers_determine_no_frame(world: Any) -> None:
     _, sweeps, markers = marked(world, 2)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
@@ -169,6 +173,7 @@ def test_two_markers_determine_no_frame(world: Any) -> None:
     assert {"too_few_markers", "device_scale"} <= codes(solution)
 
 
+@pytest.mark.slow
 def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
     _, sweeps, markers = marked(world, 4)
     wrong = replace(markers[3], position=markers[3].position + [0.15, 0.0, 0.0])
@@ -176,6 +181,7 @@ def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
     assert "marker_misfit" in codes(solution)
 
 
+@pytest.mark.slow
 def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
     sweeps = world.stream(lamps, position_at, 6.0, sensors=SPAN)
@@ -188,6 +194,7 @@ def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> 
         assert check["jump_95_m"] < 0.02
 
 
+@pytest.mark.slow
 def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
     sweeps = world.stream(lamps, position_at, 6.0, sensors=SPAN)

@@ -44,6 +44,7 @@ def off(estimate: StationsEstimate, points: Array) -> float:
     return float(np.mean(np.linalg.norm(umeyama(found, true).apply(found) - true, axis=1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", list(combinations((1, 2, 5, 16), 2)) + [(1, 2, 5, 16)])
 @pytest.mark.parametrize("flat", [True, False])
 def test_the_scene_and_its_kind_are_found(
@@ -71,6 +72,7 @@ def test_a_floor_is_z_zero_with_stations_above(world: Any) -> None:
     assert np.all(rig.rotations[:, 2, 2] > 0)  # upright
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 def test_the_order_of_stations_does_not_matter(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2, 5)
@@ -114,6 +116,7 @@ def test_few_places_on_a_floor_are_enough(world: Any, n: int) -> None:
     assert off(found, points) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["first", "second", "third"])
 @pytest.mark.parametrize("flat", [True, False])
 def test_reflections_of_one_station_are_outvoted(world: Any, where: str, flat: bool) -> None:

@@ -53,6 +53,7 @@ def same(a: SequenceMatches, b: SequenceMatches) -> None:
         assert np.array_equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("polynomial", range(32))
 def test_every_clean_window_of_60_bits(light: Any, polynomial: int) -> None:
     index = np.arange(0, lfsr.SEQUENCE_LENGTH, 1 if kernels else 911)
@@ -213,6 +214,7 @@ def test_twins(light: Any) -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"])
 def test_twins_on_published_light(published: Callable[[str], Edges], name: str) -> None:
     bits = demodulate_bursts(split_bursts(published(name)))

@@ -105,6 +105,7 @@ def test_three_stations_of_which_no_place_sees_all(world: Any, flat: bool) -> No
     check(found, lamps, points, MEAN_M[flat])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 def test_four_stations_in_pairs_only(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2, 5, 16)
@@ -161,6 +162,7 @@ def test_of_two_islands_the_larger_is_solved(world: Any, flat: bool) -> None:
     check(found, lamps, points, 2 * MEAN_M[flat])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize(("number", "length"), [(6, 9.0), (16, 24.0)])
 def test_a_hall_of_stations_of_which_three_see_a_place(
@@ -252,6 +254,7 @@ def tracker(recordings: Path) -> Any:
     return read_libsurvive([path], stations=True)
 
 
+@pytest.mark.slow
 def test_recorded_stations_predict_each_other(tracker: Any) -> None:
     """Stations, calibrations and sweeps of four real units agree, in our model."""
     solution = solve(tracker.sweeps, tracker.scene)

@@ -57,6 +57,7 @@ def factory(channel: int, number: int) -> tuple[int, ...]:
     return tuple(ootx.encode_frame(payload).tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate_hz", "resolution_hz"),
     [(24e6, None), (32e6, None), (40e6, None), (100e6, None), (1e9, 5e8), (1e9, 24e6)],
@@ -105,6 +106,7 @@ def test_clean_light_to_a_fraction_of_a_bit(light: Any) -> None:
     assert np.array_equal(got.sweeps.plane, passed.plane)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [1, 5, 9, 13])
 def test_each_channel(light: Any, first: int) -> None:
     channels = range(first, first + 4)
@@ -120,6 +122,7 @@ def test_each_channel(light: Any, first: int) -> None:
         )
 
 
+@pytest.mark.slow
 def test_factory_data_of_two_stations(light: Any) -> None:
     senders = [
         light.Sender(4, slow=factory(4, 0xABCDEF01)),
@@ -179,6 +182,7 @@ def test_motion_capture_is_dropped(light: Any) -> None:
     assert set(got.rotors) == {1, 2}
 
 
+@pytest.mark.slow
 def test_light_that_does_not_end(light: Any) -> None:
     # Half a second without a gap, right behind a sweep, is one burst.
     (line,), passed = light.of([light.Sender(3)], 1.0)
@@ -298,6 +302,7 @@ def test_a_jump_of_a_clock_ends(light: Any) -> None:
     assert len(got.sweeps) >= len(passed.time_s) - 1
 
 
+@pytest.mark.slow
 def test_the_published_capture(published: Callable[[str], Edges]) -> None:
     got = demodulate_recording([published(CAPTURE)])
     (reading,) = got.photodiodes

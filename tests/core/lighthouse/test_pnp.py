@@ -156,6 +156,7 @@ def test_the_fit_uses_photodiodes_with_one_plane() -> None:
     assert squared_distances(fit, position, rotation)[0] < 22.5
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_repeated_trials() -> None:
     rng = np.random.default_rng(5)
     calibration = factory(2)

@@ -278,6 +278,7 @@ def capture(data: Path) -> tuple[Edges, np.ndarray]:
     return edges, bursts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("after_us", "decoded", "false"), [(0, 0.436, 0.11), (9, 0.796, 0.022), (12, 0.74, 0.035)]
 )

@@ -157,6 +157,7 @@ def normalized_error(solution: Solution, motion: Motion) -> float:
     return float(np.mean(np.einsum("mi,mij,mj->m", off, inverse, off)) / 6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planes_known", [True, False])
 def test_a_moving_tracker_is_tracked(planes_known: bool) -> None:
     sweeps = record(ROOM, TRACKER, carried, 2.0, planes_known=planes_known)
@@ -182,6 +183,7 @@ def test_one_station_determines_the_pose_of_a_non_coplanar_device() -> None:
     assert np.percentile(np.linalg.norm(errors(solution, carried)[:, :3], axis=1), 95) < 0.03
 
 
+@pytest.mark.slow
 def test_the_scene_is_estimated_from_the_device_alone() -> None:
     sweeps = record(ROOM, TRACKER, carried, 6.0)
     known = {s.channel: s.calibration for s in ROOM}
@@ -201,6 +203,7 @@ def test_the_scene_is_estimated_from_the_device_alone() -> None:
     assert len(solution.trajectories[0]) > 290
 
 
+@pytest.mark.slow
 def test_without_calibration_the_trajectory_is_right_after_a_rigid_transform() -> None:
     sweeps = record(ROOM, TRACKER, carried, 6.0)
     solution = solve_devices(sweeps, {"device": TRACKER})
@@ -235,6 +238,7 @@ def cramer_rao(
     return np.sqrt(np.diag(np.linalg.inv(information)))
 
 
+@pytest.mark.slow
 def test_the_errors_of_a_deck_are_close_to_the_cramer_rao_bound() -> None:
     stations = (station(1, (-1.5, 0.0, 1.8), 0), station(2, (1.2, -1.0, 1.8), 1))
     sweeps = record(stations, DECK, standing, 4.0)
@@ -255,6 +259,7 @@ def test_a_deck_under_one_station_has_an_ambiguous_orientation() -> None:
     assert "ambiguous_orientation" in codes(solution)
 
 
+@pytest.mark.slow
 def test_a_deck_at_rest_does_not_determine_a_scene() -> None:
     stations = (station(1, (-1.5, 0.0, 1.8), 0), station(2, (1.2, -1.0, 1.8), 1))
     sweeps = record(stations, DECK, standing, 2.0)
@@ -263,6 +268,7 @@ def test_a_deck_at_rest_does_not_determine_a_scene() -> None:
     assert {"ambiguous_station_pair", "few_device_positions"} <= codes(solution)
 
 
+@pytest.mark.slow
 def test_outliers_are_rejected_and_counted() -> None:
     sweeps = record(ROOM, TRACKER, carried, 2.0)
     rng = np.random.default_rng(1)
@@ -278,6 +284,7 @@ def test_outliers_are_rejected_and_counted() -> None:
     assert 0.9 * np.count_nonzero(wrong) < left_out < 1.05 * np.count_nonzero(wrong)
 
 
+@pytest.mark.slow
 def test_a_moved_station_is_reported() -> None:
     moved = replace(ROOM[2], position=ROOM[2].position + [0.3, 0.0, 0.0])
     sweeps = record((*ROOM[:2], moved), TRACKER, carried, 2.0)
@@ -341,6 +348,7 @@ def test_a_pause_of_years_is_handled() -> None:
     assert normalized_error(solution, standing) < 1.5
 
 
+@pytest.mark.slow
 def test_the_poses_of_a_recorded_tracker_agree_with_libsurvive(data: Path) -> None:
     """The reference are libsurvive's poses in its own scene. libsurvive gives all sweeps the same
     weight, three of which are 1.8 mrad off; that is a part of the difference."""

@@ -289,6 +289,7 @@ def test_without_labels_polynomials_are_unknown_and_nothing_else_changes() -> No
     assert are_equal(unknown, replace(known, polynomial=unknown.polynomial))
 
 
+@pytest.mark.slow
 def test_the_whole_floor_is_in_the_beams() -> None:
     for seed in range(5):
         for planar in (True, False):

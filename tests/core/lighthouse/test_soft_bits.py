@@ -163,6 +163,7 @@ def test_twins_on_windows(width: int) -> None:
     agree(split_windows(np.zeros((0, width), np.uint8)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"])
 def test_twins_on_published_light(published: Callable[[str], Edges], name: str) -> None:
     agree(split_bursts(published(name)))

@@ -60,6 +60,7 @@ def marked(world: Any, lamps: Any, places: Array | None = None) -> Scene:
 # ---- scenes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("channels", [(1, 2), (1, 2, 5), (1, 2, 5, 16)])
 def test_markers_give_metres_and_frame(world: Any, channels: tuple[int, ...], flat: bool) -> None:
@@ -317,6 +318,7 @@ def test_several_devices_share_a_scene(world: Any) -> None:
 # ---- free rotors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 def test_free_rotors_and_a_moving_receiver(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2, 5)
@@ -359,6 +361,7 @@ SPOILED_MEAN = {True: 1.5e-3, False: 6e-3}
 """Mean error in metres that a spoiled recording may have, by whether it is flat."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("channels", [(1, 2), (1, 2, 5)])
 def test_single_jumps_are_rejected_and_counted(
@@ -401,6 +404,7 @@ def test_single_reflections_are_rejected(world: Any, flat: bool) -> None:
     assert sum(solution.rejected.values()) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("liar", [0, 1, 2])
 def test_a_station_that_lies_for_a_while_is_outvoted(world: Any, liar: int, flat: bool) -> None:
@@ -749,6 +753,7 @@ def test_a_few_moments_in_space_that_are_called_flat(world: Any) -> None:
     assert solution is None or sum(solution.rejected.values()) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["any counts", "one jumbled", "equal planes", "drawn twice"])
 @pytest.mark.parametrize("channels", [(1,), (1, 2), (2, 5, 16), (1, 2, 5, 16)])
 def test_garbage_is_refused_or_told_never_a_crash(

@@ -178,6 +178,7 @@ def test_few_places_are_all_needed_and_that_is_told(world: Any) -> None:
     assert found.bundle_points == found.verification.epochs == 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 def test_a_station_that_was_moved_since_is_named(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2, 5, 16)

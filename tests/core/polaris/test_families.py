@@ -65,6 +65,7 @@ def test_placements_count() -> None:
     assert families.distance(tags, 0, 8**5) == 4
 
 
+@pytest.mark.slow
 @given(st.sampled_from(DESIGNS), st.data())
 @settings(max_examples=40, deadline=None)
 def test_members_keep_the_distance(tags: Tags, data) -> None:

@@ -84,6 +84,7 @@ def known_speed(world: Any) -> Round:
     return Round(found, np.array(pose), np.vstack(magnets), np.vstack(sigma))
 
 
+@pytest.mark.slow
 def test_every_heading_is_read(known_speed: Round) -> None:
     assert {found.tag_id for found in known_speed.found} == {ID}
     assert min(found.margin for found in known_speed.found) > 0.9
@@ -182,6 +183,7 @@ def hands(world: Any) -> Hands:
     return Hands(ids, np.array(z_pose), np.vstack(z_magnets), np.array(pose))
 
 
+@pytest.mark.slow
 def test_no_wrong_bit_at_any_speed_profile(hands: Hands) -> None:
     assert set(hands.ids) == {ID}
 
@@ -220,6 +222,7 @@ def design(rng: np.random.Generator, order: int, magnets: int, p: int) -> tuple[
     return cells, tuple(int(s) for s in rng.integers(p, size=magnets))
 
 
+@pytest.mark.slow
 def test_a_dense_tag_is_read_by_its_grid(world: Any) -> None:
     """Thirteen magnets at 1.6 clearances, of which the scan takes two for one: read
     only because all cells of the grid are tried (it was refused before that was so)."""
@@ -234,6 +237,7 @@ def test_a_dense_tag_is_read_by_its_grid(world: Any) -> None:
     assert found.tag_id == codec.id_of(tags, Layout(cells, symbols))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "magnets", "p", "spacing"),
     [

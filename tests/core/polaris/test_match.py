@@ -56,6 +56,7 @@ def seen(places: ArrayLike, *, free: bool = False, sigma: float = 2e-5) -> Sight
 coordinate = st.floats(-0.2, 0.2)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     coordinate, coordinate, st.floats(-3.1, 3.1), st.permutations(range(5)), st.integers(0, 1000)

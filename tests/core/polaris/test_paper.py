@@ -263,6 +263,7 @@ def test_lost_samples_and_a_dead_sensor_that_sees_nothing() -> None:
     assert warning == SolverWarning("sensor_silent", "without sensor 1, which gave no samples")
 
 
+@pytest.mark.slow
 def test_sensors_may_come_in_any_order() -> None:
     samples = drive([lying(0.17, 0.004, 0.4)], 0.34)
     order = np.random.default_rng(4).permutation(9)
@@ -360,6 +361,7 @@ def scored(data: Path, request: pytest.FixtureRequest) -> Scores:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", RUNS)
 def test_places_are_no_worse_than_the_authors(scored: Scores, kind: str) -> None:
     rigid, anchored = np.mean([run[:2] for run in scored[kind]], axis=0)

@@ -107,6 +107,7 @@ def scatter_deg(some: list[Run]) -> float:
     return float(np.degrees(np.sqrt(np.mean(np.angle(turned * turned.mean(axis=0).conj()) ** 2))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_no_wrong_bit(name: str, runs: dict[str, list[Run]]) -> None:
     """The authors: 5 wrong bits of 540 over their 30 runs."""

@@ -389,6 +389,7 @@ def capped(steps: np.ndarray, word, places: list[int]) -> float:
     return sum(min(1.0, apart(REDUNDANT, steps[k], word[k])) for k in places)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_a_missing_magnet_and_a_misread_one_are_borne(data) -> None:
@@ -414,6 +415,7 @@ def test_what_the_margin_of_a_clean_tag_is() -> None:
     assert read(REDUNDANT, *magnets(REDUNDANT, 33)).margin == 5
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.data())
 def test_one_misread_more_is_refused(data) -> None:

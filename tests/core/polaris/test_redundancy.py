@@ -71,6 +71,7 @@ def test_words_differ_in_five_places(magnets: int, orientations: int) -> None:
     assert min(errors(one, other) for one, other in pairs) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("magnets", "orientations"), [(5, 4), (5, 5), (6, 5)])
 def test_decoding_is_right_for_whatever_is_seen(magnets: int, orientations: int) -> None:
     """Of all that can be seen at all, exactly what brute force over the words would accept."""
@@ -113,6 +114,7 @@ def damaged(draw) -> tuple[Tags, tuple[int, ...], list[int | None], int, int]:
     return tags, word, seen, misread, missing
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=400)
 @given(damaged())
 def test_the_promise_holds_at_any_size(case) -> None:

@@ -401,6 +401,7 @@ def test_what_wobbles_stays_within_its_share_and_comes_near_it() -> None:
         assert max(np.abs(np.diff((v - middle) / swing)).max() for v in values) < 0.5
 
 
+@pytest.mark.slow
 def test_a_tour_crosses_the_tags_of_a_site_in_their_order() -> None:
     tags = Tags(
         site={
@@ -457,6 +458,7 @@ def test_a_tag_is_crossed_whole_in_part_or_not(lateral: float, whole: bool | Non
 # ---- tags, debris, motors, odometry
 
 
+@pytest.mark.slow
 def test_hand_built_tags_are_the_same_in_every_session_and_told() -> None:
     wrong = {"build_angle_rad": 0.1, "build_place_m": 5e-4, "build_strength": 0.05}
     tags = Tags(site={k: Placed(0.3 * k, 0.0, 0.3) for k in range(40)})
@@ -578,6 +580,7 @@ def test_motors_are_felt_while_they_drive_and_more_at_one_end() -> None:
     assert way == pytest.approx(np.broadcast_to(way[0, 0], way.shape))
 
 
+@pytest.mark.slow
 def test_odometry_tells_the_way_too_long_and_turns_away() -> None:
     tags = Tags(site={1: Placed(0.0, 0.0, 0.0), 2: Placed(1.0, 0.5, 0.0)})
     options = replace(PLAIN, odometry=True, rate_hz=20.0)

@@ -95,6 +95,7 @@ def spoiled(kind: str, samples: Samples) -> Samples:
     return Samples(samples.device, samples.array, samples.time_ns[keep], b[keep])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -138,6 +139,7 @@ def test_slow_and_fast(step_mm: float, world: Any) -> None:
     assert found.speed_mps == pytest.approx(step_mm / 10, rel=0.06)
 
 
+@pytest.mark.slow
 def test_backward(world: Any) -> None:
     course = world.driven(world.line(length=0.28), [0, 2.8], [1, 0])
     tag, _, recording = passed(world, course=course)
@@ -146,6 +148,7 @@ def test_backward(world: Any) -> None:
     assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
 
 
+@pytest.mark.slow
 def test_standing_still_over_the_tag(world: Any) -> None:
     course = world.driven(world.line(length=0.28), [0, 1.2, 2.7, 4.3], [0, 0.43, 0.43, 1])
     tag, _, recording = passed(world, course=course, heading=np.radians(33), seed=2)
@@ -160,6 +163,7 @@ def test_standing_still_over_the_tag(world: Any) -> None:
 # ---- what must be refused
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lateral", [-0.12, -0.08, 0.09, 0.12])
 def test_tag_beside_the_bar_is_partial(lateral: float, world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, heading=0.1)
@@ -170,6 +174,7 @@ def test_tag_beside_the_bar_is_partial(lateral: float, world: Any) -> None:
     assert solution.trajectories == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [slice(0, 110), slice(170, 280)])
 def test_recording_cut_within_the_tag_is_partial(part: slice, world: Any) -> None:
     _, _, recording = passed(world, heading=0.0)
@@ -178,6 +183,7 @@ def test_recording_cut_within_the_tag_is_partial(part: slice, world: Any) -> Non
     assert solution.rejected == {"partial": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gone", range(5))
 def test_plain_tag_without_a_magnet_is_refused(gone: int, world: Any) -> None:
     strength = tuple(float(k != gone) for k in range(5))
@@ -189,6 +195,7 @@ def test_plain_tag_without_a_magnet_is_refused(gone: int, world: Any) -> None:
     assert len(found.magnets) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -207,6 +214,7 @@ def test_tag_of_another_design_is_refused(wrong: dict[str, Any], world: Any) -> 
     assert sum(solution.rejected.values()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing", [0.036, 0.045])
 def test_slightly_wrong_spacing_is_never_a_surely_wrong_pose(spacing: float, world: Any) -> None:
     tag, course, recording = passed(world, heading=0.0)
@@ -240,6 +248,7 @@ def test_without_a_tag_there_are_magnets_but_no_ids(world: Any) -> None:
 # ---- several tags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ahead", "aside"), [(0.5, 0.0), (0.2, 0.0), (0.13, 0.0), (0.0, 0.13)]
 )  # far, near, as near as tags can lie, side by side

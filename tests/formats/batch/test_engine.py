@@ -53,6 +53,7 @@ def calls(folder: Path, number: int) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pool", [pools.serial(), pools.processes(3)], ids=["serial", "processes"])
 def test_each_job_has_its_result(module: ModuleType, tmp_path: Path, pool: Pool) -> None:
     kinds = ["late", "", "raise", "", "late", ""]
@@ -69,6 +70,7 @@ def test_each_job_has_its_result(module: ModuleType, tmp_path: Path, pool: Pool)
     assert [calls(tmp_path, number) for number in results] == [1] * 6
 
 
+@pytest.mark.slow
 def test_a_deadly_job_takes_no_other_along(module: ModuleType, tmp_path: Path) -> None:
     kinds = ["late", "deadly", "late", "", "once", "exit", "", ""]
     jobs = [(tmp_path, number, how) for number, how in enumerate(kinds)]

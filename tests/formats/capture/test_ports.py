@@ -590,6 +590,7 @@ old_calls = pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarni
 """pyserial 3.5 starts its thread as one did before Python 3.10."""
 
 
+@pytest.mark.slow
 @old_calls
 def test_a_remote_port(opened: Opened) -> None:
     remote = Remote(EVERY_BYTE)

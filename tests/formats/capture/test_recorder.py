@@ -124,6 +124,7 @@ def test_what_is_said_late_is_not_dated_before_what_is_written_later(
     assert times == sorted(times)
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_slow_costs_no_byte(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +194,7 @@ def test_the_file_is_forced_to_the_disk_by_another_thread(
     assert set(names) == {"locatk-sync"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_comes_together(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch, seed: int
@@ -290,6 +292,7 @@ def test_a_device_that_does_not_come_back(port: Any, start: Any, raw_bytes: Any)
     assert recorded.ended == "stopped"
 
 
+@pytest.mark.slow
 def test_a_silence_while_it_is_away_is_no_second_warning(port: Any, start: Any) -> None:
     running = start(silence_s=0.3)
     port.refusals = [SourceError("not there") for _ in range(10_000)]
@@ -359,6 +362,7 @@ def test_a_driver_that_hangs_does_not_hold_the_file(
 # ---- silence, clock, overruns
 
 
+@pytest.mark.slow
 def test_silence_is_told_once_until_something_comes(port: Any, start: Any, log_lines: Any) -> None:
     running = start(silence_s=0.2)
     running.until_said("nothing received for 0 s")
@@ -373,6 +377,7 @@ def test_silence_is_told_once_until_something_comes(port: Any, start: Any, log_l
     assert recorded.totals.losses() == []
 
 
+@pytest.mark.slow
 def test_a_disk_that_was_slow_is_no_silence(
     port: Any, start: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -492,6 +497,7 @@ def test_it_ends_at_the_size(port: Any, start: Any, raw_bytes: Any) -> None:
     assert b"".join(sent).startswith(raw_bytes(*recorded.paths))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", [{"max_bytes": 1_000_000}, {"rotate_bytes": 1_000_000}])
 def test_sizes_hold_for_what_comes_at_once(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch, limits: Any
@@ -534,6 +540,7 @@ def check_parts(paths: list[Path]) -> None:
         assert {RAW, "/log"} <= {channel.topic for channel in read.channels}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", [{"rotate_s": 0.05}, {"rotate_bytes": 8_000, "flush_s": 0.01}])
 def test_parts_hold_every_byte_once(
     port: Any, start: Any, raw_bytes: Any, limits: dict[str, float]
@@ -556,6 +563,7 @@ def test_parts_hold_every_byte_once(
     assert set(ended[:-1]) == {"goes on in the next part"}
 
 
+@pytest.mark.slow
 def test_a_part_ends_in_a_gap(port: Any, start: Any, raw_bytes: Any) -> None:
     running = start(note="of all", rotate_s=0.1)
     first, second = pieces(5), pieces(5)
@@ -575,6 +583,7 @@ def test_a_part_ends_in_a_gap(port: Any, start: Any, raw_bytes: Any) -> None:
     assert sum(map(float, away)) == pytest.approx(recorded.totals.gap_s, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_next_part_cannot_be_begun(port: Any, start: Any, raw_bytes: Any) -> None:
     running = start(rotate_s=0.3)
     parts.part_path(running.wanted.output, 2).write_bytes(b"somebody else's")

@@ -212,6 +212,7 @@ def test_while_the_reader_is_away_bytes_are_lost_and_counted(port: PseudoPort) -
     assert totals.unheard == totals.made - totals.sent > 0
 
 
+@pytest.mark.slow
 def test_a_reader_that_does_not_read_loses_bytes_in_the_middle(port: PseudoPort) -> None:
     packets = numbered(500, size=200)  # 100 kB, where a terminal holds 20 kB
     reader = Reader(port.path, first=lambda descriptor: time.sleep(0.3))
@@ -234,6 +235,7 @@ def test_a_busy_reader_loses_nothing(port: PseudoPort) -> None:
     assert reader.data == joined(packets)
 
 
+@pytest.mark.slow
 def test_as_fast_as_the_reader_takes_it_nothing_is_lost(port: PseudoPort) -> None:
     """Neither while it is busy nor while it is away, but for what it left unread."""
     packets = numbered(6000, step_ms=1000, size=200)
@@ -249,6 +251,7 @@ def test_as_fast_as_the_reader_takes_it_nothing_is_lost(port: PseudoPort) -> Non
     assert totals.overrun == 0
 
 
+@pytest.mark.slow
 def test_unplugging(port: PseudoPort) -> None:
     packets = numbered(580)
     reader = Reader(port.path)

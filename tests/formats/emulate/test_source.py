@@ -179,6 +179,7 @@ def test_images_come_over_no_serial_port(tmp_path: Path, recordings: list[Record
     assert "camera:" in caught.value.hint
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_simulated_sessions(system: str, tmp_path: Path) -> None:
     """They hold observations that a device can send, artifacts and truth."""

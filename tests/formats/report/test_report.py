@@ -126,6 +126,7 @@ def test_what_exists_is_not_replaced_unasked(tmp_path: Path) -> None:
         write_report(tmp_path / "nowhere" / "a.html", [judged(solution("red"))])
 
 
+@pytest.mark.slow
 def test_neither_matplotlib_nor_scipy_is_imported() -> None:
     """They would take longer than all else."""
     code = (
@@ -152,6 +153,7 @@ def test_names_of_devices_do_no_harm() -> None:
     assert any(name and "&lt;" in name for name in names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Łódź 🤖", "%{x}", "$5^2$", "_x", "a\nb", "<b>bold</b>", " "])
 def test_odd_names_are_shown(name: str) -> None:
     page = render([judged(solution(name, "other"))])
@@ -282,6 +284,7 @@ def times(panel: Any) -> list[float]:
     return np.concatenate([x[np.isfinite(x)] for x in found]).tolist()
 
 
+@pytest.mark.slow
 def test_all_time_axes_begin_with_the_recording() -> None:
     recording = SimpleNamespace(
         start_ns=START_NS - 3_000_000_000, end_ns=START_NS + 10**10, facts={}

@@ -110,6 +110,7 @@ def _texts(value: ast.AST | None, constants: dict[str, Any]) -> set[str]:
     return set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", list(seen_reasons.SYSTEMS))
 def test_every_reason_of_core_has_a_sentence_and_no_other_has(system: str) -> None:
     given, known = reasons(system), set(seen_reasons.SYSTEMS[system]())

@@ -163,6 +163,7 @@ def test_the_telling_detections_are_those_refused_the_least_sure_and_the_surest(
 # ---- systems
 
 
+@pytest.mark.slow
 def test_every_panel_has_words_and_draws_without_webgl(
     lighthouse: tuple[Session, Solution], polaris: tuple[Session, Solution], tmp_path: Path
 ) -> None:
@@ -289,6 +290,7 @@ def test_names_of_sensors_are_no_html(tmp_path: Path) -> None:
         assert "<u>" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [True, False])
 def test_frames_are_shown_decoded_and_rejected(tmp_path: Path, camera: bool) -> None:
     made = dots_simulate.simulate(

@@ -296,6 +296,7 @@ def flattened(batches: list[Batch]) -> dict[Any, list[Any]]:
     return dict(found)
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(0, len(MIXED)), max_size=30))
 @settings(deadline=None)
 def test_pieces_do_not_matter(cuts: list[int]) -> None:
@@ -365,6 +366,7 @@ def back(sweeps: Sweeps) -> dict[str, Batch]:
     return {batch.stream.node: batch for batch in batches}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "recording",
     ["twoLH-2D_scene/dataset/lighthouse/data.csv", "twoLH-3D_scene/dataset/data_all.csv"],

@@ -92,6 +92,7 @@ def said(kind: str, words: list[str]) -> dict[str, Any]:
     return {"b_tesla": np.array(values) * 1e-6, "temperature_celsius": warmth}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("compiler", "standard"), [("gcc", ("-std=c99",)), ("g++", ("-x", "c++", "-std=c++11"))]
 )

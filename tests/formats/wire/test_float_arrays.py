@@ -158,6 +158,7 @@ def test_axes_are_the_arrays() -> None:
     assert fields(batches)[7, :3].tolist() == pytest.approx([-y * 1e-6, -x * 1e-6, -z * 1e-6])
 
 
+@pytest.mark.slow
 def test_any_start_is_right_where_the_line_pauses(published: list[np.ndarray]) -> None:
     for k, values in enumerate(published):
         data, true = to_bytes(values), tesla(values)
@@ -285,6 +286,7 @@ def hit(data: bytes, size: int, kind: str, rng: np.random.Generator) -> tuple[by
     return data[:at] + rng.bytes(n) + data[at:], at, -n
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lose", "add"])
 @pytest.mark.parametrize("device", KINDS)
 def test_lost_and_added_bytes(published: list[np.ndarray], device: str, kind: str) -> None:
@@ -321,6 +323,7 @@ def test_lost_and_added_bytes(published: list[np.ndarray], device: str, kind: st
     assert wrong <= (2 if device == "three" else 1)
 
 
+@pytest.mark.slow
 def test_bytes_lost_all_the_time(published: list[np.ndarray]) -> None:
     rng = np.random.default_rng(7)
     whole = got = wrong = 0
@@ -337,6 +340,7 @@ def test_bytes_lost_all_the_time(published: list[np.ndarray]) -> None:
     assert wrong <= 3
 
 
+@pytest.mark.slow
 def test_flipped_bits_become_no_number_where_they_can_be_noticed(
     published: list[np.ndarray],
 ) -> None:
@@ -453,6 +457,7 @@ def test_values_that_are_no_counts() -> None:
 # ---- no arrays at all
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [PolarisDecoder, MagxDecoder])
 @pytest.mark.parametrize(
     "piece",
@@ -520,6 +525,7 @@ def test_short_streams(n: int) -> None:
 # ---- pieces and connections
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.data())
 def test_any_split_gives_the_same(draw: st.DataObject) -> None:

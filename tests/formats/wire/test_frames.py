@@ -437,6 +437,7 @@ def some_frames(count: int, seed: int, nodes: int = 3) -> list[bytes]:
     return frames
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.integers(0, 1 << 32), st.lists(st.integers(0, 1 << 16), max_size=40))
 def test_any_split_gives_the_same(seed: int, cuts: list[int]) -> None:
@@ -451,6 +452,7 @@ def test_any_split_gives_the_same(seed: int, cuts: list[int]) -> None:
     assert other.remarks == decoder.remarks
 
 
+@pytest.mark.slow
 def test_more_than_is_decoded_at_once() -> None:
     frames = some_frames(3000, 11)
     wire = b"".join(frames)
@@ -462,6 +464,7 @@ def test_more_than_is_decoded_at_once() -> None:
     assert (decoder.counts.frames, decoder.counts.bad, decoder.counts.lost) == (3000, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_faults_cost_their_frames_alone(seed: int) -> None:
     random = np.random.default_rng(seed)

@@ -179,6 +179,7 @@ def test_many_at_once_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -
     assert (counts.bad, counts.skipped) == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("few", [0, framing.FEW])
 def test_damage_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -> None:
     monkeypatch.setattr(framing, "FEW", few)

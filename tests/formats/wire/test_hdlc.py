@@ -71,6 +71,7 @@ def test_pieces_do_not_matter(sent: list[bytes], shared: bool, cuts: list[int]) 
         assert stream[:end].endswith(packed(payload)[1:])
 
 
+@pytest.mark.slow
 @given(payloads, st.binary(max_size=40), st.data())
 def test_faults_make_no_wrong_frame(sent: list[bytes], noise: bytes, draw: st.DataObject) -> None:
     good = [packed(b"first")] + [packed(payload) for payload in sent] + [packed(b"last")]

@@ -122,6 +122,7 @@ def damaged(pieces: list[bytes], seed: int) -> list[bytes]:
 SENDERS = sorted(name for name, device in DEVICES.items() if device.encoder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENDERS)
 def test_no_device_is_taken_for_another(name: str) -> None:
     """The table of confusion; the devices are the rows, what is done to the bytes the columns."""
@@ -155,6 +156,7 @@ def test_clean_frames_are_sure_soon(name: str) -> None:
         assert verdict.device == name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENDERS)
 def test_pieces_do_not_matter(name: str) -> None:
     for what, pieces in sent(name):
@@ -182,6 +184,7 @@ def noise(kind: str) -> bytes:
     return made[kind]()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boot", [b"", BOOT])
 @pytest.mark.parametrize(
     "kind",

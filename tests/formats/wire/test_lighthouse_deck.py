@@ -209,6 +209,7 @@ def test_pieces_do_not_matter(cuts: list[int]) -> None:
     assert decoder.counts == decode(CLEAN)[1].counts
 
 
+@pytest.mark.slow
 def test_byte_by_byte_with_faults() -> None:
     data = bytearray(CLEAN[: 300 * FRAME])
     del data[1000:1005]
@@ -226,6 +227,7 @@ QUIET = 20 * FRAME
 """The jury has sat before the first fault."""
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(QUIET, len(CLEAN) - 1), min_size=1, max_size=8), st.data())
 @settings(max_examples=100, deadline=None)
 def test_lost_and_added_bytes_make_no_wrong_sweep(places: list[int], draw: st.DataObject) -> None:
@@ -259,6 +261,7 @@ def near(got: dict[str, NDArray[Any]], *, sensors: bool = True) -> bool:
     )
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(QUIET * 8, len(CLEAN) * 8 - 1), min_size=1, max_size=8, unique=True))
 @settings(max_examples=100, deadline=None)
 def test_flipped_bits_make_no_wrong_sweep(bits: list[int]) -> None:

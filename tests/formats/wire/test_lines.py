@@ -657,6 +657,7 @@ def test_noise_does_no_harm(data: bytes) -> None:
         assert all(len(column) == len(batch) for column in batch.columns.values())
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
