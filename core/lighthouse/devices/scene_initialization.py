@@ -157,7 +157,7 @@ class StationLink:
     epochs : int
         Number of epochs that agree with it.
     is_ambiguous : bool
-        Whether a quite different pose has about as many votes. A coplanar device that was not
+        True if a quite different pose has about as many votes. A coplanar device that was not
         moved has two poses under each station, and nothing decides between them.
     """
 

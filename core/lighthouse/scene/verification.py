@@ -57,7 +57,7 @@ def verify_scene(
     floor_z : float, optional
         Height of all photodiodes, if they move on a plane.
     held_out : bool
-        Whether the epochs took no part in the estimation of the scene.
+        True if the epochs took no part in the estimation of the scene.
 
     Returns
     -------
