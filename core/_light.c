@@ -82,17 +82,17 @@ PyObject *window_edges(PyObject *self, PyObject *args)
 
 /* ---- Soft bits -------------------------------------------------------------------------- */
 
-#define TURN_STEPS 4096      /* steps of a full turn in the table of sines */
+#define SINE_STEPS 4096      /* steps of one period in the table of sines */
 #define MAX_RUN_CHIPS 3.0    /* longer runs between edges are limited to this */
 #define MIN_ODD_EXCESS 1e-3f /* bits start at the second chip only beyond this evidence */
 #define FULL_LEVEL (1 << 20) /* a level as a whole number, so that sums are exact */
-static int32_t sines[TURN_STEPS + TURN_STEPS / 4]; /* sine; a quarter turn later cosine */
+static int32_t sines[SINE_STEPS + SINE_STEPS / 4]; /* sine; a quarter of a period later cosine */
 
 static void make_sines(void)
 {
-    if (sines[TURN_STEPS / 4] != 0) return;
-    for (int k = 0; k < TURN_STEPS + TURN_STEPS / 4; k++)
-        sines[k] = (int32_t)rint(sin(2 * M_PI / TURN_STEPS * k) * 16384);
+    if (sines[SINE_STEPS / 4] != 0) return;
+    for (int k = 0; k < SINE_STEPS + SINE_STEPS / 4; k++)
+        sines[k] = (int32_t)rint(sin(2 * M_PI / SINE_STEPS * k) * 16384);
 }
 
 /* Round to the nearest whole number. Sampled times are often halves: these round up despite small
@@ -110,9 +110,9 @@ HOT static double fit_chip_grid(const double *time, int edges, double *skew)
         for (int kind = 0; kind < 2 && k + kind < edges; kind++) {
             const double chips = time[k + kind];
             const int step =
-                (int)((chips - (double)(int)chips) * TURN_STEPS + 0.5) & (TURN_STEPS - 1);
+                (int)((chips - (double)(int)chips) * SINE_STEPS + 0.5) & (SINE_STEPS - 1);
             sine[kind] += sines[step];
-            cosine[kind] += sines[step + TURN_STEPS / 4];
+            cosine[kind] += sines[step + SINE_STEPS / 4];
             if (k + kind + 1 < edges) {
                 const double length = time[k + kind + 1] - chips;
                 run[kind] += length < MAX_RUN_CHIPS ? length : MAX_RUN_CHIPS;

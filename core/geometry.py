@@ -128,7 +128,7 @@ def slerp(first: ArrayLike, second: ArrayLike, fraction: ArrayLike) -> Array:
 
 
 def _components(array: Array) -> list[Array]:
-    """Components along the last axis."""
+    """Split an array into its components along the last axis."""
     return [array[..., k] for k in range(array.shape[-1])]
 
 
@@ -211,6 +211,15 @@ def rotation_exp(vectors: ArrayLike) -> Array:
 def rotation_log(rotation: ArrayLike) -> Array:
     """Return the rotation vectors (..., 3), at most pi long, of rotation matrices (..., 3, 3)."""
     return rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
+
+
+def rotation_angle(first: ArrayLike, second: ArrayLike) -> Array:
+    """Return the angles (...), from 0 to pi, between rotations (..., 3, 3).
+
+    An angle below about 1e-8 is lost in the rounding of the cosine.
+    """
+    trace = np.einsum("...ij,...ij->...", np.asarray(first, float), np.asarray(second, float))
+    return np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
 # ---- rigid motions

@@ -65,10 +65,10 @@ DAMPING_FACTOR = 10.0
 
 RELATIVE_RIDGE = 1e-12
 """Added to the diagonal of each small matrix, relative to its largest element, so that parameters
-that nothing determines stay where they are."""
+that no residual determines keep their values."""
 
-RIDGE = 1e-300
-"""The same for matrices of zeros (a point that nothing observed)."""
+ABSOLUTE_RIDGE = 1e-300
+"""Added as well, for matrices of zeros (a point that nothing observed)."""
 
 RANK_TOLERANCE = 1e-14
 """Relative size of singular values that count as zero when the reduced system is solved."""
@@ -85,7 +85,7 @@ class Equations(Protocol):
         """(m,) objective of each problem."""
 
     def solve(self, damping: Array, problems: Indices) -> Any:
-        """Step of some of the problems."""
+        """Return the damped step of some of the problems."""
 
 
 class Problem(Protocol[State]):
@@ -169,7 +169,7 @@ def minimize(
     inner_iterations_after : int, optional
         From this iteration on, the eliminated blocks take a step of their own after each step
         (Schur equations only; the problem is a :class:`BlockProblem`). That doubles the work of
-        an iteration and shortens the way through curved valleys (inner iterations in Ceres
+        an iteration and shortens the path through curved valleys (inner iterations in Ceres
         Solver; Ruhe and Wedin, SIAM Rev. 22 (1980) 318).
 
     Returns
@@ -207,12 +207,12 @@ def minimize(
         iterations[active] = iteration
         lower = np.maximum(dampings[active] / DAMPING_FACTOR, MIN_DAMPING)
         dampings[active] = np.where(improved, lower, dampings[active] * DAMPING_FACTOR)
-        found = np.where(improved & (gain < min_gain), SMALL_GAIN, RUNNING)
+        reason = np.where(improved & (gain < min_gain), SMALL_GAIN, RUNNING)
         if min_step > 0:
-            found[np.linalg.norm(step, axis=1) < min_step] = SMALL_STEP
-        found[dampings[active] > MAX_DAMPING] = MAX_DAMPING_REACHED
-        status[active] = found
-        active = active[found == RUNNING]
+            reason[np.linalg.norm(step, axis=1) < min_step] = SMALL_STEP
+        reason[dampings[active] > MAX_DAMPING] = MAX_DAMPING_REACHED
+        status[active] = reason
+        active = active[reason == RUNNING]
     return Minimum(state, equations, iterations, status)
 
 
@@ -236,20 +236,20 @@ class DenseEquations:
     residual: Array
 
     @classmethod
-    def from_residuals(
-        cls, residual: Array, jacobian: Array, weight: Array, cost: Array
-    ) -> DenseEquations:
-        """Build the equations from residuals (m, n), Jacobians (m, n, p) and weights (m, n)."""
-        root = np.sqrt(weight)
-        return cls.from_weighted(residual, residual * root, jacobian * root[..., None], cost)
-
-    @classmethod
     def from_weighted(
         cls, residual: Array, weighted: Array, jacobian: Array, cost: Array
     ) -> DenseEquations:
-        """Build the equations from residuals and Jacobians times the roots of their weights.
+        """Build the equations from weighted residuals and Jacobians.
 
-        ``residual`` (m, n) is kept as it is, before weighting.
+        Parameters
+        ----------
+        residual : (m, n) ndarray
+            Before weighting; it is stored as it is.
+        weighted : (m, n) ndarray
+            Residuals times the square roots of their weights.
+        jacobian : (m, n, p) ndarray
+            Derivatives of the residuals times the same roots.
+        cost : (m,) ndarray
         """
         transposed = np.swapaxes(jacobian, -1, -2)
         gradient = (transposed @ weighted[..., None])[..., 0]
@@ -267,7 +267,7 @@ class DenseEquations:
         self.cost = self.cost + 0.5 * np.sum((deviation / sigma) ** 2, axis=1)
 
     def solve(self, damping: Array, problems: Indices) -> Array:
-        """Damped steps (k, p) of the chosen problems (k,)."""
+        """Return the damped steps (k, p) of the chosen problems (k,)."""
         matrix = self.hessian[problems]
         _damp(matrix, damping[:, None])
         step = -np.linalg.solve(matrix, self.gradient[problems][..., None])[..., 0]
@@ -325,7 +325,7 @@ class SchurEquations:
     weight: Array = field(default_factory=lambda: np.zeros(0))
 
     def solve(self, damping: Array, problems: Indices | None = None) -> SchurStep:
-        """Damped step of all parameters."""
+        """Return the damped step of all parameters."""
         reduced, right, inverses = self._reduced(float(damping[0]))
         # A penalty of the size of the matrix keeps the step out of the gauge directions.
         gauge = self.gauge
@@ -337,14 +337,14 @@ class SchurEquations:
         return SchurStep(shared, -(inverses @ back[..., None])[..., 0])
 
     def solve_blocks(self) -> Array:
-        """Undamped step (k, d) of the blocks, the shared parameters being fixed."""
+        """Return the undamped step (k, d) of the blocks, the shared parameters being fixed."""
         matrix = self.block_hessian.copy()
         _damp(matrix, 0.0)
         step = -np.linalg.solve(matrix, self.block_gradient[..., None])[..., 0]
         return step.astype(np.float64, copy=False)
 
     def covariance(self) -> Array:
-        """(p, p) covariance of the shared parameters, the blocks being estimated as well.
+        """Return the covariance (p, p) of the shared parameters, with all blocks estimated.
 
         It is zero for parameters that are not free and along the gauge.
         """
@@ -354,7 +354,7 @@ class SchurEquations:
         return np.asarray(projection @ np.linalg.pinv(inside, hermitian=True) @ projection)
 
     def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """Schur complement (p, p), its right side (p,), and the inverses of the blocks."""
+        """Return Schur complement (p, p), its right side (p,), and the inverses of the blocks."""
         p = len(self.gradient)
         full = self.hessian.copy()
         full[np.diag_indices(p)] *= 1.0 + damping
@@ -369,16 +369,17 @@ class SchurEquations:
 
 
 def _damp(matrices: Array, damping: Array | float) -> None:
-    """Scale the diagonals of matrices (..., p, p) by ``1 + damping`` in place, with a ridge."""
+    """Scale the diagonals of matrices (..., p, p) by ``1 + damping``, and add a ridge."""
     diagonal = np.einsum("...ii->...i", matrices)
     diagonal *= 1.0 + damping
-    diagonal += RELATIVE_RIDGE * np.max(diagonal, axis=-1, keepdims=True, initial=0.0) + RIDGE
+    largest = np.max(diagonal, axis=-1, keepdims=True, initial=0.0)
+    diagonal += RELATIVE_RIDGE * largest + ABSOLUTE_RIDGE
 
 
 def cauchy_loss(
     residual: Array, scale: Array | float, cutoff: float = np.inf
 ) -> tuple[Array, Array]:
-    """Cauchy's loss and its weights.
+    """Return the Cauchy loss of residuals and their weights.
 
     Parameters
     ----------

@@ -9,15 +9,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+MAX_SAMPLED_CORRESPONDENCES = 256
+"""Maximum number of correspondences from which samples are drawn; it bounds the memory."""
 
-MAX_SAMPLED = 256
-"""Number of correspondences from which samples are drawn, at most; it bounds the memory."""
-
-MAX_SCORED = 600
-"""Number of correspondences on which candidate models are compared, at most."""
+MAX_SCORED_CORRESPONDENCES = 600
+"""Maximum number of correspondences on which candidate models are compared."""
 
 MAX_REFITS = 10
-"""Number of refits on the inliers, which settle in two or three."""
+"""Maximum number of refits on the inliers; two or three are usual until these are stable."""
+
+SIGMA_PER_MEDIAN_ABSOLUTE = 1.4826
+"""Standard deviation of a normal distribution, relative to its median absolute value: the inverse
+of its quantile at 3/4."""
 
 
 def consensus(
@@ -26,12 +29,12 @@ def consensus(
     a: Array,
     b: Array,
     *,
-    sample: int,
+    sample_size: int,
     gate: float,
     trials: int = 300,
     seed: int = 0,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Model with the most correspondences within a gate (RANSAC), refined on them.
+    """Fit the model with the most correspondences within a gate (RANSAC), refined on them.
 
     Parameters
     ----------
@@ -41,14 +44,14 @@ def consensus(
         From models (..., p, q) and points (n, d), (n, d) to residuals (..., n).
     a, b : (n, d) ndarray
         Correspondences.
-    sample : int
-        How many determine a model.
+    sample_size : int
+        Number of correspondences that determine a model.
     gate : float
         Residual up to which a correspondence agrees, in the unit of ``residuals``.
     trials : int
         Random samples; all are fitted and scored in one batch.
     seed : int
-        Same seed, same answer.
+        Seed of the random samples: equal inputs and seeds give equal results.
 
     Returns
     -------
@@ -62,17 +65,17 @@ def consensus(
     """
     rng = np.random.default_rng(seed)
     n = len(a)
-    pool = rng.permutation(n)[:MAX_SAMPLED]
+    pool = rng.permutation(n)[:MAX_SAMPLED_CORRESPONDENCES]
     keys = rng.random((trials, len(pool)))
-    samples = pool[np.argpartition(keys, min(sample, len(pool)) - 1, axis=1)[:, :sample]]
-    scored = np.linspace(0, n - 1, min(n, MAX_SCORED)).astype(int)
+    samples = pool[np.argpartition(keys, min(sample_size, len(pool)) - 1, axis=1)[:, :sample_size]]
+    scored = np.linspace(0, n - 1, min(n, MAX_SCORED_CORRESPONDENCES)).astype(int)
     models = fit(a[samples], b[samples])
     errors = np.abs(residuals(models, a[scored], b[scored]))
     cost = np.sum(np.minimum(np.nan_to_num(errors, nan=np.inf) / gate, 1.0) ** 2, axis=-1)
     model = models[int(np.argmin(cost))]
     inliers = np.abs(residuals(model, a, b)) < gate
     for _ in range(MAX_REFITS):
-        if np.count_nonzero(inliers) < sample:
+        if np.count_nonzero(inliers) < sample_size:
             break
         model = fit(a[inliers], b[inliers])
         updated = np.abs(residuals(model, a, b)) < gate
@@ -83,7 +86,9 @@ def consensus(
 
 
 def robust_sigma(residuals: Array) -> float:
-    """Standard deviation estimated from the median absolute value (1.4826 MAD about
-    zero); ``nan`` values are left out, 0.0 where nothing is left."""
+    """Estimate a standard deviation about zero from the median absolute value.
+
+    ``nan`` values are left out; 0.0 if no other value is left.
+    """
     finite = np.abs(residuals[np.isfinite(residuals)])
-    return float(1.4826 * np.median(finite)) if len(finite) else 0.0
+    return float(SIGMA_PER_MEDIAN_ABSOLUTE * np.median(finite)) if len(finite) else 0.0

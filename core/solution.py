@@ -17,6 +17,7 @@ import functools
 import math
 import types
 import typing
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
@@ -103,6 +104,14 @@ class Solution:
         return sum(len(t) for t in self.trajectories)
 
 
+def add_counts(*tables: Mapping[str, int]) -> dict[str, int]:
+    """Add numbers of rejected observations by reason, and drop those that are zero."""
+    total: Counter[str] = Counter()
+    for table in tables:
+        total.update(table)
+    return {reason: count for reason, count in total.items() if count}
+
+
 def to_json(record: Any) -> Any:
     """Return the JSON form of a dataclass, or of a value in one.
 
@@ -185,7 +194,7 @@ class _Field:
 
 @functools.cache
 def _layout(kind: Any) -> tuple[_Field, ...]:
-    """Fields of a dataclass; resolving the types takes longer than building a record."""
+    """Return the fields of a dataclass; resolving the types takes longer than building a record."""
     hints = typing.get_type_hints(kind)
     return tuple(
         _Field(

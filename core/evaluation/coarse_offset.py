@@ -1,4 +1,4 @@
-"""Coarse time offset between clocks that may be months apart, by correlating the motions.
+"""Coarse time offset between clocks that may differ by months, by correlating the motions.
 
 An offset is in seconds and is added to the stamps of the estimate.
 :func:`estimate_coarse_offset` finds the part of the truth that the estimate belongs to;
@@ -162,8 +162,8 @@ def _sample(
     """
     time_ns = start_ns + step_ns * np.arange(longest_ns // step_ns + 1)
     positions, is_known = np.zeros((len(time_ns), 3)), np.zeros(len(time_ns))
-    index, known = interpolate_positions(trajectory, time_ns, max_gap_s)
-    positions[index] = known - centre
+    index, interpolated = interpolate_positions(trajectory, time_ns, max_gap_s)
+    positions[index] = interpolated - centre
     is_known[index] = 1.0
     return positions, is_known
 

@@ -133,8 +133,8 @@ def compute_nees(
     total_covariance = np.empty((6, 6, n))
     added = None
     if truth_covariance is not None:
-        known = np.where(np.isfinite(truth_covariance), truth_covariance, 0.0)
-        added = transform_covariance(known, 1 / alignment.scale, to_estimate.T)
+        known_covariance = np.where(np.isfinite(truth_covariance), truth_covariance, 0.0)
+        added = transform_covariance(known_covariance, 1 / alignment.scale, to_estimate.T)
     for i in range(6):
         for j in range(i + 1):
             total_covariance[i, j] = covariance[:, i, j]

@@ -206,7 +206,10 @@ class Evaluation:
         }
 
     def _figures(self, statistics: dict[str, Statistics | None]) -> dict[str, Any]:
-        """JSON figures of all or of one device; those of distances also under short names."""
+        """Return the JSON figures of all devices or of one.
+
+        Figures of distances are also under short names.
+        """
         distances = statistics["ape_translation"]
         if distances is None:
             return {"n": 0}

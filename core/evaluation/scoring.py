@@ -294,7 +294,7 @@ def _compute_nees(
     rotation_errors: Array,
     alignment: Similarity,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Normalized errors squared of all matched poses and their degrees of freedom."""
+    """Compute the normalized errors squared of all matched poses and their degrees of freedom."""
     nees_parts, dof_parts = [], []
     for (estimate, truth), match, rows in zip(pairs, matches, _row_slices(matches), strict=True):
         if _has_variance(estimate):

@@ -88,6 +88,11 @@ class Calibration:
         return PLANE_TILT_RAD + self.sweeps[:, TILT]
 
     @property
+    def is_generic(self) -> bool:
+        """True for an average of other units, also if it was refined from a recording."""
+        return self.source in ("generic", "estimated")
+
+    @property
     def is_distorted(self) -> bool:
         """True if a parameter other than phase and tilt has an effect."""
         return bool(np.any(self.sweeps[:, [CURVE, GIBMAG, OGEEMAG]]))

@@ -339,7 +339,7 @@ def _interpolate_to_mean_time(
     mean_ns: NDArray[np.int64],
     photodiode: NDArray[np.int64],
 ) -> None:
-    """Interpolate ``counts`` (m, s, 2) in place to the mean times of their epochs.
+    """Interpolate ``counts`` (m, s, 2) to the mean times of their epochs, overwriting them.
 
     The rate of change of a count is that between the neighbouring epochs of the same photodiode
     (between one neighbour and itself at the ends), zero if these are not within

@@ -36,3 +36,7 @@ MIN_INLIER_GATE_RAD = 1.5e-3
 """Smallest inlier gate [rad]: residuals up to this size are explained by what a generic
 calibration leaves unmodelled (see :data:`~locatk.core.lighthouse.calibration.MODEL_SIGMA_RAD`),
 also in a recording with little noise."""
+
+UNREACHABLE_RESIDUAL_SIGMAS = 1e3
+"""Residual of an observed angle, in standard deviations, in a state in which no light plane meets
+the photodiode. It has no derivative; its cost rejects a step to such a state."""

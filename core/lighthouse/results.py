@@ -84,7 +84,7 @@ class SceneVerification:
     Attributes
     ----------
     held_out : bool
-        Whether the epochs took no part in the estimation of the scene.
+        True if the epochs took no part in the estimation of the scene.
     epochs : int
         Number of epochs; ``moments`` in the JSON form.
     stations : tuple of StationVerification
@@ -106,7 +106,7 @@ class TwoViewCandidate:
     roll_deg : float
         Root of the sum of squares of both stations' roll angles.
     fits : bool
-        Whether it explains the angles about as well as the best.
+        True if it explains the angles about as well as the best.
     chosen : bool
     """
 
@@ -133,12 +133,12 @@ class StationPairLink:
 
 @dataclass(frozen=True)
 class LighthouseFacts:
-    """Figures of a run of the Lighthouse solver; None where a figure does not apply.
+    """Figures of a run of the Lighthouse solver; None if a figure does not apply.
 
     Attributes
     ----------
     planar : bool
-        Whether the scene was solved with all photodiodes on one plane.
+        True if the scene was solved with all photodiodes on one plane.
     planar_decided_by : str
         ``"option"`` or ``"data"``.
     plane_fraction : float

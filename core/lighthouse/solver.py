@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +32,7 @@ from locatk.core.lighthouse.scene.verification import (
     select_verification_epochs,
     verify_scene,
 )
-from locatk.core.solution import Solution, SolverWarning
+from locatk.core.solution import Solution, SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
 METHODS = ("bundle", "paper")
@@ -108,8 +107,8 @@ def solve(
     rigid = select_rigid_receivers(sweeps, receivers) if receivers else {}
     if rigid and options.method == "bundle":
         solution = solve_devices(sweeps, rigid, scene)
-        others = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
-        rows = np.flatnonzero(np.isin(sweeps.device, others))
+        single = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
+        rows = np.flatnonzero(np.isin(sweeps.device, single))
         if len(rows):
             photodiodes = _solve_photodiodes(sweeps.take(rows), solution.artifact, options)
             solution = merge_solutions(solution, photodiodes)
@@ -174,7 +173,7 @@ def _locate_and_verify(
         "lighthouse",
         method,
         tracks.trajectories,
-        _add_counts(rejected_sweeps, estimate.rejected, tracks.rejected),
+        add_counts(rejected_sweeps, estimate.rejected, tracks.rejected),
         detect_stations(
             tracks.epochs, stations, tracks.estimates.residual, tracks.is_accepted, verification
         ),
@@ -202,11 +201,3 @@ def _require_sweeps(epochs: Epochs) -> None:
             hint="`locatk info` shows its contents; rejected: "
             + (", ".join(f"{n} {r}" for r, n in epochs.rejected.items()) or "nothing"),
         )
-
-
-def _add_counts(*tables: Mapping[str, int]) -> dict[str, int]:
-    """Add numbers by reason, and drop those that are zero."""
-    total: Counter[str] = Counter()
-    for table in tables:
-        total.update(table)
-    return {reason: count for reason, count in total.items() if count}

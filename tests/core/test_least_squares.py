@@ -59,7 +59,10 @@ class Decays:
             loss, weight = cauchy_loss(residual, self.loss_scale)
         else:
             loss, weight = 0.5 * residual**2, np.ones_like(residual)
-        equations = DenseEquations.from_residuals(residual, jacobian, weight, loss.sum(axis=1))
+        root = np.sqrt(weight)
+        equations = DenseEquations.from_weighted(
+            residual, residual * root, jacobian * root[..., None], loss.sum(axis=1)
+        )
         if np.isfinite(self.prior_sigma):
             deviation = np.asarray(state)[:, 2:] - self.prior_mean
             equations.add_prior(slice(2, 3), deviation, np.array([self.prior_sigma]))
@@ -154,7 +157,7 @@ def test_damping_rises_after_a_bad_step() -> None:
             x = np.asarray(state)
             jacobian = (1 / (1 + x**2))[..., None]
             cost = 0.5 * np.arctan(x)[:, 0] ** 2
-            return DenseEquations.from_residuals(np.arctan(x), jacobian, np.ones_like(x), cost)
+            return DenseEquations.from_weighted(np.arctan(x), np.arctan(x), jacobian, cost)
 
         def retract(self, state: Array, step: Array) -> Parameters:
             return (np.asarray(state) + step).view(Parameters)
@@ -173,7 +176,7 @@ def test_a_cost_of_nan_is_no_improvement() -> None:
                 residual = np.sqrt(x) - 1.0
                 jacobian = (0.5 / np.sqrt(x))[..., None]
             cost = 0.5 * residual[:, 0] ** 2
-            return DenseEquations.from_residuals(residual, jacobian, np.ones_like(x), cost)
+            return DenseEquations.from_weighted(residual, residual, jacobian, cost)
 
     # The first step from 9 leads to -3.
     problem = Root(np.zeros(1), np.zeros((1, 1)))

@@ -33,7 +33,7 @@ def test_outliers_do_not_bend_the_line(n: int, share: float) -> None:
     b = 2 * a + 1 + rng.normal(0, 0.01, (n, 1))
     wrong = rng.random(n) < share
     b[wrong] += rng.uniform(0.5, 3, (np.count_nonzero(wrong), 1))
-    model, inliers = consensus(fit_line, miss, a, b, sample=2, gate=0.05)
+    model, inliers = consensus(fit_line, miss, a, b, sample_size=2, gate=0.05)
     np.testing.assert_array_equal(inliers, ~wrong)
     np.testing.assert_allclose(model, fit_line(a[~wrong], b[~wrong]))
 
@@ -41,7 +41,7 @@ def test_outliers_do_not_bend_the_line(n: int, share: float) -> None:
 def test_same_seed_same_answer() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.random((100, 1)), rng.random((100, 1))
-    answers = [consensus(fit_line, miss, a, b, sample=2, gate=0.05, seed=s) for s in (4, 4)]
+    answers = [consensus(fit_line, miss, a, b, sample_size=2, gate=0.05, seed=s) for s in (4, 4)]
     np.testing.assert_array_equal(answers[0][0], answers[1][0])
     np.testing.assert_array_equal(answers[0][1], answers[1][1])
 
@@ -57,7 +57,7 @@ def test_every_member_of_a_sample_is_another(n: int, sample: int) -> None:
         return np.ones((*a.shape[:-2], 1, 2))
 
     a = np.arange(n, dtype=float)[:, None]
-    consensus(watched, miss, a, 2 * a, sample=sample, gate=0.1, trials=150)
+    consensus(watched, miss, a, 2 * a, sample_size=sample, gate=0.1, trials=150)
     (picks,) = samples
     assert picks.shape == (150, sample)
     assert np.mean([len(np.unique(row)) == sample for row in picks]) > 0.95
@@ -71,7 +71,7 @@ def test_a_model_without_residual_does_not_win() -> None:
         return model
 
     a = np.linspace(0, 1, 40)[:, None]
-    model, inliers = consensus(sometimes, miss, a, 3 * a, sample=2, gate=0.01)
+    model, inliers = consensus(sometimes, miss, a, 3 * a, sample_size=2, gate=0.01)
     np.testing.assert_allclose(model[0], [3, 0], atol=1e-12)
     assert inliers.all()
 

@@ -78,8 +78,8 @@ FRAME_BITS = SYNC_BITS + (1 + (PAYLOAD_BYTES + 1) // 2 + 2) * (WORD_BITS + 1)
 """Length of a frame, with its sync pattern."""
 
 MIN_FIXED_BITS = 36
-"""Of the 67 bits that all frames share, at least this number must be received, and all of those
-must be right: as many as the sync, the length and its stuffing bit have. Noise passes with a
+"""Of the 67 bits that are equal in all frames, at least this number must be received, and all of
+those must be right: as many as the sync, the length and its stuffing bit have. Noise passes with a
 probability of 2^-36."""
 
 MAX_SOLVED_BITS = 8
@@ -178,7 +178,7 @@ def decode_frames(bits: ArrayLike) -> list[OotxFrame]:
 
     Notes
     -----
-    A missing bit is filled in with the value that all frames share, else by a majority vote of
+    A missing bit is filled in with the value that it has in all frames, else by a majority vote of
     the neighbouring frames. For up to 8 bits that are still missing, all values are tried, and
     exactly one must yield the right checksum. If no frame is valid, one is composed of the
     majority of all frames.

@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 Int = NDArray[np.int32]
 
 MIN_BURST_S = 5e-6
-"""Shorter bursts are ignored. 30 bits fit into 5 us, and 17 are needed for one look-up."""
+"""Shorter bursts are ignored. 30 bits fit into 5 us, and 17 are needed to look up a sequence."""
 
 MAX_SLOW_BIT_GAP_ROTATIONS = 500
 """Longer gaps between sweeps count as this many rotations, which is more than a frame of factory
@@ -137,7 +137,7 @@ def demodulate_recording(lines: Sequence[Edges]) -> DemodulatedRecording:
     ------
     InputError
         There is no line, the sampling rate is below 24 MHz, the lines have different clocks, or
-        no burst is accepted: no base station was in sight, or two stations share each channel.
+        no burst is accepted: no base station was in sight, or each channel is that of two stations.
     """
     if not lines:
         raise InputError("there is no data line to demodulate")

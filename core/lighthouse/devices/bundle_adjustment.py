@@ -17,12 +17,11 @@ from locatk.core.lighthouse.calibration import predict_with_gradient
 from locatk.core.lighthouse.devices.pose_fit import (
     RATE,
     RATE_SIGMA,
-    UNREACHABLE_RESIDUAL,
     DeviceStates,
-    Stations,
     SweepObservations,
     photodiode_positions,
 )
+from locatk.core.lighthouse.noise import UNREACHABLE_RESIDUAL_SIGMAS
 from locatk.core.lighthouse.scene.bundle_adjustment import (
     STATION_PARAMETERS,
     BundleState,
@@ -32,6 +31,7 @@ from locatk.core.lighthouse.scene.bundle_adjustment import (
     station_blocks,
     station_jacobian,
 )
+from locatk.core.lighthouse.scene.model import StationArrays
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class DeviceAdjustment:
 
     Attributes
     ----------
-    stations : Stations
+    stations : StationArrays
     poses : DeviceStates
     residual : (m, n) ndarray
         Predicted minus observed angle in radians; ``nan`` if not observed.
@@ -52,7 +52,7 @@ class DeviceAdjustment:
     iterations : int
     """
 
-    stations: Stations
+    stations: StationArrays
     poses: DeviceStates
     residual: Array
     covariance: Array
@@ -61,7 +61,7 @@ class DeviceAdjustment:
 
 def adjust_devices(
     observations: SweepObservations,
-    stations: Stations,
+    stations: StationArrays,
     poses: DeviceStates,
     *,
     sigma_rad: float,
@@ -75,8 +75,8 @@ def adjust_devices(
     Parameters
     ----------
     observations : SweepObservations
-    stations : Stations
-        Initial guess; the first station stays where it is.
+    stations : StationArrays
+        Initial guess; the first station does not move.
     poses : DeviceStates
         Initial guess.
     sigma_rad : float
@@ -109,13 +109,15 @@ def adjust_devices(
 
 @dataclass(frozen=True)
 class _BundledDevices:
-    stations: Stations
+    """Stations and device states: the unknowns of the adjustment."""
+
+    stations: StationArrays
     poses: DeviceStates
 
 
 @dataclass(frozen=True)
 class _DeviceBundle:
-    """The adjustment as a problem for :func:`~locatk.core.least_squares.minimize`.
+    """Bundle adjustment as a problem for :func:`~locatk.core.least_squares.minimize`.
 
     ``loss_scale`` is in standard deviations; ``free`` (s, 10) are the unknowns of the stations
     that are estimated.
@@ -132,7 +134,7 @@ class _DeviceBundle:
         residual, by_pose, by_station = self._residuals(state)
         observed = observations.is_observed
         unreachable = observed & ~np.isfinite(residual)
-        residual = np.where(unreachable, UNREACHABLE_RESIDUAL, np.nan_to_num(residual))
+        residual = np.where(unreachable, UNREACHABLE_RESIDUAL_SIGMAS, np.nan_to_num(residual))
         loss, weight = cauchy_loss(residual, self.loss_scale)
         weight = np.where(observed & ~unreachable, weights[:, None] * weight, 0.0)
         root = np.sqrt(weight)[..., None]
@@ -173,8 +175,16 @@ class _DeviceBundle:
         )
 
     def _residuals(self, state: _BundledDevices) -> tuple[Array, Array, Array]:
-        """Residuals (m, n), and derivatives by device states (m, n, 12) and by the unknowns of
-        the station (m, n, 10), in standard deviations."""
+        """Return the residuals and their derivatives, in standard deviations.
+
+        Returns
+        -------
+        residual : (m, n) ndarray
+        by_pose : (m, n, 12) ndarray
+            Derivatives by pose and rates of the device.
+        by_station : (m, n, 10) ndarray
+            Derivatives by the unknowns of the station.
+        """
         observations = self.observations
         positions, rotations, calibrations = state.stations
         lever_arm, position = photodiode_positions(observations, state.poses)

@@ -189,14 +189,14 @@ def assign_planes(time_ns: IntArray, channel: NDArray[np.int32], count: Array) -
         np.where(rotor_turns > MIN_LONE_SECOND_PLANE_TURNS, 1, UNKNOWN),
     )
     order = np.lexsort((rotor_turns, rotation))
-    turns, rotation_sorted = rotor_turns[order], rotation[order]
-    step = np.diff(turns)
+    turns_sorted, rotation_sorted = rotor_turns[order], rotation[order]
+    step = np.diff(turns_sorted)
     step[np.diff(rotation_sorted) != 0] = 0.0
     widest = np.zeros(int(np.max(rotation, initial=-1)) + 1)
     np.maximum.at(widest, rotation_sorted[1:], step)
     gap = np.flatnonzero((step > MIN_PLANE_DELAY_TURNS) & (step == widest[rotation_sorted[1:]]))
     boundary = np.full(len(widest), np.nan)
-    boundary[rotation_sorted[gap]] = turns[gap] + step[gap] / 2
+    boundary[rotation_sorted[gap]] = turns_sorted[gap] + step[gap] / 2
     boundary = boundary[rotation]
     return np.where(np.isnan(boundary), lone_plane, (rotor_turns > boundary).astype(np.int64))
 
@@ -258,7 +258,7 @@ def rotation_limits_ns(channels: ArrayLike) -> tuple[int, int]:
 
 
 def make_windows(sweeps: DeviceSweeps, interval_ns: int, half_width_ns: int) -> SweepWindows:
-    """Place a window in every interval of ``interval_ns`` that contains sweeps.
+    """Make a window in every interval of ``interval_ns`` that contains sweeps.
 
     A window contains the sweeps up to ``half_width_ns`` before and after its centre.
     """

@@ -118,7 +118,7 @@ def candidate_poses(
 
 
 def is_lit_from_behind(direction: Array, normal: Array) -> NDArray[np.bool_]:
-    """Return whether photodiodes face away from the light of a station.
+    """Return whether photodiodes are lit from behind by a station.
 
     Parameters
     ----------

@@ -16,22 +16,20 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
 from locatk.core.least_squares import DenseEquations, Indices, cauchy_loss, minimize
-from locatk.core.lighthouse.calibration import Calibration, predict_angles, predict_with_gradient
+from locatk.core.lighthouse.calibration import predict_angles, predict_with_gradient
+from locatk.core.lighthouse.noise import UNREACHABLE_RESIDUAL_SIGMAS
+from locatk.core.lighthouse.scene.model import StationArrays
 
 Array = NDArray[np.float64]
-Stations = tuple[Array, Array, tuple[Calibration, ...]]
-"""Positions (s, 3), rotations (s, 3, 3) station to frame, and calibrations."""
 
 RATE_SIGMA = np.repeat([2.0, 10.0], 3)
-"""Standard deviations of the prior on velocity [m/s] and angular velocity [rad/s]: what a hand or
-a drone gives a device. They keep a velocity near zero that the sweeps do not determine."""
-
-UNREACHABLE_RESIDUAL = 1e3
-"""Residual, in standard deviations, of an angle at which no light plane meets the photodiode."""
+"""Standard deviations of the prior on velocity [m/s] and angular velocity [rad/s], as
+of a device on a drone or in a hand. They keep a velocity near zero that the sweeps do not
+determine."""
 
 MAX_ROTATION_STEP_RAD = 0.7
-"""Largest rotation of one step: the angles are far from linear in larger ones, which could turn a
-device over."""
+"""Largest rotation of one step: the angles are far from linear in larger ones, which could flip a
+device."""
 
 MIN_STEP = 1e-8
 """Norm of a step (m, rad, m/s, rad/s) below which a pose has converged."""
@@ -43,7 +41,7 @@ rotation vector."""
 
 @dataclass(frozen=True)
 class SweepObservations:
-    """Sweeps by epoch: (m, n) each, padded where ``is_observed`` is False.
+    """Sweeps by epoch: (m, n) each, padded to the same number.
 
     Attributes
     ----------
@@ -56,6 +54,7 @@ class SweepObservations:
     time_offset_s : (m, n) ndarray
         Time of the sweep minus the time of the epoch, in seconds.
     is_observed : (m, n) bool ndarray
+        False for the padding.
     """
 
     sensor_position: Array
@@ -69,7 +68,7 @@ class SweepObservations:
         return len(self.angle)
 
     def take(self, epochs: Indices | NDArray[np.bool_]) -> SweepObservations:
-        """The observations of the chosen epochs."""
+        """Return the observations of the chosen epochs."""
         return SweepObservations(*(getattr(self, f.name)[epochs] for f in fields(self)))
 
 
@@ -92,23 +91,23 @@ class DeviceStates:
 
     @classmethod
     def at_rest(cls, position: Array, rotation: Array) -> DeviceStates:
-        """States of devices at rest, at poses (m, 3), (m, 3, 3)."""
+        """Return the states of devices at rest, at poses (m, 3), (m, 3, 3)."""
         return cls(position, rotation, np.zeros((len(position), 6)))
 
     def __len__(self) -> int:
         return len(self.position)
 
     def take(self, epochs: Indices | NDArray[np.bool_]) -> DeviceStates:
-        """A copy of the chosen states."""
+        """Return a copy of the chosen states."""
         return DeviceStates(self.position[epochs], self.rotation[epochs], self.rate[epochs])
 
     def put(self, epochs: Indices | NDArray[np.bool_], other: DeviceStates) -> None:
-        """Overwrite the chosen states in place."""
+        """Overwrite the chosen states."""
         for f in fields(self):
             getattr(self, f.name)[epochs] = getattr(other, f.name)
 
     def later(self, seconds: Array) -> DeviceStates:
-        """States after (m,) seconds at constant rates."""
+        """Return the states after (m,) seconds at constant rates."""
         return DeviceStates(
             self.position + self.rate[:, :3] * seconds[:, None],
             rotation_exp(self.rate[:, 3:] * seconds[:, None]) @ self.rotation,
@@ -116,7 +115,7 @@ class DeviceStates:
         )
 
     def stepped(self, change: Array) -> DeviceStates:
-        """States after a change (m, 12): translation, rotation in the frame's axes, rates."""
+        """Return the states after a change (m, 12): translation, rotation in the frame, rates."""
         return DeviceStates(
             self.position + change[:, 0:3],
             rotation_exp(change[:, 3:6]) @ self.rotation,
@@ -147,7 +146,7 @@ class PoseFit:
 
 def fit_poses(
     observations: SweepObservations,
-    stations: Stations,
+    stations: StationArrays,
     start: DeviceStates,
     *,
     sigma_rad: float,
@@ -161,7 +160,7 @@ def fit_poses(
     Parameters
     ----------
     observations : SweepObservations
-    stations : Stations
+    stations : StationArrays
     start : DeviceStates
         Initial guess.
     sigma_rad : float
@@ -196,25 +195,25 @@ def fit_poses(
 
 @dataclass(frozen=True)
 class _PoseProblem:
-    """The fit as a problem for :func:`~locatk.core.least_squares.minimize`.
+    """Fit of poses as a problem for :func:`~locatk.core.least_squares.minimize`.
 
     ``loss_scale`` (m, 1) and ``cutoff`` are in standard deviations.
     """
 
     observations: SweepObservations
-    stations: Stations
+    stations: StationArrays
     sigma_rad: float
     loss_scale: Array
     cutoff: float
 
     def linearize(self, state: DeviceStates, epochs: Indices) -> DenseEquations:
-        everything = len(epochs) == len(self.observations)
-        observations = self.observations if everything else self.observations.take(epochs)
+        are_all_running = len(epochs) == len(self.observations)
+        observations = self.observations if are_all_running else self.observations.take(epochs)
         residual, by_pose = linearize(observations, self.stations, state)
         observed = observations.is_observed
         unreachable = observed & ~np.isfinite(residual)
         residual = np.nan_to_num(residual) / self.sigma_rad
-        residual[unreachable] = UNREACHABLE_RESIDUAL
+        residual[unreachable] = UNREACHABLE_RESIDUAL_SIGMAS
         loss, weight = cauchy_loss(residual, self.loss_scale[epochs], self.cutoff)
         root = np.where(observed & ~unreachable, np.sqrt(weight), 0.0)
         cost = np.sum(loss, axis=1, where=observed)
@@ -234,7 +233,7 @@ class _PoseProblem:
 
 
 def angle_residuals(
-    observations: SweepObservations, stations: Stations, poses: DeviceStates
+    observations: SweepObservations, stations: StationArrays, poses: DeviceStates
 ) -> Array:
     """Return predicted minus observed angles (m, n) in radians.
 
@@ -252,7 +251,7 @@ def angle_residuals(
 
 
 def linearize(
-    observations: SweepObservations, stations: Stations, poses: DeviceStates
+    observations: SweepObservations, stations: StationArrays, poses: DeviceStates
 ) -> tuple[Array, Array]:
     """Return residuals and their derivatives by the pose of the device.
 
@@ -261,9 +260,9 @@ def linearize(
     residual : (m, n) ndarray
         Predicted minus observed angle in radians; ``nan`` if no light plane meets the photodiode.
     by_pose : (m, n, 6) ndarray
-        Derivative by translation and rotation of the device at the time of each sweep. They stand
-        for those at the epoch: a device rotates little within a rotation of the station, and the
-        derivatives only have to point downhill.
+        Derivative by translation and rotation of the device at the time of each sweep. They
+        approximate those at the epoch: a device rotates little within a rotation of the station,
+        and the derivatives only have to point downhill.
     """
     lever_arm, position = photodiode_positions(observations, poses)
     residual = np.full(observations.angle.shape, np.nan)
@@ -293,15 +292,15 @@ def photodiode_positions(
         From the device to the photodiode, and in the frame; both in the frame's axes.
     """
     lever_arm = observations.sensor_position @ np.swapaxes(poses.rotation, -1, -2)
-    since = observations.time_offset_s[..., None]
+    elapsed_s = observations.time_offset_s[..., None]
     if np.any(poses.rate):
-        lever_arm = _rotated(lever_arm, poses.rate[:, None, 3:] * since)
-    return lever_arm, poses.position[:, None] + poses.rate[:, None, :3] * since + lever_arm
+        lever_arm = _rotate(lever_arm, poses.rate[:, None, 3:] * elapsed_s)
+    return lever_arm, poses.position[:, None] + poses.rate[:, None, :3] * elapsed_s + lever_arm
 
 
-def _rotated(vectors: Array, rotation_vectors: Array) -> Array:
+def _rotate(vectors: Array, rotation_vectors: Array) -> Array:
     """Rotate vectors (..., 3) by rotation vectors: Rodrigues' formula without matrices."""
     angle = np.sqrt(np.einsum("...i,...i->...", rotation_vectors, rotation_vectors))[..., None]
-    once = np.cross(rotation_vectors, vectors)
+    cross = np.cross(rotation_vectors, vectors)
     versine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return vectors + np.sinc(angle / np.pi) * once + versine * np.cross(rotation_vectors, once)
+    return vectors + np.sinc(angle / np.pi) * cross + versine * np.cross(rotation_vectors, cross)

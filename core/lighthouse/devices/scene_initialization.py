@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
+from locatk.core.geometry import rotation_angle
 from locatk.core.least_squares import cauchy_loss
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD, Calibration
 from locatk.core.lighthouse.devices.bundle_adjustment import adjust_devices
@@ -37,9 +38,7 @@ from locatk.core.lighthouse.devices.device_sweeps import (
 )
 from locatk.core.lighthouse.devices.pnp import candidate_poses
 from locatk.core.lighthouse.devices.pose_fit import (
-    UNREACHABLE_RESIDUAL,
     DeviceStates,
-    Stations,
     SweepObservations,
     angle_residuals,
     fit_poses,
@@ -48,12 +47,13 @@ from locatk.core.lighthouse.devices.tracking import (
     LOSS_SCALE_RAD,
     LOSS_SCALE_SIGMAS,
     is_accepted,
-    rotations_differ,
 )
-from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
+from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD, UNREACHABLE_RESIDUAL_SIGMAS
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.results import LighthouseFacts, StationPairLink
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene.estimation import generic_calibration_warnings
+from locatk.core.lighthouse.scene.model import StationArrays
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import SolverWarning
 
@@ -98,8 +98,8 @@ MAX_EPOCHS_PER_POSITION = 4
 """Maximum number of epochs in the bundle adjustment, in all and at one position. A device at rest
 repeats the same errors, so that the epochs of a position together have the weight of one."""
 
-SAME_POSITION_M = 0.05
-SAME_ROTATION_RAD = 0.15
+MAX_CLUSTER_DISTANCE_M = 0.05
+MAX_CLUSTER_ROTATION_RAD = 0.15
 """Maximum distance and angle between epochs that count as one position of a device."""
 
 MIN_POSITIONS = 8
@@ -157,7 +157,7 @@ class StationLink:
     epochs : int
         Number of epochs that agree with it.
     is_ambiguous : bool
-        Whether a quite different pose has about as many votes. A coplanar device that was not
+        True if a quite different pose has about as many votes. A coplanar device that was not
         moved has two poses under each station, and nothing decides between them.
     """
 
@@ -207,14 +207,14 @@ def estimate_scene_from_devices(
     poses = _concatenate_poses(station_poses)
     if not len(poses):
         raise DegenerateError(
-            "no station sees enough photodiodes of a device at a time to determine its pose",
+            "no station determines the pose of a device: too few photodiodes receive it at a time",
             hint="three or more photodiodes must receive both planes of one station; does the "
             "receiver's file describe this device?",
         )
     links = estimate_links(poses, len(channels))
     connected = connect_stations(links, poses, len(channels))
     joined = list(connected)
-    stations: Stations = (
+    stations: StationArrays = (
         np.stack([connected[i][0] for i in joined]),
         np.stack([connected[i][1] for i in joined]),
         tuple(calibrations[i] for i in joined),
@@ -275,8 +275,8 @@ def estimate_station_poses(
         owners, positions, rotations = zip(*hypotheses, strict=True)
         owner = np.array(owners)
         station_windows = SweepWindows(windows.time_ns[epochs], sweep)
-        everything = np.arange(len(epochs))
-        observations = gather_observations(sweeps, station_windows, receiver, everything)
+        all_epochs = np.arange(len(epochs))
+        observations = gather_observations(sweeps, station_windows, receiver, all_epochs)
         observations = observations.take(owner)
         fit = fit_poses(
             replace(observations, station=np.zeros_like(observations.station)),
@@ -324,7 +324,7 @@ def select_hypotheses(owner: IntArray, cost: Array, rotation: Array, accepted: M
         if kept_of_epoch and cost[row] > cost[kept_of_epoch[0]] + MAX_HYPOTHESIS_COST:
             continue
         if all(
-            rotations_differ(rotation[row], rotation[k], MIN_HYPOTHESIS_ROTATION_RAD)
+            rotation_angle(rotation[row], rotation[k]) > MIN_HYPOTHESIS_ROTATION_RAD
             for k in kept_of_epoch
         ):
             kept_of_epoch.append(int(row))
@@ -373,17 +373,16 @@ def estimate_link(poses: StationPoses, first: int, second: int) -> StationLink |
 
     def squared_misfit(pairs: IntArray, positions: Array, rotations: Array) -> Array:
         """Return the misfit (h, p) of proposals (h) at pairs of poses (p); 1 at the gate."""
-        trace = np.einsum("hij,pij->hp", rotations, rotation[pairs])
-        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        angle = rotation_angle(rotations[:, None], rotation[pairs])
         displacement = np.linalg.norm(positions[:, None] - position[pairs], axis=2)
         return (angle / LINK_ROTATION_GATE_RAD) ** 2 + (
             displacement / (LINK_POSITION_GATE_FRACTION * distance[pairs])
         ) ** 2
 
-    everything = np.arange(len(a))
+    all_pairs = np.arange(len(a))
     count = min(len(a), MAX_LINK_PROPOSALS)
     proposals = np.unique(np.linspace(0, len(a) - 1, count).astype(int))
-    misfit = squared_misfit(everything, position[proposals], rotation[proposals])
+    misfit = squared_misfit(all_pairs, position[proposals], rotation[proposals])
     # At most one of the hypotheses of an epoch is right: the one with the least misfit counts.
     epochs, epoch = np.unique(poses.epoch[a], return_inverse=True)
     cost = np.ones((len(proposals), len(epochs)))
@@ -391,7 +390,7 @@ def estimate_link(poses: StationPoses, first: int, second: int) -> StationLink |
     best = int(proposals[np.argmin(cost.sum(axis=1))])
     link_position, link_rotation = position[best], rotation[best]
     for _ in range(LINK_ITERATIONS):
-        misfit = squared_misfit(everything, link_position[None], link_rotation[None])
+        misfit = squared_misfit(all_pairs, link_position[None], link_rotation[None])
         inliers = np.flatnonzero(misfit[0] < 1.0)
         if not len(inliers):
             return None
@@ -475,7 +474,7 @@ def _stack_observations(parts: list[SweepObservations]) -> SweepObservations:
 def _adjust_scene(
     observations: SweepObservations,
     poses: StationPoses,
-    stations: Stations,
+    stations: StationArrays,
     joined: list[int],
     channels: Sequence[int],
     scene: Scene,
@@ -504,18 +503,18 @@ def _adjust_scene(
     position_count = int(np.max(position)) + 1
     weight = epoch_weights(position)
 
-    is_generic = np.array([c.source == "generic" for c in stations[2]])
-    sigma = MODEL_SIGMA_RAD if np.any(is_generic) else 2 * ANGLE_SIGMA_RAD
+    is_refined = np.array([c.source == "generic" for c in stations[2]])
+    sigma = MODEL_SIGMA_RAD if np.any(is_refined) else 2 * ANGLE_SIGMA_RAD
     adjusted = adjust_devices(
         observations, stations, states,
-        sigma_rad=sigma, loss_scale_rad=LOSS_SCALE_RAD, epoch_weight=weight, calibrate=is_generic,
+        sigma_rad=sigma, loss_scale_rad=LOSS_SCALE_RAD, epoch_weight=weight, calibrate=is_refined,
     )  # fmt: skip
     # A second adjustment uses the noise that the residuals of the first one show.
     sigma = max(ANGLE_SIGMA_RAD, robust_sigma(adjusted.residual))
     loss_scale = min(LOSS_SCALE_SIGMAS * sigma, LOSS_SCALE_RAD)
     adjusted = adjust_devices(
         observations, adjusted.stations, adjusted.poses,
-        sigma_rad=sigma, loss_scale_rad=loss_scale, epoch_weight=weight, calibrate=is_generic,
+        sigma_rad=sigma, loss_scale_rad=loss_scale, epoch_weight=weight, calibrate=is_refined,
     )  # fmt: skip
     facts = LighthouseFacts(
         adjusted_epochs=len(observations),
@@ -553,7 +552,7 @@ def _adjust_scene(
 
 
 def _initial_states(
-    observations: SweepObservations, poses: StationPoses, stations: Stations, column: IntArray
+    observations: SweepObservations, poses: StationPoses, stations: StationArrays, column: IntArray
 ) -> tuple[IntArray, DeviceStates, IntArray]:
     """Fit the poses of the devices to all stations, from the hypothesis that fits them best.
 
@@ -575,7 +574,7 @@ def _initial_states(
     epoch = poses.epoch[rows]
     residual = angle_residuals(observations.take(epoch), stations, start) / MODEL_SIGMA_RAD
     is_observed = observations.is_observed[epoch]
-    residual = np.where(np.isfinite(residual), residual, UNREACHABLE_RESIDUAL)
+    residual = np.where(np.isfinite(residual), residual, UNREACHABLE_RESIDUAL_SIGMAS)
     loss, _ = cauchy_loss(residual, INITIAL_LOSS_SCALE_RAD / MODEL_SIGMA_RAD)
     order = np.lexsort((np.sum(loss, axis=1, where=is_observed), epoch))
     best = order[np.r_[True, np.diff(epoch[order]) > 0]]
@@ -602,13 +601,12 @@ def cluster_poses(poses: DeviceStates) -> IntArray:
     cluster = np.empty(len(poses), np.int64)
     for i in range(len(poses)):
         distance = np.linalg.norm(poses.position[first_poses] - poses.position[i], axis=1)
-        is_rotated = rotations_differ(
-            poses.rotation[first_poses], poses.rotation[i], SAME_ROTATION_RAD
-        )
-        same = np.flatnonzero((distance < SAME_POSITION_M) & ~is_rotated)
-        if not len(same):
+        angle = rotation_angle(poses.rotation[first_poses], poses.rotation[i])
+        is_close = (distance < MAX_CLUSTER_DISTANCE_M) & (angle <= MAX_CLUSTER_ROTATION_RAD)
+        clusters = np.flatnonzero(is_close)
+        if not len(clusters):
             first_poses.append(i)
-        cluster[i] = same[0] if len(same) else len(first_poses) - 1
+        cluster[i] = clusters[0] if len(clusters) else len(first_poses) - 1
     return cluster
 
 
@@ -653,19 +651,7 @@ def _warnings(
                 "device at the same time as the other stations",
             )
         )
-    generic = [
-        str(channels[i])
-        for i, c in zip(joined, calibrations, strict=True)
-        if c.source in ("generic", "estimated")
-    ]
-    if generic:
-        warnings.append(
-            SolverWarning(
-                "generic_calibration",
-                f"no factory calibration is known of channel {', '.join(generic)}: the mean of "
-                "other units is used (generic), refined where the data tell",
-            )
-        )
+    warnings += generic_calibration_warnings([channels[i] for i in joined], calibrations)
     if positions < MIN_POSITIONS and len(joined) > 1:
         warnings.append(
             SolverWarning(

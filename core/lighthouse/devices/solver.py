@@ -8,8 +8,7 @@ which are solved by other modules in the scene of the rigid devices.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from locatk.core.geometry import (
     Similarity,
     quaternion_from_matrix,
     quaternion_multiply,
+    transform_covariance,
     umeyama,
 )
 from locatk.core.lighthouse.channels import period_ticks
@@ -48,9 +48,9 @@ from locatk.core.lighthouse.results import (
     StationVerification,
 )
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
-from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M, transform_covariance
+from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M
 from locatk.core.robust import robust_sigma
-from locatk.core.solution import Solution, SolverWarning
+from locatk.core.solution import Solution, SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -163,7 +163,7 @@ def solve_devices(
         "lighthouse",
         "bundle",
         trajectories,
-        rejected=_total(device.rejected for device in tracked),
+        rejected=add_counts(*(device.rejected for device in tracked)),
         detections=detections,
         artifact=solved,
         facts=facts,
@@ -190,7 +190,7 @@ def merge_solutions(rigid: Solution, photodiodes: Solution) -> Solution:
     return replace(
         photodiodes,
         trajectories=(*rigid.trajectories, *single),
-        rejected=_total((rigid.rejected, photodiodes.rejected)),
+        rejected=add_counts(rigid.rejected, photodiodes.rejected),
         detections=tuple(
             replace(by_channel[channel], station=k) for k, channel in enumerate(sorted(by_channel))
         ),
@@ -212,14 +212,6 @@ def _estimate_scene(
     return estimate_scene_from_devices(devices, channels, scene)
 
 
-def _total(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Return the sums of counts by reason."""
-    total: Counter[str] = Counter()
-    for each in counts:
-        total.update(each)
-    return dict(total)
-
-
 def _distinct(warnings: Sequence[SolverWarning]) -> tuple[SolverWarning, ...]:
     """Return the warnings without repeated messages."""
     by_message: dict[str, SolverWarning] = {}
@@ -238,21 +230,21 @@ def station_detections(
 
     ``tracked`` are devices tracked in ``scene``.
     """
-    station = np.concatenate([device.sweeps.station for device in tracked])
+    station_index = np.concatenate([device.sweeps.station for device in tracked])
     is_used = np.concatenate([device.is_used for device in tracked])
     residual = np.concatenate([device.residual for device in tracked])
     detections = []
     for k, channel in enumerate(tracked[0].channels):
-        known = scene.station(channel)
-        assert known is not None
-        is_own = station == k
+        station = scene.station(channel)
+        assert station is not None
+        is_own = station_index == k
         detections.append(
             StationDetection(
                 station=k,
                 channel=channel,
-                id=None if known.id is None else f"{known.id:08x}",
+                id=None if station.id is None else f"{station.id:08x}",
                 period_ticks=int(period_ticks(channel)),
-                calibration=known.calibration.source,
+                calibration=station.calibration.source,
                 sweeps=int(np.count_nonzero(is_own & is_used)),
                 rejected=int(np.count_nonzero(is_own & ~is_used)),
                 residual_rad=robust_sigma(residual[is_own & is_used]),
@@ -284,7 +276,7 @@ def _tracking_facts(
     detections: Sequence[StationDetection],
 ) -> LighthouseFacts:
     """Return ``facts`` with the noise of the tracked devices."""
-    is_generic = any(s.calibration.source in ("generic", "estimated") for s in scene.stations)
+    is_generic = any(s.calibration.is_generic for s in scene.stations)
     return replace(
         facts,
         angle_sigma_rad=max(device.sigma_rad for device in tracked),

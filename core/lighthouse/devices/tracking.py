@@ -5,7 +5,7 @@ Each device is solved by itself, in two passes over its epochs
 
 1. Initial poses. Some epochs are solved without an initial guess (seeds, from
    :mod:`~locatk.core.lighthouse.devices.pnp`). Their poses and rates are propagated to neighbouring
-   epochs, which are solved in their turn; all fronts of this propagation form one batch. Two fronts
+   epochs, which are solved next; all fronts of this propagation form one batch. Two fronts
    can disagree, because a coplanar device under one station has two poses that explain its angles
    almost equally. The epochs of the less certain seed are then solved again from the other one.
 2. Refinement. All epochs are fitted again with the noise that the residuals show, which also yields
@@ -14,7 +14,6 @@ Each device is solved by itself, in two passes over its epochs
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.geometry import quaternion_from_matrix
+from locatk.core.geometry import quaternion_from_matrix, rotation_angle
 from locatk.core.lighthouse.channels import CHANNELS
 from locatk.core.lighthouse.devices.device_sweeps import (
     MIN_SWEEPS,
@@ -41,7 +40,6 @@ from locatk.core.lighthouse.devices.pnp import candidate_poses, is_lit_from_behi
 from locatk.core.lighthouse.devices.pose_fit import (
     DeviceStates,
     PoseFit,
-    Stations,
     SweepObservations,
     angle_residuals,
     fit_poses,
@@ -57,7 +55,9 @@ from locatk.core.lighthouse.noise import (
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
 from locatk.core.robust import robust_sigma
+from locatk.core.solution import add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -134,7 +134,8 @@ STATE_UNKNOWNS = 12
 MAX_POSE_SIGMA_M_RAD = np.repeat([1.0, 0.5], 3)
 """Maximum standard deviations of an accepted pose, in m and rad."""
 
-UNSOLVED, SOLVED, FAILED = 0, 1, 2
+UNSOLVED, SOLVED, FAILED = range(3)
+"""Status of an epoch in the first pass. A failed epoch is not tried again from its neighbours."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,7 @@ class TrackingProblem:
 
     sweeps: DeviceSweeps
     receiver: Receiver
-    stations: Stations
+    stations: StationArrays
     windows: SweepWindows
     half_width_ns: int
 
@@ -197,7 +198,7 @@ class TrackingProblem:
 
 @dataclass
 class EpochStates:
-    """Progress of the initial poses; the functions of the first pass update it in place.
+    """Progress of the initial poses, updated by the functions of the first pass.
 
     Attributes
     ----------
@@ -258,8 +259,8 @@ def track_devices(
         No device with a receiver has a sweep, or the scene contains none of the stations.
     """
     received = received_channels(sweeps, receivers)
-    known = [station for c in received if (station := scene.station(c)) is not None]
-    if not known:
+    selected = [station for c in received if (station := scene.station(c)) is not None]
+    if not selected:
         raise DegenerateError(
             "the scene has none of the recording's stations",
             hint="its channels are "
@@ -267,23 +268,18 @@ def track_devices(
             + "; the recording has "
             + ", ".join(str(c) for c in received),
         )
-    channels = tuple(s.channel for s in known)
-    stations = (
-        np.stack([s.position for s in known]),
-        np.stack([s.rotation for s in known]),
-        tuple(s.calibration for s in known),
-    )
+    channels = tuple(s.channel for s in selected)
+    stations = stack_stations(selected)
     interval_ns = None if interval_s is None else max(1, round(interval_s * 1e9))
     tracked = []
     for number, name in enumerate(sweeps.devices):
         if name not in receivers:
             continue
-        selected, rejected = select_device_sweeps(sweeps, number, receivers[name], channels)
+        device_sweeps, rejected = select_device_sweeps(sweeps, number, receivers[name], channels)
         device = track_device(
-            name, scene.frame, selected, receivers[name], stations, channels, interval_ns
+            name, scene.frame, device_sweeps, receivers[name], stations, channels, interval_ns
         )
-        rejected = dict(Counter(rejected) + Counter(device.rejected))
-        tracked.append(replace(device, rejected=rejected))
+        tracked.append(replace(device, rejected=add_counts(rejected, device.rejected)))
     return tuple(tracked)
 
 
@@ -292,7 +288,7 @@ def track_device(
     frame: str,
     sweeps: DeviceSweeps,
     receiver: Receiver,
-    stations: Stations,
+    stations: StationArrays,
     channels: tuple[int, ...],
     interval_ns: int | None = None,
 ) -> TrackedDevice:
@@ -304,7 +300,7 @@ def track_device(
         Names of the device and of the scene's frame.
     sweeps : DeviceSweeps
     receiver : Receiver
-    stations : Stations
+    stations : StationArrays
     channels : tuple of int
         Of the stations.
     interval_ns : int, optional
@@ -322,11 +318,11 @@ def track_device(
     states = EpochStates.initial(is_solvable)
     estimate_initial_poses(problem, states)
     tracked = _refine(problem, states, name, frame, channels)
-    rejected = Counter(
-        moment_with_too_few_sweeps=int(np.count_nonzero(~is_solvable)),
-        moment_inconsistent=int(np.count_nonzero(is_solvable & (states.status != SOLVED))),
-    )
-    return replace(tracked, rejected=dict(rejected + Counter(tracked.rejected)))
+    rejected = {
+        "moment_with_too_few_sweeps": int(np.count_nonzero(~is_solvable)),
+        "moment_inconsistent": int(np.count_nonzero(is_solvable & (states.status != SOLVED))),
+    }
+    return replace(tracked, rejected=add_counts(rejected, tracked.rejected))
 
 
 # ---- first pass: initial poses
@@ -476,15 +472,9 @@ def choose_hypothesis(cost: Array, rotation: Array) -> tuple[int, float]:
     """
     order = np.argsort(cost)
     best = int(order[0])
-    is_other = rotations_differ(rotation, rotation[best], MAX_UNPREDICTED_ROTATION_RAD)
+    is_other = rotation_angle(rotation, rotation[best]) > MAX_UNPREDICTED_ROTATION_RAD
     margin = np.min(cost[is_other] - cost[best], initial=MAX_SEED_MARGIN)
     return best, float(margin)
-
-
-def rotations_differ(first: Array, second: Array, limit_rad: float) -> Mask:
-    """Return whether rotations (..., 3, 3) differ by more than an angle in radians."""
-    trace = np.einsum("...ij,...ij->...", first, second)
-    return np.asarray(trace < 1 + 2 * np.cos(limit_rad))
 
 
 def from_behind_fraction(problem: TrackingProblem, epochs: IntArray, poses: DeviceStates) -> Array:
@@ -573,7 +563,7 @@ def resolve_conflicts(problem: TrackingProblem, states: EpochStates) -> None:
 
 
 def find_conflicting_seed(time_ns: IntArray, states: EpochStates, resolved: set[int]) -> int | None:
-    """Return the least certain seed whose poses contradict those of a neighbouring seed.
+    """Return the least certain seed that contradicts a neighbouring seed.
 
     Neighbouring epochs contradict each other if their rotations differ by more than their rates
     predict. Seeds in ``resolved`` are not returned; None if no conflict is left.
@@ -582,9 +572,8 @@ def find_conflicting_seed(time_ns: IntArray, states: EpochStates, resolved: set[
     first, second = solved[:-1], solved[1:]
     elapsed_s = np.asarray((time_ns[second] - time_ns[first]) * 1e-9)
     predicted = states.poses.take(first).later(elapsed_s).rotation
-    is_conflict = rotations_differ(
-        predicted, states.poses.rotation[second], MAX_UNPREDICTED_ROTATION_RAD
-    )
+    unpredicted_rad = rotation_angle(predicted, states.poses.rotation[second])
+    is_conflict = unpredicted_rad > MAX_UNPREDICTED_ROTATION_RAD
     is_conflict &= elapsed_s < MAX_PROPAGATION_GAP_S
     is_conflict &= states.seed[first] != states.seed[second]
     if not np.any(is_conflict):
@@ -633,11 +622,11 @@ def _refine(
     is_undetermined = np.any(
         np.sqrt(np.einsum("mii->mi", covariance)) > MAX_POSE_SIGMA_M_RAD, axis=1
     )
-    rejected = Counter(
-        moment_with_too_few_sweeps=int(np.count_nonzero(has_too_few)),
-        pose_not_determined=int(np.count_nonzero(is_undetermined & ~has_too_few)),
-        sweep_contradicts_pose=int(np.count_nonzero(np.isfinite(residual) & ~is_used)),
-    )
+    rejected = {
+        "moment_with_too_few_sweeps": int(np.count_nonzero(has_too_few)),
+        "pose_not_determined": int(np.count_nonzero(is_undetermined & ~has_too_few)),
+        "sweep_contradicts_pose": int(np.count_nonzero(np.isfinite(residual) & ~is_used)),
+    }
     is_good = ~(has_too_few | is_undetermined)
     accepted, poses = solved[is_good], fit.poses.take(is_good)
     trajectory = Trajectory(
@@ -658,7 +647,7 @@ def _refine(
         is_used,
         sigma,
         lasting_sigma,
-        dict(+rejected),
+        add_counts(rejected),
         float(np.mean(behind)) if len(sampled) else 0.0,
         int(np.count_nonzero(is_ambiguous(states, accepted))),
     )
@@ -775,7 +764,7 @@ def pose_covariance(
     them those of a generic calibration, repeat in all rotations of a window. Motion that the
     constant rates of a window do not describe is added.
     """
-    is_generic = any(c.source in ("generic", "estimated") for c in problem.stations[2])
+    is_generic = any(c.is_generic for c in problem.stations[2])
     variance = sigma**2 + (ROTATIONS_PER_WINDOW - 1.0) * lasting_sigma**2
     variance += ROTATIONS_PER_WINDOW * CALIBRATION_SIGMA_RAD**2 if is_generic else 0.0
     covariance = np.linalg.inv(fit.information)[:, :6, :6] * variance / fit_sigma**2

@@ -1,6 +1,6 @@
 """Verification of the stations of a scene with rigid devices.
 
-In short segments of the recording, each station is left out in turn. The poses are then estimated
+In short segments of the recording, each station is left out once. The poses are then estimated
 from the other stations, and predict at which rotor angles the station should have crossed the
 photodiodes.
 """
@@ -28,7 +28,7 @@ from locatk.core.trajectory import Trajectory
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-SEGMENTS = 60
+SEGMENT_COUNT = 60
 """Number of segments, evenly distributed over the recording. It bounds the computing time to half a
 second per station, however long the recording is."""
 
@@ -75,7 +75,7 @@ def verify_devices(
 
 
 def select_segments(sweeps: Sweeps) -> tuple[Sweeps, IntArray]:
-    """Select the sweeps in ``SEGMENTS`` segments of the recording.
+    """Select the sweeps in ``SEGMENT_COUNT`` segments of the recording.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def select_segments(sweeps: Sweeps) -> tuple[Sweeps, IntArray]:
     """
     first_ns, last_ns = int(sweeps.time_ns.min()), int(sweeps.time_ns.max())
     last_start_ns = max(first_ns, last_ns - SEGMENT_NS)
-    start_ns = np.linspace(first_ns, last_start_ns, SEGMENTS).astype(np.int64)
+    start_ns = np.linspace(first_ns, last_start_ns, SEGMENT_COUNT).astype(np.int64)
     segment = np.searchsorted(start_ns, sweeps.time_ns, side="right") - 1
     selected = sweeps.take(sweeps.time_ns - start_ns[segment] < SEGMENT_NS)
     return selected, start_ns + SEGMENT_NS // 2
@@ -102,11 +102,13 @@ def _verify_station(
     """Compare one station with the poses that the others determine."""
     station = scene.station(channel)
     assert station is not None
-    others = tuple(s for s in scene.stations if s.channel != channel)
+    other_stations = tuple(s for s in scene.stations if s.channel != channel)
     undetermined = StationVerification(channel, "others", 0, None, None, None, None, None)
     try:
         tracked = track_devices(
-            sweeps.take(sweeps.channel != channel), receivers, replace(scene, stations=others)
+            sweeps.take(sweeps.channel != channel),
+            receivers,
+            replace(scene, stations=other_stations),
         )
     except DegenerateError:
         return undetermined

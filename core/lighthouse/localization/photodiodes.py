@@ -32,7 +32,7 @@ from locatk.core.lighthouse.results import SceneVerification, StationDetection
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
 from locatk.core.robust import robust_sigma
-from locatk.core.solution import SolverWarning
+from locatk.core.solution import SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -148,7 +148,7 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
 
     sigma = angle_sigma(estimates, is_accepted)
     calibration_sigma = None
-    is_generic = any(c.source in ("generic", "estimated") for c in stations[2])
+    is_generic = any(c.is_generic for c in stations[2])
     # A floor homography absorbs the errors of the calibration.
     if is_generic and floor_map is None:
         calibration_sigma = CALIBRATION_SIGMA_RAD
@@ -164,7 +164,7 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
         sigma,
         calibration_sigma,
         restored,
-        {reason: count for reason, count in rejected.items() if count},
+        add_counts(rejected),
         (
             *_restored_warnings(restored),
             *_contradiction_warnings(
@@ -198,6 +198,7 @@ def split_by_device(
 
 
 def _restored_warnings(restored: int) -> list[SolverWarning]:
+    """Return a warning if epochs had swapped sweeps."""
     if not restored:
         return []
     return [
@@ -305,7 +306,7 @@ def restore_swapped_sweeps(
     Returns
     -------
     epochs, estimates, count
-        With restored sweeps, and in how many epochs.
+        With restored sweeps, and the number of restored epochs.
     """
     restored = 0
     if epochs.labelled or len(epochs.channels) != 2:
@@ -351,7 +352,7 @@ def leave_out_worst_station(
     Returns
     -------
     estimates, count
-        With consistent estimates where leaving out one station gives any, and their number.
+        Consistent estimates replace the others if leaving out one station yields any; their number.
     """
     if angles.shape[1] < 3:
         return estimates, 0

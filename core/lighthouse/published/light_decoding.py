@@ -65,7 +65,7 @@ FIRMWARE_POLYNOMIALS = 8
 MAX_CHIPS = 128
 """Number of runs of a window that are used."""
 
-ATTEMPTS = ((8, 39, 4), (9, 38, 4), (8, 29, 3), (9, 28, 3), (8, 19, 2))
+MATCH_ATTEMPTS_BITS = ((8, 39, 4), (9, 38, 4), (8, 29, 3), (9, 28, 3), (8, 19, 2))
 """Number of skipped bits, of bits compared after the 17, and of tolerated mismatches, in the order
 of the attempts."""
 
@@ -253,7 +253,7 @@ def identify_polynomials(
     polynomial = np.full(len(bits), -1, np.int32)
     offset = np.zeros(len(bits), np.int32)
     rows = np.arange(len(bits))
-    for skipped, compared, max_mismatches in ATTEMPTS:
+    for skipped, compared, max_mismatches in MATCH_ATTEMPTS_BITS:
         mismatches = _count_mismatches(bits[rows], skipped, compared, polynomials)
         best = np.argmin(mismatches, axis=0)
         is_match = mismatches[best, np.arange(len(rows))] <= max_mismatches
@@ -287,7 +287,7 @@ def _split_chips(windows: NDArray[np.uint8]) -> Chips:
 
 
 def _resolve_fuzzy_chips(chips: Chips) -> None:
-    """Determine fuzzy chips from their neighbours where possible: ones come in pairs. In place."""
+    """Determine fuzzy chips from their neighbours if possible: ones come in pairs."""
     # True if an odd number of ones starts at a chip. No rule changes a chip ahead that it does not
     # also skip, so that these stay valid.
     odd_run = np.zeros(chips.shape, bool)
@@ -336,7 +336,7 @@ def _resolve_fuzzy_chips(chips: Chips) -> None:
 
 
 def _pair_ones(chips: Chips) -> None:
-    """Determine fuzzy chips after ones, and prepend a 1 to odd runs of ones. In place."""
+    """Determine fuzzy chips after ones, and prepend a 1 to odd runs of ones."""
     ones = np.zeros(chips.shape[1], np.uint8)
     for j in range(MAX_CHIPS):
         chip = chips[j]

@@ -293,18 +293,18 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
     angles = rotor_angles(epochs)
     image = image_points(epochs, angles)
     is_complete = np.isfinite(image).all(axis=(1, 2))
-    known, visited = marker_angles(prior.markers, epochs, angles)
+    marker_points, visited = marker_angles(prior.markers, epochs, angles)
     is_visited = np.isfinite(visited).all(axis=(1, 2))
-    known, visited = known[is_visited], image_points(epochs, visited[is_visited])
+    marker_points, visited = marker_points[is_visited], image_points(epochs, visited[is_visited])
 
     if kind == "one-planar":
-        solved = one_planar(known[:, :2], visited[:, 0])
+        solved = one_planar(marker_points[:, :2], visited[:, 0])
         to_frame, scale = Similarity.identity(), "markers"
     else:
         first, second = (np.insert(image[is_complete, k], 0, 1.0, axis=1) for k in (0, 1))
         require_distinct_positions(first, second, 4 if kind == "two-planar" else 8)
         solved = (two_planar if kind == "two-planar" else two_3d)(image[is_complete])
-        to_frame, scale = _scene_frame(solved, known, visited, prior, epochs, angles)
+        to_frame, scale = _scene_frame(solved, marker_points, visited, prior, epochs, angles)
         if scale == "unit":
             warnings.append(
                 SolverWarning("unit_scale", "unit scale: the distance of the two stations is 1")
@@ -357,15 +357,15 @@ def image_points(epochs: Epochs, angles: Array) -> Array:
 
 def _scene_frame(
     solved: PaperScene,
-    known: Array,
+    marker_points: Array,
     visited: Array,
     prior: Scene,
     epochs: Epochs,
     angles: Array,
 ) -> tuple[Similarity, str]:
     """Return the similarity to the frame of the markers, or to the known scale, and its source."""
-    if len(known) >= MIN_MARKERS:
-        return umeyama(solved.locate(visited), known), "markers"
+    if len(marker_points) >= MIN_MARKERS:
+        return umeyama(solved.locate(visited), marker_points), "markers"
     unit = Similarity.identity()
     if not prior.distances:
         return unit, "unit"

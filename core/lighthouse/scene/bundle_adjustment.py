@@ -29,31 +29,28 @@ from locatk.core.lighthouse.calibration import (
     Calibration,
     predict_with_gradient,
 )
+from locatk.core.lighthouse.noise import UNREACHABLE_RESIDUAL_SIGMAS
 
 Array = NDArray[np.float64]
 
 STATION_PARAMETERS = 10
 """Unknowns of a station: position, rotation vector in the frame, two tilts, two phases."""
 
-POSITION, ROTATION = slice(0, 3), slice(3, 6)
-CALIBRATION = slice(6, 10)
-"""Ranges of these unknowns."""
+POSITION, ROTATION, CALIBRATION = slice(0, 3), slice(3, 6), slice(6, 10)
+"""Columns of these unknowns."""
 
 LOSS_SCALE_RAD = 3e-3
 """Residual at which the weight of an angle is one half: beyond what a generic calibration leaves
 unmodelled (1 mrad), and far below reflections and demodulation errors."""
 
-INDEPENDENT_POINTS = 100
-"""Points that carry independent information, at most: points share the error of the model, and
-the accuracy of a scene saturates at about so many (Alvarado-Marin et al. 2024, Fig. 12). With more,
-tilts and phases would be bent to explain what they do not cause."""
+MAX_INDEPENDENT_POINTS = 100
+"""Maximum number of points that carry independent information: the errors of the model are common
+to points, and the accuracy of a scene saturates at about so many (Alvarado-Marin et al. 2024,
+Fig. 12). With more, tilts and phases would absorb errors that have other causes."""
 
 INNER_ITERATIONS_AFTER = 10
 """Iterations after which the points take a step of their own as well, which doubles the work and
 carries the adjustment through the curved valleys of a narrow field of view."""
-
-UNREACHABLE_RESIDUAL = 1e3
-"""Residual, in standard deviations, of an angle at which no light plane meets the photodiode."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ def adjust_bundle(
     planar: bool = False,
     fixed_points: bool = False,
     calibrate: bool = True,
-    independent_points: int = INDEPENDENT_POINTS,
+    independent_points: int = MAX_INDEPENDENT_POINTS,
     loss_scale_rad: float = LOSS_SCALE_RAD,
     max_iterations: int = 50,
 ) -> BundleAdjustment:
@@ -141,7 +138,7 @@ def adjust_bundle(
     """
     observed = np.isfinite(angles)
     sigma_rad = sigma_rad * float(np.sqrt(max(1.0, len(angles) / independent_points)))
-    calibrated = [calibrate and c.source in ("generic", "estimated") for c in state.calibrations]
+    calibrated = [calibrate and c.is_generic for c in state.calibrations]
     problem = _PointBundle(
         angles=np.where(observed, angles, 0.0),
         observed=observed,
@@ -170,7 +167,7 @@ def adjust_bundle(
 
 @dataclass(frozen=True)
 class _PointBundle:
-    """The adjustment as a problem for :func:`~locatk.core.least_squares.minimize`.
+    """Bundle adjustment as a problem for :func:`~locatk.core.least_squares.minimize`.
 
     Attributes
     ----------
@@ -208,7 +205,7 @@ class _PointBundle:
             by_point = by_local @ state.rotations[i].T
             residual = (predicted - self.angles[:, i]) / self.sigma_rad
             reachable = np.isfinite(residual)
-            residual = np.where(reachable, residual, UNREACHABLE_RESIDUAL)
+            residual = np.where(reachable, residual, UNREACHABLE_RESIDUAL_SIGMAS)
             loss, weight = cauchy_loss(residual, self.loss_scale)
             weight = np.where(self.observed[:, i], weight, 0.0)
             cost += float(np.sum(loss, where=self.observed[:, i]))
@@ -252,10 +249,10 @@ class _PointBundle:
 
 
 def _gauge_directions(positions: Array, dims: int) -> Array:
-    """Orthonormal directions (s * 10, g) of the stations' unknowns that no angle depends on.
+    """Return orthonormal directions (s * 10, g) of the unknowns that no angle depends on.
 
-    Translation, rotation and scale of everything; in a plane (``dims`` 2) translation in x and
-    y, rotation about z, and scale. None if the points are known.
+    They are translation, rotation and scale of everything; in a plane (``dims`` 2) translation in
+    x and y, rotation about z, and scale. There are none (g = 0) if the points are known.
     """
     s = len(positions)
     motions = []
@@ -280,9 +277,10 @@ def _gauge_directions(positions: Array, dims: int) -> Array:
 
 
 def free_parameters(calibrated: Sequence[bool] | NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(s, 10) unknowns that are estimated; tilts and phases only of ``calibrated`` stations.
+    """Return which unknowns (s, 10) are estimated.
 
-    The first phase is zero in every unit and never estimated.
+    Tilts and phases are estimated for ``calibrated`` stations only, and the first phase, which is
+    zero in every unit, for none.
     """
     free = np.ones((len(calibrated), STATION_PARAMETERS), bool)
     varies = calibration_sigma() > 0
@@ -293,7 +291,7 @@ def free_parameters(calibrated: Sequence[bool] | NDArray[np.bool_]) -> NDArray[n
 def station_jacobian(
     by_position: Array, offset: Array, by_tilt: Array, plane: NDArray[np.int64]
 ) -> Array:
-    """Derivatives (..., 10) of rotor angles by the unknowns of their station.
+    """Return the derivatives (..., 10) of rotor angles by the unknowns of their station.
 
     Parameters
     ----------
@@ -342,7 +340,7 @@ def add_calibration_prior(
 def retract_stations(
     state: BundleState, change: Array
 ) -> tuple[Array, Array, tuple[Calibration, ...]]:
-    """Positions, rotations and calibrations after a change (s, 10) of their unknowns."""
+    """Return positions, rotations and calibrations after a change (s, 10) of their unknowns."""
     return (
         state.positions + change[:, POSITION],
         rotation_exp(change[:, ROTATION]) @ state.rotations,
@@ -354,24 +352,24 @@ def retract_stations(
 
 
 def station_blocks(covariance: Array, stations: int) -> Array:
-    """(s, 10, 10) diagonal blocks of a covariance (s * 10, s * 10)."""
+    """Return the diagonal blocks (s, 10, 10) of a covariance (s * 10, s * 10)."""
     n = STATION_PARAMETERS
     blocks = covariance.reshape(stations, n, stations, n)
     return np.stack([blocks[i, :, i, :] for i in range(stations)])
 
 
 def calibration_parameters(calibration: Calibration) -> Array:
-    """(4,) both tilts and both phases in radians, which an adjustment may estimate."""
+    """Return both tilts and both phases (4,) in radians, which an adjustment may estimate."""
     return np.concatenate([calibration.sweeps[:, TILT], calibration.sweeps[:, PHASE]])
 
 
 def calibration_sigma() -> Array:
-    """(4,) standard deviations of :func:`calibration_parameters` over units, in radians."""
+    """Return the standard deviations (4,) of :func:`calibration_parameters` over units."""
     return np.concatenate([PHASE_TILT_SIGMA_RAD[:, 1], PHASE_TILT_SIGMA_RAD[:, 0]])
 
 
 def with_parameters(calibration: Calibration, change: Array) -> Calibration:
-    """Return a calibration whose :func:`calibration_parameters` are changed by (4,)."""
+    """Add a change (4,) to the :func:`calibration_parameters` of a calibration."""
     if not np.any(change):
         return calibration
     sweeps = calibration.sweeps.copy()

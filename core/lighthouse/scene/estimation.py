@@ -82,8 +82,8 @@ MIN_PLANE_TEST_KEYFRAMES = 20
 """Number of pairs on which a plane is tested, and their fewest common keyframes."""
 
 MIN_SPATIAL_PAIR_FRACTION = 0.25
-"""Fraction of these pairs off any plane from which the scene is in space. A single pair may share
-only a part of the drive that happens to be flat."""
+"""Fraction of these pairs off any plane from which the scene is in space. The common keyframes
+of a single pair may be of a flat part of the drive only."""
 
 MIN_SHARED_KEYFRAMES = 4
 """Fewest common keyframes that link two stations to one group."""
@@ -112,7 +112,7 @@ class SceneEstimate:
     verification_angles : (n, s, 2) ndarray or None
         Rotor angles to verify the scene on; None if all epochs are suitable.
     held_out : bool
-        Whether these took no part in the estimation.
+        True if these took no part in the estimation.
     """
 
     scene: Scene
@@ -205,11 +205,11 @@ def require_two_stations(kind: str, epochs: Epochs) -> None:
 def select_stations(
     epochs: Epochs, columns: Sequence[int], reason: str
 ) -> tuple[Epochs, dict[str, int]]:
-    """Keep the sweeps of some stations; returns the number of the others under ``reason``."""
+    """Keep the sweeps of some stations, and count those of the others under ``reason``."""
     if len(columns) == len(epochs.channels):
         return epochs, {}
-    others = [i for i in range(len(epochs.channels)) if i not in columns]
-    removed = int(np.count_nonzero(np.isfinite(epochs.counts[:, others])))
+    removed_columns = [i for i in range(len(epochs.channels)) if i not in columns]
+    removed = int(np.count_nonzero(np.isfinite(epochs.counts[:, removed_columns])))
     kept = replace(
         epochs,
         channels=epochs.channels[list(columns)],
@@ -223,20 +223,21 @@ def select_stations(
 
 def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
     """Resect the station with the most markers on a floor."""
-    known, observed = marker_angles(prior.markers, epochs, rotor_angles(epochs))
+    marker_points, observed = marker_angles(prior.markers, epochs, rotor_angles(epochs))
     is_complete = np.all(np.isfinite(observed), axis=2)
     column = int(np.argmax(np.count_nonzero(is_complete, axis=0)))
     epochs, rejected = select_stations(epochs, [column], "other_station")
-    known, observed = known[is_complete[:, column]], observed[is_complete[:, column]][:, [column]]
-    if len(known) < MIN_FLOOR_MARKERS:
+    marker_points = marker_points[is_complete[:, column]]
+    observed = observed[is_complete[:, column]][:, [column]]
+    if len(marker_points) < MIN_FLOOR_MARKERS:
         raise DegenerateError(
             f"one station needs {MIN_FLOOR_MARKERS} visited markers on the floor and has "
-            f"{len(known)}",
+            f"{len(marker_points)}",
             hint="add [[markers]] with sightings to a scene.toml and give it by --artifact, "
             "or record with two stations",
         )
-    floor_z = float(np.mean(known[:, 2]))
-    on_floor = known - np.array([0.0, 0.0, floor_z])
+    floor_z = float(np.mean(marker_points[:, 2]))
+    on_floor = marker_points - np.array([0.0, 0.0, floor_z])
     calibration = prior.calibrations.get(int(epochs.channels[0]), GENERIC_CALIBRATION)
     rays = rays_of(ideal_angles(observed[:, 0], calibration), calibration.tilts)
     position, rotation = resect_on_plane(on_floor[:, :2], rays)
@@ -272,8 +273,8 @@ def _estimate_stations_of(
     keyframes, _ = average_standstills(angles, epochs.device)
 
     def misfit_of_markers(state: BundleState, columns: tuple[int, int]) -> float:
-        known, observed = marker_angles(prior.markers, epochs, angles)
-        return marker_misfit(state, True, known, observed[:, columns])
+        marker_points, observed = marker_angles(prior.markers, epochs, angles)
+        return marker_misfit(state, True, marker_points, observed[:, columns])
 
     estimate = estimate_stations(
         keyframes,
@@ -319,8 +320,8 @@ def _left_out_warnings(estimate: StationsEstimate, epochs: Epochs) -> list[Solve
     for reason in dict.fromkeys(estimate.left_out.values()):
         channels = [
             str(epochs.channels[k])
-            for k, other in sorted(estimate.left_out.items())
-            if other == reason
+            for k, station_reason in sorted(estimate.left_out.items())
+            if station_reason == reason
         ]
         warnings.append(
             SolverWarning(
@@ -366,7 +367,7 @@ def generic_calibration_warnings(
     generic = [
         str(channel)
         for channel, calibration in zip(channels, calibrations, strict=True)
-        if calibration.source in ("generic", "estimated")
+        if calibration.is_generic
     ]
     if not generic:
         return ()
@@ -465,7 +466,7 @@ def estimate_stations(
     sigma : float
         Standard deviation of an angle including the errors of its calibration, in radians.
     planar : bool, optional
-        Whether all photodiodes are on one plane; decided from the data if None.
+        True if all photodiodes are on one plane; decided from the data if None.
     marker_misfit : callable, optional
         Misfit of the markers in the state of two stations, given with their columns. It decides
         between the two decompositions of a homography.
@@ -628,7 +629,7 @@ def largest_group(shared: NDArray[np.int64]) -> tuple[int, ...]:
 
 def _fills_space(rays: Array, shared: NDArray[np.int64], group: tuple[int, ...], seed: int) -> bool:
     """Return whether enough pairs of a group have common keyframes that are on no plane."""
-    verdicts = []
+    is_flat_pair = []
     for i, j in _ranked_pairs(shared, group)[:MAX_PLANE_TEST_PAIRS]:
         if shared[i, j] < MIN_PLANE_TEST_KEYFRAMES:
             break
@@ -636,9 +637,9 @@ def _fills_space(rays: Array, shared: NDArray[np.int64], group: tuple[int, ...],
         a, b = rays[is_common, i], rays[is_common, j]
         homography, _ = estimate_homography(a, b, seed)
         median = float(np.median(homography_residuals(homography, a, b)))
-        verdicts.append(is_plane_like(a, b, median))
-    spatial = verdicts.count(False)
-    return bool(verdicts) and spatial >= MIN_SPATIAL_PAIR_FRACTION * len(verdicts)
+        is_flat_pair.append(is_plane_like(a, b, median))
+    spatial_pairs = is_flat_pair.count(False)
+    return bool(is_flat_pair) and spatial_pairs >= MIN_SPATIAL_PAIR_FRACTION * len(is_flat_pair)
 
 
 def _ranked_pairs(shared: NDArray[np.int64], group: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -657,8 +658,8 @@ def _start_pairs(
     pairs: list[StationPair] = []
     first_error: DegenerateError | None = None
     for i, j in ranked:
-        is_weak = shared[i, j] < MIN_SHARED_KEYFRAMES or shared[i, j] < min_shared
-        if pairs and (is_weak or len(pairs) == MAX_START_PAIRS):
+        has_too_few = shared[i, j] < MIN_SHARED_KEYFRAMES or shared[i, j] < min_shared
+        if pairs and (has_too_few or len(pairs) == MAX_START_PAIRS):
             break
         pair = pair_of(i, j)
         if isinstance(pair, StationPair):
@@ -666,8 +667,8 @@ def _start_pairs(
         else:
             first_error = first_error or pair
     if not pairs:
-        assert first_error is not None  # Each pair was either estimated or refused.
+        assert first_error is not None  # Each pair was either estimated or raised an error.
         raise first_error
-    # All pairs share one floor or none: if they differ, the pair with the most keyframes decides.
-    alike = [pair for pair in pairs if pair.planar == pairs[0].planar]
-    return sorted(alike, key=lambda pair: pair.relative_sigma)
+    # Either all pairs are over one floor or none is: the pair with the most keyframes decides.
+    consistent = [pair for pair in pairs if pair.planar == pairs[0].planar]
+    return sorted(consistent, key=lambda pair: pair.relative_sigma)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError, InputError
-from locatk.core.geometry import Similarity, umeyama
+from locatk.core.geometry import Similarity, transform_covariance, umeyama
 from locatk.core.lighthouse.epochs import Epochs
 from locatk.core.lighthouse.light_planes import counts_to_angles
 from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
@@ -105,11 +105,11 @@ def fix_gauge(
     DegenerateError
         The markers are on a line, or no distance was observed at both ends.
     """
-    known, observed = marker_angles(prior.markers, epochs, angles)
-    to_markers = align_to_markers(state, planar, known, observed)
+    marker_points, observed = marker_angles(prior.markers, epochs, angles)
+    to_markers = align_to_markers(state, planar, marker_points, observed)
     if to_markers is not None:
         return _framed_by_markers(
-            state, station_covariance, planar, prior, known, observed, to_markers
+            state, station_covariance, planar, prior, marker_points, observed, to_markers
         )
     warnings = []
     if prior.markers:
@@ -137,17 +137,17 @@ def _framed_by_markers(
     station_covariance: Array,
     planar: bool,
     prior: Scene,
-    known: Array,
+    marker_points: Array,
     observed: Array,
     to_markers: Similarity,
 ) -> FramedState:
-    """Transform a state by ``to_markers`` and check the result."""
+    """Transform a state by ``to_markers``, and add warnings about the markers."""
     warnings = []
-    misfit = marker_misfit(state, planar, known, observed)
+    misfit = marker_misfit(state, planar, marker_points, observed)
     if MAX_MARKER_MISFIT_M < misfit < np.inf:
         warnings.append(marker_misfit_warning(misfit))
     framed = transform_state(state, to_markers)
-    floor_z = float(np.mean(known[:, 2])) if planar else 0.0
+    floor_z = float(np.mean(marker_points[:, 2])) if planar else 0.0
     if planar and np.mean(framed.positions[:, 2]) < floor_z:
         warnings.append(
             SolverWarning(
@@ -288,7 +288,7 @@ def locate_with(state: BundleState, planar: bool, angles: Array) -> PositionEsti
     )
 
 
-def marker_misfit(state: BundleState, planar: bool, known: Array, observed: Array) -> float:
+def marker_misfit(state: BundleState, planar: bool, marker_points: Array, observed: Array) -> float:
     """Return the rms residual of markers in metres, after the best similarity.
 
     Infinite for fewer than :data:`MIN_MARKERS_FOR_MISFIT` located markers. Parameters as for
@@ -298,15 +298,15 @@ def marker_misfit(state: BundleState, planar: bool, known: Array, observed: Arra
     is_located = np.isfinite(position[:, 0])
     if np.count_nonzero(is_located) < MIN_MARKERS_FOR_MISFIT:
         return float("inf")
-    to_markers = align_to_markers(state, planar, known, observed)
+    to_markers = align_to_markers(state, planar, marker_points, observed)
     if to_markers is None:
         return float("inf")
-    error = to_markers.apply(position[is_located]) - known[is_located]
+    error = to_markers.apply(position[is_located]) - marker_points[is_located]
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
 def align_to_markers(
-    state: BundleState, planar: bool, known: Array, observed: Array
+    state: BundleState, planar: bool, marker_points: Array, observed: Array
 ) -> Similarity | None:
     """Estimate the similarity from the frame of a state to that of the markers.
 
@@ -315,7 +315,7 @@ def align_to_markers(
     state : BundleState
     planar : bool
         The photodiodes of the state have z = 0.
-    known : (k, 3) ndarray
+    marker_points : (k, 3) ndarray
         Positions of the markers in metres.
     observed : (k, s, 2) ndarray
         Rotor angles there.
@@ -335,7 +335,7 @@ def align_to_markers(
     if np.count_nonzero(is_located) < MIN_MARKERS:
         return None
     try:
-        return umeyama(estimates.position[is_located], known[is_located])
+        return umeyama(estimates.position[is_located], marker_points[is_located])
     except DegenerateError:
         raise DegenerateError(
             "the visited markers are on one line and do not fix a frame",
@@ -372,15 +372,15 @@ def scale_from_distances(
         for d in distances
     ]
     lengths = np.array([np.linalg.norm(second - first) for first, second in ends])
-    known = np.array([d.distance for d in distances])
+    known_m = np.array([d.distance for d in distances])
     is_observed = np.isfinite(lengths) & (lengths > 0)
     if not np.any(is_observed):
         raise DegenerateError(
             "no known distance was observed at both ends by enough stations",
             hint="check the times of its visits",
         )
-    lengths, known = lengths[is_observed], known[is_observed]
-    return float(lengths @ known / (lengths @ lengths))
+    lengths, known_m = lengths[is_observed], known_m[is_observed]
+    return float(lengths @ known_m / (lengths @ lengths))
 
 
 def scale_from_odometry(
@@ -447,17 +447,6 @@ def transform_state(state: BundleState, to: Similarity) -> BundleState:
         state.calibrations,
         to.apply(state.points),
     )
-
-
-def transform_covariance(covariance: Array, scale: float, rotation: Array) -> Array:
-    """Transform covariances (..., k, k) of stations or poses by a similarity of their frame.
-
-    Their first six unknowns are position and rotation vector.
-    """
-    jacobian = np.eye(covariance.shape[-1])
-    jacobian[0:3, 0:3] = scale * rotation
-    jacobian[3:6, 3:6] = rotation
-    return jacobian @ covariance @ jacobian.T
 
 
 def first_station_frame(state: BundleState, planar: bool, scale: float) -> Similarity:

@@ -127,7 +127,7 @@ def spread_evenly(is_observed: NDArray[np.bool_], usable: Indices, limit: int) -
     Parameters
     ----------
     is_observed : (m, s) bool ndarray
-        Whether each station was received in each keyframe.
+        True if a station was received in a keyframe.
     usable : (k,) int ndarray
         Indices of the keyframes to select from, ascending.
     limit : int

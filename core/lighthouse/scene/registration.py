@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import fit_homography as fit_checked_homography
-from locatk.core.geometry import fit_plane
+from locatk.core.geometry import fit_plane, rotation_angle
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
 from locatk.core.lighthouse.scene.bundle_adjustment import BundleState, adjust_bundle
@@ -209,7 +209,7 @@ class StationRegistration:
         estimates: PositionEstimates,
         pair_of: PairOf,
     ) -> BundleState | None:
-        """Place a station by its pairs with registered ones; None if they do not determine it.
+        """Estimate the pose of a station from its pairs with registered ones; None if undetermined.
 
         On a floor pairs are not needed, because there a single station locates keyframes.
         """
@@ -226,7 +226,7 @@ class StationRegistration:
                 return _single_station(index, position, rotation, pair)
         for n, (pair, origin, rotation, direction) in enumerate(views):
             for _, second_origin, second_rotation, second_direction in views[n + 1 :]:
-                if _angle_between(rotation, second_rotation) > MAX_ROTATION_DISAGREEMENT_RAD:
+                if rotation_angle(rotation, second_rotation) > MAX_ROTATION_DISAGREEMENT_RAD:
                     continue
                 crossing = intersect_lines(
                     self.positions[[origin, second_origin]],
@@ -317,12 +317,6 @@ def _single_station(index: int, position: Array, rotation: Array, pair: StationP
     return BundleState(position[None], rotation[None], (calibration,), np.zeros((0, 3)))
 
 
-def _angle_between(first: Array, second: Array) -> float:
-    """Return the angle in radians between two rotations."""
-    cosine = (np.trace(first.T @ second) - 1.0) / 2.0
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
 def consistent_median(ratios: Array) -> float | None:
     """Return the median of ratios (n,), or None if they are too few or disagree.
 
@@ -393,16 +387,22 @@ def resect_on_plane(points: Array, rays: Array) -> Pose:
     section 2.2).
     """
     require_plane_homography(points, rays)
-    known = np.c_[np.ones(len(points)), points]
+    homogeneous = np.c_[np.ones(len(points)), points]
     if len(points) > MIN_PLANE_POINTS:
         h, is_inlier = consensus(
-            fit_homography, homography_residuals, known, rays, sample=4, gate=INLIER_GATE_TAN
+            fit_homography,
+            homography_residuals,
+            homogeneous,
+            rays,
+            sample_size=4,
+            gate=INLIER_GATE_TAN,
         )
-        known = known[is_inlier] if np.count_nonzero(is_inlier) >= MIN_PLANE_POINTS else known
+        if np.count_nonzero(is_inlier) >= MIN_PLANE_POINTS:
+            homogeneous = homogeneous[is_inlier]
     else:
-        h = fit_homography(known, rays)
+        h = fit_homography(homogeneous, rays)
     h = h / np.mean(np.linalg.norm(h[:, 1:], axis=0))
-    if np.mean(h[0] @ known.T) < 0:
+    if np.mean(h[0] @ homogeneous.T) < 0:
         h = -h
     columns = h[:, 1:]
     rotation = _nearest_rotation(np.c_[columns, np.cross(columns[:, 0], columns[:, 1])])
@@ -432,13 +432,13 @@ def resect_in_space(points: Array, rays: Array) -> list[Pose]:
     """
     _require_spread(points)
     centroid, size = points.mean(axis=0), points.std()
-    known = np.c_[np.ones(len(points)), (points - centroid) / size]
+    normalized = np.c_[np.ones(len(points)), (points - centroid) / size]
     p, is_inlier = consensus(
         fit_projection,
         homography_residuals,
-        known,
+        normalized,
         rays,
-        sample=6,
+        sample_size=6,
         gate=INLIER_GATE_TAN,
         trials=PROJECTION_TRIALS,
     )
@@ -449,8 +449,8 @@ def resect_in_space(points: Array, rays: Array) -> list[Pose]:
         rotation = _nearest_rotation(p[:, 1:])
         mean_scale = np.mean(np.linalg.svd(p[:, 1:])[1])
         poses.append((centroid - size * rotation.T @ p[:, 0] / mean_scale, rotation.T))
-    enough = np.count_nonzero(is_inlier) >= MIN_SPACE_POINTS
-    plane_points = points[is_inlier] if enough else points
+    has_enough_inliers = np.count_nonzero(is_inlier) >= MIN_SPACE_POINTS
+    plane_points = points[is_inlier] if has_enough_inliers else points
     centre, normal = fit_plane(plane_points)
     basis = np.linalg.svd(normal[None])[2]
     axes = np.stack([basis[1], np.cross(normal, basis[1]), normal], axis=1)
@@ -494,7 +494,7 @@ def fit_floor_homography(points: Array, rays: Array) -> Array:
     if len(points) == MIN_PLANE_POINTS:
         return _inverse_homography(fit_homography(floor, rays))
     start, is_inlier = consensus(
-        fit_homography, homography_residuals, floor, rays, sample=4, gate=INLIER_GATE_TAN
+        fit_homography, homography_residuals, floor, rays, sample_size=4, gate=INLIER_GATE_TAN
     )
     if np.count_nonzero(is_inlier) < MIN_PLANE_POINTS:
         raise DegenerateError(

@@ -233,21 +233,21 @@ def fit_homography(a: Array, b: Array) -> Array:
     return np.linalg.inv(from_b) @ fit_projection(a, b) @ from_a
 
 
-def fit_projection(known: Array, rays: Array) -> Array:
-    """Fit projections (..., 3, d) with rays ~ P known by direct linear transform.
+def fit_projection(points: Array, rays: Array) -> Array:
+    """Fit projections (..., 3, d) with rays ~ P points by direct linear transform.
 
-    ``known`` are (..., n, d) homogeneous points, ``rays`` (..., n, 3) with x = 1 in front
+    ``points`` (..., n, d) are homogeneous, ``rays`` (..., n, 3) with x = 1 in front
     (Hartley and Zisserman, sections 4.1 and 7.1). The points are not normalized.
     """
-    zero = np.zeros_like(known)
+    zero = np.zeros_like(points)
     rows = np.concatenate(
         [
-            np.concatenate([-rays[..., 1:2] * known, rays[..., 0:1] * known, zero], axis=-1),
-            np.concatenate([-rays[..., 2:3] * known, zero, rays[..., 0:1] * known], axis=-1),
+            np.concatenate([-rays[..., 1:2] * points, rays[..., 0:1] * points, zero], axis=-1),
+            np.concatenate([-rays[..., 2:3] * points, zero, rays[..., 0:1] * points], axis=-1),
         ],
         axis=-2,
     )
-    return _null_vector(rows).reshape(*rows.shape[:-2], 3, known.shape[-1])
+    return _null_vector(rows).reshape(*rows.shape[:-2], 3, points.shape[-1])
 
 
 def homography_residuals(h: Array, a: Array, b: Array) -> Array:
@@ -303,7 +303,7 @@ def _null_vector(rows: Array) -> Array:
 def estimate_homography(a: Array, b: Array, seed: int = 0) -> tuple[Array, NDArray[np.bool_]]:
     """Estimate a homography by RANSAC; returns it and its (n,) inliers."""
     return consensus(
-        fit_homography, homography_residuals, a, b, sample=4, gate=INLIER_GATE_TAN, seed=seed
+        fit_homography, homography_residuals, a, b, sample_size=4, gate=INLIER_GATE_TAN, seed=seed
     )
 
 
@@ -314,7 +314,7 @@ def estimate_epipolar(a: Array, b: Array, seed: int = 0) -> tuple[Array, NDArray
         epipolar_residuals,
         a,
         b,
-        sample=8,
+        sample_size=8,
         gate=INLIER_GATE_TAN,
         trials=EPIPOLAR_TRIALS,
         seed=seed,
@@ -394,10 +394,11 @@ def triangulate(a: Array, b: Array, rotation: Array, translation: Array) -> tupl
     """
     rotated = a @ rotation.T
     aa, bb, ab = (np.sum(p * q, axis=-1) for p, q in ((rotated, rotated), (b, b), (rotated, b)))
-    at, bt = -rotated @ translation, -b @ translation
+    a_dot_t, b_dot_t = -rotated @ translation, -b @ translation
     with np.errstate(divide="ignore", invalid="ignore"):
         determinant = aa * bb - ab**2
-        return (at * bb - ab * bt) / determinant, (ab * at - aa * bt) / determinant
+        depth_a = (a_dot_t * bb - ab * b_dot_t) / determinant
+        return depth_a, (ab * a_dot_t - aa * b_dot_t) / determinant
 
 
 # ---- plane or space

@@ -57,7 +57,7 @@ def verify_scene(
     floor_z : float, optional
         Height of all photodiodes, if they move on a plane.
     held_out : bool
-        Whether the epochs took no part in the estimation of the scene.
+        True if the epochs took no part in the estimation of the scene.
 
     Returns
     -------
@@ -134,18 +134,18 @@ def verify_stations(
         rows = np.isfinite(angles[:, i]).any(axis=1)
         other_angles = angles[rows]
         other_angles[:, i] = np.nan
-        others = locate(other_angles)
-        is_located = np.isfinite(others.position[:, 0])
+        from_others = locate(other_angles)
+        is_located = np.isfinite(from_others.position[:, 0])
         against = "others" if np.any(is_located) else "joint"
-        position = others.position if np.any(is_located) else joint.position[rows]
+        position = from_others.position if np.any(is_located) else joint.position[rows]
         local = (position - positions[i]) @ rotations[i]
         with np.errstate(invalid="ignore"):
             residual = predict_angles(local, calibrations[i]) - angles[rows, i]
         distance = np.linalg.norm(local, axis=1)[:, None]
         count = int(np.count_nonzero(np.isfinite(residual).any(axis=1)))
-        jump = np.linalg.norm(others.position - joint.position[rows], axis=1)
+        jump = np.linalg.norm(from_others.position - joint.position[rows], axis=1)
         jump = jump[np.isfinite(jump)]
-        residual_of_others = np.abs(others.residual[(others.redundancy > 0) & is_located])
+        residual_of_others = np.abs(from_others.residual[(from_others.redundancy > 0) & is_located])
         checks.append(
             StationVerification(
                 int(channel),

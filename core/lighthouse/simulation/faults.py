@@ -27,7 +27,7 @@ def inject_faults(
     noise_rad: float,
     rng: np.random.Generator,
 ) -> None:
-    """Turn a fraction of the sweeps into outliers, a third of each kind.
+    """Replace a fraction of the sweeps by outliers, a third of each kind.
 
     Parameters
     ----------

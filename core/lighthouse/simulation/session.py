@@ -156,7 +156,7 @@ class SimulatedSession:
     true_scene : Scene
         ``scene`` with the true stations.
     is_outlier : (n,) bool ndarray
-        True for the sweeps that were turned into outliers.
+        True for the sweeps that were replaced by outliers.
     """
 
     sweeps: Sweeps
@@ -224,7 +224,7 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
 def _simulate_stations(
     rng: np.random.Generator, options: SimulationOptions
 ) -> list[SimulatedStation]:
-    """Place stations around the floor, 2 m from its centre, looking down at it."""
+    """Distribute stations around the floor, 2 m from its centre, looking down at it."""
     count = options.stations
     azimuth = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 3)
     azimuth = azimuth + np.radians(rng.uniform(-10, 10, count))

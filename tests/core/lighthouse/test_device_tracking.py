@@ -36,8 +36,8 @@ from locatk.core.lighthouse.devices.tracking import (
     truncated_cost,
 )
 from locatk.core.lighthouse.devices.verification import (
+    SEGMENT_COUNT,
     SEGMENT_NS,
-    SEGMENTS,
     select_inner_poses,
     select_segments,
 )
@@ -357,8 +357,8 @@ def test_segments_bound_the_number_of_verified_sweeps() -> None:
     zero = np.zeros(len(time_ns), np.int32)
     sweeps = Sweeps(("device",), time_ns, zero, zero, zero + 1, zero, zero, zero.astype(float))
     selected, middle_ns = select_segments(sweeps)
-    assert len(middle_ns) == SEGMENTS
-    assert len(selected) == SEGMENTS * SEGMENT_NS // 10**7
+    assert len(middle_ns) == SEGMENT_COUNT
+    assert len(selected) == SEGMENT_COUNT * SEGMENT_NS // 10**7
     closest = np.abs(selected.time_ns[:, None] - middle_ns[None]).min(axis=1)
     assert closest.max() <= SEGMENT_NS // 2
 

@@ -14,17 +14,17 @@ from locatk.core.lighthouse.devices import pose_fit
 from locatk.core.lighthouse.devices.bundle_adjustment import adjust_devices
 from locatk.core.lighthouse.devices.pose_fit import (
     DeviceStates,
-    Stations,
     SweepObservations,
     fit_poses,
     linearize,
     photodiode_positions,
 )
 from locatk.core.lighthouse.scene import bundle_adjustment as bundle
+from locatk.core.lighthouse.scene.model import StationArrays
 
 Array = NDArray[np.float64]
 
-STATIONS: Stations = (
+STATIONS: StationArrays = (
     np.array([[-2.0, 0.0, 1.0], [0.3, -2.0, 1.2]]),
     rotation_exp(np.array([[0.0, 0.3, 0.1], [0.1, 0.2, 1.5]])),
     (GENERIC_CALIBRATION, GENERIC_CALIBRATION),
