@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from locatk.core.lighthouse.scene.keyframes import (
-    HELD_OUT_INTERVAL,
-    MIN_KEYFRAMES_FOR_HOLD_OUT,
     STANDSTILL_ANGLE_RAD,
     average_standstills,
     split_held_out,
@@ -106,8 +104,7 @@ def test_every_fifth_of_each_kind_is_held_out() -> None:
 
 
 def test_nothing_is_held_out_of_few() -> None:
-    taken, held = split_held_out(ALL, np.arange(MIN_KEYFRAMES_FOR_HOLD_OUT - 1))
-    assert len(taken) == MIN_KEYFRAMES_FOR_HOLD_OUT - 1
-    assert len(held) == 0
-    taken, held = split_held_out(ALL, np.arange(MIN_KEYFRAMES_FOR_HOLD_OUT))
-    assert len(held) == MIN_KEYFRAMES_FOR_HOLD_OUT // HELD_OUT_INTERVAL
+    taken, held = split_held_out(ALL, np.arange(199))
+    assert (len(taken), len(held)) == (199, 0)
+    taken, held = split_held_out(ALL, np.arange(200))
+    assert (len(taken), len(held)) == (160, 40)

@@ -14,6 +14,7 @@ from locatk.core.lighthouse.epochs import Epochs, rotor_angles
 from locatk.core.lighthouse.localization.photodiodes import (
     MAX_JUMP_WINDOW_S,
     MAX_RANGE_M,
+    _contradiction_warnings,
     angle_sigma,
     find_jumps,
     inlier_gate,
@@ -257,3 +258,11 @@ def test_an_exchange_must_fit_well_to_be_undone(
     )
     assert exact.max_residual[7] < INLIER_GATE_RAD
     assert (restored.max_residual[7] < INLIER_GATE_RAD / 2) is np.bool_(is_restored)
+
+
+@pytest.mark.parametrize(("inconsistent", "warns"), [(20, False), (21, True)])
+def test_a_fifth_of_the_epochs_may_contradict_the_scene(inconsistent: int, warns: bool) -> None:
+    warnings = _contradiction_warnings(inconsistent, 100)
+    assert [w.code for w in warnings] == ["scene_contradicted"] * warns
+    # Without a solved epoch there is nothing that contradicts.
+    assert _contradiction_warnings(0, 0) == []

@@ -17,6 +17,7 @@ from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, MODEL_SIGMA_RAD, ideal_angles
 from locatk.core.lighthouse.light_planes import rays as rays_of
 from locatk.core.lighthouse.scene import two_view
+from locatk.core.lighthouse.scene.bundle_adjustment import BundleAdjustment, BundleState
 
 Array = NDArray[np.float64]
 
@@ -257,8 +258,10 @@ def test_narrow_views_must_fit_a_plane_better() -> None:
     assert not two_view.is_plane_like(wide, narrow, 9e-4)
 
 
-@pytest.mark.parametrize("baseline", [0.01, 0.05])
-def test_stations_at_the_same_position_are_refused(world: Any, baseline: float) -> None:
+@pytest.mark.parametrize(("baseline", "is_refused"), [(0.01, True), (0.05, False)])
+def test_stations_at_the_same_position_are_refused(
+    world: Any, baseline: float, is_refused: bool
+) -> None:
     """Their distance counts relative to that from the floor (two metres)."""
     (first,) = world.lamps(1)
     position = first.position + [0.0, 2.0 * baseline, 0.0]
@@ -273,7 +276,7 @@ def test_stations_at_the_same_position_are_refused(world: Any, baseline: float) 
          for k in range(2)], axis=1
     )  # fmt: skip
     options = {"sigma": MODEL_SIGMA_RAD, "planar": True}
-    if baseline > two_view.MIN_BASELINE_RATIO:
+    if not is_refused:
         pair = two_view.estimate_station_pair(angles, rays, calibrations, (0, 1), **options)
         assert pair.planar
     else:
@@ -311,3 +314,36 @@ def test_markers_decide_if_they_clearly_prefer_one_candidate(
     )  # fmt: skip
     assert (pair.facts.candidate_decided_by == "markers") is by_markers
     assert (np.abs(pair.state.rotations[:, 2, 1]).max() > 0.2) is np.bool_(by_markers)
+
+
+@pytest.mark.parametrize(("cost", "chosen"), [(1.9, 1), (2.1, 0)])
+def test_an_upright_candidate_must_explain_the_angles_about_as_well(
+    monkeypatch: pytest.MonkeyPatch, cost: float, chosen: int
+) -> None:
+    """The second candidate has no roll, but a higher cost than the first."""
+    roll = cv2.Rodrigues(np.array([0.3, 0.0, 0.0]))[0]
+    refined = [
+        BundleAdjustment(
+            BundleState(
+                np.zeros((2, 3)),
+                np.stack([rotation] * 2),
+                (GENERIC_CALIBRATION,) * 2,
+                np.zeros((4, 3)),
+            ),
+            np.full((4, 2, 2), 1e-3),
+            np.ones((4, 2, 2)),
+            np.zeros((2, 10, 10)),
+            5,
+            each,
+        )
+        for rotation, each in ((roll, 1.0), (np.eye(3), cost))
+    ]
+    results = iter(refined)
+    monkeypatch.setattr(two_view, "adjust_bundle", lambda *_, **__: next(results))
+    candidates = [adjustment.state for adjustment in refined]
+    best, figures, _ = two_view._choose_candidate(
+        np.zeros((4, 2, 2)), candidates, True, 1e-3, None, (0, 1)
+    )
+    assert best is refined[chosen]
+    assert [f.chosen for f in figures] == [chosen == 0, chosen == 1]
+    assert [f.fits for f in figures] == [True, chosen == 1]
