@@ -71,6 +71,13 @@ class SweepObservations:
         """Return the observations of the chosen epochs."""
         return SweepObservations(*(getattr(self, f.name)[epochs] for f in fields(self)))
 
+    def trimmed(self) -> SweepObservations:
+        """The same with as little padding as possible, at the ends of the rows."""
+        order = np.argsort(~self.is_observed, axis=1, kind="stable")
+        order = order[:, : int(np.max(np.count_nonzero(self.is_observed, axis=1), initial=0))]
+        row = np.arange(len(self))[:, None]
+        return SweepObservations(*(getattr(self, f.name)[row, order] for f in fields(self)))
+
 
 @dataclass(frozen=True)
 class DeviceStates:

@@ -380,7 +380,7 @@ def _solve_seed_batch(
     )
     owner, observations = owner[best], observations.take(best)
     poses = fit_poses(
-        own_observations.take(best),
+        own_observations.take(best).trimmed(),
         problem.stations,
         poses.take(best),
         sigma_rad=ANGLE_SIGMA_RAD,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -202,3 +204,15 @@ def test_no_step_turns_a_device_over() -> None:
     # The whole step is shortened, so that its direction stays.
     shift = after.position - poses.position
     np.testing.assert_allclose(shift[:, 0], [0.1 * pose_fit.MAX_ROTATION_STEP_RAD / 2.8, 0.1])
+
+
+def test_padding_does_not_count() -> None:
+    looks, poses = world(4, 30, noise=1e-3)
+    few = replace(looks, is_observed=looks.is_observed & (looks.station == 1))
+    trimmed = few.trimmed()
+    assert trimmed.angle.shape[1] == few.is_observed.sum(axis=1).max() < few.angle.shape[1]
+    np.testing.assert_array_equal(trimmed.is_observed.sum(axis=1), few.is_observed.sum(axis=1))
+    options = {"sigma_rad": 1e-3, "loss_scale_rad": 3e-3}
+    whole, short = (fit_poses(each, STATIONS, poses, **options) for each in (few, trimmed))
+    np.testing.assert_allclose(short.poses.position, whole.poses.position, atol=1e-12)
+    np.testing.assert_allclose(short.cost, whole.cost, rtol=1e-9)
