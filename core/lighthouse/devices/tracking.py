@@ -338,7 +338,10 @@ def estimate_initial_poses(problem: TrackingProblem, states: EpochStates) -> Non
     gaps = epochs[states.status[epochs] != SOLVED]
     is_seed = np.r_[True, np.diff(gaps) > 1][: len(gaps)]
     is_seed |= np.arange(len(gaps)) % SECOND_SEED_SPACING_EPOCHS == 0
-    solve_seeds(problem, states, gaps[is_seed][:MAX_SECOND_SEEDS], minimal_sets=True)
+    seeds = gaps[is_seed][:MAX_SECOND_SEEDS]
+    solve_seeds(problem, states, seeds, minimal_sets=False)
+    # Minimal sets take longer, and help only if outliers spoil the candidates of all rays.
+    solve_seeds(problem, states, seeds[states.status[seeds] != SOLVED], minimal_sets=True)
     states.status[gaps[states.status[gaps] == FAILED]] = UNSOLVED
     propagate(problem, states)
     resolve_conflicts(problem, states)
