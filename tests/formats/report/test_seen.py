@@ -49,7 +49,10 @@ def reasons(system: str) -> set[str]:
     """Every reason that the sources of a system can give."""
     found: set[str] = set()
     for path in sorted((ROOT / "core" / system).rglob("*.py")):
-        if not path.name.startswith(("simulate", "paper_study", "camera_views")):
+        # Demodulation counts bursts, which are no observations of a solution.
+        if path.parent.name != "demodulation" and not path.name.startswith(
+            ("simulate", "paper_study", "camera_views")
+        ):
             tree = ast.parse(path.read_text())
             constants = {
                 target.id: node.value.value
@@ -103,8 +106,8 @@ def _texts(value: ast.AST | None, constants: dict[str, Any]) -> set[str]:
         return {known} if isinstance(known, str) else set()
     if isinstance(value, ast.IfExp):
         return _texts(value.body, constants) | _texts(value.orelse, constants)
-    if isinstance(value, ast.Call) and getattr(value.func, "id", None) == "Counter":
-        return {each.arg for each in value.keywords if each.arg}
+    if isinstance(value, ast.Dict):
+        return set().union(*(_texts(key, constants) for key in value.keys))
     if isinstance(value, ast.Tuple):
         return set().union(*(_texts(each, constants) for each in value.elts))
     return set()
