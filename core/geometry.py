@@ -208,11 +208,6 @@ def rotation_exp(vectors: ArrayLike) -> Array:
     return np.eye(3) + sine * cross + versine * (cross @ cross)
 
 
-def rotation_log(rotation: ArrayLike) -> Array:
-    """Return the rotation vectors (..., 3), at most pi long, of rotation matrices (..., 3, 3)."""
-    return rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
-
-
 def rotation_angle(first: ArrayLike, second: ArrayLike) -> Array:
     """Return the angles (...), from 0 to pi, between rotations (..., 3, 3).
 

@@ -20,12 +20,16 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(1)
 
 
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    return g.rotation_vector_from_quaternion(g.quaternion_from_matrix(matrix))
+
+
 def test_rotations_agree_with_scipy(rng: np.random.Generator) -> None:
     theirs = Rotation.random(200, random_state=rng)
     matrix, quaternion = theirs.as_matrix(), theirs.as_quat(canonical=True)
     np.testing.assert_allclose(g.matrix_from_quaternion(quaternion), matrix, atol=1e-14)
     np.testing.assert_allclose(g.quaternion_from_matrix(matrix), quaternion, atol=1e-14)
-    np.testing.assert_allclose(g.rotation_log(matrix), theirs.as_rotvec(), atol=1e-12)
+    np.testing.assert_allclose(rotation_vector(matrix), theirs.as_rotvec(), atol=1e-12)
     np.testing.assert_allclose(g.rotation_exp(theirs.as_rotvec()), matrix, atol=1e-14)
     both = g.quaternion_multiply(quaternion[:100], quaternion[100:])
     expected = (theirs[:100] * theirs[100:]).as_matrix()
@@ -94,15 +98,15 @@ def test_exp_is_a_rotation_as_scipy_has_it(vector: np.ndarray) -> None:
 @given(VECTORS)
 def test_log_inverts_exp(vector: np.ndarray) -> None:
     matrix = g.rotation_exp(vector)
-    np.testing.assert_allclose(g.rotation_exp(g.rotation_log(matrix)), matrix, atol=1e-7)
+    np.testing.assert_allclose(g.rotation_exp(rotation_vector(matrix)), matrix, atol=1e-7)
     if np.linalg.norm(vector) < 3.1:
-        np.testing.assert_allclose(g.rotation_log(matrix), vector, atol=1e-10)
+        np.testing.assert_allclose(rotation_vector(matrix), vector, atol=1e-10)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-14, 1e-9, 1e-4, np.pi - 1e-9, np.pi])
 def test_log_and_exp_at_the_edges(angle: float) -> None:
     for axis in np.vstack([np.eye(3), -np.eye(3), np.ones((1, 3)) / np.sqrt(3)]):
-        back = g.rotation_log(g.rotation_exp(axis * angle))
+        back = rotation_vector(g.rotation_exp(axis * angle))
         assert np.linalg.norm(back) == pytest.approx(angle, rel=1e-9, abs=1e-15)
         # At half a turn both ends of the axis are right.
         assert abs(back @ axis) == pytest.approx(angle, rel=1e-9, abs=1e-15)

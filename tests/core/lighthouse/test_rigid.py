@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import (
     matrix_from_quaternion,
     rotation_exp,
-    rotation_log,
     umeyama,
 )
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, Calibration, predict_angles
@@ -147,7 +147,7 @@ def errors(solution: Solution, motion: Motion) -> Array:
     track = solution.trajectories[0]
     position, rotation = motion((track.time_ns - START_NS) * 1e-9)
     turned = matrix_from_quaternion(track.quaternion) @ np.swapaxes(rotation, 1, 2)
-    return np.c_[track.position - position, rotation_log(turned)]
+    return np.c_[track.position - position, Rotation.from_matrix(turned).as_rotvec()]
 
 
 def normalized_error(solution: Solution, motion: Motion) -> float:
@@ -195,7 +195,7 @@ def test_the_scene_is_estimated_from_the_device_alone() -> None:
     for found, true in zip(scene.stations, ROOM, strict=True):
         place = axes.T @ (true.position - ROOM[0].position)
         assert np.linalg.norm(found.position - place) < 3e-3
-        turn = rotation_log(found.rotation @ (axes.T @ true.rotation).T)
+        turn = Rotation.from_matrix(found.rotation @ (axes.T @ true.rotation).T).as_rotvec()
         assert np.linalg.norm(turn) < np.radians(0.05)
         if found.channel != 1:
             off = np.r_[found.position - place, turn]
@@ -212,7 +212,7 @@ def test_without_calibration_the_trajectory_is_right_after_a_rigid_transform() -
     to = umeyama(track.position, truth, with_scale=False)
     assert np.linalg.norm(to.apply(track.position) - truth, axis=1).max() < 5e-3
     turned = to.rotation @ matrix_from_quaternion(track.quaternion)
-    away = rotation_log(turned @ np.swapaxes(rotation, 1, 2))
+    away = Rotation.from_matrix(turned @ np.swapaxes(rotation, 1, 2)).as_rotvec()
     assert np.degrees(np.linalg.norm(away, axis=1)).mean() < 0.5
     assert {s.calibration.source for s in solution.artifact.stations} == {"estimated"}
     assert "generic_calibration" in codes(solution)
@@ -374,7 +374,7 @@ def test_the_poses_of_a_recorded_tracker_agree_with_libsurvive(data: Path) -> No
     at = np.searchsorted(truth.time_ns, track.time_ns)
     away = np.linalg.norm(track.position - truth.position[at], axis=1)
     turned = np.swapaxes(matrix_from_quaternion(truth.quaternion[at]), 1, 2)
-    turn = rotation_log(turned @ matrix_from_quaternion(track.quaternion))
+    turn = Rotation.from_matrix(turned @ matrix_from_quaternion(track.quaternion)).as_rotvec()
     angle = np.degrees(np.linalg.norm(turn, axis=1))
     assert np.percentile(away, 95) < 5e-3
     assert np.mean(angle) < 0.5
