@@ -12,7 +12,7 @@ from locatk.cli import console, failures, options
 from locatk.core.errors import InputError, LocatkError
 
 if TYPE_CHECKING:
-    from locatk.core.dots.calibrate import CameraReport
+    from locatk.core.dots.calibration.camera import CameraReport
     from locatk.core.dots.frames import Frames
     from locatk.core.dots.sheet import Manifest
     from locatk.formats.session import Session
@@ -59,7 +59,7 @@ def camera(
       locatk calibrate camera run.mcap -o camera.toml --device left --json
       locatk solve run.mcap -o solved.mcap --camera camera.toml
     """
-    from locatk.core.dots.calibrate import CalibrateOptions, calibrate
+    from locatk.core.dots.calibration.camera import CalibrateOptions, calibrate
     from locatk.formats import observations, sheets
     from locatk.formats.session import Session
 

@@ -12,9 +12,9 @@ from locatk.cli import console, options, recordings
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.calibrate import CalibrationReport, Drive
-    from locatk.core.landmarks.calibrate_marks import Landmark
-    from locatk.core.landmarks.floor import FloorMap
+    from locatk.core.landmarks.calibration.floor import CalibrationReport, Drive
+    from locatk.core.landmarks.calibration.marks import Landmark
+    from locatk.core.landmarks.map.floor import FloorMap
 
 MOST_LANDMARKS = 40
 """Of more than these, only flagged landmarks are listed for people."""
@@ -54,7 +54,7 @@ def map_(
       locatk calibrate map day/*.mcap --artifact map.toml -o built.toml --json
       locatk solve later.mcap -o solved.mcap --artifact built.toml
     """
-    from locatk.core.landmarks.calibrate import calibrate
+    from locatk.core.landmarks.calibration.floor import calibrate
     from locatk.formats import maps
 
     inputs = [*sessions, *([artifact] if artifact else [])]
@@ -89,7 +89,7 @@ def _drives(
 
     With ``same``, each session must hold the design of ``floor``.
     """
-    from locatk.core.landmarks import calibrate
+    from locatk.core.landmarks.calibration import floor as calibrate
     from locatk.formats import observations
     from locatk.formats.session import Session
 
@@ -127,7 +127,7 @@ def _check_same(floor: FloorMap, other: FloorMap, path: Path) -> None:
 
 def _letters(landmark: Landmark) -> str:
     """Its bars as they lie, `-` where there is none."""
-    from locatk.core.landmarks.estimate import GONE
+    from locatk.core.landmarks.detection.explanations import GONE
 
     return "".join(
         "-" if abs(value) < GONE else "N" if value > 0 else "S"

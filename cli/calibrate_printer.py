@@ -11,8 +11,8 @@ from locatk.cli import console, failures, options
 from locatk.core.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
-    from locatk.core.dots.printer import PrinterReport
-    from locatk.core.dots.printer_fields import FieldScore
+    from locatk.core.dots.calibration.printed_fields import FieldScore
+    from locatk.core.dots.calibration.printer import PrinterReport
     from locatk.core.dots.sheet import Manifest
 
 RULER_MM = 100.0
@@ -82,7 +82,7 @@ def printer(
       locatk calibrate printer photo.jpg --measured-x 100.2 --measured-y 99.7
       locatk calibrate printer scan.png --manifest sheet.toml --overwrite
     """
-    from locatk.core.dots.printer import calibrate
+    from locatk.core.dots.calibration.printer import calibrate
     from locatk.formats import printer as files
     from locatk.formats.scans import read_scan
     from locatk.formats.sheets import read_manifest, write_manifest

@@ -13,7 +13,7 @@ from locatk.cli.solve import speed_option
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.calibrate import CalibrationReport, Pass
+    from locatk.core.polaris.calibration import CalibrationReport, Pass
     from locatk.core.polaris.tag import Tags
 
 
@@ -49,7 +49,7 @@ def tag(
       locatk calibrate tag runs/*.mcap --artifact tag.toml -o built.toml --speed 0.105
       locatk solve later.mcap -o solved.mcap --artifact built.toml
     """
-    from locatk.core.polaris.calibrate import calibrate
+    from locatk.core.polaris.calibration import calibrate
     from locatk.formats import tags as files
 
     inputs = [*sessions, *([artifact] if artifact else [])]
@@ -84,7 +84,7 @@ def _passes(
     from dataclasses import replace
 
     from locatk.core import polaris
-    from locatk.core.polaris.calibrate import pass_of
+    from locatk.core.polaris.calibration import pass_of
     from locatk.formats import observations
     from locatk.formats.session import Session
 

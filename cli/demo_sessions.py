@@ -44,7 +44,7 @@ def lighthouse(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ..
 def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     from math import radians
 
-    from locatk.core.dots import simulate
+    from locatk.core.dots.simulation import session as simulate
     from locatk.formats import frames
     from locatk.formats.output import atomic_write
     from locatk.formats.pdf import pattern
@@ -78,8 +78,9 @@ def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
 def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     from math import radians
 
-    from locatk.core.polaris import cards, simulate
     from locatk.core.polaris.codec import layout_of
+    from locatk.core.polaris.drawing import cards
+    from locatk.core.polaris.simulation import session as simulate
     from locatk.core.polaris.tag import Placed, Tags
     from locatk.formats import arrays
     from locatk.formats.output import atomic_write
@@ -121,9 +122,9 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
 
 
 def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    from locatk.core.landmarks import simulate
-    from locatk.core.landmarks.design import DesignOptions, design
-    from locatk.core.landmarks.pack import pack
+    from locatk.core.landmarks.design.generation import DesignOptions, design
+    from locatk.core.landmarks.drawing.pack import pack
+    from locatk.core.landmarks.simulation import session as simulate
     from locatk.formats import halls
     from locatk.formats.output import atomic_write
     from locatk.formats.pdf import landmarks

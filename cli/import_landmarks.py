@@ -11,8 +11,8 @@ import click
 from locatk.cli import console, options
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.floor import FloorMap
     from locatk.core.landmarks.halls import HallSensors
+    from locatk.core.landmarks.map.floor import FloorMap
 
 F = TypeVar("F", bound=Callable[..., Any])
 

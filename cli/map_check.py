@@ -12,8 +12,8 @@ from locatk.cli import console, map_proof, options
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.floor import FloorMap
-    from locatk.core.landmarks.proof import Proof
+    from locatk.core.landmarks.design.proof import Proof
+    from locatk.core.landmarks.map.floor import FloorMap
 
 
 @click.command("check", short_help="Prove that a map is unique, or show where not.")
@@ -37,8 +37,8 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
       locatk map check floors/*.toml -q && echo good
       locatk map check map.toml --json | jq '.maps[0].proof.duplicates'
     """
-    from locatk.core.landmarks.built import laid_codes
-    from locatk.core.landmarks.proof import prove
+    from locatk.core.landmarks.design.proof import prove
+    from locatk.core.landmarks.map.as_built import laid_codes
     from locatk.formats.maps import read_map
 
     proved: list[tuple[Path, FloorMap, Proof]] = []

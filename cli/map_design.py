@@ -17,10 +17,10 @@ from locatk.core.errors import InputError
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.analysis import Analysis
-    from locatk.core.landmarks.floor import Cell, FloorMap, Wall
+    from locatk.core.landmarks.design.analysis import Analysis
+    from locatk.core.landmarks.design.proof import Proof
     from locatk.core.landmarks.landmark import Geometry
-    from locatk.core.landmarks.proof import Proof
+    from locatk.core.landmarks.map.floor import Cell, FloorMap, Wall
 
 
 @click.command("design", short_help="Find a map in which every window is unique.")
@@ -125,9 +125,9 @@ def command(
     on_floor(size, [cell for pair in walls for cell in pair], "--wall")
     options.guard_output(output, overwrite=overwrite)
 
-    from locatk.core.landmarks.analysis import analyse
-    from locatk.core.landmarks.design import DesignOptions
-    from locatk.core.landmarks.proof import prove
+    from locatk.core.landmarks.design.analysis import analyse
+    from locatk.core.landmarks.design.generation import DesignOptions
+    from locatk.core.landmarks.design.proof import prove
     from locatk.formats.map_library import design
     from locatk.formats.maps import write_map
 
@@ -159,8 +159,8 @@ def command(
 
 
 def _tell(output: Path, floor: FloorMap, proof: Proof, analysis: Analysis, as_json: bool) -> None:
-    from locatk.core.landmarks import advice
-    from locatk.core.landmarks.materials import patterns
+    from locatk.core.landmarks.design import advice
+    from locatk.core.landmarks.design.materials import patterns
 
     found = patterns(floor)
     counts = ", ".join(f"{item.landmarks} {item.letters}" for item in found)
@@ -197,8 +197,8 @@ def _tell(output: Path, floor: FloorMap, proof: Proof, analysis: Analysis, as_js
 
 def _landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
     """The tables of one landmark."""
-    from locatk.core.landmarks import advice
-    from locatk.core.landmarks.analysis import analyse
+    from locatk.core.landmarks.design import advice
+    from locatk.core.landmarks.design.analysis import analyse
 
     found = analyse(geometry)
     _check_pitch(geometry, pitch_m)

@@ -13,7 +13,7 @@ from locatk.cli import console, options
 if TYPE_CHECKING:
     from datetime import datetime
 
-    from locatk.core.landmarks.floor import FloorMap
+    from locatk.core.landmarks.map.floor import FloorMap
 
 ENDINGS = {".csv": "csv", ".json": "lif", ".lif": "lif", ".yaml": "ros", ".svg": "svg"}
 ENDINGS |= {".yml": "ros", ".dxf": "dxf"}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.analysis import Analysis, Shape
+    from locatk.core.landmarks.design.analysis import Analysis, Shape
     from locatk.core.landmarks.landmark import Geometry
 
 
@@ -55,7 +55,7 @@ def text(found: Analysis, pitch_m: float) -> str:
 
 def entry(found: Analysis, pitch_m: float) -> dict[str, Any]:
     """The same for ``--json``: SI units, as each key says (docs/commands.md)."""
-    from locatk.core.landmarks.territory import neighbour_field
+    from locatk.core.landmarks.design.territory import neighbour_field
 
     one, all_eight = neighbour_field(found.geometry, pitch_m)
     hall = found.hall_class
@@ -141,7 +141,7 @@ def _lines(shape: Shape) -> list[str]:
 
 
 def _needed(found: Analysis, pitch_m: float) -> list[tuple[str, str, str]]:
-    from locatk.core.landmarks.territory import neighbour_field
+    from locatk.core.landmarks.design.territory import neighbour_field
 
     low, high = found.heights_m
     one, all_eight = (1e6 * float(field) for field in neighbour_field(found.geometry, pitch_m))

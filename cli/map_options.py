@@ -12,8 +12,8 @@ from locatk.cli.options import number, together
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.floor import Cell, Wall
     from locatk.core.landmarks.landmark import Geometry
+    from locatk.core.landmarks.map.floor import Cell, Wall
 
 LARGEST_SIDE = 2_000
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.floor import Cell, FloorMap
-    from locatk.core.landmarks.localise import Place
-    from locatk.core.landmarks.proof import Faults, Proof
+    from locatk.core.landmarks.design.localization_steps import Place
+    from locatk.core.landmarks.design.proof import Faults, Proof
+    from locatk.core.landmarks.map.floor import Cell, FloorMap
 
 SHOWN = 10
 """Duplicates that are printed; all that are listed are in --json."""

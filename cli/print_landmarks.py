@@ -11,9 +11,9 @@ from locatk.cli import console, options
 from locatk.core.errors import OutputExistsError, error_context
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.floor import FloorMap
-    from locatk.core.landmarks.pack import Pack
-    from locatk.core.landmarks.pack_floor import Paper, Tile
+    from locatk.core.landmarks.drawing.pack import Pack
+    from locatk.core.landmarks.drawing.true_size import Paper, Tile
+    from locatk.core.landmarks.map.floor import FloorMap
     from locatk.core.materials import Item
 
 
@@ -104,8 +104,8 @@ def landmarks(
       locatk print landmarks map.toml -o floor.pdf --floor --paper roll:914mm --overlap 20
       locatk print landmarks map.toml -o pack.pdf --spares 10 --bom parts.csv
     """
-    from locatk.core.landmarks.materials import bill
-    from locatk.core.landmarks.pack_floor import paper
+    from locatk.core.landmarks.design.materials import bill
+    from locatk.core.landmarks.drawing.true_size import paper
     from locatk.formats.maps import read_map
     from locatk.formats.materials import write_bill
     from locatk.formats.output import atomic_write
@@ -155,7 +155,7 @@ def _pack(
     floor: FloorMap, on: Paper, margin_mm: float, spares_percent: float, templates_only: bool
 ) -> tuple[bytes, dict[str, Any]]:
     """The PDF, and what is in it."""
-    from locatk.core.landmarks.pack import PARTS, pack
+    from locatk.core.landmarks.drawing.pack import PARTS, pack
     from locatk.formats.pdf.landmarks import render
 
     made = pack(
@@ -174,7 +174,7 @@ def _pack(
 def _floor(
     floor: FloorMap, on: Paper, margin_mm: float, overlap_mm: float
 ) -> tuple[bytes, dict[str, Any]]:
-    from locatk.core.landmarks.pack_floor import floor_tiles
+    from locatk.core.landmarks.drawing.true_size import floor_tiles
     from locatk.formats.pdf.landmarks import render_floor
 
     tiles = floor_tiles(floor, on, margin_mm=margin_mm, overlap_mm=overlap_mm)
@@ -189,7 +189,7 @@ def _title(floor: FloorMap) -> str:
 
 def _pack_entry(made: Pack) -> dict[str, Any]:
     """What ``--json`` says of a pack (docs/formats.md)."""
-    from locatk.core.landmarks.drawing import digit
+    from locatk.core.landmarks.drawing.landmark import digit
     from locatk.core.landmarks.landmark import name
 
     return {

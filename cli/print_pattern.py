@@ -12,9 +12,9 @@ from locatk.cli import console, failures, options
 from locatk.core.errors import OutputExistsError
 
 if TYPE_CHECKING:
-    from locatk.core.dots.layout import Layout
+    from locatk.core.dots.drawing.layout import Layout
+    from locatk.core.dots.drawing.tiles import Tiling
     from locatk.core.dots.sheet import Manifest
-    from locatk.core.dots.tiles import Tiling
 
 CODECS = ("anoto", "libdots", "microdots")
 FORMATS = ("pdf", "png", "txt")
@@ -195,9 +195,9 @@ def pattern(
       locatk print pattern -o map.pdf --overlay drawing.pdf --strip-black
       locatk print pattern -o sheet.png --origin 1330,7200 --section 24,32
     """
-    from locatk.core.dots import layout
-    from locatk.core.dots.ledger import plan
-    from locatk.core.dots.tiles import tiling
+    from locatk.core.dots.design.ledger import plan
+    from locatk.core.dots.drawing import layout
+    from locatk.core.dots.drawing.tiles import tiling
     from locatk.formats import printing
     from locatk.formats.ledger import LEDGER_FILE, open_ledger
 

@@ -14,8 +14,8 @@ from locatk.core.errors import InputError, error_context
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from locatk.core.polaris.cards import Template
-    from locatk.core.polaris.tag import Layout, Tags
+    from locatk.core.polaris.drawing.cards import Template
+    from locatk.core.polaris.tag import TagLayout, Tags
 
 FORMATS = ("pdf", "svg")
 
@@ -92,8 +92,8 @@ def tag(
       locatk print tag tag.toml --id 262143 -o tag.svg
       locatk print tag tag.toml --id 7 -o below.pdf --mirror
     """
-    from locatk.core.dots.layout import paper_size
-    from locatk.core.polaris import cards
+    from locatk.core.dots.drawing.layout import paper_size
+    from locatk.core.polaris.drawing import cards
     from locatk.formats.tags import read_tags
 
     format_name = format_name or _ending(output)
@@ -122,7 +122,7 @@ def _ending(output: Path) -> str:
     return ending if ending in FORMATS else "pdf"
 
 
-def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int, Layout]]:
+def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int, TagLayout]]:
     """The tags to draw; an id that the solver would not read is refused."""
     from locatk.core.polaris.codec import layout_of
 

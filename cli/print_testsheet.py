@@ -44,7 +44,7 @@ def testsheet(
       locatk print testsheet -o test.pdf
       locatk print testsheet -o test.pdf --size Letter --dpi 1200
     """
-    from locatk.core.dots.testsheet import printer_sheet
+    from locatk.core.dots.drawing.test_sheet import printer_sheet
     from locatk.formats.output import atomic_write
     from locatk.formats.pdf.testsheet import render
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from locatk.core.dots.sheet import Manifest
-    from locatk.core.dots.simulate import SimulationOptions
+    from locatk.core.dots.simulation.session import SimulationOptions
 
 
 class Pair(click.ParamType):
@@ -149,7 +149,7 @@ def command(
     """
     from dataclasses import replace
 
-    from locatk.core.dots import simulate
+    from locatk.core.dots.simulation import session as simulate
     from locatk.formats import sheets
 
     if frames is not None and duration_s is not None:
@@ -208,7 +208,7 @@ def _write(
     """Render into the session, a frame at a time; what was written."""
     from dataclasses import asdict
 
-    from locatk.core.dots import simulate
+    from locatk.core.dots.simulation import session as simulate
     from locatk.formats.frames import Shot, write_shots
 
     simulated = simulate.simulate(manifest, wanted)

@@ -15,7 +15,7 @@ from locatk.cli.simulate_options import ABOVE_0, ANY, FROM_0, SHARE, in_si
 from locatk.core.errors import FormatError
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.simulate import Simulated, SimulationOptions
+    from locatk.core.landmarks.simulation.session import SimulatedSession, SimulationOptions
 
 
 MOST_TOLD = 12
@@ -187,7 +187,7 @@ def command(map_file: Path, output: Path, overwrite: bool, as_json: bool, **give
       locatk simulate landmarks map.toml -o pass.mcap --strategy pass --cell 2,3 --lateral 20
       locatk simulate landmarks map.toml -o bad.mcap --flip 2,3:1 --range 20 --swap left:right
     """
-    from locatk.core.landmarks import simulate
+    from locatk.core.landmarks.simulation import session as simulate
     from locatk.formats import halls, maps
 
     files = [given[name] for name in ("path_file", "sensors_file") if given[name]]
@@ -226,7 +226,7 @@ def _wanted(given: dict[str, Any]) -> SimulationOptions:
     """The simulation's options, of what was said on the command line."""
     from dataclasses import fields, replace
 
-    from locatk.core.landmarks import simulate
+    from locatk.core.landmarks.simulation import session as simulate
     from locatk.formats import maps
 
     said = in_si(given)
@@ -295,7 +295,7 @@ def _waypoints(file: Path) -> tuple[tuple[float, float], ...]:
     return tuple(places)
 
 
-def _warnings(simulated: Simulated) -> list[str]:
+def _warnings(simulated: SimulatedSession) -> list[str]:
     """What a user may not have meant."""
     lines = list(simulated.notes)
     if simulated.saturated:
@@ -305,13 +305,13 @@ def _warnings(simulated: Simulated) -> list[str]:
     return lines
 
 
-def _tour(simulated: Simulated) -> list[tuple[int, int]]:
+def _tour(simulated: SimulatedSession) -> list[tuple[int, int]]:
     """Cells in the order of their visits, each once in a row."""
     cells = [visit.cell for visit in simulated.events]
     return [cell for k, cell in enumerate(cells) if k == 0 or cell != cells[k - 1]]
 
 
-def _told(simulated: Simulated) -> dict[str, Any]:
+def _told(simulated: SimulatedSession) -> dict[str, Any]:
     """What was simulated, for ``--json``."""
     return {
         "samples": len(simulated.samples[0]),
@@ -330,7 +330,7 @@ def _told(simulated: Simulated) -> dict[str, Any]:
     }
 
 
-def _visits(simulated: Simulated) -> list[dict[str, Any]]:
+def _visits(simulated: SimulatedSession) -> list[dict[str, Any]]:
     return [
         {
             "cell": list(visit.cell),
@@ -343,7 +343,7 @@ def _visits(simulated: Simulated) -> list[dict[str, Any]]:
     ]
 
 
-def _facts(simulated: Simulated, wanted: SimulationOptions) -> dict[str, str]:
+def _facts(simulated: SimulatedSession, wanted: SimulationOptions) -> dict[str, str]:
     """The options, and what else is true: the visits, and the landmarks as they lie.
 
     Of landmarks those are told that were visited or are wrong; a floor has thousands.

@@ -12,7 +12,7 @@ from locatk.cli import console, options
 from locatk.cli.simulate_options import ABOVE_0, ANY, FROM_0, SHARE, in_si
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.simulate import Simulated, SimulationOptions
+    from locatk.core.polaris.simulation.session import SimulatedSession, SimulationOptions
 
 
 @click.command(short_help="Passes of a magnetometer bar over tags.")
@@ -125,7 +125,7 @@ def command(
       locatk simulate polaris -o hard.mcap --speed-wobble 0.3 --debris 30 --dead 4 --lost 0.02
       locatk simulate polaris -o mini.mcap --car mini --id 77
     """
-    from locatk.core.polaris import simulate
+    from locatk.core.polaris.simulation import session as simulate
     from locatk.formats import arrays, tags
 
     options.must_exist([tag])
@@ -162,7 +162,7 @@ def command(
 
 def _wanted(car: str, given: dict[str, Any]) -> SimulationOptions:
     """The simulation's options, of what was said on the command line."""
-    from locatk.core.polaris import simulate
+    from locatk.core.polaris.simulation import session as simulate
     from locatk.formats import tags
 
     said = in_si(given)
@@ -186,7 +186,7 @@ def _wanted(car: str, given: dict[str, Any]) -> SimulationOptions:
     return simulate.SimulationOptions(array=array, **said)
 
 
-def _warnings(simulated: Simulated) -> list[str]:
+def _warnings(simulated: SimulatedSession) -> list[str]:
     """What a user may not have meant."""
     lines = []
     if simulated.saturated:
@@ -196,7 +196,7 @@ def _warnings(simulated: Simulated) -> list[str]:
     return lines
 
 
-def _told(simulated: Simulated) -> dict[str, Any]:
+def _told(simulated: SimulatedSession) -> dict[str, Any]:
     """What was simulated, for ``--json``."""
     return {
         "samples": len(simulated.samples),
@@ -210,7 +210,7 @@ def _told(simulated: Simulated) -> dict[str, Any]:
     }
 
 
-def _crossings(simulated: Simulated) -> list[dict[str, Any]]:
+def _crossings(simulated: SimulatedSession) -> list[dict[str, Any]]:
     return [
         {
             "tag_id": crossing.tag_id,
@@ -223,7 +223,7 @@ def _crossings(simulated: Simulated) -> list[dict[str, Any]]:
     ]
 
 
-def _facts(simulated: Simulated, wanted: SimulationOptions) -> dict[str, str]:
+def _facts(simulated: SimulatedSession, wanted: SimulationOptions) -> dict[str, str]:
     """The options, and what else is true: the crossings, and the magnets as they lie."""
     from dataclasses import fields
 

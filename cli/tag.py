@@ -13,7 +13,7 @@ from locatk.cli.tag_design import check, design
 from locatk.cli.tag_options import design_of, design_options
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.tag import Cell, Layout, Tags
+    from locatk.core.polaris.tag import Cell, TagLayout, Tags
 
 
 class MagnetAt(click.ParamType):
@@ -148,7 +148,7 @@ def decode(
       locatk tag decode 0,0:3 1,1:41 0,2:-5 1,2:90 2,2:2 --tag tag.toml
       locatk tag decode 0,0:1 0,2:2 2,2:7 --symbols --order 3 --magnets 3
     """
-    from locatk.core.polaris.reading import read
+    from locatk.core.polaris.identification.decoding import read
 
     tags = design_of(tag, order, magnets, orientations, codec)
     step = 1.0 if symbols else 360 / tags.orientations
@@ -174,7 +174,7 @@ def decode(
     )
 
 
-def _drawing(tags: Tags, layout: Layout, degrees: list[float]) -> str:
+def _drawing(tags: Tags, layout: TagLayout, degrees: list[float]) -> str:
     """The grid with x up, v1 at the lower left."""
     from locatk.core.polaris.tag import vertices
 

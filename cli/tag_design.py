@@ -15,7 +15,7 @@ from locatk.core.errors import OutputExistsError
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.planning import Plan
+    from locatk.core.polaris.design.planning import Plan
     from locatk.core.polaris.tag import Magnet
 
 GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
@@ -86,8 +86,8 @@ def design(
       locatk tag design -o mini.toml --order 2 --magnets 3 --diameter 1 --clearance 4
       locatk tag design -o tag.toml --spacing 16 --osr 2 --rate 100 --speed 0.3
     """
-    from locatk.core.polaris import families
-    from locatk.core.polaris.planning import compact_spacing, plan
+    from locatk.core.polaris.codec import families
+    from locatk.core.polaris.design.planning import compact_spacing, plan
     from locatk.core.polaris.tag import Tags
     from locatk.formats.materials import write_bill
     from locatk.formats.tags import write_tags
@@ -148,8 +148,8 @@ def check(tag: Path, as_json: bool, **use: Any) -> None:
       locatk tag check tag.toml --sensors 3 --sensor-spacing 8 --filt 5 --speed 0.005
       locatk tag check tag.toml --placement-error 2 --json
     """
-    from locatk.core.polaris import families
-    from locatk.core.polaris.planning import plan
+    from locatk.core.polaris.codec import families
+    from locatk.core.polaris.design.planning import plan
     from locatk.formats.tags import read_tags
 
     tags = read_tags(tag)
@@ -172,7 +172,7 @@ def check(tag: Path, as_json: bool, **use: Any) -> None:
 
 
 def _magnet(diameter: float, height: float, grade: str | None, remanence: float | None) -> Magnet:
-    from locatk.core.polaris.materials import disc
+    from locatk.core.polaris.design.materials import disc
 
     if grade is None and remanence is None:
         grade = "N52"

@@ -13,7 +13,7 @@ from locatk.cli.options import number, together
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.planning import Use
+    from locatk.core.polaris.design.planning import Use
     from locatk.core.polaris.tag import Tags
 
 CODECS = ("mosk", "redundant", "polaris-released")
@@ -97,8 +97,8 @@ def use_of(
     placement_error: float | None,
 ) -> Use:
     """How tags are to be read, after :data:`use_options`."""
+    from locatk.core.polaris.design.planning import Use
     from locatk.core.polaris.mlx90393 import Settings
-    from locatk.core.polaris.planning import Use
 
     return Use(
         sensors=sensors,

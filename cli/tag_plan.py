@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.bound import Bound
-    from locatk.core.polaris.planning import Plan
+    from locatk.core.polaris.design.accuracy_bound import Bound
+    from locatk.core.polaris.design.planning import Plan
     from locatk.core.polaris.tag import Tags
 
 WIDTH = 60
@@ -97,7 +97,7 @@ def _head(plan: Plan) -> str:
 
 def _limits(plan: Plan) -> list[tuple[str, str, str, str]]:
     """Name, value, limit and where the limit is from."""
-    from locatk.core.polaris.planning import EARTH_T, FEWEST_SAMPLES, WEAKEST
+    from locatk.core.polaris.design.planning import EARTH_T, FEWEST_SAMPLES, WEAKEST
 
     tags, use = plan.tags, plan.use
     noise = ", ".join(f"{value * 1e6:.3g}" for value in plan.noise_t)

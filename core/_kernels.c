@@ -1370,7 +1370,7 @@ enum { MAX_SEQUENCE = 512, MAX_WINDOW_CELLS = 1024, MAX_WEIGHT = 1000 };
 #define MAX_POSITIONS (1LL << 40)
 #define MAX_COORDINATE (1LL << 60)
 
-/* Arrays of a codec as core/dots/reading.py passes them: lengths, weights, prefixes, crt, signs,
+/* Arrays of a codec as core/dots/identification/phase_voting.py passes them: lengths, weights, prefixes, crt, signs,
  * digits and masks. */
 typedef struct {
     PyObject *lengths, *weights, *prefixes, *crt, *signs, *digits, *masks;
@@ -1713,45 +1713,45 @@ static PyMethodDef methods[] = {
     {"find_dots", find_dots, METH_VARARGS,
      "find_dots($module, images, n, height, width, taps, block, window, min_contrast,"
      " contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
-     "Detect the dots of images; twin of locatk.core.dots.blobs.find_dots_numpy."},
+     "Detect the dots of images; twin of locatk.core.dots.detection.blobs.find_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,
      "fit_lattices($module, points, valid, n, m, lens, ring_radii, prior, seeds, min_dots,"
      " min_neighbour, max_neighbour, cell_gate, cell_sigma, symbol_gate, symbol_sigma,"
      " lens_radius, offset, parameters, uv, cells, sigma, found, /)\n--\n\n"
-     "Fit lattices to dots; twin of locatk.core.dots.grid.fit_lattices_numpy."},
+     "Fit lattices to dots; twin of locatk.core.dots.detection.lattice.fit_lattices_numpy."},
     {"soft_bits", soft_bits, METH_VARARGS,
      "soft_bits($module, uv, cells, valid, found, sigma, n, m, half_width, offset,"
      " likelihood_floor, x_bits, y_bits, /)\n--\n\n"
-     "Compute the soft bits of dots; twin of locatk.core.dots.softbits.soft_bits_numpy."},
+     "Compute the soft bits of dots; twin of locatk.core.dots.identification.soft_bits.soft_bits_numpy."},
     {"read_windows", read_windows, METH_VARARGS,
      "read_windows($module, x_bits, y_bits, n, length, lengths, weights, prefixes, crt, signs,"
      " digits, masks, range, smallest_shift, log_hypotheses, positions, evidence, /)\n--\n\n"
-     "Read positions from windows of soft bits; twin of locatk.core.dots.reading.read_numpy."},
+     "Read positions from windows of soft bits; twin of locatk.core.dots.identification.phase_voting.read_numpy."},
     {"poses", poses, METH_VARARGS,
      "poses($module, points, valid, uv, cells, n, m, half_width, lens, prior, windows, lengths,"
      " weights, prefixes, crt, signs, digits, masks, range, smallest_shift, offset, gate,"
      " min_sigma, parameters, pose, covariance, /)\n--\n\n"
-     "Estimate poses from decoded dots; twin of locatk.core.dots.pose.poses_numpy."},
+     "Estimate poses from decoded dots; twin of locatk.core.dots.localization.pose.poses_numpy."},
     {"ddtw", ddtw, METH_VARARGS,
      "ddtw($module, query, slopes, n, length, count, cost, /)\n--\n\n"
      "Compute distances by derivative dynamic time warping; twin of"
-     " locatk.core.polaris.ddtw.distances_numpy."},
+     " locatk.core.polaris.published.ddtw.distances_numpy."},
     {"bar_fields", bar_fields, METH_VARARGS,
      "bar_fields($module, points, count, half_length, half_width, height, radius, remanence,"
      " min_distance, gradient, field, slope, /)\n--\n\n"
      "Compute the fields of a landmark's four bars; twin of"
-     " locatk.core.landmarks.bars.evaluate_numpy."},
+     " locatk.core.landmarks.field.evaluate_numpy."},
     {"scan_landmarks", scan_landmarks, METH_VARARGS,
      "scan_landmarks($module, points, values, weights, count, centres, n_centres, headings,"
      " n_headings, table, size, step, min_gain, max_gain, strengths, n_strengths, cost, /)"
      "\n--\n\n"
      "Compute the cost of candidate landmark poses; twin of"
-     " locatk.core.landmarks.scan.scan_numpy."},
+     " locatk.core.landmarks.detection.scan.scan_numpy."},
     {"search_map", search_map, METH_VARARGS,
      "search_map($module, item_cells, first, use_item, use_row, parts, weights, values, words,"
      " conflicts, cells, items, length, letters, n_weights, possible, seed, steps, /)\n--\n\n"
      "Search a map whose words all differ; twin of"
-     " locatk.core.landmarks.search.search_python."},
+     " locatk.core.landmarks.design.search.search_python."},
     {"window_edges", window_edges, METH_VARARGS,
      "window_edges($module, windows, width, tick, first, rises, /)\n--\n\n"
      "Find the edges of packed windows of light samples; twin of window_edges_numpy in"

@@ -1,5 +1,5 @@
 /* Hot loops of core/landmarks: the fields of a landmark's bars, and the cost of candidate poses.
- * The twins locatk.core.landmarks.bars.evaluate_numpy and .scan.scan_numpy document the methods.
+ * The twins locatk.core.landmarks.field.evaluate_numpy and .scan.scan_numpy document the methods.
  */
 #include "_kernels.h"
 #include <math.h>
@@ -117,7 +117,7 @@ static void costs(const float *normal, const float *right, double power, double 
     }
 }
 
-/* Samples and field table of a scan; see locatk.core.landmarks.scan.scan_numpy. */
+/* Samples and field table of a scan; see locatk.core.landmarks.detection.scan.scan_numpy. */
 typedef struct {
     const double *points, *values, *weights;
     const float *table;

@@ -1,4 +1,4 @@
-/* Search of landmark maps. The twin locatk.core.landmarks.search.search_python documents the
+/* Search of landmark maps. The twin locatk.core.landmarks.design.search.search_python documents the
  * method: min-conflicts with a heat bath.
  */
 #include "_kernels.h"

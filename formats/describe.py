@@ -11,9 +11,9 @@ import numpy as np
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError, LocatkError
-from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples, SensorArray
 from locatk.core.polaris.tag import Tags

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.floor import Cell, FloorMap, laid_mark
+from locatk.core.landmarks.map.floor import Cell, FloorMap, laid_mark
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.halls import HallSamples, HallSensors
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.formats import maps as artifacts
 from locatk.formats import samples as recordings
 from locatk.formats.messages import halls

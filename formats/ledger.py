@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.dots.codec import check_window
-from locatk.core.dots.ledger import Area
+from locatk.core.dots.design.ledger import Area
 from locatk.core.errors import InputError
 from locatk.formats import toml
 from locatk.formats.output import atomic_write, check_output

@@ -21,9 +21,9 @@ import math
 import os
 
 from locatk.core.errors import FormatError, error_context
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.gridfit import TOLERANCE_M, built_poses, floor_of
 from locatk.core.landmarks.landmark import CODES
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.map.grid_fit import TOLERANCE_M, built_poses, floor_of
 from locatk.core.units import metres, mm_text
 
 HEADER = ("No", "Code", "X mm", "Y mm", "Attr1", "Attr2", "Attr3", "Attr4")
@@ -66,7 +66,7 @@ def loads_csv(
     file : path
         Named in errors.
     pitch_m, tolerance_m
-        See :func:`locatk.core.landmarks.gridfit.fit_grid`.
+        See :func:`locatk.core.landmarks.map.grid_fit.fit_grid`.
 
     Raises
     ------

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from locatk.core.drawing import Line, Polygon, arrow
-from locatk.core.landmarks.drawing import bar_outlines
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.gridfit import built_poses
+from locatk.core.landmarks.drawing.landmark import bar_outlines
 from locatk.core.landmarks.landmark import name
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.map.grid_fit import built_poses
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing

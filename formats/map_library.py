@@ -14,12 +14,12 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.design import DesignOptions, empty_floor, with_codes
-from locatk.core.landmarks.design import design as search
-from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.design.generation import DesignOptions, empty_floor, with_codes
+from locatk.core.landmarks.design.generation import design as search
+from locatk.core.landmarks.design.proof import prove
 from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, code_of, rotated
-from locatk.core.landmarks.proof import prove
-from locatk.core.landmarks.windows import ALPHABET_CODES
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.windows import ALPHABET_CODES
 
 Codes = NDArray[np.int64]
 
@@ -103,7 +103,7 @@ def design(
     Raises
     ------
     InputError, DegenerateError
-        See :func:`locatk.core.landmarks.design.design`.
+        See :func:`locatk.core.landmarks.design.generation.design`.
     """
     floor = crop(options)
     return search(options, progress) if floor is None else floor

@@ -22,9 +22,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from locatk.core.errors import FormatError, error_context
-from locatk.core.landmarks.floor import Cell, FloorMap, neighbour
-from locatk.core.landmarks.gridfit import TOLERANCE_M, built_poses, floor_of
 from locatk.core.landmarks.landmark import code_of, name
+from locatk.core.landmarks.map.floor import Cell, FloorMap, neighbour
+from locatk.core.landmarks.map.grid_fit import TOLERANCE_M, built_poses, floor_of
 from locatk.formats.output import tool_version
 
 LIF_VERSION = "1.0.0"
@@ -117,7 +117,7 @@ def loads_lif(
     file : path
         Named in errors.
     pitch_m, tolerance_m
-        See :func:`locatk.core.landmarks.gridfit.fit_grid`.
+        See :func:`locatk.core.landmarks.map.grid_fit.fit_grid`.
 
     Raises
     ------

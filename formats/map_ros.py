@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.bars import basis
-from locatk.core.landmarks.floor import HOLE, FloorMap, laid_mark
+from locatk.core.landmarks.field import basis
+from locatk.core.landmarks.map.floor import HOLE, FloorMap, laid_mark
 
 RESOLUTION_M = 0.010
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.drawing import Line, Point, Polygon, arrow
-from locatk.core.landmarks.drawing import bar_outlines
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.gridfit import built_poses
+from locatk.core.landmarks.drawing.landmark import bar_outlines
 from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, name
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.map.grid_fit import built_poses
 
 NAMESPACE = "http://www.w3.org/2000/svg"
 INKSCAPE = "http://www.inkscape.org/namespaces/inkscape"

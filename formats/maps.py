@@ -14,8 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.floor import ALPHABETS, HOLE, WINDOWS, AsBuilt, Cell, FloorMap, Wall
 from locatk.core.landmarks.landmark import Geometry, code_of, name
+from locatk.core.landmarks.map.floor import (
+    ALPHABETS,
+    HOLE,
+    WINDOWS,
+    AsBuiltLandmark,
+    Cell,
+    FloorMap,
+    Wall,
+)
 from locatk.formats import toml
 from locatk.formats.hall_sensors import (
     HALLS_FILE,
@@ -129,7 +137,7 @@ def _geometry_table(geometry: Geometry) -> dict[str, Any]:
     }
 
 
-def _built_table(cell: Cell, built: AsBuilt) -> dict[str, Any]:
+def _built_table(cell: Cell, built: AsBuiltLandmark) -> dict[str, Any]:
     sigma_x, sigma_y, sigma_heading = built.sigma[:3].tolist()
     strengths = np.asarray(built.sigma[3:], float)
     return {
@@ -278,9 +286,9 @@ def _geometry(table: Table) -> Geometry:
 
 def _all_built(
     tables: list[Table], codes: NDArray[np.int64], pitch_m: float
-) -> Mapping[Cell, AsBuilt]:
+) -> Mapping[Cell, AsBuiltLandmark]:
     """As-built landmarks by cell, each once and where there is one."""
-    found: dict[Cell, AsBuilt] = {}
+    found: dict[Cell, AsBuiltLandmark] = {}
     for table in tables:
         cell = _cell(table, "cell", table.raw("cell"), codes.shape)
         if cell in found:
@@ -291,7 +299,7 @@ def _all_built(
     return found
 
 
-def _built(table: Table, pitch_m: float) -> AsBuilt:
+def _built(table: Table, pitch_m: float) -> AsBuiltLandmark:
     strengths = np.full(4, np.nan)
     if table.raw("sigma_strength", None) is not None:
         strengths = table.array("sigma_strength", (4,), nan=True)
@@ -301,7 +309,7 @@ def _built(table: Table, pitch_m: float) -> AsBuilt:
         table.angle("sigma_heading_deg", math.nan),
         *strengths,
     )
-    built = AsBuilt(
+    built = AsBuiltLandmark(
         x_m=table.number("x_mm", shift=_METRES),
         y_m=table.number("y_mm", shift=_METRES),
         heading_rad=table.angle("heading_deg"),

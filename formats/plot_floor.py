@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import Similarity
-from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.floor_bars import WEAK, bars_on_floor, cells_near

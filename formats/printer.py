@@ -10,7 +10,7 @@ import os
 from dataclasses import replace
 from typing import Any
 
-from locatk.core.dots.printer import PrinterReport
+from locatk.core.dots.calibration.printer import PrinterReport
 from locatk.core.dots.sheet import Manifest
 from locatk.formats import toml
 from locatk.formats.output import atomic_write

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
-from locatk.core.dots.layout import Layout, Raster, lay_out
-from locatk.core.dots.ledger import Area
+from locatk.core.dots.design.ledger import Area
+from locatk.core.dots.drawing.layout import Layout, Raster, lay_out
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
 from locatk.formats import rasters

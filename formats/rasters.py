@@ -10,8 +10,8 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots.codec import DISPLACEMENT, LETTERS, codec
-from locatk.core.dots.layout import Layout, Raster, pixels
+from locatk.core.dots.codec import DOT_DIRECTIONS, SYMBOL_LETTERS, codec
+from locatk.core.dots.drawing.layout import Layout, Raster, pixels
 from locatk.core.dots.sheet import MM_PER_INCH, Manifest
 
 BAND = 256
@@ -49,7 +49,7 @@ def write_text(
     stream: IO[bytes], manifest: Manifest, number: int, done: Callable[[], object] = _nothing
 ) -> None:
     """Write sheet ``number`` as letters u, d, l and r, a line a row of dots."""
-    codes = np.frombuffer(LETTERS.encode(), np.uint8)
+    codes = np.frombuffer(SYMBOL_LETTERS.encode(), np.uint8)
     for band in symbols(manifest, number, done):
         lines = np.full((band.shape[0], band.shape[1] + 1), ord("\n"), np.uint8)
         lines[:, :-1] = codes[band]
@@ -119,7 +119,7 @@ def _packed(lines: NDArray[np.uint8], step: int) -> Iterator[bytes]:
 def _cells(raster: Raster) -> NDArray[np.uint8]:
     """(4, pitch, pitch) ink of each symbol, its place ``offset`` from the upper left."""
     cells = np.zeros((4, raster.pitch, raster.pitch), np.uint8)
-    for cell, (x, y) in zip(cells, DISPLACEMENT.tolist(), strict=True):
+    for cell, (x, y) in zip(cells, DOT_DIRECTIONS.tolist(), strict=True):
         column, row = raster.offset * (1 + x), raster.offset * (1 + y)
         cell[row : row + raster.dot, column : column + raster.dot] = 1
     return cells

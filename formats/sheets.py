@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.dots import sequences
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.codec import PERIOD, RANGE, check_window
+from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, check_window, sequences
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import InputError
 from locatk.formats import toml
@@ -118,9 +117,9 @@ def _sheet(table: Table) -> Sheet:
     name = table.text("id")
     if not name.strip():
         raise table.error("id", "expected a name")
-    origin = _whole(table, "origin", 0, RANGE - 1)
-    size = _whole(table, "size", 1, RANGE)
-    section = _whole(table, "section", 0, PERIOD - 1, (0, 0))
+    origin = _whole(table, "origin", 0, SECTION_LENGTH - 1)
+    size = _whole(table, "size", 1, SECTION_LENGTH)
+    section = _whole(table, "section", 0, MAIN_SEQUENCE_LENGTH - 1, (0, 0))
     try:
         check_window(origin, size, section)
     except InputError as error:

@@ -14,7 +14,7 @@ import numpy as np
 from locatk.core.dots.results import DotDetection, DotFacts
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError, LocatkError
-from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.results import LandmarkDetection, LandmarkFacts
 from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Scene

@@ -15,7 +15,7 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.polaris.array import Array, SensorArray
-from locatk.core.polaris.tag import CODECS, AsBuilt, Magnet, Placed, Tags
+from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, Placed, Tags
 from locatk.formats import toml
 from locatk.formats.toml import Degrees, Shifted, Table
 from locatk.formats.toml_checks import above, check_remanence, twin
@@ -201,8 +201,8 @@ def _by_id(tables: list[Table], why: Callable[[int], str | None]) -> Iterator[tu
         yield number, table
 
 
-def _built(table: Table, tags: Tags) -> AsBuilt:
-    built = AsBuilt(
+def _built(table: Table, tags: Tags) -> AsBuiltTag:
+    built = AsBuiltTag(
         offset_m=table.array("offset_mm", (tags.magnets, 2), shift=_METRES),
         angle_rad=table.angles("angle_deg", tags.magnets),
         passes=table.integer("passes", 0, 10**9, 0),

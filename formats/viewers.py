@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.sheet import Manifest
 from locatk.core.geometry import quaternion_from_heading, quaternion_from_matrix
-from locatk.core.landmarks.floor import Cell, FloorMap
 from locatk.core.landmarks.landmark import name
+from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris import codec
 from locatk.core.polaris.tag import Placed, Tags, built_magnets, places, vertices

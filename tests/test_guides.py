@@ -146,7 +146,7 @@ def _toml_of_formats(name: str) -> str:
 
 def _pictures(sheet: Path, frames: int = 20) -> Iterator[bytes]:
     """PNG files of a camera over a printed sheet."""
-    from locatk.core.dots.simulate import SimulationOptions, simulate
+    from locatk.core.dots.simulation.session import SimulationOptions, simulate
     from locatk.formats.images import encode_png
     from locatk.formats.sheets import read_manifest
 
@@ -184,7 +184,7 @@ def _drive_csv(folder: Path, words: list[str]) -> None:
     import numpy as np
 
     from locatk.core.geometry import heading_from_quaternion
-    from locatk.core.landmarks.simulate import SimulationOptions, simulate
+    from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
     from locatk.formats.maps import read_map
 
     made = simulate(read_map(folder / words[words.index("--map") + 1]), SimulationOptions())

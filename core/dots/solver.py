@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec, codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.locate import FEW_DOTS, locate
-from locatk.core.dots.located import Located, nothing
-from locatk.core.dots.paper import locate_paper
+from locatk.core.dots.localization.frames import FEW_DOTS, locate
+from locatk.core.dots.localization.located import Located, nothing
+from locatk.core.dots.published.localization import locate_paper
 from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from locatk.core.landmarks.built import laid_code
-from locatk.core.landmarks.floor import HOLE, Cell, FloorMap
-from locatk.core.landmarks.globalize import HALF_PI, Located
+from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.landmark import pattern, rotated
-from locatk.core.landmarks.sighting import Sighting
+from locatk.core.landmarks.localization.cell_filter import HALF_PI, Located
+from locatk.core.landmarks.map.as_built import laid_code
+from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
 
 MIN_CELL_PROBABILITY = 0.8
 """Posterior probability of a cell of the map from which on it is reported [1]."""
@@ -111,7 +111,7 @@ class LandmarkFacts:
 
 
 def describe_visit(
-    sighting: Sighting, located: Located | None, floor: FloorMap | None
+    sighting: VisitHypotheses, located: Located | None, floor: FloorMap | None
 ) -> LandmarkDetection:
     """Return the detection that reports one visit.
 

@@ -10,17 +10,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks import neighbours, route, smooth
-from locatk.core.landmarks.estimate import FAULTY, GONE
-from locatk.core.landmarks.fit import Priors
-from locatk.core.landmarks.floor import Cell, FloorMap
-from locatk.core.landmarks.globalize import HALF_PI
+from locatk.core.landmarks.detection import neighbours
+from locatk.core.landmarks.detection.explanations import FAULTY, GONE
+from locatk.core.landmarks.detection.fit import Priors
+from locatk.core.landmarks.detection.trace import compose
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import rotated, signs
-from locatk.core.landmarks.recording import METHODS as METHODS
-from locatk.core.landmarks.recording import Recording, Seen, on_map, read
-from locatk.core.landmarks.recording import SolveOptions as SolveOptions
-from locatk.core.landmarks.remarks import (
+from locatk.core.landmarks.localization import smoothing as smooth
+from locatk.core.landmarks.localization import trajectory as route
+from locatk.core.landmarks.localization.cell_filter import HALF_PI
+from locatk.core.landmarks.localization.consistency import (
     CERTAIN,
     NO_MAP,
     contradicted,
@@ -29,13 +28,16 @@ from locatk.core.landmarks.remarks import (
     exchanged,
     why_not,
 )
+from locatk.core.landmarks.localization.recording import METHODS as METHODS
+from locatk.core.landmarks.localization.recording import Recording, Seen, on_map, read
+from locatk.core.landmarks.localization.recording import SolveOptions as SolveOptions
+from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.landmarks.results import (
     LandmarkDetection,
     LandmarkFacts,
     RobotFacts,
     describe_visit,
 )
-from locatk.core.landmarks.trace import compose
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -89,7 +91,7 @@ def solve(
     """
     options = options or SolveOptions()
     if options.method == "paper":
-        from locatk.core.landmarks import paper_solver
+        from locatk.core.landmarks.published import solver as paper_solver
 
         return paper_solver.solve(samples, floor, odometry=odometry)
     trajectories: list[Trajectory] = []

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.clean import cleaned
+from locatk.core.landmarks.detection.trace import Drift, Trace, corrections, relative, sensor_places
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.trace import Drift, Trace, corrections, relative, sensor_places
+from locatk.core.landmarks.preprocessing import cleaned
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 

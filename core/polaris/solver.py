@@ -10,14 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError, InputError
-from locatk.core.polaris import joint, paper, passes, task
+from locatk.core.polaris import passes
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.clean import cleaned
-from locatk.core.polaris.fit import Fitted
-from locatk.core.polaris.identify import Seen, identify
+from locatk.core.polaris.detection import magnets as joint
+from locatk.core.polaris.detection import task
+from locatk.core.polaris.detection.fit import Fitted
+from locatk.core.polaris.identification.tags import Seen, identify
+from locatk.core.polaris.localization import along, corrections, joined, tag_poses
+from locatk.core.polaris.magnets import DetectedMagnets
+from locatk.core.polaris.preprocessing import cleaned
+from locatk.core.polaris.published import pipeline as paper
 from locatk.core.polaris.results import HeadingCorrection, PolarisFacts, TagDetection
-from locatk.core.polaris.route import along, corrections, joined, tag_poses
-from locatk.core.polaris.sighting import Sighting
 from locatk.core.polaris.tag import Tags, places
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -181,7 +184,7 @@ def _seen(
         path = (recording.time_ns - recording.time_ns[0]) * 1e-9 * options.speed_mps
     elif driven is not None:
         path = along(driven, recording.time_ns)
-    found: list[tuple[Sighting, list[Seen]]] = []
+    found: list[tuple[DetectedMagnets, list[Seen]]] = []
     empty = 0
     for part in passes.find(recording, noise):
         fresh = _solved(recording, part, noise, tags, path)
@@ -204,14 +207,14 @@ def _solved(
     noise: Array,
     tags: Tags | None,
     path: Array | None,
-) -> tuple[Sighting, list[Seen]] | None:
+) -> tuple[DetectedMagnets, list[Seen]] | None:
     """One pass as a sighting and what it is read as; None where there is no magnet.
 
     The first fit is taken that leaves a white residual and is read; else the one with the
     least residual. A way that was given but does not explain the samples (lost ones, a
     start from rest) is left for the one that the field itself tells.
     """
-    tried: list[tuple[Sighting, list[Seen]]] = []
+    tried: list[tuple[DetectedMagnets, list[Seen]]] = []
     for way in (path, None) if path is not None else (None,):
         prepared = task.prepare(recording, part, noise, tags, way)
         for fitted in joint.fits(prepared):
@@ -242,9 +245,9 @@ def _on_grid(
     recording: Samples,
     prepared: task.Task,
     fitted: Fitted,
-    found: tuple[Sighting, list[Seen]],
+    found: tuple[DetectedMagnets, list[Seen]],
     tags: Tags | None,
-) -> tuple[Sighting, list[Seen]] | None:
+) -> tuple[DetectedMagnets, list[Seen]] | None:
     """The same pass with a source on each cell of the grid that was laid, if it is read then.
 
     Where magnets lie closer than one and a half clearances, their fields run into one
@@ -271,7 +274,9 @@ def _on_grid(
 
 
 def _may_be_one(
-    before: tuple[Sighting, list[Seen]], after: tuple[Sighting, list[Seen]], tags: Tags
+    before: tuple[DetectedMagnets, list[Seen]],
+    after: tuple[DetectedMagnets, list[Seen]],
+    tags: Tags,
 ) -> bool:
     """Whether two passes may be the ends of one tag: neither is read, and they are near."""
     if any(seen.tag_id is not None for seen in (*before[1], *after[1])):

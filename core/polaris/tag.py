@@ -50,7 +50,7 @@ class Magnet:
 
 
 @dataclass(frozen=True)
-class Layout:
+class TagLayout:
     """What one tag's id means: a magnet's cell and its orientation, magnet by magnet.
 
     Attributes
@@ -66,7 +66,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class AsBuilt:
+class AsBuiltTag:
     """How the magnets of one tag really lie, from ``locatk calibrate tag``.
 
     Attributes
@@ -129,7 +129,7 @@ class Tags:
     clearance_m: float = 0.01
     ids: tuple[int, ...] | None = None
     min_distance: int = 1
-    built: Mapping[int, AsBuilt] = field(default_factory=dict)
+    built: Mapping[int, AsBuiltTag] = field(default_factory=dict)
     site: Mapping[int, Placed] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -164,7 +164,7 @@ def angles(tags: Tags, symbols: tuple[int, ...]) -> Array:
     return -tags.step_rad * np.asarray(symbols, float)
 
 
-def built_magnets(tags: Tags, tag_id: int, layout: Layout) -> tuple[Array, Array]:
+def built_magnets(tags: Tags, tag_id: int, layout: TagLayout) -> tuple[Array, Array]:
     """Places (M, 2) and angles (M,) of the magnets of ``tag_id`` as it was built, where
     that was measured, else as designed."""
     place, angle = places(tags, layout.cells), angles(tags, layout.symbols)

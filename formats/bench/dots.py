@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots import simulate
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.locate import locate
-from locatk.core.dots.located import Located, nothing
+from locatk.core.dots.localization.frames import locate
+from locatk.core.dots.localization.located import Located, nothing
 from locatk.core.dots.sheet import Manifest
-from locatk.core.dots.simulate_decoys import KINDS, decoys
+from locatk.core.dots.simulation import session as simulate
+from locatk.core.dots.simulation.decoys import KINDS, decoys
 from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import heading_from_quaternion

@@ -8,14 +8,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots import exact, layout
-from locatk.core.dots.codec import DISPLACEMENT, MAIN, PERIOD, RANGE, Codec, codec
-from locatk.core.dots.decode import THRESHOLD, Decoded, decode
+from locatk.core.dots.codec import (
+    DOT_DIRECTIONS,
+    MAIN_SEQUENCE,
+    MAIN_SEQUENCE_LENGTH,
+    SECTION_LENGTH,
+    Codec,
+    codec,
+)
+from locatk.core.dots.codec import lookup as exact
+from locatk.core.dots.drawing import layout
+from locatk.core.dots.identification.decoding import THRESHOLD, Decoded, decode
 from locatk.core.dots.sheet import Manifest
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED, cpu_seconds, measured
 
-ORIGIN = (RANGE // 2, RANGE // 4)
+ORIGIN = (SECTION_LENGTH // 2, SECTION_LENGTH // 4)
 WINDOW = 8
 WINDOWS = 20_000
 SPOILT = 2000
@@ -130,14 +138,14 @@ def random_windows(
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Truth (n, 3): x, y and quarter turns; and symbols (n, 8, 8) as they are seen."""
     along = np.arange(WINDOW)
-    x, y = rng.integers(0, RANGE - WINDOW, (2, n))
-    u, v = rng.integers(0, PERIOD, (2, n))
+    x, y = rng.integers(0, SECTION_LENGTH - WINDOW, (2, n))
+    u, v = rng.integers(0, MAIN_SEQUENCE_LENGTH, (2, n))
     turns = rng.integers(0, 4, n)
     columns = table.phases(x[:, None] + along) + u[:, None]
     rows = table.phases(y[:, None] + along) + v[:, None]
     down, right = (y[:, None] + along)[:, :, None], (x[:, None] + along)[:, None, :]
-    printed = MAIN[(columns[:, None, :] + down) % PERIOD]
-    printed = printed + 2 * MAIN[(rows[:, :, None] + right) % PERIOD]
+    printed = MAIN_SEQUENCE[(columns[:, None, :] + down) % MAIN_SEQUENCE_LENGTH]
+    printed = printed + 2 * MAIN_SEQUENCE[(rows[:, :, None] + right) % MAIN_SEQUENCE_LENGTH]
     seen = np.empty_like(printed)
     for quarter in range(4):
         seen[turns == quarter] = exact.turn(printed[turns == quarter], quarter)
@@ -219,7 +227,7 @@ def _raster(paper: str, sheet: Manifest, pdf: bytes) -> list[Figure]:
     seen = np.stack(
         [
             black[y + dy :: pitch, x + dx :: pitch][:rows, :columns]
-            for dx, dy in (placed.raster.offset * DISPLACEMENT.astype(int)).tolist()
+            for dx, dy in (placed.raster.offset * DOT_DIRECTIONS.astype(int)).tolist()
         ]
     )
     # A dot is alone in the square of one pitch about its place.

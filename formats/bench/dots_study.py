@@ -8,9 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots import layout, simulate
+from locatk.core.dots.drawing import layout
 from locatk.core.dots.sheet import Manifest
-from locatk.core.dots.simulate_courses import Course
+from locatk.core.dots.simulation import session as simulate
+from locatk.core.dots.simulation.paths import Course
 from locatk.core.dots.solver import METHODS, SolveOptions, solve
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED

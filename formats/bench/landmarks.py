@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.paper_study import study
+from locatk.core.landmarks.published.study import study
 from locatk.formats.bench import Figure
 from locatk.formats.bench.landmarks_global import global_figures
 from locatk.formats.bench.landmarks_sessions import session_figures

@@ -16,17 +16,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks import globalize
-from locatk.core.landmarks.floor import STEPS, Cell, FloorMap, neighbour
+from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
+from locatk.core.landmarks.detection.trace import Drift
 from locatk.core.landmarks.landmark import CODES, PATTERNS, code_of, rotated
-from locatk.core.landmarks.recording import SolveOptions
-from locatk.core.landmarks.remarks import CERTAIN
+from locatk.core.landmarks.localization import cell_filter as globalize
+from locatk.core.landmarks.localization.consistency import CERTAIN
+from locatk.core.landmarks.localization.recording import SolveOptions
+from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
+from locatk.core.landmarks.map.windows import path, readings
 from locatk.core.landmarks.results import MIN_CELL_PROBABILITY
-from locatk.core.landmarks.sighting import Hypothesis, Sighting
-from locatk.core.landmarks.simulate_options import Errors
-from locatk.core.landmarks.simulate_sensors import odometry
-from locatk.core.landmarks.trace import Drift
-from locatk.core.landmarks.windows import path, readings
+from locatk.core.landmarks.simulation.options import Errors
+from locatk.core.landmarks.simulation.sensors import odometry
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED
 from locatk.formats.map_library import entries
@@ -150,7 +150,7 @@ def random_walk(floor: FloorMap, start: Cell, heading: int, rng: np.random.Gener
 
 def sightings(
     floor: FloorMap, walk: Walk, laid: dict[Cell, int], rng: np.random.Generator
-) -> list[Sighting]:
+) -> list[VisitHypotheses]:
     """What is seen on a walk over landmarks laid as ``laid`` says, else as the map does."""
     stops = _stops(floor, walk, rng)
     told = _odometry(stops, rng)
@@ -167,7 +167,7 @@ def sightings(
             int(rotated(code, -quarters)), 1.0, pose + sigma * rng.standard_normal(3),
             np.diag(sigma**2), unknown, unknown,
         )  # fmt: skip
-        seen.append(Sighting("robot", n, n, n + 1, told[n], (hypothesis,)))
+        seen.append(VisitHypotheses("robot", n, n, n + 1, told[n], (hypothesis,)))
     return seen
 
 
@@ -204,7 +204,7 @@ def misread(floor: FloorMap, rng: np.random.Generator) -> dict[Cell, int]:
 
 
 def told_places(
-    floor: FloorMap, seen: Sequence[Sighting]
+    floor: FloorMap, seen: Sequence[VisitHypotheses]
 ) -> tuple[list[tuple[Cell, int, float]], list[tuple[Cell, int, float]]]:
     """Cell, heading and probability of the last sighting after each of them, and of all
     sightings in the end."""

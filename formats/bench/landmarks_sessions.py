@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.remarks import CERTAIN
-from locatk.core.landmarks.simulate import Simulated, simulate
-from locatk.core.landmarks.simulate_options import Faults, SimulationOptions
+from locatk.core.landmarks.localization.consistency import CERTAIN
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.simulation.options import Faults, SimulationOptions
+from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
 from locatk.core.landmarks.solver import SolveOptions, solve
 from locatk.core.solution import Solution
 from locatk.formats.bench import Figure
@@ -73,7 +73,7 @@ def session(floor: FloorMap, options: SimulationOptions, method: str = "field") 
     return judged(made, solve(made.samples, floor, SolveOptions(method), odometry=made.odometry))
 
 
-def judged(made: Simulated, solution: Solution) -> Session:
+def judged(made: SimulatedSession, solution: Solution) -> Session:
     """Compare a solution with the truth."""
     truth = made.truth[0]
     start = truth.time_ns[0]

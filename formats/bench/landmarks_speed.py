@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
 from locatk.core.kernels import kernels
-from locatk.core.landmarks import bars, fit
-from locatk.core.landmarks.design import DesignOptions, design
-from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks import field as bars
+from locatk.core.landmarks.design.generation import DesignOptions, design
+from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.detection import fit
+from locatk.core.landmarks.detection.sightings import sighting
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.proof import prove
-from locatk.core.landmarks.sightings import sighting
-from locatk.core.landmarks.simulate import simulate
-from locatk.core.landmarks.simulate_options import SimulationOptions
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.simulation.options import SimulationOptions
+from locatk.core.landmarks.simulation.session import simulate
 from locatk.core.landmarks.solver import solve
 from locatk.core.landmarks.visits import driven, find
 from locatk.formats.bench import Figure

@@ -21,15 +21,19 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks import estimate, fit, paper, paper_pose, paper_valleys
+from locatk.core.landmarks.detection import explanations as estimate
+from locatk.core.landmarks.detection import fit
+from locatk.core.landmarks.detection.sightings import sighting
+from locatk.core.landmarks.detection.trace import Drift, Trace, compose, relative, sensor_places
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
-from locatk.core.landmarks.sightings import sighting
-from locatk.core.landmarks.simulate_floor import BAR_DRAWS, bar_fields, scatter_bars
-from locatk.core.landmarks.simulate_options import Errors
-from locatk.core.landmarks.simulate_passes import Pass, passes
+from locatk.core.landmarks.published import pose as paper_pose
+from locatk.core.landmarks.published import search as paper
+from locatk.core.landmarks.published import valleys as paper_valleys
+from locatk.core.landmarks.simulation.floor import BAR_DRAWS, bar_fields, scatter_bars
+from locatk.core.landmarks.simulation.options import Errors
+from locatk.core.landmarks.simulation.passes import Pass, passes
 from locatk.core.landmarks.solver import SolveOptions
-from locatk.core.landmarks.trace import Drift, Trace, compose, relative, sensor_places
 from locatk.core.landmarks.visits import Driven, Visit, driven, find
 
 Array = NDArray[np.float64]

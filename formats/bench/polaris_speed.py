@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.kernels import kernels
-from locatk.core.polaris import ddtw
+from locatk.core.polaris.published import ddtw
+from locatk.core.polaris.published.templates import OFFSETS, POINTS, template_set, templates
 from locatk.core.polaris.tag import Tags
-from locatk.core.polaris.templates import OFFSETS, POINTS, template_set, templates
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED, alone, cpu_seconds, measured
 

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.polaris.bound import magnet_covariance, pose_covariance
 from locatk.core.polaris.codec import capacity, layout_of
+from locatk.core.polaris.design.accuracy_bound import magnet_covariance, pose_covariance
 from locatk.core.polaris.results import TagDetection
-from locatk.core.polaris.simulate import Simulated, SimulationOptions, simulate
-from locatk.core.polaris.simulate_options import CARS, usual_bar
+from locatk.core.polaris.simulation.options import CARS, usual_bar
+from locatk.core.polaris.simulation.session import SimulatedSession, SimulationOptions, simulate
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import Tags
 from locatk.formats.bench import Figure
@@ -103,7 +103,7 @@ def drive(tags: Tags, tag_id: int, *, known_speed: bool = False, **options: Any)
     return judged(made, solve([made.samples], tags, SolveOptions(speed_mps=speed)).detections)
 
 
-def judged(made: Simulated, detections: Sequence[TagDetection]) -> Outcome:
+def judged(made: SimulatedSession, detections: Sequence[TagDetection]) -> Outcome:
     """Compare the detections of a pass over one tag with the truth."""
     tag_id = made.magnets.tag_id[0]
     count = len(made.magnets)
@@ -135,7 +135,7 @@ def judged(made: Simulated, detections: Sequence[TagDetection]) -> Outcome:
     return Outcome(verdict, reasons, int(count - seen.sum()), magnets, pose)
 
 
-def _true(made: Simulated, time_s: float) -> tuple[Array, Array]:
+def _true(made: SimulatedSession, time_s: float) -> tuple[Array, Array]:
     """Magnets (M, 3) and tag (3,) as x, y, direction in the array's frame at ``time_s``.
 
     With one tag, the frame of the truth is the tag's.

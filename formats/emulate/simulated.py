@@ -49,7 +49,7 @@ def simulate_session(
 
 def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
     """The paper's bar over three tags, from rest."""
-    from locatk.core.polaris.simulate import SimulationOptions, simulate
+    from locatk.core.polaris.simulation.session import SimulationOptions, simulate
     from locatk.core.polaris.tag import Placed, Tags
 
     places = enumerate(zip(IDS, (0.0, 90.0, 200.0), strict=True))
@@ -69,8 +69,8 @@ def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
 def _landmarks(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
     """The paper's robot on a floor of 6 x 8 landmarks, of which it visits enough to be sure
     where it is."""
-    from locatk.core.landmarks.design import DesignOptions, design
-    from locatk.core.landmarks.simulate import SimulationOptions, simulate
+    from locatk.core.landmarks.design.generation import DesignOptions, design
+    from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
 
     floor = design(DesignOptions(rows=6, columns=8, seed=seed))
     simulated = simulate(floor, SimulationOptions(landmarks=6, seed=seed))

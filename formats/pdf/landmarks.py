@@ -9,7 +9,7 @@ from reportlab.lib.units import mm
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core.drawing import Page
-from locatk.core.landmarks.pack_floor import Tile
+from locatk.core.landmarks.drawing.true_size import Tile
 from locatk.formats.pdf import page
 from locatk.formats.pdf.drawings import bind, sheets
 

@@ -18,7 +18,7 @@ from reportlab.lib.units import mm
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core import drawing
-from locatk.core.dots.layout import Layout
+from locatk.core.dots.drawing.layout import Layout
 from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
 

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from reportlab.pdfbase import pdfdoc
 from reportlab.pdfgen.canvas import Canvas
 
-from locatk.core.dots.codec import DISPLACEMENT, LETTERS
-from locatk.core.dots.layout import Layout, Raster, pixels
+from locatk.core.dots.codec import DOT_DIRECTIONS, SYMBOL_LETTERS
+from locatk.core.dots.drawing.layout import Layout, Raster, pixels
+from locatk.core.dots.drawing.tiles import seams
 from locatk.core.dots.sheet import Manifest
-from locatk.core.dots.tiles import seams
 from locatk.formats.pdf import page
 from locatk.formats.rasters import symbols
 
 LONGEST = 32_000
 """Letters in one string; a PDF reader need take no more than 32767 (ISO 32000-1 annex C)."""
 
-_CODES = np.frombuffer(LETTERS.encode(), np.uint8)
+_CODES = np.frombuffer(SYMBOL_LETTERS.encode(), np.uint8)
 
 
 def render(
@@ -143,11 +143,11 @@ def _font(canvas: Canvas, raster: Raster) -> pdfdoc.PDFObjectReference:
         first, last = min(_CODES), max(_CODES)
         glyphs = {}
         n = raster.dot
-        for letter, (right, down) in zip(LETTERS, DISPLACEMENT.tolist(), strict=True):
+        for letter, (right, down) in zip(SYMBOL_LETTERS, DOT_DIRECTIONS.tolist(), strict=True):
             x, y = right * raster.offset, -down * raster.offset
             draw = f"{raster.pitch} 0 {x} {y} {x + n} {y + n} d1 {x} {y} {n} {n} re f"
             glyphs[letter] = document.Reference(pdfdoc.PDFStream(None, draw.encode(), []))
-        codes = " ".join(f"{ord(letter)} /{letter}" for letter in sorted(LETTERS))
+        codes = " ".join(f"{ord(letter)} /{letter}" for letter in sorted(SYMBOL_LETTERS))
         widths = [raster.pitch if code in _CODES else 0 for code in range(first, last + 1)]
         font = _dictionary(
             Type="/Font",

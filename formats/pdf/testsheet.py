@@ -6,7 +6,7 @@ import io
 
 from reportlab.pdfgen.canvas import Canvas
 
-from locatk.core.dots.testsheet import MARKER_SIDE, Corner, Field, PrinterSheet
+from locatk.core.dots.drawing.test_sheet import MARKER_SIDE, Corner, Field, PrinterSheet
 from locatk.formats.pdf import page
 from locatk.formats.pdf.pattern import draw_dots
 

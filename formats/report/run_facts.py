@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from locatk.core.dots.sheet import Manifest
-from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution, to_json

@@ -62,7 +62,10 @@ def _lighthouse() -> dict[str, Reason]:
 
 
 def _dots() -> dict[str, Reason]:
-    from locatk.core.dots import decode, grid, paper, solver
+    from locatk.core.dots import solver
+    from locatk.core.dots.detection import lattice as grid
+    from locatk.core.dots.identification import decoding as decode
+    from locatk.core.dots.published import localization as paper
 
     return _of(
         "frames",
@@ -89,7 +92,7 @@ def _dots() -> dict[str, Reason]:
 
 
 def _polaris() -> dict[str, Reason]:
-    from locatk.core.polaris import reading
+    from locatk.core.polaris.identification import decoding as reading
 
     return _of(
         "passes",
@@ -122,7 +125,8 @@ def _polaris() -> dict[str, Reason]:
 
 
 def _landmarks() -> dict[str, Reason]:
-    from locatk.core.landmarks import results, sightings
+    from locatk.core.landmarks import results
+    from locatk.core.landmarks.detection import sightings
 
     return _of(
         "visits",

@@ -157,7 +157,7 @@ def _png(image: NDArray[np.uint8], codec: Codec | None, camera: Camera | None) -
     """A frame about :data:`WIDTH_PX` wide, with what was decoded in it where ``codec`` is given."""
     import cv2
 
-    from locatk.core.dots.locate import sightings
+    from locatk.core.dots.localization.frames import sightings
 
     height, width = image.shape
     scale = max(1, round(WIDTH_PX / width)) if width < WIDTH_PX else WIDTH_PX / width

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.dots import simulate
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.simulate import SimulationOptions
+from locatk.core.dots.simulation import session as simulate
+from locatk.core.dots.simulation.session import SimulationOptions
 from locatk.formats import frames as files
 from locatk.formats import sheets
 
@@ -20,14 +20,14 @@ CAMERA = Camera((188, 120), 360.0, (96.2, 57.1), -0.45)
 MANIFEST = simulate.sheet()
 
 
-def seen(count: int, *, tilt_deg: float = 0.0, **more: object) -> simulate.Simulated:
+def seen(count: int, *, tilt_deg: float = 0.0, **more: object) -> simulate.SimulatedSession:
     options = SimulationOptions(
         frames=count, path="random", camera=CAMERA, tilt_rad=math.radians(tilt_deg), **more
     )  # type: ignore[arg-type]
     return simulate.simulate(MANIFEST, options)
 
 
-def write(path: Path, *sessions: simulate.Simulated, camera: Camera | None = None) -> Path:
+def write(path: Path, *sessions: simulate.SimulatedSession, camera: Camera | None = None) -> Path:
     cameras = [
         replace(session.frames, device=f"camera{n or ''}") for n, session in enumerate(sessions)
     ]

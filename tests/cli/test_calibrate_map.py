@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.landmarks import simulate
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.simulate import Faults, Simulated, SimulationOptions
-from locatk.core.landmarks.simulate_floor import lay
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.simulation import session as simulate
+from locatk.core.landmarks.simulation.floor import lay
+from locatk.core.landmarks.simulation.session import Faults, SimulatedSession, SimulationOptions
 from locatk.formats import halls, maps
 from locatk.formats.session import Session
 from locatk.formats.tracks import read_odometry
@@ -25,7 +25,9 @@ LOOPS = (
 )
 
 
-def drive(cells: tuple[tuple[int, int], ...], seed: int, floor: FloorMap = FLOOR) -> Simulated:
+def drive(
+    cells: tuple[tuple[int, int], ...], seed: int, floor: FloorMap = FLOOR
+) -> SimulatedSession:
     """A robot of its own, always on the same floor."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "lay", lambda f, e, x, _: lay(f, e, x, 5))
@@ -34,7 +36,9 @@ def drive(cells: tuple[tuple[int, int], ...], seed: int, floor: FloorMap = FLOOR
         )
 
 
-def write(path: Path, session: Simulated, floor: FloorMap | None = FLOOR, **more: object) -> Path:
+def write(
+    path: Path, session: SimulatedSession, floor: FloorMap | None = FLOOR, **more: object
+) -> Path:
     given: dict = {"truth": session.truth, "odometry": session.odometry, **more}
     halls.write_session(path, session.samples, floor=floor, **given)
     return path
@@ -48,13 +52,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def other(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+def other(tmp_path_factory: pytest.TempPathFactory) -> SimulatedSession:
     """A drive over three of them, one with a flipped bar: by the map as designed, nowhere."""
     return drive(((0, 0), (0, 1), (1, 1)), 9)
 
 
 @pytest.fixture(scope="module")
-def sound() -> Simulated:
+def sound() -> SimulatedSession:
     """A drive over four landmarks without a fault."""
     return drive(((0, 1), (0, 0), (1, 0), (2, 0)), 10)
 
@@ -117,7 +121,7 @@ def test_json_is_all_that_is_on_stdout(locatk, runs: list[Path], tmp_path: Path)
 
 @pytest.mark.slow
 def test_later_sessions_are_solved_with_it(
-    locatk, runs: list[Path], other: Simulated, tmp_path: Path
+    locatk, runs: list[Path], other: SimulatedSession, tmp_path: Path
 ) -> None:
     out, later = tmp_path / "built.toml", write(tmp_path / "later.mcap", other)
     assert locatk("calibrate", "map", *runs, "-o", out).exit_code == 0
@@ -128,7 +132,7 @@ def test_later_sessions_are_solved_with_it(
 
 
 def test_recordings_that_cannot_be_used_are_named(
-    locatk, runs: list[Path], other: Simulated, tmp_path: Path
+    locatk, runs: list[Path], other: SimulatedSession, tmp_path: Path
 ) -> None:
     out = tmp_path / "built.toml"
     blind = replace(other.samples[0], field_t=1e-5 * np.sign(other.samples[0].field_t))
@@ -149,7 +153,9 @@ def test_recordings_that_cannot_be_used_are_named(
     assert len(maps.read_map(out).built) == 6
 
 
-def test_the_map_may_be_given_and_must_be_there(locatk, sound: Simulated, tmp_path: Path) -> None:
+def test_the_map_may_be_given_and_must_be_there(
+    locatk, sound: SimulatedSession, tmp_path: Path
+) -> None:
     bare, out = write(tmp_path / "bare.mcap", sound, floor=None), tmp_path / "built.toml"
     result = locatk("calibrate", "map", bare, "-o", out)
     assert result.exit_code == 1
@@ -167,7 +173,7 @@ def test_the_map_may_be_given_and_must_be_there(locatk, sound: Simulated, tmp_pa
 
 
 def test_one_session_that_cannot_be_used_is_an_error(
-    locatk, other: Simulated, tmp_path: Path
+    locatk, other: SimulatedSession, tmp_path: Path
 ) -> None:
     run, out = write(tmp_path / "run.mcap", other, odometry=()), tmp_path / "built.toml"
     assert read_odometry(Session.open(run)) == []
@@ -179,7 +185,7 @@ def test_one_session_that_cannot_be_used_is_an_error(
 
 
 @pytest.mark.slow
-def test_several_robots_of_one_session(locatk, sound: Simulated, tmp_path: Path) -> None:
+def test_several_robots_of_one_session(locatk, sound: SimulatedSession, tmp_path: Path) -> None:
     second = drive(((1, 0), (0, 0), (0, 1)), 11)
     both = replace(
         sound,

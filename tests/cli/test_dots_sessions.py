@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.codec import DISPLACEMENT, codec
+from locatk.core.dots.codec import DOT_DIRECTIONS, codec
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.formats import observations, sheets
 from locatk.formats.session import Session
@@ -42,7 +42,7 @@ def draw(
     first = (int(x) - reach, int(y) - reach)
     symbols = codec(name).symbols(first, (2 * reach, 2 * reach), sheet.section)
     rows, columns = np.mgrid[: 2 * reach, : 2 * reach]
-    places = np.stack([columns + first[0], rows + first[1]], -1) + DISPLACEMENT[symbols] / 6
+    places = np.stack([columns + first[0], rows + first[1]], -1) + DOT_DIRECTIONS[symbols] / 6
     right, down = (places - (x, y)).reshape(-1, 2).T * PX_A_PITCH
     c, s = math.cos(heading), math.sin(heading)
     across = (width - 1) / 2 + c * right - s * down

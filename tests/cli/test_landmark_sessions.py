@@ -15,9 +15,9 @@ import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
-from locatk.core.landmarks.floor import AsBuilt, FloorMap
 from locatk.core.landmarks.halls import NAMES, HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import code_of
+from locatk.core.landmarks.map.floor import AsBuiltLandmark, FloorMap
 from locatk.core.landmarks.results import LandmarkDetection, LandmarkFacts, RobotFacts
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -30,7 +30,7 @@ FLOOR = FloorMap(
     np.array([[code_of("NNNS"), code_of("NSNS"), -1], [code_of("SSSS"), code_of("NNSS"), 5]]),
     walls=frozenset({((0, 0), (0, 1))}),
     built={
-        (1, 1): AsBuilt(
+        (1, 1): AsBuiltLandmark(
             0.002, 0.0, 0.0, np.array([1.0, 0.9, 0.0, -1.0]), np.full(7, np.nan), 4, ("missing:2",)
         )
     },
@@ -505,7 +505,7 @@ def test_viewers_see_the_bars(locatk, solver: Solver, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_from_a_log_to_poses(locatk, tmp_path: Path) -> None:
     """Simulated, written as a table, imported again and solved: within 2 mm of the truth."""
-    from locatk.core.landmarks.design import DesignOptions, design
+    from locatk.core.landmarks.design.generation import DesignOptions, design
 
     floor = design(DesignOptions(rows=4, columns=5, seed=3))
     board, run = write_map(tmp_path / "map.toml", floor), tmp_path / "run.mcap"

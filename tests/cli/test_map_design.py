@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.floor import HOLE, AsBuilt, FloorMap
 from locatk.core.landmarks.landmark import PATTERN_OF, Geometry, rotated
+from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
 from locatk.formats.maps import read_map, write_map
 
 
@@ -315,7 +315,9 @@ def test_check_holds_a_map_to_its_promise(locatk, made: Path, tmp_path: Path) ->
 
 def test_check_says_what_was_built_otherwise(locatk, made: Path, tmp_path: Path) -> None:
     path = tmp_path / "built.toml"
-    built = AsBuilt(0, 0, 0, np.array([1.0, -1, 1, 0]), np.full(7, np.nan), 1, ("missing:3",))
+    built = AsBuiltLandmark(
+        0, 0, 0, np.array([1.0, -1, 1, 0]), np.full(7, np.nan), 1, ("missing:3",)
+    )
     write_map(path, replace(read_map(made), built={(1, 2): built}))
     result = locatk("map", "check", path)
     assert result.exit_code == 0

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from locatk.cli.app import app
-from locatk.core.landmarks.floor import ALPHABETS, HOLE, WINDOWS, AsBuilt, FloorMap
 from locatk.core.landmarks.landmark import Geometry, signs
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, AsBuiltLandmark, FloorMap
 from locatk.formats.maps import dumps_map, read_map, write_map
 
 FLOOR = FloorMap(
@@ -23,7 +23,7 @@ FLOOR = FloorMap(
     detect=1,
     geometry=Geometry(bar_length_m=0.025),
     walls=frozenset({((0, 0), (1, 0))}),
-    built={(1, 2): AsBuilt(0.002, 0.0, 0.0, signs(9), np.full(7, np.nan))},
+    built={(1, 2): AsBuiltLandmark(0.002, 0.0, 0.0, signs(9), np.full(7, np.nan))},
     name="hall",
 )
 

@@ -17,7 +17,7 @@ from locatk.core.geometry import quaternion_from_heading
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.codec import layout_of
 from locatk.core.polaris.results import MagnetDetection, PlanarPose, TagDetection
-from locatk.core.polaris.tag import AsBuilt, Placed, Tags, angles, built_magnets, places
+from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags, angles, built_magnets, places
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import arrays, observations, solutions, tags
@@ -155,7 +155,7 @@ def test_info_tells_arrays_and_tags(locatk, tmp_path: Path) -> None:
 
 def test_info_tells_artifacts(locatk, tmp_path: Path) -> None:
     path = tmp_path / "tag.toml"
-    built = AsBuilt(np.full((5, 2), 1e-4), np.full(5, math.radians(3)), 7)
+    built = AsBuiltTag(np.full((5, 2), 1e-4), np.full(5, math.radians(3)), 7)
     tags.write_tags(
         path, replace(TAGS, ids=(3, 9), built={9: built}, site={3: Placed(1.5, -0.2, math.pi / 2)})
     )
@@ -410,7 +410,7 @@ def test_viewers_see_the_tag_where_it_lies(locatk, solver: Solver, tmp_path: Pat
 
 # ---- calibrate tag
 
-BUILT = AsBuilt(
+BUILT = AsBuiltTag(
     1e-4 * np.array([[3.0, -2], [-4, 1], [2, 5], [0, -3], [-1, -1]]),
     np.radians([4.3, -2.2, 13.0, 0.0, -2.8]),
 )
@@ -508,7 +508,7 @@ def test_one_pass_is_too_few(locatk, solver: Solver, tmp_path: Path) -> None:
 def test_an_earlier_calibration_does_not_come_back(locatk, solver: Solver, tmp_path: Path) -> None:
     """The solver must see the magnets, not what was believed of them; other tags stay."""
     solver.seen = passes()
-    other = AsBuilt(np.zeros((5, 2)), np.full(5, 0.1), 3)
+    other = AsBuiltTag(np.zeros((5, 2)), np.full(5, 0.1), 3)
     before = replace(TAGS, built={ID: other, 7: other}, notes=("kept",))
     artifact, out = tmp_path / "before.toml", tmp_path / "after.toml"
     tags.write_tags(artifact, before)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from locatk.cli import print_pattern
-from locatk.core.dots import sequences
-from locatk.core.dots.layout import DPIS
+from locatk.core.dots.codec import sequences
+from locatk.core.dots.drawing.layout import DPIS
 from locatk.formats.ledger import LEDGER_FILE, open_ledger
 from locatk.formats.sheets import read_manifest
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from locatk.cli.calibrate_printer import printer
-from locatk.core.dots.codec import DISPLACEMENT, codec
+from locatk.core.dots.codec import DOT_DIRECTIONS, codec
+from locatk.core.dots.drawing.test_sheet import printer_sheet
 from locatk.core.dots.sheet import Manifest, Sheet
-from locatk.core.dots.testsheet import printer_sheet
 from locatk.formats import sheets
 
 SCAN_DPI = 450
@@ -77,7 +77,7 @@ def test_dots_are_whole_pixels_and_say_what_they_ought_to(locatk, tmp_path: Path
         for row in range(rows):
             for column in range(columns):
                 x, y = np.array([column, row]) * pitch + offset
-                x, y = (x, y) + offset * DISPLACEMENT[symbols[row, column]]
+                x, y = (x, y) + offset * DOT_DIRECTIONS[symbols[row, column]]
                 expected[y : y + n, x : x + n] = True
         seen = page[top:bottom, left:right]
         # Pure K is not 0 in a viewer's RGB; what counts is that nothing lies between.

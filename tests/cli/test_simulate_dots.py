@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.dots import simulate
 from locatk.core.dots.camera import Camera
+from locatk.core.dots.simulation import session as simulate
 from locatk.formats import sheets
 from locatk.formats.frames import read_frames
 from locatk.formats.session import Session

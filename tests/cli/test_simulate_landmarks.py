@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import name
-from locatk.core.landmarks.simulate import (
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.simulation.session import (
     Aims,
     Errors,
     Faults,
     Limits,
-    Simulated,
+    SimulatedSession,
     SimulationOptions,
     simulate,
 )
@@ -39,7 +39,7 @@ def floor(tmp_path: Path) -> Path:
     return path
 
 
-def holds(path: Path, wanted: Simulated) -> Session:
+def holds(path: Path, wanted: SimulatedSession) -> Session:
     """The session at ``path``, which holds what was simulated."""
     session = Session.open(path)
     (samples,) = read_samples(session)

@@ -12,7 +12,7 @@ import pytest
 
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris.array import SensorArray, bar
-from locatk.core.polaris.simulate import CARS, SimulationOptions, simulate, usual_bar
+from locatk.core.polaris.simulation.session import CARS, SimulationOptions, simulate, usual_bar
 from locatk.core.polaris.tag import Placed, Tags
 from locatk.formats import tags as artifacts
 from locatk.formats.arrays import read_samples

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.core.polaris import codec, families
-from locatk.core.polaris.tag import AsBuilt, Tags
+from locatk.core.polaris import codec
+from locatk.core.polaris.codec import families
+from locatk.core.polaris.tag import AsBuiltTag, Tags
 from locatk.formats.tags import read_tags, write_tags
 
 
@@ -182,7 +183,7 @@ def test_check_tells_a_family_that_is_too_close(locatk, tmp_path: Path) -> None:
 
 def test_check_uses_what_was_calibrated(locatk, tmp_path: Path) -> None:
     path = tmp_path / "tag.toml"
-    off = AsBuilt(np.zeros((5, 2)), np.full(5, np.radians(2.0)), 3)
+    off = AsBuiltTag(np.zeros((5, 2)), np.full(5, np.radians(2.0)), 3)
     write_tags(path, Tags(orientations=16, built={0: off}))
     assert locatk("tag", "check", path).exit_code == 0
     assert locatk("tag", "check", path, "--placement-error", 6).exit_code == 3

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.core.dots import layout
 from locatk.core.dots.codec import codec
-from locatk.core.dots.exact import decode_exact
-from locatk.core.dots.located import nothing
+from locatk.core.dots.codec.lookup import decode_exact
+from locatk.core.dots.drawing import layout
+from locatk.core.dots.localization.located import nothing
 from locatk.formats.bench import Figure, dots, dots_print, dots_study, timing
 from locatk.formats.pdf import pattern
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.core.landmarks import windows
-from locatk.core.landmarks.floor import FloorMap, neighbour
 from locatk.core.landmarks.landmark import CODES, rotated
-from locatk.core.landmarks.simulate import Simulated, simulate
-from locatk.core.landmarks.simulate_options import NONE, SimulationOptions
-from locatk.core.landmarks.simulate_passes import Pass, passes
+from locatk.core.landmarks.map import windows
+from locatk.core.landmarks.map.floor import FloorMap, neighbour
+from locatk.core.landmarks.simulation.options import NONE, SimulationOptions
+from locatk.core.landmarks.simulation.passes import Pass, passes
+from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
 from locatk.core.landmarks.solver import solve
 from locatk.core.solution import Solution
 from locatk.formats.bench import (
@@ -325,12 +325,14 @@ def test_a_filter_that_is_sure_of_another_place_is_caught(
 
 
 @pytest.fixture(scope="module")
-def solved(floor: FloorMap) -> tuple[Simulated, Solution]:
+def solved(floor: FloorMap) -> tuple[SimulatedSession, Solution]:
     made = simulate(floor, SimulationOptions(seed=2))
     return made, solve(made.samples, floor, odometry=made.odometry)
 
 
-def test_a_solved_session_is_compared_with_the_truth(solved: tuple[Simulated, Solution]) -> None:
+def test_a_solved_session_is_compared_with_the_truth(
+    solved: tuple[SimulatedSession, Solution],
+) -> None:
     made, solution = solved
     one = landmarks_sessions.judged(made, solution)
     assert one.given
@@ -343,7 +345,7 @@ def test_a_solved_session_is_compared_with_the_truth(solved: tuple[Simulated, So
     assert one.error_m.mean() == pytest.approx(0.2, abs=0.01)
 
 
-def test_a_wrong_cell_is_seen(solved: tuple[Simulated, Solution]) -> None:
+def test_a_wrong_cell_is_seen(solved: tuple[SimulatedSession, Solution]) -> None:
     made, solution = solved
     *others, last = solution.detections
     row, column = last.cell

@@ -13,9 +13,9 @@ import pytest
 
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris import codec
-from locatk.core.polaris.ddtw import distances, prepare
+from locatk.core.polaris.published.ddtw import distances, prepare
 from locatk.core.polaris.results import MagnetDetection, TagDetection
-from locatk.core.polaris.simulate import Simulated, SimulationOptions, simulate
+from locatk.core.polaris.simulation.session import SimulatedSession, SimulationOptions, simulate
 from locatk.core.polaris.tag import Tags, places
 from locatk.formats.bench import Figure, polaris, polaris_speed, polaris_study
 
@@ -223,12 +223,12 @@ def test_a_run_is_what_its_detections_say() -> None:
 
 
 @pytest.fixture(scope="module")
-def made() -> Simulated:
+def made() -> SimulatedSession:
     options = SimulationOptions(route=(1234,), heading_rad=2.0, lateral_m=0.005, earth_t=0.0)
     return simulate(Tags(), options)
 
 
-def told(made: Simulated, tag_id: int | None, refused: str | None = None) -> TagDetection:
+def told(made: SimulatedSession, tag_id: int | None, refused: str | None = None) -> TagDetection:
     """The truth at some sample, as a detection."""
     at = 150
     heading = heading_from_quaternion(made.truth.quaternion[at : at + 1])[0]
@@ -249,7 +249,7 @@ def told(made: Simulated, tag_id: int | None, refused: str | None = None) -> Tag
     )
 
 
-def test_the_truth_has_no_errors_in_any_order(made: Simulated) -> None:
+def test_the_truth_has_no_errors_in_any_order(made: SimulatedSession) -> None:
     found = told(made, 1234)
     found = replace(found, magnets=found.magnets[::-1])
     outcome = polaris_study.judged(made, [found])
@@ -264,7 +264,7 @@ def test_the_truth_has_no_errors_in_any_order(made: Simulated) -> None:
     assert outcome.pose == pytest.approx([0, -0.9e-3, 0], abs=1e-9)
 
 
-def test_a_right_id_at_another_place_is_misplaced(made: Simulated) -> None:
+def test_a_right_id_at_another_place_is_misplaced(made: SimulatedSession) -> None:
     found = told(made, 1234)
     found = replace(found, x_m=found.x_m + 2e-3)
     assert polaris_study.judged(made, [found]).verdict == "misplaced"
@@ -274,7 +274,7 @@ def test_a_right_id_at_another_place_is_misplaced(made: Simulated) -> None:
     assert polaris_study.judged(made, [found]).verdict == "misplaced"
 
 
-def test_a_pass_is_right_wrong_refused_or_silent(made: Simulated) -> None:
+def test_a_pass_is_right_wrong_refused_or_silent(made: SimulatedSession) -> None:
     right, wrong = told(made, 1234), told(made, 1235)
     refused = told(made, None, "tie")
     refused = replace(refused, magnets=refused.magnets[:3])

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import ArtifactError, FormatError, InputError
-from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.trajectory import Trajectory
 from locatk.formats import halls, maps, observations
 from locatk.formats.messages import timestamp

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.dots.codec import RANGE
-from locatk.core.dots.layout import lay_out, snap
-from locatk.core.dots.ledger import Area, plan
+from locatk.core.dots.codec import SECTION_LENGTH
+from locatk.core.dots.design.ledger import Area, plan
+from locatk.core.dots.drawing.layout import lay_out, snap
 from locatk.core.errors import ArtifactError, InputError, MissingDataError, OutputExistsError
 from locatk.formats.ledger import LEDGER_FILE, Ledger, open_ledger
 from locatk.formats.printing import publish
@@ -49,7 +49,7 @@ AREAS = st.builds(
     st.uuids().map(str),
     st.sampled_from(["anoto", "libdots", "microdots"]),
     st.tuples(st.integers(0, 62), st.integers(0, 62)),
-    st.tuples(st.integers(0, RANGE - 5000), st.integers(0, RANGE - 5000)),
+    st.tuples(st.integers(0, SECTION_LENGTH - 5000), st.integers(0, SECTION_LENGTH - 5000)),
     st.tuples(st.integers(1, 5000), st.integers(1, 5000)),
 )
 
@@ -125,7 +125,7 @@ def test_runs_at_once_take_different_areas(tmp_path: Path) -> None:
     code = (
         "import sys, time\n"
         "from pathlib import Path\n"
-        "from locatk.core.dots.ledger import allocate\n"
+        "from locatk.core.dots.design.ledger import allocate\n"
         "from locatk.formats.ledger import open_ledger\n"
         "with open_ledger(Path(sys.argv[1])) as book:\n"
         "    new = allocate(book.areas, [(100, 100)], prefixes=['A4'], codec='anoto')\n"

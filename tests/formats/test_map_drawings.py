@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.bars import landmark_field
-from locatk.core.landmarks.floor import HOLE, AsBuilt, FloorMap
+from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import PATTERNS, signs
+from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
 from locatk.formats import map_ros, map_svg
 from locatk.formats.map_dxf import dumps_dxf
 from locatk.formats.maps import write_map
@@ -37,7 +37,7 @@ FLOOR = FloorMap(
 TURN = math.radians(30)
 BUILT = FloorMap(
     np.array([[0b0111, 0b0001]]),
-    built={(0, 1): AsBuilt(0.004, -0.003, TURN, signs(0b0001), NONE)},
+    built={(0, 1): AsBuiltLandmark(0.004, -0.003, TURN, signs(0b0001), NONE)},
 )
 
 # ---- ROS
@@ -121,7 +121,7 @@ def test_territories_are_as_built() -> None:
     np.testing.assert_allclose(ours - middle, wanted, atol=0.15)
     missing = FloorMap(
         BUILT.codes,
-        built={(0, 1): AsBuilt(0, 0, 0, np.zeros(4), NONE)},
+        built={(0, 1): AsBuiltLandmark(0, 0, 0, np.zeros(4), NONE)},
     )
     assert not (map_ros.draw(missing, size)[:, 100:] == map_ros.TERRITORY).any()
 

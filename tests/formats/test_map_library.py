@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.bounds import refuse
-from locatk.core.landmarks.design import DesignOptions
-from locatk.core.landmarks.floor import ALPHABETS, HOLE, WINDOWS, FloorMap
+from locatk.core.landmarks.design.bounds import refuse
+from locatk.core.landmarks.design.generation import DesignOptions
+from locatk.core.landmarks.design.proof import prove
 from locatk.core.landmarks.landmark import CODES, PATTERN_OF, rotated
-from locatk.core.landmarks.proof import prove
-from locatk.core.landmarks.windows import ALPHABET_CODES, readings
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, FloorMap
+from locatk.core.landmarks.map.windows import ALPHABET_CODES, readings
 from locatk.formats import map_library
 from locatk.formats.map_library import Entry, crop, entries, relabelling, turned
 

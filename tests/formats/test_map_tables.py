@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError
-from locatk.core.landmarks.floor import HOLE, AsBuilt, FloorMap
-from locatk.core.landmarks.gridfit import built_poses
 from locatk.core.landmarks.landmark import signs
+from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.grid_fit import built_poses
 from locatk.formats.map_csv import HEADER, dumps_csv, loads_csv
 from locatk.formats.map_lif import dumps_lif, loads_lif
 
@@ -77,7 +77,9 @@ def test_landmarks_as_built_come_back_where_they_lie(floor: FloorMap, data: st.D
     cells = data.draw(st.lists(st.sampled_from(floor.cells()), max_size=3, unique=True))
     turn = math.radians(1.25)
     built = {
-        cell: AsBuilt(data.draw(offset), data.draw(offset), turn, signs(floor.codes[cell]), NONE)
+        cell: AsBuiltLandmark(
+            data.draw(offset), data.draw(offset), turn, signs(floor.codes[cell]), NONE
+        )
         for cell in cells
     }
     laid = FloorMap(floor.codes, floor.pitch_m, origin_m=floor.origin_m, built=built)
@@ -101,7 +103,7 @@ def test_the_table_is_that_of_controllers() -> None:
     floor = FloorMap(
         np.array([[7, HOLE], [0, 15]]),
         origin_m=(-2.48, 0.0125),
-        built={(1, 1): AsBuilt(0.0012, 0, math.radians(-0.5), signs(15), NONE)},
+        built={(1, 1): AsBuiltLandmark(0.0012, 0, math.radians(-0.5), signs(15), NONE)},
     )
     assert dumps_csv(floor) == (
         "No;Code;X mm;Y mm;Attr1;Attr2;Attr3;Attr4\n"

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.floor import ALPHABETS, HOLE, WINDOWS, AsBuilt, FloorMap
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, name
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, AsBuiltLandmark, FloorMap
 from locatk.formats import hall_sensors
 from locatk.formats import maps as files
 from locatk.formats.maps import COMPASS, dumps_halls, dumps_map, loads_halls, loads_map
@@ -51,11 +51,11 @@ def grids(draw: st.DrawFn, letters: list[int]) -> np.ndarray:
 
 
 @st.composite
-def builts(draw: st.DrawFn, pitch: float) -> AsBuilt:
+def builts(draw: st.DrawFn, pitch: float) -> AsBuiltLandmark:
     """How a landmark may lie."""
     near = st.floats(-pitch / 2, pitch / 2)
     sigma = st.floats(0, 10) | st.just(math.nan)
-    return AsBuilt(
+    return AsBuiltLandmark(
         draw(near),
         draw(near),
         draw(st.floats(-math.pi, math.pi)),

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from locatk.core.drawing import Line, Page, Text
 from locatk.core.errors import InputError
-from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.drawing.pack import PARTS, pack
+from locatk.core.landmarks.drawing.true_size import Tile, floor_tiles, paper
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.pack import PARTS, pack
-from locatk.core.landmarks.pack_floor import Tile, floor_tiles, paper
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
 from locatk.formats.pdf.landmarks import render, render_floor
 
 DPI = 300

@@ -21,10 +21,10 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.dots.codec import codec
-from locatk.core.dots.exact import decode_exact
-from locatk.core.dots.layout import Layout, lay_out, manifest, paper_size, snap
+from locatk.core.dots.codec.lookup import decode_exact
+from locatk.core.dots.drawing.layout import Layout, lay_out, manifest, paper_size, snap
+from locatk.core.dots.drawing.tiles import seams, tiling
 from locatk.core.dots.sheet import Manifest
-from locatk.core.dots.tiles import seams, tiling
 from locatk.core.errors import InputError
 from locatk.formats import rasters
 from locatk.formats.pdf import page, pattern

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from locatk.core.drawing import Group, Line, Mark, Page, Text
 from locatk.core.errors import InputError
-from locatk.core.polaris import cards
-from locatk.core.polaris.tag import AsBuilt, Layout, Magnet, Tags, free_cells
+from locatk.core.polaris.drawing import cards
+from locatk.core.polaris.tag import AsBuiltTag, Magnet, TagLayout, Tags, free_cells
 from locatk.formats import tag_svg
 from locatk.formats.pdf import tag as tag_pdf
 
@@ -39,21 +39,21 @@ EVEN = Tags(order=4, magnets=8, orientations=16, spacing_m=0.03, magnet=Magnet(3
 Places = NDArray[np.float64]
 
 
-def some_layout(tags: Tags, seed: int) -> Layout:
+def some_layout(tags: Tags, seed: int) -> TagLayout:
     draw = random.Random(seed)
     last = tags.order - 1
     cells = [(0, 0), (0, last), (last, last)]
     cells += draw.sample(free_cells(tags.order), tags.magnets - 3)
     cells.sort(key=lambda cell: (cell[1], cell[0]))
-    return Layout(tuple(cells), tuple(draw.randrange(tags.orientations) for _ in cells))
+    return TagLayout(tuple(cells), tuple(draw.randrange(tags.orientations) for _ in cells))
 
 
-def some(tags: Tags, count: int) -> list[tuple[int, Layout]]:
+def some(tags: Tags, count: int) -> list[tuple[int, TagLayout]]:
     return [(1000 + seed, some_layout(tags, seed)) for seed in range(count)]
 
 
 def expected(
-    tags: Tags, layout: Layout, origin: tuple[float, float], mirror: bool = False
+    tags: Tags, layout: TagLayout, origin: tuple[float, float], mirror: bool = False
 ) -> tuple[Places, Places]:
     """Places on the page in mm, and angles clockwise from up in degrees."""
     cell = np.array(layout.cells, float) - (tags.order - 1) / 2
@@ -241,7 +241,7 @@ def test_tags_share_pages_without_touching(
 def test_words_are_not_drawn_over(tags: Tags, mirror: bool) -> None:
     """But by the thin dashes of the grid."""
     turns = [
-        (symbol, Layout(some_layout(tags, 7).cells, (symbol,) * tags.magnets))
+        (symbol, TagLayout(some_layout(tags, 7).cells, (symbol,) * tags.magnets))
         for symbol in range(tags.orientations)
     ]
     (page,) = cards.draw(tags, turns, (600.0, 600.0), mirror=mirror).pages
@@ -287,7 +287,7 @@ def test_svg_is_what_the_pdf_shows_in_mm() -> None:
 
 def test_labels_say_what_it_is() -> None:
     tags = replace(FULL, codec="polaris-released")
-    layout = Layout(((0, 0), (1, 0), (1, 1), (0, 2), (2, 2)), (0, 1, 2, 3, 7))
+    layout = TagLayout(((0, 0), (1, 0), (1, 1), (0, 2), (2, 2)), (0, 1, 2, 3, 7))
     made = cards.draw(tags, [(262143, layout)], A4)
     page = pypdfium2.PdfDocument(tag_pdf.render(made.pages, "t"))[0]
     words = page.get_textpage().get_text_bounded()
@@ -322,7 +322,7 @@ def test_long_ids_are_written_whole_within_their_card() -> None:
 
 def test_tags_are_drawn_as_designed_and_always_the_same() -> None:
     wanted = some(FULL, 3)
-    built = AsBuilt(np.full((5, 2), 3e-3), np.full(5, 0.2), 4)
+    built = AsBuiltTag(np.full((5, 2), 3e-3), np.full(5, 0.2), 4)
     again = replace(FULL, built={1000: built})
     first, second = (cards.draw(tags, wanted, A4).pages for tags in (FULL, again))
     assert tag_pdf.render(first, "t") == tag_pdf.render(second, "t")

@@ -13,9 +13,9 @@ from matplotlib.collections import PolyCollection
 from matplotlib.text import Text
 
 from locatk.core.geometry import Similarity, quaternion_from_heading
-from locatk.core.landmarks.drawing import bar_outlines
-from locatk.core.landmarks.floor import AsBuilt, FloorMap
+from locatk.core.landmarks.drawing.landmark import bar_outlines
 from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.map.floor import AsBuiltLandmark, FloorMap
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
@@ -74,7 +74,7 @@ def test_bars_lie_as_in_the_installation_pack(code: int, x: float, y: float, tur
     from locatk.core.landmarks.landmark import signs
 
     floor = FloorMap(np.array([[code]]), origin_m=(0.3, 0.4))
-    built = AsBuilt(x, y, turn, signs(code), np.full(7, np.nan))
+    built = AsBuiltLandmark(x, y, turn, signs(code), np.full(7, np.nan))
     for laid, shift, heading in (
         (floor, np.zeros(2), 0.0),
         (replace(floor, built={(0, 0): built}), np.array([x, y]), turn),
@@ -106,7 +106,7 @@ def test_halves_of_bars_are_north_and_south() -> None:
 
 
 def test_missing_bars_and_walls_are_drawn() -> None:
-    built = AsBuilt(0, 0, 0, np.array([1.0, 0.1, -1.0, 0.0]), np.full(7, np.nan))
+    built = AsBuiltLandmark(0, 0, 0, np.array([1.0, 0.1, -1.0, 0.0]), np.full(7, np.nan))
     walls = frozenset({((1, 0), (1, 1))})
     floor = floor_of(solution(replace(FLOOR, built={(1, 1): built}, walls=walls), []))
     assert floor is not None

@@ -13,14 +13,14 @@ from matplotlib.text import Text
 from locatk.core.geometry import Similarity, quaternion_from_heading
 from locatk.core.polaris.codec import layout_of
 from locatk.core.polaris.results import MagnetDetection, PlanarPose, TagDetection
-from locatk.core.polaris.tag import AsBuilt, Placed, Tags, built_magnets
+from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags, built_magnets
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plot import draw
 from locatk.formats.plot_tags import tags_of
 
 ID = 4711
-BUILT = Tags(built={ID: AsBuilt(np.full((5, 2), 1e-3), np.full(5, 0.1), 3)})
+BUILT = Tags(built={ID: AsBuiltTag(np.full((5, 2), 1e-3), np.full(5, 0.1), 3)})
 
 
 def detection(tags: Tags, x: float, y: float, heading: float) -> TagDetection:

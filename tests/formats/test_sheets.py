@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.codec import RANGE
+from locatk.core.dots.codec import SECTION_LENGTH
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.formats import sheets
 from locatk.formats.sheets import dumps_camera, dumps_manifest, loads_camera, loads_manifest
@@ -40,12 +40,14 @@ def manifests(draw: st.DrawFn) -> Manifest:
     places = draw(st.lists(st.none() | pairs, min_size=count, max_size=count))
     origins = []
     for number in range(count):
-        low = number * (RANGE // count)
-        origins.append((draw(st.integers(low, low + RANGE // count - 1)), draw(st.integers(0, 9))))
+        low = number * (SECTION_LENGTH // count)
+        origins.append(
+            (draw(st.integers(low, low + SECTION_LENGTH // count - 1)), draw(st.integers(0, 9)))
+        )
     made = []
     for number, (name, place, (x, y)) in enumerate(zip(names, places, origins, strict=True)):
-        room = (number + 1) * (RANGE // count) - x
-        size = (draw(st.integers(1, room)), draw(st.integers(1, RANGE - y)))
+        room = (number + 1) * (SECTION_LENGTH // count) - x
+        size = (draw(st.integers(1, room)), draw(st.integers(1, SECTION_LENGTH - y)))
         made.append(
             Sheet(
                 name,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.codec import capacity
-from locatk.core.polaris.tag import CODECS, AsBuilt, Magnet, Placed, Tags
+from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, Placed, Tags
 from locatk.formats import tags as files
 from locatk.formats.tags import dumps_array, dumps_tags, loads_array, loads_tags
 
@@ -50,7 +50,7 @@ def tag_sets(draw: st.DrawFn) -> Tags:
     offset = st.floats(-0.35 * spacing, 0.35 * spacing)
     angle = st.floats(-math.pi, math.pi)
     built = st.builds(
-        AsBuilt, arrays((magnets, 2), offset), arrays((magnets,), angle), st.integers(0, 99)
+        AsBuiltTag, arrays((magnets, 2), offset), arrays((magnets,), angle), st.integers(0, 99)
     )
     return Tags(
         order,

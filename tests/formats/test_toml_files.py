@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import ArtifactError, MissingDataError, OutputExistsError
-from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.halls import HallSensors, circle
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
 from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags

@@ -22,7 +22,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.geometry import quaternion_from_heading
-from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris.tag import Placed, Tags

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots.blobs import Dots, find_dots
+from locatk.core.dots.detection.blobs import Dots, find_dots
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots import calibrate as calibration
-from locatk.core.dots import camera_views, simulate
-from locatk.core.dots.calibrate import CalibrateOptions, CameraReport, calibrate
+from locatk.core.dots.calibration import camera as calibration
+from locatk.core.dots.calibration import camera_views
+from locatk.core.dots.calibration.camera import CalibrateOptions, CameraReport, calibrate
+from locatk.core.dots.calibration.camera_views import SeenFrame, spread, spread_order
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.camera_views import SeenFrame, spread, spread_order
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.simulate import SimulationOptions
+from locatk.core.dots.simulation import session as simulate
+from locatk.core.dots.simulation.session import SimulationOptions
 from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import DegenerateError, InputError
 
@@ -32,19 +33,21 @@ TRUTH = Camera(SIZE, 360.0, (96.2, 57.1), -0.45)
 MANIFEST = simulate.sheet()
 
 
-def simulated(frames: int = 25, camera: Camera = TRUTH, **more: object) -> simulate.Simulated:
+def simulated(
+    frames: int = 25, camera: Camera = TRUTH, **more: object
+) -> simulate.SimulatedSession:
     options = SimulationOptions(frames=frames, path="random", camera=camera, **more)  # type: ignore[arg-type]
     session = simulate.simulate(MANIFEST, options)
     return replace(session, frames=replace(session.frames, images=list(session.frames.images)))
 
 
 @pytest.fixture(scope="module")
-def tilted() -> simulate.Simulated:
+def tilted() -> simulate.SimulatedSession:
     return simulated(tilt_rad=math.radians(10))
 
 
 @pytest.fixture(scope="module")
-def upright() -> simulate.Simulated:
+def upright() -> simulate.SimulatedSession:
     return simulated(seed=1)
 
 
@@ -140,7 +143,7 @@ def as_frames(images: Sequence[Image]) -> Frames:
 # ---- the camera
 
 
-def test_the_simulators_camera_comes_back(tilted: simulate.Simulated) -> None:
+def test_the_simulators_camera_comes_back(tilted: simulate.SimulatedSession) -> None:
     report = calibrate(tilted.frames, MANIFEST)
     check_lens(report)
     assert report.camera.focal_px == pytest.approx(TRUTH.focal_px, rel=0.01)
@@ -200,7 +203,7 @@ def test_a_strong_lens(corner: float) -> None:
     assert report.used == 12
 
 
-def test_poses_are_of_the_centre_that_is_calibrated(upright: simulate.Simulated) -> None:
+def test_poses_are_of_the_centre_that_is_calibrated(upright: simulate.SimulatedSession) -> None:
     report = calibrate(upright.frames, MANIFEST)
 
     def rms_mm(camera: Camera | None) -> float:
@@ -220,7 +223,7 @@ def test_poses_are_of_the_centre_that_is_calibrated(upright: simulate.Simulated)
 
 
 def test_untilted_frames_tell_the_lens_but_not_the_focal_length(
-    upright: simulate.Simulated,
+    upright: simulate.SimulatedSession,
 ) -> None:
     report = calibrate(upright.frames, MANIFEST)
     check_lens(report)
@@ -235,7 +238,7 @@ def test_untilted_frames_tell_the_lens_but_not_the_focal_length(
 
 @pytest.mark.slow
 def test_a_focal_length_that_is_given_is_kept(
-    upright: simulate.Simulated, tilted: simulate.Simulated
+    upright: simulate.SimulatedSession, tilted: simulate.SimulatedSession
 ) -> None:
     for session in (upright, tilted):
         report = calibrate(session.frames, MANIFEST, CalibrateOptions(focal_px=400.0))
@@ -253,7 +256,7 @@ def test_a_focal_length_that_is_given_is_kept(
 
 @pytest.mark.slow
 def test_an_earlier_focal_length_is_kept_where_nothing_tells_a_better_one(
-    upright: simulate.Simulated, tilted: simulate.Simulated
+    upright: simulate.SimulatedSession, tilted: simulate.SimulatedSession
 ) -> None:
     earlier = CalibrateOptions(camera=Camera(SIZE, 333.0, (90.0, 60.0), -0.2))
     report = calibrate(upright.frames, MANIFEST, earlier)
@@ -329,7 +332,7 @@ class Some(Sequence[Image]):
         return (self[k] for k in range(len(self)))
 
 
-def test_frames_that_cannot_be_used_are_counted(tilted: simulate.Simulated) -> None:
+def test_frames_that_cannot_be_used_are_counted(tilted: simulate.SimulatedSession) -> None:
     good = list(tilted.frames.images)
     blank = np.full((120, 188), 200, np.uint8)
     noise = np.random.default_rng(0).integers(0, 256, (120, 188), np.uint8)
@@ -345,7 +348,7 @@ def test_frames_that_cannot_be_used_are_counted(tilted: simulate.Simulated) -> N
     assert (report.seen, report.located, report.used) == (30, 24, 24)
 
 
-def test_too_few_frames(tilted: simulate.Simulated) -> None:
+def test_too_few_frames(tilted: simulate.SimulatedSession) -> None:
     blank = [np.full((120, 188), 200, np.uint8)] * 6
     with pytest.raises(DegenerateError, match="none of 6 frames show the pattern") as error:
         calibrate(as_frames(blank), MANIFEST)
@@ -356,7 +359,7 @@ def test_too_few_frames(tilted: simulate.Simulated) -> None:
     assert calibrate(as_frames(tilted.frames.images[:5]), MANIFEST).used == 5
 
 
-def test_frames_of_another_sheet(tilted: simulate.Simulated) -> None:
+def test_frames_of_another_sheet(tilted: simulate.SimulatedSession) -> None:
     other = replace(MANIFEST.sheets[0], origin=(1000, 1000))
     with pytest.raises(DegenerateError, match=r"25 of 25 frames .* off all sheets") as error:
         calibrate(tilted.frames, replace(MANIFEST, sheets=(other,)))
@@ -366,13 +369,13 @@ def test_frames_of_another_sheet(tilted: simulate.Simulated) -> None:
 
 
 @pytest.mark.parametrize("focal_px", [0.0, -5.0, math.inf, math.nan])
-def test_an_impossible_focal_length(tilted: simulate.Simulated, focal_px: float) -> None:
+def test_an_impossible_focal_length(tilted: simulate.SimulatedSession, focal_px: float) -> None:
     with pytest.raises(InputError, match="focal length"):
         calibrate(tilted.frames, MANIFEST, CalibrateOptions(focal_px=focal_px))
 
 
 def test_a_lens_that_no_camera_has_is_refused(
-    tilted: simulate.Simulated, monkeypatch: pytest.MonkeyPatch
+    tilted: simulate.SimulatedSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is returned that `locatk solve` could not take as a camera."""
     monkeypatch.setattr(calibration, "LARGEST_BEND", 0.01)
@@ -381,7 +384,7 @@ def test_a_lens_that_no_camera_has_is_refused(
 
 
 def test_of_long_sessions_some_frames_are_taken(
-    tilted: simulate.Simulated, monkeypatch: pytest.MonkeyPatch
+    tilted: simulate.SimulatedSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (camera_views, calibration):
         monkeypatch.setattr(module, "MOST_FRAMES", 8)
@@ -436,6 +439,6 @@ def test_the_few_frames_that_are_tilted_or_turned_are_among_those_taken(
     assert spread(SIZE, found[:15], 120) == found[:15]
 
 
-def test_the_same_frames_give_the_same_camera(upright: simulate.Simulated) -> None:
+def test_the_same_frames_give_the_same_camera(upright: simulate.SimulatedSession) -> None:
     first, second = (calibrate(upright.frames, MANIFEST).camera for _ in range(2))
     assert first == second

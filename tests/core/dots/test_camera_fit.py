@@ -10,8 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots import camera_models as models
-from locatk.core.dots.camera_fit import Fit, Views, fit_flat, fit_homographies, fit_poses
+from locatk.core.dots.calibration import camera_models as models
+from locatk.core.dots.calibration.camera_fit import (
+    Fit,
+    Views,
+    fit_flat,
+    fit_homographies,
+    fit_poses,
+)
 from locatk.core.geometry import rotation_exp
 
 Array = NDArray[np.float64]

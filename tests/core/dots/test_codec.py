@@ -13,8 +13,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from locatk.core.dots import sequences
-from locatk.core.dots.codec import LETTERS, PERIOD, RANGE, Codec, check_window, codec
+from locatk.core.dots.codec import (
+    MAIN_SEQUENCE_LENGTH,
+    SECTION_LENGTH,
+    SYMBOL_LETTERS,
+    Codec,
+    check_window,
+    codec,
+    sequences,
+)
 from locatk.core.errors import InputError
 
 NAMES = ("anoto", "libdots", "microdots")
@@ -26,7 +33,7 @@ FOURTH = {
 }
 
 names = st.sampled_from(NAMES)
-places = st.integers(0, RANGE - 100)
+places = st.integers(0, SECTION_LENGTH - 100)
 sections = st.tuples(st.integers(0, 62), st.integers(0, 62))
 
 
@@ -93,14 +100,14 @@ def slow_letters(
 
 
 def letters(symbols: np.ndarray[Any, Any]) -> list[str]:
-    return ["".join(LETTERS[s] for s in row) for row in symbols]
+    return ["".join(SYMBOL_LETTERS[s] for s in row) for row in symbols]
 
 
 # --- sequences
 
 
 def test_main_sequence_is_quasi_de_bruijn() -> None:
-    assert len(sequences.MAIN) == PERIOD == 63
+    assert len(sequences.MAIN) == MAIN_SEQUENCE_LENGTH == 63
     assert len(set(cyclic(sequences.MAIN, 6))) == 63
     assert missing(sequences.MAIN, 6) == {"111111"}
 
@@ -154,7 +161,7 @@ def test_lengths_are_coprime_and_make_the_range() -> None:
     for name in NAMES:
         lengths = [len(digits) for digits in codec(name).digits]
         assert all(gcd(a, b) == 1 for a, b in combinations(lengths, 2))
-        assert int(np.prod(lengths)) == RANGE == 410_815_348
+        assert int(np.prod(lengths)) == SECTION_LENGTH == 410_815_348
 
 
 def test_every_shift_has_its_own_digits() -> None:
@@ -205,9 +212,9 @@ def test_published_digits(data: Path) -> None:
     basis = published["decomposition"]
     assert basis["d_range"] == [5, 58]
     assert tuple(basis["bases"]) == sequences.BASES
-    assert basis["crt_product"] == RANGE
+    assert basis["crt_product"] == SECTION_LENGTH
     for word, bits in published["bits"]["glyph_to_(column_bit,row_bit)"].items():
-        assert bits[0] + 2 * bits[1] == LETTERS.index(word[0])
+        assert bits[0] + 2 * bits[1] == SYMBOL_LETTERS.index(word[0])
     truth = published["real_image_truth"]
     assert truth["section_(u,v)_if_A4_libdots"] == [24, 32]
     pages = published["anoto_page_truth"]["ronyeh/papertoolkit data/pattern/default/N.pattern"]
@@ -225,7 +232,7 @@ def test_section_of_a_sheet_that_starts_at_zero_by_itself() -> None:
     assert (u, v) == (24, 32)
     sheet = libdots.symbols((0, 3000), (30, 30), (u, v))
     assert letters(sheet[:1, :])[0] == "".join(
-        LETTERS[c + 2 * r]
+        SYMBOL_LETTERS[c + 2 * r]
         for i in range(30)
         for c in [int(sequences.MAIN[shifts_before("libdots", i) % 63])]
         for r in [int(sequences.MAIN[i])]
@@ -245,7 +252,7 @@ def test_first_bits_are_those_of_py_microdots() -> None:
 
 @given(names, places, places, st.integers(1, 20), st.integers(1, 20), sections)
 @example("anoto", 0, 0, 9, 9, (0, 0))
-@example("libdots", RANGE - 100, RANGE - 100, 100, 100, (62, 62))
+@example("libdots", SECTION_LENGTH - 100, SECTION_LENGTH - 100, 100, 100, (62, 62))
 @settings(max_examples=60, deadline=None)
 def test_closed_form_is_the_slow_road(
     name: str, x: int, y: int, columns: int, rows: int, section: tuple[int, int]
@@ -266,7 +273,7 @@ def test_phases_are_sums_one_by_one(name: str) -> None:
     np.testing.assert_array_equal(codec(name).phases(np.arange(count), 7), expected)
 
 
-@given(names, st.integers(0, RANGE - 400), st.integers(1, 300), st.integers(0, 62))
+@given(names, st.integers(0, SECTION_LENGTH - 400), st.integers(1, 300), st.integers(0, 62))
 @settings(max_examples=60, deadline=None)
 def test_phases_grow_by_the_shifts_between(name: str, start: int, count: int, section: int) -> None:
     one = codec(name)
@@ -276,8 +283,8 @@ def test_phases_grow_by_the_shifts_between(name: str, start: int, count: int, se
     assert (last - first) % 63 == sum(between) % 63
 
 
-@given(names, st.lists(st.integers(0, RANGE - 1), min_size=1, max_size=5))
-@example("anoto", [0, 1, 235, 236, 240, 241, RANGE - 1])
+@given(names, st.lists(st.integers(0, SECTION_LENGTH - 1), min_size=1, max_size=5))
+@example("anoto", [0, 1, 235, 236, 240, 241, SECTION_LENGTH - 1])
 def test_place_of_residues(name: str, chosen: list[int]) -> None:
     one = codec(name)
     residues = [[p % len(digits) for digits in one.digits] for p in chosen]
@@ -321,10 +328,10 @@ def test_columns_hold_the_main_sequence_and_shift_by_5_to_58(name: str) -> None:
     ("origin", "size", "section", "says"),
     [
         ((-1, 0), (8, 8), (0, 0), "origin x -1"),
-        ((0, RANGE), (8, 8), (0, 0), f"origin y {RANGE}"),
+        ((0, SECTION_LENGTH), (8, 8), (0, 0), f"origin y {SECTION_LENGTH}"),
         ((10**12, 0), (8, 8), (0, 0), "origin x"),
-        ((RANGE - 7, 0), (8, 8), (0, 0), "border of the section"),
-        ((0, RANGE - 1), (8, 2), (0, 0), "border of the section"),
+        ((SECTION_LENGTH - 7, 0), (8, 8), (0, 0), "border of the section"),
+        ((0, SECTION_LENGTH - 1), (8, 2), (0, 0), "border of the section"),
         ((0, 0), (0, 8), (0, 0), "0 x 8 dots"),
         ((0, 0), (8, 8), (63, 0), "section 63,0"),
         ((0, 0), (8, 8), (0, -1), "section 0,-1"),
@@ -340,7 +347,7 @@ def test_windows_that_no_section_holds_are_refused(
 
 
 def test_the_last_window_of_a_section_is_its_last() -> None:
-    assert codec("anoto").symbols((RANGE - 8, RANGE - 8), (8, 8)).shape == (8, 8)
+    assert codec("anoto").symbols((SECTION_LENGTH - 8, SECTION_LENGTH - 8), (8, 8)).shape == (8, 8)
 
 
 def test_codecs_by_name() -> None:

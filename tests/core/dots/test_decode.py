@@ -11,9 +11,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from locatk.core.dots import sequences
-from locatk.core.dots.codec import MAIN, PERIOD, RANGE, Codec, codec
-from locatk.core.dots.decode import THRESHOLD, Decoded, decode
+from locatk.core.dots.codec import (
+    MAIN_SEQUENCE,
+    MAIN_SEQUENCE_LENGTH,
+    SECTION_LENGTH,
+    Codec,
+    codec,
+    sequences,
+)
+from locatk.core.dots.identification.decoding import THRESHOLD, Decoded, decode
 
 CODECS = ("anoto", "libdots", "microdots")
 UP, LEFT, RIGHT, DOWN = range(4)
@@ -38,15 +44,21 @@ class Windows:
         y: Any = None,
     ) -> None:
         one = codec(name)
-        self.x = rng.integers(0, RANGE - columns, n) if x is None else np.broadcast_to(x, n)
-        self.y = rng.integers(0, RANGE - rows, n) if y is None else np.broadcast_to(y, n)
-        self.section = rng.integers(0, PERIOD, (n, 2))
+        self.x = (
+            rng.integers(0, SECTION_LENGTH - columns, n) if x is None else np.broadcast_to(x, n)
+        )
+        self.y = rng.integers(0, SECTION_LENGTH - rows, n) if y is None else np.broadcast_to(y, n)
+        self.section = rng.integers(0, MAIN_SEQUENCE_LENGTH, (n, 2))
         # One by one is slow; that this is what Codec.symbols gives is tested below.
         across, down = np.arange(columns), np.arange(rows)
         column = one.phases(self.x[:, None] + across) + self.section[:, :1]
         row = one.phases(self.y[:, None] + down) + self.section[:, 1:]
-        column_bit = MAIN[(column[:, None] + (self.y[:, None] + down)[..., None]) % PERIOD]
-        row_bit = MAIN[(row[..., None] + (self.x[:, None] + across)[:, None]) % PERIOD]
+        column_bit = MAIN_SEQUENCE[
+            (column[:, None] + (self.y[:, None] + down)[..., None]) % MAIN_SEQUENCE_LENGTH
+        ]
+        row_bit = MAIN_SEQUENCE[
+            (row[..., None] + (self.x[:, None] + across)[:, None]) % MAIN_SEQUENCE_LENGTH
+        ]
         self.symbols = (column_bit + 2 * row_bit).astype(np.int64)
         self.turn = np.zeros(n, np.int64)
 
@@ -141,15 +153,15 @@ def test_windows_that_are_not_square(size: tuple[int, int], quarters: int) -> No
 @settings(max_examples=60, deadline=None)
 @given(
     name=st.sampled_from(CODECS),
-    x=st.integers(0, RANGE - 30),
-    y=st.integers(0, RANGE - 30),
+    x=st.integers(0, SECTION_LENGTH - 30),
+    y=st.integers(0, SECTION_LENGTH - 30),
     u=st.integers(0, 62),
     v=st.integers(0, 62),
     side=st.integers(8, 30),
     quarters=st.integers(0, 3),
 )
 @example("anoto", 0, 0, 0, 0, 8, 0)
-@example("anoto", RANGE - 30, RANGE - 30, 62, 62, 30, 2)
+@example("anoto", SECTION_LENGTH - 30, SECTION_LENGTH - 30, 62, 62, 30, 2)
 def test_any_window(name: str, x: int, y: int, u: int, v: int, side: int, quarters: int) -> None:
     symbols = np.rot90(codec(name).symbols((x, y), (side, side), (u, v)), quarters)
     for _ in range(quarters):
@@ -161,7 +173,7 @@ def test_any_window(name: str, x: int, y: int, u: int, v: int, side: int, quarte
 
 
 def test_windows_at_the_rim_of_the_range() -> None:
-    edge = [0, 1, RANGE - 13, RANGE - 12]
+    edge = [0, 1, SECTION_LENGTH - 13, SECTION_LENGTH - 12]
     for x in edge:
         for y in edge:
             windows = Windows("anoto", np.random.default_rng(3), 4, 12, 12, x, y)
@@ -330,7 +342,7 @@ def test_what_libdots_repeats_is_not_told() -> None:
     assert len(places) == 2 * (6 + 1)  # facts/dots.md 2.1
     rng = np.random.default_rng(12)
     for place, order in places:
-        x = rng.integers(0, RANGE // 241 - 1, 10) * 241 + place
+        x = rng.integers(0, SECTION_LENGTH // 241 - 1, 10) * 241 + place
         windows = Windows("libdots", rng, 10, order + 1, 14, x)
         assert fate(windows, soft(windows.symbols), one) == (0, 0, 10), (place, order)
     longer = Windows("libdots", rng, 10, 9, 14, 241 * 1000 + places[0][0])
@@ -394,7 +406,7 @@ def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: int) -> None:
     rng = np.random.default_rng(16)
-    n, start = 60, RANGE - side + beyond
+    n, start = 60, SECTION_LENGTH - side + beyond
     sizes = [(side - beyond, side), (beyond, side)]
     parts = [
         Windows("anoto", rng, n, *size, at).symbols

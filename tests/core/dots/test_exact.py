@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from locatk.core.dots.codec import DOWN, LEFT, RANGE, RIGHT, UP, codec
-from locatk.core.dots.exact import Exact, decode_exact, digits_of, turn
+from locatk.core.dots.codec import DOWN, LEFT, RIGHT, SECTION_LENGTH, UP, codec
+from locatk.core.dots.codec.lookup import Exact, decode_exact, digits_of, turn
 from locatk.core.errors import InputError
 
 Symbols = NDArray[np.uint8]
@@ -24,7 +24,7 @@ def draw(
 ) -> tuple[Symbols, NDArray[np.int64], NDArray[np.int64]]:
     """Windows (n, rows, columns) anywhere; where they lie (n, 2) and their sections (n, 2)."""
     rng = np.random.default_rng(seed)
-    at = rng.integers(0, RANGE - np.array(size) + 1, (count, 2))
+    at = rng.integers(0, SECTION_LENGTH - np.array(size) + 1, (count, 2))
     sections = rng.integers(0, 63, (count, 2))
     one = codec(name)
     windows = [
@@ -90,7 +90,7 @@ def test_any_larger_window(name: str, size: tuple[int, int], seed: int, rotation
 @pytest.mark.parametrize("name", NAMES)
 def test_corners_of_the_range(name: str) -> None:
     one = codec(name)
-    at = np.array([(x, y) for x in (0, RANGE - 8) for y in (0, RANGE - 8)])
+    at = np.array([(x, y) for x in (0, SECTION_LENGTH - 8) for y in (0, SECTION_LENGTH - 8)])
     windows = np.stack([one.symbols((x, y), (8, 8), (62, 1)) for x, y in at.tolist()])
     agrees(decode_exact(windows, one), slice(None), at, np.full((4, 2), (62, 1)), 0)
 
@@ -188,12 +188,12 @@ def test_what_is_read_is_what_is_there() -> None:
 def test_window_across_the_border_is_not_read(axis: int) -> None:
     one = codec("anoto")
     at, size = [1000, 1000], [8, 8]
-    at[axis], size[axis] = RANGE - 12, 12
+    at[axis], size[axis] = SECTION_LENGTH - 12, 12
     before = one.symbols((at[0], at[1]), (size[0], size[1]))
     # The section whose first lines go on as those before the border end: all digits begin
     # anew there, so that the windows across it are consistent, and yet no codec holds them.
-    on = [RANGE % 63, RANGE % 63]
-    on[axis] = int(one.phases(RANGE - 1) + one.differences(RANGE - 1)) % 63
+    on = [SECTION_LENGTH % 63, SECTION_LENGTH % 63]
+    on[axis] = int(one.phases(SECTION_LENGTH - 1) + one.differences(SECTION_LENGTH - 1)) % 63
     at[axis] = 0
     after = one.symbols((at[0], at[1]), (size[0], size[1]), (on[0], on[1]))
     both = np.concatenate([before, after], axis=1 - axis)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots import grid
-from locatk.core.dots.grid import Lattices, fit_lattices
+from locatk.core.dots.detection import lattice as grid
+from locatk.core.dots.detection.lattice import Lattices, fit_lattices
 
 Array = NDArray[np.float64]
 

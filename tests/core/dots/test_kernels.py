@@ -11,9 +11,15 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core import kernels
-from locatk.core.dots import blobs, decode, grid, locate, pose, reading, softbits
-from locatk.core.dots.codec import RANGE, codec
-from locatk.core.dots.exact import turn
+from locatk.core.dots.codec import SECTION_LENGTH, codec
+from locatk.core.dots.codec.lookup import turn
+from locatk.core.dots.detection import blobs
+from locatk.core.dots.detection import lattice as grid
+from locatk.core.dots.identification import decoding as decode
+from locatk.core.dots.identification import phase_voting as reading
+from locatk.core.dots.identification import soft_bits as softbits
+from locatk.core.dots.localization import frames as locate
+from locatk.core.dots.localization import pose
 
 needs_kernels = pytest.mark.skipif(
     kernels.kernels is None, reason="the compiled kernels were not built (no C compiler)"
@@ -33,7 +39,7 @@ def drawn(seed: int, n: int = 6) -> NDArray[np.uint8]:
         light = 190 + 30 * np.sin(x / 90 + rng.uniform(0, 6)) - 0.2 * y
         image = light.copy()
         places = np.stack(np.meshgrid(np.arange(-14, 15), np.arange(-14, 15)), -1).reshape(-1, 2)
-        symbols = ANOTO.symbols((int(rng.integers(RANGE - 29)), 7), (29, 29)).reshape(-1)
+        symbols = ANOTO.symbols((int(rng.integers(SECTION_LENGTH - 29)), 7), (29, 29)).reshape(-1)
         offsets = np.array([[0, -1], [-1, 0], [1, 0], [0, 1]])[symbols] / 6
         turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         dots = (places + offsets + rng.uniform(-0.5, 0.5, 2)) @ turned.T * pitch
@@ -135,7 +141,7 @@ def test_readings_are_the_same(name: str, side: int, missing: float, wrong: floa
     code = codec(name)
     windows = []
     for _ in range(60):
-        x, y = (int(v) for v in rng.integers(0, RANGE - side, 2))
+        x, y = (int(v) for v in rng.integers(0, SECTION_LENGTH - side, 2))
         u, v = (int(v) for v in rng.integers(0, 63, 2))
         windows.append(turn(code.symbols((x, y), (side, side), (u, v)), int(rng.integers(4))))
     symbols = np.array(windows)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.dots.codec import codec
-from locatk.core.dots.layout import (
+from locatk.core.dots.drawing.layout import (
     DPIS,
     PAPERS,
     Layout,
@@ -24,7 +24,7 @@ from locatk.core.dots.layout import (
     snap,
     snapped,
 )
-from locatk.core.dots.tiles import seams, tiling
+from locatk.core.dots.drawing.tiles import seams, tiling
 from locatk.core.errors import InputError
 
 PAGES = st.tuples(st.floats(60, 3000), st.floats(60, 3000))

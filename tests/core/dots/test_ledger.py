@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.dots.codec import RANGE
-from locatk.core.dots.layout import lay_out, snap
-from locatk.core.dots.ledger import GAP, Area, allocate, check_name, free_origins, plan
-from locatk.core.dots.tiles import tiling
+from locatk.core.dots.codec import SECTION_LENGTH
+from locatk.core.dots.design.ledger import GAP, Area, allocate, check_name, free_origins, plan
+from locatk.core.dots.drawing.layout import lay_out, snap
+from locatk.core.dots.drawing.tiles import tiling
 from locatk.core.errors import InputError
 
 SIDES = st.tuples(st.integers(8, 3000), st.integers(8, 3000))
-HALF = RANGE // 2
-LONG = st.tuples(st.integers(HALF, RANGE), st.integers(8, 3000))
+HALF = SECTION_LENGTH // 2
+LONG = st.tuples(st.integers(HALF, SECTION_LENGTH), st.integers(8, 3000))
 
 
 def area(name: str, x: int, y: int, columns: int, rows: int, u: int = 0, v: int = 0) -> Area:
@@ -41,8 +41,8 @@ def test_new_areas_are_free(
     new = allocate(old, wanted, prefixes=["A4"] * len(wanted), codec="anoto")
     assert [item.size for item in new] == wanted
     for item in new:
-        assert item.origin[0] + item.size[0] <= RANGE
-        assert item.origin[1] + item.size[1] <= RANGE
+        assert item.origin[0] + item.size[0] <= SECTION_LENGTH
+        assert item.origin[1] + item.size[1] <= SECTION_LENGTH
     for first, second in itertools.combinations(new, 2):
         assert apart(first, second, GAP)
         assert not first.meets(second)
@@ -89,8 +89,8 @@ def test_other_codecs_are_not_apart() -> None:
 
 
 def test_a_full_section_is_said() -> None:
-    held = [area("a", 0, 0, RANGE, RANGE - 200)]
-    assert free_origins(held, (8, 200 - GAP)) == [(0, RANGE - 200 + GAP)]
+    held = [area("a", 0, 0, SECTION_LENGTH, SECTION_LENGTH - 200)]
+    assert free_origins(held, (8, 200 - GAP)) == [(0, SECTION_LENGTH - 200 + GAP)]
     with pytest.raises(InputError, match="no free area"):
         free_origins(held, (8, 200 - GAP + 1))
 
@@ -116,7 +116,7 @@ def test_areas_by_hand() -> None:
     )
     assert [item.origin for item in several] == [(5, 7), (55 + GAP, 7), (125 + 2 * GAP, 7)]
     with pytest.raises(InputError, match="cross the border"):
-        ask(RANGE - 49, 0)
+        ask(SECTION_LENGTH - 49, 0)
 
 
 def test_names_are_used_once() -> None:

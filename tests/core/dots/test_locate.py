@@ -18,11 +18,11 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.codec import PERIOD, RANGE, codec
-from locatk.core.dots.grid import Lattices
-from locatk.core.dots.locate import locate, sightings
-from locatk.core.dots.located import Located
-from locatk.core.dots.softbits import soft_bits
+from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, codec
+from locatk.core.dots.detection.lattice import Lattices
+from locatk.core.dots.identification.soft_bits import soft_bits
+from locatk.core.dots.localization.frames import locate, sightings
+from locatk.core.dots.localization.located import Located
 from locatk.core.errors import InputError
 
 Array = NDArray[np.float64]
@@ -72,9 +72,9 @@ def shots_of(shot: Shots, count: int, seed: int, **how: Any) -> list[Any]:
     rng = np.random.default_rng(seed)
     return [
         shot(
-            at=tuple(rng.uniform(100, RANGE - 100, 2)),
+            at=tuple(rng.uniform(100, SECTION_LENGTH - 100, 2)),
             heading=rng.uniform(-math.pi, math.pi),
-            section=tuple(rng.integers(0, PERIOD, 2).tolist()),
+            section=tuple(rng.integers(0, MAIN_SEQUENCE_LENGTH, 2).tolist()),
             towards=rng.uniform(0, math.tau),
             seed=seed * 1000 + k,
             **{name: value(rng) if callable(value) else value for name, value in how.items()},
@@ -332,7 +332,7 @@ def test_the_first_places_of_all(shot: Shots, at: tuple[float, float]) -> None:
 
 def test_the_last_places_of_all(shot: Shots) -> None:
     (one,) = shots_of(shot, 1, 12)
-    last = shot(**{**vars_of(one), "at": (RANGE - 20.0, RANGE - 20.0)})
+    last = shot(**{**vars_of(one), "at": (SECTION_LENGTH - 20.0, SECTION_LENGTH - 20.0)})
     assert judge(locate(last.take()[None], codec("anoto")), [last]).fate == {"right": 1}
 
 
@@ -342,10 +342,10 @@ def test_a_border_of_sections_is_rejected_and_said(shot: Shots, beyond: int) -> 
     rng = np.random.default_rng(13)
     images = []
     for heading in rng.uniform(-math.pi, math.pi, 4).tolist():
-        y = int(rng.integers(1000, RANGE - 1000))
-        one = shot(at=(RANGE - 0.5 + beyond, y + 0.0), heading=heading)
-        count, first = 2 * one.reach + 1, RANGE - one.corner[0]
-        u, v = (tuple(rng.integers(0, PERIOD, 2).tolist()) for _ in range(2))
+        y = int(rng.integers(1000, SECTION_LENGTH - 1000))
+        one = shot(at=(SECTION_LENGTH - 0.5 + beyond, y + 0.0), heading=heading)
+        count, first = 2 * one.reach + 1, SECTION_LENGTH - one.corner[0]
+        u, v = (tuple(rng.integers(0, MAIN_SEQUENCE_LENGTH, 2).tolist()) for _ in range(2))
         symbols = np.concatenate(
             [
                 codec("anoto").symbols((one.corner[0], one.corner[1]), (first, count), u),

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots import paper_grid
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.codec import MAIN, RANGE, codec
-from locatk.core.dots.exact import turn
-from locatk.core.dots.paper import (
+from locatk.core.dots.codec import MAIN_SEQUENCE, SECTION_LENGTH, codec
+from locatk.core.dots.codec.lookup import turn
+from locatk.core.dots.published import grid as paper_grid
+from locatk.core.dots.published.localization import (
     PaperPose,
     best_window,
     correlate,
@@ -93,7 +93,7 @@ def study(count: int, seed: int, **how: Any) -> tuple[Counter[str], list[float],
     fate: Counter[str] = Counter()
     off, turn_off = [], []
     for k in range(count):
-        x, y = rng.uniform(100, RANGE - 100, 2)
+        x, y = rng.uniform(100, SECTION_LENGTH - 100, 2)
         heading, (u, v) = rng.uniform(-math.pi, math.pi), rng.integers(0, 63, 2).tolist()
         frame = photograph((x, y), heading, section=(u, v), seed=k, **how)
         pose = locate_paper(frame, codec("anoto"))
@@ -324,7 +324,7 @@ def soft(symbols: Image) -> Array:
 def test_orientation_by_vote() -> None:
     rng = np.random.default_rng(6)
     for _ in range(50):
-        x, y = rng.integers(0, RANGE - 8, 2).tolist()
+        x, y = rng.integers(0, SECTION_LENGTH - 8, 2).tolist()
         symbols = codec("anoto").symbols((x, y), (8, 8))
         for quarters in range(4):
             window = soft(turn(symbols, quarters))
@@ -337,7 +337,7 @@ def test_orientation_by_vote() -> None:
 def test_correlation_after_one_flip() -> None:
     # II-B.7: 36 % of the places stay right (192 of 504 when the first of equals counts);
     # where the flipped bit has no weight, all.
-    strings = MAIN[np.add.outer(np.arange(63), np.arange(8)) % 63] * 2.0 - 1.0
+    strings = MAIN_SEQUENCE[np.add.outer(np.arange(63), np.arange(8)) % 63] * 2.0 - 1.0
     right = weighted = 0
     for bit in range(8):
         lines, weights = strings.copy(), np.ones((63, 8))
@@ -357,11 +357,11 @@ def test_correlation_after_one_flip() -> None:
 def test_place_of_eight_phases(name: str) -> None:
     rng = np.random.default_rng(7)
     one = codec(name)
-    for x in [0, RANGE - 8, *rng.integers(0, RANGE - 8, 100).tolist()]:
+    for x in [0, SECTION_LENGTH - 8, *rng.integers(0, SECTION_LENGTH - 8, 100).tolist()]:
         phases = one.phases(np.arange(x, x + 8), 17)
         assert find_place(phases, one) == x
-    across = one.phases(RANGE - 4) + np.cumsum(
-        np.r_[0, one.differences((RANGE - 4 + np.arange(7)) % RANGE)]
+    across = one.phases(SECTION_LENGTH - 4) + np.cumsum(
+        np.r_[0, one.differences((SECTION_LENGTH - 4 + np.arange(7)) % SECTION_LENGTH)]
     )
     assert find_place(across % 63, one) is None
     assert find_place(np.zeros(8, np.int64), one) is None

@@ -10,9 +10,9 @@ import pypdfium2
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots.printer import PrinterReport, calibrate, recommend
-from locatk.core.dots.printer_fields import FieldScore
-from locatk.core.dots.testsheet import PrinterSheet, printer_sheet
+from locatk.core.dots.calibration.printed_fields import FieldScore
+from locatk.core.dots.calibration.printer import PrinterReport, calibrate, recommend
+from locatk.core.dots.drawing.test_sheet import PrinterSheet, printer_sheet
 from locatk.core.errors import DegenerateError, InputError
 from locatk.formats.pdf.testsheet import render
 

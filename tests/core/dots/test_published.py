@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.locate import locate
+from locatk.core.dots.localization.frames import locate
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.solver import SolveOptions, solve
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots import simulate
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import DOWN, LEFT, RIGHT, UP, codec
 from locatk.core.dots.sheet import Manifest, Sheet
-from locatk.core.dots.simulate import METRES_PER_PX, SimulationOptions
-from locatk.core.dots.simulate_courses import Course, course
-from locatk.core.dots.simulate_decoys import KINDS, decoys
-from locatk.core.dots.simulate_optics import Exposer, Optics, Stand, view
+from locatk.core.dots.simulation import session as simulate
+from locatk.core.dots.simulation.decoys import KINDS, decoys
+from locatk.core.dots.simulation.optics import Exposer, Optics, Stand, view
+from locatk.core.dots.simulation.paths import Course, course
+from locatk.core.dots.simulation.session import METRES_PER_PX, SimulationOptions
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.floor import ALPHABETS, HOLE, STEPS, WINDOWS, Cell, FloorMap
 from locatk.core.landmarks.landmark import PATTERNS, code_of, pattern, rotated
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, STEPS, WINDOWS, Cell, FloorMap
 
 LETTERS = {
     "6": [code_of(letters) for letters in PATTERNS],

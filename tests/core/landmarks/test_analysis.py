@@ -10,12 +10,17 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks import advice
-from locatk.core.landmarks.analysis import Analysis, analyse, check_geometry
-from locatk.core.landmarks.bars import basis, landmark_field
+from locatk.core.landmarks.design import advice
+from locatk.core.landmarks.design.analysis import Analysis, analyse, check_geometry
+from locatk.core.landmarks.design.territory import (
+    contour,
+    field_pitch,
+    largest_field,
+    neighbour_field,
+)
+from locatk.core.landmarks.design.valleys import crossing, ring, valid_heights, valleys
+from locatk.core.landmarks.field import basis, landmark_field
 from locatk.core.landmarks.landmark import PATTERNS, Geometry, code_of, signs
-from locatk.core.landmarks.territory import contour, field_pitch, largest_field, neighbour_field
-from locatk.core.landmarks.valleys import crossing, ring, valid_heights, valleys
 
 ONE = replace(Geometry(), remanence_t=1.0, threshold_t=2.73e-3)
 """The default in the units of facts 2.2 and 2.3."""

@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.kernels import kernels
-from locatk.core.landmarks import bars
-from locatk.core.landmarks.bars import basis, basis_gradient, landmark_field
+from locatk.core.landmarks import field as bars
+from locatk.core.landmarks.field import basis, basis_gradient, landmark_field
 from locatk.core.landmarks.landmark import Geometry, signs
 
 GEOMETRIES = (
@@ -214,7 +214,7 @@ def test_without_the_compiled_twin_all_is_the_same() -> None:
     code = (
         "import numpy as np, sys\n"
         "from locatk.core.kernels import kernels\n"
-        "from locatk.core.landmarks.bars import basis_gradient\n"
+        "from locatk.core.landmarks.field import basis_gradient\n"
         "from locatk.core.landmarks.landmark import Geometry\n"
         "assert kernels is None\n"
         "at = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 3)\n"

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.bounds import readings_bound, refuse, square_bound
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.proof import prove
-from locatk.core.landmarks.windows import ALPHABET_CODES
+from locatk.core.landmarks.design.bounds import readings_bound, refuse, square_bound
+from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.map.windows import ALPHABET_CODES
 
 
 @pytest.mark.slow

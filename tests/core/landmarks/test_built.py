@@ -5,21 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from locatk.core.landmarks import globalize, neighbours
-from locatk.core.landmarks.built import laid_codes
-from locatk.core.landmarks.floor import HOLE, AsBuilt, FloorMap, laid_mark
+from locatk.core.landmarks.detection import neighbours
+from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
+from locatk.core.landmarks.detection.trace import Drift, Trace, sensor_places
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import code_of, rotated, signs
-from locatk.core.landmarks.sighting import Hypothesis, Sighting
-from locatk.core.landmarks.simulate_floor import floor_field, lay
-from locatk.core.landmarks.simulate_options import NONE, Faults
-from locatk.core.landmarks.trace import Drift, Trace, sensor_places
+from locatk.core.landmarks.localization import cell_filter as globalize
+from locatk.core.landmarks.map.as_built import laid_codes
+from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap, laid_mark
+from locatk.core.landmarks.simulation.floor import floor_field, lay
+from locatk.core.landmarks.simulation.options import NONE, Faults
 
 CODES = np.array([[13, 5, 4, 12], [3, 7, 2, 15], [1, 11, HOLE, 8]])
 
 
-def built(strength: object, x_m: float = 0.0, y_m: float = 0.0, turn: float = 0.0) -> AsBuilt:
-    return AsBuilt(x_m, y_m, turn, np.array(strength, float), np.full(7, np.nan))
+def built(
+    strength: object, x_m: float = 0.0, y_m: float = 0.0, turn: float = 0.0
+) -> AsBuiltLandmark:
+    return AsBuiltLandmark(x_m, y_m, turn, np.array(strength, float), np.full(7, np.nan))
 
 
 def test_codes_are_the_designs_where_nothing_else_is_known() -> None:
@@ -71,7 +74,7 @@ def test_a_flipped_bar_that_is_known_does_not_count_against_a_place() -> None:
     flip = {(0, 1): built([1, -1, -1, -1])}  # designed NSNS
     tour = [((0, 0), 13), ((0, 1), code_of("NSSS")), ((0, 2), 4)]
     sightings = [
-        Sighting(
+        VisitHypotheses(
             "robot", n, n, n + 1, np.array([0.2 * n, 0.0, 0.0]),
             (Hypothesis(int(rotated(code, 0)), 1.0, np.zeros(3), 1e-6 * np.eye(3),
                         signs(code), np.full(4, 0.02)),),

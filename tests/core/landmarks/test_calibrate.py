@@ -13,13 +13,21 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks import gauge, simulate, smooth, solver
-from locatk.core.landmarks.calibrate import CalibrationReport, Drive, calibrate, read
-from locatk.core.landmarks.calibrate_marks import _flags, landmarks
-from locatk.core.landmarks.floor import Cell, FloorMap
+from locatk.core.landmarks import solver
+from locatk.core.landmarks.calibration import datum as gauge
+from locatk.core.landmarks.calibration.floor import CalibrationReport, Drive, calibrate, read
+from locatk.core.landmarks.calibration.marks import _flags, landmarks
 from locatk.core.landmarks.landmark import signs
-from locatk.core.landmarks.simulate import Errors, Faults, Simulated, SimulationOptions
-from locatk.core.landmarks.simulate_floor import Laid, lay
+from locatk.core.landmarks.localization import smoothing as smooth
+from locatk.core.landmarks.map.floor import Cell, FloorMap
+from locatk.core.landmarks.simulation import session as simulate
+from locatk.core.landmarks.simulation.floor import Laid, lay
+from locatk.core.landmarks.simulation.session import (
+    Errors,
+    Faults,
+    SimulatedSession,
+    SimulationOptions,
+)
 
 CODES = np.array([[13, 5, 4, 12], [3, 7, 2, 15], [1, 11, 6, 8]])
 FLOOR = FloorMap(CODES)
@@ -40,7 +48,7 @@ def drive(
     floor_seed: int = 5,
     faults: Faults = FAULTS,
     errors: Errors | None = None,
-) -> Simulated:
+) -> SimulatedSession:
     """A robot of its own on the floor of ``floor_seed``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "lay", lambda f, e, x, _: lay(f, e, x, floor_seed))
@@ -52,7 +60,7 @@ def drive(
         )
 
 
-def taken(session: Simulated, name: str = "run", floor: FloorMap = FLOOR) -> Drive:
+def taken(session: SimulatedSession, name: str = "run", floor: FloorMap = FLOOR) -> Drive:
     found = read(name, session.samples[0], session.odometry[0], floor)
     assert isinstance(found, Drive)
     return found

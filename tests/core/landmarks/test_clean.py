@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.clean import FULL, cleaned
 from locatk.core.landmarks.halls import HallSamples, HallSensors
+from locatk.core.landmarks.preprocessing import FULL, cleaned
 from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import DegenerateError, InputError
-from locatk.core.landmarks import search
-from locatk.core.landmarks.design import DesignOptions, design
-from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.design import search
+from locatk.core.landmarks.design.generation import DesignOptions, design
+from locatk.core.landmarks.design.proof import prove
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.proof import prove
-from locatk.core.landmarks.windows import ALPHABET_CODES, placements, ways
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.windows import ALPHABET_CODES, placements, ways
 
 MODES = [
     (5, 6, "6", "L", 0),

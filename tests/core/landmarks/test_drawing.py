@@ -10,8 +10,8 @@ import pytest
 
 from locatk.core.drawing import Circle, Line, Mark, Polygon, Text
 from locatk.core.errors import InputError
-from locatk.core.landmarks.bars import landmark_field
-from locatk.core.landmarks.drawing import (
+from locatk.core.landmarks.design.materials import bill, material, patterns
+from locatk.core.landmarks.drawing.landmark import (
     bar_outlines,
     card_mm,
     check,
@@ -19,11 +19,11 @@ from locatk.core.landmarks.drawing import (
     draw_symbol,
     reach_mm,
 )
-from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.drawing.plan import nice_scale
+from locatk.core.landmarks.drawing.templates import cells_by_code, cells_text
+from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import CODES, PATTERNS, Geometry, code_of, name, rotated
-from locatk.core.landmarks.materials import bill, material, patterns
-from locatk.core.landmarks.pack_plan import nice_scale
-from locatk.core.landmarks.pack_templates import cells_by_code, cells_text
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
 
 OTHER = Geometry(bar_length_m=0.02, bar_width_m=0.004, radius_m=0.0315, sensor_height_m=0.01)
 

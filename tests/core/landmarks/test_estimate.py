@@ -11,13 +11,19 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.bars import basis
-from locatk.core.landmarks.estimate import Explanation, _in_one_frame, explain, robot, stand
-from locatk.core.landmarks.fit import Priors
+from locatk.core.landmarks.detection.explanations import (
+    Explanation,
+    _in_one_frame,
+    explain,
+    robot,
+    stand,
+)
+from locatk.core.landmarks.detection.fit import Priors
+from locatk.core.landmarks.detection.trace import Trace
+from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
-from locatk.core.landmarks.simulate_options import NONE
-from locatk.core.landmarks.simulate_passes import Pass, passes
-from locatk.core.landmarks.trace import Trace
+from locatk.core.landmarks.simulation.options import NONE
+from locatk.core.landmarks.simulation.passes import Pass, passes
 from locatk.core.landmarks.visits import driven, find
 
 Array = NDArray[np.float64]

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from locatk.core.landmarks.fit import POSE, Fitted, Priors, Problem, descend
+from locatk.core.landmarks.detection.fit import POSE, Fitted, Priors, Problem, descend
+from locatk.core.landmarks.detection.trace import Drift, Trace, compose, corrections
 from locatk.core.landmarks.landmark import Geometry, signs
-from locatk.core.landmarks.simulate_floor import bar_fields
-from locatk.core.landmarks.simulate_passes import sensor_points
-from locatk.core.landmarks.trace import Drift, Trace, compose, corrections
+from locatk.core.landmarks.simulation.floor import bar_fields
+from locatk.core.landmarks.simulation.passes import sensor_points
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.floor import HOLE, STEPS, Cell, FloorMap
-from locatk.core.landmarks.globalize import BEYOND, PAD, Located, locate
+from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
+from locatk.core.landmarks.detection.trace import Drift
 from locatk.core.landmarks.landmark import CODES, rotated
-from locatk.core.landmarks.sighting import Hypothesis, Sighting
-from locatk.core.landmarks.trace import Drift
+from locatk.core.landmarks.localization.cell_filter import BEYOND, PAD, Located, locate
+from locatk.core.landmarks.map.floor import HOLE, STEPS, Cell, FloorMap
 
 Array = NDArray[np.float64]
 State = tuple[Cell, int]
@@ -53,7 +53,7 @@ def inside(floor: FloorMap, way: Sequence[State]) -> bool:
 
 def sightings(
     floor: FloorMap, way: Sequence[State], codes: Sequence[int], seed: int = 0
-) -> list[Sighting]:
+) -> list[VisitHypotheses]:
     """What a robot shows that goes that way and reads ``codes`` (as on the map's frame).
 
     It is some millimetres and degrees off the cells, and its odometry begins anywhere.
@@ -70,11 +70,11 @@ def sightings(
         own = Hypothesis(
             int(rotated(code, -quarters)), 1.0, off, np.eye(3) * 1e-7, np.ones(4), np.ones(4)
         )
-        out.append(Sighting("robot", number, 0, 1, told, (own,)))
+        out.append(VisitHypotheses("robot", number, 0, 1, told, (own,)))
     return out
 
 
-def found(floor: FloorMap, seen: Sequence[Sighting]) -> list[Located]:
+def found(floor: FloorMap, seen: Sequence[VisitHypotheses]) -> list[Located]:
     return locate(seen, floor, misread=MISREAD, drift=Drift())
 
 
@@ -221,7 +221,7 @@ def test_turned_frames_are_the_same_landmarks(published: FloorMap) -> None:
             np.ones(4),
             np.ones(4),
         )
-        turned.append(Sighting("robot", number, 0, 1, one.odometry, (own,)))
+        turned.append(VisitHypotheses("robot", number, 0, 1, one.odometry, (own,)))
     for one, other, number in zip(
         found(published, seen), found(published, turned), range(4), strict=True
     ):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.floor import HOLE, AsBuilt, FloorMap
-from locatk.core.landmarks.gridfit import built_poses, fit_grid, floor_of
 from locatk.core.landmarks.landmark import signs
+from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.grid_fit import built_poses, fit_grid, floor_of
 
 
 def names(count: int) -> list[str]:
@@ -89,7 +89,7 @@ def test_poses_are_as_built() -> None:
     floor = FloorMap(
         np.array([[5, HOLE], [7, 1]]),
         origin_m=(1.0, 2.0),
-        built={(1, 0): AsBuilt(0.003, -0.002, 0.1, signs(7), np.full(7, np.nan))},
+        built={(1, 0): AsBuiltLandmark(0.003, -0.002, 0.1, signs(7), np.full(7, np.nan))},
     )
     wanted = [(1, 2, 0), (1.003, 2.198, 0.1), (1.2, 2.2, 0)]
     np.testing.assert_allclose(built_poses(floor), wanted, atol=1e-15)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.bars import landmark_field
+from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import (
     CODES,
     PATTERN_OF,

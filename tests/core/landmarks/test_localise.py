@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.floor import STEPS, WINDOWS, Cell, FloorMap
+from locatk.core.landmarks.design.localization_steps import NEVER, localise, wanted_turns
 from locatk.core.landmarks.landmark import PATTERN_OF, rotated
-from locatk.core.landmarks.localise import NEVER, localise, wanted_turns
+from locatk.core.landmarks.map.floor import STEPS, WINDOWS, Cell, FloorMap
 
 TURNS = {
     "L": (0, 1, 0, -1),
@@ -23,7 +23,7 @@ TURNS = {
 
 
 class Robot:
-    """Drives as :mod:`locatk.core.landmarks.localise` says, and notes what it learns."""
+    """Drives as :mod:`~locatk.core.landmarks.design.localization_steps` says, and learns."""
 
     def __init__(self, floor: FloorMap, cell: Cell, heading: int) -> None:
         self.floor, self.cell, self.heading, self.phase = floor, cell, heading, 0

@@ -10,11 +10,11 @@ import pytest
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks import paper
+from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, code_of, name, rotated
-from locatk.core.landmarks.sighting import Sighting
-from locatk.core.landmarks.simulate import Pass, passes
+from locatk.core.landmarks.published import search as paper
+from locatk.core.landmarks.simulation.session import Pass, passes
 
 GEOMETRY = Geometry()
 
@@ -22,7 +22,7 @@ VALLEYS_ALONE = {"never_over_bars", "voltages_undetermined", "voltages_contradic
 """Codes of the warnings that the voltages did not amend the pose."""
 
 
-def off(run: Pass, seen: Sighting) -> np.ndarray | None:
+def off(run: Pass, seen: VisitHypotheses) -> np.ndarray | None:
     """Error (3,) of the best hypothesis; None where its code is not the landmark's.
 
     Where the robot stands about half way between two of the frames either may be taken.

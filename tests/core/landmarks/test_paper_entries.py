@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.paper_entries import crossings, entries
+from locatk.core.landmarks.published.entries import crossings, entries
 
 
 def straight(count: int, aside: float) -> np.ndarray:

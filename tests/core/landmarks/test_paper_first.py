@@ -12,7 +12,7 @@ from scipy.spatial import Delaunay
 
 from locatk.core.errors import DegenerateError
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.paper_first import (
+from locatk.core.landmarks.published.first_step import (
     RADII,
     circle_centres,
     first_centre,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from locatk.core.errors import DegenerateError
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import Geometry, signs
-from locatk.core.landmarks.paper_pose import compensate, turn_to_bars
+from locatk.core.landmarks.published.pose import compensate, turn_to_bars
 
 GEOMETRY = Geometry()
 

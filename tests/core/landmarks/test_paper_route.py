@@ -12,12 +12,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from locatk.core.errors import DegenerateError
-from locatk.core.landmarks import paper
-from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.landmark import PATTERNS, code_of, rotated
-from locatk.core.landmarks.paper_route import Landing, landing, locate, sequence
-from locatk.core.landmarks.sighting import Hypothesis, Sighting
-from locatk.core.landmarks.simulate import SimulationOptions, simulate
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.published import search as paper
+from locatk.core.landmarks.published.route import Landing, landing, locate, sequence
+from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
 
 
 @given(
@@ -139,11 +139,11 @@ def test_nothing_ambiguous_walls_and_holes() -> None:
         locate(floor, codes, (0,))
 
 
-def sighted(x: float, y: float, heading: float, pose: tuple, code: int) -> Sighting:
+def sighted(x: float, y: float, heading: float, pose: tuple, code: int) -> VisitHypotheses:
     """A landmark seen from (x, y, heading) of the odometry, the robot at ``pose`` in its frame."""
     unknown = np.full(4, np.nan)
     best = Hypothesis(code, 1.0, np.array(pose), np.full((3, 3), np.nan), unknown, unknown)
-    return Sighting("robot", 0, 0, 1, np.array([x, y, heading]), (best,))
+    return VisitHypotheses("robot", 0, 0, 1, np.array([x, y, heading]), (best,))
 
 
 def test_a_sequence_turns_codes_to_the_frames_of_arrival() -> None:

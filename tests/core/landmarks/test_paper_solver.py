@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.simulate import NONE, Simulated, SimulationOptions, simulate
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.simulation.session import (
+    NONE,
+    SimulatedSession,
+    SimulationOptions,
+    simulate,
+)
 from locatk.core.landmarks.solver import SolveOptions, solve
 from locatk.core.solution import Solution
 
@@ -24,12 +29,12 @@ def published(data: Path) -> FloorMap:
 
 
 @functools.cache
-def session(codes: bytes, seed: int) -> Simulated:
+def session(codes: bytes, seed: int) -> SimulatedSession:
     floor = FloorMap(np.frombuffer(codes, np.int64).reshape(24, 24))
     return simulate(floor, SimulationOptions(seed=seed, errors=NONE, rate_hz=100))
 
 
-def solved(floor: FloorMap, seed: int, told: FloorMap | None) -> tuple[Simulated, Solution]:
+def solved(floor: FloorMap, seed: int, told: FloorMap | None) -> tuple[SimulatedSession, Solution]:
     one = session(np.ascontiguousarray(floor.codes).tobytes(), seed)
     return one, solve(one.samples, told, PAPER, odometry=one.odometry)
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.paper_study import half_disc_interval, study
+from locatk.core.landmarks.published.study import half_disc_interval, study
 
 
 def outline_interval(x: float, y: float, heading: float) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.landmarks.landmark import Geometry, name, pattern, rotated, signs
-from locatk.core.landmarks.paper_valleys import Recognised, Valleys, profile, recognise, valleys
+from locatk.core.landmarks.published.valleys import Recognised, Valleys, profile, recognise, valleys
 
 GEOMETRY = Geometry()
 RADIUS = GEOMETRY.circle_m

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.floor import HOLE, FloorMap
+from locatk.core.landmarks.design.proof import least_distance, prove
 from locatk.core.landmarks.landmark import PATTERNS, code_of
-from locatk.core.landmarks.proof import least_distance, prove
-from locatk.core.landmarks.windows import readings
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.windows import readings
 
 Walk = Callable[[FloorMap], dict[Any, Any]]
 

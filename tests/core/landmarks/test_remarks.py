@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks import remarks
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.simulate import Faults, Simulated, SimulationOptions, simulate
+from locatk.core.landmarks.localization import consistency as remarks
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.simulation.session import (
+    Faults,
+    SimulatedSession,
+    SimulationOptions,
+    simulate,
+)
 from locatk.core.landmarks.solver import solve
 from locatk.core.solution import Solution, SolverWarning
 
@@ -21,12 +26,12 @@ FLOOR = FloorMap(CODES)
 CELLS = ((2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3))
 
 
-def drive(**options: object) -> Simulated:
+def drive(**options: object) -> SimulatedSession:
     given = {"strategy": "path", "cells": ((2, 2), (2, 5), (4, 5), (4, 3)), "rate_hz": 30.0}
     return simulate(FLOOR, SimulationOptions(**given | {"seed": 1} | options))  # type: ignore[arg-type]
 
 
-def solved(one: Simulated, floor: FloorMap = FLOOR) -> Solution:
+def solved(one: SimulatedSession, floor: FloorMap = FLOOR) -> Solution:
     return solve(one.samples, floor, odometry=one.odometry)
 
 

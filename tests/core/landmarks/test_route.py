@@ -10,16 +10,17 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks import route, solver
-from locatk.core.landmarks.floor import FloorMap
-from locatk.core.landmarks.simulate import (
+from locatk.core.landmarks import solver
+from locatk.core.landmarks.localization import trajectory as route
+from locatk.core.landmarks.localization.smoothing import StayPose
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.simulation.session import (
     NONE,
     Errors,
-    Simulated,
+    SimulatedSession,
     SimulationOptions,
     simulate,
 )
-from locatk.core.landmarks.smooth import StayPose
 from locatk.core.landmarks.solver import SolveOptions
 from locatk.core.trajectory import Trajectory
 
@@ -29,7 +30,7 @@ FLOOR = FloorMap(np.random.default_rng(5).integers(0, 16, (8, 8)))
 
 
 @functools.cache
-def session(seed: int, clean: bool = False) -> tuple[Simulated, Trajectory]:
+def session(seed: int, clean: bool = False) -> tuple[SimulatedSession, Trajectory]:
     errors = NONE if clean else Errors()
     options = SimulationOptions(
         strategy="path",
@@ -45,7 +46,7 @@ def session(seed: int, clean: bool = False) -> tuple[Simulated, Trajectory]:
     return one, found.trajectories[0]
 
 
-def errors_of(one: Simulated, told: Trajectory) -> tuple[Array, Array]:
+def errors_of(one: SimulatedSession, told: Trajectory) -> tuple[Array, Array]:
     """Errors (n, 3), and their normalised squares (n,)."""
     truth, start = one.truth[0], one.truth[0].time_ns[0]
     heading = np.unwrap(heading_from_quaternion(truth.quaternion))

@@ -7,11 +7,11 @@ import pytest
 
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.kernels import kernels
-from locatk.core.landmarks import scan
+from locatk.core.landmarks.detection import scan
+from locatk.core.landmarks.detection.trace import Drift, Trace, corrections, relative
 from locatk.core.landmarks.landmark import Geometry, signs
-from locatk.core.landmarks.simulate_options import NONE
-from locatk.core.landmarks.simulate_passes import Pass, passes
-from locatk.core.landmarks.trace import Drift, Trace, corrections, relative
+from locatk.core.landmarks.simulation.options import NONE
+from locatk.core.landmarks.simulation.passes import Pass, passes
 
 GEOMETRY = Geometry()
 

@@ -21,32 +21,32 @@ from scipy.spatial.transform import Rotation
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.bars import basis, landmark_field
-from locatk.core.landmarks.floor import HOLE, STEPS, WINDOWS, AsBuilt, Cell, FloorMap
+from locatk.core.landmarks.field import basis, landmark_field
 from locatk.core.landmarks.halls import NAMES, HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, code_of, pattern, signs
-from locatk.core.landmarks.simulate import (
-    EPOCH_NS,
-    NONE,
-    Aims,
-    Errors,
-    Faults,
-    Limits,
-    Simulated,
-    SimulationOptions,
-    passes,
-    simulate,
-)
-from locatk.core.landmarks.simulate_floor import (
+from locatk.core.landmarks.map.floor import HOLE, STEPS, WINDOWS, AsBuiltLandmark, Cell, FloorMap
+from locatk.core.landmarks.simulation.floor import (
     BAR_DRAWS,
     DIPOLE_LENGTHS,
     bar_fields,
     dipole_fields,
     scatter_bars,
 )
-from locatk.core.landmarks.simulate_robot import Robot
-from locatk.core.landmarks.simulate_sensors import odometry
-from locatk.core.landmarks.simulate_strategy import free
+from locatk.core.landmarks.simulation.robot import Robot
+from locatk.core.landmarks.simulation.sensors import odometry
+from locatk.core.landmarks.simulation.session import (
+    EPOCH_NS,
+    NONE,
+    Aims,
+    Errors,
+    Faults,
+    Limits,
+    SimulatedSession,
+    SimulationOptions,
+    passes,
+    simulate,
+)
+from locatk.core.landmarks.simulation.strategy import free
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -60,13 +60,13 @@ EXACT = Aims(0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def tour() -> Simulated:
+def tour() -> SimulatedSession:
     """The paper's strategy on a faultless floor."""
     return simulate(FLOOR, replace(PLAIN, seed=3))
 
 
 @pytest.fixture(scope="module")
-def nominal() -> Simulated:
+def nominal() -> SimulatedSession:
     """The same with the nominal errors."""
     return simulate(FLOOR, SimulationOptions(rate_hz=100.0, seed=3))
 
@@ -86,7 +86,7 @@ def sensed(poses: Array, sensors: Array) -> Array:
     return np.array(spots)
 
 
-def cells_of(simulated: Simulated) -> list[Cell]:
+def cells_of(simulated: SimulatedSession) -> list[Cell]:
     """In the order of their visits, each once in a row."""
     cells = [visit.cell for visit in simulated.events]
     return [cell for k, cell in enumerate(cells) if k == 0 or cell != cells[k - 1]]
@@ -114,7 +114,7 @@ def test_the_simulator_has_no_part_of_the_solvers(root: Path) -> None:
                     assert name in allowed or name.startswith("simulate"), f"{path}: {name}"
 
 
-def test_samples_are_the_closed_form_at_the_truth(tour: Simulated) -> None:
+def test_samples_are_the_closed_form_at_the_truth(tour: SimulatedSession) -> None:
     (samples,), (truth,) = tour.samples, tour.truth
     spots = sensed(flat(truth), circle(0.025))
     wanted = sum(
@@ -266,7 +266,7 @@ def test_it_goes_back_rather_than_around_where_that_is_near() -> None:
 # ---- the paper's strategy
 
 
-def test_it_searches_spins_and_goes_an_l(tour: Simulated) -> None:
+def test_it_searches_spins_and_goes_an_l(tour: SimulatedSession) -> None:
     (truth,) = tour.truth
     # The first pass may have brushed the landmark behind the first one.
     *brushed, first_cell, second_cell, third_cell = cells_of(tour)
@@ -291,7 +291,7 @@ def test_it_searches_spins_and_goes_an_l(tour: Simulated) -> None:
         assert np.abs(turned).max() < math.radians(4)
 
 
-def test_each_visit_is_felt(nominal: Simulated) -> None:
+def test_each_visit_is_felt(nominal: SimulatedSession) -> None:
     (samples,) = nominal.samples
     threshold = FLOOR.geometry.threshold_t
     assert nominal.events
@@ -441,7 +441,7 @@ def test_a_pass_finds_its_pattern() -> None:
 # ---- odometry
 
 
-def test_odometry_without_errors_is_the_truth(tour: Simulated) -> None:
+def test_odometry_without_errors_is_the_truth(tour: SimulatedSession) -> None:
     (truth,), (told,) = tour.truth, tour.odometry
     assert told.frame == "odometry"
     assert flat(told)[0] == pytest.approx([0, 0, 0])
@@ -589,7 +589,9 @@ def test_a_misread_landmark_is_another_one_of_the_alphabet(alphabet: str) -> Non
 
 
 def test_a_floor_lies_as_it_was_built() -> None:
-    built = AsBuilt(0.004, -0.003, 0.05, np.array([1.1, -0.9, 0.0, math.nan]), np.full(7, math.nan))
+    built = AsBuiltLandmark(
+        0.004, -0.003, 0.05, np.array([1.1, -0.9, 0.0, math.nan]), np.full(7, math.nan)
+    )
     floor = replace(FLOOR, built={(2, 3): built})
     simulated = simulate(floor, replace(PLAIN, rate_hz=10.0, errors=Errors()))
     (mark,) = (mark for mark in simulated.floor_as_laid if mark.cell == (2, 3))
@@ -602,7 +604,7 @@ def test_a_floor_lies_as_it_was_built() -> None:
 # ---- seeds and bad input
 
 
-def test_the_same_seed_gives_the_same_session(nominal: Simulated) -> None:
+def test_the_same_seed_gives_the_same_session(nominal: SimulatedSession) -> None:
     again = simulate(FLOOR, SimulationOptions(rate_hz=100.0, seed=3))
     assert np.array_equal(again.samples[0].field_t, nominal.samples[0].field_t)
     assert np.array_equal(again.odometry[0].position, nominal.odometry[0].position)
@@ -611,7 +613,7 @@ def test_the_same_seed_gives_the_same_session(nominal: Simulated) -> None:
     assert not np.allclose(other.truth[0].position[0], nominal.truth[0].position[0])
 
 
-def test_more_noise_leaves_all_else_as_it_is(nominal: Simulated) -> None:
+def test_more_noise_leaves_all_else_as_it_is(nominal: SimulatedSession) -> None:
     loud = SimulationOptions(rate_hz=100.0, seed=3, errors=replace(Errors(), noise_t=3e-4))
     read = simulate(FLOOR, loud)
     assert np.array_equal(read.truth[0].position, nominal.truth[0].position)

@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.bars import landmark_field
-from locatk.core.landmarks.fit import POSE, Priors
-from locatk.core.landmarks.floor import Cell
+from locatk.core.landmarks.detection.fit import POSE, Priors
+from locatk.core.landmarks.detection.trace import (
+    Trace,
+    compose,
+    corrections,
+    relative,
+    sensor_places,
+)
+from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import Geometry, signs
-from locatk.core.landmarks.smooth import (
+from locatk.core.landmarks.localization.smoothing import (
     Mark,
     Run,
     Stay,
@@ -24,7 +30,7 @@ from locatk.core.landmarks.smooth import (
     link,
     smooth,
 )
-from locatk.core.landmarks.trace import Trace, compose, corrections, relative, sensor_places
+from locatk.core.landmarks.map.floor import Cell
 
 Array = NDArray[np.float64]
 

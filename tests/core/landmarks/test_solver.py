@@ -11,14 +11,14 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.floor import HOLE, FloorMap
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import pattern
-from locatk.core.landmarks.simulate import (
+from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.simulation.session import (
     Aims,
     Errors,
     Faults,
-    Simulated,
+    SimulatedSession,
     SimulationOptions,
     simulate,
 )
@@ -37,7 +37,7 @@ WAY = ((2, 2), (2, 5), (4, 5), (4, 3))
 CELLS = [(2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3)]
 
 
-def drive(floor: FloorMap = FLOOR, **options: object) -> Simulated:
+def drive(floor: FloorMap = FLOOR, **options: object) -> SimulatedSession:
     given = {
         "strategy": "path",
         "cells": WAY,
@@ -50,7 +50,7 @@ def drive(floor: FloorMap = FLOOR, **options: object) -> Simulated:
 
 
 @functools.cache
-def session() -> Simulated:
+def session() -> SimulatedSession:
     return drive()
 
 
@@ -59,7 +59,7 @@ def warning_codes(solution: Solution) -> list[str]:
 
 
 def solved(
-    one: Simulated, floor: FloorMap | None = FLOOR, **change: Callable[[Array], Array]
+    one: SimulatedSession, floor: FloorMap | None = FLOOR, **change: Callable[[Array], Array]
 ) -> Solution:
     samples, own = one.samples[0], one.odometry[0]
     if "field" in change:
@@ -69,7 +69,7 @@ def solved(
     return solve([samples], floor, odometry=[own])
 
 
-def farthest(one: Simulated, found: Solution) -> float:
+def farthest(one: SimulatedSession, found: Solution) -> float:
     """Largest distance of a pose to the truth, in metres."""
     told: Trajectory = found.trajectories[0]
     truth, start = one.truth[0], one.truth[0].time_ns[0]
@@ -158,7 +158,7 @@ def test_recordings_that_cannot_be_are_errors(
 
 
 @functools.cache
-def spinning() -> Simulated:
+def spinning() -> SimulatedSession:
     """The paper's strategy, which turns on each landmark."""
     return drive(strategy="paper", cells=(), seed=5)
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.trace import (
+from locatk.core.landmarks.detection.trace import (
     Drift,
     Trace,
     bent,

@@ -10,10 +10,15 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.floor import FloorMap
+from locatk.core.landmarks.detection.trace import Drift
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.simulate import Errors, Simulated, SimulationOptions, simulate
-from locatk.core.landmarks.trace import Drift
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.simulation.session import (
+    Errors,
+    SimulatedSession,
+    SimulationOptions,
+    simulate,
+)
 from locatk.core.landmarks.visits import Visit, check_way, driven, find
 
 CODES = np.random.default_rng(3).integers(0, 16, (6, 6))
@@ -22,7 +27,7 @@ GEOMETRY = Geometry()
 
 
 @functools.cache
-def session(pitch_m: float = 0.2, noise_t: float = 1.5e-4) -> Simulated:
+def session(pitch_m: float = 0.2, noise_t: float = 1.5e-4) -> SimulatedSession:
     floor = FloorMap(CODES, pitch_m=pitch_m)
     way = ((1, 1), (1, 4), (3, 4))
     errors = Errors(noise_t=noise_t, offset_t=2e-4)
@@ -31,7 +36,7 @@ def session(pitch_m: float = 0.2, noise_t: float = 1.5e-4) -> Simulated:
     )
 
 
-def visits_of(one: Simulated) -> list[Visit]:
+def visits_of(one: SimulatedSession) -> list[Visit]:
     run = driven(one.samples[0], one.odometry[0])
     return find(run, one.floor.geometry, Drift(), one.floor.pitch_m)
 

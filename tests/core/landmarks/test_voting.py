@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.paper_study import study
-from locatk.core.landmarks.voting import voted_centre
+from locatk.core.landmarks.published.study import study
+from locatk.core.landmarks.published.voting import voted_centre
 
 NO_WAY = np.full((1, 1, 2, 2), np.nan)
 

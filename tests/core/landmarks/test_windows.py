@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.floor import HOLE, WINDOWS, FloorMap
 from locatk.core.landmarks.landmark import code_of
-from locatk.core.landmarks.windows import readings, ways
+from locatk.core.landmarks.map.floor import HOLE, WINDOWS, FloorMap
+from locatk.core.landmarks.map.windows import readings, ways
 
 SEEDS = st.integers(0, 2**32 - 1)
 

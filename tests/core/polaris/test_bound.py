@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.magnetics import dipole_field
-from locatk.core.polaris import bound as bounds
 from locatk.core.polaris.array import SensorArray, bar
-from locatk.core.polaris.bound import (
+from locatk.core.polaris.design import accuracy_bound as bounds
+from locatk.core.polaris.design.accuracy_bound import (
     MARGIN,
     STEP_SIGMA_M,
     UNKNOWNS,
@@ -25,8 +25,8 @@ from locatk.core.polaris.bound import (
     magnet_covariance,
     pose_covariance,
 )
-from locatk.core.polaris.planning import some_layouts
-from locatk.core.polaris.tag import Layout, Magnet, Tags, angles, places
+from locatk.core.polaris.design.planning import some_layouts
+from locatk.core.polaris.tag import Magnet, TagLayout, Tags, angles, places
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def array(noise_ut: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> SensorArray
     return SensorArray(bar(9, 0.02), noise_t=np.array(noise_ut) * 1e-6)
 
 
-def brute_force(tags: Tags, layout: Layout, sensors: SensorArray, step: float, unknown: Unknown):
+def brute_force(tags: Tags, layout: TagLayout, sensors: SensorArray, step: float, unknown: Unknown):
     """The covariance by a dense information matrix of every unknown, from magpylib's dipoles
     and central differences."""
     place, angle = places(tags, layout.cells), angles(tags, layout.symbols)
@@ -201,7 +201,7 @@ def test_merged_samples_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_heading_turns_the_tag() -> None:
     """A tag at 90 degrees is another tag, whose magnets lie and point elsewhere."""
-    square = Layout(((0, 0), (0, 2), (2, 2)), (0, 2, 5))
+    square = TagLayout(((0, 0), (0, 2), (2, 2)), (0, 2, 5))
     tags = replace(TAGS, magnets=3)
     turned = magnet_covariance(
         tags, square, array(), step_m=1e-3, heading_rad=math.pi / 2, unknown="strength"
@@ -218,7 +218,7 @@ def test_heading_turns_the_tag() -> None:
 def test_pose_of_independent_magnets() -> None:
     """Closed form: n equal magnets give the middle to sigma / sqrt(n) where their centre is
     the tag's, and the heading to sigma over the root of the sum of squared radii."""
-    corners = Layout(((0, 0), (2, 0), (0, 2), (2, 2)), (0, 0, 0, 0))
+    corners = TagLayout(((0, 0), (2, 0), (0, 2), (2, 2)), (0, 0, 0, 0))
     tags = Tags(order=3, magnets=4, spacing_m=0.04)
     covariance = np.diag(np.tile([1e-10, 1e-10, 1e-4], 4))
     pose = pose_covariance(tags, corners, covariance, 0.3)

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
-from locatk.core.polaris.calibrate import Pass, calibrate
+from locatk.core.polaris.calibration import Pass, calibrate
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.tag import AsBuilt, Tags, built_magnets
+from locatk.core.polaris.tag import AsBuiltTag, Tags, built_magnets
 
 TAGS = Tags()
 ID = 123_456
@@ -25,7 +25,7 @@ def passes(
 ) -> tuple[np.ndarray, list[Pass]]:
     """A tag built by hand (5, 3), and passes over it in frames that mean nothing."""
     rng = np.random.default_rng(seed)
-    real = AsBuilt(rng.normal(size=(5, 2)) * 5e-4, rng.normal(size=5) * 0.1)
+    real = AsBuiltTag(rng.normal(size=(5, 2)) * 5e-4, rng.normal(size=5) * 0.1)
     place, angle = built_magnets(replace(TAGS, built={ID: real}), ID, LAYOUT)
     made = []
     for k in range(count):
@@ -37,7 +37,7 @@ def passes(
     return np.column_stack([place, angle]), made
 
 
-def shape_of(built: AsBuilt) -> np.ndarray:
+def shape_of(built: AsBuiltTag) -> np.ndarray:
     """Distances between magnets, and angles against the first one: nothing of a frame."""
     place, angle = built_magnets(replace(TAGS, built={ID: built}), ID, LAYOUT)
     apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(5, 1)]
@@ -51,7 +51,7 @@ def test_exact_passes_give_the_exact_shape(seed: int, count: int) -> None:
     real, made = passes(count, seed)
     (report,) = calibrate(TAGS, made).found
     nominal, angle = built_magnets(TAGS, ID, LAYOUT)
-    expected = AsBuilt(real[:, :2] - nominal, real[:, 2] - angle)
+    expected = AsBuiltTag(real[:, :2] - nominal, real[:, 2] - angle)
     np.testing.assert_allclose(shape_of(report.built), shape_of(expected), atol=1e-8)
     assert report.scatter_m.max() < 1e-8
     # On the grid by least squares: neither moved nor turned as a whole.
@@ -78,7 +78,7 @@ def test_a_pass_that_is_known_better_counts_more() -> None:
         both = [replace(made[0], sigma=sure), Pass("b", ID, worse, np.full((5, 3), sigma))]
         (report,) = calibrate(TAGS, both).found
         nominal, angle = built_magnets(TAGS, ID, LAYOUT)
-        exact = shape_of(AsBuilt(real[:, :2] - nominal, real[:, 2] - angle))
+        exact = shape_of(AsBuiltTag(real[:, :2] - nominal, real[:, 2] - angle))
         off = np.abs(shape_of(report.built) - exact)[:10].max()
         assert off == pytest.approx(1e-3 * share, abs=2e-4)
 
@@ -90,7 +90,7 @@ def test_a_magnet_that_some_passes_miss_is_measured_by_the_others() -> None:
     (report,) = calibrate(TAGS, made).found
     assert report.passes.tolist() == [4, 3, 4, 3, 4]
     nominal, angle = built_magnets(TAGS, ID, LAYOUT)
-    expected = AsBuilt(real[:, :2] - nominal, real[:, 2] - angle)
+    expected = AsBuiltTag(real[:, :2] - nominal, real[:, 2] - angle)
     np.testing.assert_allclose(shape_of(report.built), shape_of(expected), atol=1e-8)
 
 

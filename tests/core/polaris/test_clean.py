@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.polaris.array import Samples, SensorArray, bar
-from locatk.core.polaris.clean import cleaned
+from locatk.core.polaris.preprocessing import cleaned
 
 NOISE = np.full((5, 3), 1e-6)
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from locatk.core import kernels
 from locatk.core.errors import InputError
-from locatk.core.polaris import ddtw
+from locatk.core.polaris.published import ddtw
+from locatk.core.polaris.published.templates import template_set, templates
 from locatk.core.polaris.tag import Tags
-from locatk.core.polaris.templates import template_set, templates
 
 Array = NDArray[np.float64]
 

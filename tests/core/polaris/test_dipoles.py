@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from locatk.core.polaris.dipoles import Offsets, thickness
+from locatk.core.polaris.detection.field_model import Offsets, thickness
 from locatk.core.polaris.tag import Magnet
 
 Array = NDArray[np.float64]

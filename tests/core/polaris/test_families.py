@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
-from locatk.core.polaris import codec, families
+from locatk.core.polaris import codec
+from locatk.core.polaris.codec import families
 from locatk.core.polaris.tag import Tags
 
 LARGE = Tags(order=5, magnets=13, orientations=20)

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.polaris.dipoles import thickness
-from locatk.core.polaris.fit import fit
-from locatk.core.polaris.problem import Problem
+from locatk.core.polaris.detection.field_model import thickness
+from locatk.core.polaris.detection.fit import fit
+from locatk.core.polaris.detection.fit_problem import Problem
+from locatk.core.polaris.detection.window import Priors, State, Window
 from locatk.core.polaris.tag import Magnet
-from locatk.core.polaris.window import Priors, State, Window
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples, SensorArray
-from locatk.core.polaris.identify import Seen, identify
-from locatk.core.polaris.sighting import Sighting
-from locatk.core.polaris.tag import AsBuilt, Layout, Tags
+from locatk.core.polaris.identification.tags import Seen, identify
+from locatk.core.polaris.magnets import DetectedMagnets
+from locatk.core.polaris.tag import AsBuiltTag, TagLayout, Tags
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ REDUNDANT = Tags(codec="redundant", magnets=8)
 
 
 def id_of(symbols: tuple[int, ...] = SYMBOLS, tags: Tags = TAGS) -> int:
-    return codec.id_of(tags, Layout(CELLS, symbols))
+    return codec.id_of(tags, TagLayout(CELLS, symbols))
 
 
 def recording(width_m: float = 0.16) -> Samples:
@@ -35,14 +35,16 @@ def recording(width_m: float = 0.16) -> Samples:
     return Samples("bar", SensorArray(position), time, np.zeros((400, 9, 3)))
 
 
-def seen(*tags: Any, keep: list[int] | None = None, first: int = 150, **more: Any) -> Sighting:
+def seen(
+    *tags: Any, keep: list[int] | None = None, first: int = 150, **more: Any
+) -> DetectedMagnets:
     """The magnets of tags of the independent world, as a fit would give them."""
     place = np.vstack([tag.places for tag in tags])
     angle = np.concatenate([tag.angles for tag in tags])
     if keep is not None:
         place, angle = place[keep], angle[keep]
     m = len(place)
-    sighting = Sighting(
+    sighting = DetectedMagnets(
         time_ns=2_000_000_000,
         first=first,
         stop=251,
@@ -229,7 +231,7 @@ def test_as_built_angles_and_places_are_used(world: Any) -> None:
     turned = np.radians([20.0, -18.0, 15.0, -20.0, 12.0])
     moved = 1e-3 * np.array([[1.5, 0], [0, -1], [-1, 0.5], [0.5, 1], [-1, -0.5]])
     tag = world.Tag(CELLS, SYMBOLS, x=0.01, heading=0.7, turned=turned, moved=moved)
-    built = replace(TAGS, built={id_of(): AsBuilt(moved, turned, 5)})
+    built = replace(TAGS, built={id_of(): AsBuiltTag(moved, turned, 5)})
     plain = one(identify(seen(tag), recording(), TAGS))
     known = one(identify(seen(tag), recording(), built))
     assert known.tag_id == id_of()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from locatk.core.polaris import codec
 from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
-from locatk.core.polaris.tag import Layout, Magnet, Tags
+from locatk.core.polaris.tag import Magnet, TagLayout, Tags
 from locatk.core.solution import Solution
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 TAGS = Tags()
 CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
 SYMBOLS = (0, 3, 5, 2, 6)
-ID = codec.id_of(TAGS, Layout(CELLS, SYMBOLS))
+ID = codec.id_of(TAGS, TagLayout(CELLS, SYMBOLS))
 
 
 def the_tag(solution: Solution) -> TagDetection:
@@ -234,7 +234,7 @@ def test_a_dense_tag_is_read_by_its_grid(world: Any) -> None:
     course = world.line(length=1.5 * 0.048 + 0.12)
     made = world.record([tag], course, array=world.bar(7), seed=0)
     found = the_tag(solve([made], tags))
-    assert found.tag_id == codec.id_of(tags, Layout(cells, symbols))
+    assert found.tag_id == codec.id_of(tags, TagLayout(cells, symbols))
 
 
 @pytest.mark.slow
@@ -260,7 +260,7 @@ def test_every_bit_of_other_designs(
     tag = world.Tag(cells, symbols, heading=rng.uniform(-np.pi, np.pi), **shape)
     course = world.line(length=1.5 * side + 0.12)
     found = the_tag(solve([world.record([tag], course, array=bar, seed=1)], tags))
-    assert found.tag_id == codec.id_of(tags, Layout(cells, symbols))
+    assert found.tag_id == codec.id_of(tags, TagLayout(cells, symbols))
     assert len(found.magnets) == magnets
     assert np.all(np.abs(pose_errors(world, found, course, tag)) < [6e-4, 5e-5, 2e-3])
 
@@ -280,7 +280,7 @@ def test_mini_tag(world: Any) -> None:
             [tag], course, array=world.bar(3, 0.008), clearance=0.005, rate=17.0, seed=k
         )
         found = the_tag(solve([recording], tags))
-        assert found.tag_id == codec.id_of(tags, Layout(cells, symbols))
+        assert found.tag_id == codec.id_of(tags, TagLayout(cells, symbols))
         errors.append(pose_errors(world, found, course, tag))
     assert np.linalg.norm(np.array(errors)[:, :2], axis=1).max() < 0.58e-3
     assert np.abs(np.array(errors)[:, 2]).max() < np.radians(1.0)

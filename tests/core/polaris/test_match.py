@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
-from locatk.core.polaris.match import matches, refitted, ruled
-from locatk.core.polaris.sighting import Sighting
+from locatk.core.polaris.identification.matching import matches, refitted, ruled
+from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.tag import Tags
 
 Array = NDArray[np.float64]
@@ -35,10 +35,10 @@ def laid(
     return np.column_stack([np.real(z), np.imag(z)])
 
 
-def seen(places: ArrayLike, *, free: bool = False, sigma: float = 2e-5) -> Sighting:
+def seen(places: ArrayLike, *, free: bool = False, sigma: float = 2e-5) -> DetectedMagnets:
     place = np.asarray(places, float)
     m = len(place)
-    return Sighting(
+    return DetectedMagnets(
         time_ns=0,
         first=0,
         stop=101,

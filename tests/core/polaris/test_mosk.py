@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
-from locatk.core.polaris import codec, mosk
-from locatk.core.polaris.tag import CODECS, Layout, Tags
+from locatk.core.polaris import codec
+from locatk.core.polaris.codec import mosk
+from locatk.core.polaris.tag import CODECS, TagLayout, Tags
 
 RELEASED = Tags(codec="polaris-released")
 
@@ -84,7 +85,7 @@ def test_every_layout_has_an_id_and_comes_back(tags: Tags, data) -> None:
     symbols = data.draw(
         st.lists(st.integers(0, tags.orientations - 1), min_size=size, max_size=size)
     )
-    layout = Layout(tuple(cells), tuple(symbols))
+    layout = TagLayout(tuple(cells), tuple(symbols))
     tag_id = codec.id_of(tags, layout)
     assert 0 <= tag_id < codec.capacity(tags)
     assert codec.layout_of(tags, tag_id) == layout
@@ -161,19 +162,19 @@ def test_a_step_changes_one_bit_of_the_id(data) -> None:
     symbols = list(layout.symbols)
     symbols[data.draw(st.integers(0, 4))] += data.draw(st.sampled_from([1, -1]))
     turned = tuple(s % tags.orientations for s in symbols)
-    assert bits_apart(codec.id_of(tags, Layout(layout.cells, turned)), tag_id) == 1
+    assert bits_apart(codec.id_of(tags, TagLayout(layout.cells, turned)), tag_id) == 1
 
 
 def test_released_ids_are_the_published_ones() -> None:
     cells = ((0, 0), (1, 1), (2, 1), (0, 2), (2, 2))
-    assert codec.id_of(RELEASED, Layout(cells, (0, 0, 0, 0, 0))) == 262143
-    assert codec.id_of(RELEASED, Layout(cells, (0, 1, 2, 3, 4))) == 255183
+    assert codec.id_of(RELEASED, TagLayout(cells, (0, 0, 0, 0, 0))) == 262143
+    assert codec.id_of(RELEASED, TagLayout(cells, (0, 1, 2, 3, 4))) == 255183
 
 
 @settings(deadline=None)
 @given(st.sampled_from(sorted(TABLE)), st.lists(st.integers(0, 7), min_size=5, max_size=5))
 def test_released_ids_follow_the_table(numbers: tuple[int, ...], symbols: list[int]) -> None:
-    layout = Layout(tuple(NUMBERED[n] for n in numbers), tuple(symbols))
+    layout = TagLayout(tuple(NUMBERED[n] for n in numbers), tuple(symbols))
     expected = int("".join(BITS[s] for s in symbols) + TABLE[numbers], 2)
     assert codec.id_of(RELEASED, layout) == expected
     assert codec.layout_of(RELEASED, expected) == layout
@@ -181,7 +182,7 @@ def test_released_ids_follow_the_table(numbers: tuple[int, ...], symbols: list[i
 
 @pytest.mark.parametrize("numbers", [(1, 4, 6, 7, 8), (1, 5, 6, 7, 8)])
 def test_two_placements_are_not_in_the_released_table(numbers: tuple[int, ...]) -> None:
-    layout = Layout(tuple(NUMBERED[n] for n in numbers), (0,) * 5)
+    layout = TagLayout(tuple(NUMBERED[n] for n in numbers), (0,) * 5)
     with pytest.raises(InputError, match="no id"):
         codec.id_of(RELEASED, layout)
 
@@ -231,4 +232,4 @@ def test_ids_beyond_the_capacity_are_refused(name: str) -> None:
 @pytest.mark.parametrize("name", CODECS)
 def test_layouts_that_are_no_tag_are_refused(name: str, cells, symbols) -> None:
     with pytest.raises(InputError):
-        codec.id_of(Tags(codec=name), Layout(cells, symbols))
+        codec.id_of(Tags(codec=name), TagLayout(cells, symbols))

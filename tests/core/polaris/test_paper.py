@@ -19,21 +19,21 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import umeyama
-from locatk.core.polaris import paper
 from locatk.core.polaris.array import Samples, SensorArray, bar
-from locatk.core.polaris.peaks import find_peaks, signals
-from locatk.core.polaris.sighting import Sighting
-from locatk.core.polaris.tag import Layout, Tags, angles, places
+from locatk.core.polaris.magnets import DetectedMagnets
+from locatk.core.polaris.published import pipeline as paper
+from locatk.core.polaris.published.peaks import find_peaks, signals
+from locatk.core.polaris.tag import TagLayout, Tags, angles, places
 from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
 TAGS = Tags()
 SPEED = 0.1
-LAYOUT = Layout(((0, 0), (1, 1), (2, 1), (0, 2), (2, 2)), (0, 7, 2, 5, 4))
+LAYOUT = TagLayout(((0, 0), (1, 1), (2, 1), (0, 2), (2, 2)), (0, 7, 2, 5, 4))
 
 
-def lying(x: float, y: float, heading: float, layout: Layout = LAYOUT) -> tuple[Array, Array]:
+def lying(x: float, y: float, heading: float, layout: TagLayout = LAYOUT) -> tuple[Array, Array]:
     """Places (M, 2) and angles (M,) of a tag's magnets on the floor."""
     cos, sin = math.cos(heading), math.sin(heading)
     turned = places(TAGS, layout.cells) @ np.array([[cos, sin], [-sin, cos]])
@@ -64,13 +64,13 @@ def drive(
     return Samples("bar", array, np.rint(way / SPEED * 1e9).astype(np.int64), field)
 
 
-def on_the_floor(sighting: Sighting, samples: Samples) -> Array:
+def on_the_floor(sighting: DetectedMagnets, samples: Samples) -> Array:
     """Places with the way of the array added: from where it started."""
     way = (sighting.time_ns - samples.time_ns[0]) * 1e-9 * SPEED
     return sighting.place_m + [way, 0.0]
 
 
-def compared(sighting: Sighting, samples: Samples, truth: tuple[Array, Array]) -> Array:
+def compared(sighting: DetectedMagnets, samples: Samples, truth: tuple[Array, Array]) -> Array:
     """Distance in m and turn in rad (M, 2) of each true magnet's nearest."""
     place = on_the_floor(sighting, samples)
     apart = np.linalg.norm(place[:, None] - truth[0], axis=2)
@@ -121,13 +121,13 @@ def test_the_pattern_gives_pose_cells_and_angles(
     heading: float, order: list[int], placement: int
 ) -> None:
     free = list(itertools.combinations([(1, 0), (0, 1), (1, 1), (2, 1), (1, 2)], 2))[placement]
-    layout = Layout(((0, 0), (0, 2), (2, 2), *free), (0, 7, 2, 5, 4))
+    layout = TagLayout(((0, 0), (0, 2), (2, 2), *free), (0, 7, 2, 5, 4))
     place, angle = lying(0.3, -0.02, heading, layout)
     place, angle = place[order], angle[order]
     pattern = paper.position_pattern(place)
     assert pattern is not None
     assert [order[k] for k in pattern] == [0, 1, 2]
-    sighting = Sighting(
+    sighting = DetectedMagnets(
         time_ns=0,
         first=0,
         stop=1,

@@ -12,9 +12,8 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.materials import GRADES_T, remanence
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.materials import bill, disc
-from locatk.core.polaris.mlx90393 import Settings
-from locatk.core.polaris.planning import (
+from locatk.core.polaris.design.materials import bill, disc
+from locatk.core.polaris.design.planning import (
     PLACEMENT_RAD,
     Use,
     compact_spacing,
@@ -24,7 +23,8 @@ from locatk.core.polaris.planning import (
     some_layouts,
     width,
 )
-from locatk.core.polaris.tag import AsBuilt, Magnet, Tags
+from locatk.core.polaris.mlx90393 import Settings
+from locatk.core.polaris.tag import AsBuiltTag, Magnet, Tags
 
 MINI = Tags(
     order=2, magnets=3, spacing_m=0.016, clearance_m=0.004, magnet=disc(1e-3, 0.5e-3, grade="N52")
@@ -141,7 +141,7 @@ def test_misread_is_the_chance_of_a_tag() -> None:
 
 def test_calibrated_tags_tell_how_well_they_are_laid() -> None:
     off = np.radians([4.3, -2.2, 13.0, 0.0, -2.8])
-    tags = replace(Tags(), built={7: AsBuilt(np.zeros((5, 2)), off, 10)})
+    tags = replace(Tags(), built={7: AsBuiltTag(np.zeros((5, 2)), off, 10)})
     assert plan(tags).placement_rad == pytest.approx(np.sqrt(np.mean(off**2)))
     assert plan(Tags()).placement_rad == PLACEMENT_RAD
     assert plan(tags, Use(placement_rad=0.01)).placement_rad == 0.01

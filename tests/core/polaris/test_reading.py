@@ -13,9 +13,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from locatk.core.polaris import codec, families, redundancy
-from locatk.core.polaris.reading import TIE, Reading, read
-from locatk.core.polaris.tag import AsBuilt, Cell, Tags
+from locatk.core.polaris import codec
+from locatk.core.polaris.codec import families
+from locatk.core.polaris.codec import redundant as redundancy
+from locatk.core.polaris.identification.decoding import TIE, Reading, read
+from locatk.core.polaris.tag import AsBuiltTag, Cell, Tags
 
 SMALL = Tags(order=2, magnets=3, orientations=5)
 DEFAULT = Tags()
@@ -35,9 +37,9 @@ def magnets(tags: Tags, tag_id: int) -> tuple[list[Cell], np.ndarray]:
     return list(layout.cells), np.array(layout.symbols, float)
 
 
-def turned(tags: Tags, *steps: float) -> AsBuilt:
+def turned(tags: Tags, *steps: float) -> AsBuiltTag:
     """As built, with magnets this many steps clockwise from where they should point."""
-    return AsBuilt(np.zeros((len(steps), 2)), -np.array(steps) * tags.step_rad, 1)
+    return AsBuiltTag(np.zeros((len(steps), 2)), -np.array(steps) * tags.step_rad, 1)
 
 
 def apart(tags: Tags, one: float, other: float) -> float:

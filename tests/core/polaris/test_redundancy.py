@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
-from locatk.core.polaris import codec, redundancy
-from locatk.core.polaris.tag import Layout, Tags
+from locatk.core.polaris import codec
+from locatk.core.polaris.codec import redundant as redundancy
+from locatk.core.polaris.tag import TagLayout, Tags
 
 DESIGNS = [
     *(Tags(order=4, magnets=m, orientations=8, codec="redundant") for m in range(5, 10)),
@@ -179,7 +180,7 @@ def test_layouts_that_are_no_word_are_refused() -> None:
     layout = codec.layout_of(tags, 100)
     turned = (layout.symbols[0] ^ 1, *layout.symbols[1:])
     with pytest.raises(InputError, match="no word"):
-        codec.id_of(tags, Layout(layout.cells, turned))
+        codec.id_of(tags, TagLayout(layout.cells, turned))
     moved = (*layout.cells[:-3], (1, 2), *layout.cells[-2:])
     with pytest.raises(InputError, match="in the cells"):
-        codec.id_of(tags, Layout(moved, layout.symbols))
+        codec.id_of(tags, TagLayout(moved, layout.symbols))

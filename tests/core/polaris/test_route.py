@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.route import along
+from locatk.core.polaris.localization import along
 from locatk.core.polaris.solver import solve
-from locatk.core.polaris.tag import Layout, Placed, Tags
+from locatk.core.polaris.tag import Placed, TagLayout, Tags
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 TAGS = Tags()
 CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
 SYMBOLS = ((0, 3, 5, 2, 6), (1, 7, 4, 4, 3), (2, 2, 0, 6, 1))
-IDS = tuple(codec.id_of(TAGS, Layout(CELLS, symbols)) for symbols in SYMBOLS)
+IDS = tuple(codec.id_of(TAGS, TagLayout(CELLS, symbols)) for symbols in SYMBOLS)
 PLACES = ((0.0, 0.008, 0.4), (0.5, -0.012, 2.0), (1.0, 0.005, -1.3))
 SITE = {i: Placed(*place) for i, place in zip(IDS, PLACES, strict=True)}
 

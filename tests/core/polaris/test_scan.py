@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.polaris.scan import Atom, Scanner
+from locatk.core.polaris.detection.scan import Atom, Scanner
 
 Array = NDArray[np.float64]
 

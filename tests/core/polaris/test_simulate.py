@@ -23,17 +23,17 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.magnetics import dipole_field
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray, bar
-from locatk.core.polaris.simulate import (
+from locatk.core.polaris.simulation.field import Discs, disc_field, scatter
+from locatk.core.polaris.simulation.sensors import Faults, measure
+from locatk.core.polaris.simulation.session import (
     CARS,
     EPOCH_NS,
-    Simulated,
+    SimulatedSession,
     SimulationOptions,
     simulate,
     usual_bar,
 )
-from locatk.core.polaris.simulate_field import Discs, disc_field, scatter
-from locatk.core.polaris.simulate_sensors import Faults, measure
-from locatk.core.polaris.tag import AsBuilt, Layout, Magnet, Placed, Tags
+from locatk.core.polaris.tag import AsBuiltTag, Magnet, Placed, TagLayout, Tags
 
 Array = NDArray[np.float64]
 UT = 1e-6
@@ -50,19 +50,19 @@ DARK = Tags(magnet=Magnet(remanence_t=1e-12))
 """A tag without any field."""
 
 
-def stamped(simulated: Simulated) -> Array:
+def stamped(simulated: SimulatedSession) -> Array:
     """Seconds since the start of the drive."""
     return (simulated.samples.time_ns - EPOCH_NS) * 1e-9
 
 
-def over_v1(symbol: int) -> Simulated:
+def over_v1(symbol: int) -> SimulatedSession:
     """Straight over v1 of a lonely tag, whose magnet has this orientation; then over v2."""
-    layout = Layout(((0, 0), (0, 1), (1, 1)), (symbol, 0, 0))
+    layout = TagLayout(((0, 0), (0, 1), (1, 1)), (symbol, 0, 0))
     options = replace(PLAIN, route=(codec.id_of(LONELY, layout),), lateral_m=0.25, run_up_m=0.05)
     return simulate(LONELY, options)
 
 
-def sample_at(simulated: Simulated, x_m: float, axis: int = 0) -> Array:
+def sample_at(simulated: SimulatedSession, x_m: float, axis: int = 0) -> Array:
     """Readings (N, 3) where the array's middle is at that x (or y), between the samples."""
     way = simulated.truth.position[:, axis]
     return np.asarray(CubicSpline(way, simulated.samples.field_t)(x_m))
@@ -163,7 +163,7 @@ def test_orientation_two_of_eight_points_to_the_right() -> None:
 
 def test_a_turned_array_sees_the_field_in_its_own_axes() -> None:
     """Across the tag, towards its left: a north ahead of the tag is on the array's right."""
-    layout = Layout(((0, 0), (0, 1), (1, 1)), (0, 0, 0))
+    layout = TagLayout(((0, 0), (0, 1), (1, 1)), (0, 0, 0))
     route = (codec.id_of(LONELY, layout),)
     # The array passes v1 and v4, 0.25 m behind the tag's middle: to the left, going to +y.
     options = replace(PLAIN, route=route, heading_rad=math.pi / 2, lateral_m=0.25)
@@ -240,7 +240,7 @@ def test_the_published_run_looks_like_its_simulation(data: Path) -> None:
     assert likeness() > 0.85
     assert likeness(heading=math.pi) < 0.5
     assert likeness(lateral=0.017) < 0.5
-    turned = codec.id_of(tags, Layout(codec.layout_of(tags, 262143).cells, (4,) * 5))
+    turned = codec.id_of(tags, TagLayout(codec.layout_of(tags, 262143).cells, (4,) * 5))
     assert likeness(turned) < 0.5
 
 
@@ -485,9 +485,9 @@ def test_hand_built_tags_are_the_same_in_every_session_and_told() -> None:
 
 def test_the_build_shows_in_the_field() -> None:
     """Magnet v1 turned by 30 degrees and moved by 2 mm, by what the tag's artifact says."""
-    layout = Layout(((0, 0), (0, 1), (1, 1)), (0, 0, 0))
+    layout = TagLayout(((0, 0), (0, 1), (1, 1)), (0, 0, 0))
     tag_id = codec.id_of(LONELY, layout)
-    built = AsBuilt(np.array([[2e-3, 0.0], [0, 0], [0, 0]]), np.radians([30.0, 0, 0]))
+    built = AsBuiltTag(np.array([[2e-3, 0.0], [0, 0], [0, 0]]), np.radians([30.0, 0, 0]))
     tags = replace(LONELY, built={tag_id: built})
     simulated = simulate(tags, replace(PLAIN, route=(tag_id,), lateral_m=0.25))
     above = sample_at(simulated, -0.248)[4] / UT

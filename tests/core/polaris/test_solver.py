@@ -17,7 +17,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
-from locatk.core.polaris.tag import Layout, Placed, Tags
+from locatk.core.polaris.tag import Placed, TagLayout, Tags
 from locatk.core.solution import Solution
 
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ OTHER = (1, 7, 4, 4, 3)
 
 
 def id_of(symbols: tuple[int, ...], tags: Tags = TAGS) -> int:
-    return codec.id_of(tags, Layout(CELLS, symbols))
+    return codec.id_of(tags, TagLayout(CELLS, symbols))
 
 
 def the_tag(solution: Solution) -> TagDetection:

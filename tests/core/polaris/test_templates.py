@@ -8,8 +8,8 @@ import magpylib
 import numpy as np
 import pytest
 
+from locatk.core.polaris.published.templates import template_set, templates
 from locatk.core.polaris.tag import Magnet, Tags
-from locatk.core.polaris.templates import template_set, templates
 
 ALONG = np.linspace(-0.03, 0.03, 31)
 

@@ -9,8 +9,8 @@ import pytest
 
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import ArtifactError, FormatError, InputError, MissingDataError
-from locatk.core.landmarks.floor import FloorMap
 from locatk.core.landmarks.halls import HallSensors
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.polaris.array import SensorArray, bar

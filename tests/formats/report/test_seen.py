@@ -16,8 +16,8 @@ import pytest
 pytest.importorskip("plotly")
 
 from locatk.core.dots.results import DotFacts, FrameOutcome
+from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.results import describe_visit
-from locatk.core.landmarks.sighting import Sighting
 from locatk.core.lighthouse.results import StationDetection
 from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.solution import GenericRecord, Solution
@@ -282,7 +282,7 @@ def test_many_tags_are_listed_in_part() -> None:
 
 def test_a_refused_visit_of_the_solver_is_listed() -> None:
     told = describe_visit(
-        Sighting("robot", 10**18, 0, 9, np.zeros(3), (), refused="too_weak"), None, None
+        VisitHypotheses("robot", 10**18, 0, 9, np.zeros(3), (), refused="too_weak"), None, None
     )
     saw, rejected = seen.panels(Solution("landmarks", "field", (), {"too_weak": 1}, (told,)))
     assert saw.table is not None

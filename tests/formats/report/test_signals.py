@@ -13,15 +13,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 pytest.importorskip("plotly")
 
-from locatk.core.dots import simulate as dots_simulate
 from locatk.core.dots import solver as dots_solver
+from locatk.core.dots.simulation import session as dots_simulate
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.lighthouse import simulation as lighthouse_simulation
 from locatk.core.lighthouse import solver as lighthouse_solver
-from locatk.core.polaris import simulate as polaris_simulate
 from locatk.core.polaris import solver as polaris_solver
 from locatk.core.polaris.array import Samples
+from locatk.core.polaris.simulation import session as polaris_simulate
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats import arrays, frames, halls, observations

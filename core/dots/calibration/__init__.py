@@ -1,0 +1,1 @@
+"""Calibration of cameras and printers from frames and scans of the pattern."""

@@ -1,0 +1,23 @@
+"""Codecs of the dot pattern: positions to symbols and back."""
+
+from locatk.core.dots.codec.pattern import (
+    DOT_DIRECTIONS,
+    MAIN_SEQUENCE,
+    MAIN_SEQUENCE_LENGTH,
+    SECTION_LENGTH,
+    SYMBOL_LETTERS,
+    Codec,
+    check_window,
+    codec,
+)
+
+__all__ = [
+    "DOT_DIRECTIONS",
+    "MAIN_SEQUENCE",
+    "MAIN_SEQUENCE_LENGTH",
+    "SECTION_LENGTH",
+    "SYMBOL_LETTERS",
+    "Codec",
+    "check_window",
+    "codec",
+]

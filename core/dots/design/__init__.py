@@ -1,0 +1,1 @@
+"""Allocation of areas of the pattern to sheets."""

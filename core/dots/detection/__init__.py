@@ -1,0 +1,1 @@
+"""Detection of dots and of the lattice on which they are printed."""

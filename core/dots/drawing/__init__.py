@@ -1,0 +1,1 @@
+"""Layouts of printed sheets on the pixels of the printer."""

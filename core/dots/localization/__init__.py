@@ -1,0 +1,1 @@
+"""Localization: from decoded windows to poses of the camera."""

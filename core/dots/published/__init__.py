@@ -1,0 +1,1 @@
+"""The published algorithm of the dot pattern, for comparison."""

@@ -1,0 +1,1 @@
+"""Simulated frames of a camera over printed dots, with their truth."""

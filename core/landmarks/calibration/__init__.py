@@ -1,0 +1,1 @@
+"""Calibration of a floor: as-built landmarks from recordings of drives."""

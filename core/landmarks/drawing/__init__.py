@@ -1,0 +1,1 @@
+"""Installation pack of a floor: plan, templates at true size, lists."""

@@ -1,0 +1,1 @@
+"""The published algorithm of the magnetic landmarks, for comparison."""

@@ -1,0 +1,1 @@
+"""Simulated robots on a floor of landmarks, with their truth."""

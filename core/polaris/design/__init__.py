@@ -1,0 +1,1 @@
+"""Design of tags: accuracy bound, advice and bill of materials."""

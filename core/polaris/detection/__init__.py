@@ -1,0 +1,1 @@
+"""Detection of magnets: maximum-likelihood fit of dipoles to one pass of the array."""

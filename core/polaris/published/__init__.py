@@ -1,0 +1,1 @@
+"""The published algorithm of Polaris, for comparison."""

@@ -1,0 +1,1 @@
+"""Simulated passes of a magnetometer array over tags, with their truth."""
