@@ -160,9 +160,9 @@ def command(
 
 def _tell(output: Path, floor: FloorMap, proof: Proof, analysis: Analysis, as_json: bool) -> None:
     from locatk.core.landmarks.design import advice
-    from locatk.core.landmarks.design.materials import patterns
+    from locatk.core.landmarks.design.materials import count_patterns
 
-    found = patterns(floor)
+    found = count_patterns(floor)
     counts = ", ".join(f"{item.landmarks} {item.letters}" for item in found)
     bars = 4 * len(floor.cells())
     console.result(f"Wrote {output}\n")

@@ -172,11 +172,11 @@ def check(tag: Path, as_json: bool, **use: Any) -> None:
 
 
 def _magnet(diameter: float, height: float, grade: str | None, remanence: float | None) -> Magnet:
-    from locatk.core.polaris.design.materials import disc
+    from locatk.core.polaris.design.materials import disc_magnet
 
     if grade is None and remanence is None:
         grade = "N52"
-    return disc(metres(diameter), metres(height), grade=grade or "", remanence_t=remanence)
+    return disc_magnet(metres(diameter), metres(height), grade=grade or "", remanence_t=remanence)
 
 
 def _tell(planned: Plan, warnings: list[str], more: dict[str, Any], as_json: bool) -> None:

@@ -18,11 +18,11 @@ from scipy.optimize import brentq
 
 from locatk.core.errors import InputError
 from locatk.core.magnetics import dipole_field
-from locatk.core.materials import Item
+from locatk.core.materials import BillItem
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray
 from locatk.core.polaris.design.accuracy_bound import Bound, Unknown, bound
-from locatk.core.polaris.design.materials import bill
+from locatk.core.polaris.design.materials import bill_of_materials
 from locatk.core.polaris.mlx90393 import Settings, for_rate, published_bar
 from locatk.core.polaris.tag import Magnet, TagLayout, Tags
 
@@ -124,7 +124,7 @@ class Plan:
         Chance that a tag has a magnet more than half a step off.
     array_m, tag_m, diagonal_m, play_m : float
         Widths; and how far to either side a tag may lie.
-    materials : tuple of Item
+    materials : tuple of BillItem
     warnings, notes : tuple of str
     """
 
@@ -158,7 +158,7 @@ class Plan:
     tag_m: float
     diagonal_m: float
     play_m: float
-    materials: tuple[Item, ...]
+    materials: tuple[BillItem, ...]
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -304,7 +304,7 @@ def plan(tags: Tags, use: Use | None = None, count: int = 1) -> Plan:
         tag_m=side,
         diagonal_m=math.sqrt(2) * side,
         play_m=(bar - side) / 2,
-        materials=bill(tags, use.sensors, "Melexis MLX90393", count),
+        materials=bill_of_materials(tags, use.sensors, "Melexis MLX90393", count),
     )
     return replace(result, warnings=tuple(_warnings(result)), notes=tuple(_notes(result)))
 

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.materials import GRADES_T, remanence
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.design.materials import bill, disc
+from locatk.core.polaris.design.materials import disc_magnet
 from locatk.core.polaris.design.planning import (
     PLACEMENT_RAD,
     Use,
@@ -27,7 +26,11 @@ from locatk.core.polaris.mlx90393 import Settings
 from locatk.core.polaris.tag import AsBuiltTag, Magnet, Tags
 
 MINI = Tags(
-    order=2, magnets=3, spacing_m=0.016, clearance_m=0.004, magnet=disc(1e-3, 0.5e-3, grade="N52")
+    order=2,
+    magnets=3,
+    spacing_m=0.016,
+    clearance_m=0.004,
+    magnet=disc_magnet(1e-3, 0.5e-3, grade="N52"),
 )
 MINI_USE = Use(
     sensors=3, sensor_spacing_m=0.008, settings=Settings(filt=5), rate_hz=17, speed_mps=0.005
@@ -46,7 +49,7 @@ def test_field_above_a_magnet(height: float, field: float) -> None:
 
 
 def test_field_of_the_small_magnet() -> None:
-    small = disc(1e-3, 0.5e-3, grade="N52")
+    small = disc_magnet(1e-3, 0.5e-3, grade="N52")
     assert peak_ut(small, 10) == pytest.approx(45, rel=0.01)
     assert peak_ut(small, 5) == pytest.approx(359, rel=0.005)
 
@@ -61,7 +64,7 @@ def test_widths_of_the_field() -> None:
 
 def test_the_rule_gives_the_spacings_of_the_paper() -> None:
     assert compact_spacing(Magnet(), 0.01) == 0.040
-    assert compact_spacing(disc(1e-3, 0.5e-3, grade="N52"), 0.004) == 0.016
+    assert compact_spacing(disc_magnet(1e-3, 0.5e-3, grade="N52"), 0.004) == 0.016
 
 
 @pytest.mark.parametrize(
@@ -164,7 +167,7 @@ def test_too_weak() -> None:
 
 
 def test_saturation() -> None:
-    strong = replace(Tags(), magnet=disc(0.005, 0.003, grade="N52"))
+    strong = replace(Tags(), magnet=disc_magnet(0.005, 0.003, grade="N52"))
     (warning,) = plan(strong).warnings
     assert "saturate" in warning
     assert plan(strong).peak_t > Settings().range_t.min()
@@ -172,7 +175,7 @@ def test_saturation() -> None:
 
 
 def test_magnets_that_are_no_points() -> None:
-    wide = replace(Tags(), magnet=disc(0.004, 0.0005, grade="N35"), clearance_m=0.0035)
+    wide = replace(Tags(), magnet=disc_magnet(0.004, 0.0005, grade="N35"), clearance_m=0.0035)
     dense = Use(sensors=33, sensor_spacing_m=0.005, settings=Settings(resolution=3))
     (warning,) = plan(wide, dense).warnings
     assert "diameter" in warning
@@ -229,33 +232,3 @@ def test_layouts_are_those_of_the_family() -> None:
     assert all(layout in members for layout in some_layouts(tags, 8))
     huge = Tags(order=12, magnets=60, orientations=20)
     assert some_layouts(huge, 3) == some_layouts(huge, 3)
-
-
-@pytest.mark.parametrize("grade", GRADES_T)
-def test_grades(grade: str) -> None:
-    low, high = GRADES_T[grade]
-    assert low < remanence(grade) < high
-    assert disc(2e-3, 1e-3, grade=grade).grade == grade
-
-
-def test_moments_of_common_discs() -> None:
-    assert disc(2e-3, 0.5e-3, grade="N52").moment == pytest.approx(1.812e-3, rel=1e-3)
-    assert disc(3e-3, 1e-3, grade="N42").moment == pytest.approx(7.312e-3, rel=1e-3)
-    measured = disc(2e-3, 0.5e-3, grade="N52", remanence_t=1.1)
-    assert (measured.grade, measured.remanence_t) == ("N52", 1.1)
-    with pytest.raises(InputError, match="no grade"):
-        disc(2e-3, 0.5e-3, grade="N99")
-    with pytest.raises(InputError, match="remanence"):
-        disc(2e-3, 0.5e-3, remanence_t=14_500)
-    with pytest.raises(InputError, match="no disc"):
-        disc(-2e-3, 0.5e-3, grade="N52")
-
-
-def test_the_bill_counts_tags() -> None:
-    items = {item.part: item for item in bill(Tags(), 9, "MLX90393", 20)}
-    assert items["disc magnet"].count == 100
-    assert items["substrate"].count == 20
-    assert items["magnetometer"].count == 9
-    assert items["disc magnet"].price_usd == 0.015
-    other = bill(replace(Tags(), magnet=disc(3e-3, 1e-3, grade="N42")), 9, "MLX90393")
-    assert other[0].price_usd is None
