@@ -118,9 +118,11 @@ def design(
     )
     if count is not None:
         with console.working("Generating"):
-            tags = replace(tags, ids=families.generate(tags, count, min_distance))
-        tags = replace(tags, notes=(f"family of rule {families.VERSION}, count {count}",))
-    families.check(tags)
+            tags = replace(tags, ids=families.generate_family(tags, count, min_distance))
+        tags = replace(
+            tags, notes=(f"family of rule {families.FAMILY_RULE_VERSION}, count {count}",)
+        )
+    families.check_family(tags)
     with console.working("Planning"):
         planned = plan(tags, use_of(**use), count=len(tags.ids or (0,)))
     write_tags(output, tags, overwrite=overwrite)
@@ -158,7 +160,7 @@ def check(tag: Path, as_json: bool, **use: Any) -> None:
     warnings = list(planned.warnings)
     found: int | None = None
     if tags.ids is not None and len(tags.ids) > 1:
-        found, pair = families.closest(tags, tags.ids)
+        found, pair = families.closest_pair(tags, tags.ids)
         console.result(
             f"Smallest distance in the family: {found} (ids {pair[0]} and {pair[1]}), "
             f"{tags.min_distance} is asked for\n"
