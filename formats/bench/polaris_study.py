@@ -245,7 +245,7 @@ def _by_heading(known_speed: bool) -> list[tuple[Outcome, Array, Array]]:
             # The tag lies to the right of an array that passes to its left.
             covariance = magnet_covariance(
                 tags, layout_of(tags, tag_id), options.array, step_m=step, heading_rad=-heading,
-                offset_m=-lateral, unknown="strength" if known_speed else "steps",
+                offset_m=-lateral, nuisance="strength" if known_speed else "steps",
             )  # fmt: skip
             pose = pose_covariance(tags, layout_of(tags, tag_id), covariance, -heading)
             found.append((outcome, np.diag(covariance).reshape(-1, 3), np.diag(pose)))
