@@ -12,9 +12,10 @@ from locatk.core.errors import OutputExistsError, error_context
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.drawing.pack import Pack
-    from locatk.core.landmarks.drawing.true_size import Paper, Tile
+    from locatk.core.landmarks.drawing.true_size import Tile
     from locatk.core.landmarks.map.floor import FloorMap
     from locatk.core.materials import Item
+    from locatk.core.paper import Paper
 
 
 @click.command(short_help="Installation pack of a landmark floor.")
@@ -105,7 +106,7 @@ def landmarks(
       locatk print landmarks map.toml -o pack.pdf --spares 10 --bom parts.csv
     """
     from locatk.core.landmarks.design.materials import bill
-    from locatk.core.landmarks.drawing.true_size import paper
+    from locatk.core.paper import parse_paper
     from locatk.formats.maps import read_map
     from locatk.formats.materials import write_bill
     from locatk.formats.output import atomic_write
@@ -114,8 +115,8 @@ def landmarks(
         raise click.UsageError("--templates and --floor are different drawings; leave one out.")
     if overlap_mm is not None and not whole_floor:
         raise click.UsageError("--overlap is that of --floor.")
-    on = paper(paper_name)
-    if on.roll and not whole_floor:
+    on = parse_paper(paper_name)
+    if on.is_roll and not whole_floor:
         raise click.UsageError("A roll is for --floor; the pack needs sheets, as --paper A4.")
     options.guard_output(output, overwrite=overwrite, inputs=[map_file])
     if bom is not None:

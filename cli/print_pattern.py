@@ -198,6 +198,7 @@ def pattern(
     from locatk.core.dots.design.ledger import plan
     from locatk.core.dots.drawing import layout
     from locatk.core.dots.drawing.tiles import tiling
+    from locatk.core.paper import paper_size
     from locatk.formats import printing
     from locatk.formats.ledger import LEDGER_FILE, open_ledger
 
@@ -219,7 +220,7 @@ def pattern(
     if overlay is not None:
         items = printing.page_layouts(overlay, margin_mm, raster)
     else:
-        _, paper = layout.paper_size(size or "A4", landscape=landscape)
+        _, paper = paper_size(size or "A4", landscape=landscape)
         one = layout.lay_out(paper, margin_mm, raster)
         items = [one] * count if tiles is None else [tiling(one, tiles, overlap_mm)]
     new_book = not book.exists()

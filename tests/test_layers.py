@@ -206,6 +206,35 @@ def test_commands_import_little_at_import_time(root: Path) -> None:
             assert is_light, f"{path} imports {name} at its top"
 
 
+SYSTEMS = ("dots", "landmarks", "lighthouse", "polaris")
+
+SOLVER_STAGES = (
+    "solver", "preprocessing", "detection", "identification", "demodulation", "localization",
+    "devices", "published",
+)  # fmt: skip
+"""Modules and packages of a system that estimate; the simulators must not share their code."""
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_no_system_imports_another(root: Path, system: str) -> None:
+    sisters = tuple(f"locatk.core.{other}." for other in SYSTEMS if other != system)
+    paths = sorted((root / "core" / system).rglob("*.py"))
+    assert len(paths) > 10
+    for path in paths:
+        names = imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        assert not [name for name in names if f"{name}.".startswith(sisters)], path
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_simulators_share_no_code_with_solvers(root: Path, system: str) -> None:
+    stages = tuple(f"locatk.core.{system}.{stage}." for stage in SOLVER_STAGES)
+    paths = sorted((root / "core" / system / "simulation").glob("*.py"))
+    assert len(paths) > 3
+    for path in paths:
+        names = imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        assert not [name for name in names if f"{name}.".startswith(stages)], path
+
+
 def test_every_package_is_installed(root: Path) -> None:
     settings = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
     installed = set(settings["tool"]["setuptools"]["packages"])

@@ -20,6 +20,7 @@ from locatk.core.dots.codec import lookup as exact
 from locatk.core.dots.drawing import layout
 from locatk.core.dots.identification.decoding import THRESHOLD, Decoded, decode
 from locatk.core.dots.sheet import Manifest
+from locatk.core.paper import paper_size
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED, cpu_seconds, measured
 
@@ -49,7 +50,7 @@ PRINTS = {"A4": (0.15, 70.0, 45.6, 12_500.0), "A0": (2.0, 1100.0, None, None)}
 def page(paper: str) -> Manifest:
     """A sheet as ``locatk print pattern`` makes it by default."""
     raster = layout.snap(0.508, None, 300)
-    _, size_mm = layout.paper_size(paper)
+    _, size_mm = paper_size(paper)
     placed = layout.lay_out(size_mm, 5.0, raster)
     return layout.manifest(raster, placed.sheets(paper, ORIGIN), "anoto")
 

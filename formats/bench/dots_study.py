@@ -13,6 +13,7 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.paths import Course
 from locatk.core.dots.solver import METHODS, SolveOptions, solve
+from locatk.core.paper import paper_size
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED
 
@@ -43,7 +44,7 @@ def study_figures() -> list[Figure]:
     printer, its paper and its CNC machine as well.
     """
     raster = layout.snap(0.508, None, 300)
-    placed = layout.lay_out(layout.paper_size("A3")[1], 5.0, raster)
+    placed = layout.lay_out(paper_size("A3")[1], 5.0, raster)
     manifest = layout.manifest(raster, placed.sheets("A3", (7_000_000, 9_000_000)), "anoto")
     middle = np.array(manifest.sheets[0].page_mm) * 0.5e-3
     along = np.linspace(-SPAN_M / 2, SPAN_M / 2, GRID)

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from locatk.core.drawing import Line, Page, Text
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.pack import PARTS, pack
-from locatk.core.landmarks.drawing.true_size import Tile, floor_tiles, paper
+from locatk.core.landmarks.drawing.true_size import Tile, floor_tiles
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.paper import parse_paper
 from locatk.formats.pdf.landmarks import render, render_floor
 
 DPI = 300
@@ -311,7 +312,7 @@ FLOORS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("floor", "name", "overlap"), FLOORS)
 def test_the_floor_at_true_size_is_whole(floor: FloorMap, name: str, overlap: float) -> None:
-    tiles = floor_tiles(floor, paper(name), overlap_mm=overlap)
+    tiles = floor_tiles(floor, parse_paper(name), overlap_mm=overlap)
     data = render_floor(tiles, "t")
     assert len(pypdfium2.PdfDocument(data)) == len(tiles)
     whole = set()
@@ -376,7 +377,7 @@ def check_tile(floor: FloorMap, tile: Tile, dark: Places) -> None:
 
 
 def test_floors_have_rulers() -> None:
-    tiles = floor_tiles(HALL, paper("A3"))
+    tiles = floor_tiles(HALL, parse_paper("A3"))
     dark = ink(render_floor(tiles[:1], "t"), dpi=600) > 0.5
     px = 600 / 25.4
     length, _, _ = longest_runs(dark[-round(9.5 * px) : -round(3 * px), : round(140 * px)])
@@ -384,12 +385,12 @@ def test_floors_have_rulers() -> None:
 
 
 def test_a_roll_is_as_long_as_it_needs_to_be() -> None:
-    (tile,) = floor_tiles(HALL, paper("roll:914mm"))
+    (tile,) = floor_tiles(HALL, parse_paper("roll:914mm"))
     # 4 x 5 cells of 180 mm and what is drawn around them; the roll may lie either way.
     assert 914.0 in tile.size_mm
     assert 540 + 110 < min(tile.size_mm) < 914
     long = some_floor(60, 2)
-    strips = floor_tiles(long, paper("roll:914mm"))
+    strips = floor_tiles(long, parse_paper("roll:914mm"))
     assert len(strips) == 3
     assert max(max(strip.size_mm) for strip in strips) <= 5080
 
@@ -397,7 +398,7 @@ def test_a_roll_is_as_long_as_it_needs_to_be() -> None:
 @pytest.mark.parametrize("text", ["roll", "roll:", "roll:0mm", "roll:wide", "roll:99999mm", "A17"])
 def test_papers_that_are_none(text: str) -> None:
     with pytest.raises(InputError, match="paper"):
-        paper(text)
+        parse_paper(text)
 
 
 def test_tables_say_what_the_map_says() -> None:
@@ -499,13 +500,13 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(InputError, match="margin"):
         pack(HALL, A4, margin_mm=100)
     with pytest.raises(InputError, match="pages of A4"):
-        floor_tiles(some_floor(40, 40), paper("A4"))
+        floor_tiles(some_floor(40, 40), parse_paper("A4"))
     with pytest.raises(InputError, match="overlap"):
-        floor_tiles(HALL, paper("A4"), overlap_mm=150)
+        floor_tiles(HALL, parse_paper("A4"), overlap_mm=150)
     with pytest.raises(InputError, match="joining marks"):
-        floor_tiles(HALL, paper("A4"), margin_mm=3)
+        floor_tiles(HALL, parse_paper("A4"), margin_mm=3)
     with pytest.raises(InputError, match="overlap at a pitch"):
-        floor_tiles(replace(HALL, pitch_m=0.03), paper("A4"))
+        floor_tiles(replace(HALL, pitch_m=0.03), parse_paper("A4"))
 
 
 @pytest.mark.slow
@@ -513,7 +514,7 @@ def test_same_input_same_bytes_in_one_ink() -> None:
     floor = replace(HALL, name="Лаборатория (1)")
     first, second = (render(pack(floor, A4).pages, "t") for _ in range(2))
     assert first == second
-    tiles = [floor_tiles(floor, paper("A3")) for _ in range(2)]
+    tiles = [floor_tiles(floor, parse_paper("A3")) for _ in range(2)]
     assert render_floor(tiles[0], "t") == render_floor(tiles[1], "t")
     for data in (first, render_floor(tiles[0], "t")):
         with pikepdf.open(io.BytesIO(data)) as pdf:

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.codec import codec
 from locatk.core.dots.codec.lookup import decode_exact
-from locatk.core.dots.drawing.layout import Layout, lay_out, manifest, paper_size, snap
+from locatk.core.dots.drawing.layout import Layout, lay_out, manifest, snap
 from locatk.core.dots.drawing.tiles import seams, tiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
+from locatk.core.paper import paper_size
 from locatk.formats import rasters
 from locatk.formats.pdf import page, pattern
 

@@ -148,7 +148,8 @@ def check_window(
             raise InputError(f"origin {axis} {start} is not in 0..{SECTION_LENGTH - 1}")
         if start + count > SECTION_LENGTH:
             raise InputError(
-                f"{count} dots from {axis} {start} cross the border of the section at {SECTION_LENGTH}",
+                f"{count} dots from {axis} {start} cross the border of the section "
+                f"at {SECTION_LENGTH}",
                 hint=f"Use an origin {axis} of at most {SECTION_LENGTH - count}",
             )
 

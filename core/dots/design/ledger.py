@@ -14,10 +14,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from locatk.core.dots.codec import SECTION_LENGTH, check_window
-from locatk.core.dots.drawing.layout import Layout, manifest, paper_name
+from locatk.core.dots.drawing.layout import Layout, manifest
 from locatk.core.dots.drawing.tiles import Tiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
+from locatk.core.paper import paper_name
 
 GAP = 64
 """Places left free around an area that is chosen here, so that a window on the rim of a

@@ -10,25 +10,13 @@ left one.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from locatk.core.dots.codec import check_window
 from locatk.core.dots.sheet import MM_PER_INCH, OFFSET, Manifest, Sheet
 from locatk.core.errors import InputError
-
-PAPERS = {
-    "A0": (841.0, 1189.0),
-    "A1": (594.0, 841.0),
-    "A2": (420.0, 594.0),
-    "A3": (297.0, 420.0),
-    "A4": (210.0, 297.0),
-    "A5": (148.0, 210.0),
-    "Letter": (215.9, 279.4),
-    "Tabloid": (279.4, 431.8),
-}
-"""Width and height in mm of the papers known by name."""
+from locatk.core.paper import MAX_PAPER_MM
 
 DPIS = (300, 600, 1200)
 
@@ -37,10 +25,6 @@ BASE_DPI = 300
 
 SMALLEST = 8
 """Rows and columns of the smallest window that tells its position and its heading."""
-
-LARGEST_MM = 100_000.0
-
-_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)\s*(?:mm)?", re.IGNORECASE | re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -122,56 +106,6 @@ class Layout:
         return (Sheet(name, origin, self.size, section, self.page_mm, (x, y)),)
 
 
-def paper_size(text: str, *, landscape: bool | None = None) -> tuple[str, tuple[float, float]]:
-    """Name, and width and height in mm, of a paper.
-
-    Parameters
-    ----------
-    text : str
-        A name of :data:`PAPERS`, in any case, or ``"WxHmm"``.
-    landscape : bool, optional
-        Turn it so that its width is the longer (True) or the shorter (False) side.
-
-    Raises
-    ------
-    InputError
-        There is no such paper.
-
-    Examples
-    --------
-    >>> paper_size("a4", landscape=True)
-    ('A4', (297.0, 210.0))
-    >>> paper_size("600x3000mm")
-    ('600x3000', (600.0, 3000.0))
-    """
-    sizes = {name.lower(): name for name in PAPERS}
-    found = _SIZE.fullmatch(text.strip())
-    if found:
-        width, height = float(found[1]), float(found[2])
-        name = f"{width:g}x{height:g}"
-        if not all(0 < side <= LARGEST_MM for side in (width, height)):
-            raise InputError(f"a paper of {name} mm")
-    elif text.strip().lower() in sizes:
-        name = sizes[text.strip().lower()]
-        width, height = PAPERS[name]
-    else:
-        raise InputError(
-            f"no paper {text!r}", hint=f"Use {', '.join(PAPERS)} or WxHmm, as in 600x3000mm"
-        )
-    if landscape is not None and landscape != (width > height):
-        width, height = height, width
-    return name, (width, height)
-
-
-def paper_name(page_mm: tuple[float, float]) -> str:
-    """Name of the paper that is within 1 mm of ``page_mm``, either way up; else ``"WxH"``."""
-    for name, sides in PAPERS.items():
-        both = zip(sorted(page_mm), sorted(sides), strict=True)
-        if all(abs(side - known) <= 1 for side, known in both):
-            return name
-    return "x".join(f"{side:.0f}" for side in page_mm)
-
-
 def snap(pitch_mm: float, dot_mm: float | None, dpi: int) -> Raster:
     """The pattern that a printer of ``dpi`` can print and that is nearest to what is asked.
 
@@ -227,9 +161,9 @@ def lay_out(page_mm: tuple[float, float], margin_mm: float, raster: Raster) -> L
     InputError
         Fewer than :data:`SMALLEST` rows or columns fit.
     """
-    if not 0 <= margin_mm <= LARGEST_MM:
+    if not 0 <= margin_mm <= MAX_PAPER_MM:
         raise InputError(f"a margin of {margin_mm:g} mm")
-    if not all(0 < side <= LARGEST_MM for side in page_mm):
+    if not all(0 < side <= MAX_PAPER_MM for side in page_mm):
         raise InputError(f"a page of {page_mm[0]:g} x {page_mm[1]:g} mm")
     base = MM_PER_INCH / BASE_DPI
     margin = math.ceil(margin_mm / base - 1e-6) * raster.step

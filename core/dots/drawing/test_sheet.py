@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.codec import SECTION_LENGTH, codec, sequences
-from locatk.core.dots.drawing.layout import BASE_DPI, DPIS, PAPERS, Layout, Raster, snap
+from locatk.core.dots.drawing.layout import BASE_DPI, DPIS, Layout, Raster, snap
 from locatk.core.dots.sheet import MM_PER_INCH
 from locatk.core.errors import InputError
+from locatk.core.paper import PAPER_SIZES_MM
 
 SIZES = ("A4", "Letter")
 """Papers for which there is a test sheet."""
@@ -171,7 +172,7 @@ def printer_sheet(paper: str, dpi: int, codec_name: str = "anoto") -> PrinterShe
     def pixels(length_mm: float) -> int:
         return round(length_mm * BASE_DPI / MM_PER_INCH) * step
 
-    width, height = (pixels(side) for side in PAPERS[paper])
+    width, height = (pixels(side) for side in PAPER_SIZES_MM[paper])
     page = (width, height)
     module = MARKER_MODULE * step
     edge, far = pixels(EDGE_MM), pixels(EDGE_MM) + MARKER_SIDE * module

@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass, replace
 
 from locatk.core.dots.codec import check_window
-from locatk.core.dots.drawing.layout import LARGEST_MM, Layout
+from locatk.core.dots.drawing.layout import Layout
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import InputError
+from locatk.core.paper import MAX_PAPER_MM
 
 MOST = 1000
 """Tiles of a floor."""
@@ -84,7 +85,7 @@ def tiling(layout: Layout, count: tuple[int, int], overlap_mm: float) -> Tiling:
             f"{count[0]} x {count[1]} tiles", hint=f"A floor has at least 1 and at most {MOST}"
         )
     r = layout.raster
-    if not 0 <= overlap_mm <= LARGEST_MM:
+    if not 0 <= overlap_mm <= MAX_PAPER_MM:
         raise InputError(f"an overlap of {overlap_mm:g} mm")
     places = math.ceil(overlap_mm / r.mm(r.pitch) - 1e-6)
     if places > min(layout.size) // 2:

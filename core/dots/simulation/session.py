@@ -26,6 +26,7 @@ from locatk.core.dots.simulation.paths import PATHS, Course, course
 from locatk.core.dots.simulation.printed_paper import Paper
 from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
+from locatk.core.paper import paper_size
 from locatk.core.simulation import check_options
 from locatk.core.trajectory import Trajectory
 
@@ -76,7 +77,7 @@ def sheet(codec: str = "anoto") -> Manifest:
     It lies in the middle of the plane, where each digit sequence is under way.
     """
     raster = layout.snap(0.508, None, 300)
-    _, page_mm = layout.paper_size("A4")
+    _, page_mm = paper_size("A4")
     page = layout.lay_out(page_mm, 5.0, raster)
     return layout.manifest(
         raster, page.sheets("simulated", (SECTION_LENGTH // 2, SECTION_LENGTH // 4)), codec

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 
-from locatk.core.dots.drawing.layout import paper_size
 from locatk.core.drawing import Line, Mark, Point, Text
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.landmark import card_mm, check, digit, draw_landmark, north_mark
 from locatk.core.landmarks.drawing.page import TEXT, check_margin, printable, size_text
 from locatk.core.landmarks.drawing.plan import block_name
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
+from locatk.core.paper import Paper
 from locatk.core.units import mm_text
 
 MOST_TILES = 500
@@ -24,42 +23,6 @@ LEAST_MARGIN_MM = 7.0
 """Rulers, joining marks and words stand in the margin."""
 
 Box = tuple[float, float, float, float]
-
-_ROLL = re.compile(r"roll:(\d+(?:\.\d+)?)(?:\s*mm)?", re.IGNORECASE | re.ASCII)
-
-
-@dataclass(frozen=True)
-class Paper:
-    """Sheets of a size, or a roll: its length is then ``inf``."""
-
-    name: str
-    size_mm: Point
-
-    @property
-    def roll(self) -> bool:
-        """Whether a page is as long as it needs to be."""
-        return math.isinf(self.size_mm[1])
-
-
-def paper(text: str) -> Paper:
-    """A paper by name, as ``"WxHmm"``, or a roll as ``"roll:914mm"``.
-
-    Raises
-    ------
-    InputError
-        There is no such paper.
-
-    Examples
-    --------
-    >>> paper("roll:914mm").size_mm
-    (914.0, inf)
-    """
-    if not text.lower().startswith("roll"):
-        return Paper(*paper_size(text))
-    found = _ROLL.fullmatch(text.strip())
-    if found is None or not 0 < float(found[1]) <= LONGEST_MM:
-        raise InputError(f"no paper {text!r}", hint="A roll is named by its width: roll:914mm")
-    return Paper(f"roll:{float(found[1]):g}mm", (float(found[1]), math.inf))
 
 
 @dataclass(frozen=True)

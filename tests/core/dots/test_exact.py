@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from locatk.core.dots.codec import DOWN, LEFT, RIGHT, SECTION_LENGTH, UP, codec
 from locatk.core.dots.codec.lookup import Exact, decode_exact, digits_of, turn
+from locatk.core.dots.codec.pattern import DOWN, LEFT, RIGHT, SECTION_LENGTH, UP, codec
 from locatk.core.errors import InputError
 
 Symbols = NDArray[np.uint8]

@@ -13,13 +13,10 @@ from hypothesis import strategies as st
 from locatk.core.dots.codec import codec
 from locatk.core.dots.drawing.layout import (
     DPIS,
-    PAPERS,
     Layout,
     Raster,
     lay_out,
     manifest,
-    paper_name,
-    paper_size,
     pixels,
     snap,
     snapped,
@@ -28,27 +25,6 @@ from locatk.core.dots.drawing.tiles import seams, tiling
 from locatk.core.errors import InputError
 
 PAGES = st.tuples(st.floats(60, 3000), st.floats(60, 3000))
-
-
-def test_papers() -> None:
-    assert paper_size("A4") == ("A4", (210.0, 297.0))
-    assert paper_size(" letter ", landscape=True) == ("Letter", (279.4, 215.9))
-    assert paper_size("Tabloid", landscape=False) == ("Tabloid", (279.4, 431.8))
-    assert paper_size("914.4x3000mm") == ("914.4x3000", (914.4, 3000.0))
-    assert paper_size("3000 X 600") == ("3000x600", (3000.0, 600.0))
-    assert paper_size("3000x600", landscape=False)[1] == (600.0, 3000.0)
-    # ISO 216: each paper is the one before, cut in half.
-    for large, small in (("A0", "A1"), ("A1", "A2"), ("A2", "A3"), ("A3", "A4"), ("A4", "A5")):
-        assert PAPERS[small] == (PAPERS[large][1] // 2, PAPERS[large][0])
-    assert paper_name((297.4, 209.8)) == "A4"
-    assert paper_name((215.9, 279.4)) == "Letter"
-    assert paper_name((500.2, 30)) == "500x30"
-
-
-@pytest.mark.parametrize("text", ["A9", "", "10x", "0x100mm", "-5x100", "1e9x1e9", "nanx5", "٣x٣"])
-def test_unknown_papers_are_refused(text: str) -> None:
-    with pytest.raises(InputError):
-        paper_size(text)
 
 
 def test_usual_pattern_on_the_usual_printers() -> None:

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.codec import DOWN, LEFT, RIGHT, UP, codec
+from locatk.core.dots.codec.pattern import DOWN, LEFT, RIGHT, UP, codec
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.decoys import KINDS, decoys

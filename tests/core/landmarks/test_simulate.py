@@ -5,11 +5,9 @@ Nothing here localizes: what is held is that samples, odometry and truth belong 
 
 from __future__ import annotations
 
-import ast
 import math
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import magpylib
 import numpy as np
@@ -100,18 +98,6 @@ def relative(poses: Array) -> Array:
 
 
 # ---- the field
-
-
-def test_the_simulator_has_no_part_of_the_solvers(root: Path) -> None:
-    own = sorted((root / "core" / "landmarks").glob("simulate*.py"))
-    assert len(own) >= 7
-    allowed = {"floor", "halls", "landmark"}
-    for path in own:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module is not None:
-                *folder, name = node.module.split(".")
-                if folder[-1:] == ["landmarks"]:
-                    assert name in allowed or name.startswith("simulate"), f"{path}: {name}"
 
 
 def test_samples_are_the_closed_form_at_the_truth(tour: SimulatedSession) -> None:
