@@ -13,21 +13,23 @@ program reads 12 of the 13 right; its scatter over all runs is 4.7 and 9.8. Simu
 were counted too: 220, with headings of 0, 45, 90, 135 and 180 degrees and others, tags of
 three to eight magnets, clearances of 5 to 15 mm, 100 and 40 samples per second.
 
-================================================  =====  ===========  =======================
-Choice                                            right  scatter      simulated: right, wrong
-================================================  =====  ===========  =======================
-As it is                                          12     4.7, 3.7     210, 2
-Windows of at most one point per sample (31)      10     7.5, 6.0     196, 2
-Derivatives over the samples' standard deviation  7      6.4, 39.9    200, 10
-... and 31 points                                 6      11.1, 47.0   185, 9
-Each axis to a standard deviation of 1 (release)  7      5.3, 10.8    117, 91
-Lateral offsets to d/2 in steps of d/4 (text)     11     2.8, 35.6    125, 77
-Lateral offsets to d/4 in steps of d/8 (release)  12     4.7, 3.7     203, 9
-72 orientations                                   12     3.5, 3.5     210, 4
-Nine lateral offsets                              12     4.1, 3.0     213, 0
-Magpylib's cylinders for dipoles                  12     4.7, 3.7     211, 2
-Neighbours not subtracted (text and release)      12     4.0, 3.7     203, 8
-================================================  =====  ===========  =======================
+=================================================  =====  ===========  =======================
+Choice                                             right  scatter      simulated: right, wrong
+=================================================  =====  ===========  =======================
+As it is                                           12     4.7, 3.7     210, 2
+Windows of at most one point per sample (31)       10     7.5, 6.0     196, 2
+Derivatives over the samples' standard deviation   7      6.4, 39.9    200, 10
+... and 31 points                                  6      11.1, 47.0   185, 9
+Each axis to a standard deviation of 1 (release)   7      5.3, 10.8    117, 91
+... mean of the costs, 15 mm (release as a whole)  12     4.1, 7.6     not run
+Mean of the costs along the path (release)         12     6.4, 5.2     not run
+Lateral offsets to d/2 in steps of d/4 (text)      11     2.8, 35.6    125, 77
+Lateral offsets to d/4 in steps of d/8 (release)   12     4.7, 3.7     203, 9
+72 orientations                                    12     3.5, 3.5     210, 4
+Nine lateral offsets                               12     4.1, 3.0     213, 0
+Magpylib's cylinders for dipoles                   12     4.7, 3.7     211, 2
+Neighbours not subtracted (text and release)       12     4.0, 3.7     203, 8
+=================================================  =====  ===========  =======================
 
 - Window and template have the same number of points (8.3.1), however dense the samples are.
   The released program compares 30 samples, 2.6 mm apart, with 80 points, 1 mm apart.
