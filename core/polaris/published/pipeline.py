@@ -166,7 +166,7 @@ def detect_magnets(
 
 
 @dataclass(frozen=True)
-class _LocatedMagnet:
+class LocatedMagnet:
     """Magnet below the array; ``path_m`` is the array's distance as it passed the magnet.
 
     ``pair`` are the two sensors that located it, that of the peak first.
@@ -180,7 +180,7 @@ class _LocatedMagnet:
     angle_rad: float
     moment_am2: float
 
-    def distance_m(self, other: _LocatedMagnet) -> float:
+    def distance_m(self, other: LocatedMagnet) -> float:
         """Return the distance to another magnet on the floor."""
         along = self.x_m + self.path_m - other.x_m - other.path_m
         return math.hypot(along, self.y_m - other.y_m)
@@ -197,7 +197,7 @@ class _PassDetector:
         self.templates = template_set(tags, max_offset, grid)
         self.slopes = ddtw.prepare(self.templates.field_t)
 
-    def detect(self, signal: Signals, path: Array) -> list[_LocatedMagnet]:
+    def detect(self, signal: Signals, path: Array) -> list[LocatedMagnet]:
         """Locate the magnets of a pass, then again without the fields of their neighbours."""
         peaks = find_peaks(signal, self.tags.spacing_m / 2 / self.step_m)
         magnets = []
@@ -213,16 +213,7 @@ class _PassDetector:
             isolated = signal.subtract(total - field)
             peak = refine_peak(isolated, magnet.peak, peak_range)
             refined.append(self.locate(isolated, path, peak, magnet.pair))
-        return self.without_duplicates(refined)
-
-    def without_duplicates(self, magnets: Sequence[_LocatedMagnet]) -> list[_LocatedMagnet]:
-        """Keep the strongest of magnets that are closer than half a spacing."""
-        kept: list[_LocatedMagnet] = []
-        for magnet in magnets:
-            distances = [magnet.distance_m(other) for other in kept]
-            if min(distances, default=math.inf) > self.tags.spacing_m / 2:
-                kept.append(magnet)
-        return kept
+        return without_duplicates(refined, self.tags.spacing_m / 2)
 
     def sensor_pair(
         self, signal: Signals, peak: Peak, peaks: Sequence[Peak]
@@ -264,7 +255,7 @@ class _PassDetector:
 
     def locate(
         self, signal: Signals, path: Array, peak: Peak, pair: tuple[int, int]
-    ) -> _LocatedMagnet:
+    ) -> LocatedMagnet:
         """Align the window around a peak with the templates, then solve Eq. 3."""
         first, second = pair
         centre = float(np.interp(peak.sample, np.arange(len(path)), path))
@@ -281,7 +272,7 @@ class _PassDetector:
         to_second = self.position_m[second, 1] - y
         offset = lateral_offset(float(ratio), angle, abs(to_second), self.tags.clearance_m)
         unit_field = field_strength(np.array([offset]), angle, self.tags.clearance_m)
-        return _LocatedMagnet(
+        return LocatedMagnet(
             peak=peak,
             pair=pair,
             path_m=centre,
@@ -291,13 +282,28 @@ class _PassDetector:
             moment_am2=float(peak.amplitude_t / unit_field[0]),
         )
 
-    def magnet_field(self, magnet: _LocatedMagnet, path: Array) -> Array:
+    def magnet_field(self, magnet: LocatedMagnet, path: Array) -> Array:
         """Compute the field (n, N, 3) of a magnet along the path."""
         sensor = np.tile(self.position_m, (len(path), 1, 1))
         sensor[..., 0] += (path - magnet.path_m)[:, None] - magnet.x_m
         sensor[..., 1] -= magnet.y_m
         sensor[..., 2] = self.tags.clearance_m
         return dipole_field(sensor, magnet.moment_am2 * _direction(magnet.angle_rad))
+
+
+def without_duplicates(
+    magnets: Sequence[LocatedMagnet], min_distance_m: float
+) -> list[LocatedMagnet]:
+    """Keep the first of magnets that are no farther than ``min_distance_m`` from each other.
+
+    Two sensors may detect one magnet at different times. Magnets are sorted, the strongest
+    first.
+    """
+    kept: list[LocatedMagnet] = []
+    for magnet in magnets:
+        if all(magnet.distance_m(other) > min_distance_m for other in kept):
+            kept.append(magnet)
+    return kept
 
 
 def disjoint_pairs(gains: Sequence[float]) -> list[int]:
@@ -438,7 +444,7 @@ def _split_passes(
 
 
 def _as_detected(
-    magnets: Sequence[_LocatedMagnet],
+    magnets: Sequence[LocatedMagnet],
     samples: Samples,
     path: Array,
     span: tuple[int, int],

@@ -22,8 +22,9 @@ from locatk.core.geometry import umeyama
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.published import pipeline as paper
-from locatk.core.polaris.published.peaks import find_peaks, measure_signals
+from locatk.core.polaris.published.peaks import Peak, find_peaks, measure_signals
 from locatk.core.polaris.published.templates import TemplateGrid
+from locatk.core.polaris.simulation.session import SimulationOptions, simulate
 from locatk.core.polaris.tag import TagLayout, Tags, angles, places
 from locatk.core.solution import SolverWarning
 
@@ -193,6 +194,29 @@ def test_pairs_in_a_row_that_gain_the_most(gains: list[float]) -> None:
     assert all(gains[k] > 0 for k in chosen)
 
 
+def test_of_magnets_that_are_too_close_the_strongest_is_kept() -> None:
+    def magnet(path_m: float, x_m: float, y_m: float) -> paper.LocatedMagnet:
+        peak = Peak(0, 0.0, 1e-4)
+        return paper.LocatedMagnet(peak, (0, 1), path_m, x_m, y_m, 0.0, 1e-3)
+
+    # The position on the floor is the sensor's own and that of the array together.
+    strongest, same, beside, ahead = (
+        magnet(0.10, 0.0, 0.0), magnet(0.08, 0.02, 0.019), magnet(0.10, 0.0, 0.021),
+        magnet(0.121, 0.0, 0.0),
+    )  # fmt: skip
+    kept = paper.without_duplicates([strongest, same, beside, ahead], 0.02)
+    assert kept == [strongest, beside, ahead]
+
+
+def test_no_two_magnets_of_a_pass_are_closer_than_half_a_spacing() -> None:
+    # A tag of 20 mm under sensors 20 mm apart: too dense, so that one magnet has two peaks.
+    tags = Tags(magnets=8, clearance_m=0.005, spacing_m=0.02)
+    drive_over = SimulationOptions(route=(9770,), heading_rad=10.0, lateral_m=0.003, seed=10)
+    (magnets,) = paper.detect_magnets(simulate(tags, drive_over).samples, tags, SPEED)
+    distance = np.linalg.norm(magnets.place_m[:, None] - magnets.place_m, axis=2)
+    assert distance[np.triu_indices(len(magnets), 1)].min() > 0.01
+
+
 @pytest.mark.parametrize(
     "magnets",
     [
@@ -320,6 +344,17 @@ def test_a_wide_tag_flips_no_moment_across_the_track(heading_deg: int) -> None:
         samples = drive([truth], 0.4, clearance_m=0.012)
         (magnets,) = paper.detect_magnets(samples, tags, SPEED)
         assert compared(magnets, samples, truth)[:, 1].max() < math.radians(45)
+
+
+@pytest.mark.parametrize("lateral", [0.022, 0.024, 0.036, 0.038])
+def test_the_gap_of_a_dead_sensor_flips_no_moment(lateral: float) -> None:
+    # The gap is twice the distance of two sensors; templates of such offsets would flip it.
+    truth = np.array([[0.1, lateral]]), np.array([math.pi / 2])
+    samples = drive([truth], 0.2)
+    field = samples.field_t.copy()
+    field[:, 2] = np.nan
+    (magnets,) = paper.detect_magnets(replace(samples, field_t=field), TAGS, SPEED)
+    assert compared(magnets, samples, truth)[0, 1] < math.radians(45)
 
 
 def test_the_resolution_of_the_templates_is_that_of_the_orientations() -> None:
