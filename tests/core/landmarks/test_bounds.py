@@ -91,5 +91,5 @@ def test_a_one_way_square_may_read_like_itself_turned() -> None:
     """One wall leaves one of the four ways around a square, and no word is useless then."""
     codes = np.zeros((2, 2), int)
     walls = frozenset({((0, 0), (0, 1))})
-    assert prove_map(FloorMap(codes, alphabet="6", window="2x2", walls=walls)).unique
+    assert prove_map(FloorMap(codes, alphabet="6", window="2x2", walls=walls)).is_unique
     require_enough_words(2, 2, alphabet="6", window="2x2", walls=walls)
