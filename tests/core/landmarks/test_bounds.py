@@ -93,3 +93,15 @@ def test_a_one_way_square_may_read_like_itself_turned() -> None:
     walls = frozenset({((0, 0), (0, 1))})
     assert prove_map(FloorMap(codes, alphabet="6", window="2x2", walls=walls)).is_unique
     require_enough_words(2, 2, alphabet="6", window="2x2", walls=walls)
+
+
+def test_one_way_squares_do_not_count_as_reversible() -> None:
+    """19 x 20 cells with 14 walls have 1284 readings, of which 28 are read in one direction only.
+
+    The other 1256 are no more than the 1260 words that differ from their rotated reverse.
+    """
+    corners = [(row, column) for row in range(1, 17, 3) for column in (1, 4, 7)][:14]
+    walls = frozenset(((row, column), (row, column + 1)) for row, column in corners)
+    require_enough_words(19, 20, alphabet="6", window="2x2", walls=walls)
+    with pytest.raises(InputError, match="1264 readings"):
+        require_enough_words(19, 20, alphabet="6", window="2x2", walls=frozenset(sorted(walls)[1:]))
