@@ -22,7 +22,7 @@ from locatk.core.drawing.pages import TEXT_POINTS
 from locatk.core.landmarks.drawing.landmark import draw_symbol, north_mark
 from locatk.core.landmarks.landmark import PATTERNS, code_of, name
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.landmarks.map.windows import PATHS
+from locatk.core.landmarks.map.windows import WINDOW_PATHS
 
 LEGEND_HEIGHT_MM = 44.0
 """Height of the strip with the legend."""
@@ -90,7 +90,7 @@ def _explain_landmark(corner: Point) -> list[Mark]:
 
 def _explain_window(window: str, corner: Point) -> list[Mark]:
     """Draw the cells of a window as a robot visits them that drives along +x."""
-    cells = [(row, column) for column, row in PATHS[window]]
+    cells = [(row, column) for column, row in WINDOW_PATHS[window]]
     rows = 1 + max(row for row, _ in cells)
     side = min(9.0, 27.0 / rows)
     half = side / 2

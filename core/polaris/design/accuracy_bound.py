@@ -40,7 +40,7 @@ PASS_MARGIN_CLEARANCES = 4.0
 
 MAX_SAMPLES = 400
 """Largest number of samples of a pass. Denser samples are averaged in groups, which changes the
-bound by less than 2 %."""
+bounds of the angle and across the track by less than 2 %."""
 
 
 @dataclass(frozen=True)

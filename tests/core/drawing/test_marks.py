@@ -69,7 +69,7 @@ def test_cut_marks_point_to_the_corners_from_outside() -> None:
         assert math.dist(corner, mark.start) == pytest.approx(1.0)
         assert math.dist(corner, mark.end) == pytest.approx(CUT_MARK_MM)
         for point in (mark.start, mark.end):
-            assert not (10 < point[0] < 50 and 20 < point[1] < 80)
+            assert not (10 <= point[0] <= 50 and 20 <= point[1] <= 80)
 
 
 def test_an_arrow_ends_at_its_tip() -> None:

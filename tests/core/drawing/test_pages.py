@@ -9,6 +9,7 @@ import pytest
 from locatk.core.drawing import Line, Mark, Polygon, Text, line_height
 from locatk.core.drawing.pages import (
     FLOW_TEXT_POINTS,
+    FRAME_CLEARANCE_MM,
     TEXT_POINTS,
     Column,
     PageFrame,
@@ -46,8 +47,8 @@ def test_the_content_is_clear_of_title_notes_and_rulers() -> None:
     assert {text.text for text in header} == {"A title", "a note", "page 1 of 1"}
     lowest = min(text.position[1] for text in header)
     # Descenders are at most a quarter of the font size.
-    assert top < lowest - 0.25 * TEXT_POINTS * 25.4 / 72
-    assert top > lowest - 5
+    descender = 0.25 * TEXT_POINTS * 25.4 / 72
+    assert lowest - 5 < top < lowest - descender - FRAME_CLEARANCE_MM
     ruler_ends = [
         end
         for mark in FRAME.draw(1, 1).marks

@@ -196,7 +196,7 @@ def test_follows_the_noise() -> None:
     assert twice == pytest.approx(4 * once)
 
 
-def test_merged_samples_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_merged_samples_give_the_same_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     fine = accuracy_bound(TAGS, LAYOUTS[:2], array(), step_m=0.6e-3, nuisance="steps")
     monkeypatch.setattr(bounds, "MAX_SAMPLES", 100)
     coarse = accuracy_bound(TAGS, LAYOUTS[:2], array(), step_m=0.6e-3, nuisance="steps")
@@ -204,7 +204,16 @@ def test_merged_samples_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     assert coarse.angle_rad == pytest.approx(fine.angle_rad, rel=0.02)
 
 
-def test_heading_turns_the_tag() -> None:
+def test_merged_steps_keep_their_random_walk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With weak magnets the position along the track depends on the prior of the steps."""
+    noisy = array((50.0, 50.0, 50.0))
+    fine = accuracy_bound(TAGS, LAYOUTS[:2], noisy, step_m=0.6e-3, nuisance="steps")
+    monkeypatch.setattr(bounds, "MAX_SAMPLES", 100)
+    coarse = accuracy_bound(TAGS, LAYOUTS[:2], noisy, step_m=0.6e-3, nuisance="steps")
+    assert coarse.x_m == pytest.approx(fine.x_m, rel=0.03)
+
+
+def test_the_heading_rotates_the_tag() -> None:
     """A tag at 90 degrees is another tag, whose magnets lie and point elsewhere."""
     square = TagLayout(((0, 0), (0, 2), (2, 2)), (0, 2, 5))
     tags = replace(TAGS, magnets=3)
@@ -241,6 +250,6 @@ def test_pose_of_independent_magnets() -> None:
         (SensorArray(bar(1, 0.02), noise_t=np.full(3, 1e-6)), 0.5, "determine"),
     ],
 )
-def test_what_cannot_be_told(sensors: SensorArray, step: float, said: str) -> None:
+def test_undetermined_passes_are_rejected(sensors: SensorArray, step: float, said: str) -> None:
     with pytest.raises(InputError, match=said):
         magnet_covariance(TAGS, LAYOUTS[0], sensors, step_m=step)

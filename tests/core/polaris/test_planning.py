@@ -157,6 +157,7 @@ def test_too_fast() -> None:
     (warning,) = found.warnings
     most = float(re.findall(r"at most ([\d.]+) m/s", warning)[0])
     assert evaluate_design(Tags(), ReadingConditions(speed_mps=most * 0.98)).warnings == ()
+    assert evaluate_design(Tags(), ReadingConditions(speed_mps=most * 1.03)).warnings != ()
     wild = evaluate_design(Tags(), ReadingConditions(speed_mps=1e6))
     assert any("too fast" in warning for warning in wild.warnings)
 
