@@ -205,7 +205,7 @@ def _stride(capacity: int) -> int:
 
 
 def _distances(
-    tags: Tags, rows: NDArray[np.int16], others: NDArray[np.int16]
+    tags: Tags, rows: NDArray[np.int16], other_rows: NDArray[np.int16]
 ) -> NDArray[np.float32]:
     """Return the distances (n, m) of the tags of two tables by one matrix product.
 
@@ -214,7 +214,9 @@ def _distances(
     cells, base = rows.shape[1], tags.orientations
     # One column for each cell and orientation; the last orientation is the empty cell.
     costs = _cell_costs(base)[rows].reshape(len(rows), cells * (base + 1))
-    one_hot = np.eye(base + 1, dtype=np.float32)[others].reshape(len(others), cells * (base + 1))
+    one_hot = np.eye(base + 1, dtype=np.float32)[other_rows].reshape(
+        len(other_rows), cells * (base + 1)
+    )
     distances: NDArray[np.float32] = costs @ one_hot.T
     return distances
 
