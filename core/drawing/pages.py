@@ -253,7 +253,7 @@ class TextFlow:
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """Column of a table: its head, its width, and the alignment of its text."""
 
     head: str
@@ -263,7 +263,7 @@ class Column:
 
 def table_pages(
     rows: Sequence[Sequence[str]],
-    columns: Sequence[Column],
+    columns: Sequence[TableColumn],
     frame: PageFrame,
     *,
     points: float = TEXT_POINTS,
@@ -288,7 +288,7 @@ def table_pages(
 
 
 def _draw_table_block(
-    rows: Sequence[Sequence[str]], columns: Sequence[Column], corner: Point, points: float
+    rows: Sequence[Sequence[str]], columns: Sequence[TableColumn], corner: Point, points: float
 ) -> list[Mark]:
     """Draw the head and rows of a table from its upper left corner down."""
     step = line_height(points)

@@ -9,7 +9,7 @@ from locatk.core.drawing import TRUE_SIZE_INSTRUCTION, Point, text_width
 from locatk.core.drawing.pages import (
     TEXT_POINTS,
     TITLE_POINTS,
-    Column,
+    TableColumn,
     PageFrame,
     TextFlow,
     UnnumberedPage,
@@ -123,14 +123,14 @@ def marking_list_pages(
     longest = max(len(value) for row in rows for value in row[2:4])
     position_mm = max(12.0, text_width("0" * longest, TEXT_POINTS) + 3.0)
     columns = (
-        Column("row", 8.5, is_right_aligned=True),
-        Column("col", 8.5, is_right_aligned=True),
-        Column("x mm", position_mm, is_right_aligned=True),
-        Column("y mm", position_mm, is_right_aligned=True),
-        Column("code", 8.5, is_right_aligned=True),
-        Column("bars", 11.0, is_right_aligned=True),
-        Column("pat.", 8.0, is_right_aligned=True),
-        Column("done", 8.0, is_right_aligned=True),
+        TableColumn("row", 8.5, is_right_aligned=True),
+        TableColumn("col", 8.5, is_right_aligned=True),
+        TableColumn("x mm", position_mm, is_right_aligned=True),
+        TableColumn("y mm", position_mm, is_right_aligned=True),
+        TableColumn("code", 8.5, is_right_aligned=True),
+        TableColumn("bars", 11.0, is_right_aligned=True),
+        TableColumn("pat.", 8.0, is_right_aligned=True),
+        TableColumn("done", 8.0, is_right_aligned=True),
     )
     notes = (
         "Bars: the letters of bar 0 (at +x), 1 (+y), 2 (-x) and 3 (-y); N: magnetised "

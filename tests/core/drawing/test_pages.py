@@ -11,7 +11,7 @@ from locatk.core.drawing.pages import (
     FLOW_TEXT_POINTS,
     FRAME_CLEARANCE_MM,
     TEXT_POINTS,
-    Column,
+    TableColumn,
     PageFrame,
     TextFlow,
     UnnumberedPage,
@@ -129,7 +129,7 @@ def test_rows_of_text_wrap_their_last_column() -> None:
 
 
 def test_tables_fill_blocks_and_pages_in_order() -> None:
-    columns = (Column("no", 20.0, is_right_aligned=True), Column("name", 30.0))
+    columns = (TableColumn("no", 20.0, is_right_aligned=True), TableColumn("name", 30.0))
     rows = [(str(number), f"item {number}") for number in range(500)]
     pages = table_pages(rows, columns, FRAME)
     assert len(pages) == 3
