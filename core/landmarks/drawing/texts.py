@@ -9,8 +9,8 @@ from locatk.core.drawing import TRUE_SIZE_INSTRUCTION, Point, text_width
 from locatk.core.drawing.pages import (
     TEXT_POINTS,
     TITLE_POINTS,
-    TableColumn,
     PageFrame,
+    TableColumn,
     TextFlow,
     UnnumberedPage,
     table_pages,
