@@ -513,7 +513,7 @@ def _facts(simulated: SimulatedSession, options: SimulationOptions) -> dict[str,
         {"tag_id": tag_id, "x_m": x, "y_m": y, "angle_rad": angle, "moment_am2": moment}
         for tag_id, (x, y), angle, moment in zip(
             magnets.tag_id,
-            magnets.place_m.tolist(),
+            magnets.position_m.tolist(),
             magnets.angle_rad.tolist(),
             magnets.moment_am2.tolist(),
             strict=True,

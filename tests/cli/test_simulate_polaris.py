@@ -115,7 +115,7 @@ def test_a_session_holds_samples_bar_tag_and_truth(locatk, tmp_path: Path) -> No
     assert json.loads(facts["simulated_crossings"]) == [crossing]
     magnets = json.loads(facts["simulated_magnets"])
     assert [[magnet["x_m"], magnet["y_m"]] for magnet in magnets] == pytest.approx(
-        wanted.magnets.place_m
+        wanted.magnets.position_m
     )
 
 
