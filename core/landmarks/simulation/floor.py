@@ -25,8 +25,8 @@ from locatk.core.simulation import random_stream
 Array = NDArray[np.float64]
 
 REACH_M = 0.3
-"""Distance beyond which the field of a landmark is ignored [m]: that of a strong one is 1 uT there, a
-hundredth of the noise."""
+"""Distance beyond which the field of a landmark is ignored [m]. That of a strong one is 1 uT
+there, a hundredth of the noise."""
 
 DIPOLE_LENGTHS = 6
 """Distance in lengths of a bar beyond which it is a dipole, to 0.3 uT. Dipoles are faster."""

@@ -44,6 +44,8 @@ STRATEGIES = ("paper", "path", "pass")
 class Errors:
     """Errors of sensors, landmarks and odometry: standard deviations, unless stated otherwise.
 
+    The defaults are assumptions for inexpensive parts: no recordings of such a floor are published.
+
     Attributes
     ----------
     noise_t : float
@@ -173,7 +175,7 @@ class Aims:
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What to simulate.
+    """Options of a simulated session.
 
     Attributes
     ----------
@@ -207,14 +209,15 @@ class SimulationOptions:
     sensors : HallSensors or None
         None for four on the circle of the map's geometry.
     range_t : float
-        Greatest field that they tell, where ``sensors`` is None.
+        Largest field that they measure if ``sensors`` is None.
     rate_hz, odometry_hz : float
+        Rates of the samples and of the odometry.
     rest_s, stop_s : float
-        Standing at the start and at the end, and on each landmark.
+        Rests at the start and at the end, and on each landmark.
     device : str
     seed : int
     floor_seed : int or None
-        Of how the bars lie, where it is another one: several drives over the same floor.
+        Seed of the errors of the floor, for several drives over the same floor; None for ``seed``.
 
     Raises
     ------
