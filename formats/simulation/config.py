@@ -26,9 +26,11 @@ from locatk.formats.simulation.settings import NO_DEFAULT, FilePath, Number, Req
 from locatk.formats.toml import Inline, Table
 from locatk.formats.toml_files import head
 
-VERSION = 1
+FORMAT_VERSION = 1
+"""Version of the configuration files of all simulators."""
 
 COMMENT_WIDTH_CHARACTERS = 98
+"""Longest line of a comment in a configuration file."""
 
 
 class SettingsError(InputError):
@@ -110,7 +112,7 @@ class SimulationConfig:
             f"# Settings of `locatk simulate {self.system} --config FILE`.",
             "# A key behind # has its default, or an example of a value. Remove the # to set it.",
             "# Options of the command line override this file.",
-            *toml.dumps(head(self._format, VERSION)).splitlines(),
+            *toml.dumps(head(self._format, FORMAT_VERSION)).splitlines(),
         ]
         for table, members in self.tables.items():
             lines += ["", f"[{table}]"]
@@ -152,7 +154,7 @@ class SimulationConfig:
         return f"locatk-simulation-{self.system}"
 
     def _parse(self, table: Table, folder: Path) -> dict[str, Any]:
-        toml.check_format(table, self._format, VERSION)
+        toml.check_format(table, self._format, FORMAT_VERSION)
         settings = {}
         for name, members in self.tables.items():
             section = table.table(name, None)
@@ -188,7 +190,7 @@ class SimulationConfig:
         replaced = set(flags)
         for first, second in self.conflicts:
             for keys, others in ((first, second), (second, first)):
-                if any(key in flags for key in keys):
+                if any(_is_set(flags, key) for key in keys):
                     replaced.update(others)
         for need in self.requirements:
             if need.other in flags and need.values and flags[need.other] not in need.values:
@@ -198,15 +200,15 @@ class SimulationConfig:
         return merged
 
     def _check_combinations(self, settings: Mapping[str, Any]) -> None:
+        """Raise an error for settings that cannot be combined; those that are off do not count."""
         for first, second in self.conflicts:
-            present = [
-                next((key for key in keys if key in settings), "") for keys in (first, second)
-            ]
-            if all(present):
-                one, other = (self.setting(key).title for key in present)
-                raise SettingsError(f"Give {one} or {other}, not both")
+            one = next((key for key in first if _is_set(settings, key)), None)
+            other = next((key for key in second if _is_set(settings, key)), None)
+            if one and other:
+                titles = f"{self.setting(one).title} or {self.setting(other).title}"
+                raise SettingsError(f"Give {titles}, not both")
         for need in self.requirements:
-            if need.key not in settings:
+            if not _is_set(settings, need.key):
                 continue
             needed = self.setting(need.other)
             value = settings.get(need.other, self.default(needed))
@@ -238,6 +240,10 @@ class SimulationConfig:
             for key, value in settings.items()
             if isinstance(kind := self.setting(key).kind, FilePath) and value not in kind.names
         ]
+
+
+def _is_set(settings: Mapping[str, Any], key: str) -> bool:
+    return settings.get(key, False) is not False
 
 
 def with_values(options: Any, values: Mapping[str, Any]) -> Any:

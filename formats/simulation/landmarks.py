@@ -363,11 +363,7 @@ _ODOMETRY = (
         former_flag="--slips",
     ),
     Setting(
-        "odometry.slip_mm",
-        NOT_NEGATIVE,
-        "Length of a slip",
-        "errors.slip_m",
-        former_flag="--slip",
+        "odometry.slip_mm", NOT_NEGATIVE, "Length of a slip", "errors.slip_m", former_flag="--slip"
     ),
 )
 

@@ -93,12 +93,7 @@ _ROBOT = (
         example=80.0,
     ),
     Setting(
-        "robot.speed_mps",
-        POSITIVE,
-        "Speed",
-        "speed_mps",
-        "--speed",
-        default_text="0.1; mini 0.005",
+        "robot.speed_mps", POSITIVE, "Speed", "speed_mps", "--speed", default_text="0.1; mini 0.005"
     ),
     Setting(
         "robot.speed_wobble_fraction",
@@ -184,11 +179,7 @@ _SENSORS = (
         default_text="100; mini 17",
     ),
     Setting(
-        "sensors.gain",
-        Integer(0, 7),
-        "GAIN_SEL of the MLX90393",
-        former_flag="--gain",
-        default=7,
+        "sensors.gain", Integer(0, 7), "GAIN_SEL of the MLX90393", former_flag="--gain", default=7
     ),
     Setting(
         "sensors.resolution",

@@ -70,7 +70,7 @@ def test_the_defaults_of_the_file_are_those_of_the_simulator(config: SimulationC
         for setting in config.settings
         if config.default(setting) is not None
     }
-    uncommented = config.loads(config.dumps(with_default))
+    uncommented = config.merge(config.loads(config.dumps(with_default)), {})
     assert uncommented == with_default
     values = {
         name: value
@@ -207,6 +207,17 @@ def test_a_setting_of_the_file_gives_way_to_one_that_excludes_it() -> None:
     assert merge({"robot.strategy": "path", **path}, {"robot.cells": cells["robot.cells"]}) == cells
     # A tour of five landmarks, for once as a pass.
     assert merge({"robot.landmarks": 5}, {"robot.strategy": "pass"}) == {"robot.strategy": "pass"}
+
+
+def test_a_switch_that_is_off_excludes_nothing() -> None:
+    noise = {"errors.noise_ut": 1.0}
+    off = {"errors.measured_noise": False}
+    assert polaris.CONFIG.merge(noise | off, {}) == noise | off
+    assert polaris.CONFIG.merge(noise, off) == noise | off
+    assert polaris.CONFIG.merge(noise, {"errors.measured_noise": True}) == {
+        "errors.measured_noise": True
+    }
+    assert dots.CONFIG.merge({dots.IS_SCALE_KNOWN: False}, {}) == {dots.IS_SCALE_KNOWN: False}
 
 
 @pytest.mark.parametrize(
