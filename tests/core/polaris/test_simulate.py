@@ -24,7 +24,7 @@ from locatk.core.magnetics import dipole_field
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.simulation.field import Discs, disc_field, scatter_debris
-from locatk.core.polaris.simulation.sensors import SensorFaults, measure
+from locatk.core.polaris.simulation.sensors import SensorFaults, measure, received_frames
 from locatk.core.polaris.simulation.session import (
     CARS,
     SimulatedSession,
@@ -729,3 +729,10 @@ def test_what_the_tags_do_not_allow_is_refused(
 
 def test_without_a_route_the_first_of_the_family_is_crossed() -> None:
     assert simulate(Tags(ids=(300, 8)), PLAIN).crossings[0].tag_id == 300
+
+
+def test_the_first_and_the_last_frame_always_arrive() -> None:
+    for seed in range(5):
+        is_received = received_frames(10, 0.9, seed)
+        assert is_received.tolist() == [True, *[False] * 8, True]
+    assert np.count_nonzero(~received_frames(100, 0.25, 0)) == 25
