@@ -144,7 +144,7 @@ def _true(made: SimulatedSession, time_s: float) -> tuple[Array, Array]:
     at = int(np.argmin(np.abs(time_ns - round(time_s * 1e9))))
     heading = float(heading_from_quaternion(made.truth.quaternion[at : at + 1])[0])
     cos, sin = math.cos(heading), math.sin(heading)
-    points = np.vstack([made.magnets.place_m, np.zeros(2)]) - made.truth.position[at, :2]
+    points = np.vstack([made.magnets.position_m, np.zeros(2)]) - made.truth.position[at, :2]
     turned = points @ np.array([[cos, -sin], [sin, cos]])
     angle = np.r_[made.magnets.angle_rad, 0.0] - heading
     every = np.column_stack([turned, angle])
