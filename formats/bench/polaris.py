@@ -31,7 +31,7 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.codec import layout_of
 from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
-from locatk.core.polaris.tag import places
+from locatk.core.polaris.tag import cell_positions
 from locatk.formats.bench import Figure
 from locatk.formats.bench.polaris_speed import speed_figures
 from locatk.formats.bench.polaris_study import study_figures
@@ -157,7 +157,7 @@ def rigid_error(place_m: Array, tag_id: int) -> float:
     translation; ``nan`` where they were not found."""
     if not np.isfinite(place_m).all():
         return math.nan
-    nominal = places(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, tag_id).cells)
+    nominal = cell_positions(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, tag_id).cells)
     aligned = umeyama(place_m, nominal, with_scale=False).apply(place_m)
     return 1e3 * float(np.linalg.norm(aligned - nominal, axis=1).mean())
 

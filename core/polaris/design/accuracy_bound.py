@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.errors import InputError
 from locatk.core.magnetics import MU0_4PI, dipole_tensor
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.tag import TagLayout, Tags, angles, places
+from locatk.core.polaris.tag import TagLayout, Tags, cell_positions, symbol_angles
 
 Array = NDArray[np.float64]
 
@@ -115,7 +115,7 @@ def magnet_covariance(
     -------
     (3 M, 3 M) ndarray
         Of x, y, angle of the first magnet, of the second, ..., in m and rad, as in
-        :attr:`locatk.core.polaris.magnets.Sighting.covariance`.
+        :attr:`locatk.core.polaris.magnets.DetectedMagnets.covariance`.
 
     Raises
     ------
@@ -128,8 +128,8 @@ def magnet_covariance(
         raise InputError("the noise of the array is not known", hint="Give its noise")
     if not (step_m > 0 and math.isfinite(step_m)):
         raise InputError(f"a step of {step_m} m from sample to sample is no pass")
-    place = turn(places(tags, layout.cells), heading_rad) + [0.0, offset_m]
-    angle = angles(tags, layout.symbols) + heading_rad
+    place = turn(cell_positions(tags, layout.cells), heading_rad) + [0.0, offset_m]
+    angle = symbol_angles(tags, layout.symbols) + heading_rad
     path, merged = _path(place, step_m, MARGIN * tags.clearance_m)
     noise = noise / math.sqrt(merged)
 
@@ -156,7 +156,7 @@ def pose_covariance(tags: Tags, layout: TagLayout, covariance: Array, heading_ra
     InputError
         The magnets do not determine a pose.
     """
-    place = turn(places(tags, layout.cells), heading_rad)
+    place = turn(cell_positions(tags, layout.cells), heading_rad)
     keep = np.arange(len(covariance)) % 3 < 2
     slope = np.zeros((2 * len(place), 3))
     slope[0::2, 0] = slope[1::2, 1] = 1

@@ -23,7 +23,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray
 from locatk.core.polaris.design.accuracy_bound import Bound, Unknown, bound
 from locatk.core.polaris.design.materials import bill
-from locatk.core.polaris.mlx90393 import Settings, for_rate, published_bar
+from locatk.core.polaris.mlx90393 import Settings, published_bar, settings_for_rate
 from locatk.core.polaris.tag import Magnet, TagLayout, Tags
 
 Array = NDArray[np.float64]
@@ -367,7 +367,7 @@ def _warnings(plan: Plan) -> Iterator[str]:
     """Describe the limits that a design exceeds, with figures and remedies."""
     tags, use = plan.tags, plan.use
     if use.rate_hz is not None and use.rate_hz > plan.max_rate_hz:
-        faster = for_rate(use.rate_hz, use.settings)
+        faster = settings_for_rate(use.rate_hz, use.settings)
         remedy = (
             "no osr and filt are that fast"
             if faster is None

@@ -21,7 +21,7 @@ from locatk.core.drawing import (
     Text,
     arrow,
 )
-from locatk.core.polaris.tag import Cell, TagLayout, Tags, places, vertices
+from locatk.core.polaris.tag import Cell, TagLayout, Tags, cell_positions, vertices
 
 AXIS_MM, TICK_MM = 4.0, 1.5
 """What the axes take beside the magnets: above and at the left, below and at the right."""
@@ -82,7 +82,7 @@ class _Drawn:
 
     def _cell(self, cell: Cell) -> Point:
         """Where a cell is."""
-        forward, left = places(self.tags, (cell,))[0].tolist()
+        forward, left = cell_positions(self.tags, (cell,))[0].tolist()
         return -1e3 * left, 1e3 * forward
 
     def marks(self) -> list[Mark]:

@@ -329,12 +329,12 @@ def pose_and_angles(
 
     None where there is no position pattern.
     """
-    pattern, turn = position_pattern(sighting.place_m), heading(sighting.place_m)
+    pattern, turn = position_pattern(sighting.position_m), heading(sighting.position_m)
     if pattern is None or turn is None:
         return None
-    middle = (sighting.place_m[pattern[0]] + sighting.place_m[pattern[2]]) / 2
+    middle = (sighting.position_m[pattern[0]] + sighting.position_m[pattern[2]]) / 2
     cos, sin = math.cos(turn), math.sin(turn)
-    own = (sighting.place_m - middle) @ np.array([[cos, -sin], [sin, cos]]) / tags.spacing_m
+    own = (sighting.position_m - middle) @ np.array([[cos, -sin], [sin, cos]]) / tags.spacing_m
     half = (tags.order - 1) / 2
     cells = tuple((round(half - y), round(half + x)) for x, y in own.tolist())
     angle = np.remainder(sighting.angle_rad - turn + math.pi, math.tau) - math.pi
@@ -397,7 +397,7 @@ def _sighting(
         first=first,
         stop=stop,
         path_m=path[first:stop] - path[middle],
-        place_m=np.array([(m.x_m + m.way_m - path[middle], m.y_m) for m in chosen]),
+        position_m=np.array([(m.x_m + m.way_m - path[middle], m.y_m) for m in chosen]),
         angle_rad=np.array([m.angle_rad for m in chosen]),
         moment_am2=np.array([m.moment_am2 for m in chosen]),
         covariance=np.full((3 * len(chosen), 3 * len(chosen)), np.nan),

@@ -19,7 +19,14 @@ from locatk.core.polaris.simulation.field import (
     scatter,
 )
 from locatk.core.polaris.simulation.options import SimulationOptions
-from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags, angles, built_magnets, places
+from locatk.core.polaris.tag import (
+    AsBuiltTag,
+    PlanarPose,
+    Tags,
+    as_built_magnets,
+    cell_positions,
+    symbol_angles,
+)
 
 Array = NDArray[np.float64]
 
@@ -32,7 +39,7 @@ class Floor:
     ----------
     frame : str
         ``"site"``, or ``"tag-<id>"`` of the one tag.
-    site : mapping of int to Placed
+    site : mapping of int to PlanarPose
         All tags that lie there.
     route : tuple of int
         Those that are crossed, in their order.
@@ -44,7 +51,7 @@ class Floor:
     """
 
     frame: str
-    site: Mapping[int, Placed]
+    site: Mapping[int, PlanarPose]
     route: tuple[int, ...]
     discs: Discs
     built: Mapping[int, AsBuiltTag]
@@ -73,13 +80,15 @@ def floor(tags: Tags, options: SimulationOptions) -> Floor:
     return Floor(frame, site, route, discs, built, debris, earth)
 
 
-def on_floor(at: Placed, points: Array) -> Array:
+def on_floor(at: PlanarPose, points: Array) -> Array:
     """Points (..., 2) of a tag's frame in the site's."""
     cos, sin = np.cos(at.heading_rad), np.sin(at.heading_rad)
     return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]) + [at.x_m, at.y_m])
 
 
-def _world(tags: Tags, route: tuple[int, ...]) -> tuple[Mapping[int, Placed], tuple[int, ...], str]:
+def _world(
+    tags: Tags, route: tuple[int, ...]
+) -> tuple[Mapping[int, PlanarPose], tuple[int, ...], str]:
     """Where the tags lie, which are crossed, and the frame's name."""
     if tags.site:
         strange = [tag_id for tag_id in route if tag_id not in tags.site]
@@ -95,11 +104,11 @@ def _world(tags: Tags, route: tuple[int, ...]) -> tuple[Mapping[int, Placed], tu
             "several tags, and no site that says where they lie",
             hint="Give the tags a site, or cross one of them",
         )
-    return {first: Placed(0.0, 0.0, 0.0)}, (first,), f"tag-{first}"
+    return {first: PlanarPose(0.0, 0.0, 0.0)}, (first,), f"tag-{first}"
 
 
 def _build(
-    tags: Tags, site: Mapping[int, Placed], options: SimulationOptions
+    tags: Tags, site: Mapping[int, PlanarPose], options: SimulationOptions
 ) -> tuple[Discs, dict[int, AsBuiltTag]]:
     """The magnets of all tags as they truly lie, and the same against the design."""
     ids: list[int] = []
@@ -113,14 +122,15 @@ def _build(
                 f"tag {tag_id} is not of the family", hint=f"It has {len(tags.ids)} members"
             )
         layout = codec.layout_of(tags, tag_id)
-        where, towards = built_magnets(tags, tag_id, layout)
+        where, towards = as_built_magnets(tags, tag_id, layout)
         # By the tag's own number, so that it is the same on every site.
         rng = np.random.default_rng([options.build_seed, 20, tag_id])
         where = where + options.build_place_m * rng.normal(size=where.shape)
         towards = towards + options.build_angle_rad * rng.normal(size=towards.shape)
         strength.append(1 + options.build_strength * rng.normal(size=towards.shape))
         built[tag_id] = AsBuiltTag(
-            where - places(tags, layout.cells), towards - angles(tags, layout.symbols)
+            where - cell_positions(tags, layout.cells),
+            towards - symbol_angles(tags, layout.symbols),
         )
         ids += [tag_id] * len(where)
         place.append(on_floor(at, where))
@@ -132,7 +142,7 @@ def _build(
 
 
 def _strew(
-    tags: Tags, at: list[Placed], discs: Discs, earth: Array, options: SimulationOptions
+    tags: Tags, at: list[PlanarPose], discs: Discs, earth: Array, options: SimulationOptions
 ) -> Debris:
     """Debris over each tag, and a spacing around it."""
     reach = ((tags.order - 1) / 2 + 1) * tags.spacing_m

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.polaris.tag import Placed
+from locatk.core.polaris.tag import PlanarPose
 
 Array = NDArray[np.float64]
 
@@ -73,12 +73,12 @@ class Line:
         return place + beyond * np.stack([np.cos(heading), np.sin(heading)], axis=-1), heading
 
 
-def line(stops: Sequence[Placed], run_up_m: float, straight_m: float) -> Line:
+def line(stops: Sequence[PlanarPose], run_up_m: float, straight_m: float) -> Line:
     """A line straight through each stop at its heading, bent in between.
 
     Parameters
     ----------
-    stops : sequence of Placed
+    stops : sequence of PlanarPose
         At least one; no two neighbours in one place.
     run_up_m : float
         How far it starts before the first stop and ends after the last.

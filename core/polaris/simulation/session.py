@@ -25,7 +25,7 @@ from locatk.core.polaris.simulation.options import SimulationOptions as Simulati
 from locatk.core.polaris.simulation.options import usual_bar as usual_bar
 from locatk.core.polaris.simulation.paths import Course, Drive, line
 from locatk.core.polaris.simulation.sensors import Faults, measure, motor_field, received
-from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags
+from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, Tags
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -170,7 +170,7 @@ def _stamps(time_s: Array) -> NDArray[np.int64]:
 # ---- the drive
 
 
-def _course(tags: Tags, at: Sequence[Placed], options: SimulationOptions) -> Course:
+def _course(tags: Tags, at: Sequence[PlanarPose], options: SimulationOptions) -> Course:
     """The way over tags that lie there."""
     clearance = tags.clearance_m if options.clearance_m is None else options.clearance_m
     lowest = clearance - options.height_wobble_m
@@ -196,7 +196,7 @@ def _course(tags: Tags, at: Sequence[Placed], options: SimulationOptions) -> Cou
     )
 
 
-def _stops(at: Sequence[Placed], options: SimulationOptions) -> list[Placed]:
+def _stops(at: Sequence[PlanarPose], options: SimulationOptions) -> list[PlanarPose]:
     """Where the array's middle crosses each tag, and which way it goes there."""
     middle = np.array([[tag.x_m, tag.y_m] for tag in at])
     stops = []
@@ -208,12 +208,12 @@ def _stops(at: Sequence[Placed], options: SimulationOptions) -> list[Placed]:
             heading = float(np.arctan2(along[1], along[0]))
         x = tag.x_m - options.lateral_m * np.sin(heading)
         y = tag.y_m + options.lateral_m * np.cos(heading)
-        stops.append(Placed(float(x), float(y), heading))
+        stops.append(PlanarPose(float(x), float(y), heading))
     return stops
 
 
 def _crossings(
-    tags: Tags, site: Mapping[int, Placed], course: Course, sensors: Array
+    tags: Tags, site: Mapping[int, PlanarPose], course: Course, sensors: Array
 ) -> tuple[Crossing, ...]:
     """Tags of which a cell may pass under the bar, in the order of time."""
     half = (tags.order - 1) / 2 * tags.spacing_m

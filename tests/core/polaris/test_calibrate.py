@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from locatk.core.errors import InputError
 from locatk.core.polaris.calibration import Pass, calibrate
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.tag import AsBuiltTag, Tags, built_magnets
+from locatk.core.polaris.tag import AsBuiltTag, Tags, as_built_magnets
 
 TAGS = Tags()
 ID = 123_456
@@ -26,7 +26,7 @@ def passes(
     """A tag built by hand (5, 3), and passes over it in frames that mean nothing."""
     rng = np.random.default_rng(seed)
     real = AsBuiltTag(rng.normal(size=(5, 2)) * 5e-4, rng.normal(size=5) * 0.1)
-    place, angle = built_magnets(replace(TAGS, built={ID: real}), ID, LAYOUT)
+    place, angle = as_built_magnets(replace(TAGS, built={ID: real}), ID, LAYOUT)
     made = []
     for k in range(count):
         turn, shift = rng.uniform(-9, 9), rng.normal(size=2)
@@ -39,7 +39,7 @@ def passes(
 
 def shape_of(built: AsBuiltTag) -> np.ndarray:
     """Distances between magnets, and angles against the first one: nothing of a frame."""
-    place, angle = built_magnets(replace(TAGS, built={ID: built}), ID, LAYOUT)
+    place, angle = as_built_magnets(replace(TAGS, built={ID: built}), ID, LAYOUT)
     apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(5, 1)]
     along = np.arctan2(*(place[-1] - place[0])[::-1])
     return np.r_[apart, np.cos(angle - along), np.sin(angle - along)]
@@ -50,7 +50,7 @@ def shape_of(built: AsBuiltTag) -> np.ndarray:
 def test_exact_passes_give_the_exact_shape(seed: int, count: int) -> None:
     real, made = passes(count, seed)
     (report,) = calibrate(TAGS, made).found
-    nominal, angle = built_magnets(TAGS, ID, LAYOUT)
+    nominal, angle = as_built_magnets(TAGS, ID, LAYOUT)
     expected = AsBuiltTag(real[:, :2] - nominal, real[:, 2] - angle)
     np.testing.assert_allclose(shape_of(report.built), shape_of(expected), atol=1e-8)
     assert report.scatter_m.max() < 1e-8
@@ -77,7 +77,7 @@ def test_a_pass_that_is_known_better_counts_more() -> None:
     for sigma, share in ((1e-5, 0.5), (1e-2, 0.0)):
         both = [replace(made[0], sigma=sure), Pass("b", ID, worse, np.full((5, 3), sigma))]
         (report,) = calibrate(TAGS, both).found
-        nominal, angle = built_magnets(TAGS, ID, LAYOUT)
+        nominal, angle = as_built_magnets(TAGS, ID, LAYOUT)
         exact = shape_of(AsBuiltTag(real[:, :2] - nominal, real[:, 2] - angle))
         off = np.abs(shape_of(report.built) - exact)[:10].max()
         assert off == pytest.approx(1e-3 * share, abs=2e-4)
@@ -89,7 +89,7 @@ def test_a_magnet_that_some_passes_miss_is_measured_by_the_others() -> None:
         made[k].seen[magnet] = np.nan
     (report,) = calibrate(TAGS, made).found
     assert report.passes.tolist() == [4, 3, 4, 3, 4]
-    nominal, angle = built_magnets(TAGS, ID, LAYOUT)
+    nominal, angle = as_built_magnets(TAGS, ID, LAYOUT)
     expected = AsBuiltTag(real[:, :2] - nominal, real[:, 2] - angle)
     np.testing.assert_allclose(shape_of(report.built), shape_of(expected), atol=1e-8)
 
@@ -120,7 +120,7 @@ def test_what_is_far_from_the_design_is_said() -> None:
     _, made = passes(3)
     for each in made:
         # A speed that is told 3 % too low, on the same way each time.
-        turn = each.seen[:, 2] - built_magnets(TAGS, ID, LAYOUT)[1]
+        turn = each.seen[:, 2] - as_built_magnets(TAGS, ID, LAYOUT)[1]
         c, s = math.cos(turn[0]), math.sin(turn[0])
         each.seen[:, :2] = each.seen[:, :2] @ [[c, -s], [s, c]] * [0.97, 1]
         each.seen[:, 2] -= turn[0] - 0.6 * (np.arange(5) == 4)

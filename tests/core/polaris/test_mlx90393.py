@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.polaris.mlx90393 import (
+    INVALID_OSR_AND_FILTER,
     MEASURED_NOISE_UT,
-    STANDS_STILL,
     Settings,
-    for_rate,
     published_bar,
     settings,
+    settings_for_rate,
 )
 
 CONVERSION_MS = (
@@ -32,7 +32,7 @@ CONVERSION_MS = (
 )
 """The data sheet's table, by filter and oversampling (as in Adafruit's driver)."""
 
-ALLOWED = [(o, f) for o in range(4) for f in range(8) if (o, f) not in STANDS_STILL]
+ALLOWED = [(o, f) for o in range(4) for f in range(8) if (o, f) not in INVALID_OSR_AND_FILTER]
 
 
 @pytest.fixture(scope="module")
@@ -111,12 +111,12 @@ def test_noise_is_not_made_up() -> None:
 
 
 def test_the_slowest_settings_that_are_fast_enough() -> None:
-    chosen = for_rate(100, settings())
+    chosen = settings_for_rate(100, settings())
     assert chosen is not None
     assert (chosen.osr, chosen.filt) == (2, 3)
-    assert for_rate(61, settings()) == settings()
-    assert for_rate(1000, settings()) is None
-    kept = for_rate(100, settings(gain=5, resolution=1))
+    assert settings_for_rate(61, settings()) == settings()
+    assert settings_for_rate(1000, settings()) is None
+    kept = settings_for_rate(100, settings(gain=5, resolution=1))
     assert kept is not None
     assert (kept.gain, kept.resolution) == (5, 1)
 

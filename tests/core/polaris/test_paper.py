@@ -23,7 +23,7 @@ from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.published import pipeline as paper
 from locatk.core.polaris.published.peaks import find_peaks, signals
-from locatk.core.polaris.tag import TagLayout, Tags, angles, places
+from locatk.core.polaris.tag import TagLayout, Tags, cell_positions, symbol_angles
 from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
@@ -36,8 +36,8 @@ LAYOUT = TagLayout(((0, 0), (1, 1), (2, 1), (0, 2), (2, 2)), (0, 7, 2, 5, 4))
 def lying(x: float, y: float, heading: float, layout: TagLayout = LAYOUT) -> tuple[Array, Array]:
     """Places (M, 2) and angles (M,) of a tag's magnets on the floor."""
     cos, sin = math.cos(heading), math.sin(heading)
-    turned = places(TAGS, layout.cells) @ np.array([[cos, sin], [-sin, cos]])
-    return turned + [x, y], angles(TAGS, layout.symbols) + heading
+    turned = cell_positions(TAGS, layout.cells) @ np.array([[cos, sin], [-sin, cos]])
+    return turned + [x, y], symbol_angles(TAGS, layout.symbols) + heading
 
 
 def drive(
@@ -144,7 +144,7 @@ def test_the_pattern_gives_pose_cells_and_angles(
     assert pose[:2] == pytest.approx((0.3, -0.02))
     assert math.remainder(pose[2] - heading, math.tau) == pytest.approx(0, abs=1e-9)
     assert cells == tuple(layout.cells[k] for k in order)
-    wrong = np.remainder(turned - angles(TAGS, layout.symbols)[order] + 1, math.tau) - 1
+    wrong = np.remainder(turned - symbol_angles(TAGS, layout.symbols)[order] + 1, math.tau) - 1
     np.testing.assert_allclose(wrong, 0, atol=1e-9)
 
 

@@ -13,7 +13,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.localization import along
 from locatk.core.polaris.solver import solve
-from locatk.core.polaris.tag import Placed, TagLayout, Tags
+from locatk.core.polaris.tag import PlanarPose, TagLayout, Tags
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -24,7 +24,7 @@ CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
 SYMBOLS = ((0, 3, 5, 2, 6), (1, 7, 4, 4, 3), (2, 2, 0, 6, 1))
 IDS = tuple(codec.id_of(TAGS, TagLayout(CELLS, symbols)) for symbols in SYMBOLS)
 PLACES = ((0.0, 0.008, 0.4), (0.5, -0.012, 2.0), (1.0, 0.005, -1.3))
-SITE = {i: Placed(*place) for i, place in zip(IDS, PLACES, strict=True)}
+SITE = {i: PlanarPose(*place) for i, place in zip(IDS, PLACES, strict=True)}
 
 
 def quaternions(heading: Array) -> Array:

@@ -17,7 +17,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
-from locatk.core.polaris.tag import Placed, TagLayout, Tags
+from locatk.core.polaris.tag import PlanarPose, TagLayout, Tags
 from locatk.core.solution import Solution
 
 Array = NDArray[np.float64]
@@ -272,7 +272,7 @@ def test_order_is_that_of_time_and_the_site_places_the_array(world: Any) -> None
         world.Tag(CELLS, OTHER, x=0.6, y=-0.01, heading=2.0),
     ]
     ids = [id_of(SYMBOLS), id_of(OTHER)]
-    site = {i: Placed(t.x, t.y, t.heading) for i, t in zip(ids, tags, strict=True)}
+    site = {i: PlanarPose(t.x, t.y, t.heading) for i, t in zip(ids, tags, strict=True)}
     course = world.line(length=0.9, past=(0.3, 0.0))
     solution = solve([world.record(tags, course, seed=9)], replace(TAGS, site=site))
     assert [d.tag_id for d in solution.detections] == ids
