@@ -103,12 +103,13 @@ def preprocess(samples: Samples) -> PreprocessedSamples:
         percentage = 100 * is_stuck[:, sensor].mean()
         message = f"sensor {sensor + 1} was stuck ({percentage:.0f} % of the time)"
         warnings.append(SolverWarning("sensor_stuck", message).about(samples.device))
-    # Stuck sensors take part in this estimate: its floor keeps their noise above zero.
-    is_spike = _spikes(np.where(is_stuck[..., None], np.nan, field), estimate_noise(samples))
+    # The noise is estimated without stuck samples, which have none.
+    field = np.where(is_stuck[..., None], np.nan, field)
+    is_spike = _spikes(field, estimate_noise(replace(samples, field_t=field)))
     if is_spike.any():
         message = f"{int(is_spike.sum())} values were spikes"
         warnings.append(SolverWarning("spikes", message).about(samples.device))
-    field = np.where(is_stuck[..., None] | is_spike, np.nan, field)
+    field = np.where(is_spike, np.nan, field)
     missing = np.isnan(field).any(axis=2).mean()
     if missing > 0:
         message = f"{100 * missing:.2g} % of the sensors' samples missing"

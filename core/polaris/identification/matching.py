@@ -29,6 +29,10 @@ GOOD_MISFIT_SPACINGS, MAX_MISFIT_SPACINGS = 0.05, 0.1
 """Rms distance of the magnets from their cells, in spacings: the limit that is tried first, and
 the final one."""
 
+MISFIT_RESOLUTION_M = 1e-9
+"""Difference of misfits below which placements are equivalent [m]: rotations of a symmetric pattern
+differ by rounding only."""
+
 ESTIMATED_PATH_LENGTH_TOLERANCE, KNOWN_PATH_LENGTH_TOLERANCE = 0.15, 0.05
 """Relative tolerance of distances if the path was estimated from the field alone, and if it was
 known."""
@@ -124,8 +128,13 @@ def match_tags(
         matches = [m for m in by_count.get(count, []) if m.misfit_m < limit * tags.spacing_m]
         if matches:
             with_vertices = [match for match in matches if vertex_cells <= set(match.cells)]
-            return sorted(with_vertices or matches, key=lambda match: match.misfit_m)
+            return sorted(with_vertices or matches, key=_rounded_misfit)
     return []
+
+
+def _rounded_misfit(match: TagMatch) -> float:
+    """Return the misfit as a sort key: equivalent placements keep the order of enumeration."""
+    return round(match.misfit_m / MISFIT_RESOLUTION_M)
 
 
 def refit_match(

@@ -67,7 +67,7 @@ def drive(
 def on_the_floor(sighting: DetectedMagnets, samples: Samples) -> Array:
     """Places with the way of the array added: from where it started."""
     way = (sighting.time_ns - samples.time_ns[0]) * 1e-9 * SPEED
-    return sighting.place_m + [way, 0.0]
+    return sighting.position_m + [way, 0.0]
 
 
 def compared(sighting: DetectedMagnets, samples: Samples, truth: tuple[Array, Array]) -> Array:
@@ -132,7 +132,7 @@ def test_the_pattern_gives_pose_cells_and_angles(
         first=0,
         stop=1,
         path_m=np.zeros(1),
-        place_m=place,
+        position_m=place,
         angle_rad=angle,
         moment_am2=np.ones(5),
         covariance=np.full((15, 15), np.nan),
@@ -271,7 +271,7 @@ def test_sensors_may_come_in_any_order() -> None:
     mixed = Samples("bar", array, samples.time_ns, samples.field_t[:, order])
     (mine,) = paper.sightings(samples, TAGS, SPEED)
     (other,) = paper.sightings(mixed, TAGS, SPEED)
-    np.testing.assert_allclose(other.place_m, mine.place_m)
+    np.testing.assert_allclose(other.position_m, mine.position_m)
 
 
 def test_nothing_is_found_in_noise() -> None:
@@ -340,7 +340,7 @@ def scored(data: Path, request: pytest.FixtureRequest) -> Scores:
             samples = published(data / "polaris" / kind / f"RawData_{run}.csv")
             (sighting,) = paper.sightings(samples, tags, 0.105)
             assert len(sighting) == 5
-            place = 1e3 * np.column_stack([-sighting.place_m[:, 1], sighting.place_m[:, 0]])
+            place = 1e3 * np.column_stack([-sighting.position_m[:, 1], sighting.position_m[:, 0]])
             apart = np.linalg.norm(place[:, None] - place[0] - TRUE_MM, axis=2)
             order = apart.argmin(axis=0)
             assert sorted(order.tolist()) == [0, 1, 2, 3, 4]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.localization import along
+from locatk.core.polaris.localization import distance_along
 from locatk.core.polaris.solver import solve
 from locatk.core.polaris.tag import PlanarPose, TagLayout, Tags
 from locatk.core.solution import Solution
@@ -126,7 +126,7 @@ def test_a_tag_that_is_not_on_the_site_is_told(tour: tuple[Any, Samples]) -> Non
     known = {i: SITE[i] for i in IDS[:2]}
     solution = solve([recording], replace(TAGS, site=known))
     (warning,) = [each for each in solution.warnings if each.code == "tag_not_on_site"]
-    assert f"tag {IDS[2]} has no place on the site" in warning.message
+    assert f"tag {IDS[2]} has no position on the site" in warning.message
     assert solution.poses > 0
 
 
@@ -175,7 +175,7 @@ def test_corrections_lead_to_the_next_tag(world: Any, tour: tuple[Any, Samples])
 def test_along_counts_backward_as_negative(world: Any) -> None:
     course = world.driven(world.line(length=1.0, direction=1.1), [0, 5, 10], [0, 1, 0.5])
     driven = odometry(world, course, turn=0.7)
-    way = along(driven, driven.time_ns)
+    way = distance_along(driven, driven.time_ns)
     assert way[0] == 0
     assert way.max() == pytest.approx(1.0, abs=0.01)
     assert way[-1] == pytest.approx(0.5, abs=0.01)
@@ -185,4 +185,4 @@ def test_along_counts_only_what_the_robot_looks_at(world: Any) -> None:
     """Sideways is no way along the array's x."""
     course = world.line(length=1.0, direction=0.3, crab=np.pi / 3)
     driven = odometry(world, course)
-    assert along(driven, driven.time_ns)[-1] == pytest.approx(0.5, abs=0.01)
+    assert distance_along(driven, driven.time_ns)[-1] == pytest.approx(0.5, abs=0.01)
