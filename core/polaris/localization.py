@@ -81,7 +81,7 @@ def localize(
         frame, site = f"tag-{first_id}", {first_id: PlanarPose(0.0, 0.0, 0.0)}
     parts, warnings = [], []
     for observation in observations:
-        if observation.tag_id in site:
+        if observation.tag_id is not None and observation.tag_id in site:
             parts.append(_poses_over_tag(samples, observation, site[observation.tag_id]))
         else:
             location = "on the site" if frame == "site" else f"in the frame of {frame}"

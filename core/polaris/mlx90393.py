@@ -195,7 +195,7 @@ def published_bar(
         There is no sensor, or the spacing is not positive.
     """
     if count < 1 or not (spacing_m > 0 and math.isfinite(spacing_m)):
-        raise InputError(f"impossible bar: {count} sensors at a spacing of {spacing_m * 1e3:g} mm")
+        raise InputError(f"no bar of {count} sensors at a spacing of {spacing_m * 1e3:g} mm")
     part = settings or Settings()
     noise = part.noise_t if noise_t is None else np.asarray(noise_t, float)
     # Axes of the array from those of the part: x = -Y, y = -X, z = -Z.

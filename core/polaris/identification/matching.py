@@ -279,11 +279,11 @@ class _GridProblem:
         jacobian[..., 0, 2], jacobian[..., 1, 2] = rotated_y, -rotated_x
         jacobian[..., 0, 3] = magnets[..., 0]
         whitening = self.whitening[problems]
-        residual = residual.reshape(k, 2 * m)
-        weighted = (whitening @ residual[..., None])[..., 0]
+        flat = residual.reshape(k, 2 * m)
+        weighted = (whitening @ flat[..., None])[..., 0]
         cost = 0.5 * np.sum(weighted**2, axis=1)
         equations = DenseEquations.from_weighted(
-            residual, weighted, whitening @ jacobian.reshape(k, 2 * m, 4), cost
+            flat, weighted, whitening @ jacobian.reshape(k, 2 * m, 4), cost
         )
         equations.add_prior(
             slice(3, 4), state.parameters[:, 3:] - 1.0, np.array([self.scale_sigma])
