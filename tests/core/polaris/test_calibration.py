@@ -129,3 +129,11 @@ def test_what_is_far_from_the_design_is_said() -> None:
     stretched, turned = report.notes
     assert "shorter along the travel" in stretched
     assert f"cell {LAYOUT.cells[4]} is" in turned
+
+
+def test_scatter_of_two_passes_is_that_of_their_population() -> None:
+    """Two angles that differ by d have a standard deviation of d / sqrt(2)."""
+    _, made = passes(2)
+    made[1].observed[2, 2] += 0.02
+    (report,) = calibrate(TAGS, made).calibrated
+    assert report.scatter_rad[2] == pytest.approx(0.02 / math.sqrt(2), rel=1e-6)

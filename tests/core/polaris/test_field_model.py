@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import magpylib
 import numpy as np
 import pytest
@@ -111,3 +113,18 @@ def test_each_axis_of_the_field_has_its_own_place_along_the_track() -> None:
     for axis in range(3):
         truth = cylinder(place + [shift[axis], 0, 0], DISC, 1.0)[..., axis]
         assert np.abs(found[..., axis] - truth).max() < 1e-3 * np.abs(truth).max()
+
+
+def test_disc_correction_is_the_second_derivative_along_z() -> None:
+    """To second order a disc's field is ``f + c f_zz`` (here by finite differences)."""
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(-0.02, 0.02, (3, 3, 5, 2)), rng.uniform(-0.02, 0.02, (3, 1, 1, 2))
+    height, step, correction = 0.011, 1e-4, -1e-7
+
+    def fields(z: float, c: float = 0.0) -> Any:
+        return MagnetOffsets.from_components(x, y, z).unit_fields(c)
+
+    second = (fields(height + step) - 2 * fields(height) + fields(height - step)) / step**2
+    expected = correction * second
+    change = fields(height, correction) - fields(height)
+    np.testing.assert_allclose(change, expected, atol=1e-3 * np.abs(expected).max())

@@ -199,3 +199,16 @@ def test_what_the_samples_do_not_determine_is_an_error(world: Any) -> None:
     nothing = replace(window, field_t=np.full_like(window.field_t, np.inf))
     with pytest.raises(DegenerateError):
         fit_pass(nothing, truth, PassPriors())
+
+
+def test_steps_are_limited_to_a_fraction_of_the_height(world: Any) -> None:
+    """Far from the minimum the derivatives would move a magnet by several heights."""
+    window, truth, _ = posed(world, known=True)
+    start = replace(truth, position_m=truth.position_m + 0.012, moment_am2=0 * truth.moment_am2)
+    weight = 1 / np.broadcast_to(window.noise_t**2, window.field_t.shape)
+    problem = PassProblem(window, PassPriors(), weight, start)
+    equations = problem.linearize(start, np.arange(1))
+    moved = problem.retract(start, equations.solve(np.array([1e-9]), np.arange(1)))
+    change = np.abs(moved.position_m - start.position_m).max()
+    assert change == pytest.approx(0.7 * start.height_m)
+    assert 0.7 * start.height_m <= moved.height_m <= 1.4 * start.height_m

@@ -203,3 +203,10 @@ def test_unusable_recordings_are_errors(rows: slice, order: int, message: str) -
     )
     with pytest.raises(InputError, match=message):
         preprocess(cut)
+
+
+def test_equal_time_stamps_are_an_error() -> None:
+    recording = samples()
+    frozen = replace(recording, time_ns=np.zeros_like(recording.time_ns))
+    with pytest.raises(InputError, match="time stamps"):
+        preprocess(frozen)
