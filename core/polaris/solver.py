@@ -26,6 +26,7 @@ from locatk.core.polaris.preprocessing import (
     preprocess,
 )
 from locatk.core.polaris.published import pipeline as published
+from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.results import PolarisFacts, TagDetection
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution, SolverWarning, add_counts
@@ -47,10 +48,13 @@ class SolveOptions:
     speed_mps : float or None
         Speed of the array over the floor, if it is known and constant; ``paper`` needs it. Without
         it, the path is taken from odometry, or else estimated from the field.
+    templates : TemplateGrid or None
+        Resolution of the templates of ``paper``; None for the paper's.
     """
 
     method: str = "joint"
     speed_mps: float | None = None
+    templates: TemplateGrid | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -60,6 +64,10 @@ class SolveOptions:
         if self.speed_mps is not None and not 0 < self.speed_mps < 100:
             raise InputError(
                 f"impossible speed {self.speed_mps!r} m/s", hint="Give it in metres per second"
+            )
+        if self.templates is not None and self.method != "paper":
+            raise InputError(
+                f"method {self.method} uses no templates", hint="Give them with --method paper"
             )
 
 
@@ -128,7 +136,7 @@ def _solve_array(
     recording = preprocessed.samples
     rejected: Counter[str] = Counter()
     if options.method == "paper":
-        passes = _identify_published(recording, tags, options.speed_mps)
+        passes = _identify_published(recording, tags, options)
     else:
         path_m = _known_path(recording, options.speed_mps, driven)
         passes, unexplained = _identify_passes(preprocessed, tags, path_m)
@@ -192,7 +200,7 @@ def _identify_passes(
 
 
 def _identify_published(
-    recording: Samples, tags: Tags | None, speed_mps: float | None
+    recording: Samples, tags: Tags | None, options: SolveOptions
 ) -> list[IdentifiedPass]:
     """Detect the magnets of all passes by the published algorithm, and identify the tags."""
     if tags is None:
@@ -200,7 +208,5 @@ def _identify_published(
             "the published algorithm needs the tag",
             hint="Give it as --artifact, or import with --tag",
         )
-    return [
-        IdentifiedPass(magnets, identify_tags(magnets, recording, tags))
-        for magnets in published.sightings(recording, tags, speed_mps)
-    ]
+    passes = published.detect_magnets(recording, tags, options.speed_mps, options.templates)
+    return [IdentifiedPass(magnets, identify_tags(magnets, recording, tags)) for magnets in passes]
