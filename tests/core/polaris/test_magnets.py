@@ -156,7 +156,7 @@ def test_sources_at_given_positions(world: Any) -> None:
     grid = world.Tag(tuple((c, r) for r in range(3) for c in range(3)), (0,) * 9).places
     shift = hypothesis.magnets.position_m.mean(axis=0) - tag.places.mean(axis=0)
     again = detect_magnets_at(samples, hypothesis, grid + shift).magnets
-    assert len(again) == 5
+    assert (len(again), again.other_sources) == (5, 0)
     distance = np.linalg.norm(
         again.position_m[:, None] - hypothesis.magnets.position_m[None], axis=2
     )

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.polaris import codec
+from locatk.core.polaris import codec, solver
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.results import TagDetection
@@ -357,3 +357,20 @@ def test_a_height_is_as_sure_as_the_scale_of_its_way(world: Any) -> None:
     assert np.all(np.abs(off) > 5e-5)
     assert np.all(np.abs(off) < 2 * sigma)
     assert np.all(sigma < 5e-4)
+
+
+def test_passes_are_merged_only_if_that_identifies_a_tag(
+    world: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two passes that may be the ends of one tag stay two if the whole cannot be identified."""
+    _, _, recording = passed(world)
+    (part,) = solver.find_passes(recording, np.full((9, 3), 5e-7))
+    refused = solve([recording], replace(TAGS, spacing_m=0.03)).detections
+    assert [each.tag_id for each in refused] == [None]
+    half = (part.first + part.stop) // 2
+    ends = [replace(part, stop=half), replace(part, first=half)]
+    monkeypatch.setattr(solver, "find_passes", lambda *_: ends)
+    monkeypatch.setattr(solver, "may_be_one_tag", lambda *_: True)
+    assert len(solve([recording], replace(TAGS, spacing_m=0.03)).detections) == 2
+    (merged,) = solve([recording], TAGS).detections
+    assert merged.tag_id == id_of(SYMBOLS)
