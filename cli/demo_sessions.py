@@ -81,7 +81,7 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     from locatk.core.polaris.codec import layout_of
     from locatk.core.polaris.drawing.cards import draw_tag_cards
     from locatk.core.polaris.simulation import session as simulate
-    from locatk.core.polaris.tag import Placed, Tags
+    from locatk.core.polaris.tag import PlanarPose, Tags
     from locatk.formats import arrays
     from locatk.formats.output import atomic_write
     from locatk.formats.pdf.drawings import render_pages
@@ -90,7 +90,7 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     tags = Tags(
         codec="polaris-released",
         site={
-            number: Placed(0.5 * k, 0.02 * k, radians(turn))
+            number: PlanarPose(0.5 * k, 0.02 * k, radians(turn))
             for k, (number, turn) in enumerate(zip(ids, (0.0, 90.0, 200.0), strict=True))
         },
     )

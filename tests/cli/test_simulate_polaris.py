@@ -13,13 +13,13 @@ import pytest
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.simulation.session import CARS, SimulationOptions, simulate, usual_bar
-from locatk.core.polaris.tag import Placed, Tags
+from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.formats import tags as artifacts
 from locatk.formats.arrays import read_samples
 from locatk.formats.session import Session
 from locatk.formats.tracks import read_odometry, read_truth
 
-SITE = Tags(ids=(3, 7), site={3: Placed(0.0, 0.0, 0.0), 7: Placed(0.4, 0.0, 1.0)})
+SITE = Tags(ids=(3, 7), site={3: PlanarPose(0.0, 0.0, 0.0), 7: PlanarPose(0.4, 0.0, 1.0)})
 
 
 SETTINGS = """

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.errors import InputError
 from locatk.core.magnetics import MU0_4PI, dipole_tensor
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.tag import TagLayout, Tags, angles, places
+from locatk.core.polaris.tag import TagLayout, Tags, cell_positions, symbol_angles
 
 Array = NDArray[np.float64]
 
@@ -136,8 +136,8 @@ def magnet_covariance(
         raise InputError("the noise of the array is unknown", hint="Give its noise")
     if not (step_m > 0 and math.isfinite(step_m)):
         raise InputError(f"a step of {step_m} m from sample to sample is not positive")
-    position_m = rotate(places(tags, layout.cells), heading_rad) + [0.0, offset_m]
-    angle_rad = angles(tags, layout.symbols) + heading_rad
+    position_m = rotate(cell_positions(tags, layout.cells), heading_rad) + [0.0, offset_m]
+    angle_rad = symbol_angles(tags, layout.symbols) + heading_rad
     path_m, group = _sample_path(position_m, step_m, PASS_MARGIN_CLEARANCES * tags.clearance_m)
     noise = noise / math.sqrt(group)
 
@@ -164,7 +164,7 @@ def pose_covariance(tags: Tags, layout: TagLayout, covariance: Array, heading_ra
     InputError
         The magnets do not determine a pose.
     """
-    position_m = rotate(places(tags, layout.cells), heading_rad)
+    position_m = rotate(cell_positions(tags, layout.cells), heading_rad)
     is_position = np.arange(len(covariance)) % 3 < 2
     jacobian = np.zeros((2 * len(position_m), 3))
     jacobian[0::2, 0] = jacobian[1::2, 1] = 1

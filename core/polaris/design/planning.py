@@ -28,7 +28,7 @@ from locatk.core.polaris.design.accuracy_bound import (
     accuracy_bound,
 )
 from locatk.core.polaris.design.materials import bill_of_materials
-from locatk.core.polaris.mlx90393 import Settings, for_rate, published_bar
+from locatk.core.polaris.mlx90393 import Settings, published_bar, settings_for_rate
 from locatk.core.polaris.tag import Magnet, TagLayout, Tags
 from locatk.core.units import length_text
 
@@ -419,7 +419,7 @@ def _warnings(report: DesignReport) -> Iterator[str]:
     """Describe the limits that a design exceeds, with figures and remedies."""
     tags, use = report.tags, report.use
     if use.rate_hz is not None and use.rate_hz > report.max_rate_hz:
-        faster = for_rate(use.rate_hz, use.settings)
+        faster = settings_for_rate(use.rate_hz, use.settings)
         remedy = (
             "no osr and filt are that fast"
             if faster is None

@@ -21,7 +21,7 @@ from locatk.core.drawing import (
     capital_height,
     cross,
 )
-from locatk.core.polaris.tag import Cell, TagLayout, Tags, places, vertices
+from locatk.core.polaris.tag import Cell, TagLayout, Tags, cell_positions, vertices
 
 AXIS_ARROW_MM = 4.0
 """Space for the arrows of the axes, above and at the left of the magnets."""
@@ -97,7 +97,7 @@ class _TagDrawing:
         return self.origin[0] + side, self.origin[1] + up
 
     def _cell_centre(self, cell: Cell) -> Point:
-        forward, left = places(self.tags, (cell,))[0].tolist()
+        forward, left = cell_positions(self.tags, (cell,))[0].tolist()
         return -1e3 * left, 1e3 * forward
 
     def marks(self) -> list[Mark]:

@@ -19,7 +19,14 @@ from locatk.core.polaris.simulation.field import (
     scatter_debris,
 )
 from locatk.core.polaris.simulation.options import RandomSource, SimulationOptions
-from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags, angles, built_magnets, places
+from locatk.core.polaris.tag import (
+    AsBuiltTag,
+    PlanarPose,
+    Tags,
+    as_built_magnets,
+    cell_positions,
+    symbol_angles,
+)
 from locatk.core.simulation import random_stream
 
 Array = NDArray[np.float64]
@@ -33,7 +40,7 @@ class TagFloor:
     ----------
     frame : str
         ``"site"``, or ``"tag-<id>"`` of the only tag.
-    site : mapping of int to Placed
+    site : mapping of int to PlanarPose
         Poses of all tags on the floor.
     route : tuple of int
         Tags to cross, in order.
@@ -45,7 +52,7 @@ class TagFloor:
     """
 
     frame: str
-    site: Mapping[int, Placed]
+    site: Mapping[int, PlanarPose]
     route: tuple[int, ...]
     discs: Discs
     built: Mapping[int, AsBuiltTag]
@@ -75,7 +82,7 @@ def build_floor(tags: Tags, options: SimulationOptions) -> TagFloor:
     return TagFloor(frame, site, route, discs, built, debris, earth_t)
 
 
-def to_site_frame(tag_pose: Placed, points: Array) -> Array:
+def to_site_frame(tag_pose: PlanarPose, points: Array) -> Array:
     """Transform points (..., 2) from the frame of a tag to that of the site."""
     cos, sin = np.cos(tag_pose.heading_rad), np.sin(tag_pose.heading_rad)
     return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]) + [tag_pose.x_m, tag_pose.y_m])
@@ -83,7 +90,7 @@ def to_site_frame(tag_pose: Placed, points: Array) -> Array:
 
 def _arrange_tags(
     tags: Tags, route: tuple[int, ...]
-) -> tuple[Mapping[int, Placed], tuple[int, ...], str]:
+) -> tuple[Mapping[int, PlanarPose], tuple[int, ...], str]:
     """Return the poses of the tags, the tags to cross, and the name of the frame."""
     if tags.site:
         unknown = [tag_id for tag_id in route if tag_id not in tags.site]
@@ -99,11 +106,11 @@ def _arrange_tags(
             "several tags and no site with their positions",
             hint="Give the tags a site, or cross one of them",
         )
-    return {first: Placed(0.0, 0.0, 0.0)}, (first,), f"tag-{first}"
+    return {first: PlanarPose(0.0, 0.0, 0.0)}, (first,), f"tag-{first}"
 
 
 def _build_tags(
-    tags: Tags, site: Mapping[int, Placed], options: SimulationOptions
+    tags: Tags, site: Mapping[int, PlanarPose], options: SimulationOptions
 ) -> tuple[Discs, dict[int, AsBuiltTag]]:
     """Return the magnets of all tags with their errors, and the same relative to the design."""
     ids: list[int] = []
@@ -117,14 +124,15 @@ def _build_tags(
                 f"tag {tag_id} is not of the family", hint=f"It has {len(tags.ids)} members"
             )
         layout = codec.layout_of(tags, tag_id)
-        position_m, angle_rad = built_magnets(tags, tag_id, layout)
+        position_m, angle_rad = as_built_magnets(tags, tag_id, layout)
         # A stream for each id: the tag is the same on every site.
         rng = random_stream(options.build_seed, RandomSource.TAG, tag_id)
         position_m = position_m + options.build_place_m * rng.normal(size=position_m.shape)
         angle_rad = angle_rad + options.build_angle_rad * rng.normal(size=angle_rad.shape)
         strengths.append(1 + options.build_strength * rng.normal(size=angle_rad.shape))
         built[tag_id] = AsBuiltTag(
-            position_m - places(tags, layout.cells), angle_rad - angles(tags, layout.symbols)
+            position_m - cell_positions(tags, layout.cells),
+            angle_rad - symbol_angles(tags, layout.symbols),
         )
         ids += [tag_id] * len(position_m)
         positions.append(to_site_frame(tag_pose, position_m))
@@ -140,7 +148,11 @@ def _build_tags(
 
 
 def _debris_of_tags(
-    tags: Tags, tag_poses: list[Placed], discs: Discs, earth_t: Array, options: SimulationOptions
+    tags: Tags,
+    tag_poses: list[PlanarPose],
+    discs: Discs,
+    earth_t: Array,
+    options: SimulationOptions,
 ) -> Debris:
     """Scatter debris over each tag, and a grid spacing beyond its outer cells."""
     half_width_m = ((tags.order - 1) / 2 + 1) * tags.spacing_m

@@ -10,7 +10,7 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.mlx90393 import Settings, for_rate, published_bar
+from locatk.core.polaris.mlx90393 import Settings, published_bar, settings_for_rate
 from locatk.core.polaris.tag import Magnet, Tags
 from locatk.core.simulation import (
     check_options,
@@ -53,7 +53,7 @@ def usual_bar(
     InputError
         The MLX90393 has no such gain or resolution, or is not that fast.
     """
-    part = for_rate(rate_hz, Settings(gain=gain, resolution=resolution))
+    part = settings_for_rate(rate_hz, Settings(gain=gain, resolution=resolution))
     if part is None:
         raise InputError(
             f"no setting of the MLX90393 gives {rate_hz:g} Hz", hint="Give a lower rate"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.polaris.tag import Placed
+from locatk.core.polaris.tag import PlanarPose
 
 Array = NDArray[np.float64]
 
@@ -78,12 +78,12 @@ class PlanarPath:
         return position + beyond * np.stack([np.cos(heading), np.sin(heading)], axis=-1), heading
 
 
-def path_through(stops: Sequence[Placed], run_up_m: float, straight_m: float) -> PlanarPath:
+def path_through(stops: Sequence[PlanarPose], run_up_m: float, straight_m: float) -> PlanarPath:
     """Return the path straight through each stop at its heading, curved in between.
 
     Parameters
     ----------
-    stops : sequence of Placed
+    stops : sequence of PlanarPose
         At least one; no two neighbours at the same position.
     run_up_m : float
         Length of the path before the first stop and after the last.

@@ -31,7 +31,7 @@ from locatk.core.polaris.simulation.sensors import (
     motor_field,
     received_frames,
 )
-from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags
+from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, Tags
 from locatk.core.simulation import MAX_SAMPLES, exact_trajectory, random_stream, stamps_ns
 from locatk.core.trajectory import Trajectory
 
@@ -162,7 +162,9 @@ def simulate(
 # ---- the drive
 
 
-def _drive(tags: Tags, tag_poses: Sequence[Placed], options: SimulationOptions) -> ArrayTrajectory:
+def _drive(
+    tags: Tags, tag_poses: Sequence[PlanarPose], options: SimulationOptions
+) -> ArrayTrajectory:
     """Return the trajectory over tags."""
     clearance = tags.clearance_m if options.clearance_m is None else options.clearance_m
     lowest = clearance - options.height_wobble_m
@@ -192,7 +194,7 @@ def _drive(tags: Tags, tag_poses: Sequence[Placed], options: SimulationOptions) 
     )
 
 
-def _stops(tag_poses: Sequence[Placed], options: SimulationOptions) -> list[Placed]:
+def _stops(tag_poses: Sequence[PlanarPose], options: SimulationOptions) -> list[PlanarPose]:
     """Return the pose of the middle of the array on each tag; x is the direction of travel."""
     middle = np.array([[pose.x_m, pose.y_m] for pose in tag_poses])
     stops = []
@@ -204,12 +206,12 @@ def _stops(tag_poses: Sequence[Placed], options: SimulationOptions) -> list[Plac
             heading = float(np.arctan2(along[1], along[0]))
         x = pose.x_m - options.lateral_m * np.sin(heading)
         y = pose.y_m + options.lateral_m * np.cos(heading)
-        stops.append(Placed(float(x), float(y), heading))
+        stops.append(PlanarPose(float(x), float(y), heading))
     return stops
 
 
 def _crossings(
-    tags: Tags, site: Mapping[int, Placed], trajectory: ArrayTrajectory, sensors_m: Array
+    tags: Tags, site: Mapping[int, PlanarPose], trajectory: ArrayTrajectory, sensors_m: Array
 ) -> tuple[Crossing, ...]:
     """Return the tags of which a cell may pass below the array, in the order of time."""
     half = (tags.order - 1) / 2 * tags.spacing_m

@@ -26,7 +26,7 @@ from locatk.core.polaris.design.accuracy_bound import (
     pose_covariance,
 )
 from locatk.core.polaris.design.planning import sample_layouts
-from locatk.core.polaris.tag import Magnet, TagLayout, Tags, angles, places
+from locatk.core.polaris.tag import Magnet, TagLayout, Tags, cell_positions, symbol_angles
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def brute_force(
 ):
     """The covariance by a dense information matrix of every unknown, from magpylib's dipoles
     and central differences."""
-    place, angle = places(tags, layout.cells), angles(tags, layout.symbols)
+    place, angle = cell_positions(tags, layout.cells), symbol_angles(tags, layout.symbols)
     count = len(place)
     low, high = place[:, 0].min(), place[:, 0].max()
     reach = PASS_MARGIN_CLEARANCES * tags.clearance_m
@@ -221,8 +221,8 @@ def test_the_heading_rotates_the_tag() -> None:
         tags, square, array(), step_m=1e-3, heading_rad=math.pi / 2, nuisance="strength"
     )
     # Counter-clockwise: v1 comes to lie where v4 was, v2 where v1 was, v3 where v2 was.
-    there = places(tags, ((2, 0), (0, 0), (0, 2)))
-    same = bounds.rotate(places(tags, square.cells), math.pi / 2)
+    there = cell_positions(tags, ((2, 0), (0, 0), (0, 2)))
+    same = bounds.rotate(cell_positions(tags, square.cells), math.pi / 2)
     assert same == pytest.approx(there, abs=1e-12)
     upright = Tags(order=3, magnets=3)
     pose = pose_covariance(upright, square, turned, math.pi / 2)

@@ -32,7 +32,7 @@ from locatk.core.polaris.simulation.session import (
     simulate,
     usual_bar,
 )
-from locatk.core.polaris.tag import AsBuiltTag, Magnet, Placed, TagLayout, Tags
+from locatk.core.polaris.tag import AsBuiltTag, Magnet, PlanarPose, TagLayout, Tags
 from locatk.core.simulation import SESSION_START_NS
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def sample_at(simulated: SimulatedSession, x_m: float, axis: int = 0) -> Array:
 
 def test_samples_are_what_magpylib_says_one_by_one() -> None:
     """Its own sensors and magnets, placed by truth and by the paper's words alone."""
-    tags = Tags(site={300: Placed(0.1, -0.2, 0.4), 77: Placed(0.45, -0.05, -2.0)})
+    tags = Tags(site={300: PlanarPose(0.1, -0.2, 0.4), 77: PlanarPose(0.45, -0.05, -2.0)})
     options = replace(
         PLAIN,
         earth_t=50 * UT,
@@ -405,10 +405,10 @@ def test_what_wobbles_stays_within_its_share_and_comes_near_it() -> None:
 def test_a_tour_crosses_the_tags_of_a_site_in_their_order() -> None:
     tags = Tags(
         site={
-            5: Placed(0.0, 0.0, 0.0),
-            9: Placed(0.6, 0.0, 1.0),
-            77: Placed(0.6, 0.6, -2.0),
-            8: Placed(5.0, 5.0, 0.0),
+            5: PlanarPose(0.0, 0.0, 0.0),
+            9: PlanarPose(0.6, 0.0, 1.0),
+            77: PlanarPose(0.6, 0.6, -2.0),
+            8: PlanarPose(5.0, 5.0, 0.0),
         }
     )
     simulated = simulate(tags, replace(PLAIN, route=(5, 9, 77, 5)))
@@ -436,7 +436,7 @@ def test_a_tour_crosses_the_tags_of_a_site_in_their_order() -> None:
 
 
 def test_tags_in_a_row_are_crossed_on_one_straight_line() -> None:
-    tags = Tags(site={k: Placed(0.3 * k, 0.1 * k, 0.2 * k) for k in range(1, 4)})
+    tags = Tags(site={k: PlanarPose(0.3 * k, 0.1 * k, 0.2 * k) for k in range(1, 4)})
     simulated = simulate(tags, PLAIN)
     assert [crossing.tag_id for crossing in simulated.crossings] == [1, 2, 3]
     x, y, _ = simulated.truth.position.T
@@ -461,7 +461,7 @@ def test_a_tag_is_crossed_whole_in_part_or_not(lateral: float, whole: bool | Non
 @pytest.mark.slow
 def test_hand_built_tags_are_the_same_in_every_session_and_told() -> None:
     wrong = {"build_angle_rad": 0.1, "build_place_m": 5e-4, "build_strength": 0.05}
-    tags = Tags(site={k: Placed(0.3 * k, 0.0, 0.3) for k in range(40)})
+    tags = Tags(site={k: PlanarPose(0.3 * k, 0.0, 0.3) for k in range(40)})
     plain = replace(PLAIN, rate_hz=20.0)
     one = simulate(tags, replace(plain, route=(0,), **wrong))  # type: ignore[arg-type]
     two = simulate(tags, replace(plain, route=(3,), seed=9, **wrong))  # type: ignore[arg-type]
@@ -582,7 +582,7 @@ def test_motors_are_felt_while_they_drive_and_more_at_one_end() -> None:
 
 @pytest.mark.slow
 def test_odometry_tells_the_way_too_long_and_turns_away() -> None:
-    tags = Tags(site={1: Placed(0.0, 0.0, 0.0), 2: Placed(1.0, 0.5, 0.0)})
+    tags = Tags(site={1: PlanarPose(0.0, 0.0, 0.0), 2: PlanarPose(1.0, 0.5, 0.0)})
     options = replace(PLAIN, odometry=True, rate_hz=20.0)
     assert simulate(tags, replace(options, odometry=False)).odometry is None
     right = simulate(tags, replace(options, odometry_scale=0.0, odometry_turn_rad=0.0))
@@ -709,7 +709,7 @@ def test_what_cannot_be_is_refused(wrong: dict[str, object]) -> None:
     ("tags", "options", "said"),
     [
         (Tags(), {"route": (1, 2)}, "no site"),
-        (Tags(site={4: Placed(0, 0, 0)}), {"route": (5,)}, "not on the site"),
+        (Tags(site={4: PlanarPose(0, 0, 0)}), {"route": (5,)}, "not on the site"),
         (Tags(ids=(3, 8)), {"route": (4,)}, "not of the family"),
         (Tags(), {"route": (327_680,)}, "327680"),
         (Tags(), {"clearance_m": 2e-4}, "magnet"),

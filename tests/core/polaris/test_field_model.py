@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import magpylib
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from locatk.core.polaris.detection.field_model import Offsets, thickness
+from locatk.core.polaris.detection.field_model import MagnetOffsets, disc_correction
 from locatk.core.polaris.tag import Magnet
 
 Array = NDArray[np.float64]
@@ -15,12 +17,12 @@ Array = NDArray[np.float64]
 DISC = Magnet(2e-3, 0.5e-3, 1.45)
 
 
-def over(height: float, count: int = 23) -> tuple[Offsets, Array]:
+def over(height: float, count: int = 23) -> tuple[MagnetOffsets, Array]:
     """A plane of sensors over a magnet: as offsets and as places (5, count, 3)."""
     x = np.linspace(-0.03, 0.03, count)
     y = np.array([-0.021, -0.008, 0.0, 0.005, 0.03])
     along = np.broadcast_to(x[:, None], (len(y), 3, count, 1)).copy()
-    offsets = Offsets.of(along, y[:, None, None, None], height)
+    offsets = MagnetOffsets.from_components(along, y[:, None, None, None], height)
     place = np.stack(np.broadcast_arrays(x, y[:, None], height), axis=-1)
     return offsets, place
 
@@ -34,7 +36,7 @@ def cylinder(place: Array, magnet: Magnet, angle: float) -> Array:
     return np.asarray(source.getB(place))
 
 
-def modelled(offsets: Offsets, moment: ArrayLike, flat: float = 0.0) -> Array:
+def modelled(offsets: MagnetOffsets, moment: ArrayLike, flat: float = 0.0) -> Array:
     """The solver's field, in the shape of :func:`cylinder`."""
     field = offsets.unit_fields(flat)[:, :, :, 0] @ np.asarray(moment, float)
     return np.asarray(field.transpose(0, 2, 1))
@@ -63,7 +65,7 @@ def test_disc_is_magpylibs_cylinder(
     peak = np.abs(truth).max()
     moment = flat_moment(magnet, angle)
     as_point = np.abs(modelled(offsets, moment) - truth).max() / peak
-    as_disc = np.abs(modelled(offsets, moment, thickness(magnet)) - truth).max() / peak
+    as_disc = np.abs(modelled(offsets, moment, disc_correction(magnet)) - truth).max() / peak
     assert as_point < point
     assert as_disc < disc
     assert as_disc < 0.25 * as_point  # what the thickness is for
@@ -77,11 +79,11 @@ def test_moment_upward_is_magpylibs_too() -> None:
 
 
 def test_no_magnet_is_a_point() -> None:
-    assert thickness(None) == 0.0
+    assert disc_correction(None) == 0.0
 
 
-def shifted(offsets: Offsets, **by: float) -> Offsets:
-    return Offsets.of(
+def shifted(offsets: MagnetOffsets, **by: float) -> MagnetOffsets:
+    return MagnetOffsets.from_components(
         offsets.x + by.get("x", 0.0), offsets.y + by.get("y", 0.0), offsets.z + by.get("z", 0.0)
     )
 
@@ -106,8 +108,23 @@ def test_each_axis_of_the_field_has_its_own_place_along_the_track() -> None:
     _, place = over(0.01)
     shift = np.array([-5e-4, 0.0, 5e-4])
     along = place[:, None, :, None, 0] + shift[:, None, None]
-    skewed = Offsets.of(along, place[:, None, :1, None, 1], 0.01)
-    found = modelled(skewed, flat_moment(DISC, 1.0), thickness(DISC))
+    skewed = MagnetOffsets.from_components(along, place[:, None, :1, None, 1], 0.01)
+    found = modelled(skewed, flat_moment(DISC, 1.0), disc_correction(DISC))
     for axis in range(3):
         truth = cylinder(place + [shift[axis], 0, 0], DISC, 1.0)[..., axis]
         assert np.abs(found[..., axis] - truth).max() < 1e-3 * np.abs(truth).max()
+
+
+def test_disc_correction_is_the_second_derivative_along_z() -> None:
+    """To second order a disc's field is ``f + c f_zz`` (here by finite differences)."""
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(-0.02, 0.02, (3, 3, 5, 2)), rng.uniform(-0.02, 0.02, (3, 1, 1, 2))
+    height, step, correction = 0.011, 1e-4, -1e-7
+
+    def fields(z: float, c: float = 0.0) -> Any:
+        return MagnetOffsets.from_components(x, y, z).unit_fields(c)
+
+    second = (fields(height + step) - 2 * fields(height) + fields(height - step)) / step**2
+    expected = correction * second
+    change = fields(height, correction) - fields(height)
+    np.testing.assert_allclose(change, expected, atol=1e-3 * np.abs(expected).max())

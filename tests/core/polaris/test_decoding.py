@@ -14,8 +14,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from locatk.core.polaris import codec
-from locatk.core.polaris.codec import families, redundant
-from locatk.core.polaris.identification.decoding import TIE, Reading, read
+from locatk.core.polaris.codec import families
+from locatk.core.polaris.identification.decoding import MAX_TIE_STEPS, DecodedTag, decode_tag
 from locatk.core.polaris.tag import AsBuiltTag, Cell, Tags
 
 SMALL = Tags(order=2, magnets=3, orientations=5)
@@ -89,7 +89,7 @@ def test_what_is_laid_is_read(tags: Tags, data) -> None:
     off = np.array([data.draw(offsets) for _ in cells])
     wraps = np.array([data.draw(st.integers(-3, 3)) for _ in cells]) * tags.orientations
     order = data.draw(st.permutations(range(len(cells))))
-    reading = read(tags, [cells[k] for k in order], (steps + off + wraps)[order])
+    reading = decode_tag(tags, [cells[k] for k in order], (steps + off + wraps)[order])
     assert reading.tag_id == tag_id
     assert (reading.refused, reading.corrected, reading.erased) == ("", 0, 0)
     assert reading.symbols == tuple(int(steps[k]) for k in order)
@@ -101,8 +101,8 @@ def test_what_is_laid_is_read(tags: Tags, data) -> None:
 def test_the_released_ids_are_read(data) -> None:
     cells = [(0, 0), (1, 1), (2, 1), (0, 2), (2, 2)]
     off = np.array([data.draw(st.floats(-0.3, 0.3)) for _ in cells])
-    assert read(RELEASED, cells, off).tag_id == 262143
-    assert read(RELEASED, cells, np.arange(5) + off).tag_id == 255183
+    assert decode_tag(RELEASED, cells, off).tag_id == 262143
+    assert decode_tag(RELEASED, cells, np.arange(5) + off).tag_id == 255183
 
 
 @settings(deadline=None)
@@ -110,10 +110,10 @@ def test_the_released_ids_are_read(data) -> None:
 def test_an_orientation_between_two_is_a_tie(tags: Tags, data) -> None:
     cells, steps = magnets(tags, data.draw(st.integers(0, codec.capacity(tags) - 1)))
     k = data.draw(st.integers(0, len(cells) - 1))
-    steps[k] += data.draw(st.floats(0.5 - 0.49 * TIE, 0.5 + 0.49 * TIE))
-    reading = read(tags, cells, steps)
+    steps[k] += data.draw(st.floats(0.5 - 0.49 * MAX_TIE_STEPS, 0.5 + 0.49 * MAX_TIE_STEPS))
+    reading = decode_tag(tags, cells, steps)
     assert (reading.tag_id, reading.refused) == (None, "tie")
-    assert 0 <= reading.margin < TIE
+    assert 0 <= reading.margin < MAX_TIE_STEPS
 
 
 @pytest.mark.parametrize(("sigma", "refused"), [(0.01, ""), (0.03, ""), (0.04, "tie")])
@@ -121,16 +121,18 @@ def test_near_a_border_it_depends_on_sigma(sigma: float, refused: str) -> None:
     """0.1 steps from the border are three standard deviations of 0.033."""
     cells, steps = magnets(DEFAULT, 4711)
     steps[2] += 0.4
-    assert read(DEFAULT, cells, steps, np.full(5, sigma)).refused == refused
+    assert decode_tag(DEFAULT, cells, steps, np.full(5, sigma)).refused == refused
     # Of the other magnets it does not matter: they are far from theirs.
     others = np.full(5, 0.1)
     others[2] = 0.01
-    assert read(DEFAULT, cells, steps, others).refused == ""
+    assert decode_tag(DEFAULT, cells, steps, others).refused == ""
 
 
 def test_a_sigma_that_is_not_known_is_none() -> None:
     cells, steps = magnets(DEFAULT, 4711)
-    assert read(DEFAULT, cells, steps, np.full(5, np.nan)) == read(DEFAULT, cells, steps)
+    assert decode_tag(DEFAULT, cells, steps, np.full(5, np.nan)) == decode_tag(
+        DEFAULT, cells, steps
+    )
 
 
 def test_refusals_name_their_reason() -> None:
@@ -138,7 +140,7 @@ def test_refusals_name_their_reason() -> None:
     free = next(k for k, cell in enumerate(cells) if cell not in [(0, 0), (0, 2), (2, 2)])
 
     def reason(cells: list[Cell], steps: np.ndarray, tags: Tags = DEFAULT) -> str:
-        reading = read(tags, cells, steps)
+        reading = decode_tag(tags, cells, steps)
         assert reading.tag_id is None
         assert len(reading.symbols) == len(cells)
         return reading.refused
@@ -163,9 +165,9 @@ def test_refusals_name_their_reason() -> None:
 def test_arguments_that_do_not_fit_are_a_mistake_of_the_caller() -> None:
     cells, steps = magnets(DEFAULT, 4711)
     with pytest.raises(ValueError, match="5 cells"):
-        read(DEFAULT, cells, steps[:4])
+        decode_tag(DEFAULT, cells, steps[:4])
     with pytest.raises(ValueError, match="5 cells"):
-        read(DEFAULT, cells, steps, np.zeros(4))
+        decode_tag(DEFAULT, cells, steps, np.zeros(4))
 
 
 # --- as built
@@ -183,9 +185,9 @@ def test_with_tags_as_built_it_is_the_nearest_of_all_ids(data) -> None:
     cells, steps = magnets(tags, some)
     steps += [data.draw(st.floats(-1, 1)) for _ in cells]
     best, margin = brute(tags, range(codec.capacity(tags)), cells, steps)
-    assume(abs(margin - TIE) > 1e-9)
-    reading = read(tags, cells, steps)
-    assert reading.tag_id == (best if margin >= TIE else None)
+    assume(abs(margin - MAX_TIE_STEPS) > 1e-9)
+    reading = decode_tag(tags, cells, steps)
+    assert reading.tag_id == (best if margin >= MAX_TIE_STEPS else None)
     if reading.tag_id is not None:
         assert reading.margin == pytest.approx(margin)
 
@@ -195,23 +197,23 @@ def test_a_magnet_laid_13_degrees_off_is_read_at_16_orientations_once_it_was_mea
     design = Tags(orientations=16)
     cells, steps = magnets(design, 54321)
     laid = np.array([4.3, -2.2, 13.0, 0.0, -2.8]) / 22.5
-    assert read(design, cells, steps + laid).tag_id != 54321
+    assert decode_tag(design, cells, steps + laid).tag_id != 54321
     known = replace(design, built={54321: turned(design, *laid)})
-    reading = read(known, cells, steps + laid + 0.02)
+    reading = decode_tag(known, cells, steps + laid + 0.02)
     assert reading.tag_id == 54321
     assert reading.corrected == 0
     assert reading.margin > 0.3
     # And the tag that this one was mistaken for is read still where it lies.
-    neighbour = read(design, cells, steps + laid).tag_id
+    neighbour = decode_tag(design, cells, steps + laid).tag_id
     assert neighbour is not None
-    assert read(known, *magnets(known, neighbour)).tag_id == neighbour
+    assert decode_tag(known, *magnets(known, neighbour)).tag_id == neighbour
 
 
 def test_a_tag_that_is_not_as_it_was_built_is_not_another() -> None:
     tags = replace(DEFAULT, built={4711: turned(DEFAULT, 0, 0.45, 0, 0, 0)})
     cells, steps = magnets(tags, 4711)
     steps[1] -= 0.4
-    assert read(tags, cells, steps).refused == "tie"
+    assert decode_tag(tags, cells, steps).refused == "tie"
 
 
 # --- families
@@ -229,7 +231,7 @@ def test_members_are_read_as_by_brute_force(data) -> None:
     cells, steps = magnets(tags, member)
     steps += [data.draw(st.floats(-1.6, 1.6)) for _ in cells]
     best, margin = brute(tags, tags.ids, cells, steps)
-    assume(abs(margin - TIE) > 1e-9)
+    assume(abs(margin - MAX_TIE_STEPS) > 1e-9)
     # Whole steps from what is expected of the best, magnet by magnet.
     as_built = best in tags.built
     alone = [
@@ -237,9 +239,9 @@ def test_members_are_read_as_by_brute_force(data) -> None:
     ]
     assume(all(abs(d % 1 - 0.5) > 1e-9 for d in alone))
     corrected = sum(round(d) for d in alone)
-    reading = read(tags, cells, steps)
+    reading = decode_tag(tags, cells, steps)
     assert reading.margin == pytest.approx(margin)
-    assert reading.tag_id == (best if margin >= TIE and corrected <= 3 else None)
+    assert reading.tag_id == (best if margin >= MAX_TIE_STEPS and corrected <= 3 else None)
     if reading.tag_id is not None:
         assert reading.corrected == corrected
 
@@ -255,7 +257,7 @@ def test_a_family_corrects_half_its_distance(data) -> None:
         steps[k] += data.draw(st.sampled_from([-1, 1]))
     hit = np.rint(steps - magnets(tags, member)[1])
     wrong = int(np.abs(hit).sum())
-    reading = read(tags, cells, steps)
+    reading = decode_tag(tags, cells, steps)
     assert (reading.tag_id, reading.corrected, reading.refused) == (member, wrong, "")
     assert reading.symbols == tuple(int(s) for s in magnets(tags, member)[1])
     assert reading.margin >= 7 - 2 * wrong
@@ -271,7 +273,7 @@ def test_beyond_half_its_distance_nothing_is_read_as_another(data) -> None:
     k, other = data.draw(st.permutations(range(5)))[:2]
     steps[k] += 2
     steps[other] -= 2
-    reading = read(tags, cells, steps)
+    reading = decode_tag(tags, cells, steps)
     if reading.tag_id is None:
         assert reading.refused in ("not_in_family", "tie")
     else:
@@ -284,7 +286,7 @@ def test_between_two_members_is_a_tie() -> None:
     tags = replace(DEFAULT, ids=ids, min_distance=2)
     assert families.smallest_distance(tags, ids) == 2
     steps[1] += 1
-    reading = read(tags, cells, steps)
+    reading = decode_tag(tags, cells, steps)
     assert (reading.tag_id, reading.refused, reading.margin) == (None, "tie", 0)
 
 
@@ -301,14 +303,14 @@ def test_a_foreign_tag_is_not_in_the_family() -> None:
     near = {i for i in range(0, 327680, 997) if families.distance(tags, i, tags.ids[0]) > 0}
     for tag_id in sorted(near)[:60]:
         nearest = min(families.distance(tags, tag_id, member) for member in tags.ids)
-        reading = read(tags, *magnets(tags, tag_id))
+        reading = decode_tag(tags, *magnets(tags, tag_id))
         assert (reading.tag_id is None) == (nearest > 2)
         if nearest > 3:
             assert reading.refused == "not_in_family"
     exact = replace(tags, min_distance=1)
-    assert read(exact, *magnets(tags, tags.ids[3])).tag_id == tags.ids[3]
+    assert decode_tag(exact, *magnets(tags, tags.ids[3])).tag_id == tags.ids[3]
     foreign = next(i for i in range(9) if i not in tags.ids)
-    assert read(exact, *magnets(tags, foreign)).refused == "not_in_family"
+    assert decode_tag(exact, *magnets(tags, foreign)).refused == "not_in_family"
 
 
 @settings(deadline=None)
@@ -323,7 +325,7 @@ def test_a_missing_magnet_takes_half_a_turn_from_the_distance(data) -> None:
     steps[turn[1]] += data.draw(st.sampled_from([-1, 0, 1]))
     wrong = int(np.abs(steps - magnets(tags, member)[1]).sum())
     rest = [k for k in range(5) if k != gone]
-    reading = read(tags, [cells[k] for k in rest], steps[rest])
+    reading = decode_tag(tags, [cells[k] for k in rest], steps[rest])
     assert (reading.tag_id, reading.erased, reading.corrected) == (member, 1, wrong)
 
 
@@ -336,7 +338,7 @@ def test_beside_a_missing_magnet_less_is_corrected() -> None:
             cells, steps = magnets(tags, member)
             steps[missing] += min(wrong, 2)
             steps[missing + 1] -= max(wrong - 2, 0)
-            reading = read(tags, cells[missing:], steps[missing:])
+            reading = decode_tag(tags, cells[missing:], steps[missing:])
             if wrong <= borne:
                 assert (reading.tag_id, reading.corrected) == (member, wrong)
                 assert reading.erased == missing
@@ -349,12 +351,12 @@ def test_a_magnet_missing_from_two_members_alike_is_no_guess() -> None:
     ids = tuple(codec.id_of(DEFAULT, layout) for layout in _turned_layouts(0, (0, 4)))
     tags = replace(DEFAULT, ids=(*ids, 202517), min_distance=4)
     kept = [0, 2, 3, 4]
-    reading = read(tags, [cells[k] for k in kept], steps[kept])
+    reading = decode_tag(tags, [cells[k] for k in kept], steps[kept])
     assert (reading.tag_id, reading.refused) == (None, "magnets_missing")
     kept = [0, 1, 2, 3]
-    reading = read(tags, [cells[k] for k in kept], steps[kept])
+    reading = decode_tag(tags, [cells[k] for k in kept], steps[kept])
     assert (reading.tag_id, reading.erased) == (ids[0], 1)
-    two = read(tags, cells[:2], steps[:2])
+    two = decode_tag(tags, cells[:2], steps[:2])
     assert (two.tag_id, two.refused) == (None, "magnets_missing")
 
 
@@ -365,14 +367,14 @@ def test_a_magnet_in_a_wrong_cell_counts_half_a_turn() -> None:
     k = next(k for k, cell in enumerate(cells) if cell not in [(0, 0), (0, 2), (2, 2)])
     spare = next(c for c in [(1, 0), (0, 1), (1, 1), (2, 1), (1, 2)] if c not in cells)
     moved = [*cells[:k], spare, *cells[k + 1 :]]
-    reading = read(tags, moved, steps)
+    reading = decode_tag(tags, moved, steps)
     assert (reading.tag_id, reading.corrected, reading.erased) == (member, 4, 0)
-    assert read(replace(tags, min_distance=8), moved, steps).refused == "not_in_family"
+    assert decode_tag(replace(tags, min_distance=8), moved, steps).refused == "not_in_family"
 
 
 def test_a_family_of_one_has_the_largest_margin() -> None:
     tags = replace(DEFAULT, ids=(4711,))
-    assert read(tags, *magnets(tags, 4711)) == Reading(
+    assert decode_tag(tags, *magnets(tags, 4711)) == DecodedTag(
         4711, 20.0, 0, 0, codec.layout_of(tags, 4711).symbols
     )
 
@@ -402,7 +404,7 @@ def test_a_missing_magnet_and_a_misread_one_are_borne(data) -> None:
     kept = order[missing:]
     turn = data.draw(st.integers(0, 7)) if missing < 2 else 0
     steps[kept[0]] += turn
-    reading = read(REDUNDANT, [cells[k] for k in kept], steps[kept])
+    reading = decode_tag(REDUNDANT, [cells[k] for k in kept], steps[kept])
     assert (reading.tag_id, reading.refused, reading.erased) == (tag_id, "", missing)
     assert reading.corrected == min(turn, 8 - turn)
     assert reading.symbols == tuple(words()[tag_id][k] for k in kept)
@@ -413,7 +415,7 @@ def test_a_missing_magnet_and_a_misread_one_are_borne(data) -> None:
 
 
 def test_what_the_margin_of_a_clean_tag_is() -> None:
-    assert read(REDUNDANT, *magnets(REDUNDANT, 33)).margin == 5
+    assert decode_tag(REDUNDANT, *magnets(REDUNDANT, 33)).margin == 5
 
 
 @pytest.mark.slow
@@ -428,23 +430,25 @@ def test_one_misread_more_is_refused(data) -> None:
     kept = order[missing:]
     for k in kept[: (3 - missing) // 2 + 1]:
         steps[k] += data.draw(st.integers(1, tags.orientations - 1))
-    reading = read(tags, [cells[k] for k in kept], steps[kept])
+    reading = decode_tag(tags, [cells[k] for k in kept], steps[kept])
     assert (reading.tag_id, reading.refused) == (None, "beyond_code")
 
 
 def test_a_redundant_tag_has_its_magnets_where_it_has_them() -> None:
     cells, steps = magnets(REDUNDANT, 5)
     free = next(c for c in [(1, 0), (0, 1), (1, 1), (2, 1), (1, 2)] if c not in cells)
-    assert read(REDUNDANT, [*cells[:-2], free, cells[-1]], steps).refused == "no_such_placement"
+    assert (
+        decode_tag(REDUNDANT, [*cells[:-2], free, cells[-1]], steps).refused == "no_such_placement"
+    )
     kept = [0, 4, 5]
-    three = read(REDUNDANT, [cells[k] for k in kept], steps[kept])
+    three = decode_tag(REDUNDANT, [cells[k] for k in kept], steps[kept])
     assert (three.tag_id, three.erased) == (5, 3)
 
 
 def test_a_redundant_family_has_only_its_members() -> None:
     tags = replace(REDUNDANT, ids=(3, 44))
     for tag_id in range(64):
-        reading = read(tags, *magnets(tags, tag_id))
+        reading = decode_tag(tags, *magnets(tags, tag_id))
         assert reading.tag_id == (tag_id if tag_id in (3, 44) else None)
         assert reading.refused == ("" if tag_id in (3, 44) else "not_in_family")
 
@@ -453,23 +457,23 @@ def test_a_redundant_tag_as_built() -> None:
     """Four magnets more than half a step off: beyond the code, but measured."""
     laid = (0.6, -0.6, 0.1, 0.7, -0.55, 0.0)
     cells, steps = magnets(REDUNDANT, 21)
-    assert read(REDUNDANT, cells, steps + laid).tag_id is None
+    assert decode_tag(REDUNDANT, cells, steps + laid).tag_id is None
     tags = replace(REDUNDANT, built={21: turned(REDUNDANT, *laid)})
-    reading = read(tags, cells, steps + laid + 0.05)
+    reading = decode_tag(tags, cells, steps + laid + 0.05)
     assert (reading.tag_id, reading.corrected) == (21, 0)
     kept = [0, 1, 3, 4, 5]
     misread = steps + laid
     misread[3] += 3
-    reading = read(tags, [cells[k] for k in kept], misread[kept])
+    reading = decode_tag(tags, [cells[k] for k in kept], misread[kept])
     assert (reading.tag_id, reading.corrected, reading.erased) == (21, 3, 1)
     # A neighbour that was not measured is read as before.
     for tag_id in (20, 22):
-        assert read(tags, *magnets(tags, tag_id)).tag_id == tag_id
+        assert decode_tag(tags, *magnets(tags, tag_id)).tag_id == tag_id
 
 
 def test_every_id_of_every_codec_is_read_as_itself() -> None:
     for tags in (SMALL, REDUNDANT, Tags(magnets=7, codec="redundant"), RELEASED):
         count = codec.capacity(tags)
         for tag_id in itertools.islice(range(count), 0, None, max(1, count // 500)):
-            assert read(tags, *magnets(tags, tag_id)).tag_id == tag_id
+            assert decode_tag(tags, *magnets(tags, tag_id)).tag_id == tag_id
     assert redundant.MAX_DECODING_WEIGHT == 3
