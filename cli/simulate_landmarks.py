@@ -233,7 +233,7 @@ def _wanted(given: dict[str, Any]) -> SimulationOptions:
     parts: dict[str, Any] = {
         "errors": simulate.Errors().scaled(said.pop("factor")),
         "faults": simulate.Faults(),
-        "limits": simulate.Limits(),
+        "limits": simulate.RobotLimits(),
         "aims": simulate.Aims(),
     }
     for part, usual in parts.items():

@@ -51,6 +51,19 @@ def digitise(read: Array, range_t: float, quantum_t: float) -> tuple[Array, int]
     return np.clip(read, -range_t, range_t), int(np.count_nonzero(np.abs(read) >= range_t))
 
 
+def odometry_biases(errors: Errors, rng: np.random.Generator) -> Array:
+    """Draw the constant errors (3,) of the odometry of one session.
+
+    These are the relative errors of distances, the rotation [rad/m] that is reported on a
+    straight line, and the relative error of rotations.
+    """
+    return rng.normal(size=3) * [
+        errors.odometry_scale,
+        errors.odometry_drift_rad_per_m,
+        errors.odometry_turn,
+    ]
+
+
 def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Array, list[int]]:
     """Poses (n, 3) as the wheels tell them, from (0, 0, 0), and where they slipped.
 
@@ -78,11 +91,7 @@ def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Ar
     chord = step[:, 0] * np.cos(half) + step[:, 1] * np.sin(half)
     way = chord / np.sinc(step[:, 2] / 2 / np.pi)
     wheels = way[:, None] + step[:, 2:] * [-TRACK_M / 2, TRACK_M / 2]
-    scale, drift, turn = rng.normal(size=3) * [
-        errors.odometry_scale,
-        errors.odometry_drift_rad_per_m,
-        errors.odometry_turn,
-    ]
+    scale, drift, turn = odometry_biases(errors, rng)
     told = wheels + errors.wheel_noise_m * np.sqrt(np.abs(wheels)) * rng.normal(size=wheels.shape)
     slips: list[int] = []
     travelled = np.cumsum(np.abs(wheels).mean(axis=1))
