@@ -72,10 +72,11 @@ POSE = Form("X,Y,DEG", "120,80,45", _pose)
 @options.input_argument("map_file")
 @options.output("Session to write (.mcap), with the truth in it.")
 @click.option(
-    "--strategy", type=click.Choice(("paper", "path", "pass")), default="paper",
+    "--strategy", type=click.Choice(("paper", "published", "path", "pass")), default="paper",
     show_default=True,
-    help="Search a landmark, spin, and go on to its neighbours; follow a --path or some "
-    "--cell; or pass one landmark straight.",
+    help="Search a landmark, spin, and go on to its neighbours, steered by the truth; the same "
+    "by the estimates of the published method; follow a --path or some --cell; or pass one "
+    "landmark straight.",
 )  # fmt: skip
 @click.option("--start", type=POSE, help="In mm of the map.  [default: anywhere between landmarks]")
 @click.option("--landmarks", type=click.IntRange(1), metavar="N",
@@ -174,7 +175,8 @@ def command(map_file: Path, output: Path, overwrite: bool, as_json: bool, **give
     """Simulate a robot that drives over the landmarks of MAP_FILE (map.toml).
 
     Each bar is a cuboid magnet of its own strength and place; the robot is a differential
-    drive whose wheels err. It steers by the truth and by the errors of its aims. Errors are
+    drive whose wheels err. It steers by the truth and by the errors of its aims, or, with
+    --strategy published, by its sensors and odometry alone. Errors are
     standard deviations. The session holds samples, odometry, the map as designed, and as
     truth where the robot was; what is wrong with the floor is in its facts alone. The same
     options and seed give the same session.
@@ -183,10 +185,12 @@ def command(map_file: Path, output: Path, overwrite: bool, as_json: bool, **give
     Examples:
       locatk simulate landmarks map.toml -o run.mcap
       locatk simulate landmarks map.toml -o tour.mcap --landmarks 12 --seed 3
+      locatk simulate landmarks map.toml -o own.mcap --strategy published
       locatk simulate landmarks map.toml -o path.mcap --strategy path --path way.csv
       locatk simulate landmarks map.toml -o pass.mcap --strategy pass --cell 2,3 --lateral 20
       locatk simulate landmarks map.toml -o bad.mcap --flip 2,3:1 --range 20 --swap left:right
     """
+    from locatk.core.landmarks.published.driver import published_driver
     from locatk.core.landmarks.simulation import session as simulate
     from locatk.formats import halls, maps
 
@@ -195,7 +199,8 @@ def command(map_file: Path, output: Path, overwrite: bool, as_json: bool, **give
     floor = maps.read_map(map_file)
     wanted = _wanted(given)
     with console.working("Simulating"):
-        simulated = simulate.simulate(floor, wanted)
+        driver = published_driver(floor, wanted) if wanted.strategy == "published" else None
+        simulated = simulate.simulate(floor, wanted, driver)
         warnings = _warnings(simulated)
         halls.write_session(
             output,
@@ -246,9 +251,10 @@ def _wanted(given: dict[str, Any]) -> SimulationOptions:
             raise click.UsageError("--sensors have a range of their own.")
         said["sensors"] = maps.read_halls(file)
     strategy = said["strategy"]
+    searches = "paper" if strategy != "published" else strategy
     for name, option, of in (
-        ("start", "--start", "paper"),
-        ("landmarks", "--landmarks", "paper"),
+        ("start", "--start", searches),
+        ("landmarks", "--landmarks", searches),
         ("spins", "--spins", "paper"),
         ("waypoints", "--path", "path"),
         ("pattern", "--pattern", "pass"),
@@ -318,6 +324,7 @@ def _told(simulated: SimulatedSession) -> dict[str, Any]:
         "device": simulated.samples[0].device,
         "frame": simulated.truth[0].frame,
         "visits": _visits(simulated),
+        "approaches": _approaches(simulated),
         "faults": [
             {"cell": list(mark.cell), "faults": list(mark.faults)}
             for mark in simulated.floor_as_laid
@@ -343,6 +350,21 @@ def _visits(simulated: SimulatedSession) -> list[dict[str, Any]]:
     ]
 
 
+def _approaches(simulated: SimulatedSession) -> list[dict[str, Any]]:
+    """Outcomes of the strategy published."""
+    return [
+        {
+            "cell": list(approach.cell),
+            "time_s": approach.time_ns / 1e9,
+            "outcome": approach.outcome,
+            "searched": approach.searched,
+            "spins": approach.spins,
+            "distance_m": approach.distance_m,
+        }
+        for approach in simulated.approaches
+    ]
+
+
 def _facts(simulated: SimulatedSession, wanted: SimulationOptions) -> dict[str, str]:
     """The options, and what else is true: the visits, and the landmarks as they lie.
 
@@ -361,6 +383,8 @@ def _facts(simulated: SimulatedSession, wanted: SimulationOptions) -> dict[str, 
             said[f"simulated_{item.name}"] = str(value)
     visited = {visit.cell for visit in simulated.events}
     said["simulated_visits"] = json.dumps(_visits(simulated))
+    if simulated.approaches:
+        said["simulated_approaches"] = json.dumps(_approaches(simulated))
     said["simulated_floor"] = json.dumps(
         [
             {

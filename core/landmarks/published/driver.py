@@ -1,15 +1,20 @@
 """Driver that follows the paper's motion strategy by the paper's own estimates (Fig. 12).
 
-The robot drives straight until its sensors cross the territory of a landmark, and estimates the
-centre by the first step (section 3.2). It drives there and spins until the second step (section
-3.3) recognises the landmark and finds its centre close to that of the spin, with up to four spins.
-Then it drives to the estimated centre, aligns with the bars (section 3.4), corrects its pose by
-the four voltages, and takes a landing curve to the next landmark of the map's window (section
-4.1). Inputs are the samples of the hall sensors, the odometry, and the geometry of bars, pitch and
-window; the codes of the map are not used.
+1. The robot drives straight until its sensors cross the territory of a landmark, and estimates the
+   centre by the first step (section 3.2).
+2. It drives there and spins. The second step (section 3.3) reads pattern and centre. If the centre
+   is not close to that of the spin, or the reading is not trusted, the robot moves to the centre
+   that it read and spins again, up to four times.
+3. It drives to the centre, aligns with the bars (section 3.4), and corrects its pose by the four
+   voltages (section 4.1).
+4. It takes a landing curve to the next landmark of the map's window (section 4.1), and goes on
+   with 2.
 
-The paper does not describe what a robot does after an approach has failed. Here it drives on
-straight ahead and searches the next landmark.
+Inputs are the samples of the hall sensors, the odometry, and the geometry of bars, pitch and
+window; the codes of the map are not used. The paper leaves open what the robot does in two cases.
+If a spin gives no centre at all, the robot here drives on, turns around, and repeats the first
+step on the same landmark. If an approach fails, it searches the next landmark: straight ahead, or
+back from where it came if there was none.
 """
 
 from __future__ import annotations
@@ -43,7 +48,7 @@ from locatk.core.landmarks.published.search import (
     spin_valleys,
     unexplained_fraction,
 )
-from locatk.core.landmarks.published.second_step import SpinReading
+from locatk.core.landmarks.published.second_step import MAX_OFFSET_FRACTION, SpinReading
 from locatk.core.landmarks.simulation.closed_loop import ApproachReport, Motion
 from locatk.core.landmarks.simulation.instruments import Measurements
 from locatk.core.landmarks.simulation.options import SimulationOptions
@@ -57,7 +62,8 @@ Motions = Generator[Motion, None, Result]
 QUARTER_TURN_RAD = math.pi / 2
 
 SEARCH_STEP_M = 0.010
-"""Path between two looks at the sensors while the robot searches: half of :data:`PASS_END_M`."""
+"""Path between two readouts of the sensors while the robot searches: half of
+:data:`PASS_END_M`."""
 
 MAX_SEARCH_M = 1.0
 """Path without a field after which the robot gives up: five times the default pitch."""
@@ -77,8 +83,8 @@ MAX_POSE_ERROR_M = 0.001
 """Distance from the centre below which the robot does not correct its position at the landmark:
 the paper's accuracy (section 5.2.3)."""
 
-MAX_FAILED_APPROACHES = 3
-"""Failed approaches after which the robot gives up."""
+MAX_APPROACHES = 4
+"""Searches after which the robot gives up."""
 
 SETTLE_S = 0.05
 """Rest after each motion: two periods of the odometry."""
@@ -103,6 +109,10 @@ class _Recording:
         return float(self.path_m[-1] - self.path_m[inside[-1]]) if len(inside) else math.inf
 
 
+class _LandmarkLostError(Exception):
+    """No landmark was found near the expected position."""
+
+
 class PublishedDriver:
     """Driver of a simulated robot by the published algorithm.
 
@@ -118,6 +128,11 @@ class PublishedDriver:
         Landmarks in a row that are read before the robot stops.
     stop_s : float
         Rest for the four voltages.
+    max_unexplained_fraction : float
+        Largest rms residual of a trusted spin, in units of its rms field; ``inf`` for the paper's
+        text, which has no such check.
+    max_approaches : int
+        Searches after which the robot gives up.
     reports : list of ApproachReport
         Approaches so far.
     """
@@ -129,19 +144,24 @@ class PublishedDriver:
         rotations: Sequence[int] = (0, 1),
         landmarks: int = 3,
         stop_s: float = 0.5,
+        max_unexplained_fraction: float = MAX_UNEXPLAINED_FRACTION,
+        max_approaches: int = MAX_APPROACHES,
     ) -> None:
         self.geometry, self.pitch_m = geometry, pitch_m
         self.rotations, self.landmarks, self.stop_s = rotations, landmarks, stop_s
+        self.max_unexplained_fraction = max_unexplained_fraction
+        self.max_approaches = max_approaches
         self.reports: list[ApproachReport] = []
 
     def motions(self, measure: Callable[[], Measurements]) -> Motions[None]:
         """Yield the motions of the whole strategy (:class:`~.closed_loop.Driver`)."""
         self._measure, self._radii_m = measure, bar_radii(self.geometry)
-        for _ in range(MAX_FAILED_APPROACHES):
-            entered = yield from self._search()
-            if entered is None:
+        yield from self._move()
+        for _ in range(self.max_approaches):
+            yield from self._leave_territory()
+            centre = yield from self._search()
+            if centre is None:
                 return
-            centre = self._first_step(entered)
             for number in range(self.landmarks):
                 frame = yield from self._approach(centre, searched=number == 0)
                 if frame is None:
@@ -156,113 +176,128 @@ class PublishedDriver:
 
         Returns the landmark's frame (3,) in that of the odometry; None if the approach failed.
         """
-        if not np.isfinite(centre_m).all():
-            self._report(searched, 0, lost=True)
-            return None
-        reading, spins = yield from self._second_step(centre_m)
+        self._spins = 0
+        reading = None
+        lost = False
+        try:
+            reading = yield from self._second_step(centre_m)
+        except _LandmarkLostError:
+            lost = True
         if reading is None:
-            self._report(searched, spins, lost=not self._has_field_at_end())
+            self._report(searched, lost=lost)
+            if lost:
+                yield from self._move((0.0, math.pi))
             return None
         code, pose = yield from self._third_step(reading)
-        self._report(searched, spins, code, pose)
+        self._report(searched, code, pose)
         return _frame_of_landmark(self._now.pose[-1], pose)
 
     def _report(
         self,
         searched: bool,
-        spins: int,
         code: int | None = None,
         pose: Array | None = None,
         *,
         lost: bool = False,
     ) -> None:
         time_ns = int(self._now.time_ns[-1])
-        self.reports.append(ApproachReport(time_ns, searched, spins, code, pose, lost))
+        self.reports.append(ApproachReport(time_ns, searched, self._spins, code, pose, lost))
 
     # ---- first step
 
-    def _search(self) -> Motions[slice | None]:
-        """Drive straight over the next landmark; return the samples of the pass.
+    def _search(self) -> Motions[Array | None]:
+        """Drive straight over the next landmark and estimate its centre (2,) by the first step.
 
-        None if no landmark was met within :data:`MAX_SEARCH_M`.
+        The centre is ``nan`` if the entries give none; None if no landmark was met within
+        :data:`MAX_SEARCH_M`.
         """
-        yield from self._move()
-        recording = self._now
-        start_m = recording.path_m[-1]
-        # After a failed approach, the robot leaves the territory first.
-        while recording.path_since_field_m() <= PASS_END_M:
-            if recording.path_m[-1] - start_m > MAX_PASS_M:
+        first = len(self._now.pose) - 1
+        start_m = self._now.path_m[first]
+        while not self._now.inside[first:].any():
+            if self._now.path_m[-1] - start_m > MAX_SEARCH_M:
                 return None
-            recording = yield from self._drive_ahead()
-        first = len(recording.pose) - 1
-        start_m = recording.path_m[first]
-        while not recording.inside[first:].any():
-            if recording.path_m[-1] - start_m > MAX_SEARCH_M:
-                return None
-            recording = yield from self._drive_ahead()
-        entry_m = recording.path_m[-1]
-        while recording.path_since_field_m() <= PASS_END_M:
-            if recording.path_m[-1] - entry_m > MAX_PASS_M:
-                break
-            recording = yield from self._drive_ahead()
-        return slice(first, len(recording.pose))
-
-    def _drive_ahead(self) -> Motions[_Recording]:
-        yield from self._move((SEARCH_STEP_M, 0.0))
-        return self._now
-
-    def _first_step(self, entered: slice) -> Array:
-        """Estimate the centre (2,) from one pass; ``nan`` if no candidate is left."""
-        recording = self._now
-        position = sensor_places(recording.pose[entered], recording.lever_arm_m)
+            yield from self._move((SEARCH_STEP_M, 0.0))
+        yield from self._leave_territory()
+        position = sensor_places(self._now.pose[first:], self._now.lever_arm_m)
         _, centre, _ = run_first_step(
-            position, recording.field_t[entered], self.geometry.threshold_t, self._radii_m
+            position, self._now.field_t[first:], self.geometry.threshold_t, self._radii_m
         )
         return centre
 
+    def _leave_territory(self) -> Motions[None]:
+        """Drive straight until no sensor was in a territory for :data:`PASS_END_M`."""
+        start_m = self._now.path_m[-1]
+        while self._now.path_since_field_m() <= PASS_END_M:
+            if self._now.path_m[-1] - start_m > MAX_PASS_M:
+                return
+            yield from self._move((SEARCH_STEP_M, 0.0))
+
     # ---- second step
 
-    def _second_step(self, centre_m: Array) -> Motions[tuple[SpinReading | None, int]]:
+    def _second_step(self, centre_m: Array) -> Motions[SpinReading | None]:
         """Spin until the landmark is recognised close to the centre of the spin.
 
-        Returns the last reading, None if no spin could be read, and the number of spins.
+        Returns the last trusted reading; None if there was none.
+
+        Raises
+        ------
+        _LandmarkLostError
+            There is no field around the expected centre, or the first step gave no centre.
         """
         reading = None
-        for spins in range(1, MAX_SPINS + 1):
+        for _ in range(MAX_SPINS):
+            if not np.isfinite(centre_m).all():
+                raise _LandmarkLostError
             yield from self._drive_to(centre_m)
             first = len(self._now.pose)
             yield from self._move((0.0, SPIN_RAD))
-            recording = self._now
-            if not recording.inside[first:].any():
-                return None, spins
-            spin_reading, spin_centre = self._read_spin(recording, slice(first, None))
-            if spin_reading is None:
+            self._spins += 1
+            if not self._now.inside[first:].any():
+                raise _LandmarkLostError
+            spin = slice(first, None)
+            valleys, spin_centre = spin_valleys(
+                self._now.pose[spin], self._now.field_t[spin], self._now.lever_arm_m, self.geometry
+            )
+            attempt = None
+            if valleys is not None:
+                attempt = recognise_spin(valleys, spin_centre, self._now.lever_arm_m, 1.0)
+            if attempt is None:
+                if self._spins < MAX_SPINS:
+                    centre_m = yield from self._repeat_first_step()
                 continue
-            reading, centre_m = spin_reading, spin_reading.centre_m
-            if np.hypot(*(centre_m - spin_centre)) <= MAX_SPIN_OFFSET_M:
-                break
-        return reading, spins
+            centre_m = attempt.centre_m
+            offset_m = np.hypot(*(centre_m - spin_centre))
+            if self._is_trusted(attempt, offset_m, spin):
+                reading = attempt
+                if offset_m <= MAX_SPIN_OFFSET_M:
+                    break
+        return reading
 
-    def _read_spin(self, recording: _Recording, spin: slice) -> tuple[SpinReading | None, Array]:
-        """Return the reading of a spin, None if it fits no landmark, and the spin's centre (2,)."""
-        pose, field, lever_arm = (
-            recording.pose[spin],
-            recording.field_t[spin],
-            recording.lever_arm_m,
-        )
-        valleys, centre = spin_valleys(pose, field, lever_arm, self.geometry)
-        reading = None if valleys is None else recognise_spin(valleys, centre, lever_arm)
-        if reading is None:
-            return None, centre
+    def _repeat_first_step(self) -> Motions[Array]:
+        """Leave the landmark straight ahead, turn around, and pass over it again."""
+        yield from self._leave_territory()
+        yield from self._move((0.0, math.pi))
+        centre = yield from self._search()
+        if centre is None:
+            raise _LandmarkLostError
+        return centre
+
+    def _is_trusted(self, reading: SpinReading, offset_m: float, spin: slice) -> bool:
+        """Return whether a reading passes the checks of ``--method paper``.
+
+        Both are not in the paper: the centre is not too far from that of the spin, and the bars
+        explain the field of the spin.
+        """
+        lever_arm = self._now.lever_arm_m
+        radius = float(np.mean(np.hypot(*lever_arm.T)))
+        if offset_m > MAX_OFFSET_FRACTION * radius:
+            return False
+        pose, field = self._now.pose[spin], self._now.field_t[spin]
         hypothesis = pose_by_valleys(reading, pose[-1])
         unexplained = unexplained_fraction(
             self.geometry, hypothesis, pose[-1], (pose, field), lever_arm
         )
-        return (None if unexplained > MAX_UNEXPLAINED_FRACTION else reading), centre
-
-    def _has_field_at_end(self) -> bool:
-        """Return whether the robot was in a territory within the last :data:`PASS_END_M`."""
-        return self._now.path_since_field_m() <= PASS_END_M
+        return unexplained <= self.max_unexplained_fraction
 
     # ---- third step and pose compensation
 

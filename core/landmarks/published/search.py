@@ -41,6 +41,7 @@ from locatk.core.landmarks.published.first_step import (
 from locatk.core.landmarks.published.pose_compensation import compensate_pose
 from locatk.core.landmarks.published.second_step import (
     HYSTERESIS_FRACTION,
+    MAX_OFFSET_FRACTION,
     SpinReading,
     Valleys,
     circle_profile,
@@ -178,14 +179,20 @@ def spin_valleys(
     return find_valleys(profile, HYSTERESIS_FRACTION * geometry.threshold_t), centre
 
 
-def recognise_spin(valleys: Valleys, centre_m: Array, lever_arm_m: Array) -> SpinReading | None:
+def recognise_spin(
+    valleys: Valleys,
+    centre_m: Array,
+    lever_arm_m: Array,
+    max_offset_fraction: float = MAX_OFFSET_FRACTION,
+) -> SpinReading | None:
     """Recognise the landmark of one spin, in the frame of the odometry; None if it fits none.
 
-    Parameters are the results of :func:`spin_valleys`, and the sensors (N, 2) in the robot's
-    frame, whose mean distance from the origin is the radius of the circle.
+    The first parameters are the results of :func:`spin_valleys`, the others the sensors (N, 2) in
+    the robot's frame, whose mean distance from the origin is the radius of the circle, and the
+    limit of :func:`~.second_step.recognise`.
     """
     radius = float(np.mean(np.hypot(*lever_arm_m.T)))
-    reading = recognise(valleys, radius)
+    reading = recognise(valleys, radius, max_offset_fraction)
     if reading is None:
         return None
     return SpinReading(reading.centre_m + centre_m, reading.bar_rad, reading.north)

@@ -208,11 +208,14 @@ class SpinReading:
         return int(north @ (1 << np.arange(4))), float(rotation + q * math.pi / 2)
 
 
-def recognise(valleys: Valleys, radius_m: float) -> SpinReading | None:
+def recognise(
+    valleys: Valleys, radius_m: float, max_offset_fraction: float = MAX_OFFSET_FRACTION
+) -> SpinReading | None:
     """Recognise a landmark and estimate its centre by the valleys on a circle of ``radius_m``.
 
     The result is in the frame of the circle's centre. None if the number of valleys, their gaps
-    or angles fit no landmark near the circle's centre; then the paper tries again.
+    or angles fit no landmark whose centre is within ``max_offset_fraction`` of the radius; then
+    the paper tries again.
     """
     bars = bar_valleys(valleys)
     if bars is None:
@@ -227,7 +230,7 @@ def recognise(valleys: Valleys, radius_m: float) -> SpinReading | None:
     offset = point[1] - point[0]
     fraction = (offset[0] * second_line[1] - offset[1] * second_line[0]) / cross
     centre = point[0] + fraction * first_line
-    if np.hypot(*centre) > MAX_OFFSET_FRACTION * radius_m:
+    if np.hypot(*centre) > max_offset_fraction * radius_m:
         return None
     direction = point - centre
     return SpinReading(centre, np.arctan2(direction[:, 1], direction[:, 0]), valleys.rising[bars])

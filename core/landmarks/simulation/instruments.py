@@ -123,7 +123,6 @@ class Instruments:
         motions = np.cumsum(moved) - (0 if known else 1)
         self._field = np.concatenate([self._field, by_motion[motions]])
 
-
     def _landmarks_near(self, points: Array) -> list[Laid]:
         """Return the landmarks that can contribute to the field at points (..., 3)."""
         if not points.size:

@@ -191,11 +191,7 @@ class Robot:
         starts = np.searchsorted(time_s, [leg.start_s for leg in self.legs[1:]])
         parts = np.split(time_s, starts)
         return np.concatenate(
-            [
-                leg.poses_at(part)
-                for leg, part in zip(self.legs, parts, strict=True)
-                if len(part)
-            ]
+            [leg.poses_at(part) for leg, part in zip(self.legs, parts, strict=True) if len(part)]
         )
 
     def _append(self, arcs: Array, size: Array, speed: float, acceleration: float) -> None:
