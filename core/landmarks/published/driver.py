@@ -83,6 +83,9 @@ MAX_POSE_ERROR_M = 0.001
 """Distance from the centre below which the robot does not correct its position at the landmark:
 the paper's accuracy (section 5.2.3)."""
 
+MIN_DRIVE_M = 0.0005
+"""Distance below which the robot does not rotate to drive there: half of the paper's accuracy."""
+
 MAX_APPROACHES = 4
 """Searches after which the robot gives up."""
 
@@ -157,6 +160,7 @@ class PublishedDriver:
         """Yield the motions of the whole strategy (:class:`~.closed_loop.Driver`)."""
         self._measure, self._radii_m = measure, bar_radii(self.geometry)
         yield from self._move()
+        direction = 0.0
         for _ in range(self.max_approaches):
             yield from self._leave_territory()
             centre = yield from self._search()
@@ -168,8 +172,12 @@ class PublishedDriver:
                     break
                 if number == self.landmarks - 1:
                     return
-                rotation = self.rotations[number % len(self.rotations)]
-                centre = yield from self._drive_to_neighbour(frame, rotation)
+                # The robot aligned with any of the four bars; it came along one of them.
+                heading = frame[2] if number == 0 else direction
+                aligned = round((heading - frame[2]) / QUARTER_TURN_RAD)
+                rotation = aligned + self.rotations[number % len(self.rotations)]
+                direction = frame[2] + rotation * QUARTER_TURN_RAD
+                centre = yield from self._drive_to_neighbour(frame[:2], direction)
 
     def _approach(self, centre_m: Array, *, searched: bool) -> Motions[Array | None]:
         """Find the centre of a landmark near an estimate and align with its bars.
@@ -344,21 +352,22 @@ class PublishedDriver:
         x, y, heading = self._now.pose[-1]
         dx, dy = position_m - [x, y]
         distance = math.hypot(dx, dy)
+        if distance < MIN_DRIVE_M:
+            return
         rotation = math.remainder(math.atan2(dy, dx) - heading, math.tau)
         if abs(rotation) > QUARTER_TURN_RAD and distance <= MAX_BACKING_M:
             rotation, distance = math.remainder(rotation + math.pi, math.tau), -distance
         yield from self._move((0.0, rotation), (distance, 0.0))
 
-    def _drive_to_neighbour(self, frame: Array, quarter_turns: int) -> Motions[Array]:
-        """Rotate by quarter turns and take the landing curve to the next landmark.
+    def _drive_to_neighbour(self, centre_m: Array, direction_rad: float) -> Motions[Array]:
+        """Rotate to a direction and take the landing curve to the next landmark.
 
-        ``frame`` (3,) is that of the present landmark. Returns the expected centre (2,) of the
+        ``centre_m`` (2,) is that of the present landmark. Returns the expected centre (2,) of the
         next one.
         """
-        direction = frame[2] + quarter_turns * QUARTER_TURN_RAD
-        goal = compose(np.array([*frame[:2], direction]), np.array([self.pitch_m, 0.0, 0.0]))
+        goal = compose(np.array([*centre_m, direction_rad]), np.array([self.pitch_m, 0.0, 0.0]))
         heading = self._now.pose[-1, 2]
-        yield from self._move((0.0, math.remainder(direction - heading, math.tau)))
+        yield from self._move((0.0, math.remainder(direction_rad - heading, math.tau)))
         curve = landing_curve(self._now.pose[-1], goal)
         yield from self._move(*curve.arcs())
         return goal[:2]
