@@ -190,8 +190,8 @@ def bar_radii(geometry: Geometry) -> tuple[float, float]:
     """
     angles = np.radians(np.arange(0, 360, 1.5) + 0.75)
     strengths = signs(code_of("NNNS"))
-    contour = territory.contour(geometry, strengths[:, None], angles)[:, 0]
-    radii_m = territory.radii(angles, contour, strengths)
+    contour = territory.threshold_contour(geometry, strengths[:, None], angles)[:, 0]
+    radii_m = territory.territory_radii(angles, contour, strengths)
     if not np.isfinite(radii_m).all():
         raise DegenerateError(
             f"no field of {geometry.threshold_t * 1e3:g} mT around the landmark",
