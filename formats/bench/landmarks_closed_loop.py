@@ -8,7 +8,6 @@ sensors and odometry only.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -79,7 +78,7 @@ def approach_figures(floor: FloorMap, which: str) -> Iterator[Figure]:
 
 def first_approaches(floor: FloorMap, robots: int, check_readings: bool = True) -> list[Approach]:
     """Simulate robots that search one landmark; return the first approach of those that met one."""
-    approaches = []
+    approaches: list[Approach] = []
     for seed in range(SEED + 800, SEED + 800 + robots):
         options = SimulationOptions("published", landmarks=1, rate_hz=SAMPLE_RATE_HZ, seed=seed)
         driver = published_driver(floor, options)
@@ -92,7 +91,9 @@ def first_approaches(floor: FloorMap, robots: int, check_readings: bool = True) 
 
 def solution_figures(floor: FloorMap) -> Iterator[Figure]:
     """Yield what the default method and the published one make of closed-loop sessions."""
-    read, by_field, by_paper = 0, [], []
+    read = 0
+    by_field: list[Session] = []
+    by_paper: list[Session] = []
     for seed in range(SEED + 1000, SEED + 1000 + DRIVEN_SESSIONS):
         options = replace(SimulationOptions("published"), seed=seed)
         session = simulate(floor, options, published_driver(floor, options))
@@ -114,8 +115,9 @@ def solution_figures(floor: FloorMap) -> Iterator[Figure]:
 
 
 def _percentage(approaches: Sequence[Approach], outcome: str) -> float:
-    counts = Counter(one.outcome for one in approaches)
-    return 100 * counts[outcome] / len(approaches) if approaches else math.nan
+    if not approaches:
+        return math.nan
+    return 100 * sum(one.outcome == outcome for one in approaches) / len(approaches)
 
 
 def _right(sessions: Sequence[Session]) -> float:

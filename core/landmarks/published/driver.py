@@ -388,7 +388,7 @@ class PublishedDriver:
             pose,
             field,
             recording.samples.sensors.position_m,
-            (np.abs(field) >= self.geometry.threshold_t).any(axis=1),
+            np.any(np.abs(field) >= self.geometry.threshold_t, axis=1),
             np.cumsum(np.hypot(*step.T)),
         )
 
