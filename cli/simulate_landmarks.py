@@ -324,7 +324,7 @@ def _told(simulated: SimulatedSession) -> dict[str, Any]:
         "device": simulated.samples[0].device,
         "frame": simulated.truth[0].frame,
         "visits": _visits(simulated),
-        "approaches": _approaches(simulated),
+        **({"approaches": _approaches(simulated)} if simulated.approaches else {}),
         "faults": [
             {"cell": list(mark.cell), "faults": list(mark.faults)}
             for mark in simulated.floor_as_laid

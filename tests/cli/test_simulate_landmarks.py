@@ -14,6 +14,7 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import name
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.published.driver import published_driver
 from locatk.core.landmarks.simulation.session import (
     Aims,
     Errors,
@@ -273,3 +274,19 @@ def test_a_map_must_be_one(locatk, floor: Path) -> None:
     result = locatk("simulate", "landmarks", floor, "-o", out)
     assert result.exit_code == 1
     assert not out.exists()
+
+
+def test_a_robot_drives_by_the_published_method(locatk, floor: Path) -> None:
+    out = floor.with_name("own.mcap")
+    given = ("--strategy", "published", "--landmarks", 1, "--rate", 100, "--seed", 2)
+    result = locatk("simulate", "landmarks", floor, "-o", out, *given, "--json")
+    assert result.exit_code == 0, result.stderr
+    options = SimulationOptions("published", landmarks=1, rate_hz=100.0, seed=2)
+    wanted = simulate(FloorMap(CODES), options, published_driver(FloorMap(CODES), options))
+    session = holds(out, wanted)
+    approaches = json.loads(result.stdout)["approaches"]
+    assert [tuple(one["cell"]) for one in approaches] == [one.cell for one in wanted.approaches]
+    assert {one["outcome"] for one in approaches} <= {
+        "centre", "no_pattern", "wrong_pattern", "lost",
+    }  # fmt: skip
+    assert json.loads(session.metadata()["facts"]["simulated_approaches"]) == approaches

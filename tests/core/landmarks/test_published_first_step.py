@@ -169,6 +169,12 @@ def test_a_pass_that_begins_inside_has_no_entry_there() -> None:
     assert np.allclose(seen.point_m, [[0.015, 0.0]])
 
 
+def test_a_pass_that_ends_inside_has_no_exit() -> None:
+    field = np.array([0.0, 4.0, 0.0, 0.0, 4.0, 4.0])
+    seen = find_entries(straight(6, 0.0), field[:, None], 2.0)
+    assert np.allclose(seen.point_m, [[0.005, 0.0]])
+
+
 def test_front_and_rear_give_one_entry_and_silent_sensors_their_way() -> None:
     field = np.array([0, 4, 4, 0, 0, 0.0])
     dead = np.full(6, np.nan)
