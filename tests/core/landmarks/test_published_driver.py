@@ -241,6 +241,7 @@ def sessions() -> list[SimulatedSession]:
     return made
 
 
+@pytest.mark.slow
 def test_most_robots_end_at_a_centre(sessions: list[SimulatedSession]) -> None:
     approaches = [one for session in sessions for one in session.approaches]
     counts = Counter(one.outcome for one in approaches)
@@ -256,6 +257,7 @@ def test_most_robots_end_at_a_centre(sessions: list[SimulatedSession]) -> None:
             assert one.spins == 4
 
 
+@pytest.mark.slow
 def test_approaches_agree_with_the_visits(sessions: list[SimulatedSession]) -> None:
     for session in sessions:
         for one in session.approaches:
@@ -265,6 +267,7 @@ def test_approaches_agree_with_the_visits(sessions: list[SimulatedSession]) -> N
             assert any(v.first_ns <= one.time_ns <= v.last_ns for v in visits)
 
 
+@pytest.mark.slow
 def test_its_sessions_can_be_solved(sessions: list[SimulatedSession]) -> None:
     right = 0
     for session in sessions[:5]:
@@ -303,6 +306,7 @@ def test_commands_depend_on_measurements_only(monkeypatch: pytest.MonkeyPatch) -
     assert list(other.motions(lambda: next(replay))) == ordered
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_session() -> None:
     first, second = (drive(seed=3, landmarks=1) for _ in range(2))
     np.testing.assert_array_equal(first.samples[0].field_t, second.samples[0].field_t)
