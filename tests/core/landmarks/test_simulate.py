@@ -244,6 +244,9 @@ def test_it_goes_back_rather_than_around_where_that_is_near() -> None:
     robot = Robot(np.array([0.0, 0.0, 0.0]))
     robot.drive_to((-0.02, 0.0), back_m=0.05)
     assert robot.pose == pytest.approx([-0.02, 0, 0])
+    robot.drive_to((0.0, 0.0), back_m=0.05)
+    assert robot.pose == pytest.approx([0, 0, 0]), "ahead, however near"
+    robot.drive_to((-0.02, 0.0), back_m=0.05)
     robot.drive_to((-0.12, 0.0), back_m=0.05)
     assert abs(robot.pose[2]) == pytest.approx(math.pi)
     assert robot.pose[:2] == pytest.approx([-0.12, 0])
@@ -355,6 +358,7 @@ def test_what_is_free() -> None:
         return np.linspace(*ends, 41)
 
     assert is_free(floor, line((0.0, -0.05), (0.0, 0.05)))
+    assert not is_free(floor, line((0.0, 0.19), (0.0, 0.21))), "within a hole"
     assert not is_free(floor, line((0.0, 0.0), (0.2, 0.0))), "a wall"
     assert not is_free(floor, line((0.0, 0.0), (0.0, 0.2))), "a hole"
     assert is_free(floor, line((0.2, 0.0), (0.2, 0.2)))
