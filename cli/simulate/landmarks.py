@@ -26,15 +26,16 @@ def command(
     """Simulate a robot that drives over the landmarks of MAP_FILE (map.toml).
 
     Each bar is a cuboid magnet of its own strength and position; the robot is a differential drive
-    with erroneous wheels. It steers by the truth and by the errors of its aims. Errors are standard
-    deviations. The session contains samples, odometry, the map as designed, and as truth the poses
-    of the robot; the errors of the floor are in its facts alone. The same settings and seed give
-    the same session.
+    with erroneous wheels. It steers by the truth and by the errors of its aims, or, with --strategy
+    published, by its sensors and odometry alone. Errors are standard deviations. The session
+    contains samples, odometry, the map as designed, and as truth the poses of the robot; the errors
+    of the floor are in its facts alone. The same settings and seed give the same session.
 
     \b
     Examples:
       locatk simulate landmarks map.toml -o run.mcap
       locatk simulate landmarks map.toml -o tour.mcap --landmarks 12 --seed 3
+      locatk simulate landmarks map.toml -o own.mcap --strategy published
       locatk simulate landmarks map.toml -o path.mcap --strategy path --path way.csv
       locatk simulate landmarks map.toml -o pass.mcap --strategy pass --cell 2,3 --noise 0.3
       locatk simulate landmarks map.toml -o bad.mcap --flip 2,3:1

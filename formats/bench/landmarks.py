@@ -1,8 +1,8 @@
 """The figures of the landmarks: the paper's study, simulated visits, floors, maps and speed.
 
 There is no published recording: what is simulated, and with which errors, is told in
-:mod:`.landmarks_study`, :mod:`.landmarks_global` and :mod:`.landmarks_sessions`. Of the data
-folder only the verified maps are used.
+:mod:`.landmarks_study`, :mod:`.landmarks_global`, :mod:`.landmarks_sessions` and
+:mod:`.landmarks_closed_loop`. Of the data folder only the verified maps are used.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.published.study import study
 from locatk.formats.bench import Figure
+from locatk.formats.bench.landmarks_closed_loop import closed_loop_figures
 from locatk.formats.bench.landmarks_global import global_figures
 from locatk.formats.bench.landmarks_sessions import session_figures
 from locatk.formats.bench.landmarks_speed import map_figures, speed_figures
@@ -67,6 +68,7 @@ def figures(data: Path) -> list[Figure]:
         *stand_figures(),
         *global_figures(folder),
         *session_figures(folder),
+        *closed_loop_figures(folder),
         *map_figures(folder),
         *speed_figures(),
     ]

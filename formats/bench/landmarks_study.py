@@ -27,9 +27,9 @@ from locatk.core.landmarks.detection.sightings import sighting
 from locatk.core.landmarks.detection.trace import Drift, Trace, compose, relative, sensor_places
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
-from locatk.core.landmarks.published import pose as paper_pose
 from locatk.core.landmarks.published import search as paper
-from locatk.core.landmarks.published import valleys as paper_valleys
+from locatk.core.landmarks.published.pose_compensation import compensate_pose
+from locatk.core.landmarks.published.second_step import find_spins
 from locatk.core.landmarks.simulation.floor import BAR_DRAWS, bar_fields, scatter_bars
 from locatk.core.landmarks.simulation.options import Errors
 from locatk.core.landmarks.simulation.passes import Pass, passes
@@ -174,24 +174,17 @@ def by_voting(number: int, one: Pass) -> tuple[Found, Found]:
 def by_valleys(number: int, one: Pass) -> Found:
     """The paper's second step alone: the valleys of the spin, with no voltages after it."""
     run, visit, visits = last_visit(one)
-    spins = paper.spins(run.pose)
+    spins = find_spins(run.pose)
     if visit is None or not spins:
         return Found(number, one.lines, visits)
-    turning = slice(*spins[-1])
-    middle = np.median(run.pose[turning, :2], axis=0)
-    lever = run.samples.sensors.position_m
-    place = sensor_places(run.pose[turning], lever)
-    field = run.samples.field_t[turning] - run.offset_t
-    around = paper_valleys.profile(place, field, middle)
-    if np.isnan(around).any():
+    spin = slice(*spins[-1])
+    lever_arm = run.samples.sensors.position_m
+    field = run.samples.field_t[spin] - run.offset_t
+    valleys, middle = paper.spin_valleys(run.pose[spin], field, lever_arm, GEOMETRY)
+    reading = None if valleys is None else paper.recognise_spin(valleys, middle, lever_arm)
+    if reading is None:
         return Found(number, one.lines, visits)
-    valleys = paper_valleys.valleys(around, paper.HYSTERESIS * GEOMETRY.threshold_t)
-    found = paper_valleys.recognise(valleys, GEOMETRY.circle_m)
-    if found is None:
-        return Found(number, one.lines, visits)
-    end = run.pose[-1]
-    code, mark = found.seen_under(float(end[2]))
-    seen = relative(end[None], np.array([*(found.centre_m + middle), mark]))[0]
+    code, seen = paper.pose_by_valleys(reading, run.pose[-1])
     at_ns = int(one.samples.time_ns[-1])
     return Found(
         number,
@@ -360,7 +353,7 @@ def stands(count: int, seed: int, anywhere: bool = False) -> Stand:
         found.nees[k] = off @ np.linalg.solve(covariance, off)
         for steps, out in ((1, found.linear), (10, found.inverted)):
             try:
-                pose = paper_pose.compensate(GEOMETRY, int(code[k]), lever, field[k], steps=steps)
+                pose = compensate_pose(GEOMETRY, int(code[k]), lever, field[k], steps=steps)
             except DegenerateError:
                 continue
             out[k] = pose - true[k]

@@ -13,6 +13,7 @@ from typing import Any
 
 from locatk.core.errors import FormatError
 from locatk.core.landmarks.landmark import PATTERNS, name
+from locatk.core.landmarks.published.driver import published_driver
 from locatk.core.landmarks.simulation.session import (
     STRATEGIES,
     SimulatedSession,
@@ -58,8 +59,9 @@ _ROBOT = (
     Setting(
         STRATEGY,
         Text(STRATEGIES),
-        "paper: search a landmark, spin, and go on to its neighbours; path: follow a path file or "
-        "cells; pass: pass one landmark straight",
+        "paper: search a landmark, spin, and go on to its neighbours, steered by the truth; "
+        "published: the same by the estimates of the published method; path: follow a path file "
+        "or cells; pass: pass one landmark straight",
         "strategy",
         "--strategy",
     ),
@@ -567,7 +569,8 @@ def write_simulation(
     """
     floor = maps.read_map(map_file)
     options = simulation_options(settings)
-    simulated = simulate(floor, options)
+    driver = published_driver(floor, options) if options.strategy == "published" else None
+    simulated = simulate(floor, options, driver)
     warnings = _warnings(simulated)
     halls.write_session(
         output,
@@ -599,6 +602,7 @@ def _summary(simulated: SimulatedSession) -> dict[str, Any]:
         "device": simulated.samples[0].device,
         "frame": simulated.truth[0].frame,
         "visits": _visits(simulated),
+        **({"approaches": _approaches(simulated)} if simulated.approaches else {}),
         "faults": [
             {"cell": list(mark.cell), "faults": list(mark.faults)}
             for mark in simulated.floor_as_laid
@@ -609,6 +613,21 @@ def _summary(simulated: SimulatedSession) -> dict[str, Any]:
         "odometry_poses": len(simulated.odometry[0]),
         "truth_poses": len(simulated.truth[0]),
     }
+
+
+def _approaches(simulated: SimulatedSession) -> list[dict[str, Any]]:
+    """Return the outcomes of the strategy ``published`` for ``--json`` and the facts."""
+    return [
+        {
+            "cell": list(approach.cell),
+            "time_s": approach.time_ns / 1e9,
+            "outcome": approach.outcome,
+            "searched": approach.searched,
+            "spins": approach.spins,
+            "distance_m": approach.distance_m,
+        }
+        for approach in simulated.approaches
+    ]
 
 
 def _visits(simulated: SimulatedSession) -> list[dict[str, Any]]:
@@ -639,6 +658,8 @@ def _facts(simulated: SimulatedSession, options: SimulationOptions) -> dict[str,
             facts[f"simulated_{item.name}"] = str(value)
     visited = {visit.cell for visit in simulated.events}
     facts["simulated_visits"] = json.dumps(_visits(simulated))
+    if simulated.approaches:
+        facts["simulated_approaches"] = json.dumps(_approaches(simulated))
     facts["simulated_floor"] = json.dumps(
         [
             {

@@ -14,11 +14,12 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import name
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.published.driver import published_driver
 from locatk.core.landmarks.simulation.session import (
     Aims,
     Errors,
     Faults,
-    Limits,
+    RobotLimits,
     SimulatedSession,
     SimulationOptions,
     simulate,
@@ -191,7 +192,7 @@ def test_each_option_reaches_the_session(locatk, floor: Path) -> None:
         start=(0.1, 0.1, math.radians(20)),
         landmarks=4,
         spins=1,
-        limits=Limits(0.2, 0.5, math.radians(120), math.radians(500)),
+        limits=RobotLimits(0.2, 0.5, math.radians(120), math.radians(500)),
         rest_s=0.2,
         stop_s=0.3,
         aims=Aims(5e-3, 1e-3, 2e-3, math.radians(0.5)),
@@ -361,3 +362,19 @@ def test_a_map_must_be_one(locatk, floor: Path) -> None:
     result = locatk("simulate", "landmarks", floor, "-o", out)
     assert result.exit_code == 1
     assert not out.exists()
+
+
+def test_a_robot_drives_by_the_published_method(locatk, floor: Path) -> None:
+    out = floor.with_name("own.mcap")
+    given = ("--strategy", "published", "--landmarks", 1, "--rate", 100, "--seed", 2)
+    result = locatk("simulate", "landmarks", floor, "-o", out, *given, "--json")
+    assert result.exit_code == 0, result.stderr
+    options = SimulationOptions("published", landmarks=1, rate_hz=100.0, seed=2)
+    wanted = simulate(FloorMap(CODES), options, published_driver(FloorMap(CODES), options))
+    session = holds(out, wanted)
+    approaches = json.loads(result.stdout)["approaches"]
+    assert [tuple(one["cell"]) for one in approaches] == [one.cell for one in wanted.approaches]
+    assert {one["outcome"] for one in approaches} <= {
+        "centre", "no_pattern", "wrong_pattern", "lost",
+    }  # fmt: skip
+    assert json.loads(session.metadata()["facts"]["simulated_approaches"]) == approaches

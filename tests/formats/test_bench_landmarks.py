@@ -23,6 +23,7 @@ from locatk.core.solution import Solution
 from locatk.formats.bench import (
     Figure,
     landmarks,
+    landmarks_closed_loop,
     landmarks_global,
     landmarks_sessions,
     landmarks_speed,
@@ -80,6 +81,8 @@ def quick() -> Iterator[None]:
         patch.setattr(landmarks, "VISITS", 3)
         patch.setattr(landmarks, "STANDS", 4)
         patch.setattr(landmarks, "START_STEP", 30)
+        patch.setattr(landmarks_closed_loop, "ROBOTS", 2)
+        patch.setattr(landmarks_closed_loop, "DRIVEN_SESSIONS", 1)
         patch.setattr(landmarks_global, "EVERY", 300)
         patch.setattr(landmarks_sessions, "SESSIONS", 1)
         patch.setattr(landmarks_sessions, "SESSION_LANDMARKS", 3)

@@ -1,17 +1,18 @@
-"""The paper's search, from a recording: first step, spin, compensation (sections 3 and 4.1).
+"""Sequential landmark search on a recording (sections 3 and 4.1).
 
-Visits are found as for the default method. Of each:
+The visits are those of the default method. For each visit:
 
-1. the first pass gives entries, and these a first centre (:mod:`.paper_first`);
-2. each spin of 330 degrees or more gives valleys, and these pattern, heading and centre
-   (:mod:`.paper_valleys`); the last one that can be read counts, as the paper retries;
-3. where the robot then stands, or passes, within a few millimetres of the centre and along
-   the bars, the four voltages amend the pose (:mod:`.paper_pose`).
+1. the first pass gives entries, and these the first estimate of the centre (:mod:`.first_step`);
+2. each rotation of at least 330 degrees on the spot gives valleys, and these the pattern, heading
+   and centre (:mod:`.second_step`); the last spin that can be read counts, because the paper
+   retries;
+3. at the sample at which the robot stops or passes within a few millimetres of the centre and
+   along the bars, four voltages correct the pose (:mod:`.pose_compensation`).
 
-A pass alone tells the paper neither pattern nor heading: such a visit is refused as
-``no_spin``, with the first centre in a warning (``first_step``). What the paper does not have:
-a reading whose bars explain less than half of the spin's field is refused as ``unexplained``.
-Farther than 8-10 mm from the centre valleys merge, and other patterns would be read silently.
+A pass alone gives neither pattern nor heading: such a visit is refused as ``no_spin``, and a
+warning contains the first estimate (``first_step``). One check is not in the paper: a reading
+whose bars explain less than 60 % of the spin's field is refused as ``unexplained``. More than 8 to
+10 mm from the centre valleys merge, and other patterns would be read without notice.
 """
 
 from __future__ import annotations
@@ -29,70 +30,81 @@ from locatk.core.landmarks.detection.trace import Drift, relative, sensor_places
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, name
-from locatk.core.landmarks.published import first_step as paper_first
-from locatk.core.landmarks.published.entries import Entries, entries
-from locatk.core.landmarks.published.pose import compensate
-from locatk.core.landmarks.published.valleys import Recognised, profile, recognise, valleys
-from locatk.core.landmarks.published.voting import voted_centre
+from locatk.core.landmarks.published.first_step import (
+    GRAZING_CHORD_M,
+    PassEntries,
+    bar_radii,
+    estimate_centre,
+    find_entries,
+    vote_centre,
+)
+from locatk.core.landmarks.published.pose_compensation import compensate_pose
+from locatk.core.landmarks.published.second_step import (
+    HYSTERESIS_FRACTION,
+    MAX_OFFSET_FRACTION,
+    SpinReading,
+    Valleys,
+    circle_profile,
+    find_spins,
+    find_valleys,
+    recognise,
+)
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-HYSTERESIS = 0.2
-"""Of the territory's threshold: what a field has to exceed on either side of a valley."""
+PASS_END_M = 0.020
+"""Path without any field after which the first pass is over: longer than a gulf is wide (10 mm),
+shorter than the gap between two territories (42 mm at the default pitch)."""
 
-SPIN_RAD = math.radians(330)
+MAX_BAR_OFFSET_M = 0.006
+"""Largest distance from the centre for the four voltages: the field of a bar is linear within
+7.5 mm of its middle with the default bars."""
 
-SPIN_M = 0.005
-"""How far the robot may move while it turns on the spot."""
+MAX_BAR_ROTATION_RAD = math.radians(12)
+"""Largest rotation from the bars for the four voltages; 5 mm on the sensors' circle."""
 
-LEFT_M = 0.020
-"""A way without any field after which the first pass is over."""
+STANDSTILL_M = 0.3e-3
+"""Largest distance between the poses of a standstill."""
 
-NEAR_M = 0.006
-"""From the centre, for the four voltages: a bar's field is linear within 7.5 mm..."""
+STANDSTILL_RAD = math.radians(0.3)
+"""Largest rotation between the poses of a standstill."""
 
-NEAR_RAD = math.radians(12)
-"""... and this is 5 mm on the circle."""
-
-STILL = (0.3e-3, math.radians(0.3))
-"""Metres and radians within which a robot stands."""
-
-UNEXPLAINED = 0.4
-"""Of the rms field of a spin: a larger rms residual refuses the reading."""
+MAX_UNEXPLAINED_FRACTION = 0.4
+"""A reading is refused if the rms residual of a spin exceeds this fraction of its rms field."""
 
 
 @dataclass(frozen=True)
 class FirstStep:
-    """What the first pass of a visit tells: the landmark's centre, without a heading.
+    """First estimate of a landmark's centre, from the first pass of a visit.
 
     Attributes
     ----------
     first, stop : int
         Samples of the pass.
-    entries : Entries
+    entries : PassEntries
         In the frame of the odometry.
     centre_m : (2,) ndarray
-        In the frame of the odometry; ``nan`` where no circle is kept.
+        In the frame of the odometry; ``nan`` if no candidate is left.
     voted_m : (2,) ndarray
-        The baseline's estimate (:mod:`.voting`).
+        Estimate of the baseline (:func:`~.first_step.vote_centre`).
     grazed : bool
-        Only a corner of the territory may have been cut; the estimate can be 28 mm off.
+        The pass may only have cut a corner of the territory; the error can be 28 mm.
     """
 
     first: int
     stop: int
-    entries: Entries
+    entries: PassEntries
     centre_m: Array
     voted_m: Array
     grazed: bool
 
 
-def sightings(
+def detect_landmarks(
     samples: HallSamples, odometry: Trajectory, geometry: Geometry
 ) -> list[VisitHypotheses]:
-    """Landmarks visited in a recording, by the published algorithm.
+    """Detect the landmarks visited in a recording by the published algorithm.
 
     Parameters
     ----------
@@ -103,82 +115,166 @@ def sightings(
 
     Returns
     -------
-    list of Sighting
-        One a visit, in order of time, with one hypothesis of probability 1 and unknown
-        covariance; or refused as ``no_spin``, ``no_pattern`` or ``unexplained``.
+    list of VisitHypotheses
+        One for each visit, in order of time: with one hypothesis of probability 1 and unknown
+        covariance, or refused as ``no_spin``, ``no_pattern`` or ``unexplained``.
 
     Raises
     ------
     InputError
         There is no odometry, it covers no sample, or no sensor can be used.
     DegenerateError
-        The field of such bars does not reach the threshold.
+        The field of the bars does not reach the threshold.
     """
-    run = visits.driven(samples, odometry)
-    both = paper_first.radii(geometry)
-    found = visits.find(run, geometry, Drift())
-    return [_Visit(run, visit.first, visit.stop, geometry, both).sighting() for visit in found]
+    return [visit.detect() for visit in _find_visits(samples, odometry, geometry)]
 
 
 def first_steps(samples: HallSamples, odometry: Trajectory, geometry: Geometry) -> list[FirstStep]:
-    """The first step alone, for each visit of a recording; raises as :func:`sightings`."""
-    run = visits.driven(samples, odometry)
-    both = paper_first.radii(geometry)
-    found = visits.find(run, geometry, Drift())
-    return [_Visit(run, visit.first, visit.stop, geometry, both).first_step() for visit in found]
+    """Run the first step alone for each visit of a recording.
 
-
-def first_step(
-    place: Array, field_t: Array, threshold_t: float, both: tuple[float, float]
-) -> tuple[Entries, Array, Array]:
-    """Entries, the paper's centre (2,) and the voted one (2,) of one pass.
-
-    ``place`` (n, N, 2) are the sensors, ``field_t`` (n, N) their fields, ``both`` r1 and r2.
+    Parameters and exceptions as in :func:`detect_landmarks`.
     """
-    seen = entries(place, field_t, threshold_t)
-    # Batches of one: a visit without a silent sensor has no way to keep away from.
-    points, silent = seen.point[None], seen.silent[None]
-    centre = paper_first.first_centre(points, silent, seen.robot[None], both)[0]
-    return seen, centre, voted_centre(points, silent, both)[0]
+    return [visit.first_step() for visit in _find_visits(samples, odometry, geometry)]
 
 
-def spins(pose: Array) -> list[tuple[int, int]]:
-    """Stretches (first, stop) in which poses (n, 3) turn by :data:`SPIN_RAD` on the spot."""
-    found = []
-    first = 0
-    while first < len(pose):
-        away = np.hypot(*(pose[first:, :2] - pose[first, :2]).T) > SPIN_M
-        stop = first + int(away.argmax()) if away.any() else len(pose)
-        heading = pose[first:stop, 2]
-        low, high = sorted((int(heading.argmin()), int(heading.argmax())))
-        if abs(heading[high] - heading[low]) >= SPIN_RAD:
-            found.append((first + low, first + high + 1))
-            first = stop
-        else:
-            # On to the next sample from which another stretch begins.
-            moved = np.hypot(*(pose[first:, :2] - pose[first, :2]).T) > SPIN_M / 10
-            first = first + int(moved.argmax()) if moved.any() else len(pose)
-    return found
+def run_first_step(
+    position_m: Array, field_t: Array, threshold_t: float, radii_m: tuple[float, float]
+) -> tuple[PassEntries, Array, Array]:
+    """Return the entries, the paper's centre (2,) and the voted centre (2,) of one pass.
+
+    ``position_m`` (n, N, 2) are the sensors, ``field_t`` (n, N) their fields, ``radii_m`` r1 and
+    r2.
+    """
+    entries = find_entries(position_m, field_t, threshold_t)
+    points, silent = entries.point_m[None], entries.silent_m[None]
+    centre = estimate_centre(points, silent, entries.robot_m[None], radii_m)[0]
+    return entries, centre, vote_centre(points, silent, radii_m)[0]
 
 
-class _Visit:
-    """One visit on its way through the steps; indices are those of its own samples."""
+def spin_valleys(
+    pose: Array, field_t: Array, lever_arm_m: Array, geometry: Geometry
+) -> tuple[Valleys | None, Array]:
+    """Find the valleys of one spin and the centre (2,) of its circle.
+
+    Parameters
+    ----------
+    pose : (n, 3) ndarray
+        Robot by odometry while it rotates on the spot.
+    field_t : (n, N) ndarray
+    lever_arm_m : (N, 2) ndarray
+        Sensors in the robot's frame.
+    geometry : Geometry
+
+    Returns
+    -------
+    valleys : Valleys or None
+        None if part of the circle was not measured.
+    centre_m : (2,) ndarray
+        In the frame of the odometry.
+    """
+    centre = np.median(pose[:, :2], axis=0)
+    profile = circle_profile(sensor_places(pose, lever_arm_m), field_t, centre)
+    if np.isnan(profile).any():
+        return None, centre
+    return find_valleys(profile, HYSTERESIS_FRACTION * geometry.threshold_t), centre
+
+
+def recognise_spin(
+    valleys: Valleys,
+    centre_m: Array,
+    lever_arm_m: Array,
+    max_offset_fraction: float = MAX_OFFSET_FRACTION,
+) -> SpinReading | None:
+    """Recognise the landmark of one spin, in the frame of the odometry; None if it fits none.
+
+    The first parameters are the results of :func:`spin_valleys`, the others the sensors (N, 2) in
+    the robot's frame, whose mean distance from the origin is the radius of the circle, and the
+    limit of :func:`~.second_step.recognise`.
+    """
+    radius = float(np.mean(np.hypot(*lever_arm_m.T)))
+    reading = recognise(valleys, radius, max_offset_fraction)
+    if reading is None:
+        return None
+    return SpinReading(reading.centre_m + centre_m, reading.bar_rad, reading.north)
+
+
+def pose_by_valleys(reading: SpinReading, odometry: Array) -> tuple[int, Array]:
+    """Return the code and the robot's pose (3,) in the landmark's frame by the valleys alone.
+
+    ``odometry`` (3,) is the robot at that time.
+    """
+    code, heading = reading.in_frame_of(odometry[2])
+    pose = relative(odometry[None], np.array([*reading.centre_m, heading]))[0]
+    pose[2] = math.remainder(pose[2], math.tau)
+    return code, pose
+
+
+def contradicts_valleys(pose: Array) -> bool:
+    """Return whether a pose (3,) by four voltages is too far from the centre to be right.
+
+    The voltages are used near the centre only; a pose beyond twice these limits shows that the
+    landmark is another one or that its fields are not linear there.
+    """
+    too_far = np.hypot(*pose[:2]) > 2 * MAX_BAR_OFFSET_M
+    return bool(too_far or abs(pose[2]) > 2 * MAX_BAR_ROTATION_RAD)
+
+
+def unexplained_fraction(
+    geometry: Geometry,
+    hypothesis: tuple[int, Array],
+    odometry: Array,
+    spin: tuple[Array, Array],
+    lever_arm_m: Array,
+) -> float:
+    """Return the rms residual of a spin for a landmark, in units of the rms of its field.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    hypothesis : (int, (3,) ndarray)
+        Code, and the robot in the frame of the landmark.
+    odometry : (3,) ndarray
+        Robot by odometry at the time of the hypothesis.
+    spin : ((n, 3) ndarray, (n, N) ndarray)
+        Poses by odometry, and fields.
+    lever_arm_m : (N, 2) ndarray
+        Sensors in the robot's frame.
+    """
+    (code, (x, y, heading)), (spin_pose, field) = hypothesis, spin
+    pose = relative(spin_pose, odometry)
+    cos, sin = math.cos(heading), math.sin(heading)
+    pose[:, :2] = pose[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
+    pose[:, 2] += heading
+    expected = landmark_field(geometry, code, sensor_places(pose, lever_arm_m))
+    return math.sqrt(np.nanmean((field - expected) ** 2) / np.nanmean(field**2))
+
+
+def _find_visits(
+    samples: HallSamples, odometry: Trajectory, geometry: Geometry
+) -> list[_VisitSearch]:
+    recording = visits.driven(samples, odometry)
+    radii_m = bar_radii(geometry)
+    found = visits.find(recording, geometry, Drift())
+    return [_VisitSearch(recording, visit.first, visit.stop, geometry, radii_m) for visit in found]
+
+
+class _VisitSearch:
+    """Search within one visit; indices are those of the visit's own samples."""
 
     def __init__(
         self,
-        run: visits.Driven,
+        recording: visits.Driven,
         first: int,
         stop: int,
         geometry: Geometry,
-        both: tuple[float, float],
+        radii_m: tuple[float, float],
     ) -> None:
-        self.run, self.first, self.stop = run, first, stop
-        self.geometry, self.both = geometry, both
-        self.pose = run.pose[first:stop]
-        self.field = run.samples.field_t[first:stop] - run.offset_t
-        self.lever = run.samples.sensors.position_m
-        self.place = sensor_places(self.pose, self.lever)
-        self.spins = spins(self.pose)
+        self.samples, self.first, self.stop = recording.samples, first, stop
+        self.geometry, self.radii_m = geometry, radii_m
+        self.pose = recording.pose[first:stop]
+        self.field = recording.samples.field_t[first:stop] - recording.offset_t
+        self.lever_arm = recording.samples.sensors.position_m
+        self.spins = find_spins(self.pose)
         self.warnings: list[SolverWarning] = []
 
     def warn(self, code: str, message: str) -> None:
@@ -186,16 +282,17 @@ class _Visit:
         self.warnings.append(SolverWarning(code, message))
 
     def first_step(self) -> FirstStep:
+        """Run the first step on the first pass."""
         stop = self._end_of_pass()
-        seen, centre, voted = first_step(
-            self.place[:stop], self.field[:stop], self.geometry.threshold_t, self.both
+        position = sensor_places(self.pose[:stop], self.lever_arm)
+        entries, centre, voted = run_first_step(
+            position, self.field[:stop], self.geometry.threshold_t, self.radii_m
         )
-        chords = seen.point[:, None] - seen.point
-        longest = float(np.hypot(chords[..., 0], chords[..., 1]).max(initial=0.0))
-        grazed = longest < paper_first.GRAZED_M
-        return FirstStep(self.first, self.first + stop, seen, centre, voted, grazed)
+        grazed = entries.longest_chord_m < GRAZING_CHORD_M
+        return FirstStep(self.first, self.first + stop, entries, centre, voted, grazed)
 
-    def sighting(self) -> VisitHypotheses:
+    def detect(self) -> VisitHypotheses:
+        """Run all steps."""
         step = self.first_step()
         if np.isfinite(step.centre_m).all():
             x, y = step.centre_m * 1e3
@@ -204,116 +301,111 @@ class _Visit:
             self.warn("first_step", message)
         refused = "no_spin"
         for start, stop in reversed(self.spins):
-            found = self._second_step(start, stop)
-            if found is None:
+            reading = self._second_step(start, stop)
+            if reading is None:
                 refused = "no_pattern"
                 continue
-            at, hypothesis = self._compensated(found, start, stop)
-            left = self._unexplained(at, hypothesis, start, stop)
-            if left > UNEXPLAINED:
+            index, code, pose = self._compensate(reading, start, stop)
+            spin = self.pose[start:stop], self.field[start:stop]
+            unexplained = unexplained_fraction(
+                self.geometry, (code, pose), self.pose[index], spin, self.lever_arm
+            )
+            if unexplained > MAX_UNEXPLAINED_FRACTION:
                 refused = "unexplained"
-                message = f"{name(hypothesis.code)} leaves {100 * left:.0f} % of the spin's field"
+                message = f"{name(code)} leaves {100 * unexplained:.0f} % of the spin's field"
                 self.warn("spin_unexplained", message)
                 continue
-            return self._answer(at, (hypothesis,), "")
+            return self._visit_hypotheses(index, (_hypothesis(code, pose),), "")
         nearest = len(self.pose) // 2
         if np.isfinite(step.centre_m).all():
             nearest = int(np.hypot(*(self.pose[:, :2] - step.centre_m).T).argmin())
-        return self._answer(nearest, (), refused)
+        return self._visit_hypotheses(nearest, (), refused)
 
     def _end_of_pass(self) -> int:
-        """Where the first pass ends: at a spin, or where nothing is felt for a while."""
+        """Return the end of the first pass: a spin, or the end of the territory."""
         end = self.spins[0][0] if self.spins else len(self.pose)
         inside = np.flatnonzero((np.abs(self.field) >= self.geometry.threshold_t).any(axis=1))
-        way = np.cumsum(np.hypot(*np.diff(self.pose[:, :2], axis=0, prepend=self.pose[:1, :2]).T))
+        step = np.diff(self.pose[:, :2], axis=0, prepend=self.pose[:1, :2])
+        path = np.cumsum(np.hypot(*step.T))
         if not len(inside):
             return end
-        gap = np.flatnonzero(np.diff(way[inside]) > LEFT_M)
+        gap = np.flatnonzero(np.diff(path[inside]) > PASS_END_M)
         last = inside[gap[0]] if len(gap) else inside[-1]
-        # The margin behind counts for the sensors that saw nothing.
-        return min(end, int(np.searchsorted(way, way[last] + LEFT_M, "right")))
+        # The samples after the territory count for the silent sensors.
+        return min(end, int(np.searchsorted(path, path[last] + PASS_END_M, "right")))
 
-    def _second_step(self, start: int, stop: int) -> Recognised | None:
-        """Centre in the odometry's frame, bars and their letters."""
-        turning = slice(start, stop)
-        middle = np.median(self.pose[turning, :2], axis=0)
-        around = profile(self.place[turning], self.field[turning], middle)
-        if np.isnan(around).any():
-            self.warn("spin_incomplete", "a spin whose circle was not seen all around")
+    def _second_step(self, start: int, stop: int) -> SpinReading | None:
+        spin = slice(start, stop)
+        valleys, centre = spin_valleys(
+            self.pose[spin], self.field[spin], self.lever_arm, self.geometry
+        )
+        if valleys is None:
+            self.warn("spin_incomplete", "a spin with a part of the circle not measured")
             return None
-        seen = valleys(around, HYSTERESIS * self.geometry.threshold_t)
-        radius = float(np.mean(np.hypot(*self.lever.T)))
-        found = recognise(seen, radius)
-        if found is None:
-            message = f"a spin with {len(seen.angle_rad)} valleys fits no landmark near its centre"
+        reading = recognise_spin(valleys, centre, self.lever_arm)
+        if reading is None:
+            count = len(valleys.angle_rad)
+            message = f"a spin with {count} valleys fits no landmark near its centre"
             self.warn("spin_without_pattern", message)
-            return None
-        return Recognised(found.centre_m + middle, found.bar_rad, found.north)
+        return reading
 
-    def _compensated(self, found: Recognised, start: int, stop: int) -> tuple[int, Hypothesis]:
-        """Sample and hypothesis: amended by the four voltages if the robot came near."""
-        away = self.pose[start:, :2] - found.centre_m
-        # Bars lie a quarter apart, so that any of the four frames tells how well it stands.
-        turned = 4 * (self.pose[start:, 2] - found.seen_under(0.0)[1])
-        aside = np.arctan2(np.sin(turned), np.cos(turned)) / 4
-        distance = np.hypot(*away.T)
-        good = (distance <= NEAR_M) & (np.abs(aside) <= NEAR_RAD)
-        good &= np.isfinite(self.field[start:]).sum(axis=1) >= 3
-        if not good.any():
-            self.warn("never_over_bars", "never stood over the bars: by the valleys alone")
-            return self._posed(stop - 1, found)
-        cost = np.where(good, distance + self.geometry.circle_m * np.abs(aside), np.inf)
-        at = start + int(cost.argmin())
-        standing = self._standing(at)
-        code, _ = found.seen_under(self.pose[at, 2])
-        whole = np.isfinite(self.field[standing]).any(axis=0)
-        field = np.nanmean(self.field[standing][:, whole], axis=0)
+    def _compensate(self, reading: SpinReading, start: int, stop: int) -> tuple[int, int, Array]:
+        """Return a sample, the code, and the robot's pose (3,) in the landmark's frame then.
+
+        The four voltages correct the pose if the robot came near the centre and along the bars.
+        """
+        index = self._nearest_to_bars(reading, start)
+        if index is None:
+            self.warn("never_over_bars", "never above the bars: by the valleys alone")
+            return stop - 1, *pose_by_valleys(reading, self.pose[stop - 1])
+        standstill = self._standstill(index)
+        code, _ = reading.in_frame_of(self.pose[index, 2])
+        valid = np.isfinite(self.field[standstill]).any(axis=0)
+        field = np.nanmean(self.field[standstill][:, valid], axis=0)
         try:
-            pose = compensate(self.geometry, code, self.lever[whole], field)
+            pose = compensate_pose(self.geometry, code, self.lever_arm[valid], field)
         except DegenerateError as error:
             self.warn("voltages_undetermined", f"{error}: by the valleys alone")
-            return self._posed(at, found)
-        if np.hypot(*pose[:2]) > 2 * NEAR_M or abs(pose[2]) > 2 * NEAR_RAD:
-            self.warn(
-                "voltages_contradict_valleys",
-                "the voltages contradict the valleys: by these alone",
-            )
-            return self._posed(at, found)
-        return at, _hypothesis(code, pose)
+            return index, *pose_by_valleys(reading, self.pose[index])
+        if contradicts_valleys(pose):
+            message = "the voltages contradict the valleys: by the valleys alone"
+            self.warn("voltages_contradict_valleys", message)
+            return index, *pose_by_valleys(reading, self.pose[index])
+        return index, code, pose
 
-    def _standing(self, at: int) -> slice:
-        """The samples around one in which the robot did not move."""
-        off = np.abs(self.pose - self.pose[at])
-        moved = np.flatnonzero((off[:, :2] > STILL[0]).any(axis=1) | (off[:, 2] > STILL[1]))
-        before, after = moved[moved < at], moved[moved > at]
+    def _nearest_to_bars(self, reading: SpinReading, start: int) -> int | None:
+        """Return the sample whose sensors are closest to the middles of the bars, if any."""
+        offset = self.pose[start:, :2] - reading.centre_m
+        # Bars are 90 degrees apart: the frame that is chosen does not matter.
+        fourfold = 4 * (self.pose[start:, 2] - reading.in_frame_of(0.0)[1])
+        rotation = np.arctan2(np.sin(fourfold), np.cos(fourfold)) / 4
+        distance = np.hypot(*offset.T)
+        usable = (distance <= MAX_BAR_OFFSET_M) & (np.abs(rotation) <= MAX_BAR_ROTATION_RAD)
+        usable &= np.isfinite(self.field[start:]).sum(axis=1) >= 3
+        if not usable.any():
+            return None
+        cost = np.where(usable, distance + self.geometry.circle_m * np.abs(rotation), np.inf)
+        return start + int(cost.argmin())
+
+    def _standstill(self, index: int) -> slice:
+        """Return the samples around one during which the robot did not move."""
+        change = np.abs(self.pose - self.pose[index])
+        moved = np.flatnonzero(
+            (change[:, :2] > STANDSTILL_M).any(axis=1) | (change[:, 2] > STANDSTILL_RAD)
+        )
+        before, after = moved[moved < index], moved[moved > index]
         first = int(before[-1]) + 1 if len(before) else 0
         return slice(first, int(after[0]) if len(after) else len(self.pose))
 
-    def _posed(self, at: int, found: Recognised) -> tuple[int, Hypothesis]:
-        code, heading = found.seen_under(self.pose[at, 2])
-        pose = relative(self.pose[at : at + 1], np.array([*found.centre_m, heading]))[0]
-        pose[2] = math.remainder(pose[2], math.tau)
-        return at, _hypothesis(code, pose)
-
-    def _unexplained(self, at: int, hypothesis: Hypothesis, start: int, stop: int) -> float:
-        """Rms of what the bars leave of the spin's field, in units of the field's rms."""
-        way = relative(self.pose[start:stop], self.pose[at])
-        x, y, turn = hypothesis.pose
-        cos, sin = math.cos(turn), math.sin(turn)
-        way[:, :2] = way[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
-        way[:, 2] += turn
-        expected = landmark_field(self.geometry, hypothesis.code, sensor_places(way, self.lever))
-        seen = self.field[start:stop]
-        return math.sqrt(np.nanmean((seen - expected) ** 2) / np.nanmean(seen**2))
-
-    def _answer(self, at: int, hypotheses: tuple[Hypothesis, ...], refused: str) -> VisitHypotheses:
-        samples = self.run.samples
+    def _visit_hypotheses(
+        self, index: int, hypotheses: tuple[Hypothesis, ...], refused: str
+    ) -> VisitHypotheses:
         return VisitHypotheses(
-            device=samples.device,
-            time_ns=int(samples.time_ns[self.first + at]),
+            device=self.samples.device,
+            time_ns=int(self.samples.time_ns[self.first + index]),
             first=self.first,
             stop=self.stop,
-            odometry=self.pose[at].copy(),
+            odometry=self.pose[index].copy(),
             hypotheses=hypotheses,
             refused=refused,
             warnings=tuple(self.warnings),

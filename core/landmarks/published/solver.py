@@ -1,7 +1,7 @@
-"""The published algorithm on whole recordings: sightings, an L on the map, odometry between.
+"""Published algorithm on whole recordings: visits, three neighbours on the map, odometry between.
 
-The paper asks for three neighbouring landmarks in a row (section 4.2); any three that were
-read one after the other do here. It knows no uncertainty: covariances are ``nan``.
+The paper needs three neighbouring landmarks in a row (section 4.2); here any three that were read
+one after the other. The paper has no uncertainty: covariances are ``nan``.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization.cell_filter import HALF_PI, Located
 from locatk.core.landmarks.localization.consistency import NO_MAP
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.landmarks.published import search as paper
-from locatk.core.landmarks.published.route import locate, sequence
+from locatk.core.landmarks.published.global_localization import landmark_sequence, match_map
+from locatk.core.landmarks.published.search import detect_landmarks
 from locatk.core.landmarks.results import (
     LandmarkDetection,
     LandmarkFacts,
@@ -35,10 +35,11 @@ from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-IN_A_ROW = 3
+WINDOW_LANDMARKS = 3
+"""Landmarks in a row that are compared with the map (section 4.2)."""
 
-ASTRAY = 0.25
-"""Of the pitch: how far a landmark may be off its cell by odometry."""
+MAX_CELL_ERROR_FRACTION = 0.25
+"""Largest distance of a landmark from its cell by odometry, in units of the pitch."""
 
 
 def solve(
@@ -47,12 +48,14 @@ def solve(
     *,
     odometry: Sequence[Trajectory] = (),
 ) -> Solution:
-    """As :func:`.solver.solve`, by the paper's sections 3 and 4.
+    """Detect landmarks and localize robots by the paper's sections 3 and 4.
+
+    Parameters and result are those of :func:`locatk.core.landmarks.solver.solve`.
 
     Raises
     ------
     InputError
-        A recording has no odometry, or no sensor of it can be used.
+        A recording has no odometry, or none of its sensors can be used.
     """
     geometry = floor.geometry if floor is not None else Geometry()
     trajectories: list[Trajectory] = []
@@ -61,30 +64,30 @@ def solve(
     robots: dict[str, RobotFacts] = {}
     for recording in samples:
         device = recording.device
-        driven = next((t for t in odometry if t.device == device), None)
-        if driven is None:
+        own_odometry = next((t for t in odometry if t.device == device), None)
+        if own_odometry is None:
             raise InputError(
                 f"no odometry of {device}",
-                hint="Record it beside the hall sensors: a trace without a way says too little",
+                hint="Record it with the hall sensors: four fields alone do not give a path",
             )
-        found = paper.sightings(recording, driven, geometry)
-        located = _located(found, floor) if floor is not None else {}
-        robots[device] = RobotFacts(localised=bool(located), landmarks_seen=len(found))
+        visits = detect_landmarks(recording, own_odometry, geometry)
+        located = _locate_visits(visits, floor) if floor is not None else {}
+        robots[device] = RobotFacts(localised=bool(located), landmarks_seen=len(visits))
         if located and floor is not None:
-            trajectories.append(_driven(device, found, located, driven, floor))
+            trajectories.append(_dead_reckoning(device, visits, located, own_odometry, floor))
         elif floor is not None:
             message = (
-                f"not localised; no {IN_A_ROW} landmarks in a row were read that the map has only "
-                "once"
+                f"not localised: no {WINDOW_LANDMARKS} landmarks in a row were read that occur "
+                "once on the map"
             )
             warnings.append(SolverWarning("not_localised", message).about(device))
         else:
             warnings.append(NO_MAP.about(device))
-        for n, one in enumerate(found):
-            detections.append(describe_visit(one, located.get(n), floor))
-            if one.refused:
-                warnings += [each.about(device) for each in one.warnings]
-    refused = Counter(seen.refused for seen in detections if seen.refused)
+        for n, visit in enumerate(visits):
+            detections.append(describe_visit(visit, located.get(n), floor))
+            if visit.refused:
+                warnings += [each.about(device) for each in visit.warnings]
+    refused = Counter(each.refused for each in detections if each.refused)
     return Solution(
         system="landmarks",
         method="paper",
@@ -97,84 +100,93 @@ def solve(
     )
 
 
-def _located(found: Sequence[VisitHypotheses], floor: FloorMap) -> dict[int, Located]:
-    """Cells of the sightings, by their number, from the first three in a row that the map
-    has only once; empty where there are none."""
-    for first in range(len(found) - IN_A_ROW + 1):
-        group = found[first : first + IN_A_ROW]
-        if any(one.refused or not one.hypotheses for one in group):
+def _locate_visits(visits: Sequence[VisitHypotheses], floor: FloorMap) -> dict[int, Located]:
+    """Return the cells of the visits by their number.
+
+    They start from the first three visits in a row that occur once on the map; empty if there are
+    none.
+    """
+    for first in range(len(visits) - WINDOW_LANDMARKS + 1):
+        group = visits[first : first + WINDOW_LANDMARKS]
+        if any(visit.refused or not visit.hypotheses for visit in group):
             continue
-        told = sequence(group, floor.pitch_m)
-        if told is None:
+        sequence = landmark_sequence(group, floor.pitch_m)
+        if sequence is None:
             continue
-        places = locate(floor, *told)
-        if places.status == "found":
-            cell, arrival = places.places[0]
-            return _spread(found, first + IN_A_ROW - 1, cell, arrival, floor)
+        matches = match_map(floor, *sequence)
+        if matches.status == "found":
+            cell, arrival = matches.positions[0]
+            return _propagate_cells(visits, first + WINDOW_LANDMARKS - 1, cell, arrival, floor)
     return {}
 
 
-def _spread(
-    found: Sequence[VisitHypotheses],
+def _propagate_cells(
+    visits: Sequence[VisitHypotheses],
     known: int,
     cell: tuple[int, int],
     arrival: int,
     floor: FloorMap,
 ) -> dict[int, Located]:
-    """Cells of all sightings, from one whose cell and heading on arrival are known."""
-    own = found[known].landmark_place() - found[known - 1].landmark_place()
-    turn = arrival * HALF_PI - math.atan2(own[1], own[0])
-    out = {known: Located(cell, _quarters(found[known], turn), 0, 1.0, 1.0)}
-    for numbers in (range(known + 1, len(found)), range(known - 1, -1, -1)):
-        at, swing = known, turn
+    """Return the cells of all visits, from one with known cell and heading on arrival."""
+    step = visits[known].landmark_place() - visits[known - 1].landmark_place()
+    odometry_rotation = arrival * HALF_PI - math.atan2(step[1], step[0])
+    located = {known: Located(cell, _quarters(visits[known], odometry_rotation), 0, 1.0, 1.0)}
+    for numbers in (range(known + 1, len(visits)), range(known - 1, -1, -1)):
+        last, rotation = known, odometry_rotation
         for n in numbers:
-            one = found[n]
-            if one.refused or not one.hypotheses:
+            visit = visits[n]
+            if visit.refused or not visit.hypotheses:
                 continue
-            # The last landmark tells how odometry now lies on the map.
-            swing = out[at].quarters * HALF_PI + found[at].best.pose[2] - found[at].odometry[2]
-            way = one.landmark_place() - found[at].landmark_place()
-            step = (
+            # The last landmark gives the rotation of the odometry's frame on the map.
+            rotation = (
+                located[last].quarters * HALF_PI
+                + visits[last].best.pose[2]
+                - visits[last].odometry[2]
+            )
+            x, y = visit.landmark_place() - visits[last].landmark_place()
+            cells = (
                 np.array(
                     [
-                        math.cos(swing) * way[1] + math.sin(swing) * way[0],
-                        math.cos(swing) * way[0] - math.sin(swing) * way[1],
+                        math.cos(rotation) * y + math.sin(rotation) * x,
+                        math.cos(rotation) * x - math.sin(rotation) * y,
                     ]
                 )
                 / floor.pitch_m
             )
-            whole = np.round(step)
-            if np.abs(step - whole).max() > ASTRAY:
+            whole = np.round(cells)
+            if np.abs(cells - whole).max() > MAX_CELL_ERROR_FRACTION:
                 continue
-            there = (out[at].cell[0] + int(whole[0]), out[at].cell[1] + int(whole[1]))
-            out[n] = Located(there, _quarters(one, swing), 0, 1.0, 1.0)
-            at = n
-    return out
+            row, column = located[last].cell
+            next_cell = (row + int(whole[0]), column + int(whole[1]))
+            located[n] = Located(next_cell, _quarters(visit, rotation), 0, 1.0, 1.0)
+            last = n
+    return located
 
 
-def _quarters(seen: VisitHypotheses, swing: float) -> int:
-    """Turn of its frame on the map, where odometry is turned by ``swing``."""
-    return round((float(seen.odometry[2]) + swing - seen.best.pose[2]) / HALF_PI) % 4
+def _quarters(visit: VisitHypotheses, odometry_rotation: float) -> int:
+    """Return the rotation of a visit's frame on the map, in quarter turns."""
+    heading = float(visit.odometry[2]) + odometry_rotation
+    return round((heading - visit.best.pose[2]) / HALF_PI) % 4
 
 
-def _driven(
+def _dead_reckoning(
     device: str,
-    found: Sequence[VisitHypotheses],
+    visits: Sequence[VisitHypotheses],
     located: dict[int, Located],
     odometry: Trajectory,
     floor: FloorMap,
 ) -> Trajectory:
-    """Poses at the times of odometry, each from the last landmark before it."""
+    """Return poses at the times of the odometry, each from the last landmark before it."""
     own = np.column_stack([odometry.position[:, :2], heading_from_quaternion(odometry.quaternion)])
     pose = np.empty_like(own)
     numbers = sorted(located)
-    starts = np.searchsorted(odometry.time_ns, [found[n].time_ns for n in numbers])
+    starts = np.searchsorted(odometry.time_ns, [visits[n].time_ns for n in numbers])
     starts[0] = 0
     for k, n in enumerate(numbers):
         part = slice(starts[k], starts[k + 1] if k + 1 < len(numbers) else len(own))
         frame = np.array([*floor.place(located[n].cell), located[n].quarters * HALF_PI])
-        here = compose(frame, found[n].best.pose)
-        pose[part] = compose(here, relative(own[part], found[n].odometry))
+        at_landmark = compose(frame, visits[n].best.pose)
+        pose[part] = compose(at_landmark, relative(own[part], visits[n].odometry))
     return Trajectory(
         device,
         "map",

@@ -9,7 +9,7 @@ from enum import IntEnum
 from locatk.core.landmarks.halls import NAMES, HallSensors
 from locatk.core.landmarks.landmark import PATTERNS
 from locatk.core.landmarks.map.floor import Cell
-from locatk.core.landmarks.simulation.robot import Limits
+from locatk.core.landmarks.simulation.robot import RobotLimits
 from locatk.core.simulation import check_options
 
 
@@ -37,7 +37,7 @@ START_M = 0.115
 ASIDE_RAD = math.pi / 4
 """Largest angle between the heading of a pass and the direction of the landmark's centre."""
 
-STRATEGIES = ("paper", "path", "pass")
+STRATEGIES = ("paper", "published", "path", "pass")
 
 
 @dataclass(frozen=True)
@@ -181,12 +181,14 @@ class SimulationOptions:
     ----------
     strategy : str
         One of :data:`STRATEGIES`. ``"paper"``: search, spin, compensate, and on to the
-        neighbours of the map's window (Fig. 12). ``"path"``: straight from waypoint to
-        waypoint. ``"pass"``: one straight pass over one landmark (section 3.5).
+        neighbours of the map's window (Fig. 12), steered by the truth and by ``aims``.
+        ``"published"``: the same, by the sensors and the odometry alone. ``"path"``: straight
+        from waypoint to waypoint. ``"pass"``: one straight pass over one landmark (section 3.5).
     start : (x, y, heading) or None
-        Of the strategy ``paper``; None for anywhere between the landmarks.
+        Of the strategies ``paper`` and ``published``; None for anywhere between the landmarks.
     landmarks : int or None
-        How many it visits; None for as many as the map's window has.
+        How many it visits (``published``: reads in a row); None for as many as the map's
+        window has.
     spins : int or None
         At how many of these it spins, the others being passed with a stop; None for those
         of the window.
@@ -202,7 +204,7 @@ class SimulationOptions:
         By how far it passes left of the centre; None for a heading within 45 degrees.
     approach_rad : float or None
         Where on the circle of starts it begins, in the map's frame; None for anywhere.
-    limits : Limits
+    limits : RobotLimits
     aims : Aims
     errors : Errors
     faults : Faults
@@ -235,7 +237,7 @@ class SimulationOptions:
     pattern: str = ""
     lateral_m: float | None = None
     approach_rad: float | None = None
-    limits: Limits = field(default_factory=Limits)
+    limits: RobotLimits = field(default_factory=RobotLimits)
     aims: Aims = field(default_factory=Aims)
     errors: Errors = field(default_factory=Errors)
     faults: Faults = field(default_factory=Faults)
@@ -293,6 +295,11 @@ class SimulationOptions:
                 ("odometry_hz", 0 < self.odometry_hz < math.inf, above_0),
                 ("rest_s", 0 <= self.rest_s < math.inf, from_0),
                 ("stop_s", 0 <= self.stop_s < math.inf, from_0),
+                (
+                    "errors",
+                    self.strategy != "published" or self.errors.slips_per_m == 0,
+                    "without slips for the strategy published",
+                ),
                 ("seed", self.seed >= 0, from_0),
                 ("floor_seed", self.floor_seed is None or self.floor_seed >= 0, from_0),
             ),

@@ -49,6 +49,19 @@ def digitise(readings: Array, range_t: float, quantum_t: float) -> tuple[Array, 
     return np.clip(readings, -range_t, range_t), saturated
 
 
+def odometry_biases(errors: Errors, rng: np.random.Generator) -> Array:
+    """Draw the constant errors (3,) of the odometry of one session.
+
+    These are the relative errors of distances, the rotation [rad/m] that is reported on a
+    straight line, and the relative error of rotations.
+    """
+    return rng.normal(size=3) * [
+        errors.odometry_scale,
+        errors.odometry_drift_rad_per_m,
+        errors.odometry_turn,
+    ]
+
+
 def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Array, list[int]]:
     """Return the poses (n, 3) of the wheel odometry, from (0, 0, 0), and the slips.
 
@@ -75,11 +88,7 @@ def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Ar
     chord = step[:, 0] * np.cos(half) + step[:, 1] * np.sin(half)
     way = chord / np.sinc(step[:, 2] / 2 / np.pi)
     wheels = way[:, None] + step[:, 2:] * [-TRACK_M / 2, TRACK_M / 2]
-    scale, drift, turn = rng.normal(size=3) * [
-        errors.odometry_scale,
-        errors.odometry_drift_rad_per_m,
-        errors.odometry_turn,
-    ]
+    scale, drift, turn = odometry_biases(errors, rng)
     told = wheels + errors.wheel_noise_m * np.sqrt(np.abs(wheels)) * rng.normal(size=wheels.shape)
     slips: list[int] = []
     travelled = np.cumsum(np.abs(wheels).mean(axis=1))

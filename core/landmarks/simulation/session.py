@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.map.floor import Cell, FloorMap
-from locatk.core.landmarks.simulation.floor import Laid, floor_field, lay
+from locatk.core.landmarks.simulation.closed_loop import Approach as Approach
+from locatk.core.landmarks.simulation.closed_loop import Driver as Driver
+from locatk.core.landmarks.simulation.closed_loop import drive_closed_loop
+from locatk.core.landmarks.simulation.floor import Laid, lay
+from locatk.core.landmarks.simulation.instruments import Instruments
 from locatk.core.landmarks.simulation.options import NONE as NONE
 from locatk.core.landmarks.simulation.options import STRATEGIES as STRATEGIES
 from locatk.core.landmarks.simulation.options import Aims as Aims
@@ -26,20 +30,15 @@ from locatk.core.landmarks.simulation.options import SimulationOptions as Simula
 from locatk.core.landmarks.simulation.passes import EPOCH_NS as EPOCH_NS
 from locatk.core.landmarks.simulation.passes import Pass as Pass
 from locatk.core.landmarks.simulation.passes import passes as passes
-from locatk.core.landmarks.simulation.passes import sensor_points, trajectory
-from locatk.core.landmarks.simulation.robot import Limits as Limits
-from locatk.core.landmarks.simulation.robot import Robot
-from locatk.core.landmarks.simulation.sensors import measure, odometry
-from locatk.core.landmarks.simulation.strategy import VISIT_M, steer
+from locatk.core.landmarks.simulation.passes import trajectory
+from locatk.core.landmarks.simulation.robot import RobotLimits as RobotLimits
+from locatk.core.landmarks.simulation.strategy import VISIT_RADIUS_M, steer
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 LARGEST_SESSION = 1_000_000
 """Samples of a session, at most."""
-
-FINER = 4
-"""Steps of the wheels for each pose of the odometry."""
 
 
 class Visit(NamedTuple):
@@ -49,7 +48,7 @@ class Visit(NamedTuple):
     ----------
     cell : (row, column)
     first_ns, last_ns : int
-        From when until when a sensor is within :data:`VISIT_M` of the landmark's centre.
+        From when until when a sensor is within :data:`VISIT_RADIUS_M` of the landmark's centre.
     nearest_ns : int
         When the robot itself is nearest to it.
     nearest_m : float
@@ -87,6 +86,8 @@ class SimulatedSession:
         When a wheel slipped, in nanoseconds.
     notes : tuple of str
         What a user may not expect.
+    approaches : tuple of Approach
+        Of the strategy ``published``, in the order of time.
     """
 
     samples: tuple[HallSamples, ...]
@@ -98,10 +99,15 @@ class SimulatedSession:
     saturated: int
     slips: tuple[int, ...]
     notes: tuple[str, ...]
+    approaches: tuple[Approach, ...] = ()
 
 
-def simulate(floor: FloorMap, options: SimulationOptions | None = None) -> SimulatedSession:
+def simulate(
+    floor: FloorMap, options: SimulationOptions | None = None, driver: Driver | None = None
+) -> SimulatedSession:
     """Drive a robot over a floor.
+
+    ``driver`` is needed by the strategy ``published``, and only used by it.
 
     The same floor and options give the same session.
 
@@ -109,7 +115,7 @@ def simulate(floor: FloorMap, options: SimulationOptions | None = None) -> Simul
     ------
     InputError
         The map has no landmark, the way or a fault does not fit it, the sensors are within
-        the bars, or the session would be endless.
+        the bars, the session would be endless, or the driver is missing.
     """
     options = options or SimulationOptions()
     errors, geometry = options.errors, floor.geometry
@@ -120,55 +126,38 @@ def simulate(floor: FloorMap, options: SimulationOptions | None = None) -> Simul
         )
     seed = options.seed if options.floor_seed is None else options.floor_seed
     laid = lay(floor, errors, options.faults, seed)
-    robot, notes = steer(floor, laid, options)
-    if robot.time_s * options.rate_hz >= LARGEST_SESSION:
-        raise InputError(
-            f"a simulation of {robot.time_s * options.rate_hz:.0f} samples",
-            hint="Change the rate, the speed or the way",
-        )
     sensors = options.sensors or HallSensors(
         position_m=circle(geometry.circle_m),
         noise_t=errors.noise_t if errors.noise_t > 0 else float("nan"),
         range_t=options.range_t,
     )
-    time_ns, poses = _sampled(robot, options.rate_hz)
-    points = sensor_points(poses, sensors, height)
-    field = _seen(poses, points, floor, laid)
-    read, saturated = measure(field, sensors, errors, options.faults, options.seed)
-    told, slips = _odometry(robot, options)
+    instruments = Instruments(floor, laid, sensors, height, options)
+    approaches: tuple[Approach, ...] = ()
+    if options.strategy == "published":
+        if driver is None:
+            raise InputError("the strategy published needs a driver")
+        robot, notes, approaches = drive_closed_loop(floor, laid, options, instruments, driver)
+    else:
+        robot, notes = steer(floor, laid, options)
+    if robot.time_s * options.rate_hz >= LARGEST_SESSION:
+        raise InputError(
+            f"a simulation of {robot.time_s * options.rate_hz:.0f} samples",
+            hint="Change the rate, the speed or the way",
+        )
+    readout = instruments.read(robot)
+    time_ns = readout.measurements.samples.time_ns
     return SimulatedSession(
-        samples=(HallSamples(options.device, sensors, time_ns, read),),
-        truth=(trajectory(options.device, "map", time_ns, poses),),
-        odometry=(told,),
+        samples=(readout.measurements.samples,),
+        truth=(trajectory(options.device, "map", time_ns, readout.poses),),
+        odometry=(readout.measurements.odometry,),
         floor=floor,
         floor_as_laid=tuple(laid.values()),
-        events=_visits(laid, time_ns, poses, points),
-        saturated=saturated,
-        slips=slips,
+        events=_visits(laid, time_ns, readout.poses, readout.points_m),
+        saturated=readout.saturated,
+        slips=readout.slips_ns,
         notes=tuple(notes),
+        approaches=approaches,
     )
-
-
-def _sampled(robot: Robot, rate_hz: float) -> tuple[NDArray[np.int64], Array]:
-    """Times and poses (n, 3) of a robot from its start to its end."""
-    time_s = np.arange(int(robot.time_s * rate_hz) + 1) / rate_hz
-    return EPOCH_NS + np.rint(time_s * 1e9).astype(np.int64), robot.at(time_s)
-
-
-def _seen(poses: Array, points: Array, floor: FloorMap, laid: dict[Cell, Laid]) -> Array:
-    """True fields (n, N); where the robot stands they are found once."""
-    moved = np.r_[True, np.any(np.diff(poses, axis=0) != 0, axis=1)]
-    field = floor_field(floor.geometry, laid.values(), points[moved])
-    return np.asarray(field[np.cumsum(moved) - 1])
-
-
-def _odometry(robot: Robot, options: SimulationOptions) -> tuple[Trajectory, tuple[int, ...]]:
-    """What the wheels tell, and when they slipped."""
-    fine_ns, poses = _sampled(robot, options.odometry_hz * FINER)
-    told, slips = odometry(poses, options.errors, np.random.default_rng([options.seed, 21]))
-    which = slice(None, None, FINER)
-    own = trajectory(options.device, "odometry", fine_ns[which], told[which])
-    return own, tuple(int(fine_ns[k]) for k in slips)
 
 
 def _visits(
@@ -180,7 +169,7 @@ def _visits(
     count = points.shape[1]
     tree = cKDTree(points[..., :2].reshape(-1, 2))
     places = [(mark.x_m, mark.y_m) for mark in laid.values()]
-    near = tree.query_ball_point(places, VISIT_M, return_sorted=True)
+    near = tree.query_ball_point(places, VISIT_RADIUS_M, return_sorted=True)
     for mark, place, sensed in zip(laid.values(), places, near, strict=True):
         over = np.unique(np.asarray(sensed, np.int64) // count)
         if not len(over):

@@ -38,13 +38,13 @@ from locatk.core.landmarks.simulation.session import (
     Aims,
     Errors,
     Faults,
-    Limits,
+    RobotLimits,
     SimulatedSession,
     SimulationOptions,
     passes,
     simulate,
 )
-from locatk.core.landmarks.simulation.strategy import free
+from locatk.core.landmarks.simulation.strategy import is_free
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -193,7 +193,7 @@ def test_errors_of_bars_are_as_large_as_asked() -> None:
     "options",
     [
         PLAIN,
-        replace(PLAIN, seed=5, landmarks=7, limits=Limits(0.2, 0.5, 1.0, 3.0)),
+        replace(PLAIN, seed=5, landmarks=7, limits=RobotLimits(0.2, 0.5, 1.0, 3.0)),
         replace(PLAIN, strategy="path", cells=((0, 0), (0, 3), (2, 3), (4, 0))),
         replace(PLAIN, strategy="path", waypoints=((0.3, 0.0), (0.6, 0.1), (0.6, 0.5))),
         replace(PLAIN, strategy="pass"),
@@ -232,19 +232,22 @@ def test_a_landing_curve_arrives_with_the_heading_it_had(
     robot = Robot(np.array(pose))
     way = pose[2] + off
     place = np.array([pose[0] + away * math.cos(way), pose[1] + away * math.sin(way)])
-    robot.land(place)
+    robot.land_at(place)
     assert robot.pose == pytest.approx([*place, pose[2]], abs=1e-9)
     # Two equal arcs: the curve passes the middle of the chord half-way through.
-    halfway = robot.at(np.array([robot.time_s / 2]))[0]
+    halfway = robot.poses_at(np.array([robot.time_s / 2]))[0]
     assert halfway[:2] == pytest.approx((np.array(pose[:2]) + place) / 2, abs=1e-9)
     assert halfway[2] - pose[2] == pytest.approx(2 * off, abs=1e-9)
 
 
 def test_it_goes_back_rather_than_around_where_that_is_near() -> None:
     robot = Robot(np.array([0.0, 0.0, 0.0]))
-    robot.go((-0.02, 0.0), back_m=0.05)
+    robot.drive_to((-0.02, 0.0), back_m=0.05)
     assert robot.pose == pytest.approx([-0.02, 0, 0])
-    robot.go((-0.12, 0.0), back_m=0.05)
+    robot.drive_to((0.0, 0.0), back_m=0.05)
+    assert robot.pose == pytest.approx([0, 0, 0]), "ahead, however near"
+    robot.drive_to((-0.02, 0.0), back_m=0.05)
+    robot.drive_to((-0.12, 0.0), back_m=0.05)
     assert abs(robot.pose[2]) == pytest.approx(math.pi)
     assert robot.pose[:2] == pytest.approx([-0.12, 0])
 
@@ -340,7 +343,7 @@ def test_it_respects_holes_and_walls(seed: int) -> None:
     floor = FloorMap(codes, walls=walls)
     options = replace(PLAIN, rate_hz=20.0, landmarks=12, spins=0, stop_s=0.0, seed=seed)
     simulated = simulate(floor, options)
-    assert free(floor, simulated.truth[0].position[:, :2])
+    assert is_free(floor, simulated.truth[0].position[:, :2])
     cells = cells_of(simulated)
     for one, other in pairwise(cells):
         heading = STEPS.index((other[0] - one[0], other[1] - one[1]))
@@ -354,14 +357,15 @@ def test_what_is_free() -> None:
     def line(*ends: tuple[float, float]) -> Array:
         return np.linspace(*ends, 41)
 
-    assert free(floor, line((0.0, -0.05), (0.0, 0.05)))
-    assert not free(floor, line((0.0, 0.0), (0.2, 0.0))), "a wall"
-    assert not free(floor, line((0.0, 0.0), (0.0, 0.2))), "a hole"
-    assert free(floor, line((0.2, 0.0), (0.2, 0.2)))
-    assert not free(floor, line((0.2, 0.0), (0.4, 0.0))), "the end of the map"
+    assert is_free(floor, line((0.0, -0.05), (0.0, 0.05)))
+    assert not is_free(floor, line((0.0, 0.19), (0.0, 0.21))), "within a hole"
+    assert not is_free(floor, line((0.0, 0.0), (0.2, 0.0))), "a wall"
+    assert not is_free(floor, line((0.0, 0.0), (0.0, 0.2))), "a hole"
+    assert is_free(floor, line((0.2, 0.0), (0.2, 0.2)))
+    assert not is_free(floor, line((0.2, 0.0), (0.4, 0.0))), "the end of the map"
     # From corner to corner it would need one of the two cells beside.
-    assert not free(floor, line((0.0, 0.0), (0.2, 0.2)))
-    assert free(replace(floor, walls=frozenset()), line((0.0, 0.0), (0.2, 0.2)))
+    assert not is_free(floor, line((0.0, 0.0), (0.2, 0.2)))
+    assert is_free(replace(floor, walls=frozenset()), line((0.0, 0.0), (0.2, 0.2)))
 
 
 def test_it_starts_where_it_is_told() -> None:
@@ -624,7 +628,7 @@ def test_more_noise_leaves_all_else_as_it_is(nominal: SimulatedSession) -> None:
         ({"errors": replace(NONE, height_m=-0.012)}, "top faces"),
         ({"rate_hz": 1e6}, "samples"),
         ({"range_t": 0.0}, "range_t"),
-        ({"limits": Limits(speed_mps=0.0)}, "limits"),
+        ({"limits": RobotLimits(speed_mps=0.0)}, "limits"),
     ],
 )
 def test_what_cannot_be_is_refused(given: dict[str, object], said: str) -> None:

@@ -12,7 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.landmarks.landmark import Geometry, name, pattern, rotated, signs
-from locatk.core.landmarks.published.valleys import Recognised, Valleys, profile, recognise, valleys
+from locatk.core.landmarks.published.second_step import (
+    SpinReading,
+    Valleys,
+    circle_profile,
+    find_valleys,
+    recognise,
+)
 
 GEOMETRY = Geometry()
 RADIUS = GEOMETRY.circle_m
@@ -33,7 +39,7 @@ def magpylibs(code: int) -> magpylib.Collection:
     return bars
 
 
-def spun(code: int, x: float, y: float, turn: float = 0.0, seed: int = 1) -> Recognised | None:
+def spun(code: int, x: float, y: float, turn: float = 0.0, seed: int = 1) -> SpinReading | None:
     """A spin of four sensors at (x, y) of a landmark; the answer is in a frame about the
     robot that is turned by ``turn`` from the landmark's."""
     bearing = HEADINGS[:, None] + np.radians([0, 90, 180, 270])
@@ -45,15 +51,15 @@ def spun(code: int, x: float, y: float, turn: float = 0.0, seed: int = 1) -> Rec
     field = field + np.random.default_rng(seed).normal(0, 0.15e-3, field.shape)
     cos, sin = math.cos(turn), math.sin(turn)
     own = circle @ np.array([[cos, -sin], [sin, cos]])
-    around = profile(own, field, np.zeros(2))
-    return recognise(valleys(around, 0.2 * GEOMETRY.threshold_t), RADIUS)
+    around = circle_profile(own, field, np.zeros(2))
+    return recognise(find_valleys(around, 0.2 * GEOMETRY.threshold_t), RADIUS)
 
 
 @pytest.mark.parametrize("code", range(16))
 def test_each_code_is_read_under_any_heading(code: int) -> None:
     rng = np.random.default_rng(code)
     for _ in range(3):
-        # 8 mm is where the paper's way still holds (facts/landmarks.md 2.4)
+        # 8 mm is where the paper's way still holds
         off, where, turn = rng.uniform(0, 0.008), *rng.uniform(-math.pi, math.pi, 2)
         x, y = off * math.cos(where), off * math.sin(where)
         found = spun(code, x, y, turn)
@@ -62,7 +68,7 @@ def test_each_code_is_read_under_any_heading(code: int) -> None:
         place = np.array([[cos, -sin], [sin, cos]]) @ found.centre_m
         assert np.hypot(*(place + [x, y])) < (0.0045 if pattern(code)[0:3] != "NSN" else 0.0003)
         for heading in (0.0, 1.0, -2.5):
-            read, frame = found.seen_under(heading)
+            read, frame = found.in_frame_of(heading)
             # The frame's heading here is the landmark's, which is -turn, and quarter turns.
             quarters = (frame + turn) / (math.pi / 2)
             assert abs(quarters - round(quarters)) < math.radians(2) / (math.pi / 2)
@@ -89,7 +95,7 @@ def test_far_off_no_centre_is_believed() -> None:
 @given(st.integers(1, 6), st.floats(0, math.tau), st.floats(0.6, 10))
 def test_valleys_of_a_wave(waves: int, phase: float, size: float) -> None:
     angle = np.radians(np.arange(360))
-    found = valleys(size * np.sin(waves * angle - phase), 0.5)
+    found = find_valleys(size * np.sin(waves * angle - phase), 0.5)
     assert len(found.angle_rad) == 2 * waves
     assert (found.rising != np.roll(found.rising, 1)).all()
     off = waves * found.angle_rad[found.rising] - phase
@@ -99,21 +105,21 @@ def test_valleys_of_a_wave(waves: int, phase: float, size: float) -> None:
 def test_small_ripples_are_no_valleys() -> None:
     angle = np.radians(np.arange(360))
     ripple = 0.4 * np.sin(60 * angle)
-    assert len(valleys(5 * np.sin(angle - 0.3) + ripple, 0.5).angle_rad) == 2
-    assert len(valleys(ripple, 0.5).angle_rad) == 0
-    assert len(valleys(3 + ripple, 0.5).angle_rad) == 0
+    assert len(find_valleys(5 * np.sin(angle - 0.3) + ripple, 0.5).angle_rad) == 2
+    assert len(find_valleys(ripple, 0.5).angle_rad) == 0
+    assert len(find_valleys(3 + ripple, 0.5).angle_rad) == 0
 
 
 def test_a_circle_that_is_not_seen_all_around() -> None:
     angle = np.radians(np.arange(0, 300.0, 3))[:, None]
     place = np.stack([np.cos(angle), np.sin(angle)], -1)
-    assert np.isnan(profile(place, np.ones((100, 1)), np.zeros(2))).all()
+    assert np.isnan(circle_profile(place, np.ones((100, 1)), np.zeros(2))).all()
     angle = np.radians(np.arange(0, 360.0, 6))[:, None]
     place = np.stack([np.cos(angle), np.sin(angle)], -1)
     field = np.sin(angle)
     field[3] = np.nan
     assert np.allclose(
-        profile(place, field, np.zeros(2)), np.sin(np.radians(np.arange(360))), atol=0.02
+        circle_profile(place, field, np.zeros(2)), np.sin(np.radians(np.arange(360))), atol=0.02
     )
 
 

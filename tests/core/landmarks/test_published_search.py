@@ -1,4 +1,4 @@
-"""The paper's search on simulated recordings, whose fields are magpylib's."""
+"""Published search on simulated recordings, whose fields are magpylib's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, code_of, name, rotated
-from locatk.core.landmarks.published import search as paper
+from locatk.core.landmarks.published.search import detect_landmarks, first_steps
+from locatk.core.landmarks.published.second_step import find_spins
 from locatk.core.landmarks.simulation.session import Pass, passes
 
 GEOMETRY = Geometry()
@@ -46,7 +47,7 @@ def off(run: Pass, seen: VisitHypotheses) -> np.ndarray | None:
 def test_spins_near_the_centre_are_read_right(letters: str) -> None:
     errors = []
     for run in passes(8, code_of(letters), then="spin", aim_m=0.003, seed=2):
-        for seen in paper.sightings(run.samples, run.odometry, GEOMETRY):
+        for seen in detect_landmarks(run.samples, run.odometry, GEOMETRY):
             if seen.refused:
                 continue
             error = off(run, seen)
@@ -68,7 +69,7 @@ def test_spins_near_the_centre_are_read_right(letters: str) -> None:
 def test_spins_far_off_are_refused_and_not_misread() -> None:
     refused, read = [], 0
     for run in passes(30, None, then="spin", aim_m=0.014, seed=7):
-        for seen in paper.sightings(run.samples, run.odometry, GEOMETRY):
+        for seen in detect_landmarks(run.samples, run.odometry, GEOMETRY):
             if seen.refused:
                 assert seen.hypotheses == ()
                 refused.append(seen.refused)
@@ -84,7 +85,7 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
     # a few percent off and sensors with offsets
     errors = []
     for run in passes(24, None, then="spin", aim_m=0.002, seed=9):
-        for seen in paper.sightings(run.samples, run.odometry, GEOMETRY):
+        for seen in detect_landmarks(run.samples, run.odometry, GEOMETRY):
             if not seen.refused and not VALLEYS_ALONE & {each.code for each in seen.warnings}:
                 error = off(run, seen)
                 assert error is not None
@@ -99,11 +100,9 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
 def test_a_pass_alone_gives_a_centre_only() -> None:
     errors = []
     for run in passes(40, code_of("NNNS"), seed=3):
-        found = paper.sightings(run.samples, run.odometry, GEOMETRY)
+        found = detect_landmarks(run.samples, run.odometry, GEOMETRY)
         assert all(seen.refused == "no_spin" and not seen.hypotheses for seen in found)
-        for step, seen in zip(
-            paper.first_steps(run.samples, run.odometry, GEOMETRY), found, strict=True
-        ):
+        for step, seen in zip(first_steps(run.samples, run.odometry, GEOMETRY), found, strict=True):
             if not np.isfinite(step.centre_m).all():
                 continue
             assert "first_step" in [each.code for each in seen.warnings]
@@ -116,7 +115,7 @@ def test_a_pass_alone_gives_a_centre_only() -> None:
             way = np.array([[cos, -sin], [sin, cos]]) @ -run.truth.position[at, :2]
             errors.append(np.hypot(*(run.odometry.position[at, :2] + way - step.centre_m)))
             assert np.isfinite(step.voted_m).all()
-    # the study's 10 mm in the real field (test_paper_study.py), and noise
+    # the study's 10 mm in the real field (test_published_study.py), and noise
     assert len(errors) > 28
     assert 0.006 < np.mean(errors) < 0.013
 
@@ -127,7 +126,7 @@ def test_a_dead_sensor_is_gone_without() -> None:
         field = run.samples.field_t.copy()
         field[:, 1] = np.nan
         samples = HallSamples(run.samples.device, run.samples.sensors, run.samples.time_ns, field)
-        for seen in paper.sightings(samples, run.odometry, GEOMETRY):
+        for seen in detect_landmarks(samples, run.odometry, GEOMETRY):
             if not seen.refused:
                 read += 1
                 assert off(run, seen) is not None
@@ -138,7 +137,7 @@ def test_without_odometry_there_is_an_error() -> None:
     run = passes(1, code_of("NNSS"), seed=4)[0]
     late = replace(run.odometry, time_ns=run.odometry.time_ns + 10**12)
     with pytest.raises(InputError, match="covers none"):
-        paper.sightings(run.samples, late, GEOMETRY)
+        detect_landmarks(run.samples, late, GEOMETRY)
 
 
 def test_spins_are_turns_on_the_spot() -> None:
@@ -147,13 +146,13 @@ def test_spins_are_turns_on_the_spot() -> None:
     spin = np.column_stack([still + 0.1, still, turn])
     drive = np.column_stack([np.arange(0, 0.1, 0.002), np.zeros(50), np.zeros(50)])
     both = np.concatenate([drive, spin, drive + [0.1, 0, turn[-1]]])
-    assert len(paper.spins(both)) == 1
-    first, stop = paper.spins(both)[0]
+    assert len(find_spins(both)) == 1
+    first, stop = find_spins(both)[0]
     assert 46 <= first <= 51
     assert 168 <= stop <= 173
     # clockwise as well; half a turn and a circle that is driven are none
-    assert len(paper.spins(spin * [1, 1, -1])) == 1
-    assert paper.spins(spin[:60]) == []
+    assert len(find_spins(spin * [1, 1, -1])) == 1
+    assert find_spins(spin[:60]) == []
     circle = 0.1 * np.column_stack([np.sin(turn), -np.cos(turn)])
-    assert paper.spins(np.column_stack([circle, turn])) == []
-    assert len(paper.spins(np.concatenate([spin, spin + [0.05, 0, 0]]))) == 2
+    assert find_spins(np.column_stack([circle, turn])) == []
+    assert len(find_spins(np.concatenate([spin, spin + [0.05, 0, 0]]))) == 2

@@ -73,7 +73,7 @@ def test_the_papers_figures_are_reproduced() -> None:
 
 
 def test_the_literal_rule_fails_where_two_lines_hit() -> None:
-    # facts/landmarks.md 3: 27 % over 20 mm; 27.8 mm in the mean with two lines, 8.1 with three
+    # 27 % over 20 mm; 27.8 mm in the mean with two lines, 8.1 with three
     found = study(3, method="literal")
     assert abs(found.figures()["over_20_share"] - 0.27) < 0.02
     mean = [np.nanmean(found.error_m[found.lines == k]) * 1e3 for k in (2, 3)]
@@ -86,7 +86,7 @@ def test_the_literal_rule_fails_where_two_lines_hit() -> None:
     [("literal", 15.4, 0.26), ("corrected", 10.0, 0.044), ("voting", 9.4, 0.031)],
 )
 def test_in_the_real_field_all_are_worse(method: str, mean_mm: float, over: float) -> None:
-    # facts/landmarks.md 3, sampled every 6 degrees there
+    # figures of a study with starts every 6 degrees
     found = study(24, "field", method).figures()  # type: ignore[arg-type]
     assert abs(found["mean_mm"] - mean_mm) < 1.5
     assert abs(found["over_20_share"] - over) < 0.03

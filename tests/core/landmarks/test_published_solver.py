@@ -1,4 +1,4 @@
-"""The published method on whole recordings: what it finds, and what it says it does not."""
+"""Published method on whole recordings: poses on the map, warnings and errors."""
 
 from __future__ import annotations
 
