@@ -13,7 +13,7 @@ import pytest
 from locatk.core.dots.codec import codec
 from locatk.core.dots.codec.lookup import decode_exact
 from locatk.core.dots.drawing import layout
-from locatk.core.dots.localization.located import nothing
+from locatk.core.dots.localization.frames import unlocalized_frames
 from locatk.formats.bench import Figure, dots, dots_print, dots_study, timing
 from locatk.formats.pdf import pattern
 
@@ -125,7 +125,7 @@ def test_the_published_frame_is_found_in_all_turns(data: Path) -> None:
 
 
 def test_a_frame_counts_as_right_wrong_or_neither() -> None:
-    located = nothing(6, "no_grid")
+    located = unlocalized_frames(6, "no_grid")
     located.rejected[:5] = ""
     located.grid[:] = 100.0
     located.heading[:] = np.pi - 0.01
@@ -138,7 +138,7 @@ def test_a_frame_counts_as_right_wrong_or_neither() -> None:
     assert (found.frames, found.right, found.wrong) == (6, 3, 2)
     assert found.rms == pytest.approx(0.1 / np.sqrt(3))
     assert found.wrong_share == pytest.approx(40)
-    nobody = dots.score(nothing(2, "no_grid"), np.zeros((2, 2)), np.zeros(2))
+    nobody = dots.score(unlocalized_frames(2, "no_grid"), np.zeros((2, 2)), np.zeros(2))
     assert (nobody.right, nobody.wrong, nobody.wrong_share) == (0, 0, 0)
     assert np.isnan(nobody.rms)
     assert Figure("f", nobody.rms, "pitch", "how", 0.003).met is False
@@ -212,7 +212,7 @@ def test_a_measure_that_fails_says_why() -> None:
     figure = timing.measured("f", "s", "dots_print.nothing()", 1.0, "how", 1.0)
     assert figure.value is None
     assert figure.met is None
-    assert "nothing" in figure.how
+    assert "unlocalized_frames" in figure.how
     with pytest.raises(OSError, match="division"):
         timing.alone("dots_print.SEED / 0")
     assert timing.alone("dots_print.ORIGIN") == list(dots_print.ORIGIN)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots.calibration import camera_models as models
+from locatk.core.dots.calibration import camera_fit as models
 from locatk.core.dots.calibration.camera_fit import (
-    Fit,
-    Views,
-    fit_flat,
+    CalibrationViews,
+    CameraFit,
     fit_homographies,
     fit_poses,
+    fit_without_lens,
 )
 from locatk.core.geometry import rotation_exp
 
@@ -47,7 +47,7 @@ def views(
     aspect: float = 0.0,
     bow_mm: float = 0.0,
     seed: int = 0,
-) -> Views:
+) -> CalibrationViews:
     """Frames in all directions, at 0.046 mm a pixel; tilted evenly, or as told."""
     rng = np.random.default_rng(seed)
     intrinsic = np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]])
@@ -71,7 +71,7 @@ def views(
         seen[astray] += rng.uniform(-1.3, 1.3, (int(astray.sum()), 2))
         found.append((seen, place[inside]))
     most = max(len(seen) for seen, _ in found)
-    result = Views(
+    result = CalibrationViews(
         SIZE,
         np.full((frames, most, 2), np.nan),
         np.full((frames, most, 2), np.nan),
@@ -83,7 +83,7 @@ def views(
     return result
 
 
-def errors(fit: Fit) -> Array:
+def errors(fit: CameraFit) -> Array:
     """Of centre, k, focal length and aspect in standard deviations."""
     found = np.array([*fit.centre, fit.radial, fit.focal, fit.aspect])
     return (found - [*CENTRE, K, FOCAL, 0.0]) / fit.sigma
@@ -94,25 +94,27 @@ def test_derivatives_are_those_of_the_model(name: str) -> None:
     rng = np.random.default_rng(1)
     plane = rng.uniform(-1, 1, (3, 7, 2))
     shared = np.array([0.02, -0.03, -0.1, 0.7, 0.01])
-    model: models.Model
+    model: models.FrameModel
     if name == "homographies":
-        model, own = models.Homographies(), rng.normal(0, 0.1, (3, 8)) + [1, 0, 0, 0, 1, 0, 0, 0]
+        model, own = models.HomographyModel(), rng.normal(0, 0.1, (3, 8)) + [1, 0, 0, 0, 1, 0, 0, 0]
     else:
         turns = rotation_exp(rng.normal(0, 0.3, (3, 3))).reshape(3, 9)
-        model, own = models.Poses(), np.c_[turns, rng.normal(0, 0.1, (3, 2)), [1.1, 0.9, 1.0]]
-    _, by_own, by_shared = models.seen(model, shared, own, plane)
+        model, own = models.PoseModel(), np.c_[turns, rng.normal(0, 0.1, (3, 2)), [1.1, 0.9, 1.0]]
+    _, by_own, by_shared = models.project(model, shared, own, plane)
     small = 1e-6
     for k in range(by_own.shape[3]):
         step = np.zeros((3, by_own.shape[3]))
         step[:, k] = small
         after, before = (
-            models.seen(model, shared, model.moved(own, s), plane)[0] for s in (step, -step)
+            models.project(model, shared, model.retract(own, s), plane)[0] for s in (step, -step)
         )
         assert by_own[..., k] == pytest.approx((after - before) / (2 * small), abs=1e-8)
     for k in range(5):
         change = np.zeros(5)
         change[k] = small
-        after, before = (models.seen(model, shared + c, own, plane)[0] for c in (change, -change))
+        after, before = (
+            models.project(model, shared + c, own, plane)[0] for c in (change, -change)
+        )
         assert by_shared[..., k] == pytest.approx((after - before) / (2 * small), abs=1e-8)
 
 
@@ -126,7 +128,7 @@ def test_without_noise_the_camera_comes_back_exactly(k: float) -> None:
         assert fit.radial == pytest.approx(k, rel=1e-5)
         assert fit.rms < 1e-4
     assert poses.focal == pytest.approx(FOCAL, rel=1e-5)
-    assert fit_flat(seen).rms > 0.3
+    assert fit_without_lens(seen).rms > 0.3
 
 
 @pytest.mark.slow
@@ -164,7 +166,7 @@ def test_bad_frames_count_little() -> None:
     seen = views(30, seed=7)
     bad = np.arange(30) % 5 < 2
     seen.pixels[bad] += np.random.default_rng(0).normal(0, 0.12, seen.pixels[bad].shape)
-    good = Views(SIZE, *(a[~bad] for a in (seen.pixels, seen.plane, seen.valid)))
+    good = CalibrationViews(SIZE, *(a[~bad] for a in (seen.pixels, seen.plane, seen.valid)))
     with_bad, without = fit_homographies(seen), fit_homographies(good)
     assert (with_bad.sigma[:3] < 1.15 * without.sigma[:3]).all()
     # Not because their dots were taken for wrong ones.
@@ -204,8 +206,8 @@ def test_a_lens_without_bend_has_a_centre_where_frames_are_tilted() -> None:
 
 def test_a_centre_that_is_held_stays() -> None:
     seen = views(10)
-    bend = fit_homographies(seen, hold_centre=True)
-    poses = fit_poses(seen, bend, 300.0, hold_centre=True)
+    bend = fit_homographies(seen, fix_centre=True)
+    poses = fit_poses(seen, bend, 300.0, fix_centre=True)
     for fit in (bend, poses):
         assert fit.centre.tolist() == [93.5, 59.5]
         assert np.isnan(fit.sigma[:2]).all()

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from locatk.core.dots.codec import codec
 from locatk.core.dots.drawing.layout import (
     DPIS,
-    Layout,
     Raster,
+    SheetLayout,
     lay_out,
     manifest,
     pixels,
@@ -158,7 +158,7 @@ def test_origins_are_checked() -> None:
         tiling(layout, (3, 1), 10).sheets("a", (410_815_348 - 400, 0))
 
 
-def floor(count: tuple[int, int] = (3, 2), overlap: float = 15) -> Layout:
+def floor(count: tuple[int, int] = (3, 2), overlap: float = 15) -> SheetLayout:
     return lay_out((148, 210), 10, snap(0.508, None, 600))
 
 

@@ -19,7 +19,11 @@ from locatk.core.dots.codec import (
     codec,
     sequences,
 )
-from locatk.core.dots.identification.decoding import THRESHOLD, Decoded, decode
+from locatk.core.dots.identification.decoding import (
+    MIN_CONFIDENCE,
+    DecodedWindows,
+    identify_windows,
+)
 
 CODECS = ("anoto", "libdots", "microdots")
 UP, LEFT, RIGHT, DOWN = range(4)
@@ -70,7 +74,7 @@ class Windows:
         self.turn = (self.turn + quarters) % 4
         return self
 
-    def right(self, found: Decoded) -> NDArray[np.bool_]:
+    def right(self, found: DecodedWindows) -> NDArray[np.bool_]:
         result: NDArray[np.bool_] = (
             (found.x == self.x)
             & (found.y == self.y)
@@ -100,15 +104,15 @@ def hidden(bits: tuple[Bits, Bits], gone: NDArray[np.bool_]) -> tuple[Bits, Bits
     return np.where(gone, np.float32(0), bits[0]), np.where(gone, np.float32(0), bits[1])
 
 
-def accepted(found: Decoded) -> NDArray[np.bool_]:
+def accepted(found: DecodedWindows) -> NDArray[np.bool_]:
     """What a user takes for a place: sure enough, and in one section."""
-    result: NDArray[np.bool_] = (found.confidence >= THRESHOLD) & ~found.border
+    result: NDArray[np.bool_] = (found.confidence >= MIN_CONFIDENCE) & ~found.border
     return result
 
 
 def fate(windows: Windows, bits: tuple[Bits, Bits], one: Codec) -> tuple[int, int, int]:
     """How many windows are read right, read wrong, and refused."""
-    found = decode(*bits, one)
+    found = identify_windows(*bits, one)
     took, right = accepted(found), windows.right(found)
     return int((took & right).sum()), int((took & ~right).sum()), int((~took).sum())
 
@@ -135,7 +139,7 @@ def test_windows_of_this_test_are_the_codecs(name: str) -> None:
 @pytest.mark.parametrize("quarters", range(4))
 def test_every_place_section_and_turn(name: str, side: int, quarters: int) -> None:
     windows = Windows(name, np.random.default_rng(side), 1000, side, side).turned(quarters)
-    found = decode(*soft(windows.symbols), codec(name))
+    found = identify_windows(*soft(windows.symbols), codec(name))
     took = accepted(found)
     assert took.all()
     np.testing.assert_array_equal(windows.right(found), took)
@@ -166,10 +170,10 @@ def test_any_window(name: str, x: int, y: int, u: int, v: int, side: int, quarte
     symbols = np.rot90(codec(name).symbols((x, y), (side, side), (u, v)), quarters)
     for _ in range(quarters):
         symbols = QUARTER[symbols]
-    found = decode(*soft(symbols[None].astype(np.int64)), codec(name))
+    found = identify_windows(*soft(symbols[None].astype(np.int64)), codec(name))
     assert (found.x[0], found.y[0], *found.section[0]) == (x, y, u, v)
     assert found.rotation[0] == quarters
-    assert found.confidence[0] >= THRESHOLD
+    assert found.confidence[0] >= MIN_CONFIDENCE
 
 
 def test_windows_at_the_rim_of_the_range() -> None:
@@ -177,7 +181,7 @@ def test_windows_at_the_rim_of_the_range() -> None:
     for x in edge:
         for y in edge:
             windows = Windows("anoto", np.random.default_rng(3), 4, 12, 12, x, y)
-            found = decode(*soft(windows.symbols), codec("anoto"))
+            found = identify_windows(*soft(windows.symbols), codec("anoto"))
             assert windows.right(found).all(), (x, y)
             assert accepted(found).all(), (x, y)
 
@@ -201,9 +205,11 @@ def test_answers_do_not_depend_on_their_company() -> None:
     rng = np.random.default_rng(5)
     windows = Windows("anoto", rng, 40, 10, 10)
     bits = flip(soft(windows.symbols), 0.03, rng)
-    together = decode(*bits, codec("anoto"))
-    alone = [decode(bits[0][k : k + 1], bits[1][k : k + 1], codec("anoto")) for k in range(40)]
-    for field in Decoded.__dataclass_fields__:
+    together = identify_windows(*bits, codec("anoto"))
+    alone = [
+        identify_windows(bits[0][k : k + 1], bits[1][k : k + 1], codec("anoto")) for k in range(40)
+    ]
+    for field in DecodedWindows.__dataclass_fields__:
         parts = np.concatenate([getattr(one, field) for one in alone])
         np.testing.assert_allclose(getattr(together, field), parts, rtol=1e-6, err_msg=field)
 
@@ -211,7 +217,7 @@ def test_answers_do_not_depend_on_their_company() -> None:
 def test_nothing_to_decode() -> None:
     for n in (0, 3):
         nothing = np.zeros((n, 12, 12), np.float32)
-        found = decode(nothing, nothing, codec("anoto"))
+        found = identify_windows(nothing, nothing, codec("anoto"))
         assert len(found.x) == n
         assert not accepted(found).any()
         assert (found.dots == 0).all()
@@ -226,7 +232,7 @@ def test_missing_dots(side: int, share: float) -> None:
     rng = np.random.default_rng(6)
     windows = Windows("anoto", rng, 400, side, side).turned(1)
     gone = rng.random(windows.symbols.shape) < share
-    found = decode(*hidden(soft(windows.symbols), gone), codec("anoto"))
+    found = identify_windows(*hidden(soft(windows.symbols), gone), codec("anoto"))
     took, right = accepted(found), windows.right(found)
     assert (took & right).sum() >= 394
     assert (took & ~right).sum() == 0
@@ -244,7 +250,7 @@ def test_a_few_wrong_bits_of_8_by_8(wrong: int, least: int, most: int) -> None:
     at = rng.permuted(np.tile(np.arange(128), (400, 1)), axis=1)[:, :wrong]
     np.put_along_axis(bits, at, -np.take_along_axis(bits, at, 1), 1)
     bits = bits.reshape(400, 2, 8, 8)
-    found = decode(bits[:, 0].copy(), bits[:, 1].copy(), codec("anoto"))
+    found = identify_windows(bits[:, 0].copy(), bits[:, 1].copy(), codec("anoto"))
     took, right = accepted(found), windows.right(found)
     assert (took & right).sum() >= least
     assert (took & ~right).sum() <= most
@@ -328,7 +334,7 @@ def test_windows_that_are_half_hidden(side: int) -> None:
 
 def repeated() -> Iterator[tuple[int, int]]:
     """Places of the fourth libdots sequence where a string of so many digits occurs again."""
-    digits = sequences.FOURTH["libdots"]
+    digits = sequences.FOURTH_DIGITS["libdots"]
     for order in (5, 6):
         strings = [(digits + digits)[k : k + order] for k in range(len(digits))]
         for place, string in enumerate(strings):
@@ -364,7 +370,7 @@ def test_noise_is_refused(size: tuple[int, int], n: int) -> None:
             )[kind].astype(np.float32)
             for _ in range(2)
         ]
-        assert not accepted(decode(bits[0], bits[1], codec("anoto"))).any()
+        assert not accepted(identify_windows(bits[0], bits[1], codec("anoto"))).any()
 
 
 @pytest.mark.parametrize("side", [8, 20])
@@ -395,7 +401,7 @@ def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
         "one symbol": np.tile(np.arange(4)[:, None, None], (1, side, side)),
         "stripes": np.tile(np.arange(side) % 2 * 3, (1, side, 1)),
     }.items():
-        found = decode(*soft(np.ascontiguousarray(symbols)), one)
+        found = identify_windows(*soft(np.ascontiguousarray(symbols)), one)
         assert not accepted(found).any(), what
 
 
@@ -415,7 +421,7 @@ def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: i
     symbols = np.concatenate(parts, axis=2)
     if axis == 1:  # upright again, after the quarter turn that makes rows of columns
         symbols = QUARTER[QUARTER[QUARTER[np.rot90(symbols, 3, (1, 2))]]]
-    found = decode(*soft(symbols), codec("anoto"))
-    assert not (found.confidence >= THRESHOLD).any()
+    found = identify_windows(*soft(symbols), codec("anoto"))
+    assert not (found.confidence >= MIN_CONFIDENCE).any()
     if side == 20 and beyond == 2:  # most of it is of one section, so that its place is known
         assert found.border.all()
