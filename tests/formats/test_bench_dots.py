@@ -47,6 +47,8 @@ PROMISED = {
     "a single frame": 0.5,
     **{f"frame.bmp turned by {90 * k} deg: centre": 0.05 for k in range(4)},
     **{f"frame.bmp turned by {90 * k} deg: heading": 0.2 for k in range(4)},
+    "study: frames right": 99.17,
+    "study, --method paper: frames right": 99.17,
     "study: worst error x": 0.155,
     "study: worst error y": 0.273,
     "study: worst error heading": 1.581,
@@ -101,8 +103,8 @@ def test_frames_are_read_as_promised(rows: dict[str, Figure]) -> None:
             assert figure.met, f"{name}: {figure.value}"
     assert rows["frames a second, in a batch"].value > 0  # type: ignore[operator]
     assert rows["A0 printed: memory"].value > 10  # type: ignore[operator]
-    # The published method scatters as its authors' code does, and rejects some.
-    assert 0.005 < rows["--method paper, dots 0.30: rms"].value < 0.2  # type: ignore[operator]
+    # The published method scatters more than the default one.
+    assert 0.003 < rows["--method paper, dots 0.30: rms"].value < 0.05  # type: ignore[operator]
     assert rows["study, --method paper: worst error x"].value > rows["study: worst error x"].value  # type: ignore[operator]
 
 
@@ -212,7 +214,7 @@ def test_a_measure_that_fails_says_why() -> None:
     figure = timing.measured("f", "s", "dots_print.nothing()", 1.0, "how", 1.0)
     assert figure.value is None
     assert figure.met is None
-    assert "unlocalized_frames" in figure.how
+    assert "nothing" in figure.how
     with pytest.raises(OSError, match="division"):
         timing.alone("dots_print.SEED / 0")
     assert timing.alone("dots_print.ORIGIN") == list(dots_print.ORIGIN)
@@ -227,3 +229,19 @@ def test_the_command_lists_them(
     answer = json.loads(result.stdout)
     assert answer["system"] == "dots"
     assert [figure["name"] for figure in answer["figures"]] == list(rows)
+
+
+def test_the_published_method_reads_the_papers_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 2,420 frames all are read; without the correction of the direction 83.6 %."""
+    for name, value in (("GRID", 5), ("ANGLES", 9), ("SAMPLES", 4), ("METHODS", ("paper",))):
+        monkeypatch.setattr(dots_study, name, value)
+    monkeypatch.setattr(dots_study, "RIGHT_MM", 1e9)
+    monkeypatch.setattr(dots_study, "RIGHT_DEG", 1e9)
+    values = {
+        figure.name.removeprefix("study: "): figure.value for figure in dots_study.study_figures()
+    }
+    assert values["frames right"] >= 98  # type: ignore[operator]
+    # With these gates a wrong position would count as right: there is none among 100 frames.
+    assert values["worst error x"] < 0.155  # type: ignore[operator]
+    assert values["worst error y"] < 0.273  # type: ignore[operator]
+    assert values["worst error heading"] < 1.581  # type: ignore[operator]

@@ -1,4 +1,4 @@
-"""The codecs have the properties on which reading them rests (facts/dots.md 2.3)."""
+"""Properties of the codecs that decoding depends on."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def one_flip(bits: str) -> list[str]:
     return [bits[:i] + flipped(bits[i]) + bits[i + 1 :] for i in range(len(bits))]
 
 
-# --- the slow road: facts/dots.md 2.4 and 2.5 in plain Python, one place after the other
+# --- the definition of the pattern in plain Python, one position after the other
 
 
 def shift(name: str, place: int) -> int:

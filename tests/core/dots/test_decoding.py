@@ -345,7 +345,7 @@ def repeated() -> Iterator[tuple[int, int]]:
 def test_what_libdots_repeats_is_not_told() -> None:
     one = codec("libdots")
     places = list(repeated())
-    assert len(places) == 2 * (6 + 1)  # facts/dots.md 2.1
+    assert len(places) == 2 * (6 + 1)
     rng = np.random.default_rng(12)
     for place, order in places:
         x = rng.integers(0, SECTION_LENGTH // 241 - 1, 10) * 241 + place

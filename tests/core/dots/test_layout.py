@@ -28,7 +28,7 @@ PAGES = st.tuples(st.floats(60, 3000), st.floats(60, 3000))
 
 
 def test_usual_pattern_on_the_usual_printers() -> None:
-    """facts/dots.md 5.3: 0.508 mm is 6, 12 and 24 px; offset and dot are a sixth of that."""
+    """A pitch of 0.508 mm is 6, 12 and 24 px; offset and dot are a sixth of that."""
     assert snap(0.508, None, 300) == Raster(300, 6, 1, 1)
     assert snap(0.508, None, 600) == Raster(600, 12, 2, 2)
     assert snap(0.508, None, 1200) == Raster(1200, 24, 4, 4)

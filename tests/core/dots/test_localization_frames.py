@@ -423,7 +423,7 @@ def test_the_pattern_in_a_mirror_and_as_a_negative(shot: Shots) -> None:
 
 
 def test_a_sheet_of_another_codec_has_its_places_elsewhere(shot: Shots) -> None:
-    # microdots and anoto share three of four sequences (facts/dots.md 2.2).
+    # microdots and anoto share three of four sequences.
     images = np.stack([one.take() for one in shots_of(shot, 20, 16, codec="microdots")])
     assert not localize_frames(images, codec("anoto")).accepted.any()
 

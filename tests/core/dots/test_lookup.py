@@ -218,7 +218,7 @@ def test_anoto_sheet_read_as_another_codec() -> None:
     assert not (alt.ok & (alt.x == at[:, 0])).any()
     libdots = decode_exact(windows, codec("libdots"))
     right = libdots.ok & (libdots.x == at[:, 0]) & (libdots.y == at[:, 1])
-    # 217 of 241 places an axis (facts/dots.md 2.2)
+    # 217 of 241 positions per axis
     assert abs(right.mean() - (217 / 241) ** 2) < 0.05
 
 

@@ -1,4 +1,4 @@
-"""The one public camera frame of the pattern (facts/dots.md 2.6): a libdots sheet, 320 x 241.
+"""The one public camera frame of the pattern, of cellulo-localization: a libdots sheet, 320 x 241.
 
 Its place was recovered from its dots by two other decoders; nobody measured it.
 """
