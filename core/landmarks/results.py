@@ -12,8 +12,7 @@ import numpy as np
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.landmark import pattern, rotated
 from locatk.core.landmarks.localization.cell_filter import HALF_PI, Located
-from locatk.core.landmarks.map.as_built import laid_code
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, as_built_code
 
 MIN_CELL_PROBABILITY = 0.8
 """Posterior probability of a cell of the map from which on it is reported [1]."""
@@ -148,7 +147,7 @@ def describe_visit(
         best = sighting.hypotheses[located.hypothesis]
         cell, quarters = located.cell, located.quarters
         if floor is not None:
-            laid = laid_code(floor, located.cell)
+            laid = as_built_code(floor, located.cell)
             if laid == HOLE:
                 cell = None
                 refused = "off_map"

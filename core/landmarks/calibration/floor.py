@@ -35,14 +35,13 @@ from locatk.core.landmarks.calibration.marks import (
     landmarks,
     unknown,
 )
-from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.detection.fit import Priors
 from locatk.core.landmarks.detection.trace import compose
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.localization import recording
 from locatk.core.landmarks.localization import smoothing as smooth
-from locatk.core.landmarks.map.as_built import laid_codes
-from locatk.core.landmarks.map.floor import Cell, FloorMap
+from locatk.core.landmarks.map.floor import Cell, FloorMap, as_built_codes
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -279,11 +278,11 @@ def _notes(
 
 def _uniqueness(floor: FloorMap) -> list[str]:
     """What flipped bars do to the proof of the map."""
-    codes = laid_codes(floor)
+    codes = as_built_codes(floor)
     changed = int(np.count_nonzero(codes != floor.codes))
     if not changed:
         return []
-    count = prove(replace(floor, codes=codes, built={}), steps=False).duplicate_count
+    count = prove_map(replace(floor, codes=codes, built={}), steps=False).duplicate_count
     is_not = "1 landmark is" if changed == 1 else f"{changed} landmarks are"
     if not count:
         return [f"{is_not} not laid as designed; the map is unique all the same, as laid"]

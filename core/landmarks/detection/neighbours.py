@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks import field as bars
 from locatk.core.landmarks.detection.trace import Trace, compose, sensor_places
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, laid_mark
+from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, as_built_landmark
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def without(trace: Trace, pose: Array, wrong: Array, cell: Cell, floor: FloorMap
         for column in range(max(0, cell[1] - span), min(columns, cell[1] + span + 1)):
             if (row, column) == cell or floor.codes[row, column] == HOLE:
                 continue
-            mark, strength = laid_mark(floor, (row, column))
+            mark, strength = as_built_landmark(floor, (row, column))
             away = place - mark[:2]
             near = np.hypot(away[..., 0], away[..., 1]) < REACH_M
             if near.any():

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.detection.trace import Drift
 from locatk.core.landmarks.landmark import CODES, rotated
-from locatk.core.landmarks.map.as_built import laid_codes
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE, FloorMap, as_built_codes
 
 Array = NDArray[np.float64]
 
@@ -122,7 +121,7 @@ def locate(
             pairwise(sightings), pairwise(kept), strict=True
         )
     ]
-    laid = laid_codes(floor)
+    laid = as_built_codes(floor)
     read = [_seen(hypotheses, laid, misread) for hypotheses in kept]
     seen = list(read)
     every = [sum(one.probability for _, one in hypotheses) / CODES for hypotheses in kept]

@@ -15,8 +15,7 @@ from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization import cell_filter as globalize
 from locatk.core.landmarks.localization.cell_filter import Located
-from locatk.core.landmarks.map.as_built import laid_code
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE, FloorMap, as_built_code
 from locatk.core.landmarks.results import MIN_CELL_PROBABILITY
 from locatk.core.landmarks.visits import Driven, Visit, check_way, driven, find, joined
 from locatk.core.trajectory import Trajectory
@@ -148,5 +147,5 @@ def on_map(found: Recording, floor: FloorMap) -> list[Seen]:
         for one in found.seen
         if one.located is not None
         and one.located.probability >= MIN_CELL_PROBABILITY
-        and laid_code(floor, one.located.cell) != HOLE
+        and as_built_code(floor, one.located.cell) != HOLE
     ]
