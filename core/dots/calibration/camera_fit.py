@@ -209,7 +209,7 @@ def fit_poses(
 
 def homographies(views: CalibrationViews) -> Array:
     """Return homographies (n, 8) by linear least squares, in half diagonals, without a lens."""
-    frame, plane = _normalize(views)
+    frame, plane = normalize_views(views)
     return _linear_homographies(frame, plane, views.valid)
 
 
@@ -223,13 +223,19 @@ def _fit(
 ) -> CameraFit:
     """Fit a model with the ``free`` parameters of the camera, and estimate the weights."""
     half = views.half_diagonal
-    observed, plane = _normalize(views)
+    observed, plane = normalize_views(views)
     is_free = np.isin(np.arange(CAMERA_PARAMETERS), free)
     prior_mean = np.array([0.0, 0.0, 0.0, usual_log_focal, 0.0])
     state = CameraState(camera, frames)
     weights = views.valid * (INITIAL_SIGMA_PX / half) ** -2.0
+    initial = CameraProblem(model, observed, plane, views.valid, weights, is_free, prior_mean)
+    if not np.isfinite(initial.frame_equations(state).cost):
+        raise DegenerateError(
+            "no lens of this kind shows such frames: some dots would be beyond its fold",
+            hint="Is the sheet flat? Are the frames whole, neither cropped nor scaled?",
+        )
     for _ in range(REWEIGHTED_FITS):
-        problem = _CameraProblem(model, observed, plane, views.valid, weights, is_free, prior_mean)
+        problem = CameraProblem(model, observed, plane, views.valid, weights, is_free, prior_mean)
         minimum = minimize(
             problem,
             state,
@@ -237,15 +243,10 @@ def _fit(
             max_iterations=MAX_ITERATIONS,
             min_gain=MIN_GAIN,
         )
-        if not np.isfinite(minimum.equations.cost[0]):
-            raise DegenerateError(
-                "no lens of this kind shows such frames: some dots would be beyond its fold",
-                hint="Is the sheet flat? Are the frames whole, neither cropped nor scaled?",
-            )
         state, residual = minimum.state, minimum.equations.residual
         weights = _estimate_weights(residual, views.valid)
     sigma = np.full(CAMERA_PARAMETERS, np.nan)
-    final = _CameraProblem(model, observed, plane, views.valid, weights, is_free, prior_mean)
+    final = CameraProblem(model, observed, plane, views.valid, weights, is_free, prior_mean)
     sigma[is_free] = final.camera_sigma(state)
     focal = half * math.exp(state.camera[LOG_FOCAL]) if is_free[LOG_FOCAL] else math.nan
     return CameraFit(
@@ -261,7 +262,7 @@ def _fit(
     )
 
 
-def _normalize(views: CalibrationViews) -> tuple[Array, Array]:
+def normalize_views(views: CalibrationViews) -> tuple[Array, Array]:
     """Return the dots in the frame and on the sheet (n, m, 2), 0 for missing dots.
 
     In the frame they are in half diagonals from the middle; on the sheet from the mean of each
@@ -299,7 +300,7 @@ class CameraState:
 
 
 @dataclass(frozen=True)
-class _FrameEquations:
+class FrameEquations:
     """Normal equations of each of n frames, with s = 5 parameters of the camera and q of its own.
 
     Attributes
@@ -324,7 +325,7 @@ class _FrameEquations:
 
 
 @dataclass(frozen=True)
-class _CameraProblem:
+class CameraProblem:
     """Fit of a camera as a problem for :func:`~locatk.core.least_squares.minimize`.
 
     Attributes
@@ -383,7 +384,7 @@ class _CameraProblem:
             state.camera + step.shared, self.model.retract(state.frames, step.blocks)
         )
 
-    def frame_equations(self, state: CameraState) -> _FrameEquations:
+    def frame_equations(self, state: CameraState) -> FrameEquations:
         """Return the normal equations of the frames, without the prior."""
         predicted, by_frame, by_camera = project(self.model, state.camera, state.frames, self.plane)
         is_visible = np.asarray(np.isfinite(predicted).all(axis=2))
@@ -398,7 +399,7 @@ class _CameraProblem:
         gram = table.transpose(0, 2, 1) @ table
         s = CAMERA_PARAMETERS
         cost = 0.5 * float(gram[:, -1, -1].sum()) if is_possible else math.inf
-        return _FrameEquations(
+        return FrameEquations(
             hessian=gram[:, :s, :s],
             gradient=gram[:, :s, -1],
             block_hessian=gram[:, s:-1, s:-1],

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from locatk.core.dots.calibration.camera_fit import (
     fit_poses,
     fit_without_lens,
 )
+from locatk.core.errors import DegenerateError
 from locatk.core.geometry import rotation_exp
 
 Array = NDArray[np.float64]
@@ -220,3 +223,79 @@ def test_tilts_are_those_of_the_frames() -> None:
     assert np.isnan(bend.tilt).all()
     poses = fit_poses(seen, bend, 300.0)
     assert np.degrees(poses.tilt) == pytest.approx(tilts_deg, abs=0.15)
+
+
+# ---- guards
+
+
+def test_a_start_beyond_the_fold_of_the_lens_is_refused() -> None:
+    """With so large a k the lens would not show the corners at all."""
+    seen = views(12, noise=0.0)
+    start = fit_homographies(seen)
+    folded = replace(start, radial=0.4 / HALF**2)
+    with pytest.raises(DegenerateError, match="beyond its fold"):
+        fit_poses(seen, folded, 300.0)
+
+
+def problem_of(seen: CalibrationViews) -> tuple[Any, models.CameraState]:
+    """The least-squares problem of homographies, with all dots of the same weight."""
+    observed, plane = models.normalize_views(seen)
+    free = np.array([True, True, True, False, False])
+    problem = models.CameraProblem(
+        models.HomographyModel(),
+        observed,
+        plane,
+        seen.valid,
+        seen.valid.astype(float),
+        free,
+        np.zeros(5),
+    )
+    return problem, models.CameraState(np.zeros(5), models.homographies(seen))
+
+
+def test_dots_that_the_lens_does_not_show_are_outliers() -> None:
+    problem, state = problem_of(views(4))
+    folded = models.CameraState(np.array([0, 0, 5.0, 0, 0]), state.frames)
+    equations = problem.linearize(folded, np.arange(1))
+    assert equations.cost[0] == math.inf
+    assert np.isfinite(equations.hessian).all()
+    assert np.isfinite(equations.block_gradient).all()
+    invisible = (equations.residual == models.INVISIBLE_RESIDUAL).all(axis=2)
+    assert 0 < invisible.sum() < problem.valid.sum()
+    # Without weight they are rejected outliers and cost nothing.
+    without = replace(problem, weights=np.where(invisible, 0.0, problem.weights))
+    assert np.isfinite(without.linearize(folded, np.arange(1)).cost[0])
+
+
+def test_rejected_dots_keep_their_residuals() -> None:
+    """Their weights are estimated anew from these; as zeros they would be inliers again."""
+    problem, state = problem_of(views(4))
+    rejected = np.zeros_like(problem.valid)
+    rejected[:, 3] = True
+    without = replace(problem, weights=np.where(rejected, 0.0, problem.weights))
+    before, after = (p.linearize(state, np.arange(1)) for p in (problem, without))
+    np.testing.assert_array_equal(after.residual, before.residual)
+    assert np.abs(after.residual[rejected]).max() > 0
+    assert after.cost[0] < before.cost[0]
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    problem, state = problem_of(views(3))
+    state = models.CameraState(np.array([0.01, -0.02, -0.1, 0, 0]), state.frames)
+    equations = problem.linearize(state, np.arange(1))
+    for k in range(3):
+        step = np.zeros(5)
+        step[k] = 1e-6
+        after, before = (
+            problem.linearize(models.CameraState(state.camera + s, state.frames), np.arange(1))
+            for s in (step, -step)
+        )
+        slope = (after.cost[0] - before.cost[0]) / 2e-6
+        assert equations.gradient[k] == pytest.approx(slope, rel=1e-5)
+
+
+def test_the_prior_holds_what_frames_do_not_determine() -> None:
+    """Untilted frames of a lens without distortion have neither a centre nor a focal length."""
+    fit = fit_homographies(views(6, tilt_deg=0.0, k=0.0))
+    assert fit.sigma[:2] == pytest.approx([models.CENTRE_PRIOR_SIGMA * HALF] * 2, rel=0.1)
+    assert abs(fit.centre - [93.5, 59.5]).max() < fit.sigma[0]

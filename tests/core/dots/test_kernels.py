@@ -133,6 +133,24 @@ def test_soft_bits_are_the_same() -> None:
         np.testing.assert_allclose(a, b, atol=1e-4)
 
 
+def test_of_two_dots_at_a_node_the_likelier_one_counts_without_kernels_too() -> None:
+    for order in ([0, 1, 2], [2, 1, 0], [1, 0, 2]):
+        offset = np.array([[1 / 6, 0.01], [-0.25, 0.1], [0.3, 0.3]], np.float32)[order]
+        lattices = grid.DotLattices(
+            parameters=np.zeros((1, 9)),
+            points=np.zeros((1, 3, 2), np.float32),
+            valid=np.ones((1, 3), bool),
+            uv=np.array([1, 0], np.float32) + offset[None],
+            nodes=np.tile(np.array([1, 0], np.float32), (1, 3, 1)),
+            sigma=np.array([0.02]),
+            fitted=np.ones(1, bool),
+            lens=True,
+        )
+        columns, rows = softbits.soft_bits_numpy(lattices, 5, np.array([0.03]))
+        assert np.count_nonzero(columns) == np.count_nonzero(rows) == 1
+        assert columns[0, 5, 6] < -3 < 3 < rows[0, 5, 6]  # right: column bit 0, row bit 1
+
+
 @needs_kernels
 @pytest.mark.parametrize("name", ["anoto", "libdots", "microdots"])
 @pytest.mark.parametrize(

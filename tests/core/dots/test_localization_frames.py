@@ -25,6 +25,7 @@ from locatk.core.dots.localization.frames import (
     LocalizedFrames,
     dot_correspondences,
     localize_frames,
+    unlocalized_frames,
 )
 from locatk.core.errors import InputError
 
@@ -489,6 +490,18 @@ def test_frames_of_any_shape(size: tuple[int, int]) -> None:
 
 def test_no_frames() -> None:
     assert len(localize_frames(np.zeros((0, 120, 188), np.uint8), codec("anoto"))) == 0
+
+
+def test_updates_keep_the_better_result() -> None:
+    result = unlocalized_frames(4, "too_few_dots")
+    result.confidence[:] = [0.5, 0.5, 0.5, 0.9]
+    part = unlocalized_frames(4, "no_code")
+    part.confidence[:] = [0.4, 0.6, 0.4, 0.9]
+    part.rejected[2] = ""
+    result.update(np.arange(4), part)
+    # Worse; better; accepted although of less confidence; equal.
+    assert result.rejected.tolist() == ["too_few_dots", "no_code", "", "no_code"]
+    assert result.confidence.tolist() == [0.5, 0.6, 0.4, 0.9]
 
 
 # --- what the dots say
