@@ -171,7 +171,7 @@ def calibrate(
     selected = select_diverse_frames(size, localized, len(frames))
 
     # With the lens known, more dots and more frames are decoded: so examine them once more.
-    lens = _camera(size, fit_homographies(stack_views(size, selected)), _usual_focal(size))
+    lens = camera_of_fit(size, fit_homographies(stack_views(size, selected)), _usual_focal(size))
     again = [frame.index for frame in selected]
     blank = [index for index, outcome in outcomes.items() if outcome == NO_PATTERN]
     again += blank[: max(MAX_FITTED_FRAMES - len(again), 0)]
@@ -185,7 +185,7 @@ def calibrate(
         isinstance(outcome, CalibrationFrame) and outcome.size != size
         for outcome in outcomes.values()
     )
-    return _calibrate_views(
+    return calibrate_views(
         stack_views(size, frames_of_size(outcomes, again, size)),
         options,
         len(outcomes),
@@ -198,7 +198,7 @@ def _usual_focal(size: tuple[int, int]) -> float:
     return USUAL_FOCAL_DIAGONALS * math.hypot(*size)
 
 
-def _camera(size: tuple[int, int], fit: CameraFit, focal: float) -> Camera:
+def camera_of_fit(size: tuple[int, int], fit: CameraFit, focal: float) -> Camera:
     """Return the camera of a fit; raise DegenerateError if it is not plausible."""
     (width, height), (x, y) = size, fit.centre.tolist()
     corner = math.hypot(max(x, width - 1 - x), max(y, height - 1 - y))
@@ -212,7 +212,7 @@ def _camera(size: tuple[int, int], fit: CameraFit, focal: float) -> Camera:
     return Camera(size, focal, (x, y), fit.radial * focal**2)
 
 
-def _calibrate_views(
+def calibrate_views(
     views: CalibrationViews, options: CalibrateOptions, examined: int, skipped: dict[str, int]
 ) -> CameraReport:
     """Fit the camera to selected frames, with those of its parameters that they determine."""
@@ -236,7 +236,7 @@ def _calibrate_views(
         focal, source = best.focal, "frames"
     elif options.camera is not None and options.camera.size == size:
         focal, source = options.camera.focal_px, "camera"
-    camera = _camera(size, best, focal)
+    camera = camera_of_fit(size, best, focal)
     notes = [
         *_misfit_notes(by_poses, by_homographies, is_pinhole=is_pinhole),
         *_focal_notes(by_poses, camera, source, is_tilted=is_tilted, is_pinhole=is_pinhole),

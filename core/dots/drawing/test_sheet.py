@@ -26,7 +26,7 @@ SIZES = ("A4", "Letter")
 PITCH_UNITS_PER_INCH = 1200
 """Unit of the pitches per inch."""
 
-PITCHES = (14, 16, 20, 24, 28, 32)
+FIELD_PITCHES_1200TH_INCH = (14, 16, 20, 24, 28, 32)
 """Pitches in 1/1200 in: 0.296, 0.339, 0.423, 0.508, 0.593 and 0.677 mm."""
 
 DOT_WIDTHS_PX = {300: (1, 2, 3), 600: (1, 2, 3, 4, 5), 1200: (1, 2, 3, 4, 5, 6, 8)}
@@ -189,7 +189,7 @@ def printer_sheet(paper: str, dpi: int, codec_name: str = "anoto") -> PrinterShe
     first = MARKERS_PER_SHEET * _variants().index((paper, dpi, codec_name))
     corners = tuple(CornerMarker(first + n, at, module) for n, at in enumerate(marker_corners))
     unit = PITCH_UNITS_PER_INCH
-    pitches = [p * dpi // unit for p in PITCHES if p * dpi % unit == 0]
+    pitches = [p * dpi // unit for p in FIELD_PITCHES_1200TH_INCH if p * dpi % unit == 0]
     dots = DOT_WIDTHS_PX[dpi]
     left, top = pixels(LEFT_MM), pixels(TOP_MM)
     column_step = (width - edge - left) // len(dots)

@@ -177,23 +177,23 @@ def _decode_soft(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWind
     windows = _pad_to_square(column_bits), _pad_to_square(row_bits)
     length = windows[0].shape[1]
     estimates = estimate_windows(*windows, codec)
-    confidence = _resolve_doubts(estimates, *windows, codec)
+    confidence = resolve_doubts(estimates, *windows, codec)
     doubtful = np.flatnonzero(confidence < MIN_CONFIDENCE)
     if len(doubtful) and length <= MAX_SMALL_WINDOW_LINES:
         part = windows[0][doubtful], windows[1][doubtful]
         second_rotation = np.argsort(-rotation_scores(*part), axis=0)[1]
         other = estimate_rotated_windows(*part, second_rotation, codec)
-        other_confidence = _resolve_doubts(other, *part, codec)
+        other_confidence = resolve_doubts(other, *part, codec)
         better = other_confidence > confidence[doubtful]
         for values, other_values in zip(estimates, other, strict=True):
             values[doubtful[better]] = other_values[better]
         confidence[doubtful[better]] = other_confidence[better]
     _, rows, columns = column_bits.shape
     dots = np.count_nonzero(windows[0], axis=(1, 2))
-    return _as_decoded(estimates, confidence, dots, (length - rows, length - columns))
+    return as_decoded(estimates, confidence, dots, (length - rows, length - columns))
 
 
-def _resolve_doubts(
+def resolve_doubts(
     estimates: WindowEstimates, column_bits: Bits, row_bits: Bits, codec: Codec
 ) -> NDArray[np.float64]:
     """Return the confidence (n,) of estimates; search for better ones if in doubt.
@@ -243,7 +243,7 @@ def _resolve_doubts(
     return result
 
 
-def _as_decoded(
+def as_decoded(
     estimates: WindowEstimates,
     confidence: NDArray[np.float64],
     dots: Integers,

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from locatk.core.dots.calibration import camera as calibration
 from locatk.core.dots.calibration import camera_fit as models
 from locatk.core.dots.calibration.camera_fit import (
     CalibrationViews,
@@ -299,3 +300,30 @@ def test_the_prior_holds_what_frames_do_not_determine() -> None:
     fit = fit_homographies(views(6, tilt_deg=0.0, k=0.0))
     assert fit.sigma[:2] == pytest.approx([models.CENTRE_PRIOR_SIGMA * HALF] * 2, rel=0.1)
     assert abs(fit.centre - [93.5, 59.5]).max() < fit.sigma[0]
+
+
+def test_frames_that_are_no_poses_have_no_focal_length() -> None:
+    """Sheared frames are homographies of the sheet, but no images of a pinhole camera."""
+    seen = views(25, tilt_deg=15.0)
+    seen.pixels[..., 0] += 0.05 * (seen.pixels[..., 1] - CENTRE[1])
+    report = calibration.calibrate_views(seen, calibration.CalibrateOptions(), 25, {})
+    assert report.focal_from == "usual"
+    assert report.notes[0].startswith("the frames are not what a pinhole sees of a flat sheet")
+
+
+@pytest.mark.parametrize(
+    ("centre", "radial", "plausible"),
+    [
+        ((93.5, 59.5), -3.5e-6, True),
+        ((-1.0, 59.5), -3.5e-6, False),
+        ((93.5, 120.0), -3.5e-6, False),
+        ((93.5, 59.5), -8e-5, False),
+    ],
+)
+def test_plausible_cameras(centre: Any, radial: float, plausible: bool) -> None:
+    fit = replace(fit_homographies(views(5)), centre=np.array(centre), radial=radial)
+    if plausible:
+        assert calibration.camera_of_fit(SIZE, fit, 350.0).centre_px == centre
+    else:
+        with pytest.raises(DegenerateError, match="no lens of this kind"):
+            calibration.camera_of_fit(SIZE, fit, 350.0)

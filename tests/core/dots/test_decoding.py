@@ -19,11 +19,13 @@ from locatk.core.dots.codec import (
     codec,
     sequences,
 )
+from locatk.core.dots.identification import decoding
 from locatk.core.dots.identification.decoding import (
     MIN_CONFIDENCE,
     DecodedWindows,
     identify_windows,
 )
+from locatk.core.errors import InputError
 
 CODECS = ("anoto", "libdots", "microdots")
 UP, LEFT, RIGHT, DOWN = range(4)
@@ -425,3 +427,48 @@ def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: i
     assert not (found.confidence >= MIN_CONFIDENCE).any()
     if side == 20 and beyond == 2:  # most of it is of one section, so that its place is known
         assert found.border.all()
+
+
+# --- guards
+
+
+def estimates(**changes: Any) -> decoding.WindowEstimates:
+    """One window that was estimated beyond doubt, with some values changed."""
+    certain = {"log_odds": 100.0, "order_log_odds": 100.0, "lead": 100.0}
+    values: dict[str, Any] = {
+        name: np.array([[certain[name]] * 2]) if name in certain else np.zeros((1, 2), np.int64)
+        for name in decoding.WindowEstimates._fields
+    }
+    values["rotation"] = np.zeros(1, np.int64)
+    values["last"] = np.full((1, 2), 7, np.int64)
+    return decoding.WindowEstimates(**(values | changes))
+
+
+@pytest.mark.parametrize(
+    ("log_odds", "order_log_odds", "least", "most"),
+    [(100.0, 100.0, 0.9999999, 1), (0.0, 100.0, 0.49, 0.51), (100.0, -5.0, 0.35, 0.45)],
+)
+def test_evidence_against_random_bits_and_against_other_codecs(
+    log_odds: float, order_log_odds: float, least: float, most: float
+) -> None:
+    bits = np.ones((1, 8, 8), np.float32)
+    changes = {
+        "log_odds": np.array([[log_odds, 100.0]]),
+        "order_log_odds": np.array([[order_log_odds, 100.0]]),
+    }
+    (confidence,) = decoding.resolve_doubts(estimates(**changes), bits, bits, codec("anoto"))
+    assert least <= confidence <= most
+
+
+def test_windows_across_a_border_have_no_confidence() -> None:
+    across = estimates(position=np.array([[SECTION_LENGTH - 3, 0]]))
+    for window, border in ((across, True), (estimates(), False)):
+        found = decoding.as_decoded(window, np.array([0.9999]), np.array([64]), (0, 0))
+        assert found.border.tolist() == [border]
+        assert found.confidence.tolist() == [0.0 if border else 0.9999]
+
+
+def test_windows_of_too_many_lines_are_refused() -> None:
+    bits = np.zeros((1, 65, 8), np.float32)
+    with pytest.raises(InputError, match="8 x 65 positions, more than 64"):
+        identify_windows(bits, bits, codec("anoto"))

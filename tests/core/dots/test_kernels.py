@@ -218,3 +218,18 @@ def test_the_kernels_can_be_left_out() -> None:
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert answer.stdout.strip() == "None"
+
+
+def test_dots_far_from_their_symbols_are_not_assigned() -> None:
+    dots = blobs.detect_dots_numpy(drawn(8, 1))
+    lattices = grid.fit_lattices_numpy(as_points(dots), dots.valid, lens=True)
+    half = softbits.window_half_width(lattices)
+    windows = decode.identify_windows(*softbits.soft_bits(lattices, half), ANOTO)
+    used = pose.assign_dots(lattices, half, windows, ANOTO).used[0]
+    first, second = np.flatnonzero(used)[:2]
+    lattices.uv[0, first, 0] += 1.2 * grid.SYMBOL_GATE_PITCHES
+    lattices.uv[0, second, 0] += 1e-3
+    after = pose.assign_dots(lattices, half, windows, ANOTO).used[0]
+    assert not after[first]
+    assert after[second]
+    assert (after | (np.arange(len(after)) == first))[used].all()
