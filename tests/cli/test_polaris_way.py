@@ -74,11 +74,16 @@ def test_published_runs_teach_how_their_tag_was_built(
 
 def test_a_simulated_tag_is_measured_as_it_was_built(locatk, tmp_path: Path) -> None:
     """From four sides; the simulation knows finite magnets, and where it put them."""
+    config = tmp_path / "sim.toml"
+    config.write_text(
+        'format = "locatk-simulation-polaris"\nformat_version = 1\n'
+        "[build]\nangle_deg = 5\nposition_mm = 0.3\nseed = 3\n"
+    )
     sessions = [tmp_path / f"side{k}.mcap" for k in range(4)]
     for k, session in enumerate(sessions):
         result = locatk(
             "simulate", "polaris", "-o", session, "--id", 77, "--heading", 90 * k + 10,
-            "--build-angle", 5, "--build-place", 0.3, "--build-seed", 3, "--seed", k,
+            "--config", config, "--seed", k,
         )  # fmt: skip
         assert result.exit_code == 0, result.stderr
     out = tmp_path / "built.toml"

@@ -261,7 +261,7 @@ def told(made: SimulatedSession, tag_id: int | None, refused: str | None = None)
     """The truth at some sample, as a detection."""
     at = 150
     heading = heading_from_quaternion(made.truth.quaternion[at : at + 1])[0]
-    magnets = turned(made.magnets.place_m - made.truth.position[at, :2], -heading)
+    magnets = turned(made.magnets.position_m - made.truth.position[at, :2], -heading)
     x, y = turned(-made.truth.position[at, :2][None], -heading)[0]
     return replace(
         DETECTION,

@@ -56,7 +56,8 @@ MAX_EARTH_FIELD_T = 65e-6
 """Strongest field of the Earth on its surface."""
 
 WORST_PATTERN = 2
-"""Index of landmark 3, NNNS, whose valleys are the most displaced: radii and tolerances are its."""
+"""Index of landmark 3, NNNS, whose valleys are the most displaced. The radii and tolerances of a
+geometry are those of this pattern."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +81,14 @@ class PatternAnalysis:
         Angular width of the gulf of the threshold contour at each valley
         (:data:`.territory.GULF_DEPTH_M`).
     r1_m, r2_m : float
-        Radii of the quarter discs of the threshold between equal and unequal bars; ``nan`` if the
-        pattern has none.
+        Radii of the quarter discs in which the field exceeds the threshold: r1 between two bars of
+        equal sign, r2 of unequal sign; ``nan`` if the pattern has none.
     bias_m : (2,) ndarray
         Centre as estimated by the paper's intersection of valleys (section 3.3); ``nan`` if the
         number of valleys is not the expected one.
     slope_t_per_m : (4,) ndarray
-        Gradient of the field over each bar, along it and counter-clockwise: the best line within a
-        quarter of the bar's length on both sides of the zero.
+        Slope of the field along each bar, counter-clockwise: that of the line fitted within a
+        quarter of the bar's length of its zero.
     zero_m : (4,) ndarray
         Distance from the middle of each bar to that zero, counter-clockwise; ``nan`` without one.
     departure_m : (4,) ndarray
@@ -122,7 +123,11 @@ class PatternAnalysis:
 
 @dataclass(frozen=True)
 class ToleranceEffect:
-    """Effect of one deviation on landmark 3 (NNNS); quantities as in :class:`PatternAnalysis`."""
+    """Effect of one deviation on landmark 3 (NNNS).
+
+    Its radii r1 and r2 and the length of its bias (:class:`PatternAnalysis`), and the largest field
+    of any pattern (:class:`LandmarkAnalysis`).
+    """
 
     deviation: str
     r1_m: float

@@ -23,10 +23,11 @@ HALF_TURN_SYMMETRIC_LETTERS = {"6": 6, "16": 4, "compass": 0}
 def max_distinct_readings(alphabet: str, window: str, detect: int = 0) -> int:
     """Return the largest number of different readings of one floor, over all headings.
 
-    A window that can also be driven backwards (all but ``L``) reads a word and, at the opposite
-    heading, its rotated reverse. Words that equal their rotated reverse cannot occur in a unique
-    map: palindromes of straight windows for ``"6"``, 16 of 256 words of ``I2`` and 256 of 65,536
-    words of ``2x2`` for ``"16"``. If ``detect`` misread landmarks are to be detected, no two
+    The cells of a window (of all but ``L``) are also those of a window at the opposite heading. It
+    reads the same landmarks rotated by half a turn: in reverse order, or for ``2x2`` as c, d, a, b.
+    A word that equals its counterpart cannot occur in a unique map: palindromes of straight windows
+    (of ``2x2`` abab) for ``"6"``, 16 of 256 words of ``I2`` and 256 of 65,536 words of ``2x2`` for
+    ``"16"``. If ``detect`` misread landmarks are to be detected, no two
     readings may agree in all but that many letters (Singleton bound: R. C. Singleton, IEEE Trans.
     Inf. Theory 10, 116, 1964). With ``compass`` each heading has words of its own.
     """

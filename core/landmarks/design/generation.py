@@ -28,7 +28,8 @@ from locatk.core.landmarks.map.windows import (
 TEMPERATURE_RANGES = ((0.45, 0.3), (0.6, 0.4), (0.38, 0.3), (0.8, 0.5))
 """Start and end temperature, in conflicts, of the cooling rounds, which take turns.
 
-Loose maps are found with any of them. Which one suits a tight map is not known beforehand.
+Maps with far fewer readings than words are found with any of them. Which range suits a map with
+nearly as many readings as words is not known beforehand.
 """
 
 ROUND_LENGTHS = (1, 3, 9)
@@ -80,14 +81,14 @@ class DesignOptions:
 def design_map(
     options: DesignOptions, progress: Callable[[float, int], None] | None = None
 ) -> FloorMap:
-    """Search a unique map; equal options give equal maps, with or without compiled loops.
+    """Search for a unique map; equal options give equal maps, with or without compiled loops.
 
     Parameters
     ----------
     options : DesignOptions
     progress : function, optional
-        Called at intervals with the used fraction of the budget and the number of readings that
-        still equal an earlier one.
+        Called at intervals with the used fraction of the budget and the number of words that still
+        equal an earlier one; a reading has one word, or with ``detect`` one per choice of letters.
 
     Raises
     ------
@@ -117,7 +118,7 @@ def design_map(
     steps_per_stage = options.evaluations / max(1.0, evaluations_per_step) / STAGES_PER_ROUND
     steps_per_stage = steps_per_stage / len(TEMPERATURE_RANGES) / sum(ROUND_LENGTHS)
     stages = len(ROUND_LENGTHS) * len(TEMPERATURE_RANGES) * STAGES_PER_ROUND
-    fewest_repeats = len(problem.item_cells)
+    fewest_repeats, used = len(problem.item_cells), 0
     values = random_values(cell_count, letters, options.seed)
     for index in range(stages):
         number, stage = divmod(index, STAGES_PER_ROUND)
@@ -132,10 +133,14 @@ def design_map(
             codes = np.array(ALPHABET_CODES[alphabet])[values].reshape(has_landmark.shape)
             return with_codes(blank, np.where(has_landmark, codes, HOLE), options.seed)
         fewest_repeats = min(fewest_repeats, repeats)
+        used += length
         if progress is not None:
-            progress((index + 1) / stages, repeats)
+            progress(
+                used / (STAGES_PER_ROUND * len(TEMPERATURE_RANGES) * sum(ROUND_LENGTHS)), repeats
+            )
     raise DegenerateError(
-        f"no map was found: at best {fewest_repeats} of {len(cells)} readings repeat another one",
+        f"no map was found: at best {fewest_repeats} of {len(problem.item_cells)} words of its "
+        "readings repeat another one",
         hint="try another seed, a row less, a larger window, the alphabet 16, or more holes",
     )
 
@@ -193,10 +198,14 @@ def empty_floor(options: DesignOptions) -> FloorMap:
 def with_codes(
     floor: FloorMap, codes: np.ndarray, seed: int, notes: tuple[str, ...] = ()
 ) -> FloorMap:
-    """Return the floor with other codes."""
+    """Return the floor with other codes, and with the seed and notes of these codes."""
     return replace(floor, codes=np.asarray(codes, np.int64), seed=seed, notes=notes)
 
 
 def _stage_seed(seed: int, stage: int, purpose: int) -> int:
-    """Return a seed far from the others: the generator's own states advance by one odd number."""
+    """Return a seed whose random numbers do not overlap those of other stages.
+
+    SplitMix64 advances its state by :data:`.search.GOLDEN_GAMMA`; seeds must not differ by few such
+    steps. The purpose is 1 for initial letters and 2 for the search.
+    """
     return (seed + 1) * 0xD1342543DE82EF95 + (stage << 8 | purpose) * 0xAF251AF3B0F025B5

@@ -29,7 +29,11 @@ MAX_LISTED_STARTS = 10
 """Starts that are listed by name."""
 
 MAX_LANDMARKS_UNCHECKED = 40
-"""Landmarks after which the starts that no drive can distinguish are determined and given up."""
+"""Landmarks after which the starts that this drive never distinguishes are determined and
+dropped."""
+
+LETTER_RANGE = 32
+"""Letters are smaller than this number: an observation is ``turn * LETTER_RANGE + letter``."""
 
 NO_TURN = 4
 """Value of a turn if the robot cannot leave its cell."""
@@ -87,7 +91,7 @@ def count_localization_steps(floor: FloorMap) -> LocalizationSteps:
             # A group continues while one of its starts can be distinguished from the others.
             remaining &= np.bincount(group, is_distinguishable[start])[group] > 0
         start, state, group = start[remaining], state[remaining], group[remaining]
-        group = group * ((NO_TURN + 1) * 32) + drive.observation[state]
+        group = group * ((NO_TURN + 1) * LETTER_RANGE) + drive.observation[state]
         state = drive.next_state[state]
         visited += 1
     return _summarize(landmarks.reshape(*floor.shape, 4))
@@ -143,7 +147,8 @@ class LocalizationDrive:
         letter = letter.reshape(-1)
         cell = np.arange(count)[:, None, None]
         turn = np.full((count, 4, phases), NO_TURN)
-        for fallback in (2, 3, 1, 0):  # Ahead is preferred, then left, right, back.
+        # Each overwrites the one before: ahead is preferred, then left, right, back.
+        for fallback in (2, 3, 1, 0):
             is_passable = passable[:, (heading + fallback) % 4, None]
             turn[np.broadcast_to(is_passable, turn.shape)] = fallback
         follows_window = passable[cell, (heading[:, None] + wanted) % 4]
@@ -155,7 +160,7 @@ class LocalizationDrive:
             turn == NO_TURN, cell * 4 + heading[:, None], next_cell * 4 + next_heading
         )
         next_phase = np.where(follows_window, (np.arange(phases) + 1) % phases, 0)
-        observation = turn * 32 + letter[next_pose]
+        observation = turn * LETTER_RANGE + letter[next_pose]
         next_state = next_pose * phases + next_phase
         return cls(phases, letter, next_state.reshape(-1), observation.reshape(-1))
 
@@ -182,7 +187,8 @@ class LocalizationDrive:
 def window_turns(window: str) -> tuple[int, ...]:
     """Return the quarter turns before each step of a window's path and of its mirror image."""
     steps = np.diff(np.array(WINDOW_PATHS[window]), axis=0)
+    # At heading 0, ahead is along the columns and left along the rows.
     directions = [STEPS.index((int(left), int(ahead))) for ahead, left in steps]
     turns = [after - before for before, after in zip([0, *directions], directions, strict=False)]
-    folded = [(turn + 1) % 4 - 1 for turn in turns]
-    return (*folded, *(-turn for turn in folded))
+    signed_turns = [(turn + 1) % 4 - 1 for turn in turns]
+    return (*signed_turns, *(-turn for turn in signed_turns))

@@ -131,12 +131,12 @@ class MapProof:
 
     @property
     def landmarks_mean(self) -> float | None:
-        """Mean number of landmarks to visit until the position is known, over all starts."""
+        """Mean number of landmarks to visit, over the starts that can be distinguished."""
         return self.localization.mean if self.localization else None
 
     @property
     def landmarks_p99(self) -> float | None:
-        """Number of landmarks that suffices for 99 % of the starts."""
+        """99th percentile of that number, interpolated."""
         return self.localization.p99 if self.localization else None
 
     @property
@@ -151,7 +151,7 @@ def prove_map(floor: FloorMap, *, steps: bool = True) -> MapProof:
     Parameters
     ----------
     floor : FloorMap
-        Any map; its own statements are not used.
+        Map as designed: as-built records are ignored. Its ``detect`` is checked, not assumed.
     steps : bool
         Count the landmarks until localization from each start too.
     """

@@ -1,4 +1,4 @@
-"""Search of a map: letters of cells are redrawn where two windows read the same."""
+"""Search for a map: letters of cells are redrawn where two windows read the same."""
 
 from __future__ import annotations
 
@@ -33,12 +33,17 @@ UINT64_MASK = (1 << 64) - 1
 class SearchProblem:
     """Items whose words must all be different.
 
+    Each cell has a value, the index of its letter. An item is a reading, or a choice of some of its
+    letters. Its word is the integer ``base[item] + sum(parts[item_rows[item, k],
+    values[item_cells[item, k]]])`` over its letters k. A use is an occurrence of a cell in an item.
+
     Attributes
     ----------
     item_cells, item_rows : (items, length) int32 ndarray
         Cells whose letters make each word, and their rows of ``parts``.
     first : (cells + 1,) int32 ndarray
-        Rows ``first[cell]`` to ``first[cell + 1] - 1`` of the next two are the uses of a cell.
+        The uses of a cell are ``first[cell]`` to ``first[cell + 1] - 1`` of ``use_item`` and
+        ``use_row``.
     use_item, use_row : int32 ndarray
         Item of each use, and its row of ``parts``.
     parts : (rows, letters) uint64 ndarray
@@ -202,7 +207,8 @@ def search_python(
     An item in conflict is drawn, then one of its cells. For each letter the conflicts that the
     cell would have are counted: each of its items has as many as there are other items with the
     same word. The letter is drawn with a weight that depends on its excess of conflicts over the
-    best letter, as at a temperature ("heat bath"). Items without a conflict are never changed.
+    best letter, as at a temperature ("heat bath"). Only cells of an item in conflict are redrawn,
+    which also changes the words of the other items that use the cell.
     """
     state = seed & UINT64_MASK
 
@@ -219,7 +225,9 @@ def search_python(
     first = problem.first.tolist()
     uses = list(zip(problem.use_item.tolist(), problem.use_row.tolist(), strict=True))
     counts: dict[int, int] = {}
+    # XOR of all items with a word: of exactly two, XOR with one gives the other.
     item_xor: dict[int, int] = {}
+    # Items that may be in conflict; those that no longer are are removed when they are drawn.
     listed: list[int] = []
     is_listed = [False] * len(word_of)
 

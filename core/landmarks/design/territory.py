@@ -64,11 +64,11 @@ def threshold_contour(geometry: Geometry, strengths: ArrayLike, angles_rad: Arra
 
 
 def territory_radii(angles_rad: Array, contour_m: Array, strengths: Array) -> tuple[float, float]:
-    """Return r1 and r2: radii of the circles that deviate least from one contour.
+    """Return r1 and r2: mean radii of a contour in quarters between equal and unequal bars.
 
-    The circle of the smallest standard deviation (section 3.1 of the paper) is the mean over
-    :data:`SECTOR_DEG` of each quarter. The gulf of the valley between two equal bars is left out.
-    A radius without a quarter is ``nan``.
+    The paper (section 3.1) takes the circle of least standard deviation, which is this mean. Only
+    the middle of each quarter (:data:`SECTOR_DEG`) counts, without the gulf between equal bars.
+    ``nan`` if there is no such quarter.
     """
     degrees = np.degrees(angles_rad) % 360
     in_sector = (degrees % 90 >= SECTOR_DEG[0]) & (degrees % 90 <= SECTOR_DEG[1])
@@ -147,7 +147,10 @@ def max_neighbour_field(geometry: Geometry, pitch_m: ArrayLike) -> tuple[Array, 
 
 
 def min_pitch_for_field(geometry: Geometry, limit_t: float) -> float:
-    """Return the pitch at which the nearest neighbour adds ``limit_t``; ``nan`` without one."""
+    """Return the smallest pitch from which the nearest neighbour adds no more than ``limit_t``.
+
+    At least the smallest possible pitch; ``nan`` if there is none up to :data:`MAX_PITCH_FACTOR`.
+    """
     smallest = geometry.radius_m + geometry.circle_m + geometry.bar_length_m / 2
     pitch = np.geomspace(smallest, MAX_PITCH_FACTOR * smallest, 60)
     field = max_neighbour_field(geometry, pitch)[0]

@@ -1,7 +1,7 @@
 """Neutral valleys of a landmark on the circle of the sensors, and linear fits over its bars.
 
-A neutral valley is a zero of the upright field on the circle on which the robot's sensors turn
-(Neutral Magnetic Valley, section 3.3 of the paper).
+A neutral valley is a zero of the vertical component of the field on the circle on which the
+robot's sensors turn (Neutral Magnetic Valley, section 3.3 of the paper).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ VALLEY_COUNTS = (4, 6, 6, 6, 8, 8)
 """Number of valleys of each of :data:`PATTERNS` (section 3.3 of the paper)."""
 
 SAMPLE_PHASE_STEPS = 0.37
-"""Offset of the sampled angles, in steps: the field is zero to rounding at symmetric angles."""
+"""Offset of the sampled angles, in steps, so that no sample is at an angle of symmetry, where the
+field is zero up to rounding and its sign random."""
 
 VALLEY_SAMPLES = 1440
 """Samples of the circle between which valleys are located: a quarter of a degree each."""

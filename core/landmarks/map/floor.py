@@ -22,8 +22,9 @@ HOLE = -1
 """Code of a cell without a landmark."""
 
 ALPHABETS = ("6", "16", "compass")
-"""What is read of a landmark: its pattern; its pattern and orientation; or the pattern and
-orientation of the three patterns that give the heading on their own, all in one orientation."""
+"""What a robot reads of a landmark. ``"6"``: which of the paper's six patterns, equal up to
+rotation, it is. ``"16"``: the polarity of each bar. ``"compass"``: the same, but the map has only
+three patterns, all in the same orientation, each of which gives the heading."""
 
 WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
 """Names of the windows; their cells are in :data:`.windows.WINDOW_PATHS`."""
@@ -43,7 +44,7 @@ def neighbour(cell: Cell, heading: int) -> Cell:
 
 @dataclass(frozen=True)
 class AsBuiltLandmark:
-    """Pose and bar strengths of one landmark as measured by ``locatk calibrate map``.
+    """Offset from the design, and bar strengths, of one landmark (``locatk calibrate map``).
 
     Attributes
     ----------
@@ -130,7 +131,8 @@ class FloorMap:
     def open(self, cell: Cell, heading: int) -> bool:
         """Return whether a robot can drive from ``cell`` to the next one at a heading.
 
-        The heading is in quarter turns. Holes, walls and the border are not passable.
+        The heading is in quarter turns. Holes, walls and the border are not passable; ``cell``
+        itself may be a hole.
         """
         row, column = neighbour(cell, heading)
         rows, columns = self.shape
@@ -145,7 +147,7 @@ class FloorMap:
 def as_built_landmark(floor: FloorMap, cell: Cell) -> tuple[Array, Array]:
     """Return the pose (3,) in the map frame and the signed bar strengths (4,) of a landmark.
 
-    Both are as designed as far as they were not measured.
+    What was not measured is as designed.
     """
     pose = np.array([*floor.place(cell), 0.0])
     strength = signs(floor.codes[cell])

@@ -168,11 +168,12 @@ def fit_grid(
     origin = (position - pitch * steps).mean(0)
     offset = position - origin - pitch * steps
     _check_offsets(offset, names, pitch, tolerance_m)
+    # Three parameters are fitted: the pitch and the origin.
     scatter = math.sqrt((offset**2).sum() / max(offset.size - 3, 1))
     if pitch_m is None:
         pitch = _round_mm(pitch, ROUNDING_SIGMAS * scatter / math.sqrt(sum_of_squares))
-    tolerance = ROUNDING_SIGMAS * scatter / math.sqrt(len(position))
-    x, y = (_round_mm(value, tolerance) for value in (position - pitch * steps).mean(0).tolist())
+    rounding = ROUNDING_SIGMAS * scatter / math.sqrt(len(position))
+    x, y = (_round_mm(value, rounding) for value in (position - pitch * steps).mean(0).tolist())
     return FittedGrid(pitch, (x, y), cells, position - [x, y] - pitch * steps)
 
 
@@ -234,5 +235,5 @@ def _round_mm(value_m: float, tolerance_m: float) -> float:
     for decimals in _DECIMALS_MM:
         rounded = float(Decimal(repr(round(1e3 * value_m, decimals))).scaleb(-3))
         if abs(rounded - value_m) <= tolerance_m + 1e-10:
-            return rounded + 0.0
+            return rounded + 0.0  # 0.0 instead of -0.0
     return value_m

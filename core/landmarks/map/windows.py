@@ -33,7 +33,8 @@ ALPHABET_CODES: dict[str, tuple[int, ...]] = {
 }
 """Codes of the landmarks of each alphabet.
 
-The three patterns of ``compass`` differ under each heading, so that one landmark gives it.
+The three patterns of ``compass`` read differently at every heading, and none like another one at
+another heading, so that one landmark gives the heading.
 """
 
 
@@ -76,7 +77,7 @@ def letters_as_read(codes: Integers, heading: Integers, alphabet: str) -> Intege
     Codes and headings broadcast.
     """
     if alphabet == "6":
-        return PATTERN_OF[codes + 0 * heading]
+        return PATTERN_OF[np.broadcast_arrays(codes, heading)[0]]
     return rotated(codes, -heading)
 
 
@@ -90,8 +91,10 @@ def passable_steps(floor: FloorMap) -> Bools:
     padded = np.zeros((rows + 2, columns + 2), bool)
     padded[1:-1, 1:-1] = has_landmark
     passable = np.zeros((rows, columns, 4), bool)
-    for heading, (down, right) in enumerate(STEPS):
-        has_next = padded[1 + down : 1 + down + rows, 1 + right : 1 + right + columns]
+    for heading, (row_step, column_step) in enumerate(STEPS):
+        has_next = padded[
+            1 + row_step : 1 + row_step + rows, 1 + column_step : 1 + column_step + columns
+        ]
         passable[..., heading] = has_landmark & has_next
     for first, second in floor.walls:
         for cell, next_cell in ((first, second), (second, first)):

@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
-from locatk.core.polaris.codec import families, mosk
-from locatk.core.polaris.codec import redundant as redundancy
+from locatk.core.polaris.codec import families, mosk, redundant
 from locatk.core.polaris.tag import Cell, TagLayout, Tags, vertices
 
 Array = NDArray[np.float64]
@@ -105,7 +104,7 @@ def read(
     member is read where no more than ``(min_distance - 1) // 2`` steps had to be corrected,
     ``P // 2`` less distance counting for each magnet missing; beyond that distance missing
     magnets are borne only where everything seen agrees and all other members are
-    :data:`SURE` steps further. *Codec redundant* reads what :func:`redundancy.decode`
+    :data:`SURE` steps further. *Codec redundant* reads what :func:`redundant.decode_word`
     accepts, then asks whether the family has it; as its code corrects misreads of any size,
     soft distances count one step a magnet at most, and the margin is a lower bound: what
     the ``5 - missing`` magnets cost that would change cheapest, the fewest in which another
@@ -220,7 +219,7 @@ def _read_member(tags: Tags, seen: _Seen, ids: tuple[int, ...]) -> Reading:
     if not len(rows):
         return _refusal(tags, seen, "not_in_family")
     seen_rows = rows[:, seen.column]
-    expected = np.where(seen_rows == families.EMPTY, np.nan, seen_rows)
+    expected = np.where(seen_rows == families.EMPTY_CELL, np.nan, seen_rows)
     owner = np.arange(len(ids))
     electable = np.ones(len(ids), bool)
     number = _numbers(ids) if tags.built else {}
@@ -254,7 +253,7 @@ def _read_member(tags: Tags, seen: _Seen, ids: tuple[int, ...]) -> Reading:
 
 def _read_redundant(tags: Tags, seen: _Seen) -> Reading:
     """Words of the redundant code."""
-    cells = redundancy.cells(tags)
+    cells = redundant.cells(tags)
     if not set(seen.cells) <= set(cells):
         return _refusal(tags, seen, "no_such_placement")
     missing = tags.magnets - len(seen.cells)
@@ -263,13 +262,13 @@ def _read_redundant(tags: Tags, seen: _Seen) -> Reading:
     for place, symbol in zip(where, seen.nearest, strict=True):
         word[place] = symbol
     expected: dict[int, Array] = {}
-    decoded = redundancy.decode(tags, word)
+    decoded = redundant.decode_word(tags, word)
     if decoded is not None:
-        expected[redundancy.message(tags, decoded)] = np.array(decoded, float)[where]
+        expected[redundant.id_of_word(tags, decoded)] = np.array(decoded, float)[where]
     if tags.built:
         built, rows = tuple(tags.built), _built(tags, tuple(tags.built))[:, seen.column]
         misread = (np.abs(_deviation(tags, rows, seen)) > 0.5).sum(axis=1)
-        for k in np.flatnonzero(2 * misread + missing <= redundancy.BUDGET):
+        for k in np.flatnonzero(2 * misread + missing <= redundant.MAX_DECODING_WEIGHT):
             expected[built[k]] = rows[k]
     if not expected:
         return _refusal(tags, seen, "beyond_code")
@@ -290,11 +289,11 @@ def _read_redundant(tags: Tags, seen: _Seen) -> Reading:
 
 def _code_margin(tags: Tags, symbols: NDArray[np.int_], costs: Array, seen: _Seen) -> float:
     """How much more another word costs at least: it differs in ``5 - missing`` magnets."""
-    others = np.repeat(np.arange(redundancy.field_size(tags.orientations))[:, None], len(costs), 1)
+    others = np.repeat(np.arange(redundant.field_size(tags.orientations))[:, None], len(costs), 1)
     there = _capped(tags, others.astype(float), seen)
     there[symbols, np.arange(len(costs))] = np.inf
     changes = np.sort(there.min(axis=0) - costs)
-    differing = redundancy.DISTANCE - (tags.magnets - len(seen.cells))
+    differing = redundant.MIN_WORD_DISTANCE - (tags.magnets - len(seen.cells))
     return float(changes[:differing].sum())
 
 
@@ -351,14 +350,14 @@ def _accepted(
 
 def _id_of(tags: Tags, cells: tuple[Cell, ...], symbols: Sequence[int]) -> int:
     """The id of magnets in any order."""
-    pairs = sorted(zip(cells, symbols, strict=True), key=lambda pair: mosk.row_first(pair[0]))
+    pairs = sorted(zip(cells, symbols, strict=True), key=lambda pair: mosk.row_major_key(pair[0]))
     return codec.id_of(tags, TagLayout(tuple(c for c, _ in pairs), tuple(s for _, s in pairs)))
 
 
 def _built(tags: Tags, ids: tuple[int, ...]) -> Array:
     """Orientations (n, K * K) in steps of tags as they were built; nan where no magnet is."""
     rows = _members(tags, ids)
-    taken = rows != families.EMPTY
+    taken = rows != families.EMPTY_CELL
     result = np.where(taken, rows, np.nan)
     # A table's row has its magnets in the order of the layout. Angles turn the other way.
     angles = np.concatenate([np.asarray(tags.built[tag_id].angle_rad) for tag_id in ids])
@@ -367,7 +366,7 @@ def _built(tags: Tags, ids: tuple[int, ...]) -> Array:
 
 
 def _members(tags: Tags, ids: tuple[int, ...]) -> NDArray[np.int16]:
-    """:func:`families.table`, remembered."""
+    """:func:`families.symbol_table`, remembered."""
     return _table(tags.order, tags.magnets, tags.orientations, tags.codec, ids)
 
 
@@ -376,7 +375,7 @@ def _table(
     order: int, magnets: int, orientations: int, name: str, ids: tuple[int, ...]
 ) -> NDArray[np.int16]:
     design = Tags(order=order, magnets=magnets, orientations=orientations, codec=name)
-    rows = families.table(design, ids)
+    rows = families.symbol_table(design, ids)
     rows.flags.writeable = False
     return rows
 

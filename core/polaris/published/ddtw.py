@@ -11,8 +11,8 @@ Here the derivatives of a series are divided by their rms, one scale for the thr
   the middle of a magnet, all moments between 0 and 90 degrees then have the same template,
   and an axis without field divides by zero. It also takes the mean of the accumulated costs
   along the path instead of the last one.
-- One scale from the standard deviation of the samples depends on how densely a window is
-  sampled, which the derivative per sample follows as well.
+- The standard deviation of the samples does not depend on how densely a window is sampled, but
+  the derivative per sample does: divided by it, distances depend on the density.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ from locatk.core.polaris.array import Samples
 Array = NDArray[np.float64]
 
 MIN_QUIET_SAMPLES = 9
-"""Shortest start of a recording, or stretch between magnets, that gives a background: the
-mean of nine has a third of a sample's noise."""
+"""Least number of samples at the start of a recording, or between magnets, that give a background:
+the mean of nine has a third of a sample's noise."""
 
 MAX_QUIET_SIGMAS = 6.0
 """Largest deviation of an axis within the quiet start, in standard deviations of its noise;
@@ -101,9 +101,12 @@ def measure_signals(samples: Samples, width_samples: float) -> Signals:
     if len(samples) < 2 * MIN_QUIET_SAMPLES:
         raise InputError(f"{len(samples)} samples are too few to find magnets in")
     field = _interpolate_lost(samples.field_t)
-    # Second differences: the field of a magnet is smooth from sample to sample, noise is not.
-    second = np.abs(np.diff(field, 2, axis=0))
-    noise = NOISE_FROM_MEDIAN * np.median(second, axis=0) / np.sqrt(6.0)
+    # Second differences: the field of a magnet is smooth from sample to sample, noise is not. Their
+    # variance is 1 + 4 + 1 times that of a sample; interpolated samples have none.
+    measured = np.abs(np.diff(samples.field_t, 2, axis=0))
+    interpolated = np.abs(np.diff(field, 2, axis=0))
+    second = np.where(np.isnan(measured).all(axis=0), interpolated, measured)
+    noise = NOISE_FROM_MEDIAN * np.nanmedian(second, axis=0) / np.sqrt(6.0)
     raw = Signals(
         field_t=field,
         amplitude_t=field[..., 0],
@@ -183,6 +186,8 @@ def estimate_background(
     number = counts[stop] - counts[first]
     mean = (sums[stop] - sums[first]) / np.maximum(number, 1)[:, None, None]
     known = np.flatnonzero(is_clear & (number >= min(span, MIN_QUIET_SAMPLES // 2)))
+    if not len(known):
+        return np.zeros_like(signal.field_t)
     right = np.searchsorted(known, index).clip(1, max(len(known) - 1, 1))
     left, right = known[right - 1], known[np.minimum(right, len(known) - 1)]
     fraction = ((index - left) / np.maximum(right - left, 1)).clip(0, 1)[:, None, None]

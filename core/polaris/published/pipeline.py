@@ -11,7 +11,9 @@ The text leaves choices, and the released program (github.com/wjk5117/Polaris,
 scatter of the orientations in degrees, rms about each magnet's mean, per set. The authors'
 program reads 12 of the 13 right; its scatter over all runs is 4.7 and 9.8. Simulated passes
 were counted too: 220, with headings of 0, 45, 90, 135 and 180 degrees and others, tags of
-three to eight magnets, clearances of 5 to 15 mm, 100 and 40 samples per second.
+three to eight magnets, clearances of 5 to 15 mm, 100 and 40 samples per second. Each row of the
+table changes one choice of this implementation, its first row; a row with "..." changes the one
+above it. d is the spacing of the tag.
 
 =================================================  =====  ===========  =======================
 Choice                                             right  scatter      simulated: right, wrong
@@ -49,8 +51,8 @@ Neighbours not subtracted (text and release)       12     4.0, 3.7     203, 8
 - No sensor serves two magnets that are passed at the same time, as in Fig. 14(b).
 - Heading and id come from the grid that fits all magnets best, and an orientation at the
   border between two is refused. The estimator of the text and the release, the position
-  pattern alone (:func:`pattern_heading`), has mean absolute headings of 0.92 and 1.73 degrees
-  instead of 0.76 and 0.45; nominally they are 0.
+  pattern alone (:func:`pattern_heading`), has mean absolute errors of the heading, nominally 0,
+  of 0.92 and 1.73 degrees instead of 0.76 and 0.45.
 """
 
 from __future__ import annotations
@@ -114,8 +116,8 @@ def detect_magnets(
     tags : Tags
         Spacing, clearance and magnet are used.
     speed_mps : float
-        Speed of the array along its x; the published recordings were made at 0.105 m/s with
-        40 samples per second.
+        Speed of the array along its x, above 0. The published recordings were made at 0.105 m/s
+        with 40 samples per second.
     grid : TemplateGrid, optional
         Resolution of the templates; by default the paper's.
 
@@ -127,13 +129,15 @@ def detect_magnets(
     Raises
     ------
     InputError
-        The speed is not known, fewer than two sensors gave samples, or the samples are too
-        few or too far apart.
+        The speed is not known or not above 0, fewer than two sensors gave samples, or the
+        samples are too few or too far apart.
     """
     if speed_mps is None:
         raise InputError(
             "no speed, which the paper's method needs,", hint="Give it with --speed, in m/s"
         )
+    if not 0 < speed_mps < math.inf:
+        raise InputError(f"a speed of {speed_mps:g} m/s is not above 0")
     bar, warnings = _working_sensors(samples)
     path = speed_mps * (bar.time_ns - bar.time_ns[0]) * 1e-9
     step = float(np.median(np.diff(path))) if len(path) > 1 else math.inf
@@ -393,9 +397,9 @@ def position_pattern(position_m: Array) -> tuple[int, int, int] | None:
 def pattern_heading(position_m: Array) -> float | None:
     """Estimate the heading of a tag by its position pattern alone (6.2.4).
 
-    As in the released code it is the direction from the centroid of the three magnets to v2,
-    which in the tag's frame is ahead and to the left: radians, counter-clockwise. None if
-    there is no position pattern.
+    As in the released code it is the direction from the centroid of the three magnets to v2, less
+    the 45 degrees that it has in the tag's frame: radians, counter-clockwise. None if there is no
+    position pattern.
     """
     pattern = position_pattern(position_m)
     if pattern is None:
@@ -416,11 +420,15 @@ def _working_sensors(samples: Samples) -> tuple[Samples, tuple[SolverWarning, ..
     kept = order[works[order]]
     if len(kept) < 2:
         raise InputError(
-            f"{len(kept)} of {len(works)} sensors of {samples.device} gave samples",
+            f"{len(kept)} of {len(works)} sensors of {samples.device} gave more than "
+            f"{MIN_VALID_FRACTION:.0%} of their samples",
             hint="The paper's method needs two adjacent sensors",
         )
     dead = ", ".join(str(k + 1) for k in np.flatnonzero(~works))
-    silent = SolverWarning("sensor_silent", f"without sensor {dead}, which gave no samples")
+    silent = SolverWarning(
+        "sensor_silent",
+        f"without sensor {dead}: at most {MIN_VALID_FRACTION:.0%} of its samples are valid",
+    )
     warnings = (silent,) if dead else ()
     array = replace(samples.array, position_m=samples.array.position_m[kept])
     return Samples(samples.device, array, samples.time_ns, samples.field_t[:, kept]), warnings

@@ -17,10 +17,10 @@ from locatk.core.polaris.tag import Magnet, Tags
 Array = NDArray[np.float64]
 
 MAX_ORIENTATIONS = 3600
-"""A tenth of a degree, which is far below the error of a magnet that was placed by hand."""
+"""Steps of a tenth of a degree, far below the error of a magnet that was placed by hand."""
 
 MAX_OFFSETS = 101
-"""A tenth of a millimetre for the paper's array, whose sensors are 20 mm apart."""
+"""Steps of 0.2 mm over the +-10 mm of the paper's array, whose sensors are 20 mm apart."""
 
 MIN_POINTS = 5
 """The alignment compares first derivatives; a shorter window holds fewer than three of them."""

@@ -104,8 +104,10 @@ def test_more_than_the_bound_is_refused() -> None:
 def test_a_spent_budget_says_what_is_left() -> None:
     """34 x 34 less one is within the bound, and none is known."""
     seen: list[tuple[float, int]] = []
-    with pytest.raises(DegenerateError, match=r"at best \d+ of 3844 readings repeat") as error:
-        design_map(DesignOptions(32, 32, evaluations=100_000), lambda *told: seen.append(told))
+    options = DesignOptions(32, 32, evaluations=100_000)
+    message = r"at best \d+ of 3844 words of its readings repeat"
+    with pytest.raises(DegenerateError, match=message) as error:
+        design_map(options, lambda *report: seen.append(report))
     assert "seed" in str(error.value.hint)
     shares = [share for share, _ in seen]
     assert shares == sorted(shares)
@@ -167,3 +169,13 @@ def test_weights_are_those_of_a_heat_bath() -> None:
     assert heat[0] == 2**search.WEIGHT_BITS
     assert heat[1:4] / heat[:3] == pytest.approx(np.exp(-2), rel=1e-3)
     assert heat[-1] <= 2
+
+
+def test_progress_is_the_used_fraction_of_the_budget() -> None:
+    fractions: list[float] = []
+    options = DesignOptions(32, 32, evaluations=2_000_000)
+    with pytest.raises(DegenerateError):
+        design_map(options, lambda fraction, repeats: fractions.append(fraction))
+    assert fractions[-1] == pytest.approx(1.0)
+    # The first third of the stages are the short rounds: 1 of 13 parts of the budget.
+    assert fractions[len(fractions) // 3 - 1] == pytest.approx(1 / 13)

@@ -22,7 +22,12 @@ from locatk.core.geometry import umeyama
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.published import pipeline as paper
-from locatk.core.polaris.published.peaks import Peak, find_peaks, measure_signals
+from locatk.core.polaris.published.peaks import (
+    Peak,
+    estimate_background,
+    find_peaks,
+    measure_signals,
+)
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.simulation.session import SimulationOptions, simulate
 from locatk.core.polaris.tag import TagLayout, Tags, angles, places
@@ -279,7 +284,9 @@ def test_lost_samples_and_a_dead_sensor_that_sees_nothing() -> None:
     (sighting,) = paper.detect_magnets(replace(samples, field_t=field), TAGS, SPEED)
     assert compared(sighting, samples, truth)[:, 0].mean() < 2.4e-3
     (warning,) = sighting.warnings
-    assert warning == SolverWarning("sensor_silent", "without sensor 1, which gave no samples")
+    assert warning == SolverWarning(
+        "sensor_silent", "without sensor 1: at most 50% of its samples are valid"
+    )
 
 
 @pytest.mark.slow
@@ -291,6 +298,22 @@ def test_sensors_may_come_in_any_order() -> None:
     (mine,) = paper.detect_magnets(samples, TAGS, SPEED)
     (other,) = paper.detect_magnets(mixed, TAGS, SPEED)
     np.testing.assert_allclose(other.place_m, mine.place_m)
+
+
+def test_interpolated_samples_do_not_lower_the_estimate_of_noise() -> None:
+    samples = drive([], 0.6)
+    lost = np.random.default_rng(5).random(samples.field_t.shape[:2]) < 0.45
+    field = np.where(lost[..., None], np.nan, samples.field_t)
+    whole, gaps = (
+        measure_signals(replace(samples, field_t=f), 2.0) for f in (samples.field_t, field)
+    )
+    np.testing.assert_allclose(gaps.noise_t, whole.noise_t, rtol=0.3)
+
+
+def test_background_of_scattered_clear_samples_is_zero() -> None:
+    signal = measure_signals(drive([], 0.3), 2.0)
+    peaks = [Peak(0, sample, 1e-4) for sample in range(300) if sample % 10]
+    assert not estimate_background(signal, peaks, 0.5, 4).any()
 
 
 def test_nothing_is_found_in_noise() -> None:
@@ -309,6 +332,9 @@ def test_what_cannot_be_solved_is_refused() -> None:
     with pytest.raises(InputError, match="speed") as error:
         paper.detect_magnets(samples, TAGS, None)
     assert "--speed" in str(error.value.hint)
+    for speed in (0.0, -SPEED, np.inf, np.nan):
+        with pytest.raises(InputError, match="not above 0"):
+            paper.detect_magnets(samples, TAGS, speed)
     with pytest.raises(InputError, match=r"10 mm apart.*40 mm"):
         paper.detect_magnets(samples, TAGS, 10 * SPEED)
     with pytest.raises(InputError, match="too few"):

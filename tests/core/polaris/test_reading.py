@@ -14,8 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from locatk.core.polaris import codec
-from locatk.core.polaris.codec import families
-from locatk.core.polaris.codec import redundant as redundancy
+from locatk.core.polaris.codec import families, redundant
 from locatk.core.polaris.identification.decoding import TIE, Reading, read
 from locatk.core.polaris.tag import AsBuiltTag, Cell, Tags
 
@@ -28,7 +27,7 @@ REDUNDANT = Tags(magnets=6, codec="redundant")
 
 @cache
 def family(count: int, distance: int) -> Tags:
-    ids = families.generate(DEFAULT, count, distance)
+    ids = families.generate_family(DEFAULT, count, distance)
     return replace(DEFAULT, ids=ids, min_distance=distance)
 
 
@@ -473,4 +472,4 @@ def test_every_id_of_every_codec_is_read_as_itself() -> None:
         count = codec.capacity(tags)
         for tag_id in itertools.islice(range(count), 0, None, max(1, count // 500)):
             assert read(tags, *magnets(tags, tag_id)).tag_id == tag_id
-    assert redundancy.BUDGET == 3
+    assert redundant.MAX_DECODING_WEIGHT == 3

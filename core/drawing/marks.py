@@ -1,4 +1,4 @@
-"""Line drawings in mm, independent of the output as PDF or SVG.
+"""Marks of a line drawing, in mm, independent of the output as PDF or SVG.
 
 A point is (x, y) from the lower left corner of the page, x to the right and y up; angles are in
 degrees, counter-clockwise. Everything is drawn in black.
@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 Point: TypeAlias = tuple[float, float]
 
+Box: TypeAlias = tuple[float, float, float, float]
+"""Left, bottom, right and top edge of a rectangle."""
+
 MM_PER_POINT = 25.4 / 72
 
-LINE_MM = 0.15
+LINE_WIDTH_MM = 0.15
 """Default width of a line."""
 
 CAPITAL_HEIGHT_EM = 0.72
@@ -25,7 +29,11 @@ MAX_LETTER_WIDTH_EM = 0.6
 """Mean width of the letters of a text, as a fraction of the font size, that few texts exceed in any
 sans-serif font."""
 
+LINE_SPACING_EM = 1.3
+"""Distance between the baselines of two lines of text, as a fraction of the font size."""
+
 RULER_FONT_POINTS = 5.0
+"""Font size of the numbers of a ruler."""
 
 RULER_BASELINE_MM = 2.6
 """Distance of the baseline of a ruler's numbers from its edge."""
@@ -39,10 +47,10 @@ CUT_MARK_MM = 3.0
 CUT_MARK_GAP_MM = 1.0
 """Distance of the inner end of a cut mark from the corner."""
 
-TRUE_SIZE = "Print at 100 %, without scaling, and measure the rulers."
+TRUE_SIZE_INSTRUCTION = "Print at 100 %, without scaling, and measure the rulers."
 """Instruction on pages at true size."""
 
-RULER_MM = 100
+MAX_RULER_LENGTH_MM = 100
 """Length of the rulers of a page that is large enough."""
 
 
@@ -52,7 +60,7 @@ class Line:
 
     start: Point
     end: Point
-    width_mm: float = LINE_MM
+    width_mm: float = LINE_WIDTH_MM
     dash_mm: float | None = None
 
 
@@ -62,7 +70,7 @@ class Circle:
 
     centre: Point
     radius_mm: float
-    width_mm: float = LINE_MM
+    width_mm: float = LINE_WIDTH_MM
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,7 @@ class Polygon:
 
     corners: tuple[Point, ...]
     filled: bool = False
-    width_mm: float = LINE_MM
+    width_mm: float = LINE_WIDTH_MM
 
 
 @dataclass(frozen=True)
@@ -162,17 +170,61 @@ def arrow(start: Point, tip: Point, head_mm: float, width_mm: float = 0.2) -> li
     return [Line(start, base, width_mm), Polygon((tip, left, right), filled=True)]
 
 
+def cross(centre: Point, arm_mm: float, width_mm: float = LINE_WIDTH_MM) -> list[Mark]:
+    """Draw a horizontal and a vertical line through a point, ``arm_mm`` to each side."""
+    x, y = centre
+    return [
+        Line((x - arm_mm, y), (x + arm_mm, y), width_mm),
+        Line((x, y - arm_mm), (x, y + arm_mm), width_mm),
+    ]
+
+
+def rectangle(box: Box, width_mm: float = LINE_WIDTH_MM) -> Polygon:
+    """Outline a rectangle with sides along the page."""
+    left, bottom, right, top = box
+    return Polygon(((left, bottom), (right, bottom), (right, top), (left, top)), width_mm=width_mm)
+
+
 def page_rulers(size: Point, margin: float) -> list[Mark]:
     """Draw rulers along the lower and the left edge of a page, as long as it permits."""
     corner = margin + RULER_DEPTH_MM
     marks: list[Mark] = []
     for side, upright in ((size[0], False), (size[1], True)):
         # The last 8 mm are for the number at the end and the unit after it.
-        length = min(RULER_MM, int(side - margin - corner - 8) // 10 * 10)
+        length = min(MAX_RULER_LENGTH_MM, int(side - margin - corner - 8) // 10 * 10)
         if length > 0:
             start = (corner, corner + 2) if upright else (corner + 2, corner)
             marks += ruler(start, length, upright=upright)
     return marks
+
+
+def capital_height(points: float) -> float:
+    """Return the height in mm of capitals and digits of a font size."""
+    return CAPITAL_HEIGHT_EM * points * MM_PER_POINT
+
+
+def line_height(points: float, spacing_em: float = LINE_SPACING_EM) -> float:
+    """Return the distance in mm between the baselines of two lines of text."""
+    return spacing_em * points * MM_PER_POINT
+
+
+def paragraph(
+    lines: Sequence[str],
+    corner: Point,
+    points: float,
+    *,
+    spacing_em: float = LINE_SPACING_EM,
+    bold: bool = False,
+) -> list[Text]:
+    """Draw lines of text one below the other.
+
+    The first baseline is one line height below ``corner``, the upper left corner.
+    """
+    step = line_height(points, spacing_em)
+    return [
+        Text(line, (corner[0], corner[1] - number * step), points, bold=bold)
+        for number, line in enumerate(lines, 1)
+    ]
 
 
 def text_width(text: str, points: float) -> float:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
-from locatk.core.polaris.codec import redundant as redundancy
+from locatk.core.polaris.codec import redundant
 from locatk.core.polaris.tag import TagLayout, Tags
 
 DESIGNS = [
@@ -44,12 +44,12 @@ def errors(word: tuple[int, ...], seen: tuple[int | None, ...]) -> int:
     [(4, 4), (5, 5), (6, 5), (8, 8), (10, 8), (12, 11), (16, 16), (20, 19)],
 )
 def test_the_field_is_the_largest_that_fits(orientations: int, size: int) -> None:
-    assert redundancy.field_size(orientations) == size
+    assert redundant.field_size(orientations) == size
 
 
 @pytest.mark.parametrize("size", [3, 4, 5, 7, 8, 11, 13, 16, 19])
 def test_the_field_is_a_field(size: int) -> None:
-    field = redundancy.field(size)
+    field = redundant.finite_field(size)
     everything = range(size)
     for a in everything:
         assert field.multiply(a, 1) == a
@@ -84,7 +84,7 @@ def test_decoding_is_right_for_whatever_is_seen(magnets: int, orientations: int)
         missing = seen.count(None)
         near = [word for word in known if 2 * errors(word, seen) + missing <= BUDGET]
         assert len(near) <= 1
-        assert redundancy.decode(tags, seen) == (near[0] if near else None)
+        assert redundant.decode_word(tags, seen) == (near[0] if near else None)
 
 
 def test_every_missing_magnet_with_every_misread_is_corrected() -> None:
@@ -94,14 +94,14 @@ def test_every_missing_magnet_with_every_misread_is_corrected() -> None:
             for symbol in range(8):
                 seen: list[int | None] = list(word)
                 seen[missing], seen[wrong] = None, symbol
-                assert redundancy.decode(tags, seen) == word
+                assert redundant.decode_word(tags, seen) == word
 
 
 @st.composite
 def damaged(draw) -> tuple[Tags, tuple[int, ...], list[int | None], int, int]:
     """A design, a word of it, what is seen, and the numbers of misread and missing."""
     tags = draw(st.sampled_from(DESIGNS))
-    size = redundancy.field_size(tags.orientations)
+    size = redundant.field_size(tags.orientations)
     word = codec.layout_of(tags, draw(st.integers(0, codec.capacity(tags) - 1))).symbols
     missing = draw(st.integers(0, 3))
     misread = draw(st.integers(0, (BUDGET - missing) // 2 + 1))
@@ -122,17 +122,17 @@ def test_the_promise_holds_at_any_size(case) -> None:
     """Within the budget the word comes back; one misread more is noticed."""
     tags, word, seen, misread, missing = case
     expected = word if 2 * misread + missing <= BUDGET else None
-    assert redundancy.decode(tags, seen) == expected
+    assert redundant.decode_word(tags, seen) == expected
 
 
 @settings(deadline=None)
 @given(st.sampled_from([t for t in DESIGNS if t.magnets > 5]), st.data())
 def test_three_misreads_of_a_whole_tag_are_noticed(tags: Tags, data) -> None:
-    size = redundancy.field_size(tags.orientations)
+    size = redundant.field_size(tags.orientations)
     seen = list(codec.layout_of(tags, data.draw(st.integers(0, codec.capacity(tags) - 1))).symbols)
     for place in data.draw(st.permutations(range(tags.magnets)))[:3]:
         seen[place] = (seen[place] + data.draw(st.integers(1, size - 1))) % size
-    assert redundancy.decode(tags, seen) is None
+    assert redundant.decode_word(tags, seen) is None
 
 
 @settings(deadline=None)
@@ -140,7 +140,7 @@ def test_three_misreads_of_a_whole_tag_are_noticed(tags: Tags, data) -> None:
 def test_ids_come_back(tags: Tags, data) -> None:
     tag_id = data.draw(st.integers(0, codec.capacity(tags) - 1))
     layout = codec.layout_of(tags, tag_id)
-    assert layout.cells == redundancy.cells(tags)
+    assert layout.cells == redundant.cells(tags)
     assert codec.id_of(tags, layout) == tag_id
 
 
@@ -151,7 +151,7 @@ def test_an_orientation_that_no_word_has_counts_as_missing() -> None:
     seen: list[int | None] = list(word)
     seen[3] = seen[7] = 19
     seen[11] = None
-    assert redundancy.decode(tags, seen) == word
+    assert redundant.decode_word(tags, seen) == word
 
 
 def test_words_never_change() -> None:
