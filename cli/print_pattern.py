@@ -12,8 +12,8 @@ from locatk.cli import console, failures, options
 from locatk.core.errors import OutputExistsError
 
 if TYPE_CHECKING:
-    from locatk.core.dots.drawing.layout import Layout
-    from locatk.core.dots.drawing.tiles import Tiling
+    from locatk.core.dots.drawing.layout import SheetLayout
+    from locatk.core.dots.drawing.tiles import SheetTiling
     from locatk.core.dots.sheet import Manifest
 
 CODECS = ("anoto", "libdots", "microdots")
@@ -216,7 +216,7 @@ def pattern(
     raster = layout.snap(pitch_mm, dot_mm, int(dpi))
     for note in layout.snapped(raster, pitch_mm, dot_mm):
         console.say(f"{note[0].upper()}{note[1:]}.")
-    items: Sequence[Layout | Tiling]
+    items: Sequence[SheetLayout | SheetTiling]
     if overlay is not None:
         items = printing.page_layouts(overlay, margin_mm, raster)
     else:

@@ -1713,7 +1713,7 @@ static PyMethodDef methods[] = {
     {"find_dots", find_dots, METH_VARARGS,
      "find_dots($module, images, n, height, width, taps, block, window, min_contrast,"
      " contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
-     "Detect the dots of images; twin of locatk.core.dots.detection.blobs.find_dots_numpy."},
+     "Detect the dots of images; twin of locatk.core.dots.detection.blobs.detect_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,
      "fit_lattices($module, points, valid, n, m, lens, ring_radii, prior, seeds, min_dots,"
      " min_neighbour, max_neighbour, cell_gate, cell_sigma, symbol_gate, symbol_sigma,"
@@ -1726,12 +1726,12 @@ static PyMethodDef methods[] = {
     {"read_windows", read_windows, METH_VARARGS,
      "read_windows($module, x_bits, y_bits, n, length, lengths, weights, prefixes, crt, signs,"
      " digits, masks, range, smallest_shift, log_hypotheses, positions, evidence, /)\n--\n\n"
-     "Read positions from windows of soft bits; twin of locatk.core.dots.identification.phase_voting.read_numpy."},
+     "Read positions from windows of soft bits; twin of locatk.core.dots.identification.phase_voting.estimate_windows_numpy."},
     {"poses", poses, METH_VARARGS,
      "poses($module, points, valid, uv, cells, n, m, half_width, lens, prior, windows, lengths,"
      " weights, prefixes, crt, signs, digits, masks, range, smallest_shift, offset, gate,"
      " min_sigma, parameters, pose, covariance, /)\n--\n\n"
-     "Estimate poses from decoded dots; twin of locatk.core.dots.localization.pose.poses_numpy."},
+     "Estimate poses from decoded dots; twin of locatk.core.dots.localization.pose.localize_windows_numpy."},
     {"ddtw", ddtw, METH_VARARGS,
      "ddtw($module, query, slopes, n, length, count, cost, /)\n--\n\n"
      "Compute distances by derivative dynamic time warping; twin of"

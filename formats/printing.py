@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from locatk.core.dots.design.ledger import Area
-from locatk.core.dots.drawing.layout import Layout, Raster, lay_out
+from locatk.core.dots.drawing.layout import Raster, SheetLayout, lay_out
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
 from locatk.formats import rasters
@@ -37,7 +37,7 @@ class Drawn:
     losses: tuple[str, ...] = ()
 
 
-def page_layouts(document: Path, margin_mm: float, raster: Raster) -> list[Layout]:
+def page_layouts(document: Path, margin_mm: float, raster: Raster) -> list[SheetLayout]:
     """Layouts of sheets that go over the pages of a PDF.
 
     Raises

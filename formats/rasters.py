@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.codec import DOT_DIRECTIONS, SYMBOL_LETTERS, codec
-from locatk.core.dots.drawing.layout import Layout, Raster, pixels
+from locatk.core.dots.drawing.layout import Raster, SheetLayout, pixels
 from locatk.core.dots.sheet import MM_PER_INCH, Manifest
 
 BAND = 256
@@ -89,7 +89,7 @@ def _chunk(stream: IO[bytes], kind: bytes, data: bytes) -> None:
     stream.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", check))
 
 
-def _rows(layout: Layout, rows: Iterator[NDArray[np.uint8]]) -> Iterator[bytes]:
+def _rows(layout: SheetLayout, rows: Iterator[NDArray[np.uint8]]) -> Iterator[bytes]:
     """The lines of a page from the top down, packed, each after its filter byte of 0."""
     raster, (width, height) = layout.raster, layout.page
     left, top = (start - raster.offset for start in layout.first)

@@ -85,7 +85,7 @@ def _sheet_table(sheet: Sheet, pitch_mm: float) -> dict[str, Any]:
 
 def _manifest(table: Table) -> Manifest:
     toml.check_format(table, MANIFEST_FORMAT, VERSION)
-    name = table.text("codec", choices=tuple(sequences.FOURTH))
+    name = table.text("codec", choices=tuple(sequences.FOURTH_DIGITS))
     pitch = above(table, "pitch_mm")
     dot = above(table, "dot_mm", pitch / 6)
     offset = above(table, "offset_mm", pitch / 6)

@@ -1,4 +1,4 @@
-"""Printed micro-dot pattern: from camera frames of a sheet to poses on it."""
+"""Printed micro-dot pattern: poses on a sheet from camera frames of it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["SolveOptions", "solve"]
 
 
 def __getattr__(name: str) -> Any:
-    # OpenCV belongs to the call, not to `import locatk.core.dots`.
+    # The solver imports OpenCV, which many modules that need only the data types do not.
     if name in __all__:
         from locatk.core.dots import solver
 

@@ -1,4 +1,4 @@
-"""The camera that looks at the dots: focal length, centre and radial distortion."""
+"""Model of the camera over the dots: focal length, centre and radial distortion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 class Camera:
     """Pinhole camera with the division model of one radial coefficient.
 
-    An undistorted point lies at ``centre + r / (1 + k |r|^2)``, where ``r`` is the
-    distorted point's offset from the centre in focal lengths (papers/dots.txt eq. 2, which
-    gives k in px^-2: multiply that by the focal length squared). Barrel distortion, which
-    draws the corners in, has k below 0.
+    An undistorted point is ``centre + r / (1 + k |r|^2)``, where ``r`` is the distorted point's
+    offset from the centre in focal lengths (Hostettler et al. 2016, Eq. 2, with k in px^-2:
+    multiply that by the focal length squared). Barrel distortion, which moves the corners
+    inwards, has k below 0.
 
     Attributes
     ----------
@@ -24,8 +24,8 @@ class Camera:
     focal_px : float
         Focal length in px.
     centre_px : (x, y)
-        Where the optical axis meets the frame; the pixel at the upper left has its
-        centre at (0, 0).
+        Intersection of the optical axis with the frame; the upper left pixel has its centre at
+        (0, 0).
     radial : float
         k; dimensionless.
     """
@@ -37,21 +37,21 @@ class Camera:
 
     @property
     def radial_px(self) -> float:
-        """k in px^-2."""
+        """Coefficient k in px^-2."""
         return self.radial / self.focal_px**2
 
     def undistort(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 2) px of a frame to (..., 2) px of a frame without distortion."""
+        """Return the points (..., 2) in px of a frame without distortion."""
         offset = points - np.array(self.centre_px)
         square = (offset * offset).sum(axis=-1, keepdims=True)
         result: NDArray[np.float64] = self.centre_px + offset / (1 + self.radial_px * square)
         return result
 
     def distort(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of :meth:`undistort`; in closed form.
+        """Return the points (..., 2) in px of a frame with distortion; inverts :meth:`undistort`.
 
-        ``k u r^2 - r + u = 0`` has the root ``r = 2 u / (1 + sqrt(1 - 4 k u^2))``.
-        Points so far out that no distorted one belongs to them become nan.
+        ``k u r^2 - r + u = 0`` has the root ``r = 2 u / (1 + sqrt(1 - 4 k u^2))``. Points that are
+        the image of no distorted point become nan.
         """
         offset = points - np.array(self.centre_px)
         square = (offset * offset).sum(axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Camera frames as a solver takes them."""
+"""Frames of one camera: the observations of the solver."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of one camera, in the order of time.
+    """Frames of one camera, in the order of time.
 
     Attributes
     ----------
@@ -20,10 +20,10 @@ class Frames:
     time_ns : (n,) int64 ndarray
         Nanoseconds since the epoch, ascending.
     names : tuple of str
-        Name of each frame: the file it came from, or its number.
+        Name of each frame: its file, or its number.
     images : sequence of (height, width) uint8 ndarray
-        Grey values, dots dark. Any sequence: ``images[i]`` may load the frame just then,
-        and raises InputError where that frame cannot be read.
+        Grey values, dots dark. Any sequence: ``images[i]`` may load the frame on access, and
+        raises InputError if that frame cannot be read.
     """
 
     device: str

@@ -1,4 +1,4 @@
-"""Sheets: which area of the pattern was printed where on a paper, and paper on a floor."""
+"""Printed sheets: the area of the pattern on each paper, and the papers on a floor."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 MM_PER_INCH = 25.4
 
-OFFSET = 1 / 6
-"""How far a dot lies from its place, in pitches (papers/dots.txt III-A.1)."""
+DOT_OFFSET_PITCHES = 1 / 6
+"""Distance of a dot from its grid position [pitches] (Hostettler et al. 2016, III-A.1)."""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """One printed area of the pattern.
+    """Printed area of the pattern.
 
     Attributes
     ----------
@@ -29,12 +29,12 @@ class Sheet:
     page_mm : (width, height)
         Of the paper.
     first_mm : (x, y)
-        From the paper's upper left corner right and down to the place of the upper left
-        dot, as it was sent to the printer.
+        From the paper's upper left corner right and down to the grid position of the upper left
+        dot, as sent to the printer.
     position_mm : (x, y) or None
-        Tiles: where the paper's lower left corner lies on the floor.
+        Tiles: position of the paper's lower left corner on the floor.
     heading_deg : float
-        Tiles: how far the paper is turned on the floor, counter-clockwise.
+        Tiles: rotation of the paper on the floor, counter-clockwise.
     """
 
     id: str
@@ -49,22 +49,22 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All sheets of one print job, and how they were printed.
+    """Sheets of one print job, with the parameters of the print.
 
     Attributes
     ----------
     sheets : tuple of Sheet
     codec : str
     pitch_mm : float
-        Between two places, as it was sent to the printer.
+        Distance of two grid positions, as sent to the printer.
     dot_mm : float
         Width of a dot.
     offset_mm : float
-        From a place to its dot.
+        From a grid position to its dot.
     dpi : int
     scale : (x, y)
-        Measured over nominal length on the paper, along its width and height: 1.002 where
-        the printer makes 100.2 mm of 100 mm.
+        Measured over nominal length on the paper, along its width and height: 1.002 if 100 mm are
+        printed as 100.2 mm.
     notes : tuple of str
     """
 
@@ -78,43 +78,48 @@ class Manifest:
     notes: tuple[str, ...] = ()
 
     def frame(self, number: int) -> str:
-        """Name of the frame in which poses on sheet ``number`` are given.
+        """Return the name of the coordinate frame of poses on sheet ``number``.
 
-        ``"floor"`` for tiles, whose places on it are known; else the sheet's id.
+        It is ``"floor"`` for tiles, whose positions on it are known, and else the sheet's id.
         """
         sheet = self.sheets[number]
         return sheet.id if sheet.position_mm is None else "floor"
 
     def find(self, grid: ArrayLike, section: ArrayLike, *, slack: float = 0.0) -> NDArray[np.intp]:
-        """Number of the sheet that holds each place, else the nearest; -1 where none is near.
+        """Return the number of the sheet that contains each position, or of the nearest one.
 
         Parameters
         ----------
         grid : (n, 2) array_like
             Grid coordinates, with fractions.
         section : (n, 2) array_like
-            Each 0..62; -1 where it is not known, which then fits any.
+            Each 0..62; -1 if unknown, which then matches any.
         slack : float
-            Pitches by which a place may lie outside: the middle of a frame on the rim.
+            Pitches by which a position may be outside: the middle of a frame on the border.
+
+        Returns
+        -------
+        (n,) intp ndarray
+            -1 if no sheet is within ``slack``.
         """
-        at, sections = np.asarray(grid, float), np.asarray(section)
-        found = np.full(len(at), -1, np.intp)
-        nearest = np.full(len(at), np.inf)
+        position, sections = np.asarray(grid, float), np.asarray(section)
+        number_of = np.full(len(position), -1, np.intp)
+        least_outside = np.full(len(position), np.inf)
         for number, sheet in enumerate(self.sheets):
             low = np.array(sheet.origin)
             high = low + np.array(sheet.size) - 1
-            outside = np.maximum(np.maximum(low - at, at - high), 0).max(axis=1, initial=0)
-            fits = ((sections == np.array(sheet.section)) | (sections == -1)).all(axis=1)
-            better = fits & (outside <= slack) & (outside < nearest)
-            found[better], nearest[better] = number, outside[better]
-        return found
+            beyond = np.maximum(np.maximum(low - position, position - high), 0)
+            outside = beyond.max(axis=1, initial=0)
+            matches = ((sections == np.array(sheet.section)) | (sections == -1)).all(axis=1)
+            better = matches & (outside <= slack) & (outside < least_outside)
+            number_of[better], least_outside[better] = number, outside[better]
+        return number_of
 
     def to_metres(self, number: int, grid: ArrayLike) -> NDArray[np.float64]:
-        """Places on sheet ``number`` as metres in its frame, x right, y up.
+        """Return positions on sheet ``number`` in metres in its frame, x right, y up.
 
-        The origin is the paper's lower left corner, or the floor's where the sheet is a
-        tile. ``grid`` is (..., 2) in grid coordinates; so is the answer, in metres,
-        corrected by :attr:`scale`.
+        The origin is the paper's lower left corner, or that of the floor if the sheet is a tile.
+        ``grid`` (..., 2) are grid coordinates. The result (..., 2) is corrected by :attr:`scale`.
         """
         sheet = self.sheets[number]
         on_paper = (np.asarray(grid, float) - sheet.origin) * self.pitch_mm + sheet.first_mm
@@ -127,7 +132,7 @@ class Manifest:
         return result
 
     def jacobian(self, number: int) -> NDArray[np.float64]:
-        """(2, 2) derivative of :meth:`to_metres`, in metres a pitch."""
+        """Return the derivative (2, 2) of :meth:`to_metres`, in metres per pitch."""
         axes = self.to_metres(number, np.array([[0, 0], [1, 0], [0, 1]]))
         result: NDArray[np.float64] = (axes[1:] - axes[0]).T
         return result

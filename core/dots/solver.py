@@ -1,4 +1,9 @@
-"""Camera frames of a dot sheet to poses in metres on it."""
+"""Pipeline of the dots solver, from camera frames of a sheet to poses in metres on it.
+
+The frames of each camera pass the stages detect, identify and localize
+(:mod:`~locatk.core.dots.localization.frames`), which give a pose on the grid of the pattern; the
+manifest of the printed sheets converts it to metres.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +17,13 @@ from numpy.typing import NDArray
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec, codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.localization.frames import FEW_DOTS, locate
-from locatk.core.dots.localization.located import Located, nothing
-from locatk.core.dots.published.localization import locate_paper
+from locatk.core.dots.localization.frames import (
+    TOO_FEW_DOTS,
+    LocalizedFrames,
+    localize_frames,
+    unlocalized_frames,
+)
+from locatk.core.dots.published.localization import localize_published
 from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
@@ -24,12 +33,14 @@ from locatk.core.trajectory import Trajectory
 
 METHODS = ("lattice", "paper")
 
-LOADED = 6_000_000
-"""Pixels of frames of one size that are in memory at once."""
+MAX_LOADED_PX = 6_000_000
+"""Pixels of the frames of one size that are in memory at once."""
 
-RIM = 12.0
-"""Pitches by which the middle of a frame may lie outside of the printed area whose dots
-it still sees."""
+SHEET_SLACK_PITCHES = 12.0
+"""Largest distance of the middle of a frame from the printed area whose dots it shows [pitches]."""
+
+MAX_TOLERATED_NO_CODE = 3
+"""Number of frames without code up to which a session gets no warning."""
 
 UNREADABLE = "unreadable_frame"
 OTHER_SIZE = "not_of_the_cameras_size"
@@ -38,15 +49,15 @@ OFF_SHEET = "off_sheet"
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """How to solve.
+    """Options of the solver.
 
     Attributes
     ----------
     method : str
-        ``"lattice"``, or ``"paper"`` for the algorithm as published.
+        ``"lattice"`` or ``"paper"`` (the published method).
     camera : Camera, optional
-        Without it the centre of the frame is the camera's, and the bend of its lens is
-        estimated in each frame.
+        Default: its centre is the middle of the frame, and the distortion of its lens is estimated
+        in each frame.
     """
 
     method: str = "lattice"
@@ -56,16 +67,23 @@ class SolveOptions:
 def solve(
     frames: Sequence[Frames], manifest: Manifest, options: SolveOptions | None = None
 ) -> Solution:
-    """Poses of every camera on the sheets of ``manifest``.
+    """Estimate the poses of cameras on the sheets of ``manifest``.
 
-    A pose is where the camera's centre lies on the sheet, with the direction of the image's
-    right as heading; roll, pitch and height are not estimated. A camera that sees several
-    sheets whose places on the floor are unknown has a trajectory on each.
+    A pose is the position of the camera's centre on the sheet, with the direction of the image's
+    right as heading; roll, pitch and height are not estimated. A camera over several sheets whose
+    positions on the floor are unknown has a trajectory on each.
+
+    Parameters
+    ----------
+    frames : sequence of Frames
+        One element per camera.
+    manifest : Manifest
+    options : SolveOptions, optional
 
     Raises
     ------
     InputError
-        There is no such method, or the manifest names an unknown codec.
+        The method or the codec of the manifest is unknown.
     """
     options = options or SolveOptions()
     if options.method not in METHODS:
@@ -76,20 +94,14 @@ def solve(
     outcomes: list[FrameOutcome] = []
     detections: list[DotDetection] = []
     trajectories: list[Trajectory] = []
-    astray: list[NDArray[np.float64]] = []
+    off_sheet: list[NDArray[np.float64]] = []
     for camera_frames in frames:
-        located = _locate_all(camera_frames, code, options)
-        accepted = np.flatnonzero(located.accepted)
-        sheet = np.full(len(located), -1, np.intp)
-        sheet[accepted] = manifest.find(
-            located.grid[accepted], located.section[accepted], slack=RIM
-        )
-        off = accepted[sheet[accepted] < 0]
-        located.rejected[off] = OFF_SHEET
-        astray += list(located.grid[off[:1]])
-        poses = _poses(located, sheet, manifest)
-        outcomes += _outcomes(camera_frames, located)
-        detections += _detections(camera_frames, located, sheet, poses, manifest)
+        localized = _localize(camera_frames, code, options)
+        sheet = _assign_sheets(localized, manifest)
+        off_sheet += list(localized.grid[localized.rejected == OFF_SHEET])
+        poses = _sheet_poses(localized, sheet, manifest)
+        outcomes += _outcomes(camera_frames, localized)
+        detections += _detections(camera_frames, localized, sheet, poses, manifest)
         trajectories += _trajectories(camera_frames, sheet, poses, manifest)
     rejected = Counter(frame.rejected for frame in outcomes if frame.rejected)
     return Solution(
@@ -99,24 +111,25 @@ def solve(
         rejected=dict(sorted(rejected.items())),
         detections=tuple(detections),
         artifact=manifest,
-        warnings=_warnings(options, manifest, rejected, astray),
+        warnings=_warnings(options, manifest, rejected, off_sheet),
         facts=DotFacts(tuple(outcomes)),
     )
 
 
-def _locate_all(frames: Frames, code: Codec, options: SolveOptions) -> Located:
-    located = nothing(len(frames), FEW_DOTS)
-    find = _locate_paper if options.method == "paper" else locate
-    for indices, images in _batches(frames, located.rejected, options.camera):
-        located.keep(indices, find(images, code, options.camera))
-    return located
+def _localize(frames: Frames, code: Codec, options: SolveOptions) -> LocalizedFrames:
+    """Localize the frames of a camera on the grid."""
+    result = unlocalized_frames(len(frames), TOO_FEW_DOTS)
+    localize = _localize_published if options.method == "paper" else localize_frames
+    for indices, images in _batches(frames, result.rejected, options.camera):
+        result.update(indices, localize(images, code, options.camera))
+    return result
 
 
 def _batches(
     frames: Frames, rejected: NDArray[np.object_], camera: Camera | None
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """Frames of one size at a time, with their indices; what is wrong goes to ``rejected``."""
-    held: dict[tuple[int, ...], list[int]] = {}
+    """Yield indices and images of frames of one size; store reasons of others in ``rejected``."""
+    indices_by_shape: dict[tuple[int, ...], list[int]] = {}
     images: dict[int, NDArray[np.uint8]] = {}
     for index in range(len(frames)):
         try:
@@ -128,64 +141,88 @@ def _batches(
             rejected[index] = OTHER_SIZE
             continue
         images[index] = image
-        same = held.setdefault(image.shape, [])
-        same.append(index)
-        if len(same) * image.size >= LOADED:
-            yield np.array(same), np.stack([images.pop(k) for k in same])
-            same.clear()
-    for same in filter(None, held.values()):
-        yield np.array(same), np.stack([images.pop(k) for k in same])
+        indices = indices_by_shape.setdefault(image.shape, [])
+        indices.append(index)
+        if len(indices) * image.size >= MAX_LOADED_PX:
+            yield np.array(indices), np.stack([images.pop(k) for k in indices])
+            indices.clear()
+    for indices in filter(None, indices_by_shape.values()):
+        yield np.array(indices), np.stack([images.pop(k) for k in indices])
 
 
-def _locate_paper(images: NDArray[np.uint8], code: Codec, camera: Camera | None = None) -> Located:
-    """The published algorithm's answers; for lack of better its quality is the confidence."""
-    located = nothing(len(images), FEW_DOTS)
+def _localize_published(
+    images: NDArray[np.uint8], code: Codec, camera: Camera | None = None
+) -> LocalizedFrames:
+    """Localize frames by the published algorithm; its quality stands in for the confidence."""
+    result = unlocalized_frames(len(images), TOO_FEW_DOTS)
     for k, image in enumerate(images):
-        pose = locate_paper(image, code, camera)
-        located.grid[k] = pose.x, pose.y
-        located.section[k] = pose.section
-        located.heading[k] = pose.heading_rad
-        located.dots[k] = pose.dots
-        located.corrected[k] = pose.corrected_bits
-        located.confidence[k] = pose.quality
-        located.rejected[k] = pose.rejected or ""
-    return located
+        pose = localize_published(image, code, camera)
+        result.grid[k] = pose.x, pose.y
+        result.section[k] = pose.section
+        result.heading[k] = pose.heading_rad
+        result.dots[k] = pose.dots
+        result.corrected[k] = pose.corrected_bits
+        result.confidence[k] = pose.quality
+        result.rejected[k] = pose.rejected or ""
+    return result
+
+
+# ---- from the grid to metres
 
 
 @dataclass(frozen=True)
-class _Poses:
-    """Of all frames, without meaning where there is no sheet: (n, 2) m, (n,) rad, (n, 3, 3)."""
+class _SheetPoses:
+    """Poses of all frames: (n, 2) m, (n,) rad, (n, 3, 3); nan for frames without a sheet."""
 
     position: NDArray[np.float64]
     heading: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
 
-def _poses(located: Located, sheet: NDArray[np.intp], manifest: Manifest) -> _Poses:
-    n = len(located)
-    poses = _Poses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
+def _assign_sheets(localized: LocalizedFrames, manifest: Manifest) -> NDArray[np.intp]:
+    """Return the sheet (n,) of each frame, -1 if it has none, and reject frames off all sheets."""
+    sheet = np.full(len(localized), -1, np.intp)
+    accepted = np.flatnonzero(localized.accepted)
+    sheet[accepted] = manifest.find(
+        localized.grid[accepted], localized.section[accepted], slack=SHEET_SLACK_PITCHES
+    )
+    localized.rejected[accepted[sheet[accepted] < 0]] = OFF_SHEET
+    return sheet
+
+
+def _sheet_poses(
+    localized: LocalizedFrames, sheet: NDArray[np.intp], manifest: Manifest
+) -> _SheetPoses:
+    """Convert poses on the grid to metres in the frames of their sheets."""
+    n = len(localized)
+    poses = _SheetPoses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
     for number in np.unique(sheet[sheet >= 0]):
-        on = sheet == number
+        is_here = sheet == number
         jacobian = manifest.jacobian(int(number))
-        poses.position[on] = manifest.to_metres(int(number), located.grid[on])
-        right = np.column_stack([np.cos(located.heading[on]), -np.sin(located.heading[on])])
+        heading = localized.heading[is_here]
+        poses.position[is_here] = manifest.to_metres(int(number), localized.grid[is_here])
+        right = np.column_stack([np.cos(heading), -np.sin(heading)])
         x, y = (right @ jacobian.T).T
-        poses.heading[on] = np.arctan2(y, x)
+        poses.heading[is_here] = np.arctan2(y, x)
         full = np.eye(3)
         full[:2, :2] = jacobian
-        poses.covariance[on] = full @ located.covariance[on] @ full.T
+        poses.covariance[is_here] = full @ localized.covariance[is_here] @ full.T
     return poses
 
 
-def _outcomes(frames: Frames, located: Located) -> list[FrameOutcome]:
+# ---- results
+
+
+def _outcomes(frames: Frames, localized: LocalizedFrames) -> list[FrameOutcome]:
+    """Return the outcome of every frame."""
     return [
         FrameOutcome(
             time_s=frames.time_ns[k] * 1e-9,
             frame=frames.names[k],
-            dots=int(located.dots[k]),
-            corrected_bits=int(located.corrected[k]),
-            confidence=float(located.confidence[k]),
-            rejected=located.rejected[k] or None,
+            dots=int(localized.dots[k]),
+            corrected_bits=int(localized.corrected[k]),
+            confidence=float(localized.confidence[k]),
+            rejected=localized.rejected[k] or None,
         )
         for k in range(len(frames))
     ]
@@ -193,11 +230,12 @@ def _outcomes(frames: Frames, located: Located) -> list[FrameOutcome]:
 
 def _detections(
     frames: Frames,
-    located: Located,
+    localized: LocalizedFrames,
     sheet: NDArray[np.intp],
-    poses: _Poses,
+    poses: _SheetPoses,
     manifest: Manifest,
 ) -> list[DotDetection]:
+    """Return the frames that have a pose."""
     return [
         DotDetection(
             time_s=frames.time_ns[k] * 1e-9,
@@ -205,11 +243,11 @@ def _detections(
             x_m=float(poses.position[k, 0]),
             y_m=float(poses.position[k, 1]),
             heading_rad=float(poses.heading[k]),
-            confidence=float(located.confidence[k]),
-            corrected_bits=int(located.corrected[k]),
-            dots=int(located.dots[k]),
-            grid_x=float(located.grid[k, 0]),
-            grid_y=float(located.grid[k, 1]),
+            confidence=float(localized.confidence[k]),
+            corrected_bits=int(localized.corrected[k]),
+            dots=int(localized.dots[k]),
+            grid_x=float(localized.grid[k, 0]),
+            grid_y=float(localized.grid[k, 1]),
             sheet=manifest.sheets[sheet[k]].id,
         )
         for k in np.flatnonzero(sheet >= 0)
@@ -217,22 +255,22 @@ def _detections(
 
 
 def _trajectories(
-    frames: Frames, sheet: NDArray[np.intp], poses: _Poses, manifest: Manifest
+    frames: Frames, sheet: NDArray[np.intp], poses: _SheetPoses, manifest: Manifest
 ) -> Iterator[Trajectory]:
-    """One a frame of reference; the device's name bears it where there are several."""
+    """Yield a trajectory per frame of reference, which the device is named after if several."""
     names = np.array([manifest.frame(k) for k in range(len(manifest.sheets))], object)
-    seen = list(dict.fromkeys(names[sheet[sheet >= 0]]))
-    for name in seen or [names[0]]:
-        on = np.flatnonzero((sheet >= 0) & (names[sheet] == name))
-        covariance = np.full((len(on), 6, 6), np.nan)
+    visited = list(dict.fromkeys(names[sheet[sheet >= 0]]))
+    for name in visited or [names[0]]:
+        indices = np.flatnonzero((sheet >= 0) & (names[sheet] == name))
+        covariance = np.full((len(indices), 6, 6), np.nan)
         plane = np.array([0, 1, 5])
-        covariance[:, plane[:, None], plane] = poses.covariance[on]
+        covariance[:, plane[:, None], plane] = poses.covariance[indices]
         yield Trajectory(
-            device=frames.device if len(seen) < 2 else f"{frames.device}-{name}",
+            device=frames.device if len(visited) < 2 else f"{frames.device}-{name}",
             frame=str(name),
-            time_ns=frames.time_ns[on],
-            position=np.column_stack([poses.position[on], np.zeros(len(on))]),
-            quaternion=quaternion_from_heading(poses.heading[on]),
+            time_ns=frames.time_ns[indices],
+            position=np.column_stack([poses.position[indices], np.zeros(len(indices))]),
+            quaternion=quaternion_from_heading(poses.heading[indices]),
             covariance=covariance,
         )
 
@@ -241,14 +279,15 @@ def _warnings(
     options: SolveOptions,
     manifest: Manifest,
     rejected: Counter[str],
-    astray: list[NDArray[np.float64]],
+    off_sheet: list[NDArray[np.float64]],
 ) -> tuple[SolverWarning, ...]:
+    """Return the warnings of a session; ``off_sheet`` are grid coordinates of rejected frames."""
     warnings = []
     if options.method == "paper":
         warnings.append(
             SolverWarning(
                 "no_uncertainty",
-                "the published method knows no uncertainty: its confidence is a quality",
+                "the published method estimates no uncertainty: its confidence is a quality",
             )
         )
     if options.camera is None:
@@ -259,8 +298,8 @@ def _warnings(
                 f"no camera model: poses are of the middle of the frame, its lens {lens}",
             )
         )
-    if rejected[OFF_SHEET]:
-        x, y = astray[0]
+    if off_sheet:
+        x, y = off_sheet[0]
         warnings.append(
             SolverWarning(
                 "frames_off_sheet",
@@ -268,7 +307,7 @@ def _warnings(
                 f"the first at {x:.1f}, {y:.1f}: is it the manifest of another sheet?",
             )
         )
-    if rejected["no_code"] > max(3, sum(rejected.values()) // 2):
+    if rejected["no_code"] > max(MAX_TOLERATED_NO_CODE, sum(rejected.values()) // 2):
         warnings.append(
             SolverWarning(
                 "frames_without_code",

@@ -20,8 +20,11 @@ from numpy.typing import NDArray
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.localization.frames import locate
-from locatk.core.dots.localization.located import Located, nothing
+from locatk.core.dots.localization.frames import (
+    LocalizedFrames,
+    localize_frames,
+    unlocalized_frames,
+)
 from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.decoys import KINDS, decoys
@@ -145,7 +148,7 @@ def render(
     )
 
 
-def score(located: Located, grid: Array, heading: Array) -> Score:
+def score(located: LocalizedFrames, grid: Array, heading: Array) -> Score:
     """Compare with the truth."""
     accepted = located.accepted
     away = located.grid - grid
@@ -163,7 +166,9 @@ def condition_figures() -> list[Figure]:
     right = wrong = 0
     for number, condition in enumerate(CONDITIONS):
         images, grid, heading = render(condition, FRAMES, SEED + 100 + number, manifest)
-        found = score(locate(images, codec(manifest.codec), condition.camera), grid, heading)
+        found = score(
+            localize_frames(images, codec(manifest.codec), condition.camera), grid, heading
+        )
         rows += _rows(condition, found)
         right, wrong = right + found.right, wrong + found.wrong
     share = 100 * wrong / max(right + wrong, 1)
@@ -200,7 +205,9 @@ def decoy_figures() -> list[Figure]:
     """Frames of something else that are taken for the pattern, by kind."""
     rows, total = [], 0
     for kind in KINDS:
-        accepted = int(locate(decoys(kind, DECOYS, SEED + 200), codec("anoto")).accepted.sum())
+        accepted = int(
+            localize_frames(decoys(kind, DECOYS, SEED + 200), codec("anoto")).accepted.sum()
+        )
         total += accepted
         rows.append(
             Figure(f"{kind}: accepted", 100 * accepted / DECOYS, "%", f"{accepted} of {DECOYS}",
@@ -234,12 +241,12 @@ def paper_method_figures() -> list[Figure]:
     return rows
 
 
-def _by_solve(images: NDArray[np.uint8], manifest: Manifest, method: str) -> Located:
+def _by_solve(images: NDArray[np.uint8], manifest: Manifest, method: str) -> LocalizedFrames:
     """Frames solved as a session of them is; places again in grid coordinates."""
     n = len(images)
     frames = Frames("camera", np.arange(n), tuple(map(str, range(n))), list(images))
     solution = solve([frames], manifest, SolveOptions(method))
-    located = nothing(n, "rejected")
+    located = unlocalized_frames(n, "rejected")
     for found in solution.detections:
         k = int(found.frame)
         located.grid[k] = found.grid_x, found.grid_y
@@ -255,10 +262,10 @@ def speed_figures() -> list[Figure]:
     """Frames a second in a batch, and time of a single one."""
     return [
         measured("frames a second, in a batch", "1/s", f"dots.batch_speed({FRAMES})", 1.0,
-                 f"locate() of {FRAMES} frames of 188 x 120 px in memory, one thread, best of 3",
+                 f"localize_frames() of {FRAMES} frames of 188 x 120 px, one thread, best of 3",
                  4000.0, "higher", CELLULO, 4000.0),
         measured("a single frame", "ms", f"dots.single_time({min(FRAMES, 200)})", 1e3,
-                 "locate() of one frame a call, median, one thread", 0.5, "lower", CELLULO, 0.26),
+                 "localize_frames() of one frame, median, one thread", 0.5, "lower", CELLULO, 0.26),
     ]  # fmt: skip
 
 
@@ -266,14 +273,17 @@ def batch_speed(frames: int) -> tuple[float]:
     """Frames a second of processor time."""
     images, _, _ = render(CONDITIONS[1], frames, SEED + 400, page("A0"))
     table = codec("anoto")
-    return (frames / cpu_seconds(lambda: locate(images, table), 3),)
+    return (frames / cpu_seconds(lambda: localize_frames(images, table), 3),)
 
 
 def single_time(frames: int) -> tuple[float]:
     """Seconds of processor time for a frame that comes alone, the median of some."""
     images, _, _ = render(CONDITIONS[1], frames, SEED + 401, page("A0"))
     table = codec("anoto")
-    times = [cpu_seconds(lambda one=image[None]: locate(one, table), 3) for image in images]  # type: ignore[misc]
+    times = [
+        cpu_seconds(lambda one=image[None]: localize_frames(one, table), 3)  # type: ignore[misc]
+        for image in images
+    ]
     return (float(np.median(times)),)
 
 
@@ -297,7 +307,9 @@ def real_figures(path: Path) -> list[Figure]:
         ]
     rows = []
     for quarter, name in enumerate(names):
-        located = locate(np.ascontiguousarray(np.rot90(frame, quarter))[None], codec("libdots"))
+        located = localize_frames(
+            np.ascontiguousarray(np.rot90(frame, quarter))[None], codec("libdots")
+        )
         how = f"{located.dots[0]} dots, {located.corrected[0]} bits corrected; a libdots sheet"
         away, turned = math.nan, math.nan
         if located.accepted[0]:

@@ -18,7 +18,11 @@ from locatk.core.dots.codec import (
 )
 from locatk.core.dots.codec import lookup as exact
 from locatk.core.dots.drawing import layout
-from locatk.core.dots.identification.decoding import THRESHOLD, Decoded, decode
+from locatk.core.dots.identification.decoding import (
+    MIN_CONFIDENCE,
+    DecodedWindows,
+    identify_windows,
+)
 from locatk.core.dots.sheet import Manifest
 from locatk.core.paper import paper_size
 from locatk.formats.bench import Figure
@@ -64,7 +68,7 @@ def codec_figures() -> list[Figure]:
     seconds = cpu_seconds(lambda: table.symbols(ORIGIN, size))
     rng = np.random.default_rng(SEED)
     truth, symbols = random_windows(table, WINDOWS, rng)
-    right = is_right(decode(*soft(symbols), table), truth)
+    right = is_right(identify_windows(*soft(symbols), table), truth)
     rows = [
         Figure("A0 encoded", seconds, "s",
                f"{size[0]} x {size[1]} dots in the middle of the plane, best of 5", 0.2,
@@ -85,7 +89,7 @@ def codec_figures() -> list[Figure]:
     rows += _spoilt("8x8 windows, 1.8 % of bits wrong", truth, symbols, lot)
     for side in (WINDOW, 16):
         lots = rng.integers(0, 4, (SPOILT, side, side)).astype(np.uint8)
-        accepted = decode(*soft(lots), table).confidence >= THRESHOLD
+        accepted = identify_windows(*soft(lots), table).confidence >= MIN_CONFIDENCE
         rows.append(
             Figure(f"random bits, {side}x{side}: accepted", 100 * float(accepted.mean()), "%",
                    f"{SPOILT} windows of symbols drawn by lot", 0.1,
@@ -99,13 +103,13 @@ def decoding(windows: int) -> tuple[float]:
     table = codec("anoto")
     _, symbols = random_windows(table, windows, np.random.default_rng(SEED))
     bits = soft(symbols)
-    return (cpu_seconds(lambda: decode(*bits, table)) / windows,)
+    return (cpu_seconds(lambda: identify_windows(*bits, table)) / windows,)
 
 
 def _decoding() -> Figure:
     return measured(
         "8x8 window decoded", "us", f"dots_print.decoding({WINDOWS})", 1e6,
-        f"decode() of {WINDOWS} windows in one call, any place, section and turn, one thread",
+        f"identify_windows() of {WINDOWS} windows, any place, section and turn, one thread",
         5.0, "lower", f"{MICRODOTS}, 6x6 of it, no turn", 150.0,
     )  # fmt: skip
 
@@ -120,8 +124,8 @@ def _spoilt(
     """Windows of which the bits in ``wrong`` (n, 128) are turned over, all equally sure."""
     signs = np.where(wrong, -1, 1).astype(np.float32).reshape(-1, 2, WINDOW, WINDOW)
     column, row = soft(symbols)
-    answer = decode(column * signs[:, 0], row * signs[:, 1], codec("anoto"))
-    right, accepted = is_right(answer, truth), answer.confidence >= THRESHOLD
+    answer = identify_windows(column * signs[:, 0], row * signs[:, 1], codec("anoto"))
+    right, accepted = is_right(answer, truth), answer.confidence >= MIN_CONFIDENCE
     good, bad = int((right & accepted).sum()), int((~right & accepted).sum())
     peer = None if peers[0] is None else MICRODOTS
     return [
@@ -149,7 +153,7 @@ def random_windows(
     printed = printed + 2 * MAIN_SEQUENCE[(rows[:, :, None] + right) % MAIN_SEQUENCE_LENGTH]
     seen = np.empty_like(printed)
     for quarter in range(4):
-        seen[turns == quarter] = exact.turn(printed[turns == quarter], quarter)
+        seen[turns == quarter] = exact.rotate_symbols(printed[turns == quarter], quarter)
     return np.stack([x, y, turns], axis=1), seen
 
 
@@ -162,7 +166,7 @@ def soft(symbols: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.fl
     return column, row
 
 
-def is_right(answer: Decoded, truth: NDArray[np.int64]) -> NDArray[np.bool_]:
+def is_right(answer: DecodedWindows, truth: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which answers have the place and the turn of ``truth`` (n, 3)."""
     found = np.stack([answer.x, answer.y, answer.rotation], axis=1)
     return (found == truth).all(axis=1)
@@ -243,9 +247,9 @@ def _raster(paper: str, sheet: Manifest, pdf: bytes) -> list[Figure]:
     rng = np.random.default_rng(SEED + 1)
     at = rng.integers(0, (columns - WINDOW + 1, rows - WINDOW + 1), (RASTER_WINDOWS, 2))
     cut = np.stack([read[down:, right:][:WINDOW, :WINDOW] for right, down in at])
-    answer = decode(*soft(cut), codec(sheet.codec))
+    answer = identify_windows(*soft(cut), codec(sheet.codec))
     truth = np.c_[at + sheet.sheets[0].origin, np.zeros(len(at), np.int64)]
-    right = is_right(answer, truth) & (answer.confidence >= THRESHOLD)
+    right = is_right(answer, truth) & (answer.confidence >= MIN_CONFIDENCE)
     return [
         Figure(names[0], 100 * share, "%",
                "pdfium's raster: one black pixel in each square of a pitch, where its symbol "

@@ -1,4 +1,4 @@
-"""The study of the paper's section IV, on a simulated sheet: 121 places and 36 angles."""
+"""Study of the paper's section IV on a simulated sheet: 121 positions and 36 angles."""
 
 from __future__ import annotations
 
@@ -30,6 +30,9 @@ JITTER_M = 10e-6
 
 RIGHT_MM, RIGHT_DEG = 0.254, 5.0
 """Half a pitch; what is further off is counted, not averaged, as in the paper's Fig. 13."""
+
+PAPER_RIGHT_PERCENT = 99.17
+"""Frames of which the paper decoded x (section IV-A): 120 of 121 positions."""
 
 TABLE_III = {"x": ("mm", 0.155, 0.010), "y": ("mm", 0.273, 0.014), "heading": ("deg", 1.581, 0.407)}
 """Unit, worst error and precision as published."""
@@ -79,14 +82,15 @@ def _study(manifest: Manifest, spots: Array, heading: Array, method: str) -> Arr
 
 
 def _rows(method: str, placing: Array, turning: Array) -> Iterator[Figure]:
-    # The paper's figures are what the project's own method has to beat.
+    # Both methods have to read as many frames as the paper; the default method has to be at least
+    # as accurate.
     promised = method == METHODS[0]
     label = "study" if promised else f"study, --method {method}"
     right = np.isfinite(placing[..., 0])
     yield Figure(
         f"{label}: frames right", 100 * float(right.mean()), "%",
         f"{GRID} x {GRID} places over 200 x 200 mm, {SAMPLES} samples each: {right.size} frames",
-        99.17 if promised else None, "higher", "paper, its x", 99.17,
+        PAPER_RIGHT_PERCENT, "higher", "paper, its x", PAPER_RIGHT_PERCENT,
     )  # fmt: skip
     for axis, (name, (unit, worst, spread)) in enumerate(TABLE_III.items()):
         errors = (turning if name == "heading" else placing)[..., axis]

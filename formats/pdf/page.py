@@ -18,7 +18,7 @@ from reportlab.lib.units import mm
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core import drawing
-from locatk.core.dots.drawing.layout import Layout
+from locatk.core.dots.drawing.layout import SheetLayout
 from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
 
@@ -53,7 +53,7 @@ class Box:
     top: float
 
     @classmethod
-    def of(cls, layout: Layout) -> Box:
+    def of(cls, layout: SheetLayout) -> Box:
         """All that the dots of a layout can cover."""
         left, top, right, bottom = (layout.raster.mm(edge) for edge in layout.box)
         height = layout.raster.mm(layout.page[1])

@@ -17,7 +17,7 @@ from reportlab.pdfbase import pdfdoc
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core.dots.codec import DOT_DIRECTIONS, SYMBOL_LETTERS
-from locatk.core.dots.drawing.layout import Layout, Raster, pixels
+from locatk.core.dots.drawing.layout import Raster, SheetLayout, pixels
 from locatk.core.dots.drawing.tiles import seams
 from locatk.core.dots.sheet import Manifest
 from locatk.formats.pdf import page
@@ -78,7 +78,9 @@ def cramped(manifest: Manifest) -> list[str]:
     ]
 
 
-def draw_dots(canvas: Canvas, name: str, layout: Layout, rows: Iterable[NDArray[np.uint8]]) -> None:
+def draw_dots(
+    canvas: Canvas, name: str, layout: SheetLayout, rows: Iterable[NDArray[np.uint8]]
+) -> None:
     """Draw a pattern on the page that was begun.
 
     Parameters
@@ -86,7 +88,7 @@ def draw_dots(canvas: Canvas, name: str, layout: Layout, rows: Iterable[NDArray[
     canvas : reportlab Canvas
     name : str
         Of the drawing, not used for another one in this document.
-    layout : Layout
+    layout : SheetLayout
         Where; its page must be the canvas'.
     rows : iterable of (rows, columns) uint8 ndarray
         Bands of rows from the top down, together of the layout's size.

@@ -6,7 +6,12 @@ import io
 
 from reportlab.pdfgen.canvas import Canvas
 
-from locatk.core.dots.drawing.test_sheet import MARKER_SIDE, Corner, Field, PrinterSheet
+from locatk.core.dots.drawing.test_sheet import (
+    MARKER_SIDE_MODULES,
+    CornerMarker,
+    PrinterField,
+    PrinterSheet,
+)
 from locatk.formats.pdf import page
 from locatk.formats.pdf.pattern import draw_dots
 
@@ -38,7 +43,7 @@ def render(sheet: PrinterSheet) -> bytes:
     return stream.getvalue()
 
 
-def _draw_marker(canvas: Canvas, sheet: PrinterSheet, corner: Corner) -> None:
+def _draw_marker(canvas: Canvas, sheet: PrinterSheet, corner: CornerMarker) -> None:
     """Black modules, each row's neighbours in one rectangle, on the printer's pixels."""
     canvas.saveState()
     point = 72 / sheet.dpi
@@ -47,10 +52,10 @@ def _draw_marker(canvas: Canvas, sheet: PrinterSheet, corner: Corner) -> None:
     side, bottom = corner.module, sheet.page[1]
     path = canvas.beginPath()
     for row, black in enumerate(corner.modules()):
-        starts = [k for k in range(MARKER_SIDE) if black[k] and not (k and black[k - 1])]
+        starts = [k for k in range(MARKER_SIDE_MODULES) if black[k] and not (k and black[k - 1])]
         for start in starts:
             end = start
-            while end < MARKER_SIDE and black[end]:
+            while end < MARKER_SIDE_MODULES and black[end]:
                 end += 1
             y = bottom - top - (row + 1) * side
             path.rect(left + start * side, y, (end - start) * side, side)
@@ -58,7 +63,7 @@ def _draw_marker(canvas: Canvas, sheet: PrinterSheet, corner: Corner) -> None:
     canvas.restoreState()
 
 
-def _caption(canvas: Canvas, sheet: PrinterSheet, field: Field) -> None:
+def _caption(canvas: Canvas, sheet: PrinterSheet, field: PrinterField) -> None:
     """Name, dot and pitch below a field."""
     left, _, _, bottom = field.layout.box
     x, y = sheet.mm(left), sheet.mm(sheet.page[1] - bottom) - LINE_MM

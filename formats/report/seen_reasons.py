@@ -73,19 +73,18 @@ def _dots() -> dict[str, Reason]:
             "unreadable_frame": "The image is damaged or cut short.",
             "not_of_the_cameras_size": "The frame has another size than the camera's calibration.",
             "off_sheet": f"A place was decoded, but no sheet of the manifest reaches within "
-            f"{solver.RIM:g} pitches of it.",
-            "too_few_dots": f"Fewer than {grid.FEWEST} dots were found: no pattern in sight, out "
-            "of focus, or blurred.",
+            f"{solver.SHEET_SLACK_PITCHES:g} pitches of it.",
+            "too_few_dots": f"Fewer than {grid.MIN_LATTICE_DOTS} dots were found: no pattern in "
+            "sight, out of focus, or blurred.",
             "no_grid": "Dots were found, but no regular grid among them.",
             "no_code": "A grid was found, but no place of this code: too many dots are missing or "
             "false, or the sheet was printed with another code.",
-            "low_confidence": f"The likeliest place is less than {100 * decode.THRESHOLD:g} % "
+            "low_confidence": f"The likeliest place is less than {100 * decode.MIN_CONFIDENCE:g} % "
             "sure.",
             "section_border": "The frame lies across the border of two sections of the pattern.",
-            "no_dots": f"Fewer than {paper.FEWEST_DOTS} blobs were taken for dots (published "
-            "method).",
-            "no_window": f"No window of {paper.WINDOW} x {paper.WINDOW} dots is in the frame "
-            "(published method).",
+            "no_dots": f"Fewer than {paper.MIN_DOTS} blobs were taken for dots (published method).",
+            "no_window": f"No window of {paper.WINDOW_DOTS} x {paper.WINDOW_DOTS} dots is in the "
+            "frame (published method).",
             "no_orientation": "Rows and columns vote alike for both directions (published method).",
         },
     )

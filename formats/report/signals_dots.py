@@ -157,7 +157,7 @@ def _png(image: NDArray[np.uint8], codec: Codec | None, camera: Camera | None) -
     """A frame about :data:`WIDTH_PX` wide, with what was decoded in it where ``codec`` is given."""
     import cv2
 
-    from locatk.core.dots.localization.frames import sightings
+    from locatk.core.dots.localization.frames import dot_correspondences
 
     height, width = image.shape
     scale = max(1, round(WIDTH_PX / width)) if width < WIDTH_PX else WIDTH_PX / width
@@ -167,7 +167,7 @@ def _png(image: NDArray[np.uint8], codec: Codec | None, camera: Camera | None) -
     fits = camera is None or camera.size == (width, height)
     if codec is not None and fits:
         try:
-            seen = next(sightings(image[None], codec, camera), None)
+            seen = next(dot_correspondences(image[None], codec, camera), None)
         except InputError:
             seen = None
         for x, y in () if seen is None else (seen.pixels + 0.5) * scale:

@@ -340,6 +340,6 @@ def test_a_margin_without_room_is_said(locatk, tmp_path: Path) -> None:
 
 def test_choices_are_those_of_core() -> None:
     """Written twice, because commands import nothing heavy."""
-    assert set(print_pattern.CODECS) == set(sequences.FOURTH)
+    assert set(print_pattern.CODECS) == set(sequences.FOURTH_DIGITS)
     option = next(p for p in print_pattern.pattern.params if p.name == "dpi")
     assert [int(choice) for choice in option.type.choices] == list(DPIS)

@@ -13,7 +13,7 @@ import pytest
 from locatk.core.dots.codec import codec
 from locatk.core.dots.codec.lookup import decode_exact
 from locatk.core.dots.drawing import layout
-from locatk.core.dots.localization.located import nothing
+from locatk.core.dots.localization.frames import unlocalized_frames
 from locatk.formats.bench import Figure, dots, dots_print, dots_study, timing
 from locatk.formats.pdf import pattern
 
@@ -47,6 +47,8 @@ PROMISED = {
     "a single frame": 0.5,
     **{f"frame.bmp turned by {90 * k} deg: centre": 0.05 for k in range(4)},
     **{f"frame.bmp turned by {90 * k} deg: heading": 0.2 for k in range(4)},
+    "study: frames right": 99.17,
+    "study, --method paper: frames right": 99.17,
     "study: worst error x": 0.155,
     "study: worst error y": 0.273,
     "study: worst error heading": 1.581,
@@ -101,8 +103,8 @@ def test_frames_are_read_as_promised(rows: dict[str, Figure]) -> None:
             assert figure.met, f"{name}: {figure.value}"
     assert rows["frames a second, in a batch"].value > 0  # type: ignore[operator]
     assert rows["A0 printed: memory"].value > 10  # type: ignore[operator]
-    # The published method scatters as its authors' code does, and rejects some.
-    assert 0.005 < rows["--method paper, dots 0.30: rms"].value < 0.2  # type: ignore[operator]
+    # The published method scatters more than the default one.
+    assert 0.003 < rows["--method paper, dots 0.30: rms"].value < 0.05  # type: ignore[operator]
     assert rows["study, --method paper: worst error x"].value > rows["study: worst error x"].value  # type: ignore[operator]
 
 
@@ -125,7 +127,7 @@ def test_the_published_frame_is_found_in_all_turns(data: Path) -> None:
 
 
 def test_a_frame_counts_as_right_wrong_or_neither() -> None:
-    located = nothing(6, "no_grid")
+    located = unlocalized_frames(6, "no_grid")
     located.rejected[:5] = ""
     located.grid[:] = 100.0
     located.heading[:] = np.pi - 0.01
@@ -138,7 +140,7 @@ def test_a_frame_counts_as_right_wrong_or_neither() -> None:
     assert (found.frames, found.right, found.wrong) == (6, 3, 2)
     assert found.rms == pytest.approx(0.1 / np.sqrt(3))
     assert found.wrong_share == pytest.approx(40)
-    nobody = dots.score(nothing(2, "no_grid"), np.zeros((2, 2)), np.zeros(2))
+    nobody = dots.score(unlocalized_frames(2, "no_grid"), np.zeros((2, 2)), np.zeros(2))
     assert (nobody.right, nobody.wrong, nobody.wrong_share) == (0, 0, 0)
     assert np.isnan(nobody.rms)
     assert Figure("f", nobody.rms, "pitch", "how", 0.003).met is False
@@ -227,3 +229,19 @@ def test_the_command_lists_them(
     answer = json.loads(result.stdout)
     assert answer["system"] == "dots"
     assert [figure["name"] for figure in answer["figures"]] == list(rows)
+
+
+def test_the_published_method_reads_the_papers_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 2,420 frames all are read; without the correction of the direction 83.6 %."""
+    for name, value in (("GRID", 5), ("ANGLES", 9), ("SAMPLES", 4), ("METHODS", ("paper",))):
+        monkeypatch.setattr(dots_study, name, value)
+    monkeypatch.setattr(dots_study, "RIGHT_MM", 1e9)
+    monkeypatch.setattr(dots_study, "RIGHT_DEG", 1e9)
+    values = {
+        figure.name.removeprefix("study: "): figure.value for figure in dots_study.study_figures()
+    }
+    assert values["frames right"] >= 98  # type: ignore[operator]
+    # With these gates a wrong position would count as right: there is none among 100 frames.
+    assert values["worst error x"] < 0.155  # type: ignore[operator]
+    assert values["worst error y"] < 0.273  # type: ignore[operator]
+    assert values["worst error heading"] < 1.581  # type: ignore[operator]

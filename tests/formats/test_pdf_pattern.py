@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.codec import codec
 from locatk.core.dots.codec.lookup import decode_exact
-from locatk.core.dots.drawing.layout import Layout, lay_out, manifest, snap
+from locatk.core.dots.drawing.layout import SheetLayout, lay_out, manifest, snap
 from locatk.core.dots.drawing.tiles import seams, tiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
@@ -124,7 +124,7 @@ def assert_windows_decode(
     assert (found.rotation == 0).all()
 
 
-def box_px(layout: Layout, times: int = 1) -> tuple[slice, slice]:
+def box_px(layout: SheetLayout, times: int = 1) -> tuple[slice, slice]:
     left, top, right, bottom = (edge * times for edge in layout.box)
     return slice(top, bottom), slice(left, right)
 
@@ -146,7 +146,7 @@ def test_a4_is_exact_to_the_pixel(printer: int, dpi: int) -> None:
     assert_windows_decode(symbols, at, made, (24, 32), 1000)
 
 
-def corners(layout: Layout, side: int) -> Iterator[tuple[int, int, int, int]]:
+def corners(layout: SheetLayout, side: int) -> Iterator[tuple[int, int, int, int]]:
     """Boxes at the corners of a page and in its middle."""
     width, height = layout.page
     for x in (0, (width - side) // 2, width - side):

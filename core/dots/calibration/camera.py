@@ -1,8 +1,8 @@
-"""A camera from its own frames of the pattern: focal length, centre and lens.
+"""Calibration of a camera from its own frames of the pattern: focal length, centre and lens.
 
-The dots are a calibration target of thousands of known places that every session holds
-anyway. What poses need most, the centre and the bend of the lens, any frames tell; the
-focal length only those that are tilted.
+The dots are a calibration target of thousands of known positions that every session contains. The
+parameters that poses depend on most, the centre and the distortion of the lens, follow from any
+frames; the focal length only from tilted ones.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from locatk.core.dots.calibration.camera_fit import (
-    Fit,
-    Views,
-    fit_flat,
+    CalibrationViews,
+    CameraFit,
     fit_homographies,
     fit_poses,
+    fit_without_lens,
 )
 from locatk.core.dots.calibration.camera_views import (
-    MOST_FRAMES,
-    MOST_SEEN,
+    MAX_EXAMINED_FRAMES,
+    MAX_FITTED_FRAMES,
     NO_PATTERN,
-    SeenFrame,
+    CalibrationFrame,
     common_size,
-    look,
-    seen_of,
-    spread,
+    examine_frames,
+    frames_of_size,
+    select_diverse_frames,
     spread_order,
-    views_of,
+    stack_views,
 )
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
@@ -38,39 +38,45 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.solver import OTHER_SIZE
 from locatk.core.errors import DegenerateError, InputError
 
-USUAL_FOCAL = 1.56
-"""Focal length in diagonals of a frame where nothing is known: that of the paper's camera,
-348.7 px for 188 x 120 px."""
+USUAL_FOCAL_DIAGONALS = 1.56
+"""Focal length if nothing is known [diagonals of a frame]: that of the paper's camera, 348.7 px for
+188 x 120 px."""
 
-LARGEST_FOCAL_SIGMA = 0.05
-"""Relative standard deviation up to which a focal length counts as known."""
+MAX_FOCAL_RELATIVE_SIGMA = 0.05
+"""Largest relative standard deviation of a focal length that counts as determined."""
 
-LARGEST_CENTRE_SIGMA = 0.01
-"""Standard deviation in diagonals up to which a centre counts as known; beyond, the middle
-of the frame is no worse a guess."""
+MAX_CENTRE_SIGMA_DIAGONALS = 0.01
+"""Largest standard deviation [diagonals] of a centre that counts as determined; beyond it the
+middle of the frame is as good an estimate."""
 
-LARGEST_MISFIT = 1.5
-"""Scatter about poses over that about homographies up to which the frames are taken for
-what a pinhole sees of a flat sheet."""
+MAX_POSE_MISFIT_RATIO = 1.5
+"""Largest ratio of the residuals of poses to those of homographies if the frames are images of a
+flat sheet by a pinhole camera."""
 
-LARGEST_BEND = 0.9
-"""Of |k| times the square of a corner's distance; at 1 the lens folds the frame."""
+MAX_CORNER_DISTORTION = 0.9
+"""Largest |k| times the squared distance of a corner; at 1 the lens folds the frame."""
 
-NOTED_ASPECT = 5e-4
-"""0.05 mm on a ruler of 100 mm."""
+MIN_NOTED_ASPECT = 5e-4
+"""Least aspect that is reported: 0.05 mm on a ruler of 100 mm."""
+
+NOTED_SIGMAS = 3.0
+"""Difference in standard deviations from which it is reported."""
+
+MIN_NOTED_FOCAL_RATIO = 0.01
+"""Relative difference of focal lengths from which it is reported."""
 
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """What is known of the camera.
+    """Prior knowledge of the camera.
 
     Attributes
     ----------
     focal_px : float, optional
-        Kept, whatever the frames say.
+        Focal length, which is used whatever the frames indicate.
     camera : Camera, optional
-        An earlier calibration: the frames are read with its lens, and its focal length is
-        kept where they do not tell one.
+        An earlier calibration: the frames are localized with its lens, and its focal length is used
+        if the frames do not determine one.
     """
 
     focal_px: float | None = None
@@ -79,35 +85,35 @@ class CalibrateOptions:
 
 @dataclass(frozen=True)
 class CameraReport:
-    """A camera, and how well it is known.
+    """Calibrated camera, with the uncertainty of its parameters.
 
     Attributes
     ----------
     camera : Camera
     focal_from : str
-        ``"frames"``; else it was not fitted: ``"given"``, ``"camera"`` (an earlier one) or
-        ``"usual"``. Centre and k in px^-2 hold all the same.
+        ``"frames"``; else it was not estimated: ``"given"``, ``"camera"`` (an earlier one) or
+        ``"usual"``. Centre and k in px^-2 are valid all the same.
     centre_from : str
         ``"frames"`` or ``"middle"`` of the frame.
     sigma_focal_px : float
-        Standard deviations; nan of what was not fitted.
+        Standard deviations; nan if not estimated.
     sigma_centre_px : (x, y)
     sigma_radial_px : float
         Of k in px^-2.
     aspect, sigma_aspect : float
-        The sheet's true scale along x over that along y, relative to the manifest's,
-        minus 1; nan where the focal length is not fitted.
+        The sheet's true scale along x over that along y, relative to the manifest's, minus 1; nan
+        if the focal length is not estimated.
     largest_tilt_rad : float
         Likewise.
     rms_before_px, rms_px : float
-        Root mean square distance of dots from where they should be: without a lens, and
+        Root mean square distance of the dots from their predicted positions: without a lens, and
         with the camera.
     seen, located, used : int
-        Frames that were looked at, that have a place, and that were fitted.
+        Number of frames that were examined, localized and fitted.
     dots : int
-        Dots that were fitted.
+        Number of dots that were fitted.
     skipped : dict of str to int
-        Why frames that were looked at have no place.
+        Reasons why examined frames were not used.
     notes : tuple of str
     """
 
@@ -131,26 +137,26 @@ class CameraReport:
 
     @property
     def sigma_radial(self) -> float:
-        """Of the camera's k, for its focal length."""
+        """Standard deviation of the camera's k, for its focal length."""
         return self.sigma_radial_px * self.camera.focal_px**2
 
     @property
     def distortion(self) -> float:
-        """Share by which the lens draws in what belongs half a diagonal from its centre."""
+        """Fraction by which the lens moves a point at half a diagonal towards its centre."""
         return -self.camera.radial_px * (math.hypot(*self.camera.size) / 2) ** 2
 
 
 def calibrate(
     frames: Frames, manifest: Manifest, options: CalibrateOptions | None = None
 ) -> CameraReport:
-    """Fit the camera of a session to the dots in its frames.
+    """Estimate the camera of a session from the dots in its frames.
 
-    Of a long session, frames are taken that are spread over time, headings and tilts.
+    Of a long session, frames are selected that differ in time, heading and tilt.
 
     Raises
     ------
     DegenerateError
-        Too few frames show the pattern, or what they show is no lens of this kind.
+        Too few frames show the pattern, or no lens of this kind has such frames.
     InputError
         The manifest names an unknown codec, or the focal length is not above 0.
     """
@@ -158,41 +164,46 @@ def calibrate(
     if options.focal_px is not None and not 0 < options.focal_px < math.inf:
         raise InputError(f"a focal length of {options.focal_px:g} px", hint="Give one above 0")
     code = codec(manifest.codec)
-    order = spread_order(len(frames))[:MOST_SEEN]
-    looked = look(frames, manifest, code, order, (None, options.camera))
-    size = common_size(looked, len(frames))
-    chosen = spread(size, seen_of(looked, looked, size), len(frames))
+    order = spread_order(len(frames))[:MAX_EXAMINED_FRAMES]
+    outcomes = examine_frames(frames, manifest, code, order, (None, options.camera))
+    size = common_size(outcomes, len(frames))
+    localized = frames_of_size(outcomes, outcomes, size)
+    selected = select_diverse_frames(size, localized, len(frames))
 
-    # With the lens known, more dots and frames are told: so look at them once more.
-    lens = _camera(size, fit_homographies(views_of(size, chosen)), _usual_focal(size))
-    again = [seen.index for seen in chosen]
-    blank = [index for index, outcome in looked.items() if outcome == NO_PATTERN]
-    again += blank[: max(MOST_FRAMES - len(again), 0)]
-    looked |= {
+    # With the lens known, more dots and more frames are decoded: so examine them once more.
+    lens = camera_of_fit(size, fit_homographies(stack_views(size, selected)), _usual_focal(size))
+    again = [frame.index for frame in selected]
+    blank = [index for index, outcome in outcomes.items() if outcome == NO_PATTERN]
+    again += blank[: max(MAX_FITTED_FRAMES - len(again), 0)]
+    outcomes |= {
         index: outcome
-        for index, outcome in look(frames, manifest, code, again, (lens,)).items()
-        if isinstance(outcome, SeenFrame)
+        for index, outcome in examine_frames(frames, manifest, code, again, (lens,)).items()
+        if isinstance(outcome, CalibrationFrame)
     }
-    skipped = Counter(outcome for outcome in looked.values() if isinstance(outcome, str))
-    skipped[OTHER_SIZE] = sum(isinstance(o, SeenFrame) and o.size != size for o in looked.values())
-    return _report(
-        views_of(size, seen_of(looked, again, size)),
+    skipped = Counter(outcome for outcome in outcomes.values() if isinstance(outcome, str))
+    skipped[OTHER_SIZE] = sum(
+        isinstance(outcome, CalibrationFrame) and outcome.size != size
+        for outcome in outcomes.values()
+    )
+    return calibrate_views(
+        stack_views(size, frames_of_size(outcomes, again, size)),
         options,
-        len(looked),
+        len(outcomes),
         {reason: count for reason, count in sorted(skipped.items()) if count},
     )
 
 
 def _usual_focal(size: tuple[int, int]) -> float:
-    return USUAL_FOCAL * math.hypot(*size)
+    """Return the focal length in px if nothing is known."""
+    return USUAL_FOCAL_DIAGONALS * math.hypot(*size)
 
 
-def _camera(size: tuple[int, int], fit: Fit, focal: float) -> Camera:
-    """The camera of a fit, where it is one."""
+def camera_of_fit(size: tuple[int, int], fit: CameraFit, focal: float) -> Camera:
+    """Return the camera of a fit; raise DegenerateError if it is not plausible."""
     (width, height), (x, y) = size, fit.centre.tolist()
-    far = math.hypot(max(x, width - 1 - x), max(y, height - 1 - y))
-    inside = -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
-    if not inside or abs(fit.radial) * far**2 > LARGEST_BEND:
+    corner = math.hypot(max(x, width - 1 - x), max(y, height - 1 - y))
+    is_inside = -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
+    if not is_inside or abs(fit.radial) * corner**2 > MAX_CORNER_DISTORTION:
         raise DegenerateError(
             f"no lens of this kind shows such frames: its centre would be at {x:.0f}, {y:.0f} px "
             f"and k {fit.radial:.2g} px^-2",
@@ -201,90 +212,99 @@ def _camera(size: tuple[int, int], fit: Fit, focal: float) -> Camera:
     return Camera(size, focal, (x, y), fit.radial * focal**2)
 
 
-def _report(
-    views: Views, options: CalibrateOptions, seen: int, skipped: dict[str, int]
+def calibrate_views(
+    views: CalibrationViews, options: CalibrateOptions, examined: int, skipped: dict[str, int]
 ) -> CameraReport:
+    """Fit the camera to selected frames, with those of its parameters that they determine."""
     size, usual = views.size, _usual_focal(views.size)
-    largest = LARGEST_CENTRE_SIGMA * math.hypot(*size)
-    bend = fit_homographies(views)
-    poses = fit_poses(views, bend, usual)
-    tilted = poses.sigma[3] <= LARGEST_FOCAL_SIGMA * poses.focal
-    fits = poses.rms <= LARGEST_MISFIT * bend.rms
-    best = poses if tilted and fits else bend
-    held = bool(best.sigma[:2].max() > largest)
-    if held:
-        best = (
-            fit_poses(views, bend, usual, hold_centre=True)
-            if best is poses
-            else fit_homographies(views, hold_centre=True)
-        )
-    known = tilted and fits
+    by_homographies = fit_homographies(views)
+    by_poses = fit_poses(views, by_homographies, usual)
+    is_tilted = by_poses.sigma[3] <= MAX_FOCAL_RELATIVE_SIGMA * by_poses.focal
+    is_pinhole = by_poses.rms <= MAX_POSE_MISFIT_RATIO * by_homographies.rms
+    determines_focal = is_tilted and is_pinhole
+    best = by_poses if determines_focal else by_homographies
+    max_centre_sigma = MAX_CENTRE_SIGMA_DIAGONALS * math.hypot(*size)
+    fix_centre = bool(best.sigma[:2].max() > max_centre_sigma)
+    if fix_centre and determines_focal:
+        best = fit_poses(views, by_homographies, usual, fix_centre=True)
+    elif fix_centre:
+        best = fit_homographies(views, fix_centre=True)
     focal, source = usual, "usual"
     if options.focal_px is not None:
         focal, source = options.focal_px, "given"
-    elif known:
+    elif determines_focal:
         focal, source = best.focal, "frames"
     elif options.camera is not None and options.camera.size == size:
         focal, source = options.camera.focal_px, "camera"
-    camera = _camera(size, best, focal)
+    camera = camera_of_fit(size, best, focal)
+    notes = [
+        *_misfit_notes(by_poses, by_homographies, is_pinhole=is_pinhole),
+        *_focal_notes(by_poses, camera, source, is_tilted=is_tilted, is_pinhole=is_pinhole),
+        *_centre_and_aspect_notes(best, fix_centre=fix_centre),
+    ]
     return CameraReport(
         camera=camera,
         focal_from=source,
-        centre_from="middle" if held else "frames",
+        centre_from="middle" if fix_centre else "frames",
         sigma_focal_px=float(best.sigma[3]) if source == "frames" else math.nan,
         sigma_centre_px=(float(best.sigma[0]), float(best.sigma[1])),
         sigma_radial_px=float(best.sigma[2]),
         aspect=best.aspect,
         sigma_aspect=float(best.sigma[4]),
         largest_tilt_rad=float(best.tilt.max()),
-        rms_before_px=fit_flat(views).rms,
+        rms_before_px=fit_without_lens(views).rms,
         rms_px=best.rms,
-        seen=seen,
-        located=seen - sum(skipped.values()),
+        seen=examined,
+        located=examined - sum(skipped.values()),
         used=len(views),
         dots=int(best.used.sum()),
         skipped=skipped,
-        notes=tuple(_notes(best, poses, bend, camera, source, held=held, tilted=tilted, fits=fits)),
+        notes=tuple(notes),
     )
 
 
-def _notes(
-    best: Fit,
-    poses: Fit,
-    bend: Fit,
-    camera: Camera,
-    source: str,
-    *,
-    held: bool,
-    tilted: bool,
-    fits: bool,
+def _misfit_notes(
+    by_poses: CameraFit, by_homographies: CameraFit, *, is_pinhole: bool
 ) -> Iterator[str]:
-    focal = camera.focal_px
-    if not fits:
+    """Report frames that are not images of a flat sheet by a pinhole camera."""
+    if not is_pinhole:
         yield (
             "the frames are not what a pinhole sees of a flat sheet: dots miss their places by "
-            f"{poses.rms:.2g} px, and by {bend.rms:.2g} px where each frame may be any homography; "
-            "the shutter may be a rolling one, the sheet not flat, or pixels not square"
+            f"{by_poses.rms:.2g} px, and by {by_homographies.rms:.2g} px where each frame may be "
+            "any homography; the shutter may be a rolling one, the sheet not flat, or pixels not "
+            "square"
         )
+
+
+def _focal_notes(
+    by_poses: CameraFit, camera: Camera, source: str, *, is_tilted: bool, is_pinhole: bool
+) -> Iterator[str]:
+    """Report the source of the focal length if it is not that of the frames."""
+    focal = camera.focal_px
     if source in ("usual", "camera"):
-        why = "" if tilted else ": they are not tilted enough"
+        reason = "" if is_tilted else ": they are not tilted enough"
         instead = "a usual one stands in" if source == "usual" else "the earlier one is kept"
         yield (
-            f"the frames do not tell the focal length{why}; {instead}, {focal:.1f} px. Poses on "
+            f"the frames do not tell the focal length{reason}; {instead}, {focal:.1f} px. Poses on "
             "the sheet do not depend on it"
         )
-    if source == "given" and tilted and fits:
-        sigma = poses.sigma[3]
-        if abs(poses.focal - focal) > max(3 * sigma, 0.01 * focal):
-            yield f"the frames tell a focal length of {poses.focal:.1f} px (sigma {sigma:.2g})"
-    if held:
+    if source == "given" and is_tilted and is_pinhole:
+        sigma = by_poses.sigma[3]
+        difference = abs(by_poses.focal - focal)
+        if difference > max(NOTED_SIGMAS * sigma, MIN_NOTED_FOCAL_RATIO * focal):
+            yield f"the frames tell a focal length of {by_poses.focal:.1f} px (sigma {sigma:.2g})"
+
+
+def _centre_and_aspect_notes(fit: CameraFit, *, fix_centre: bool) -> Iterator[str]:
+    """Report an undetermined centre, and a wrong aspect of the sheet."""
+    if fix_centre:
         yield (
             "the frames do not tell the centre, for want of bend and tilt: it is taken to be the "
             "middle of the frame"
         )
-    if abs(best.aspect) > max(3 * best.sigma[4], NOTED_ASPECT):
-        more = "longer" if best.aspect > 0 else "shorter"
+    if abs(fit.aspect) > max(NOTED_SIGMAS * fit.sigma[4], MIN_NOTED_ASPECT):
+        comparison = "longer" if fit.aspect > 0 else "shorter"
         yield (
-            f"the sheet is {100 * abs(best.aspect):.2f} % {more} along x, compared to y, than its "
-            "manifest says: its scales should be measured"
+            f"the sheet is {100 * abs(fit.aspect):.2f} % {comparison} along x, compared to y, than "
+            "its manifest says: its scales should be measured"
         )

@@ -1,4 +1,4 @@
-"""Which frames of a session are taken to calibrate its camera, and the dots in them."""
+"""Selection of the frames of a session that calibrate its camera, and of the dots in them."""
 
 from __future__ import annotations
 
@@ -10,41 +10,47 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots.calibration.camera_fit import Views, homographies
+from locatk.core.dots.calibration.camera_fit import CalibrationViews, homographies
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.localization.frames import locate, sightings
-from locatk.core.dots.sheet import OFFSET, Manifest
-from locatk.core.dots.solver import OFF_SHEET, RIM, UNREADABLE
+from locatk.core.dots.localization.frames import dot_correspondences, localize_frames
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest
+from locatk.core.dots.solver import OFF_SHEET, SHEET_SLACK_PITCHES, UNREADABLE
 from locatk.core.errors import DegenerateError, InputError
 
 Array = NDArray[np.float64]
 
 NO_PATTERN = "no_pattern"
 
-FEWEST_FRAMES = 5
-"""With fewer, nothing tells a bad frame from a good one."""
+MIN_CALIBRATION_FRAMES = 5
+"""Least number of localized frames; fewer do not reveal a bad one."""
 
-MOST_FRAMES = 200
-"""Frames that are fitted; more would tell nothing new."""
+MAX_FITTED_FRAMES = 200
+"""Maximum number of frames that are fitted; more add no information."""
 
-MOST_LOCATED = 2 * MOST_FRAMES
-"""Frames with a place from which those are chosen."""
+MAX_LOCALIZED_FRAMES = 2 * MAX_FITTED_FRAMES
+"""Number of localized frames from which the fitted ones are selected."""
 
-MOST_SEEN = 1000
-"""Frames that are looked at, where many of them show no pattern."""
+MAX_EXAMINED_FRAMES = 1000
+"""Maximum number of frames that are examined if many of them show no pattern."""
 
-BLOCK = 40
-"""Frames that are in memory at once."""
+FRAMES_PER_BLOCK = 40
+"""Number of frames that are in memory at once."""
 
-MOST_DOTS = 250
-"""Of a frame; the paper's camera sees 180."""
+MAX_DOTS_PER_FRAME = 250
+"""Maximum number of dots of a frame that are fitted; a frame of the paper's camera has 180."""
+
+MAX_SCALED_TILT = 3.0
+"""Limit of the tilts, in standard deviations, when frames are compared."""
+
+TIME_WEIGHT = 2.0
+"""Weight of time, as a fraction of the session, when frames are compared."""
 
 
 @dataclass(frozen=True)
-class SeenFrame:
-    """Dots of a located frame.
+class CalibrationFrame:
+    """Dots of a localized frame.
 
     Attributes
     ----------
@@ -53,9 +59,9 @@ class SeenFrame:
     size : (width, height)
         In px.
     pixels : (m, 2) ndarray
-        As seen, in px.
+        Observed positions in px.
     plane : (m, 2) ndarray
-        In metres on the sheet from any origin, x right, y down, as printed.
+        Positions on the sheet as printed, in metres from any origin, x right, y down.
     """
 
     index: int
@@ -64,140 +70,167 @@ class SeenFrame:
     plane: Array
 
 
-def spread_order(count: int) -> list[int]:
-    """All of 0 .. count - 1, so that any beginning of it is spread evenly over them.
+Outcomes = dict[int, CalibrationFrame | str]
+"""Dots of each examined frame, or the reason why it cannot be used, by index."""
 
-    By the fractional parts of the multiples of the golden ratio.
+
+def spread_order(count: int) -> list[int]:
+    """Return 0 .. count - 1 in an order of which every first part is spread evenly over the range.
+
+    The order is that of the fractional parts of multiples of the golden ratio.
     """
     return np.argsort(np.arange(count) * ((math.sqrt(5) - 1) / 2) % 1).tolist()
 
 
-def look(
+def examine_frames(
     frames: Frames,
     manifest: Manifest,
     code: Codec,
     order: Iterable[int],
     cameras: Sequence[Camera | None],
-) -> dict[int, SeenFrame | str]:
-    """What frames show, or why they cannot be used, by index; until there are enough.
+) -> Outcomes:
+    """Localize frames in the given order, until there are :data:`MAX_LOCALIZED_FRAMES`.
 
     Parameters
     ----------
     frames, manifest, code
     order : iterable of int
-        Frames to look at.
+        Indices of the frames to examine.
     cameras : sequence of Camera or None
-        With which of them to look, until one helps; None knows of no lens.
+        Cameras to try until one of them localizes a frame; None is an unknown lens.
     """
-    looked: dict[int, SeenFrame | str] = {}
+    outcomes: Outcomes = {}
     order = list(order)
-    for start in range(0, len(order), BLOCK):
+    for start in range(0, len(order), FRAMES_PER_BLOCK):
         images: dict[int, NDArray[np.uint8]] = {}
-        for index in order[start : start + BLOCK]:
-            looked[index] = NO_PATTERN
+        for index in order[start : start + FRAMES_PER_BLOCK]:
+            outcomes[index] = NO_PATTERN
             try:
                 images[index] = frames.images[index]
             except InputError:
-                looked[index] = UNREADABLE
+                outcomes[index] = UNREADABLE
         for camera in dict.fromkeys(cameras):
-            for index in _located(images, code, camera):
-                looked[index] = _dots_of(index, images.pop(index), manifest, code, camera)
-        if sum(isinstance(one, SeenFrame) for one in looked.values()) >= MOST_LOCATED:
+            for index in _localizable(images, code, camera):
+                image = images.pop(index)
+                outcomes[index] = _measure_dots(index, image, manifest, code, camera)
+        localized = sum(isinstance(outcome, CalibrationFrame) for outcome in outcomes.values())
+        if localized >= MAX_LOCALIZED_FRAMES:
             break
-    return looked
+    return outcomes
 
 
-def _located(images: dict[int, NDArray[np.uint8]], code: Codec, camera: Camera | None) -> list[int]:
-    """Which frames have a place. In a batch, those that have none cost least."""
-    found: list[int] = []
+def _localizable(
+    images: dict[int, NDArray[np.uint8]], code: Codec, camera: Camera | None
+) -> list[int]:
+    """Return the indices of images that can be localized, which is cheapest in batches."""
+    indices: list[int] = []
     for shape in {image.shape for image in images.values()}:
         if camera is None or camera.size == shape[::-1]:
-            same = [index for index, image in images.items() if image.shape == shape]
-            located = locate(np.stack([images[index] for index in same]), code, camera)
-            found += [same[k] for k in np.flatnonzero(located.accepted)]
-    return sorted(found)
+            batch = [index for index, image in images.items() if image.shape == shape]
+            localized = localize_frames(np.stack([images[k] for k in batch]), code, camera)
+            indices += [batch[k] for k in np.flatnonzero(localized.accepted)]
+    return sorted(indices)
 
 
-def _dots_of(
+def _measure_dots(
     index: int,
     image: NDArray[np.uint8],
     manifest: Manifest,
     code: Codec,
     camera: Camera | None,
-) -> SeenFrame | str:
+) -> CalibrationFrame | str:
+    """Return the dots of a frame with their positions on its sheet, or a reason."""
     height, width = image.shape
-    for sighting in sightings(image[None], code, camera):
-        middle = sighting.origin + sighting.grid.mean(axis=0)
-        number = int(manifest.find(middle[None], [[-1, -1]], slack=RIM)[0])
+    for dots in dot_correspondences(image[None], code, camera):
+        middle = dots.origin + dots.grid.mean(axis=0)
+        number = int(manifest.find(middle[None], [[-1, -1]], slack=SHEET_SLACK_PITCHES)[0])
         if number < 0:
             return OFF_SHEET
-        place = np.rint(sighting.grid)
-        shift = (sighting.grid - place) * (manifest.offset_mm / manifest.pitch_mm / OFFSET)
-        # Lengths alone: how a tile is turned on its floor means nothing to a camera.
+        position = np.rint(dots.grid)
+        printed_offset = manifest.offset_mm / manifest.pitch_mm
+        offset = (dots.grid - position) * (printed_offset / DOT_OFFSET_PITCHES)
+        # Lengths only: the rotation of a tile on its floor has no effect on a camera.
         pitch = np.linalg.norm(manifest.jacobian(number), axis=0)
-        plane = (place + shift) * pitch
-        some = np.random.default_rng(index).permutation(len(plane))[:MOST_DOTS]
-        return SeenFrame(index, (width, height), sighting.pixels[some], plane[some])
+        plane = (position + offset) * pitch
+        selected = np.random.default_rng(index).permutation(len(plane))[:MAX_DOTS_PER_FRAME]
+        return CalibrationFrame(index, (width, height), dots.pixels[selected], plane[selected])
     return NO_PATTERN
 
 
-def seen_of(
-    looked: dict[int, SeenFrame | str], indices: Iterable[int], size: tuple[int, int]
-) -> list[SeenFrame]:
-    """Located frames of ``size`` among ``indices``."""
-    outcomes = (looked[index] for index in indices)
-    return [one for one in outcomes if isinstance(one, SeenFrame) and one.size == size]
+def frames_of_size(
+    outcomes: Outcomes, indices: Iterable[int], size: tuple[int, int]
+) -> list[CalibrationFrame]:
+    """Return the localized frames of ``size`` among ``indices``."""
+    candidates = (outcomes[index] for index in indices)
+    return [
+        frame for frame in candidates if isinstance(frame, CalibrationFrame) and frame.size == size
+    ]
 
 
-def common_size(looked: dict[int, SeenFrame | str], total: int) -> tuple[int, int]:
-    """Size in px of most located frames of ``total``.
+def common_size(outcomes: Outcomes, total: int) -> tuple[int, int]:
+    """Return the most frequent size in px of the localized frames, of ``total`` frames.
 
     Raises
     ------
     DegenerateError
-        There are less than :data:`FEWEST_FRAMES`.
+        Fewer than :data:`MIN_CALIBRATION_FRAMES` are localized.
     """
-    sizes = Counter(one.size for one in looked.values() if isinstance(one, SeenFrame))
+    sizes = Counter(
+        frame.size for frame in outcomes.values() if isinstance(frame, CalibrationFrame)
+    )
     size, count = sizes.most_common(1)[0] if sizes else ((0, 0), 0)
-    if count >= FEWEST_FRAMES:
+    if count >= MIN_CALIBRATION_FRAMES:
         return size
-    reasons = Counter(one for one in looked.values() if isinstance(one, str))
-    of = f"of {len(looked)} frames" + (f" (of {total})" if len(looked) < total else "")
-    if reasons[OFF_SHEET] >= FEWEST_FRAMES:
+    reasons = Counter(outcome for outcome in outcomes.values() if isinstance(outcome, str))
+    examined = f"of {len(outcomes)} frames"
+    examined += f" (of {total})" if len(outcomes) < total else ""
+    if reasons[OFF_SHEET] >= MIN_CALIBRATION_FRAMES:
         raise DegenerateError(
-            f"{reasons[OFF_SHEET]} {of} show the pattern off all sheets of the manifest",
+            f"{reasons[OFF_SHEET]} {examined} show the pattern off all sheets of the manifest",
             hint="Is it the manifest of another sheet?",
         )
     raise DegenerateError(
-        f"{count or 'none'} {of} show the pattern, where {FEWEST_FRAMES} are needed",
+        f"{count or 'none'} {examined} show the pattern, where {MIN_CALIBRATION_FRAMES} are needed",
         hint="Take sharp frames at several places of the sheet that the manifest describes",
     )
 
 
-def spread(size: tuple[int, int], found: list[SeenFrame], total: int) -> list[SeenFrame]:
-    """At most :data:`MOST_FRAMES`, as different as can be in heading, tilt and time."""
-    if len(found) <= MOST_FRAMES:
-        return found
-    own = homographies(views_of(size, found))
-    heading = np.arctan2(own[:, 3], own[:, 0])
-    tilt = own[:, 6:] / np.maximum(np.std(own[:, 6:]), 1e-12)
-    when = np.array([seen.index for seen in found]) / total
-    features = np.column_stack([np.cos(heading), np.sin(heading), tilt.clip(-3, 3), 2 * when])
-    chosen = [0]
-    nearest = np.full(len(found), np.inf)
-    while len(chosen) < MOST_FRAMES:
-        away = np.linalg.norm(features - features[chosen[-1]], axis=1)
-        nearest = np.minimum(nearest, away)
-        chosen.append(int(np.argmax(nearest)))
-    return [found[k] for k in sorted(chosen)]
+def select_diverse_frames(
+    size: tuple[int, int], frames: list[CalibrationFrame], total: int
+) -> list[CalibrationFrame]:
+    """Return at most :data:`MAX_FITTED_FRAMES` that differ in heading, tilt and time.
+
+    Each next frame is the one farthest from those already selected.
+    """
+    if len(frames) <= MAX_FITTED_FRAMES:
+        return frames
+    parameters = homographies(stack_views(size, frames))
+    heading = np.arctan2(parameters[:, 3], parameters[:, 0])
+    tilt = parameters[:, 6:] / np.maximum(np.std(parameters[:, 6:]), 1e-12)
+    time = np.array([frame.index for frame in frames]) / total
+    features = np.column_stack(
+        [
+            np.cos(heading),
+            np.sin(heading),
+            tilt.clip(-MAX_SCALED_TILT, MAX_SCALED_TILT),
+            TIME_WEIGHT * time,
+        ]
+    )
+    selected = [0]
+    distance = np.full(len(frames), np.inf)
+    while len(selected) < MAX_FITTED_FRAMES:
+        to_last = np.linalg.norm(features - features[selected[-1]], axis=1)
+        distance = np.minimum(distance, to_last)
+        selected.append(int(np.argmax(distance)))
+    return [frames[k] for k in sorted(selected)]
 
 
-def views_of(size: tuple[int, int], found: Sequence[SeenFrame]) -> Views:
-    """Frames as arrays, the shorter ones filled up."""
-    most = max(len(seen.pixels) for seen in found)
-    pixels, plane = np.zeros((2, len(found), most, 2))
-    valid = np.zeros((len(found), most), bool)
-    for k, seen in enumerate(found):
-        count = len(seen.pixels)
-        pixels[k, :count], plane[k, :count], valid[k, :count] = seen.pixels, seen.plane, True
-    return Views(size, pixels, plane, valid)
+def stack_views(size: tuple[int, int], frames: Sequence[CalibrationFrame]) -> CalibrationViews:
+    """Return the dots of frames as padded arrays."""
+    most = max(len(frame.pixels) for frame in frames)
+    pixels, plane = np.zeros((2, len(frames), most, 2))
+    valid = np.zeros((len(frames), most), bool)
+    for k, frame in enumerate(frames):
+        count = len(frame.pixels)
+        pixels[k, :count], plane[k, :count], valid[k, :count] = frame.pixels, frame.plane, True
+    return CalibrationViews(size, pixels, plane, valid)

@@ -1,10 +1,10 @@
-"""Hard decoding: windows of symbols to positions by look-ups alone, as the paper has it.
+"""Hard decoding: positions of windows of symbols by look-up tables alone.
 
-papers/dots.txt II-A: every column is found in the main sequence, the shifts from column to
-column are taken apart into digits, and the places of those digits in the four secondary
-sequences make the position by the Chinese remainder theorem; the rows give the other axis.
-Nothing is corrected: every dot of a window has to agree with the answer. Where bits may be
-wrong or missing, soft decoding is the tool.
+Every column is looked up in the main sequence, the shifts from column to column are decomposed into
+digits, and the positions of those digits in the four secondary sequences give x by the Chinese
+remainder theorem; the rows give y (Hostettler et al. 2016, II-A). Nothing is corrected: every dot
+of a window has to agree with the result. If bits may be wrong or missing, use soft decoding
+(:mod:`~locatk.core.dots.identification.decoding`).
 """
 
 from __future__ import annotations
@@ -28,43 +28,48 @@ from locatk.core.dots.codec.pattern import (
 )
 from locatk.core.errors import InputError
 
-Whole = NDArray[np.int64]
+Integers = NDArray[np.int64]
 
-ORDER = 6
-"""Bits that fix a place in the main sequence, and dots a side of the smallest window."""
+BITS_PER_STRING = 6
+"""Bits that determine a phase of the main sequence (its order), and dots per side of the smallest
+window."""
 
-STRING = 5
-"""Digits that fix a place in a secondary sequence."""
+DIGITS_PER_STRING = 5
+"""Digits that determine a position in a secondary sequence (its order)."""
 
-ONE_WAY = 7
-"""Bits from which on the main sequence reads in one direction only (facts/dots.md 2.3)."""
+MIN_ORIENTED_BITS = 7
+"""Number of bits from which no string of the main sequence, reversed and inverted, occurs in it. Of
+the 63 strings of six bits 62 do."""
 
 _CYCLE = np.array([UP, LEFT, DOWN, RIGHT], np.uint8)
-_TURNED = np.empty((4, 4), np.uint8)
-"""What each symbol becomes; a row for each number of quarter turns."""
+_ROTATED_SYMBOLS = np.empty((4, 4), np.uint8)
+"""Symbols after 0 to 3 counter-clockwise quarter turns: one row per number of turns."""
 for _quarters in range(4):
-    _TURNED[_quarters, _CYCLE] = np.roll(_CYCLE, -_quarters)
+    _ROTATED_SYMBOLS[_quarters, _CYCLE] = np.roll(_CYCLE, -_quarters)
 
 
-def _lines(length: int) -> NDArray[np.uint8]:
-    """(63, length) lines of bits, one from each place of the main sequence."""
+def _main_sequence_strings(length: int) -> NDArray[np.uint8]:
+    """Return the (63, length) strings of the main sequence from each phase on."""
     return MAIN_SEQUENCE[
         np.add.outer(np.arange(MAIN_SEQUENCE_LENGTH), np.arange(length)) % MAIN_SEQUENCE_LENGTH
     ]
 
 
-_POWERS = 1 << np.arange(ORDER - 1, -1, -1, dtype=np.uint8)
-_PHASE = np.full(1 << ORDER, -1, np.int64)
-"""Place of each six bits in the main sequence, -1 for 111111, which is not in it."""
-_PHASE[_lines(ORDER) @ _POWERS] = np.arange(MAIN_SEQUENCE_LENGTH)
+_BIT_WEIGHTS = 1 << np.arange(BITS_PER_STRING - 1, -1, -1, dtype=np.uint8)
+_PHASE_OF_CODE = np.full(1 << BITS_PER_STRING, -1, np.int64)
+"""Phase of each string of six bits, as a number, in the main sequence; -1 for 111111, which does
+not occur."""
+_PHASE_OF_CODE[_main_sequence_strings(BITS_PER_STRING) @ _BIT_WEIGHTS] = np.arange(
+    MAIN_SEQUENCE_LENGTH
+)
 
-SHIFTS = np.arange(5, 59)
-"""Shifts from line to line that have digits; the others belong to no pattern."""
+POSSIBLE_SHIFTS = np.arange(5, 59)
+"""Shifts from line to line that have digits; no pattern contains the others."""
 
 
 @dataclass(frozen=True, eq=False)
-class Exact:
-    """What :func:`decode_exact` read, an entry a window; all -1 where ``ok`` is False.
+class ExactWindows:
+    """Result of :func:`decode_exact` for n windows; all entries are -1 if ``ok`` is False.
 
     Attributes
     ----------
@@ -73,160 +78,169 @@ class Exact:
     section : (n, 2) int64 ndarray
         u and v, each 0..62.
     rotation : (n,) int64 ndarray
-        Quarter turns counter-clockwise by which the print appears turned in the window,
-        0..3: what was seen is ``turn(printed, rotation)``.
+        Counter-clockwise quarter turns 0..3 of the print in the window: the observed symbols are
+        ``rotate_symbols(printed, rotation)``.
     ok : (n,) bool ndarray
-        Every dot agrees, with one answer and no other.
+        Every dot agrees, with exactly one result.
     """
 
-    x: Whole
-    y: Whole
-    section: Whole
-    rotation: Whole
+    x: Integers
+    y: Integers
+    section: Integers
+    rotation: Integers
     ok: NDArray[np.bool_]
 
 
-def turn(symbols: NDArray[np.uint8], quarters: int) -> NDArray[np.uint8]:
-    """Windows (..., rows, columns) turned counter-clockwise, and their symbols with them.
+def rotate_symbols(symbols: NDArray[np.uint8], quarters: int) -> NDArray[np.uint8]:
+    """Rotate windows (..., rows, columns) counter-clockwise, and their symbols with them.
 
     After one quarter turn an UP dot points LEFT. ``quarters`` may be negative.
     """
-    result: NDArray[np.uint8] = _TURNED[quarters % 4][np.rot90(symbols, quarters, axes=(-2, -1))]
+    result: NDArray[np.uint8] = _ROTATED_SYMBOLS[quarters % 4][
+        np.rot90(symbols, quarters, axes=(-2, -1))
+    ]
     return result
 
 
 def decode_exact(
     windows: ArrayLike, codec: Codec, rotations: tuple[int, ...] | None = None
-) -> Exact:
-    """Positions of windows of symbols in which no dot is missing or wrong.
+) -> ExactWindows:
+    """Return the positions of windows of symbols without a missing or wrong dot.
 
     Parameters
     ----------
     windows : (n, rows, columns) array_like of whole numbers
-        Symbols as they were seen; 6 or more rows and columns.
+        Observed symbols; 6 or more rows and columns.
     codec : Codec
     rotations : tuple of int, optional
-        Quarter turns that are possible. By default all four from 7 x 7 dots on, and none
-        (``(0,)``) below: 62 of the 63 strings of six bits are also strings of the main
-        sequence upside down (facts/dots.md 2.3). So 6 x 6 dots that are turned by 90 or
-        180 degrees make a valid, wrong position in 37 or 16 of 100 windows; who
-        does not know how they lie asks for ``(0, 1, 2, 3)``, and gets those windows read
-        that only one turn fits, 39 of 100.
+        Possible quarter turns. Default: all four from 7 x 7 dots on, and none (``(0,)``) below,
+        because 62 of the 63 strings of six bits are also strings of the main sequence when reversed
+        and inverted: 6 x 6 dots rotated by 90 or 180 degrees have a valid, wrong position in 37 or
+        16 of 100 windows. If the rotation is unknown, pass ``(0, 1, 2, 3)``; then the windows
+        that fit one rotation only are decoded, 39 of 100.
 
     Returns
     -------
-    Exact
-        ``ok`` is False where a dot disagrees, where several turns or places agree (libdots'
-        repeated digits, in fewer than eight dots a side), and where the window would
-        reach across the border of the section. From 8 x 8 dots on one wrong bit is
-        always found. In smaller windows, or with more wrong bits, errors may make
-        another valid window, which nothing distinguishes from a true one.
+    ExactWindows
+        ``ok`` is False if a dot disagrees, if several rotations or positions agree (repeated digits
+        of ``libdots``, in fewer than eight dots per side), or if the window would extend across the
+        border of the section. From 8 x 8 dots on a single wrong bit is always detected. In smaller
+        windows, or with more wrong bits, errors may result in another valid window, which cannot be
+        distinguished from the true one.
 
     Raises
     ------
     InputError
-        The windows are too small, or hold what is no symbol.
+        The windows are too small, or contain a value that is no symbol.
     """
-    seen = np.asarray(windows)
-    if seen.ndim != 3 or min(seen.shape[1:]) < ORDER:
+    observed = np.asarray(windows)
+    if observed.ndim != 3 or min(observed.shape[1:]) < BITS_PER_STRING:
         raise InputError(
-            f"windows of shape {seen.shape}, not (n, rows, columns) of at least 6 x 6 dots"
+            f"windows of shape {observed.shape}, not (n, rows, columns) of at least 6 x 6 dots"
         )
-    if seen.size and not (seen.dtype.kind in "iu" and seen.min() >= 0 and seen.max() <= DOWN):
+    is_integer = observed.dtype.kind in "iu"
+    if observed.size and not (is_integer and observed.min() >= 0 and observed.max() <= DOWN):
         raise InputError(f"symbols that are not whole numbers 0..{DOWN}")
     if rotations is None:
-        rotations = (0, 1, 2, 3) if min(seen.shape[1:]) >= ONE_WAY else (0,)
-    seen = seen.astype(np.uint8, copy=False)
-    read = np.full((5, len(seen)), -1, np.int64)
-    answers = np.zeros(len(seen), np.int64)
+        is_oriented = min(observed.shape[1:]) >= MIN_ORIENTED_BITS
+        rotations = (0, 1, 2, 3) if is_oriented else (0,)
+    observed = observed.astype(np.uint8, copy=False)
+    decoded = np.full((5, len(observed)), -1, np.int64)
+    results = np.zeros(len(observed), np.int64)
     for rotation in sorted({r % 4 for r in rotations}):
-        which, position, number = _decode(seen, rotation, codec)
-        read[:4, which] = position
-        read[4, which] = rotation
-        answers[which] += number
-    ok = answers == 1
-    read[:, ~ok] = -1
-    return Exact(read[0], read[1], read[2:4].T.copy(), read[4], ok)
+        index, position, count = _decode_at_rotation(observed, rotation, codec)
+        decoded[:4, index] = position
+        decoded[4, index] = rotation
+        results[index] += count
+    ok = results == 1
+    decoded[:, ~ok] = -1
+    return ExactWindows(decoded[0], decoded[1], decoded[2:4].T.copy(), decoded[4], ok)
 
 
-def _decode(
-    seen: NDArray[np.uint8], rotation: int, codec: Codec
-) -> tuple[NDArray[np.intp], Whole, Whole]:
-    """Windows that can be read as turned so.
+def _decode_at_rotation(
+    observed: NDArray[np.uint8], rotation: int, codec: Codec
+) -> tuple[NDArray[np.intp], Integers, Integers]:
+    """Decode the windows that are valid at a rotation.
 
-    Returns their numbers (m,), x, y, u and v (4, m), and of how many places each could be (m,).
+    Returns their indices (m,), x, y, u and v (4, m), and the number of positions (m,) that each
+    agrees with.
     """
-    # The first column and row sort out nearly all that is turned otherwise, cheaply.
-    back = np.rot90(seen, -rotation, axes=(1, 2))
-    upright = _TURNED[-rotation % 4]
-    first = _phases(upright[back[:, :, 0]] & 1) | _phases(upright[back[:, 0]] >> 1)
-    which = np.flatnonzero(first >= 0)
-    printed = upright[back[which]]
-    columns, rows = _phases((printed & 1).swapaxes(1, 2)), _phases(printed >> 1)
-    whole = (columns >= 0).all(axis=1) & (rows >= 0).all(axis=1)
-    which, columns, rows = which[whole], columns[whole], rows[whole]
-    x, ways_x = _places(columns, codec)
-    y, ways_y = _places(rows, codec)
-    number = ways_x * ways_y
-    found = number > 0
+    # The first column and row exclude nearly all windows of another rotation at little cost.
+    rotated = np.rot90(observed, -rotation, axes=(1, 2))
+    printed_symbol = _ROTATED_SYMBOLS[-rotation % 4]
+    first_column = _phases_of(printed_symbol[rotated[:, :, 0]] & 1)
+    first_row = _phases_of(printed_symbol[rotated[:, 0]] >> 1)
+    index = np.flatnonzero((first_column | first_row) >= 0)
+    printed = printed_symbol[rotated[index]]
+    columns, rows = _phases_of((printed & 1).swapaxes(1, 2)), _phases_of(printed >> 1)
+    is_valid = (columns >= 0).all(axis=1) & (rows >= 0).all(axis=1)
+    index, columns, rows = index[is_valid], columns[is_valid], rows[is_valid]
+    x, count_x = _positions_of(columns, codec)
+    y, count_y = _positions_of(rows, codec)
+    count = count_x * count_y
+    has_position = count > 0
     u = (columns[:, 0] - y - codec.phases(x)) % MAIN_SEQUENCE_LENGTH
     v = (rows[:, 0] - x - codec.phases(y)) % MAIN_SEQUENCE_LENGTH
-    return which[found], np.stack([x, y, u, v])[:, found], number[found]
+    return index[has_position], np.stack([x, y, u, v])[:, has_position], count[has_position]
 
 
-def _phases(bits: NDArray[np.integer]) -> Whole:
-    """Place in the main sequence at which each line of bits (..., length) begins, or -1."""
-    phase = _PHASE[bits[..., :ORDER] @ _POWERS]
-    agree = (_lines(bits.shape[-1])[phase] == bits).all(axis=-1)
-    result: Whole = np.where(agree, phase, -1)
+def _phases_of(bits: NDArray[np.integer]) -> Integers:
+    """Return the phase of the main sequence of each line of bits (..., length), or -1."""
+    phase = _PHASE_OF_CODE[bits[..., :BITS_PER_STRING] @ _BIT_WEIGHTS]
+    agrees = (_main_sequence_strings(bits.shape[-1])[phase] == bits).all(axis=-1)
+    result: Integers = np.where(agrees, phase, -1)
     return result
 
 
-def _places(phases: Whole, codec: Codec) -> tuple[Whole, Whole]:
-    """Place (n,) of the first of some adjoining lines (n, lines), and of how many it could be."""
-    shift: Whole = np.diff(phases, axis=1) % MAIN_SEQUENCE_LENGTH
-    possible = (shift >= SHIFTS[0]) & (shift <= SHIFTS[-1])
-    residues, choices = [], [possible.all(axis=1)]
-    lookups = zip(digits_of(shift), sequences.BASES, strings(codec), codec.digits, strict=True)
-    for digits, base, table, sequence in lookups:
-        code = digits[:, :STRING] @ base ** np.arange(STRING)[::-1]
-        candidates = table[code]  # (n, most times that any string occurs)
-        along = np.add.outer(np.arange(len(sequence)), np.arange(shift.shape[1]))
-        agree = (sequence[along % len(sequence)][candidates] == digits[:, None]).all(axis=2)
-        agree &= candidates >= 0
-        choices.append(agree.sum(axis=1))
-        residues.append(candidates.max(axis=1, where=agree, initial=-1))
-    place = codec.place(np.stack(residues, axis=-1))
-    ways: Whole = np.prod(choices, axis=0)
-    ways[place + phases.shape[1] > SECTION_LENGTH] = 0
-    return place, ways
+def _positions_of(phases: Integers, codec: Codec) -> tuple[Integers, Integers]:
+    """Return the position (n,) of the first of adjacent lines (n, lines), and how many agree."""
+    shift: Integers = np.diff(phases, axis=1) % MAIN_SEQUENCE_LENGTH
+    is_possible = (shift >= POSSIBLE_SHIFTS[0]) & (shift <= POSSIBLE_SHIFTS[-1])
+    residues, counts = [], [is_possible.all(axis=1)]
+    tables = zip(
+        digits_of(shift), sequences.DIGIT_BASES, digit_strings(codec), codec.digits, strict=True
+    )
+    for digits, base, table, sequence in tables:
+        code = digits[:, :DIGITS_PER_STRING] @ base ** np.arange(DIGITS_PER_STRING)[::-1]
+        candidates = table[code]  # (n, largest number of occurrences of a string)
+        following = np.add.outer(np.arange(len(sequence)), np.arange(shift.shape[1]))
+        expected = sequence[following % len(sequence)][candidates]
+        agrees = (expected == digits[:, None]).all(axis=2) & (candidates >= 0)
+        counts.append(agrees.sum(axis=1))
+        residues.append(candidates.max(axis=1, where=agrees, initial=-1))
+    position = codec.position(np.stack(residues, axis=-1))
+    count: Integers = np.prod(counts, axis=0)
+    count[position + phases.shape[1] > SECTION_LENGTH] = 0
+    return position, count
 
 
-def digits_of(shifts: Whole) -> tuple[Whole, ...]:
-    """The four digits of shifts from line to line, each of the shape of ``shifts``.
+def digits_of(shifts: Integers) -> tuple[Integers, ...]:
+    """Return the four digits of shifts from line to line, each of the shape of ``shifts``.
 
-    papers/dots.txt II-A, "basis" equation. For what is not in :data:`SHIFTS` the
-    answer means nothing.
+    Inverse of the "basis" equation (Hostettler et al. 2016, II-A). The digits of shifts that are
+    not in :data:`POSSIBLE_SHIFTS` have no meaning.
     """
-    rest = np.clip(shifts, SHIFTS[0], SHIFTS[-1]) - sequences.SMALLEST_SHIFT
+    rest = np.clip(shifts, POSSIBLE_SHIFTS[0], POSSIBLE_SHIFTS[-1]) - sequences.MIN_SHIFT
     return tuple(
         rest // weight % base
-        for weight, base in zip(sequences.WEIGHTS, sequences.BASES, strict=True)
+        for weight, base in zip(sequences.DIGIT_WEIGHTS, sequences.DIGIT_BASES, strict=True)
     )
 
 
 @functools.cache
-def strings(codec: Codec) -> tuple[Whole, ...]:
-    """For each secondary sequence, where each string of five digits occurs, -1 for nowhere.
+def digit_strings(codec: Codec) -> tuple[Integers, ...]:
+    """Return for each secondary sequence the positions of each string of five digits.
 
-    (base^5, times) each; only libdots' fourth sequence has strings that occur twice.
+    The tables are (base^5, occurrences), padded with -1; only the fourth sequence of ``libdots``
+    has strings that occur twice.
     """
     tables = []
-    for sequence, base in zip(codec.digits, sequences.BASES, strict=True):
-        along = np.add.outer(np.arange(len(sequence)), np.arange(STRING)) % len(sequence)
-        codes = sequence[along] @ base ** np.arange(STRING)[::-1]
-        table: Whole = np.full((base**STRING, np.bincount(codes).max()), -1, np.int64)
-        for place, code in enumerate(codes):
-            table[code, np.argmin(table[code])] = place
+    for sequence, base in zip(codec.digits, sequences.DIGIT_BASES, strict=True):
+        following = np.add.outer(np.arange(len(sequence)), np.arange(DIGITS_PER_STRING))
+        strings = sequence[following % len(sequence)]
+        codes = strings @ base ** np.arange(DIGITS_PER_STRING)[::-1]
+        table: Integers = np.full((base**DIGITS_PER_STRING, np.bincount(codes).max()), -1, np.int64)
+        for position, code in enumerate(codes):
+            table[code, np.argmin(table[code])] = position
         tables.append(table)
     return tuple(tables)

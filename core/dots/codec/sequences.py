@@ -1,39 +1,40 @@
-"""The digit sequences from which the dot pattern is woven.
+"""Digit sequences of the dot pattern.
 
 Every column repeats the main sequence; from one column to the next it is shifted by
 ``5 + a1 + 3 a2 + 9 a3 + 18 a4``, whose digits run through four secondary sequences
-(papers/dots.txt II-A, with the "2 3^2 a4" of its basis equation). The digits are those of
+(Hostettler et al. 2016, II-A, "basis" equation). The paper does not print the digits. They are
+those of
 US patents 6,663,008 and 7,999,798 as published in py-microdots (cheind, 118cf16) and in
-Cellulo's generatePattern.py (894f0d0); all of them agree but on the fourth sequence:
+Cellulo's generatePattern.py (894f0d0); all of them agree except on the fourth sequence:
 
 ``anoto``
-    One more "1" at index 220 of the 240 published digits. The only single insertion that
-    makes a quasi-De-Bruijn sequence of order 5, and what ten genuine sheets hold.
+    Another "1" at index 220 of the 240 published digits. It is the only single insertion that
+    results in a quasi-De-Bruijn sequence of order 5, and the sequence on ten genuine sheets.
 ``libdots``
     The "1" at the end, as in Cellulo's code and in py-microdots' ``anoto_6x6``. Six windows
     of five digits occur twice, so that 6x6 dots may have two positions.
 ``microdots``
     py-microdots' own replacement, ``anoto_6x6_a4_fixed``: quasi-De-Bruijn, and
-    compatible with nothing but itself.
+    compatible with no other variant.
 """
 
 from __future__ import annotations
 
-MAIN = "000000100111110100100001110111001010100010110110011010111100011"
+MAIN_DIGITS = "000000100111110100100001110111001010100010110110011010111100011"
 
-FIRST = (
+FIRST_DIGITS = (
     "00000100002010010100200011000120010200202011010110201201012021001110111102101021"
     "10012101120002102021110021201112020011210002201022001220202210121210212110221212"
     "0220222011221101222212002211212210222220212221112112012212201211112220021122"
 )
 
-SECOND = (
+SECOND_DIGITS = (
     "00000100002010010101100011110011010020001201012100021110111021001212101020110200"
     "10212000220011202002020120022110021011210202210022210122002122111112001221201112"
     "1120121112202201122221212201222020211221022021021102222010221222112120222"
 )
 
-THIRD = "0000010011000111100101011011101"
+THIRD_DIGITS = "0000010011000111100101011011101"
 
 FOURTH_LIBDOTS = (
     "00000102000020020100011200012002100021120101001210010022000221020110011101011012"
@@ -56,10 +57,11 @@ FOURTH_MICRODOTS = (
     "1"
 )
 
-FOURTH = {"anoto": FOURTH_ANOTO, "libdots": FOURTH_LIBDOTS, "microdots": FOURTH_MICRODOTS}
-"""Name of a codec to its fourth sequence."""
+FOURTH_DIGITS = {"anoto": FOURTH_ANOTO, "libdots": FOURTH_LIBDOTS, "microdots": FOURTH_MICRODOTS}
+"""Fourth sequence of each codec."""
 
-WEIGHTS = (1, 3, 9, 18)
-BASES = (3, 3, 2, 3)
-SMALLEST_SHIFT = 5
-"""Shift from a column to the next: 5 plus the digits times their weights, 5..58."""
+MIN_SHIFT = 5
+DIGIT_WEIGHTS = (1, 3, 9, 18)
+DIGIT_BASES = (3, 3, 2, 3)
+"""The shift from a column to the next, 5..58, is the least one plus the digits times their weights;
+each digit is less than its base."""

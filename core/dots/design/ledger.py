@@ -1,8 +1,9 @@
-"""Which areas of the pattern are in use, and where the next sheet goes.
+"""Allocation of areas of the pattern to new sheets.
 
-Two sheets that hold the same positions cannot be told apart, so each new one is given an
-area that no other has. Areas of different codecs must not meet either: the codecs share
-most of their digits, and read one another's sheets now and then (facts/dots.md 2.2).
+Two sheets with the same positions cannot be distinguished, so that each new one is allocated an
+area of its own. Areas of different codecs must not overlap either: the codecs share three of their
+four sequences, so that a decoder of one accepts windows of another (of anoto by libdots, 6 x 6
+dots, nearly all of them, one in 15 at a wrong position).
 """
 
 from __future__ import annotations
@@ -14,31 +15,31 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from locatk.core.dots.codec import SECTION_LENGTH, check_window
-from locatk.core.dots.drawing.layout import Layout, manifest
-from locatk.core.dots.drawing.tiles import Tiling
+from locatk.core.dots.drawing.layout import SheetLayout, manifest
+from locatk.core.dots.drawing.tiles import SheetTiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
 from locatk.core.paper import paper_name
 
-GAP = 64
-"""Places left free around an area that is chosen here, so that a window on the rim of a
-sheet is nowhere near another sheet."""
+GAP_POSITIONS = 64
+"""Positions left free around an allocated area, so that a window at the border of a sheet is far
+from every other sheet."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Area:
-    """An area in use.
+    """Area of the pattern that is in use.
 
     Attributes
     ----------
     id : str
-        Of the sheet, or of the floor of tiles, that holds it.
+        Of its sheet, or of its floor of tiles.
     codec : str
     section : (u, v)
     origin : (x, y)
-        Grid coordinates of its upper left place.
+        Grid coordinates of its upper left position.
     size : (columns, rows)
     """
 
@@ -48,8 +49,8 @@ class Area:
     origin: tuple[int, int]
     size: tuple[int, int]
 
-    def meets(self, other: Area) -> bool:
-        """Whether both hold a place."""
+    def overlaps(self, other: Area) -> bool:
+        """Return whether both contain a position."""
         return self.section == other.section and all(
             a < b + n and b < a + m
             for a, m, b, n in zip(self.origin, self.size, other.origin, other.size, strict=True)
@@ -59,34 +60,36 @@ class Area:
 def free_origins(
     areas: Iterable[Area], size: tuple[int, int], section: tuple[int, int] = (0, 0), count: int = 1
 ) -> list[tuple[int, int]]:
-    """Upper left places of free areas: as far up as there is room, then as far left.
+    """Return the origins of free areas: as far up as possible, then as far left.
 
-    At most ``count``, and at least one; fewer where a row of areas is full, below which
-    the next call goes on.
+    The number is at most ``count`` and at least one; there are fewer if a row of areas is full, in
+    which case the next call continues below.
 
     Raises
     ------
     InputError
-        The section is full.
+        The section has no free area of this size.
     """
     used = [area for area in areas if area.section == section]
     columns, rows = size
-    for y in sorted({0} | {area.origin[1] + area.size[1] + GAP for area in used}):
+    for y in sorted({0} | {area.origin[1] + area.size[1] + GAP_POSITIONS for area in used}):
         if y + rows > SECTION_LENGTH:
             break
-        beside = [
+        in_row = [
             (area.origin[0], area.origin[0] + area.size[0])
             for area in used
-            if area.origin[1] < y + rows + GAP and y < area.origin[1] + area.size[1] + GAP
+            if area.origin[1] < y + rows + GAP_POSITIONS
+            and y < area.origin[1] + area.size[1] + GAP_POSITIONS
         ]
-        x, found = 0, list[tuple[int, int]]()
-        for start, end in [*sorted(beside), (SECTION_LENGTH + GAP, SECTION_LENGTH)]:
-            while x + columns + GAP <= start and len(found) < count:
-                found.append((x, y))
-                x += columns + GAP
-            x = max(x, end + GAP)
-        if found:
-            return found
+        x, origins = 0, list[tuple[int, int]]()
+        section_end = (SECTION_LENGTH + GAP_POSITIONS, SECTION_LENGTH)
+        for start, end in [*sorted(in_row), section_end]:
+            while x + columns + GAP_POSITIONS <= start and len(origins) < count:
+                origins.append((x, y))
+                x += columns + GAP_POSITIONS
+            x = max(x, end + GAP_POSITIONS)
+        if origins:
+            return origins
     raise InputError(
         f"no free area of {columns} x {rows} places in section {section[0]},{section[1]}",
         hint="Choose another --section",
@@ -104,75 +107,78 @@ def allocate(
     origin: tuple[int, int] | None = None,
     force: bool = False,
 ) -> list[Area]:
-    """An area for each of several new sheets.
+    """Allocate an area for each of several new sheets.
 
     Parameters
     ----------
     areas : sequence of Area
-        Those in use.
+        Areas in use.
     sizes : sequence of (columns, rows)
-        One a sheet.
+        One per sheet.
     prefixes : sequence of str
-        One a sheet: sheets that have no name are numbered, ``A4-0001``.
+        One per sheet: sheets without a name are numbered, ``A4-0001``.
     codec, section
         Of the new areas.
     name : str, optional
         Of the sheet; of several, ``name-1``, ``name-2`` and so on.
     origin : (x, y), optional
-        Of the first; the next follow to its right. Otherwise each goes to the first free
-        place (:func:`free_origins`).
+        Of the first; the next follow on its right. Default: the first free areas
+        (:func:`free_origins`).
     force : bool
-        Hold positions that another sheet has, and take the name of one that is printed
-        once more.
+        Allow positions of another sheet, and the name of a sheet that is printed again.
 
     Raises
     ------
     InputError
-        A name or an area is in use, or cannot be one.
+        A name or an area is in use or invalid.
     """
     origins = (
-        _free(areas, sizes, codec, section)
+        _allocate_free(areas, sizes, codec, section)
         if origin is None
         else [
-            (origin[0] + sum(c + GAP for c, _ in sizes[:n]), origin[1]) for n in range(len(sizes))
+            (origin[0] + sum(c + GAP_POSITIONS for c, _ in sizes[:n]), origin[1])
+            for n in range(len(sizes))
         ]
     )
     numbers = Counter(
-        {prefix: _highest(areas, prefix) for prefix in (set(prefixes) if name is None else ())}
+        {
+            prefix: _highest_number(areas, prefix)
+            for prefix in (set(prefixes) if name is None else ())
+        }
     )
     new = []
     for n, (at, size, prefix) in enumerate(zip(origins, sizes, prefixes, strict=True), 1):
         check_window(at, size, section)
         if name is None:
             numbers[prefix] += 1
-            given = f"{prefix}-{numbers[prefix]:04d}"
+            sheet_id = f"{prefix}-{numbers[prefix]:04d}"
         else:
-            given = name if len(sizes) == 1 else f"{name}-{n}"
-        new.append(Area(given, codec, section, at, size))
-        _check(new[-1], areas, force)
+            sheet_id = name if len(sizes) == 1 else f"{name}-{n}"
+        new.append(Area(sheet_id, codec, section, at, size))
+        _check_free(new[-1], areas, force)
     return new
 
 
-def _free(
+def _allocate_free(
     areas: Sequence[Area],
     sizes: Sequence[tuple[int, int]],
     codec: str,
     section: tuple[int, int],
 ) -> list[tuple[int, int]]:
-    """An origin for each size; equal ones that follow each other are found at once."""
+    """Return a free origin for each size; runs of equal sizes are allocated at once."""
     used, origins = list(areas), []
     for size, group in itertools.groupby(sizes):
         missing = len(list(group))
         while missing:
-            found = free_origins(used, size, section, missing)
-            used += [Area("", codec, section, at, size) for at in found]
-            origins += found
-            missing -= len(found)
+            free = free_origins(used, size, section, missing)
+            used += [Area("", codec, section, at, size) for at in free]
+            origins += free
+            missing -= len(free)
     return origins
 
 
 def plan(
-    items: Sequence[Layout | Tiling],
+    items: Sequence[SheetLayout | SheetTiling],
     areas: Sequence[Area],
     *,
     codec: str,
@@ -181,12 +187,12 @@ def plan(
     origin: tuple[int, int] | None = None,
     force: bool = False,
 ) -> tuple[list[Area], Manifest]:
-    """New sheets of these layouts, which are on one raster: their areas and their manifest.
+    """Plan new sheets of layouts on one raster; return their areas and their manifest.
 
-    A :class:`Tiling` is one area, a sheet a tile. The other parameters, and what is
-    raised, are :func:`allocate`'s.
+    A :class:`~locatk.core.dots.drawing.tiles.SheetTiling` is one area with one sheet per tile. The
+    other parameters and the errors are those of :func:`allocate`.
     """
-    papers = [item.layout if isinstance(item, Tiling) else item for item in items]
+    papers = [item.layout if isinstance(item, SheetTiling) else item for item in items]
     new = allocate(
         areas,
         [item.size for item in items],
@@ -206,7 +212,7 @@ def plan(
 
 
 def check_name(name: str) -> None:
-    """Refuse what cannot be the id of a sheet: it names frames and files."""
+    """Raise InputError unless ``name`` can be the id of a sheet, which names frames and files."""
     if not _NAME.fullmatch(name) or name == "floor":
         raise InputError(
             f"{name!r} cannot be the id of a sheet",
@@ -214,19 +220,21 @@ def check_name(name: str) -> None:
         )
 
 
-def _highest(areas: Iterable[Area], prefix: str) -> int:
-    found = (re.fullmatch(re.escape(prefix) + r"-(\d{1,9})", area.id) for area in areas)
-    return max((int(match[1]) for match in found if match), default=0)
+def _highest_number(areas: Iterable[Area], prefix: str) -> int:
+    """Return the highest number of a sheet with this prefix, 0 if there is none."""
+    matches = (re.fullmatch(re.escape(prefix) + r"-(\d{1,9})", area.id) for area in areas)
+    return max((int(match[1]) for match in matches if match), default=0)
 
 
-def _check(area: Area, areas: Iterable[Area], force: bool) -> None:
+def _check_free(area: Area, areas: Iterable[Area], force: bool) -> None:
+    """Raise InputError if the name or a position of an area is in use."""
     check_name(area.id)
     for other in areas:
         if other.id == area.id and not (force and other == area):
             raise InputError(
                 f"a sheet {area.id!r} is in the ledger already", hint="Choose another --id"
             )
-        if not force and area.meets(other):
+        if not force and area.overlaps(other):
             (x, y), (columns, rows) = other.origin, other.size
             raise InputError(
                 f"the area at {area.origin[0]},{area.origin[1]} is in use: sheet {other.id!r} "

@@ -1,9 +1,9 @@
-"""Dots in grey images: where, to a fraction of a pixel, and how dark.
+"""Detection of dots in grey images, to a fraction of a pixel.
 
-The image is smoothed once by about the width of a dot; a dot is a local minimum that is
-darker than its surroundings. No threshold is global: how dark a dot must be follows from
-the minima of the same frame relative to the paper around each, so that vignettes, uneven
-light and exposure do not matter.
+The image is smoothed once by about the width of a dot; a dot is a local minimum that is darker than
+its surroundings. There is no global threshold: the least contrast of a dot follows from the minima
+of the same frame relative to the paper around each, so that vignettes, uneven light and exposure
+have no effect.
 """
 
 from __future__ import annotations
@@ -18,38 +18,39 @@ from numpy.typing import NDArray
 
 from locatk.core.kernels import kernels
 
-SMOOTHING_PX = 1.1
-"""Sigma of the smoothing; fits dots of 1.5 to 5 px at a pitch of 8 to 16 px."""
+SMOOTHING_SIGMA_PX = 1.1
+"""Sigma of the smoothing [px]; suitable for dots of 1.5 to 5 px at a pitch of 8 to 16 px."""
 
-REACH = 2
-"""Pixels to each side that smoothing, and the search for minima, look."""
+SMOOTHING_RADIUS_PX = 2
+"""Radius of the smoothing kernel, and of the neighbourhood of a minimum [px]."""
 
-PAPER = 4
-"""The paper's brightness is taken from an image this much smaller, blurred over
-:data:`PAPER_REACH` of its pixels: about two pitches."""
-PAPER_REACH = 7
+PAPER_BLOCK_PX = 4
+"""Side of the blocks over which the brightness of the paper is averaged first [px]."""
 
-FAINTEST = 1.5
-"""Least contrast of a dot, in grey levels after smoothing."""
+PAPER_WINDOW_BLOCKS = 7
+"""Side of the window over which blocks are averaged then: about two pitches."""
 
-FEWEST_DOTS = 40
-"""Minima that are dirt if they stand out and are fewer than these."""
+MIN_CONTRAST_LEVELS = 1.5
+"""Least contrast of a dot after smoothing [grey levels]."""
 
-SPLITS = 3
-"""How often dirt is set aside."""
+MIN_PATTERN_DOTS = 40
+"""Minima that stand out from the rest and are fewer than this are dirt."""
 
-SHARE = 0.45
-"""Least contrast of a dot as share of that of the frame's median dot."""
+MAX_DIRT_SPLITS = 3
+"""Maximum number of times that dirt is separated from the other minima."""
+
+MIN_CONTRAST_FRACTION = 0.45
+"""Least contrast of a dot, as a fraction of that of the frame's median dot."""
 
 
 @dataclass(frozen=True)
-class Dots:
-    """Dots of n frames, padded to the m of the fullest.
+class DetectedDots:
+    """Dots of n frames, padded to the number m of the frame with most dots.
 
     Attributes
     ----------
     xy : (n, m, 2) float32 ndarray
-        Pixels; 0 where there is no dot.
+        Position in px; 0 if there is no dot.
     valid : (n, m) bool ndarray
     """
 
@@ -58,100 +59,112 @@ class Dots:
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """(n,) dots a frame."""
+        """Number of dots (n,) in each frame."""
         result: NDArray[np.int64] = self.valid.sum(axis=1)
         return result
 
 
-def find_dots(images: NDArray[np.uint8], most: int = 4096) -> Dots:
-    """Dots of each of (n, h, w) grey images; of more than ``most`` those in the middle.
+def detect_dots(images: NDArray[np.uint8], max_dots: int = 4096) -> DetectedDots:
+    """Detect the dots in each of the grey images (n, h, w).
 
-    The position is the top of a Gaussian through the minimum and its neighbours.
+    The position of a dot is the top of a Gaussian through the minimum and its neighbours. Of more
+    than ``max_dots`` dots in a frame those nearest to its middle are returned.
     """
     n, h, w = images.shape
-    if min(h, w) <= 2 * REACH:
-        return Dots(np.zeros((n, 1, 2), np.float32), np.zeros((n, 1), bool))
+    if min(h, w) <= 2 * SMOOTHING_RADIUS_PX:
+        return DetectedDots(np.zeros((n, 1, 2), np.float32), np.zeros((n, 1), bool))
     if kernels is None:
-        return find_dots_numpy(images, most)
-    xy = np.empty((n, most, 2), np.float32)
+        return detect_dots_numpy(images, max_dots)
+    xy = np.empty((n, max_dots, 2), np.float32)
     counts = np.empty(n, np.int64)
     kernels.find_dots(
         np.ascontiguousarray(images, np.uint8),
         *(n, h, w),
-        _taps(),
-        *(PAPER, PAPER_REACH, FAINTEST, SHARE, FEWEST_DOTS, SPLITS, most),
+        _smoothing_taps(),
+        *(PAPER_BLOCK_PX, PAPER_WINDOW_BLOCKS, MIN_CONTRAST_LEVELS, MIN_CONTRAST_FRACTION),
+        *(MIN_PATTERN_DOTS, MAX_DIRT_SPLITS, max_dots),
         xy,
         counts,
     )
     xy = xy[:, : max(int(counts.max(initial=0)), 1)]
     valid = np.arange(xy.shape[1]) < counts[:, None]
-    return Dots(np.where(valid[..., None], xy, np.float32(0)), valid)
+    return DetectedDots(np.where(valid[..., None], xy, np.float32(0)), valid)
 
 
 @functools.cache
-def _taps() -> NDArray[np.float32]:
-    taps: NDArray[np.float32] = cv2.getGaussianKernel(2 * REACH + 1, SMOOTHING_PX)[: REACH + 1, 0]
+def _smoothing_taps() -> NDArray[np.float32]:
+    """Return one half of the symmetric smoothing kernel, the middle last."""
+    size = 2 * SMOOTHING_RADIUS_PX + 1
+    taps: NDArray[np.float32] = cv2.getGaussianKernel(size, SMOOTHING_SIGMA_PX)[
+        : SMOOTHING_RADIUS_PX + 1, 0
+    ]
     return taps.astype(np.float32)
 
 
-def find_dots_numpy(images: NDArray[np.uint8], most: int = 4096) -> Dots:
-    """:func:`find_dots` without the compiled kernel."""
+def detect_dots_numpy(images: NDArray[np.uint8], max_dots: int = 4096) -> DetectedDots:
+    """Detect dots as :func:`detect_dots`, without the compiled kernel."""
     n, h, w = images.shape
+    radius, block = SMOOTHING_RADIUS_PX, PAPER_BLOCK_PX
     smooth = np.empty((n, h, w), np.float32)
     minima = np.zeros((n, h, w), bool)
-    rows, columns = h // PAPER, w // PAPER
+    rows, columns = h // block, w // block
     paper = np.empty((n, rows, columns), np.float32)
-    # Of equal minima the first counts: pixels before it have to be brighter.
-    before = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    # The first of equal minima counts: the pixels before it have to be brighter.
+    before = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     before.ravel()[before.size // 2 :] = 0
     after = np.ascontiguousarray(before[::-1, ::-1])
-    core = np.s_[REACH : h - REACH, REACH : w - REACH]
-    size = (2 * REACH + 1, 2 * REACH + 1)
+    inner = np.s_[radius : h - radius, radius : w - radius]
     for k, image in enumerate(images):
-        cv2.GaussianBlur(image.astype(np.float32), size, SMOOTHING_PX, dst=smooth[k])
-        least = smooth[k] < cv2.erode(smooth[k], before)
-        least &= smooth[k] <= cv2.erode(smooth[k], after)
-        minima[k][core] = least[core]
-        whole = image[: rows * PAPER, : columns * PAPER]  # other ratios cost ten times as much
-        small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
-        cv2.blur(small.astype(np.float32), (PAPER_REACH, PAPER_REACH), dst=paper[k])
+        cv2.GaussianBlur(image.astype(np.float32), before.shape, SMOOTHING_SIGMA_PX, dst=smooth[k])
+        is_minimum = smooth[k] < cv2.erode(smooth[k], before)
+        is_minimum &= smooth[k] <= cv2.erode(smooth[k], after)
+        minima[k][inner] = is_minimum[inner]
+        # Whole blocks only: other ratios of sizes cost ten times as much.
+        cropped = image[: rows * block, : columns * block]
+        small = cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA)
+        window = (PAPER_WINDOW_BLOCKS, PAPER_WINDOW_BLOCKS)
+        cv2.blur(small.astype(np.float32), window, dst=paper[k])
 
-    at = np.flatnonzero(minima)
-    line, column = np.divmod(at, w)
+    index = np.flatnonzero(minima)
+    line, column = np.divmod(index, w)
     frame, row = np.divmod(line, h)
     light = paper[
-        frame, np.minimum(row // PAPER, rows - 1), np.minimum(column // PAPER, columns - 1)
+        frame, np.minimum(row // block, rows - 1), np.minimum(column // block, columns - 1)
     ]
     flat = smooth.reshape(-1)
-    contrast = light - flat[at]
-    keep = contrast > FAINTEST
-    at, frame, row, column = at[keep], frame[keep], row[keep], column[keep]
+    contrast = light - flat[index]
+    keep = contrast > MIN_CONTRAST_LEVELS
+    index, frame, row, column = index[keep], frame[keep], row[keep], column[keep]
     light, contrast = light[keep], contrast[keep]
 
     relative = contrast / light
-    keep = relative > (SHARE * _typical(relative, frame, n))[frame]
-    at, frame, light, contrast = at[keep], frame[keep], light[keep], contrast[keep]
-    slope_y, slope_x = _slopes(paper)
-    x = column[keep] + _peak(flat, at, 1, light, contrast, slope_x[frame])
-    y = row[keep] + _peak(flat, at, w, light, contrast, slope_y[frame])
-    return _padded(frame, x, y, (w - 1) / 2, (h - 1) / 2, n, most)
+    keep = relative > (MIN_CONTRAST_FRACTION * _median_dots(relative, frame, n))[frame]
+    index, frame, light, contrast = index[keep], frame[keep], light[keep], contrast[keep]
+    slope_y, slope_x = _paper_slopes(paper)
+    x = column[keep] + _subpixel_offset(flat, index, 1, light, contrast, slope_x[frame])
+    y = row[keep] + _subpixel_offset(flat, index, w, light, contrast, slope_y[frame])
+    return _pad(frame, x, y, ((w - 1) / 2, (h - 1) / 2), n, max_dots)
 
 
-def _slopes(paper: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(n,) grey levels a pixel by which the paper brightens downwards and to the right.
+def _paper_slopes(paper: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the gradients (n,) of the paper's brightness, down and to the right [levels / px].
 
-    Of a plane through the whole frame: light from a side would move the tops of all dots.
+    They are those of a plane through the whole frame: light from one side would displace the tops
+    of all dots.
     """
     slopes = []
     for axis in (1, 2):
         steps = np.arange(paper.shape[axis]) - (paper.shape[axis] - 1) / 2
         profile = paper.mean(axis=3 - axis) @ steps
-        slopes.append((profile / max(float(steps @ steps), 1.0) / PAPER).astype(np.float32))
+        slope = profile / max(float(steps @ steps), 1.0) / PAPER_BLOCK_PX
+        slopes.append(slope.astype(np.float32))
     return slopes[0], slopes[1]
 
 
-def _typical(contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int) -> NDArray[np.float32]:
-    """(n,) contrast of the median dot of each frame."""
+def _median_dots(
+    contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int
+) -> NDArray[np.float32]:
+    """Return the contrast (n,) of the median dot of each frame."""
     order = np.lexsort((-contrast, frame))
     edges = np.searchsorted(frame[order], np.arange(n + 1))
     parts = [contrast[order[a:b]] for a, b in itertools.pairwise(edges)]
@@ -159,13 +172,13 @@ def _typical(contrast: NDArray[np.float32], frame: NDArray[np.intp], n: int) -> 
 
 
 def _median_dot(contrast: NDArray[np.float32]) -> float:
-    """Contrast of the median dot among minima, given darkest first.
+    """Return the contrast of the median dot among minima, given darkest first.
 
-    Which are dots and which are noise is decided by Otsu's criterion: the split that most
-    reduces the variance within both parts. A first part of few is dirt on the paper, darker
-    than any dot; then the rest is split again.
+    Dots and noise are separated by Otsu's criterion: the split that reduces the variance within
+    both parts most. A first part with few minima is dirt on the paper, darker than any dot; then
+    the rest is split again.
     """
-    for _ in range(SPLITS):
+    for _ in range(MAX_DIRT_SPLITS):
         if len(contrast) < 2:
             break
         sums = np.cumsum(contrast)
@@ -173,48 +186,47 @@ def _median_dot(contrast: NDArray[np.float32]) -> float:
         rest = sums[-1] - sums[:-1]
         between = sums[:-1] ** 2 / above + rest**2 / (len(contrast) - above)
         dots = int(between.argmax()) + 1
-        if dots >= FEWEST_DOTS:
+        if dots >= MIN_PATTERN_DOTS:
             return float(contrast[(dots - 1) // 2])
         contrast = contrast[dots:]
     return float(contrast[(len(contrast) - 1) // 2]) if len(contrast) else 0.0
 
 
-def _peak(
+def _subpixel_offset(
     flat: NDArray[np.float32],
-    at: NDArray[np.intp],
-    step: int,
+    index: NDArray[np.intp],
+    stride: int,
     light: NDArray[np.float32],
     contrast: NDArray[np.float32],
     slope: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Offset of the top of a Gaussian through three samples, within half a pixel."""
+    """Return the offset, within half a pixel, of the top of a Gaussian through three samples."""
     floor = 0.05 * contrast
-    before = np.log(np.maximum(light - slope - flat[at - step], floor))
-    after = np.log(np.maximum(light + slope - flat[at + step], floor))
-    bend = 2 * np.log(contrast) - before - after
-    offset = 0.5 * (after - before) / np.maximum(bend, 1e-6)
+    before = np.log(np.maximum(light - slope - flat[index - stride], floor))
+    after = np.log(np.maximum(light + slope - flat[index + stride], floor))
+    curvature = 2 * np.log(contrast) - before - after
+    offset = 0.5 * (after - before) / np.maximum(curvature, 1e-6)
     result: NDArray[np.float32] = np.clip(offset, -0.5, 0.5)
     return result
 
 
-def _padded(
+def _pad(
     frame: NDArray[np.intp],
     x: NDArray[np.float32],
     y: NDArray[np.float32],
-    middle_x: float,
-    middle_y: float,
+    middle: tuple[float, float],
     n: int,
-    most: int,
-) -> Dots:
+    max_dots: int,
+) -> DetectedDots:
+    """Return the dots of all frames as padded arrays, at most ``max_dots`` per frame."""
     counts = np.bincount(frame, minlength=n)
-    if counts.max(initial=0) > most:
-        order = np.lexsort(((x - middle_x) ** 2 + (y - middle_y) ** 2, frame))
+    if counts.max(initial=0) > max_dots:
+        order = np.lexsort(((x - middle[0]) ** 2 + (y - middle[1]) ** 2, frame))
         rank = np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame[order]]
-        kept = np.sort(order[rank < most])
-        return _padded(frame[kept], x[kept], y[kept], middle_x, middle_y, n, most)
+        kept = np.sort(order[rank < max_dots])
+        return _pad(frame[kept], x[kept], y[kept], middle, n, max_dots)
     m = max(int(counts.max(initial=0)), 1)
     slot = np.arange(len(frame)) - (np.cumsum(counts) - counts)[frame]
     xy = np.zeros((n, m, 2), np.float32)
     xy[frame, slot, 0], xy[frame, slot, 1] = x, y
-    valid = np.arange(m) < counts[:, None]
-    return Dots(xy, valid)
+    return DetectedDots(xy, np.arange(m) < counts[:, None])

@@ -1,10 +1,11 @@
-"""Where the dots of a sheet lie on its paper, in whole pixels of the printer.
+"""Layout of the dots of a sheet on its paper, in whole pixels of the printer.
 
-A dot that straddles two pixels of the printer comes out grey or too big, so everything is
-snapped (facts/dots.md 5.3): the pitch, the offset and the dot to pixels of the printer, the
-page and the first place to 1/300 in. A page of a whole number of pixels looks the same to
-rasterisers that count from its upper left corner and to those that count from its lower
-left one.
+A dot that covers two pixels of the printer in part is printed grey or too large. (Rendered by
+pdfium at 300 dpi, a dot of one pixel has 3.5 grey pixels and less than 0.5 % full black if it is
+not aligned, and exactly one black pixel if it is.) Everything is therefore snapped: the pitch, the
+offset and the dot to pixels of the printer, the page and the first position to 1/300 in. A page of
+a whole number of pixels is the same for rasterisers that count from its upper left corner and for
+those that count from its lower left one.
 """
 
 from __future__ import annotations
@@ -14,28 +15,35 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from locatk.core.dots.codec import check_window
-from locatk.core.dots.sheet import MM_PER_INCH, OFFSET, Manifest, Sheet
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, MM_PER_INCH, Manifest, Sheet
 from locatk.core.errors import InputError
 from locatk.core.paper import MAX_PAPER_MM
 
 DPIS = (300, 600, 1200)
+"""Supported resolutions of printers."""
 
 BASE_DPI = 300
-"""The page and the first place lie on this grid, whatever the printer's is."""
+"""Resolution to which the page and the first position are snapped, for every printer."""
 
-SMALLEST = 8
-"""Rows and columns of the smallest window that tells its position and its heading."""
+MIN_SHEET_DOTS = 8
+"""Rows and columns of the smallest window with a unique position and heading."""
+
+MAX_ROUNDING_PX = 1e-3
+"""Largest difference from a whole number of pixels of a length in a manifest [px]."""
+
+MIN_NOTED_CHANGE_MM = 5e-4
+"""Least change of a length by snapping that is reported [mm]."""
 
 
 @dataclass(frozen=True)
 class Raster:
-    """The pattern in pixels of the printer.
+    """Pattern in pixels of the printer.
 
     Attributes
     ----------
     dpi : int
     pitch, offset, dot : int
-        Between two places, from a place to its dot, and width of a dot, in px.
+        Distance of two positions, of a dot from its position, and width of a dot, in px.
     """
 
     dpi: int
@@ -45,26 +53,26 @@ class Raster:
 
     @property
     def step(self) -> int:
-        """Pixels in 1/300 in."""
+        """Number of pixels in 1/300 in."""
         return self.dpi // BASE_DPI
 
     def mm(self, pixels: float) -> float:
-        """Length in mm of so many pixels."""
-        # Twelve digits: what is written down is short where the length is.
+        """Return the length in mm of a number of pixels."""
+        # Twelve digits, so that lengths in a manifest are as short as possible.
         return round(pixels * MM_PER_INCH / self.dpi, 12)
 
 
 @dataclass(frozen=True)
-class Layout:
-    """The places of a sheet on its page, in pixels.
+class SheetLayout:
+    """Positions of a sheet on its page, in pixels.
 
     Attributes
     ----------
     raster : Raster
     page : (width, height)
     first : (x, y)
-        From the page's upper left corner right and down to the upper left pixel that a
-        dot at the place of the upper left dot would cover.
+        From the page's upper left corner right and down to the upper left pixel of an undisplaced
+        dot at the upper left position.
     size : (columns, rows)
     """
 
@@ -80,7 +88,7 @@ class Layout:
 
     @property
     def box(self) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom edge of all that a dot can cover, in px."""
+        """Left, top, right and bottom edge of the area that dots can cover, in px."""
         r = self.raster
         left, top = (start - r.offset for start in self.first)
         right, bottom = (
@@ -92,13 +100,12 @@ class Layout:
     def sheets(
         self, name: str, origin: tuple[int, int], section: tuple[int, int] = (0, 0)
     ) -> tuple[Sheet, ...]:
-        """The one sheet that holds the area at ``origin``.
+        """Return the one sheet with the area at ``origin``.
 
         Raises
         ------
         InputError
-            No section holds that area whole; see
-            :func:`locatk.core.dots.codec.check_window`.
+            No section contains the whole area; see :func:`~locatk.core.dots.codec.check_window`.
         """
         check_window(origin, self.size, section)
         r = self.raster
@@ -107,7 +114,7 @@ class Layout:
 
 
 def snap(pitch_mm: float, dot_mm: float | None, dpi: int) -> Raster:
-    """The pattern that a printer of ``dpi`` can print and that is nearest to what is asked.
+    """Return the nearest pattern that a printer of ``dpi`` can print.
 
     Parameters
     ----------
@@ -120,7 +127,7 @@ def snap(pitch_mm: float, dot_mm: float | None, dpi: int) -> Raster:
     Raises
     ------
     InputError
-        Dots so small or so dense cannot be told apart.
+        Dots of this size would touch at this pitch, or a value is out of range.
     """
     if dpi not in DPIS:
         raise InputError(f"{dpi} dpi", hint=f"Use one of {', '.join(map(str, DPIS))}")
@@ -129,9 +136,9 @@ def snap(pitch_mm: float, dot_mm: float | None, dpi: int) -> Raster:
             raise InputError(f"a {name} of {length:g} mm", hint="Give it in mm, as in 0.508")
     pixel = MM_PER_INCH / dpi
     pitch = round(pitch_mm / pixel)
-    offset = max(1, round(pitch * OFFSET))
-    dot = max(1, round(pitch * OFFSET if dot_mm is None else dot_mm / pixel))
-    # Two dots that lean towards each other must leave a pixel between them.
+    offset = max(1, round(pitch * DOT_OFFSET_PITCHES))
+    dot = max(1, round(pitch * DOT_OFFSET_PITCHES if dot_mm is None else dot_mm / pixel))
+    # Two dots displaced towards each other must leave a pixel between them.
     if pitch - 2 * offset - dot < 1:
         wanted = "" if dot_mm is None else f" of {dot_mm:g} mm"
         raise InputError(
@@ -142,24 +149,24 @@ def snap(pitch_mm: float, dot_mm: float | None, dpi: int) -> Raster:
 
 
 def snapped(raster: Raster, pitch_mm: float, dot_mm: float | None) -> list[str]:
-    """What :func:`snap` has changed, in words; empty where nothing."""
+    """Return a message for each length that :func:`snap` has changed."""
     return [
         f"{name} {asked:g} mm becomes {raster.mm(pixels):.4g} mm, {pixels} px at {raster.dpi} dpi"
         for name, asked, pixels in (
             ("pitch", pitch_mm, raster.pitch),
             ("dot", dot_mm, raster.dot),
         )
-        if asked is not None and abs(raster.mm(pixels) - asked) > 5e-4
+        if asked is not None and abs(raster.mm(pixels) - asked) > MIN_NOTED_CHANGE_MM
     ]
 
 
-def lay_out(page_mm: tuple[float, float], margin_mm: float, raster: Raster) -> Layout:
-    """As many places as fit on a page inside its margin, in its middle.
+def lay_out(page_mm: tuple[float, float], margin_mm: float, raster: Raster) -> SheetLayout:
+    """Return the layout with as many positions as fit inside the margin of a page, centred.
 
     Raises
     ------
     InputError
-        Fewer than :data:`SMALLEST` rows or columns fit.
+        Fewer than :data:`MIN_SHEET_DOTS` rows or columns fit.
     """
     if not 0 <= margin_mm <= MAX_PAPER_MM:
         raise InputError(f"a margin of {margin_mm:g} mm")
@@ -170,28 +177,29 @@ def lay_out(page_mm: tuple[float, float], margin_mm: float, raster: Raster) -> L
     page, first, size = [], [], []
     for side in page_mm:
         pixels = round(side / base) * raster.step
-        start = _up(margin + raster.offset, raster.step)
-        room = pixels - margin - start - raster.dot - raster.offset
-        count = room // raster.pitch + 1
-        if count < SMALLEST:
+        start = _round_up(margin + raster.offset, raster.step)
+        available = pixels - margin - start - raster.dot - raster.offset
+        count = available // raster.pitch + 1
+        if count < MIN_SHEET_DOTS:
             raise InputError(
                 f"a page of {page_mm[0]:g} x {page_mm[1]:g} mm with a margin of {margin_mm:g} mm "
-                f"has no room for {SMALLEST} x {SMALLEST} dots",
+                f"has no room for {MIN_SHEET_DOTS} x {MIN_SHEET_DOTS} dots",
                 hint="Use a smaller margin or a larger paper",
             )
-        rest = room - (count - 1) * raster.pitch
+        rest = available - (count - 1) * raster.pitch
         page.append(pixels)
         first.append(start + rest // 2 // raster.step * raster.step)
         size.append(count)
-    return Layout(raster, (page[0], page[1]), (first[0], first[1]), (size[0], size[1]))
+    return SheetLayout(raster, (page[0], page[1]), (first[0], first[1]), (size[0], size[1]))
 
 
-def _up(pixels: int, step: int) -> int:
+def _round_up(pixels: int, step: int) -> int:
+    """Round up to a multiple of ``step``."""
     return -(-pixels // step) * step
 
 
 def manifest(raster: Raster, sheets: Iterable[Sheet], codec: str) -> Manifest:
-    """The manifest of sheets that are printed on this raster."""
+    """Return the manifest of sheets printed on this raster."""
     r = raster
     return Manifest(
         tuple(sheets),
@@ -203,34 +211,34 @@ def manifest(raster: Raster, sheets: Iterable[Sheet], codec: str) -> Manifest:
     )
 
 
-def pixels(manifest: Manifest, number: int) -> Layout:
-    """The layout of sheet ``number``, of which only the manifest is known.
+def pixels(manifest: Manifest, number: int) -> SheetLayout:
+    """Return the layout of sheet ``number`` of a manifest.
 
     Raises
     ------
     InputError
-        Its dots do not lie on the printer's pixels.
+        Its dots are not aligned with the printer's pixels.
     """
     dpi, item = manifest.dpi, manifest.sheets[number]
     if dpi % BASE_DPI:
         raise InputError(f"sheets of {dpi} dpi", hint=f"Use one of {', '.join(map(str, DPIS))}")
 
-    def whole(length_mm: float, what: str, unit: int = 1) -> int:
+    def to_pixels(length_mm: float, key: str, unit: int = 1) -> int:
         exact = length_mm * dpi / MM_PER_INCH
-        near = round(exact / unit) * unit
-        if abs(exact - near) > 1e-3:
+        rounded = round(exact / unit) * unit
+        if abs(exact - rounded) > MAX_ROUNDING_PX:
             raise InputError(
-                f"{what} of sheet {item.id!r} is not a whole number of pixels at {dpi} dpi",
+                f"{key} of sheet {item.id!r} is not a whole number of pixels at {dpi} dpi",
                 hint="Print it as a new sheet",
             )
-        return near
+        return rounded
 
     raster = Raster(
         dpi,
-        whole(manifest.pitch_mm, "pitch_mm"),
-        whole(manifest.offset_mm, "offset_mm"),
-        whole(manifest.dot_mm, "dot_mm"),
+        to_pixels(manifest.pitch_mm, "pitch_mm"),
+        to_pixels(manifest.offset_mm, "offset_mm"),
+        to_pixels(manifest.dot_mm, "dot_mm"),
     )
-    width, height = (whole(side, "page_mm", raster.step) for side in item.page_mm)
-    x, y = (whole(at - raster.mm(raster.dot / 2), "first_mm") for at in item.first_mm)
-    return Layout(raster, (width, height), (x, y), item.size)
+    width, height = (to_pixels(side, "page_mm", raster.step) for side in item.page_mm)
+    x, y = (to_pixels(at - raster.mm(raster.dot / 2), "first_mm") for at in item.first_mm)
+    return SheetLayout(raster, (width, height), (x, y), item.size)

@@ -1,96 +1,103 @@
-"""The printer's test sheet: fields of every dot size at every pitch, on the printer's pixels.
+"""Test sheet of a printer: fields of every dot size at every pitch, on the printer's pixels.
 
-Whether a printer keeps a dot of one or two pixels, smears it or halftones it away is known
-only from its paper (facts/dots.md 4), so this sheet prints them all. Each field is an area
-of the pattern of its own, far from those that sheets are given: what is read there proves
-which field it is. Markers in the corners let a photo be rectified; their numbers say which
-sheet it is, so that a picture of it needs no other file.
+Only its paper shows whether a printer keeps a dot of one or two pixels, smears it or removes it in
+the halftone, so this sheet prints them all. Each field is an area of the pattern of its own, far
+from those of other sheets, so that its symbols identify it. Markers in the corners allow a photo to
+be rectified; their numbers identify the sheet, so that a picture of it needs no other file.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.codec import SECTION_LENGTH, codec, sequences
-from locatk.core.dots.drawing.layout import BASE_DPI, DPIS, Layout, Raster, snap
+from locatk.core.dots.drawing.layout import BASE_DPI, DPIS, Raster, SheetLayout, snap
 from locatk.core.dots.sheet import MM_PER_INCH
 from locatk.core.errors import InputError
 from locatk.core.paper import PAPER_SIZES_MM
 
 SIZES = ("A4", "Letter")
-"""Papers for which there is a test sheet."""
+"""Papers that have a test sheet."""
 
-PITCHES = (14, 16, 20, 24, 28, 32)
+PITCH_UNITS_PER_INCH = 1200
+"""Unit of the pitches per inch."""
+
+FIELD_PITCHES_1200TH_INCH = (14, 16, 20, 24, 28, 32)
 """Pitches in 1/1200 in: 0.296, 0.339, 0.423, 0.508, 0.593 and 0.677 mm."""
 
-DOTS = {300: (1, 2, 3), 600: (1, 2, 3, 4, 5), 1200: (1, 2, 3, 4, 5, 6, 8)}
+DOT_WIDTHS_PX = {300: (1, 2, 3), 600: (1, 2, 3, 4, 5), 1200: (1, 2, 3, 4, 5, 6, 8)}
 """Widths of dots in pixels, by dpi."""
 
-LARGEST_DOT = 0.45
-"""In pitches; larger dots hide their place."""
+MAX_DOT_PITCHES = 0.45
+"""Largest width of a dot [pitches]; larger dots hide their displacement."""
 
 FIELD_MM = 20.0
-"""Side of a field."""
+"""Side of a field [mm]."""
 
-STEP = 128
-"""Places from a field's origin to the next; no field is as wide."""
+FIELD_STEP_POSITIONS = 128
+"""Grid positions from the origin of a field to that of the next; no field is as wide."""
 
-ORIGIN = SECTION_LENGTH // 1_000_000 * 1_000_000
-"""Origin of the first field, in x and y. Sheets are given areas from 0 on."""
+FIRST_FIELD_ORIGIN = SECTION_LENGTH // 1_000_000 * 1_000_000
+"""Grid coordinate, x and y, of the first field's origin. Other sheets are allocated from 0 on."""
 
-MARKER_MODULE = 24
-"""Pixels of 1/300 in a module of a marker."""
+MARKER_MODULE_PX = 24
+"""Side of a module of a marker, in pixels of 1/300 in."""
 
-MARKER_SIDE = 7
+MARKER_SIDE_MODULES = 7
 """Modules of a marker: five of code and its border."""
 
 EDGE_MM, LEFT_MM, TOP_MM = 10.0, 30.0, 32.0
-"""Nothing lies nearer than the first to an edge; the fields lie right and below of the
-others, and as far from the opposite edges (the right one: as far as the first)."""
+"""Least distance of anything from an edge of the paper, and distances of the fields from its left
+and its top. The fields are as far from the bottom as from the top, and from the right edge by the
+first distance."""
 
-CORNERS = 4
+MARKERS_PER_SHEET = 4
+"""Markers of a sheet, one per corner."""
 
 
 @dataclass(frozen=True)
-class Field:
-    """One field of a test sheet.
+class PrinterField:
+    """Field of a test sheet.
 
     Attributes
     ----------
     name : str
         Its column as a letter and its row as a number, as printed: ``"B4"``.
-    layout : Layout
-        Where it lies, and the size of its dots.
+    layout : SheetLayout
+        Its position, and the size of its dots.
     origin : (x, y)
         Grid coordinates of its upper left dot; section 0,0.
     """
 
     name: str
-    layout: Layout
+    layout: SheetLayout
     origin: tuple[int, int]
 
     @property
     def dot_mm(self) -> float:
+        """Width of a dot."""
         return self.layout.raster.mm(self.layout.raster.dot)
 
     @property
     def pitch_mm(self) -> float:
+        """Distance of two grid positions."""
         return self.layout.raster.mm(self.layout.raster.pitch)
 
 
 @dataclass(frozen=True)
-class Corner:
-    """A marker: a square of black and white modules.
+class CornerMarker:
+    """Marker in a corner: a square of black and white modules.
 
     Attributes
     ----------
     number : int
-        Of ArUco's dictionary of 100 markers of 5 x 5.
+        In ArUco's dictionary of 100 markers of 5 x 5.
     at : (x, y)
-        Of its upper left corner, in the printer's pixels from the page's upper left one.
+        Its upper left corner, in the printer's pixels from that of the page.
     module : int
         Side of a module in those pixels.
     """
@@ -101,22 +108,20 @@ class Corner:
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """(4, 2) corners in pixels, clockwise from the upper left one."""
-        side = MARKER_SIDE * self.module
+        """Corners (4, 2) in pixels, clockwise from the upper left one."""
+        side = MARKER_SIDE_MODULES * self.module
         return np.array(self.at) + side * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
     def modules(self) -> NDArray[np.bool_]:
-        """(7, 7) which modules are black, from the top down."""
-        import cv2
-
-        picture = cv2.aruco.generateImageMarker(dictionary(), self.number, MARKER_SIDE)
-        result: NDArray[np.bool_] = picture == 0
+        """Return which modules (7, 7) are black, from the top down."""
+        image = cv2.aruco.generateImageMarker(marker_dictionary(), self.number, MARKER_SIDE_MODULES)
+        result: NDArray[np.bool_] = image == 0
         return result
 
 
 @dataclass(frozen=True)
 class PrinterSheet:
-    """A test sheet; see :func:`printer_sheet`.
+    """Test sheet; see :func:`printer_sheet`.
 
     Attributes
     ----------
@@ -125,9 +130,9 @@ class PrinterSheet:
     codec : str
     page : (width, height)
         In the printer's pixels.
-    fields : tuple of Field
+    fields : tuple of PrinterField
         Row by row.
-    corners : tuple of Corner
+    corners : tuple of CornerMarker
         Upper left, upper right, lower right, lower left.
     """
 
@@ -135,32 +140,30 @@ class PrinterSheet:
     dpi: int
     codec: str
     page: tuple[int, int]
-    fields: tuple[Field, ...]
-    corners: tuple[Corner, ...]
+    fields: tuple[PrinterField, ...]
+    corners: tuple[CornerMarker, ...]
 
     def mm(self, pixels: float) -> float:
-        """Length in mm of so many pixels."""
+        """Return the length in mm of a number of pixels."""
         return pixels * MM_PER_INCH / self.dpi
 
-    def symbols(self, field: Field) -> NDArray[np.uint8]:
-        """(rows, columns) symbols of a field."""
+    def symbols(self, field: PrinterField) -> NDArray[np.uint8]:
+        """Return the symbols (rows, columns) of a field."""
         return codec(self.codec).symbols(field.origin, field.layout.size)
 
 
-def dictionary():  # type: ignore[no-untyped-def]  # OpenCV has no types
-    """The markers' dictionary."""
-    import cv2
-
+def marker_dictionary():  # type: ignore[no-untyped-def]  # OpenCV has no types
+    """Return the ArUco dictionary of the markers."""
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
 
 
 def printer_sheet(paper: str, dpi: int, codec_name: str = "anoto") -> PrinterSheet:
-    """The test sheet for a paper, a printer and a codec; always the same.
+    """Return the test sheet for a paper, a printer and a codec; it is always the same.
 
     Raises
     ------
     InputError
-        There is none of that paper, dpi or codec.
+        There is no test sheet of that paper, dpi or codec.
     """
     if paper not in SIZES:
         raise InputError(f"no test sheet of {paper!r}", hint=f"Use {' or '.join(SIZES)}")
@@ -174,47 +177,57 @@ def printer_sheet(paper: str, dpi: int, codec_name: str = "anoto") -> PrinterShe
 
     width, height = (pixels(side) for side in PAPER_SIZES_MM[paper])
     page = (width, height)
-    module = MARKER_MODULE * step
-    edge, far = pixels(EDGE_MM), pixels(EDGE_MM) + MARKER_SIDE * module
-    places = (
+    module = MARKER_MODULE_PX * step
+    edge = pixels(EDGE_MM)
+    inner = edge + MARKER_SIDE_MODULES * module
+    marker_corners = (
         (edge, edge),
-        (width - far, edge),
-        (width - far, height - far),
-        (edge, height - far),
+        (width - inner, edge),
+        (width - inner, height - inner),
+        (edge, height - inner),
     )
-    first = CORNERS * _variants().index((paper, dpi, codec_name))
-    corners = tuple(Corner(first + n, at, module) for n, at in enumerate(places))
-    pitches = [p * dpi // 1200 for p in PITCHES if p * dpi % 1200 == 0]
-    dots = DOTS[dpi]
+    first = MARKERS_PER_SHEET * _variants().index((paper, dpi, codec_name))
+    corners = tuple(CornerMarker(first + n, at, module) for n, at in enumerate(marker_corners))
+    unit = PITCH_UNITS_PER_INCH
+    pitches = [p * dpi // unit for p in FIELD_PITCHES_1200TH_INCH if p * dpi % unit == 0]
+    dots = DOT_WIDTHS_PX[dpi]
     left, top = pixels(LEFT_MM), pixels(TOP_MM)
-    across = (width - edge - left) // len(dots)
-    down = (height - 2 * top) // len(pitches)
+    column_step = (width - edge - left) // len(dots)
+    row_step = (height - 2 * top) // len(pitches)
     fields = []
     for row, pitch in enumerate(pitches):
         for column, dot in enumerate(dots):
-            if dot > LARGEST_DOT * pitch:
+            if dot > MAX_DOT_PITCHES * pitch:
                 continue
             raster = _raster(pitch, dot, dpi)
-            corner = (left + column * across, top + row * down)
-            # Snapped like every sheet's first place, with the offset left free before it.
+            corner = (left + column * column_step, top + row * row_step)
+            # Snapped like the first position of every sheet, and behind the offset of a dot.
             start = tuple(-(-(c + raster.offset) // step) * step for c in corner)
             count = (pixels(FIELD_MM) - 2 * raster.offset - dot) // pitch + 1
-            layout = Layout(raster, page, (start[0], start[1]), (count, count))
-            origin = (ORIGIN + column * STEP, ORIGIN + row * STEP)
-            fields.append(Field(f"{chr(ord('A') + column)}{row + 1}", layout, origin))
+            layout = SheetLayout(raster, page, (start[0], start[1]), (count, count))
+            origin = (
+                FIRST_FIELD_ORIGIN + column * FIELD_STEP_POSITIONS,
+                FIRST_FIELD_ORIGIN + row * FIELD_STEP_POSITIONS,
+            )
+            fields.append(PrinterField(f"{chr(ord('A') + column)}{row + 1}", layout, origin))
     return PrinterSheet(paper, dpi, codec_name, page, tuple(fields), corners)
 
 
 def sheet_of_marker(number: int) -> tuple[str, int, str] | None:
-    """Paper, dpi and codec of the test sheet that has this marker; None where none has."""
+    """Return paper, dpi and codec of the test sheet with this marker; None if there is none."""
     variants = _variants()
-    return variants[number // CORNERS] if 0 <= number < CORNERS * len(variants) else None
+    is_known = 0 <= number < MARKERS_PER_SHEET * len(variants)
+    return variants[number // MARKERS_PER_SHEET] if is_known else None
 
 
 def _variants() -> list[tuple[str, int, str]]:
-    return [(paper, dpi, name) for paper in SIZES for dpi in DPIS for name in sequences.FOURTH]
+    """Return paper, dpi and codec of all test sheets, in the order of their markers."""
+    return [
+        (paper, dpi, name) for paper in SIZES for dpi in DPIS for name in sequences.FOURTH_DIGITS
+    ]
 
 
 def _raster(pitch: int, dot: int, dpi: int) -> Raster:
+    """Return the raster of a pitch and a dot in the printer's pixels."""
     pixel = MM_PER_INCH / dpi
     return snap(pitch * pixel, dot * pixel, dpi)

@@ -1,12 +1,18 @@
-"""Soft decoding: the place of a window of the pattern from all dots that are seen of it.
+"""Soft decoding: position, section and rotation of windows of the pattern, from all of their dots.
 
-The evidence for an axis is the logarithm of how much likelier its dots are at a place than
-if their bits were random. Before the dots are seen, one of ``4 * 63 * RANGE`` places,
-sections and orientations is as likely as the next; by this the evidence is lowered, so
-that random bits pass a confidence of 1 - p with a probability below p, however many places
-were tried. A sheet of another codec is no random bits: columns of the main sequence in any
-order are a hypothesis too. Where wrong bits leave a doubt, the likeliest few places are
-compared with the whole window, and share the confidence.
+The evidence for a position on an axis is the logarithm of how much likelier its dots are there than
+if their bits were random. Without the dots each of ``4 * 63 * SECTION_LENGTH`` orientations,
+sections and positions is equally likely; the logarithm of their number is subtracted from the
+evidence, so that random bits pass a confidence of 1 - p with a probability below p, whatever the
+number of hypotheses tested. A sheet of another codec has no random bits: columns of the main
+sequence in any order are another hypothesis.
+
+:mod:`~locatk.core.dots.identification.phase_voting` estimates a position first. A few wrong bits in
+a small window may result in two positions that differ in the phase of a single column; neither the
+votes nor the evidence for one position alone reveal the other. In doubt a search therefore lists
+candidates, from all phases of all columns and from combinations of the phases of the least certain
+columns, and compares the whole window with each; the likelihoods of the others reduce the
+confidence.
 """
 
 from __future__ import annotations
@@ -20,221 +26,256 @@ from numpy.typing import NDArray
 from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, Codec
 from locatk.core.dots.codec.lookup import decode_exact
 from locatk.core.dots.identification.phase_voting import (
-    LONGEST,
-    PLACES,
-    Reading,
-    compare,
-    in_order,
-    read,
-    read_turned,
-    scores,
-    turned,
-    turns,
+    LOG_HYPOTHESES,
+    MAX_WINDOW_LINES,
+    Bits,
+    Integers,
+    WindowEstimates,
+    ballot_tables,
+    compare_with_any_order,
+    compare_with_pattern,
+    digit_tables,
+    estimate_rotated_windows,
+    estimate_windows,
+    following_phases,
+    phase_scores,
+    rotate_to_print,
+    rotation_scores,
 )
-from locatk.core.dots.identification.search import search
 from locatk.core.errors import InputError
 
-THRESHOLD = 0.999
-"""Least confidence of an accepted answer."""
+MIN_CONFIDENCE = 0.999
+"""Least confidence of an accepted result."""
 
-ENOUGH = math.log(THRESHOLD / (1 - THRESHOLD))
-"""Log odds of :data:`THRESHOLD`."""
+MIN_LOG_ODDS = math.log(MIN_CONFIDENCE / (1 - MIN_CONFIDENCE))
+"""Log odds of :data:`MIN_CONFIDENCE`."""
 
-STRANGE = 0.01
-"""How much likelier than a sheet of another codec it is to see one of this."""
+FOREIGN_CODEC_ODDS = 0.01
+"""Prior odds that the sheet is one of another codec."""
 
-UNLISTED = 3.0
-"""How much more the rivals of a place weigh than those that were found."""
+UNLISTED_RIVALS_FACTOR = 3.0
+"""Ratio of the likelihood of all rivals of a position to that of those in the list."""
 
-SURE = 40.0
-"""Log odds from which no other place can come near, wrong bits or not."""
+CERTAIN_LOG_ODDS = 40.0
+"""Log odds beyond which no other position is nearly as likely, even if bits are wrong."""
 
-MANY = 0.08
-"""Share of wrong bits from which another place may be as near, whatever the odds."""
+MAX_CERTAIN_WRONG_FRACTION = 0.08
+"""Fraction of wrong bits beyond which another position may be as likely, whatever the odds."""
 
-AHEAD = 10.0
-"""Votes by which a place leads that no other can share; the margin of a line or less."""
+MIN_CERTAIN_LEAD = 10.0
+"""Votes by which a position leads that no other can share: the margin of one line or less."""
 
-NARROW = 16
-"""Columns up to which a window is worth a second look when it cannot be read."""
+MAX_SMALL_WINDOW_LINES = 16
+"""Columns and rows up to which a window is small: wrong bits may hide its rotation or its position,
+so that the second rotation and misread columns are tried too."""
 
-PLAIN = 8
-"""Columns and rows from which a window without a wrong bit has one place only."""
+MIN_EXACT_LINES = 8
+"""Columns and rows from which a window without a wrong bit has one position only."""
+
+MARGINAL_RESIDUES = 6
+"""Residues of each secondary sequence that are combined to candidates."""
+
+MAX_MARGINAL_CANDIDATES = 48
+"""Maximum number of candidates from combined residues."""
+
+MISREAD_COLUMNS = 4
+"""Number of columns, the least certain ones, whose alternative phases are combined."""
+
+PHASES_PER_MISREAD_COLUMN = 3
+"""Number of phases of such a column that are tried, most likely first."""
+
+MIN_MARGINAL_PROBABILITY = 1e-4
+"""Added to the marginal probability of a digit, so that one misread column excludes no residue."""
 
 
 @dataclass(frozen=True)
-class Decoded:
-    """Answers for n windows; each array's first axis is the window.
+class DecodedWindows:
+    """Results for n windows; the first axis of each array is the window.
 
     Attributes
     ----------
     x, y : (n,) int64 ndarray
-        Grid coordinates of the printed window's upper left corner. The corner itself may
-        lie outside of the range where no dot is seen there; below 0 then.
+        Grid coordinates of the printed window's upper left corner. If no dots are observed there
+        the corner may be outside of the section, with a negative coordinate.
     section : (n, 2) int64 ndarray
     rotation : (n,) int64 ndarray
-        Quarter turns counter-clockwise by which the printed pattern is seen turned.
+        Counter-clockwise quarter turns of the print in the image.
     dots : (n,) int64 ndarray
-        Dots seen.
+        Number of dots.
     corrected : (n,) int64 ndarray
-        Bits that were seen wrong.
+        Number of wrong bits.
     confidence : (n,) float64 ndarray
-        Probability that the answer is right; accept from :data:`THRESHOLD` on.
+        Probability that the result is right; accept from :data:`MIN_CONFIDENCE` on.
     border : (n,) bool ndarray
-        Whether dots are seen on both sides of the border of a section; such a window has no
+        Whether there are dots on both sides of the border of a section; such a window has no
         confidence.
     """
 
-    x: NDArray[np.int64]
-    y: NDArray[np.int64]
-    section: NDArray[np.int64]
-    rotation: NDArray[np.int64]
-    dots: NDArray[np.int64]
-    corrected: NDArray[np.int64]
+    x: Integers
+    y: Integers
+    section: Integers
+    rotation: Integers
+    dots: Integers
+    corrected: Integers
     confidence: NDArray[np.float64]
     border: NDArray[np.bool_]
 
 
-def decode(
-    column_bits: NDArray[np.float32], row_bits: NDArray[np.float32], codec: Codec
-) -> Decoded:
-    """Place, section and orientation of n windows.
+def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWindows:
+    """Decode position, section and rotation of n windows.
 
     Parameters
     ----------
     column_bits, row_bits : (n, rows, columns) float32 ndarray
-        As seen, upright or not: logarithm of the likelihood ratio that the dot lies left
-        or down (column bit 1), and right or down (row bit 1); 0 where no dot is seen.
-        Bits of symbols that are known for sure: plus or minus 4.
+        As observed, in any rotation: log likelihood ratio that the dot is displaced left or down
+        (column bit 1), and right or down (row bit 1); 0 without a dot. Bits of symbols that are
+        certain: plus or minus 4.
     codec : Codec
 
     Raises
     ------
     InputError
-        A window has more than :data:`LONGEST` columns or rows.
+        A window has more than :data:`~.phase_voting.MAX_WINDOW_LINES` columns or rows.
     """
     _, rows, columns = column_bits.shape
-    if max(rows, columns) > LONGEST:
-        raise InputError(f"a window of {columns} x {rows} places, more than {LONGEST}")
-    if not PLAIN <= min(rows, columns) <= max(rows, columns) <= NARROW:
+    if max(rows, columns) > MAX_WINDOW_LINES:
+        raise InputError(f"a window of {columns} x {rows} positions, more than {MAX_WINDOW_LINES}")
+    if not MIN_EXACT_LINES <= min(rows, columns) <= max(rows, columns) <= MAX_SMALL_WINDOW_LINES:
         return _decode_soft(column_bits, row_bits, codec)
-    plain = _decode_plain(column_bits, row_bits, codec)
-    doubtful = np.flatnonzero(plain.confidence < THRESHOLD)
+    result = _decode_exact(column_bits, row_bits, codec)
+    doubtful = np.flatnonzero(result.confidence < MIN_CONFIDENCE)
     if len(doubtful):
         soft = _decode_soft(column_bits[doubtful], row_bits[doubtful], codec)
-        for field in fields(Decoded):
-            getattr(plain, field.name)[doubtful] = getattr(soft, field.name)
-    return plain
+        for field in fields(DecodedWindows):
+            getattr(result, field.name)[doubtful] = getattr(soft, field.name)
+    return result
 
 
-def _decode_plain(
-    column_bits: NDArray[np.float32], row_bits: NDArray[np.float32], codec: Codec
-) -> Decoded:
-    """Windows in which no dot is missing or wrong, by look-ups; the rest has no confidence."""
-    least = np.minimum(np.abs(column_bits), np.abs(row_bits)).min(axis=(1, 2))
+def _decode_exact(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWindows:
+    """Decode windows without a missing or wrong dot by look-up; others get no confidence."""
+    weakest = np.minimum(np.abs(column_bits), np.abs(row_bits)).min(axis=(1, 2))
     symbols = (column_bits > 0) + 2 * (row_bits > 0).astype(np.uint8)
     exact = decode_exact(symbols, codec)
     n, rows, columns = symbols.shape
-    # No bit is less sure than the least sure one.
-    odds = rows * columns * (math.log(2) - np.log1p(np.exp(-least.astype(np.float64)))) - PLACES
-    return Decoded(
+    # A lower bound: all bits as uncertain as the least certain one.
+    gain = math.log(2) - np.log1p(np.exp(-weakest.astype(np.float64)))
+    log_odds = rows * columns * gain - LOG_HYPOTHESES
+    return DecodedWindows(
         exact.x,
         exact.y,
         exact.section,
         exact.rotation,
         dots=np.full(n, rows * columns),
         corrected=np.zeros(n, np.int64),
-        confidence=np.where(exact.ok & (least > 0), (1 + np.exp(-odds)) ** -2, 0.0),
+        confidence=np.where(exact.ok & (weakest > 0), (1 + np.exp(-log_odds)) ** -2, 0.0),
         border=np.zeros(n, np.bool_),
     )
 
 
-def _decode_soft(
-    column_bits: NDArray[np.float32], row_bits: NDArray[np.float32], codec: Codec
-) -> Decoded:
-    x_bits, y_bits = _square(column_bits), _square(row_bits)
-    reading = read(x_bits, y_bits, codec)
-    confidence = _settle(reading, x_bits, y_bits, codec)
-    doubtful = np.flatnonzero(confidence < THRESHOLD)
-    if len(doubtful) and x_bits.shape[1] <= NARROW:
-        # In small windows a few wrong bits may hide which way is up.
-        windows = x_bits[doubtful], y_bits[doubtful]
-        second = np.argsort(-turns(*windows), axis=0)[1]
-        other = read_turned(*windows, second, codec)
-        other_confidence = _settle(other, *windows, codec)
+def _decode_soft(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWindows:
+    """Decode windows with missing or wrong dots."""
+    windows = _pad_to_square(column_bits), _pad_to_square(row_bits)
+    length = windows[0].shape[1]
+    estimates = estimate_windows(*windows, codec)
+    confidence = resolve_doubts(estimates, *windows, codec)
+    doubtful = np.flatnonzero(confidence < MIN_CONFIDENCE)
+    if len(doubtful) and length <= MAX_SMALL_WINDOW_LINES:
+        part = windows[0][doubtful], windows[1][doubtful]
+        second_rotation = np.argsort(-rotation_scores(*part), axis=0)[1]
+        other = estimate_rotated_windows(*part, second_rotation, codec)
+        other_confidence = resolve_doubts(other, *part, codec)
         better = other_confidence > confidence[doubtful]
-        for mine, its in zip(reading, other, strict=True):
-            mine[doubtful[better]] = its[better]
+        for values, other_values in zip(estimates, other, strict=True):
+            values[doubtful[better]] = other_values[better]
         confidence[doubtful[better]] = other_confidence[better]
     _, rows, columns = column_bits.shape
-    length = x_bits.shape[1]
-    return _decoded(reading, confidence, x_bits, (length - rows, length - columns))
+    dots = np.count_nonzero(windows[0], axis=(1, 2))
+    return as_decoded(estimates, confidence, dots, (length - rows, length - columns))
 
 
-def _settle(
-    reading: Reading, x_bits: NDArray[np.float32], y_bits: NDArray[np.float32], codec: Codec
+def resolve_doubts(
+    estimates: WindowEstimates, column_bits: Bits, row_bits: Bits, codec: Codec
 ) -> NDArray[np.float64]:
-    """Confidence (n,) of a reading; in doubt a search finds a better one, put in its place."""
-    rivals = np.zeros_like(reading.odds)
+    """Return the confidence (n,) of estimates; search for better ones if in doubt.
+
+    A better position and its evidence replace those in ``estimates``.
+    """
+    rivals = np.zeros_like(estimates.log_odds)
+    is_small = column_bits.shape[1] <= MAX_SMALL_WINDOW_LINES
     for axis in range(2):
-        odds, wrong = reading.odds[:, axis], reading.wrong[:, axis]
-        doubt = (wrong > 0) & (odds < SURE) | (reading.lead[:, axis] < AHEAD)
+        log_odds, wrong = estimates.log_odds[:, axis], estimates.wrong[:, axis]
+        is_doubtful = (wrong > 0) & (log_odds < CERTAIN_LOG_ODDS)
+        is_doubtful |= estimates.lead[:, axis] < MIN_CERTAIN_LEAD
         if wrong.any():
-            doubt |= wrong > MANY * np.count_nonzero(x_bits, axis=(1, 2))
-        doubtful = np.flatnonzero(doubt)
+            dots = np.count_nonzero(column_bits, axis=(1, 2))
+            is_doubtful |= wrong > MAX_CERTAIN_WRONG_FRACTION * dots
+        doubtful = np.flatnonzero(is_doubtful)
         if not len(doubtful):
             continue
-        printed = turned(x_bits[doubtful], y_bits[doubtful], reading.rotation[doubtful])
+        printed = rotate_to_print(
+            column_bits[doubtful], row_bits[doubtful], estimates.rotation[doubtful]
+        )
         lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
-        fits, narrow = scores(lines), x_bits.shape[1] <= NARROW
-        # Evidence if every line were at its best phase: where that is not enough, no place is.
-        bound = 0.5 * fits.max(axis=2).sum(axis=1) - np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
-        hope = bound > PLACES + ENOUGH
-        if not hope.any():
+        scores = phase_scores(lines)
+        # Evidence if every line had its best phase; no position has more.
+        normalization = np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
+        bound = 0.5 * scores.max(axis=2).sum(axis=1) - normalization
+        is_decodable = bound > LOG_HYPOTHESES + MIN_LOG_ODDS
+        if not is_decodable.any():
             continue
-        doubtful, lines, fits = doubtful[hope], lines[hope], fits[hope]
-        place, shift, rivals[doubtful, axis] = search(fits, codec, narrow=narrow)
-        reading.place[doubtful, axis], reading.shift[doubtful, axis] = place, shift
-        odds, wrong = compare(place, shift, lines, codec)
-        reading.odds[doubtful, axis], reading.wrong[doubtful, axis] = odds, wrong
-        reading.order[doubtful, axis] = in_order(place, shift, fits, codec)
+        doubtful, lines, scores = doubtful[is_decodable], lines[is_decodable], scores[is_decodable]
+        position, shift, rivals[doubtful, axis] = search_position(
+            scores, codec, try_misread_columns=is_small
+        )
+        estimates.position[doubtful, axis], estimates.shift[doubtful, axis] = position, shift
+        log_odds, wrong = compare_with_pattern(position, shift, lines, codec)
+        estimates.log_odds[doubtful, axis], estimates.wrong[doubtful, axis] = log_odds, wrong
+        estimates.order_log_odds[doubtful, axis] = compare_with_any_order(
+            position, shift, scores, codec
+        )
     with np.errstate(over="ignore"):
-        others = UNLISTED * rivals + np.exp(-reading.odds) + STRANGE * np.exp(-reading.order)
-    result: NDArray[np.float64] = (1 / (1 + others)).prod(axis=1)
+        alternatives = (
+            UNLISTED_RIVALS_FACTOR * rivals
+            + np.exp(-estimates.log_odds)
+            + FOREIGN_CODEC_ODDS * np.exp(-estimates.order_log_odds)
+        )
+    result: NDArray[np.float64] = (1 / (1 + alternatives)).prod(axis=1)
     return result
 
 
-def _decoded(
-    reading: Reading,
+def as_decoded(
+    estimates: WindowEstimates,
     confidence: NDArray[np.float64],
-    bits: NDArray[np.float32],
-    unused: tuple[int, int],
-) -> Decoded:
-    """``bits`` are those of the square window; the last ``unused`` rows, columns are filling."""
-    place = reading.place
-    # A corner that no dot holds may lie before the first place.
-    wraps = place + reading.first >= SECTION_LENGTH
-    straddles: NDArray[np.bool_] = (
-        ~wraps & (reading.last >= 0) & (place + reading.last >= SECTION_LENGTH)
+    dots: Integers,
+    padding: tuple[int, int],
+) -> DecodedWindows:
+    """Return the results of square windows whose last rows and columns are ``padding``."""
+    position = estimates.position
+    # A corner without dots may be before the first position of the section.
+    wraps = position + estimates.first >= SECTION_LENGTH
+    crosses: NDArray[np.bool_] = (
+        ~wraps & (estimates.last >= 0) & (position + estimates.last >= SECTION_LENGTH)
     )
-    at = np.where(wraps, place - SECTION_LENGTH, place)
-    # Which printed sides the filling lies before, seen below and to the right, by rotation.
-    rows, columns = unused
-    before = np.array([[0, 0], [rows, 0], [columns, rows], [0, columns]])[reading.rotation]
-    border = straddles[:, 0] | straddles[:, 1]
-    return Decoded(
-        x=at[:, 0] + before[:, 0],
-        y=at[:, 1] + before[:, 1],
-        section=(reading.shift - at[:, ::-1]) % MAIN_SEQUENCE_LENGTH,
-        rotation=reading.rotation,
-        dots=np.count_nonzero(bits, axis=(1, 2)),
-        corrected=reading.wrong.sum(axis=1),
+    corner = np.where(wraps, position - SECTION_LENGTH, position)
+    # The padding is below and to the right in the image; this is its width on the printed left and
+    # top, by rotation.
+    rows, columns = padding
+    before = np.array([[0, 0], [rows, 0], [columns, rows], [0, columns]])[estimates.rotation]
+    border = crosses[:, 0] | crosses[:, 1]
+    return DecodedWindows(
+        x=corner[:, 0] + before[:, 0],
+        y=corner[:, 1] + before[:, 1],
+        section=(estimates.shift - corner[:, ::-1]) % MAIN_SEQUENCE_LENGTH,
+        rotation=estimates.rotation,
+        dots=dots,
+        corrected=estimates.wrong.sum(axis=1),
         confidence=np.where(border, 0.0, confidence),
         border=border,
     )
 
 
-def _square(bits: NDArray[np.float32]) -> NDArray[np.float32]:
+def _pad_to_square(bits: Bits) -> Bits:
+    """Add missing dots below or on the right so that windows are square."""
     n, rows, columns = bits.shape
     if rows == columns:
         return bits
@@ -242,3 +283,104 @@ def _square(bits: NDArray[np.float32]) -> NDArray[np.float32]:
     result = np.zeros((n, length, length), np.float32)
     result[:, :rows, :columns] = bits
     return result
+
+
+# ---- search among many candidates
+
+
+def search_position(
+    scores: Bits, codec: Codec, *, try_misread_columns: bool
+) -> tuple[Integers, Integers, NDArray[np.float64]]:
+    """Search the most likely position on an axis of n windows.
+
+    Parameters
+    ----------
+    scores : (n, length, 63) float32 ndarray
+        :func:`~.phase_voting.phase_scores` of the columns (or rows).
+    codec : Codec
+    try_misread_columns : bool
+        Combine phases of the least certain columns too; in large windows they leave no rival.
+
+    Returns
+    -------
+    position, shift : (n,) int64 ndarray
+    rivals : (n,) float64 ndarray
+        Likelihood of the other candidates relative to this one.
+    """
+    n, length, _ = scores.shape
+    candidates = _candidates_from_marginals(scores, codec)
+    if try_misread_columns:
+        misread = _candidates_from_misread_columns(scores, codec)
+        candidates = np.concatenate([candidates, misread], axis=1)
+    candidates = np.sort(candidates, axis=1)
+    is_repeated = candidates[:, 1:] == candidates[:, :-1]
+    phases = following_phases(candidates, length, codec)
+    # One of the 63 shifts at a time, which limits the memory to (n, candidates, length) scores.
+    window = np.arange(n)[:, None, None]
+    joint = np.stack(
+        [
+            scores[window, np.arange(length), (phases + shift) % MAIN_SEQUENCE_LENGTH].sum(axis=2)
+            for shift in range(MAIN_SEQUENCE_LENGTH)
+        ],
+        axis=2,
+    ).astype(np.float64)
+    joint[:, 1:][is_repeated] = -np.inf
+    log_likelihood = 0.5 * joint.reshape(n, -1)
+    best = log_likelihood.argmax(axis=1)
+    largest = log_likelihood.max(axis=1, keepdims=True)
+    rivals = np.exp(log_likelihood - largest).sum(axis=1) - 1
+    index, shift = np.divmod(best, MAIN_SEQUENCE_LENGTH)
+    return candidates[np.arange(n), index], shift, rivals
+
+
+def _candidates_from_marginals(scores: Bits, codec: Codec) -> Integers:
+    """Return positions (n, candidates) that combine the best residues of all secondary sequences.
+
+    The probability of a shift from one column to the next is the circular correlation of the
+    probabilities of both phases; summed over shifts it gives the marginal probability of a digit.
+    """
+    n, length, _ = scores.shape
+    posterior = np.exp(0.5 * (scores - scores.max(axis=2, keepdims=True)).astype(np.float64))
+    posterior /= posterior.sum(axis=2, keepdims=True)
+    spectrum = np.fft.rfft(posterior, axis=2)
+    shift_probability = np.fft.irfft(
+        spectrum[:, 1:] * spectrum[:, :-1].conj(), MAIN_SEQUENCE_LENGTH, axis=2
+    )
+    totals, residues = np.zeros((n, 1)), np.zeros((n, 1, 0), np.int64)
+    for digits, ballots in zip(digit_tables(), ballot_tables(codec, length - 1), strict=True):
+        marginal = np.maximum(shift_probability, 0) @ digits
+        votes = np.log(marginal + MIN_MARGINAL_PROBABILITY).reshape(n, -1) @ ballots
+        best = np.argsort(-votes, axis=1)[:, :MARGINAL_RESIDUES]
+        sums = totals[:, :, None] + np.take_along_axis(votes, best, axis=1)[:, None]
+        kept = np.argsort(-sums.reshape(n, -1), axis=1)[:, :MAX_MARGINAL_CANDIDATES]
+        totals = np.take_along_axis(sums.reshape(n, -1), kept, axis=1)
+        previous, added = np.divmod(kept, best.shape[1])
+        residues = np.concatenate(
+            [
+                np.take_along_axis(residues, previous[..., None], axis=1),
+                np.take_along_axis(best, added, axis=1)[..., None],
+            ],
+            axis=2,
+        )
+    return codec.position(residues)
+
+
+def _candidates_from_misread_columns(scores: Bits, codec: Codec) -> Integers:
+    """Return positions (n, candidates) for all combinations of phases of uncertain columns."""
+    n, length, _ = scores.shape
+    ranked = np.argsort(-scores, axis=2)[:, :, :PHASES_PER_MISREAD_COLUMN]
+    score = np.take_along_axis(scores, ranked, axis=2)
+    uncertain = np.argsort(score[..., 0] - score[..., 1], axis=1)[:, :MISREAD_COLUMNS]
+    rank = np.indices((PHASES_PER_MISREAD_COLUMN,) * MISREAD_COLUMNS)
+    rank = rank.reshape(MISREAD_COLUMNS, -1).T
+    phases = np.repeat(ranked[:, None, :, 0], len(rank), axis=1)
+    window = np.arange(n)[:, None, None]
+    phases[window, np.arange(len(rank))[:, None], uncertain[:, None]] = ranked[
+        window, uncertain[:, None], rank
+    ]
+    shift = (phases[..., 1:] - phases[..., :-1]) % MAIN_SEQUENCE_LENGTH
+    residues = [
+        (digits[shift].reshape(n, len(rank), -1) @ ballots).argmax(axis=2)
+        for digits, ballots in zip(digit_tables(), ballot_tables(codec, length - 1), strict=True)
+    ]
+    return codec.position(np.stack(residues, axis=2))

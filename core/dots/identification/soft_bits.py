@@ -1,9 +1,9 @@
-"""From dots on a lattice to soft bits: what each dot says, and how sure it is.
+"""Soft bits of dots on a lattice: log likelihood ratios of the column and the row bit.
 
-A bit is one where the dot lies beyond the diagonal through its place (papers/dots.txt
-Fig. 6). Its logarithm of likelihoods, one over zero, follows from two Gaussians about where
-symbols stand, as wide as the scatter of the frame's own dots, and from a share of dots that
-lie anywhere (instead of the paper's polynomial, eq. 9).
+A bit is one if the dot is beyond the diagonal through its grid position (Hostettler et al. 2016,
+Fig. 6). Its log likelihood ratio, one over zero, follows from two Gaussians about the nominal
+offsets of symbols, as wide as the scatter of the frame's own dots, and from a fraction of dots at
+random positions. (The paper uses the polynomial of Eq. 9 instead.)
 """
 
 from __future__ import annotations
@@ -11,77 +11,84 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots.detection import lattice as grid
-from locatk.core.dots.detection.lattice import Lattices
-from locatk.core.dots.sheet import OFFSET
+from locatk.core.dots.detection.lattice import DotLattices, nearest_symbol_offset
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 from locatk.core.kernels import kernels
 
-WIDEST = 40
-"""Columns and rows about the middle of a frame that are decoded."""
+MAX_WINDOW_DOTS = 40
+"""Largest number of columns and rows, about the middle of a frame, that are decoded."""
 
-OFTEN = 0.018
-"""Likelihood of a bit that the dot's position all but excludes."""
+OUTLIER_LIKELIHOOD = 0.018
+"""Likelihood of a bit that the position of the dot practically excludes, relative to the peak of
+the Gaussian; it limits a soft bit to about 4."""
 
-SHARPEST = 0.03
-"""Least standard deviation of a dot that is believed, in pitches; the largest is twice it."""
+MIN_BIT_SIGMA_PITCHES = 0.03
+"""Least standard deviation of a dot for its soft bits; the largest is twice as much."""
 
-
-def half_width(lattices: Lattices) -> int:
-    """Half the width of the window in which all frames' dots lie."""
-    places = np.abs(lattices.place[lattices.valid & lattices.found[:, None]])
-    reach = int(places.max(initial=4)) + 1 if places.size else 5
-    return min(reach, WIDEST // 2)
+BIT_SIGMA_FACTOR = 1.5
+"""Ratio of the standard deviation for soft bits to the scatter of the frame's dots, which excludes
+those beyond the gate."""
 
 
-def soft_bits(lattices: Lattices, half: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row bits (n, 2 half, 2 half) as the decoder takes them, 0 without a dot.
+def window_half_width(lattices: DotLattices) -> int:
+    """Return half the width of the window that contains the dots of all frames."""
+    nodes = np.abs(lattices.nodes[lattices.valid & lattices.fitted[:, None]])
+    half = int(nodes.max(initial=4)) + 1 if nodes.size else 5
+    return min(half, MAX_WINDOW_DOTS // 2)
 
-    Where two dots claim a place, the one closer to where symbols stand is taken.
+
+def soft_bits(lattices: DotLattices, half: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return column and row bits (n, 2 half, 2 half) for the decoder, 0 without a dot.
+
+    Of two dots at a node the one closer to the offset of a symbol counts.
     """
     n, m = lattices.valid.shape
-    sigma = np.clip(1.5 * lattices.sigma, SHARPEST, 2 * SHARPEST)
+    sigma = np.clip(
+        BIT_SIGMA_FACTOR * lattices.sigma, MIN_BIT_SIGMA_PITCHES, 2 * MIN_BIT_SIGMA_PITCHES
+    )
     if kernels is None:
         return soft_bits_numpy(lattices, half, sigma)
-    x_bits = np.empty((n, 2 * half, 2 * half), np.float32)
-    y_bits = np.empty_like(x_bits)
+    column_bits = np.empty((n, 2 * half, 2 * half), np.float32)
+    row_bits = np.empty_like(column_bits)
     kernels.soft_bits(
-        *(lattices.uv, lattices.place, np.ascontiguousarray(lattices.valid), lattices.found),
-        *(sigma, n, m, half, OFFSET, OFTEN, x_bits, y_bits),
+        *(lattices.uv, lattices.nodes, np.ascontiguousarray(lattices.valid), lattices.fitted),
+        *(sigma, n, m, half, DOT_OFFSET_PITCHES, OUTLIER_LIKELIHOOD, column_bits, row_bits),
     )
-    return x_bits, y_bits
+    return column_bits, row_bits
 
 
 def soft_bits_numpy(
-    lattices: Lattices, half: int, scatter: NDArray[np.float64]
+    lattices: DotLattices, half: int, sigma: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """:func:`soft_bits` without the compiled kernel; ``scatter`` is (n,), in pitches."""
-    length = 2 * half
-    n = len(lattices.found)
-    rest = lattices.uv - lattices.place
-    index = lattices.place.astype(np.int64) + half
-    inside = (
-        lattices.valid & lattices.found[:, None] & ((index >= 0) & (index < length)).all(axis=2)
-    )
-    frame, dot = np.nonzero(inside)
-    index, rest = index[frame, dot], rest[frame, dot]
-    cell = (frame * length + index[:, 1]) * length + index[:, 0]
-    miss = np.abs(rest - grid.displacement(rest)).max(axis=1)
-    holder = np.full(n * length * length, -1, np.int64)
-    order = np.arange(len(cell))
-    holder[cell] = order
-    worse = np.flatnonzero(holder[cell] != order)
-    for k in worse[np.argsort(-miss[worse], kind="stable")]:
-        if miss[k] < miss[holder[cell[k]]]:
-            holder[cell[k]] = k
-    kept = holder[cell] == order
-    cell, rest, frame = cell[kept], rest[kept], frame[kept]
+    """Return soft bits as :func:`soft_bits`, without the compiled kernel.
 
-    sigma = scatter[frame]
-    spread = (-0.25 / (sigma * sigma)).astype(np.float32)
+    ``sigma`` (n,) is the standard deviation of the dots in pitches.
+    """
+    length = 2 * half
+    n = len(lattices.fitted)
+    offset = lattices.uv - lattices.nodes
+    index = lattices.nodes.astype(np.int64) + half
+    is_inside = ((index >= 0) & (index < length)).all(axis=2)
+    frame, dot = np.nonzero(lattices.valid & lattices.fitted[:, None] & is_inside)
+    index, offset = index[frame, dot], offset[frame, dot]
+    cell = (frame * length + index[:, 1]) * length + index[:, 0]
+    residual = np.abs(offset - nearest_symbol_offset(offset)).max(axis=1)
+    owner = np.full(n * length * length, -1, np.int64)
+    order = np.arange(len(cell))
+    owner[cell] = order
+    displaced = np.flatnonzero(owner[cell] != order)
+    for k in displaced[np.argsort(-residual[displaced], kind="stable")]:
+        if residual[k] < residual[owner[cell[k]]]:
+            owner[cell[k]] = k
+    kept = owner[cell] == order
+    cell, offset, frame = cell[kept], offset[kept], frame[kept]
+
+    # Both bits are projections on diagonals, so that their variance is twice that of an axis.
+    exponent = (-0.25 / (sigma[frame] * sigma[frame])).astype(np.float32)
     bits = []
-    for along in (rest[:, 1] - rest[:, 0], rest[:, 1] + rest[:, 0]):
-        one = np.exp(spread * (along - OFFSET) ** 2) + OFTEN
-        zero = np.exp(spread * (along + OFFSET) ** 2) + OFTEN
+    for projection in (offset[:, 1] - offset[:, 0], offset[:, 1] + offset[:, 0]):
+        one = np.exp(exponent * (projection - DOT_OFFSET_PITCHES) ** 2) + OUTLIER_LIKELIHOOD
+        zero = np.exp(exponent * (projection + DOT_OFFSET_PITCHES) ** 2) + OUTLIER_LIKELIHOOD
         table = np.zeros(n * length * length, np.float32)
         table[cell] = np.log(one / zero)
         bits.append(table.reshape(n, length, length))

@@ -1,15 +1,15 @@
-"""Frames to places: dots, grid and decoding joined, each frame by itself.
+"""Localization of frames on the grid: detect dots, identify the window, estimate the pose.
 
-No frame knows of another, so that the first one counts as much as the thousandth
-(the paper's peer needs a few frames until its vote on the orientation has settled:
-facts/dots.md 3.2). Batches are only for speed: a frame's answer does not depend on them.
+Frames are independent, so that the first one is as reliable as the thousandth. (The peer
+cellulo-localization, commit 894f0d0, needs several frames until its vote on the orientation has
+settled.) Batches only save time: the result of a frame does not depend on them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -17,45 +17,214 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec
-from locatk.core.dots.detection import lattice as grid
-from locatk.core.dots.detection.blobs import find_dots
-from locatk.core.dots.detection.lattice import Lattices
-from locatk.core.dots.identification.decoding import THRESHOLD, Decoded, decode
-from locatk.core.dots.identification.soft_bits import half_width, soft_bits
-from locatk.core.dots.localization.located import Located, nothing
-from locatk.core.dots.localization.pose import match, poses
+from locatk.core.dots.detection.blobs import detect_dots
+from locatk.core.dots.detection.lattice import MIN_LATTICE_DOTS, DotLattices, fit_lattices
+from locatk.core.dots.identification.decoding import (
+    MIN_CONFIDENCE,
+    DecodedWindows,
+    identify_windows,
+)
+from locatk.core.dots.identification.soft_bits import soft_bits, window_half_width
+from locatk.core.dots.localization.pose import assign_dots, localize_windows
 from locatk.core.errors import InputError
 
-BATCH = 32
-"""Frames that are worked on at once; their data fits the cache."""
+Images = NDArray[np.uint8]
 
-SMALLEST = 48
-"""Pixels of a side below which a frame cannot show a window of the pattern."""
+FRAMES_PER_BATCH = 32
+"""Number of frames that are processed at once; their data fit into the cache."""
 
-NATURAL = 120
-"""Pixels of the short side at which the pattern is looked for first: at full size in the
-paper's frames, at half size in those of twice their size, and so on."""
+MIN_SIDE_PX = 48
+"""Least side of a frame [px]; a smaller one cannot contain a window of the pattern."""
 
-LEVELS = 4
-"""Sizes that are tried at most, each half of the one before."""
+PREFERRED_SIDE_PX = 120
+"""Short side of a frame [px] at which the pattern is searched first: the paper's frames at full
+size, those of twice their size at half size, and so on."""
 
-FEW_DOTS = "too_few_dots"
+MAX_LEVELS = 4
+"""Maximum number of sizes that are tried, each half of the previous one."""
+
+MIN_CODE_CONFIDENCE = 0.5
+"""Confidence below which a frame contains no position of the codec; between this and the threshold
+the position is doubtful."""
+
+TOO_FEW_DOTS = "too_few_dots"
 NO_GRID = "no_grid"
 NO_CODE = "no_code"
-DOUBTFUL = "low_confidence"
-BORDER = "section_border"
+LOW_CONFIDENCE = "low_confidence"
+SECTION_BORDER = "section_border"
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """Dots of one located frame with where on the grid each stands, for calibration.
+class LocalizedFrames:
+    """Poses of n frames on the grid, or the reasons of their rejection.
+
+    The other values of a rejected frame have no meaning.
+
+    Attributes
+    ----------
+    grid : (n, 2) float64 ndarray
+        Grid coordinates of the camera's centre.
+    section : (n, 2) int64 ndarray
+    heading : (n,) float64 ndarray
+        From the sheet's x axis to the image's right, counter-clockwise, in rad.
+    covariance : (n, 3, 3) float64 ndarray
+        Of x, y (pitches, y down) and heading (rad); nan if unknown.
+    dots, corrected : (n,) int64 ndarray
+        Dots on the grid, and wrong bits among theirs.
+    confidence : (n,) float64 ndarray
+    rejected : (n,) object ndarray of str
+        Reason of rejection; ``""`` if the frame is localized.
+    """
+
+    grid: NDArray[np.float64]
+    section: NDArray[np.int64]
+    heading: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    dots: NDArray[np.int64]
+    corrected: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    rejected: NDArray[np.object_]
+
+    def __len__(self) -> int:
+        return len(self.rejected)
+
+    @property
+    def accepted(self) -> NDArray[np.bool_]:
+        """Whether each frame (n,) is localized."""
+        result: NDArray[np.bool_] = self.rejected == ""
+        return result
+
+    def update(self, indices: NDArray[np.int64], part: LocalizedFrames) -> None:
+        """Store ``part`` for the frames ``indices`` that it localizes or has more confidence in."""
+        better = part.accepted | (part.confidence >= self.confidence[indices])
+        for field in fields(LocalizedFrames):
+            getattr(self, field.name)[indices[better]] = getattr(part, field.name)[better]
+
+
+def unlocalized_frames(n: int, reason: str) -> LocalizedFrames:
+    """Return n frames that are all rejected for ``reason``."""
+    return LocalizedFrames(
+        grid=np.full((n, 2), np.nan),
+        section=np.full((n, 2), -1, np.int64),
+        heading=np.full(n, np.nan),
+        covariance=np.full((n, 3, 3), np.nan),
+        dots=np.zeros(n, np.int64),
+        corrected=np.zeros(n, np.int64),
+        confidence=np.zeros(n),
+        rejected=np.full(n, reason, object),
+    )
+
+
+def localize_frames(
+    images: Images,
+    codec: Codec,
+    camera: Camera | None = None,
+    *,
+    min_confidence: float = MIN_CONFIDENCE,
+) -> LocalizedFrames:
+    """Estimate position and heading of grey frames (n, h, w) of one camera.
+
+    Without a ``camera`` its centre is the middle of the frame, and the distortion of its lens is
+    estimated in each frame.
+
+    Raises
+    ------
+    InputError
+        The frames do not have 8 bits per pixel.
+    """
+    if images.dtype != np.uint8:
+        raise InputError(f"frames of {images.dtype}, not of 8 bits a pixel")
+    n, height, width = images.shape
+    result = unlocalized_frames(n, TOO_FEW_DOTS)
+    if min(height, width) < MIN_SIDE_PX:
+        return result
+    for start in range(0, n, FRAMES_PER_BATCH):
+        remaining = np.arange(start, min(start + FRAMES_PER_BATCH, n))
+        for level in _levels(height, width):
+            part, _, _ = _localize_batch(images[remaining], codec, camera, level, min_confidence)
+            result.update(remaining, part)
+            remaining = remaining[~result.accepted[remaining]]
+            if not len(remaining):
+                break
+    return result
+
+
+def _localize_batch(
+    images: Images, codec: Codec, camera: Camera | None, level: int, min_confidence: float
+) -> tuple[LocalizedFrames, DotLattices, DecodedWindows]:
+    """Localize frames (n, h, w) at a size that is halved ``level`` times."""
+    n, height, width = images.shape
+    dots = detect_dots(_shrink(images, level))
+    scale = np.float32(1 << level)
+    pixels = (dots.xy + np.float32(0.5)) * scale - np.float32(0.5)
+    centre, half_diagonal = _normalization(height, width, camera)
+    if camera is not None and camera.radial:
+        pixels = camera.undistort(pixels.astype(np.float64))
+    points = ((pixels - centre) / half_diagonal).astype(np.float32)
+    lattices = fit_lattices(points, dots.valid, lens=camera is None)
+
+    half = window_half_width(lattices)
+    windows = identify_windows(*soft_bits(lattices, half), codec)
+    poses = localize_windows(lattices, half, windows, codec)
+    rejected = np.full(n, "", object)
+    rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
+    rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
+    rejected[(rejected != "") & windows.border] = SECTION_BORDER
+    rejected[~lattices.fitted] = NO_GRID
+    rejected[dots.counts < MIN_LATTICE_DOTS] = TOO_FEW_DOTS
+    frames = LocalizedFrames(
+        grid=poses.grid,
+        section=windows.section,
+        heading=poses.heading,
+        covariance=poses.covariance,
+        dots=windows.dots,
+        corrected=windows.corrected,
+        confidence=np.where(lattices.fitted, windows.confidence, 0.0),
+        rejected=rejected,
+    )
+    return frames, lattices, windows
+
+
+def _levels(height: int, width: int) -> list[int]:
+    """Return the numbers of halvings of the frame to try, the most suitable first."""
+    short = min(height, width)
+    preferred = max(0, round(math.log2(short / PREFERRED_SIDE_PX)))
+    levels = range(max(MAX_LEVELS, preferred + 1))
+    possible = [level for level in levels if short >> level >= MIN_SIDE_PX]
+    return sorted(possible, key=lambda level: (abs(level - preferred), level))
+
+
+def _shrink(images: Images, level: int) -> Images:
+    """Halve the size of images (n, h, w) ``level`` times, leaving out incomplete blocks."""
+    if not level:
+        return images
+    _, height, width = images.shape
+    size = (width >> level, height >> level)
+    cropped = images[:, : size[1] << level, : size[0] << level]
+    return np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in cropped])
+
+
+def _normalization(
+    height: int, width: int, camera: Camera | None
+) -> tuple[NDArray[np.float64], float]:
+    """Return the centre of the camera in px, and half the diagonal of a frame in px."""
+    centre = ((width - 1) / 2, (height - 1) / 2) if camera is None else camera.centre_px
+    return np.array(centre), math.hypot(width, height) / 2
+
+
+# ---- correspondences for calibration
+
+
+@dataclass(frozen=True)
+class DotCorrespondences:
+    """Dots of one localized frame, with their positions on the grid.
 
     Attributes
     ----------
     pixels : (m, 2) float64 ndarray
-        As seen, distortion and all.
+        In the frame, with distortion.
     grid : (m, 2) float64 ndarray
-        Of the dot itself, its displacement included, relative to :attr:`origin`.
+        Grid coordinates of the dot itself, with its offset, relative to :attr:`origin`.
     origin : (2,) int64 ndarray
     """
 
@@ -64,113 +233,23 @@ class Sighting:
     origin: NDArray[np.int64]
 
 
-def locate(
-    images: NDArray[np.uint8],
-    codec: Codec,
-    camera: Camera | None = None,
-    *,
-    threshold: float = THRESHOLD,
-) -> Located:
-    """Place and heading of (n, h, w) grey frames of one camera.
-
-    Without a ``camera`` the centre of the frame is the camera's, and the bend of its lens
-    is estimated in each frame.
-
-    Raises
-    ------
-    InputError
-        The frames are not of 8 bits a pixel.
-    """
-    if images.dtype != np.uint8:
-        raise InputError(f"frames of {images.dtype}, not of 8 bits a pixel")
-    n, height, width = images.shape
-    result = nothing(n, FEW_DOTS)
-    if min(height, width) < SMALLEST:
-        return result
-    for start in range(0, n, BATCH):
-        left = np.arange(start, min(start + BATCH, n))
-        for level in _levels(height, width):
-            part, _, _ = _locate(images[left], codec, camera, level, threshold)
-            result.keep(left, part)
-            left = left[~result.accepted[left]]
-            if not len(left):
-                break
-    return result
-
-
-def sightings(
-    images: NDArray[np.uint8], codec: Codec, camera: Camera | None = None
-) -> Iterator[Sighting]:
-    """What each located frame of ``images`` shows; frames that have no place are left out."""
+def dot_correspondences(
+    images: Images, codec: Codec, camera: Camera | None = None
+) -> Iterator[DotCorrespondences]:
+    """Yield the dots of each frame of ``images`` (n, h, w) that can be localized."""
     _, height, width = images.shape
-    centre, scale = _normal_frame(height, width, camera)
+    centre, half_diagonal = _normalization(height, width, camera)
     for image in images:
         for level in _levels(height, width):
-            part, lattices, decoded = _locate(image[None], codec, camera, level, THRESHOLD)
-            if not part.accepted[0]:
+            frame, lattices, windows = _localize_batch(
+                image[None], codec, camera, level, MIN_CONFIDENCE
+            )
+            if not frame.accepted[0]:
                 continue
-            dots = match(lattices, half_width(lattices), decoded, codec)
-            seen = lattices.points[0, dots.use[0]] * scale + centre
+            dots = assign_dots(lattices, window_half_width(lattices), windows, codec)
+            used = dots.used[0]
+            pixels = lattices.points[0, used] * half_diagonal + centre
             if camera is not None:
-                seen = camera.distort(seen)
-            yield Sighting(seen, dots.target[0, dots.use[0]], dots.origin[0])
+                pixels = camera.distort(pixels)
+            yield DotCorrespondences(pixels, dots.target[0, used], dots.origin[0])
             break
-
-
-def _levels(height: int, width: int) -> list[int]:
-    """Halvings of the frame to try, likeliest first."""
-    short = min(height, width)
-    first = max(0, round(math.log2(short / NATURAL)))
-    possible = [k for k in range(max(LEVELS, first + 1)) if short >> k >= SMALLEST]
-    return sorted(possible, key=lambda k: (abs(k - first), k))
-
-
-def _normal_frame(
-    height: int, width: int, camera: Camera | None
-) -> tuple[NDArray[np.float64], float]:
-    """Centre of the camera in px, and half the diagonal of a frame."""
-    centre = ((width - 1) / 2, (height - 1) / 2) if camera is None else camera.centre_px
-    return np.array(centre), math.hypot(width, height) / 2
-
-
-def _locate(
-    images: NDArray[np.uint8],
-    codec: Codec,
-    camera: Camera | None,
-    level: int,
-    threshold: float,
-) -> tuple[Located, Lattices, Decoded]:
-    n, height, width = images.shape
-    shrink = 1 << level
-    if level:
-        size = (width >> level, height >> level)
-        whole = images[:, : size[1] << level, : size[0] << level]
-        images = np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in whole])
-    dots = find_dots(images)
-    pixels = (dots.xy + np.float32(0.5)) * np.float32(shrink) - np.float32(0.5)
-    centre, scale = _normal_frame(height, width, camera)
-    if camera is not None and camera.radial:
-        pixels = camera.undistort(pixels.astype(np.float64))
-    points = ((pixels - centre) / scale).astype(np.float32)
-    lattices = grid.fit_lattices(points, dots.valid, lens=camera is None)
-
-    half = half_width(lattices)
-    decoded = decode(*soft_bits(lattices, half), codec)
-    pose = poses(lattices, half, decoded, codec)
-    rejected = np.full(n, "", object)
-    rejected[decoded.confidence < threshold] = DOUBTFUL
-    rejected[decoded.confidence < 0.5] = NO_CODE
-    rejected[(rejected != "") & decoded.border] = BORDER
-    rejected[~lattices.found] = NO_GRID
-    rejected[dots.counts < grid.FEWEST] = FEW_DOTS
-    located = Located(
-        grid=pose.grid,
-        section=decoded.section,
-        heading=pose.heading,
-        covariance=pose.covariance,
-        dots=decoded.dots,
-        corrected=decoded.corrected,
-        confidence=np.where(lattices.found, decoded.confidence, 0.0),
-        rejected=rejected,
-    )
-    return located, lattices, decoded

@@ -1,4 +1,9 @@
-"""From a decoded window to the pose of the camera, and what its dots say of that pose."""
+"""Pose of the camera from a decoded window.
+
+Once a window is decoded, the symbol of every dot is known and with it the dot's true position. The
+lattice is fitted once more to all dots at these positions, and the pose and its covariance follow
+from the fit. (Hostettler et al. 2016, II-B.8, use one corner of the decoded window instead.)
+"""
 
 from __future__ import annotations
 
@@ -14,36 +19,59 @@ from locatk.core.dots.codec import (
     SECTION_LENGTH,
     Codec,
 )
-from locatk.core.dots.codec.sequences import SMALLEST_SHIFT
-from locatk.core.dots.detection import lattice as grid
-from locatk.core.dots.detection.lattice import Lattices
-from locatk.core.dots.identification.decoding import Decoded
+from locatk.core.dots.codec.sequences import MIN_SHIFT
+from locatk.core.dots.detection.lattice import (
+    A_U,
+    A_V,
+    C_U,
+    C_V,
+    MIN_SIGMA_PITCHES,
+    SYMBOL_GATE_PITCHES,
+    DotLattices,
+    prior_weights,
+    refit_lattices,
+    slope_at_centre,
+)
+from locatk.core.dots.identification.decoding import DecodedWindows
 from locatk.core.dots.identification.phase_voting import kernel_tables
-from locatk.core.dots.sheet import OFFSET
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 from locatk.core.kernels import kernels
 
-TURNS = np.array(
+Array = NDArray[np.float64]
+
+IMAGE_TO_PRINT = np.array(
     [[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]], np.int64
 )
-"""(4, 2, 2) directions as seen to directions as printed, by rotation."""
+"""(4, 2, 2) rotation of directions in the image to directions in print, by quarter turns."""
 
-CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-"""(4, 2) printed corner of a window, each 0 or 1, that is seen as its upper left."""
+PRINTED_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+"""(4, 2) printed corner of a window, each 0 or 1, that is at the upper left of the image."""
 
 
 @dataclass(frozen=True)
-class Match:
-    """Dots of frames against the pattern: (n, m) in use, (n, m, 2) by how much each misses
-    its lattice coordinates, and (n, m, 2) where it stands from ``origin`` on."""
+class DotAssignments:
+    """Assignment of the dots of n frames to positions of the pattern.
 
-    use: NDArray[np.bool_]
-    miss: NDArray[np.float32]
-    target: NDArray[np.float64]
+    Attributes
+    ----------
+    used : (n, m) bool ndarray
+        Whether the dot agrees with the symbol at its position.
+    residual : (n, m, 2) float32 ndarray
+        Lattice coordinates of the dot minus those of its symbol.
+    target : (n, m, 2) float64 ndarray
+        Printed position of the dot itself relative to ``origin``, in pitches.
+    origin : (n, 2) int64 ndarray
+        Grid coordinates of the window's printed corner.
+    """
+
+    used: NDArray[np.bool_]
+    residual: NDArray[np.float32]
+    target: Array
     origin: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Poses:
+class GridPoses:
     """Poses of n frames on the grid.
 
     Attributes
@@ -56,94 +84,90 @@ class Poses:
         Of x, y (pitches, y down) and heading (rad).
     """
 
-    grid: NDArray[np.float64]
-    heading: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    grid: Array
+    heading: Array
+    covariance: Array
 
 
-def poses(lattices: Lattices, half: int, decoded: Decoded, codec: Codec) -> Poses:
-    """Fit the lattices once more, to the dots that say what they should, and read poses off.
-
-    Where in its cell a dot should stand is known once its frame is decoded, so that every
-    dot tells the grid as well as it was found; papers/dots.txt II-B.8 takes one corner of
-    the decoded window instead.
-    """
+def localize_windows(
+    lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
+) -> GridPoses:
+    """Estimate the poses of frames from their lattices and decoded windows of 2 ``half`` lines."""
     if kernels is None:
-        return poses_numpy(lattices, half, decoded, codec)
+        return localize_windows_numpy(lattices, half, windows, codec)
     n, m = lattices.valid.shape
-    windows = np.empty((n, 5), np.int64)
-    windows[:, 0], windows[:, 1], windows[:, 2:4] = decoded.x, decoded.y, decoded.section
-    windows[:, 4] = decoded.rotation
+    decoded = np.empty((n, 5), np.int64)
+    decoded[:, 0], decoded[:, 1], decoded[:, 2:4] = windows.x, windows.y, windows.section
+    decoded[:, 4] = windows.rotation
     pose, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
     kernels.poses(
         np.ascontiguousarray(lattices.points),
         np.ascontiguousarray(lattices.valid),
-        *(lattices.uv, lattices.place, n, m, half, lattices.lens, grid.weights(True), windows),
+        *(lattices.uv, lattices.nodes, n, m, half, lattices.lens, prior_weights(True), decoded),
         *kernel_tables(codec),
-        *(SECTION_LENGTH, SMALLEST_SHIFT, OFFSET, grid.TIGHT, grid.FINEST),
+        *(SECTION_LENGTH, MIN_SHIFT, DOT_OFFSET_PITCHES, SYMBOL_GATE_PITCHES, MIN_SIGMA_PITCHES),
         *(lattices.parameters.copy(), pose, covariance),
     )
-    return Poses(pose[:, :2], pose[:, 2], covariance)
+    return GridPoses(pose[:, :2], pose[:, 2], covariance)
 
 
-def poses_numpy(lattices: Lattices, half: int, decoded: Decoded, codec: Codec) -> Poses:
-    """:func:`poses` without the compiled kernel."""
-    dots = match(lattices, half, decoded, codec)
-    parameters, covariance = grid.refit(lattices, dots.miss, dots.use)
-    turn = TURNS[decoded.rotation]
-    corner = CORNERS[decoded.rotation] * (2 * half - 1)
-    centre = parameters[:, [grid.C_U, grid.C_V]] + half
-    slope = grid.slope_at_centre(parameters)
-    right = np.einsum("nij,nj->ni", turn, slope[:, :, 0])
-    return Poses(
-        grid=np.einsum("nij,nj->ni", turn, centre) + corner + dots.origin,
+def localize_windows_numpy(
+    lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
+) -> GridPoses:
+    """Estimate poses as :func:`localize_windows`, without the compiled kernel."""
+    dots = assign_dots(lattices, half, windows, codec)
+    parameters, covariance = refit_lattices(lattices, dots.residual, dots.used)
+    rotation = IMAGE_TO_PRINT[windows.rotation]
+    corner = PRINTED_CORNERS[windows.rotation] * (2 * half - 1)
+    centre = parameters[:, [C_U, C_V]] + half
+    slope = slope_at_centre(parameters)
+    right = np.einsum("nij,nj->ni", rotation, slope[:, :, 0])
+    return GridPoses(
+        grid=np.einsum("nij,nj->ni", rotation, centre) + corner + dots.origin,
         heading=np.arctan2(-right[:, 1], right[:, 0]),
-        covariance=_pose_covariance(covariance, slope, turn),
+        covariance=_pose_covariance(covariance, slope, rotation),
     )
 
 
-def match(
-    lattices: Lattices,
-    half: int,
-    decoded: Decoded,
-    codec: Codec,
-) -> Match:
-    """Where in the lattice each dot should stand, if it is what the code has there."""
-    x, y, section, rotation = decoded.x, decoded.y, decoded.section, decoded.rotation
-    turn, corner = TURNS[rotation], CORNERS[rotation] * (2 * half - 1)
-    index = (lattices.place.astype(np.int64) + half) @ turn.transpose(0, 2, 1) + corner[:, None]
+def assign_dots(
+    lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
+) -> DotAssignments:
+    """Assign the dots of frames to the positions of their decoded windows of 2 ``half`` lines."""
+    x, y, section = windows.x, windows.y, windows.section
+    rotation = IMAGE_TO_PRINT[windows.rotation]
+    corner = PRINTED_CORNERS[windows.rotation] * (2 * half - 1)
+    index = (lattices.nodes.astype(np.int64) + half) @ rotation.transpose(0, 2, 1)
+    index += corner[:, None]
     steps = np.arange(2 * half)
-    columns = codec.phases((x[:, None] + steps) % SECTION_LENGTH) + section[:, :1]
-    rows = codec.phases((y[:, None] + steps) % SECTION_LENGTH) + section[:, 1:]
-    inside = ((index >= 0) & (index < 2 * half)).all(axis=2)
-    column = np.where(inside, index[..., 0], 0)
-    row = np.where(inside, index[..., 1], 0)
+    column_phases = codec.phases((x[:, None] + steps) % SECTION_LENGTH) + section[:, :1]
+    row_phases = codec.phases((y[:, None] + steps) % SECTION_LENGTH) + section[:, 1:]
+    is_inside = ((index >= 0) & (index < 2 * half)).all(axis=2)
+    column = np.where(is_inside, index[..., 0], 0)
+    row = np.where(is_inside, index[..., 1], 0)
     column_bit = MAIN_SEQUENCE[
-        (np.take_along_axis(columns, column, 1) + y[:, None] + row) % MAIN_SEQUENCE_LENGTH
+        (np.take_along_axis(column_phases, column, 1) + y[:, None] + row) % MAIN_SEQUENCE_LENGTH
     ]
     row_bit = MAIN_SEQUENCE[
-        (np.take_along_axis(rows, row, 1) + x[:, None] + column) % MAIN_SEQUENCE_LENGTH
+        (np.take_along_axis(row_phases, row, 1) + x[:, None] + column) % MAIN_SEQUENCE_LENGTH
     ]
-    printed = DOT_DIRECTIONS[column_bit + 2 * row_bit] * OFFSET
-    seen = (printed @ turn).astype(np.float32)  # the inverse turn
-    miss = lattices.uv - lattices.place - seen
-    use = lattices.valid & inside & (np.abs(miss) < grid.TIGHT).all(axis=2)
-    target = index + printed
-    return Match(use, miss, target, np.stack([x, y], axis=1))
+    printed_offset = DOT_DIRECTIONS[column_bit + 2 * row_bit] * DOT_OFFSET_PITCHES
+    # A row vector times the rotation is rotated by its inverse, from print to image.
+    image_offset = (printed_offset @ rotation).astype(np.float32)
+    residual = lattices.uv - lattices.nodes - image_offset
+    used = lattices.valid & is_inside & (np.abs(residual) < SYMBOL_GATE_PITCHES).all(axis=2)
+    return DotAssignments(used, residual, index + printed_offset, np.stack([x, y], axis=1))
 
 
-def _pose_covariance(
-    covariance: NDArray[np.float64], slope: NDArray[np.float64], turn: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """(n, 3, 3) of x, y and heading from that of a lattice's parameters."""
+def _pose_covariance(covariance: Array, slope: Array, rotation: NDArray[np.int64]) -> Array:
+    """Return the covariance (n, 3, 3) of x, y and heading from that of lattice parameters."""
     n = len(covariance)
     jacobian = np.zeros((n, 3, 9))
-    jacobian[:, :2, grid.C_U] = turn[:, :, 0]
-    jacobian[:, :2, grid.C_V] = turn[:, :, 1]
-    # Heading is minus the angle of the image's right in the lattice, but for quarter turns.
+    jacobian[:, :2, C_U] = rotation[:, :, 0]
+    jacobian[:, :2, C_V] = rotation[:, :, 1]
+    # Except for quarter turns, the heading is minus the angle of the image's right in the lattice.
     u, v = slope[:, 0, 0], slope[:, 1, 0]
-    square = u * u + v * v
-    jacobian[:, 2, grid.A_U.start] = v / square
-    jacobian[:, 2, grid.A_V.start] = -u / square
-    result: NDArray[np.float64] = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    squared = u * u + v * v
+    jacobian[:, 2, A_U.start] = v / squared
+    jacobian[:, 2, A_V.start] = -u / squared
+    result: Array = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
     return result

@@ -1,10 +1,12 @@
-"""The published algorithm, a frame at a time, cold: for comparison.
+"""The published algorithm, frame by frame and without memory, for comparison.
 
-Hostettler et al., Real-Time High-Accuracy 2D Localization with Structured Patterns
-(papers/dots.txt), II-B. The first half, from a frame to a grid and soft bits, is in
-:mod:`~locatk.core.dots.published.grid`; here is the second, from soft bits to a pose. As in
-the paper nothing asks whether an answer is likely: whatever digits the best correlations
-give are looked up, and only strings that no sequence holds are refused.
+Hostettler, Özgür, Lemaignan, Dillenbourg and Mondada, "Real-Time High-Accuracy 2D Localization
+with Structured Patterns", IEEE ICRA 2016, section II-B. The first half, from a frame to a grid and
+soft bits, is in :mod:`~locatk.core.dots.published.grid`, which also names the one correction of
+the text; here is the second half, from soft bits to a pose.
+
+As in the paper no step tests whether a result is likely: the digits of the best correlations are
+looked up, and only strings that no sequence contains are rejected.
 """
 
 from __future__ import annotations
@@ -22,57 +24,60 @@ from locatk.core.dots.codec import (
     Codec,
     sequences,
 )
-from locatk.core.dots.codec.lookup import SHIFTS, STRING, digits_of, strings
-from locatk.core.dots.published import grid as paper_grid
-from locatk.core.dots.published.grid import Grid
+from locatk.core.dots.codec.lookup import (
+    DIGITS_PER_STRING,
+    POSSIBLE_SHIFTS,
+    digit_strings,
+    digits_of,
+)
+from locatk.core.dots.published.grid import AffineGrid, detect_blobs, fit_grid, soft_bits
 from locatk.core.errors import InputError
 
 Array = NDArray[np.float64]
 
-WINDOW = 8
-"""Dots a side of what is decoded (II-B.5)."""
+WINDOW_DOTS = 8
+"""Columns and rows of the window that is decoded (II-B.5)."""
 
-FEWEST_DOTS = 9
-"""Less has no intact neighbourhood of 3 x 3 dots."""
+MIN_DOTS = 9
+"""Fewer dots have no intact neighbourhood of 3 x 3."""
 
-MOST_PLACES = 1_000_000
-"""A grid of more places than that lies over no pattern."""
+MAX_GRID_POSITIONS = 1_000_000
+"""Largest area of a grid in positions; the blobs of a larger one are no pattern."""
 
-_SHIFTED = (
+_MAIN_SEQUENCE_STRINGS = (
     MAIN_SEQUENCE[
-        np.add.outer(np.arange(MAIN_SEQUENCE_LENGTH), np.arange(WINDOW)) % MAIN_SEQUENCE_LENGTH
+        np.add.outer(np.arange(MAIN_SEQUENCE_LENGTH), np.arange(WINDOW_DOTS)) % MAIN_SEQUENCE_LENGTH
     ]
     * 2.0
     - 1.0
 )
-"""(63, 8) the main sequence from each place on, as -1 and 1."""
+"""(63, 8) strings of the main sequence from each phase on, as -1 and 1."""
 
 
 @dataclass(frozen=True)
-class PaperPose:
-    """What the published algorithm says of one frame.
+class PublishedPose:
+    """Result of the published algorithm for one frame.
 
     Attributes
     ----------
     x, y : float
-        Grid coordinates, with fractions, of the camera's centre; nan where rejected.
+        Grid coordinates of the camera's centre, with fractions; nan if rejected.
     heading_rad : float
         From the sheet's x to the image's right, counter-clockwise; -pi..pi.
     section : (u, v)
-        Each 0..62; that of most columns and rows. -1 where rejected.
+        Each 0..62, by the majority of columns and rows; -1 if rejected.
     dots : int
-        Blobs taken for dots.
+        Number of blobs.
     corrected_bits : int
-        Of the 128 in the window, those that differ from the best correlations.
+        Bits, of the 128 in the window, that differ from the best correlations.
     quality : float
-        Mean of ``|P(x) P(y)|`` over the window, 0..1: how near the dots lie to where
-        dots may lie. Not a probability.
+        Mean of ``|P(x) P(y)|`` over the window, 0..1: closeness of the dots to the nominal
+        offsets. It is no probability.
     rejected : str or None
-        ``no_dots``: fewer than nine blobs. ``no_grid``: no two directions, or no intact
-        3 x 3 neighbourhood. ``no_window``: fewer than 8 x 8 places, or over a million.
-        ``no_orientation``: rows or columns vote alike for both directions. ``no_code``:
-        their strings are in no sequence, or point to different places, or to a place
-        beyond the range.
+        ``no_dots``: fewer than nine blobs. ``no_grid``: no two directions, or no intact 3 x 3
+        neighbourhood. ``no_window``: fewer than 8 x 8 positions, or over a million.
+        ``no_orientation``: equal votes of rows or columns for both directions. ``no_code``: their
+        strings are in no sequence, or disagree, or name a position beyond the section.
     """
 
     x: float = float("nan")
@@ -85,8 +90,10 @@ class PaperPose:
     rejected: str | None = None
 
 
-def locate_paper(image: NDArray[np.uint8], codec: Codec, camera: Camera | None = None) -> PaperPose:
-    """Pose of one frame by the published algorithm.
+def localize_published(
+    image: NDArray[np.uint8], codec: Codec, camera: Camera | None = None
+) -> PublishedPose:
+    """Estimate the pose of one frame by the published algorithm.
 
     Parameters
     ----------
@@ -94,17 +101,17 @@ def locate_paper(image: NDArray[np.uint8], codec: Codec, camera: Camera | None =
         Dots dark.
     codec : Codec
     camera : Camera, optional
-        Where the device's centre lies in the frame, and the lens's radial distortion.
-        Without one: the frame's middle, and none.
+        Centre of the device in the frame, and radial distortion of the lens. Default: the middle
+        of the frame, and no distortion.
 
     Returns
     -------
-    PaperPose
+    PublishedPose
 
     Raises
     ------
     InputError
-        The image is not grey with 8 bits, or of another size than the camera's.
+        The image is not grey with 8 bits, or has another size than the camera's.
     """
     if image.ndim != 2 or image.dtype != np.uint8 or not image.size:
         raise InputError(f"a frame of {image.dtype} and shape {image.shape} is not 8-bit grey")
@@ -115,125 +122,128 @@ def locate_paper(image: NDArray[np.uint8], codec: Codec, camera: Camera | None =
             f"{camera.size[0]} x {camera.size[1]} px"
         )
     centre = np.array([(width - 1) / 2, (height - 1) / 2] if camera is None else camera.centre_px)
-    points = paper_grid.find_dots(image, camera)
+    points = detect_blobs(image, camera)
     dots = len(points)
-    if dots < FEWEST_DOTS:
-        return PaperPose(dots=dots, rejected="no_dots")
-    laid = paper_grid.lay_grid(points, centre)
-    if laid is None:
-        return PaperPose(dots=dots, rejected="no_grid")
-    grid, places, offsets = laid
-    size = np.ptp(places, axis=0) + 1
-    if size.min() < WINDOW or size.prod() > MOST_PLACES:
-        return PaperPose(dots=dots, rejected="no_window")
-    bits = paper_grid.soft_bits(places, offsets)
+    if dots < MIN_DOTS:
+        return PublishedPose(dots=dots, rejected="no_dots")
+    fitted = fit_grid(points, centre)
+    if fitted is None:
+        return PublishedPose(dots=dots, rejected="no_grid")
+    grid, nodes, offsets = fitted
+    size = np.ptp(nodes, axis=0) + 1
+    if size.min() < WINDOW_DOTS or size.prod(dtype=float) > MAX_GRID_POSITIONS:
+        return PublishedPose(dots=dots, rejected="no_window")
+    bits = soft_bits(nodes, offsets)
     corner = best_window(np.abs(bits.prod(axis=0)))
-    window = bits[:, corner[1] : corner[1] + WINDOW, corner[0] : corner[0] + WINDOW]
-    quarters = vote_orientation(window)
-    if quarters is None:
-        return PaperPose(dots=dots, rejected="no_orientation")
-    upright, grid = turn_back(window, grid, quarters, corner + places.min(axis=0))
-    weights = np.abs(upright.prod(axis=0))
-    x_phases, x_wrong = correlate(upright[0].T, weights.T)
-    y_phases, y_wrong = correlate(upright[1], weights)
-    x, y = find_place(x_phases, codec), find_place(y_phases, codec)
+    window = bits[:, corner[1] : corner[1] + WINDOW_DOTS, corner[0] : corner[0] + WINDOW_DOTS]
+    rotation = vote_orientation(window)
+    if rotation is None:
+        return PublishedPose(dots=dots, rejected="no_orientation")
+    printed, grid = rotate_to_print(window, grid, rotation, corner + nodes.min(axis=0))
+    weights = np.abs(printed.prod(axis=0))
+    x_phases, x_corrected = correlate(printed[0].T, weights.T)
+    y_phases, y_corrected = correlate(printed[1], weights)
+    x, y = look_up_position(x_phases, codec), look_up_position(y_phases, codec)
     if x is None or y is None:
-        return PaperPose(dots=dots, rejected="no_code")
-    at = np.array([x, y]) + grid.coordinates(centre)  # eq. 10 to 12
-    along = np.arange(WINDOW)
-    u = (x_phases - y - codec.phases(x + along)) % MAIN_SEQUENCE_LENGTH
-    v = (y_phases - x - codec.phases(y + along)) % MAIN_SEQUENCE_LENGTH
-    return PaperPose(
-        x=float(at[0]),
-        y=float(at[1]),
+        return PublishedPose(dots=dots, rejected="no_code")
+    position = np.array([x, y]) + grid.coordinates(centre)  # Eq. 10 to 12.
+    steps = np.arange(WINDOW_DOTS)
+    u = (x_phases - y - codec.phases(x + steps)) % MAIN_SEQUENCE_LENGTH
+    v = (y_phases - x - codec.phases(y + steps)) % MAIN_SEQUENCE_LENGTH
+    return PublishedPose(
+        x=float(position[0]),
+        y=float(position[1]),
         heading_rad=float(np.arctan2(grid.u[1], grid.u[0])),
         section=(int(np.bincount(u).argmax()), int(np.bincount(v).argmax())),
         dots=dots,
-        corrected_bits=x_wrong + y_wrong,
+        corrected_bits=x_corrected + y_corrected,
         quality=float(weights.mean()),
     )
 
 
-def best_window(likely: NDArray[np.float64]) -> NDArray[np.intp]:
-    """II-B.5: column and row of the corner of the 8 x 8 places with the largest sum."""
-    total = np.pad(likely, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-    down = total[WINDOW:] - total[:-WINDOW]
-    sums = down[:, WINDOW:] - down[:, :-WINDOW]
+def best_window(likelihood: Array) -> NDArray[np.intp]:
+    """Return column and row of the corner of the 8 x 8 positions with the largest sum (II-B.5)."""
+    total = np.pad(likelihood, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    row_sums = total[WINDOW_DOTS:] - total[:-WINDOW_DOTS]
+    sums = row_sums[:, WINDOW_DOTS:] - row_sums[:, :-WINDOW_DOTS]
     row, column = np.unravel_index(np.argmax(sums), sums.shape)
     return np.array([column, row])
 
 
 def vote_orientation(window: Array) -> int | None:
-    """II-B.6: quarter turns counter-clockwise by which the print appears turned; 0..3.
+    """Return the counter-clockwise quarter turns 0..3 of the print in the image (II-B.6).
 
-    Every column of column bits and every row of row bits is sought in the main sequence as
-    it stands, and reversed and flipped, which it is when its axis points backwards. Lines
-    with a missing dot do not vote. None where an axis has no majority.
+    Each column of column bits and each row of row bits is searched in the main sequence, as it is
+    and reversed with its bits inverted, which it is if its axis points backwards. Lines with a
+    missing dot do not vote. Returns None if an axis has no majority.
     """
-    forward = []
+    is_forward = []
     for lines in (window[0].T, window[1]):
-        whole = np.sign(lines[(lines != 0).all(axis=1)])
-        votes = [
-            int((tried[:, None] == _SHIFTED).all(axis=2).sum())
-            for tried in (whole, -whole[:, ::-1])
-        ]
-        if votes[0] == votes[1]:
+        complete = np.sign(lines[(lines != 0).all(axis=1)])
+        forward, backward = (
+            int((candidates[:, None] == _MAIN_SEQUENCE_STRINGS).all(axis=2).sum())
+            for candidates in (complete, -complete[:, ::-1])
+        )
+        if forward == backward:
             return None
-        forward.append(votes[0] > votes[1])
+        is_forward.append(forward > backward)
     return {(True, True): 0, (False, True): 1, (False, False): 2, (True, False): 3}[
-        (forward[0], forward[1])
+        (is_forward[0], is_forward[1])
     ]
 
 
-def turn_back(
-    window: Array, grid: Grid, quarters: int, corner: NDArray[np.intp]
-) -> tuple[Array, Grid]:
-    """II-B.6: quasi-probabilities as they were printed, and the grid along the print's axes.
+def rotate_to_print(
+    window: Array, grid: AffineGrid, rotation: int, corner: NDArray[np.intp]
+) -> tuple[Array, AffineGrid]:
+    """Rotate a window and its grid back by ``rotation`` quarter turns (II-B.6).
 
-    ``corner`` is the place of the window's upper left dot in ``grid``; the new grid has its
+    ``corner`` is the node of the window's upper left dot in ``grid``. The returned grid has its
     origin at the dot that was printed at the upper left.
     """
-    last = WINDOW - 1
-    first = corner + np.array([[0, 0], [0, last], [last, last], [last, 0]])[quarters]
+    last = WINDOW_DOTS - 1
+    printed_corner = corner + np.array([[0, 0], [0, last], [last, last], [last, 0]])[rotation]
     u, v = grid.u, grid.v
-    for _ in range(quarters):
-        # What was printed to the right is seen upwards, what was printed down to the right.
+    for _ in range(rotation):
+        # The printed right is the image's up, and the printed down is its right.
         u, v = -v, u
         columns, rows = window
         window = np.stack([np.rot90(rows, -1), -np.rot90(columns, -1)])
-    return window, Grid(grid.points(first), u, v)
+    return window, AffineGrid(grid.points(printed_corner), u, v)
 
 
 def correlate(lines: Array, weights: Array) -> tuple[NDArray[np.int64], int]:
-    """II-B.7: place (8,) in the main sequence of each line of soft bits, and bits corrected.
+    """Return the phase (8,) of each line of soft bits, and the number of corrected bits (II-B.7).
 
-    The bits are -1 or 1 times ``weights``, ``|P(x) P(y)|``. The first of equal correlations
+    The bits are -1 or 1 times ``weights``, ``|P(x) P(y)|``. Of equal correlations the first
     counts.
     """
-    phases = np.argmax((np.sign(lines) * weights) @ _SHIFTED.T, axis=1)
-    return phases, int((lines * _SHIFTED[phases] < 0).sum())
+    phases = np.argmax((np.sign(lines) * weights) @ _MAIN_SEQUENCE_STRINGS.T, axis=1)
+    return phases, int((lines * _MAIN_SEQUENCE_STRINGS[phases] < 0).sum())
 
 
-def find_place(phases: NDArray[np.int64], codec: Codec) -> int | None:
-    """II-A: x from the phases (8,) of adjoining columns, or y from those of rows.
+def look_up_position(phases: NDArray[np.int64], codec: Codec) -> int | None:
+    """Return x from the phases (8,) of adjacent columns, or y from those of rows (II-A).
 
-    Six lines would do. Of eight, each of the three strings of five digits says where its
-    sequence stands at the first line, and most of them decide.
+    Six lines would be sufficient. Eight have three strings of five digits, each of which gives the
+    residue of the first line; the majority counts. Returns None if there is no majority or the
+    window leaves the section.
     """
     shift = np.diff(phases) % MAIN_SEQUENCE_LENGTH
-    possible = np.isin(shift, SHIFTS)
+    is_possible = np.isin(shift, POSSIBLE_SHIFTS)
     residues = []
     for digits, base, table, sequence in zip(
-        digits_of(shift), sequences.BASES, strings(codec), codec.digits, strict=True
+        digits_of(shift), sequences.DIGIT_BASES, digit_strings(codec), codec.digits, strict=True
     ):
         votes = np.zeros(len(sequence), np.int64)
-        for k in range(len(shift) - STRING + 1):
-            if possible[k : k + STRING].all():
-                code = digits[k : k + STRING] @ base ** np.arange(STRING)[::-1]
-                places = table[code][table[code] >= 0]
-                votes[(places - k) % len(sequence)] += 1
+        for k in range(len(shift) - DIGITS_PER_STRING + 1):
+            if is_possible[k : k + DIGITS_PER_STRING].all():
+                code = (
+                    digits[k : k + DIGITS_PER_STRING] @ base ** np.arange(DIGITS_PER_STRING)[::-1]
+                )
+                candidates = table[code][table[code] >= 0]
+                votes[(candidates - k) % len(sequence)] += 1
         if not votes.any() or (votes == votes.max()).sum() > 1:
             return None
         residues.append(int(votes.argmax()))
-    place = int(codec.place(residues))
-    return place if place + len(phases) <= SECTION_LENGTH else None
+    position = int(codec.position(residues))
+    return position if position + len(phases) <= SECTION_LENGTH else None

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 PITCH_PX = 0.508 / 0.046
-"""Of the paper's camera: 188 x 120 px, each 0.046 mm wide (papers/dots.txt III-A.2)."""
+"""Of the paper's camera: 188 x 120 px, each 0.046 mm wide."""
 
 SIXTH = 1 / 6
 ASIDE = {0: (0.0, -SIXTH), 1: (-SIXTH, 0.0), 2: (SIXTH, 0.0), 3: (0.0, SIXTH)}

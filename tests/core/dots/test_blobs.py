@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots.detection.blobs import Dots, find_dots
+from locatk.core.dots.detection.blobs import DetectedDots, detect_dots
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -54,13 +54,13 @@ def draw(
     return frame
 
 
-def of(dots: Dots, frame: int = 0) -> Array:
+def of(dots: DetectedDots, frame: int = 0) -> Array:
     return dots.xy[frame][dots.valid[frame]].astype(float)
 
 
 def errors(at: Array, image: Image) -> tuple[Array, int, int]:
     """Errors (n, 2) of the dots that were found, how many were not, and what else was found."""
-    found = of(find_dots(image[None]))
+    found = of(detect_dots(image[None]))
     away = np.linalg.norm(at[:, None] - found[None], axis=2)
     nearest, there = away.argmin(axis=1), away.min(axis=1) < 1.5
     error = (found[nearest] - at)[there]
@@ -182,13 +182,13 @@ def test_no_dots_where_there_are_none() -> None:
     step = np.where(np.arange(188) < 90, 30, 220).astype(np.uint8) * np.ones((1, 120, 1), np.uint8)
     soft = np.clip(np.rint(150 + rng.normal(0, 0.4, (2, 120, 188))), 0, 255).astype(np.uint8)
     for images in (*even, slope, step, soft):
-        assert find_dots(np.ascontiguousarray(images)).counts.max() <= 3
+        assert detect_dots(np.ascontiguousarray(images)).counts.max() <= 3
 
 
 def test_white_on_black_has_no_dots_at_its_spots() -> None:
     rng = np.random.default_rng(9)
     at = places(rng)
-    dots = of(find_dots(255 - draw(at, 3.3, rng)[None]))
+    dots = of(detect_dots(255 - draw(at, 3.3, rng)[None]))
     if len(dots):
         assert np.linalg.norm(at[:, None] - dots[None], axis=2).min() > 1.5
 
@@ -206,7 +206,7 @@ def test_any_image_will_do(size: tuple[int, int]) -> None:
             ((np.indices(size).sum(axis=0) % 2) * 255).astype(np.uint8),
         ]
     )
-    dots = find_dots(images)
+    dots = detect_dots(images)
     assert dots.xy.shape == (4, dots.valid.shape[1], 2)
     assert np.isfinite(dots.xy).all()
     for k in range(4):
@@ -216,9 +216,9 @@ def test_any_image_will_do(size: tuple[int, int]) -> None:
 
 def test_no_more_dots_than_asked_for() -> None:
     noise = np.random.default_rng(11).integers(0, 256, (2, 400, 400), np.uint8)
-    assert find_dots(noise).counts.min() > 1000
+    assert detect_dots(noise).counts.min() > 1000
     for most in (1, 64, 900):
-        dots = find_dots(noise, most)
+        dots = detect_dots(noise, most)
         assert dots.valid.shape == (2, most)
         np.testing.assert_array_equal(dots.counts, most)
 
@@ -226,7 +226,7 @@ def test_no_more_dots_than_asked_for() -> None:
 def test_of_too_many_dots_those_about_the_middle_are_kept() -> None:
     rng = np.random.default_rng(12)
     at = places(rng)
-    kept = of(find_dots(draw(at, 3.3, rng)[None], 40))
+    kept = of(detect_dots(draw(at, 3.3, rng)[None], 40))
     reach = np.sort(np.linalg.norm(at - [93.5, 59.5], axis=1))
     assert len(kept) == 40
     assert np.linalg.norm(kept - [93.5, 59.5], axis=1).max() < reach[40] + 0.5
@@ -236,9 +236,9 @@ def test_frames_do_not_depend_on_their_company() -> None:
     rng = np.random.default_rng(13)
     frames = [draw(places(rng, s), 3.3, rng, noise=n) for s, n in ((11, 2), (15, 9), (25, 1))]
     frames.append(rng.integers(0, 256, (120, 188), np.uint8))
-    together = find_dots(np.stack(frames))
+    together = detect_dots(np.stack(frames))
     for k, frame in enumerate(frames):
-        alone = find_dots(frame[None])
+        alone = detect_dots(frame[None])
         np.testing.assert_array_equal(of(together, k), of(alone))
         assert together.counts[k] == alone.counts[0]
     assert (together.xy[~together.valid] == 0).all()

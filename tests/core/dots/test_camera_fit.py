@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.dots.calibration import camera_models as models
+from locatk.core.dots.calibration import camera as calibration
+from locatk.core.dots.calibration import camera_fit as models
 from locatk.core.dots.calibration.camera_fit import (
-    Fit,
-    Views,
-    fit_flat,
+    CalibrationViews,
+    CameraFit,
     fit_homographies,
     fit_poses,
+    fit_without_lens,
 )
+from locatk.core.errors import DegenerateError
 from locatk.core.geometry import rotation_exp
 
 Array = NDArray[np.float64]
@@ -47,7 +51,7 @@ def views(
     aspect: float = 0.0,
     bow_mm: float = 0.0,
     seed: int = 0,
-) -> Views:
+) -> CalibrationViews:
     """Frames in all directions, at 0.046 mm a pixel; tilted evenly, or as told."""
     rng = np.random.default_rng(seed)
     intrinsic = np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]])
@@ -71,7 +75,7 @@ def views(
         seen[astray] += rng.uniform(-1.3, 1.3, (int(astray.sum()), 2))
         found.append((seen, place[inside]))
     most = max(len(seen) for seen, _ in found)
-    result = Views(
+    result = CalibrationViews(
         SIZE,
         np.full((frames, most, 2), np.nan),
         np.full((frames, most, 2), np.nan),
@@ -83,7 +87,7 @@ def views(
     return result
 
 
-def errors(fit: Fit) -> Array:
+def errors(fit: CameraFit) -> Array:
     """Of centre, k, focal length and aspect in standard deviations."""
     found = np.array([*fit.centre, fit.radial, fit.focal, fit.aspect])
     return (found - [*CENTRE, K, FOCAL, 0.0]) / fit.sigma
@@ -94,25 +98,27 @@ def test_derivatives_are_those_of_the_model(name: str) -> None:
     rng = np.random.default_rng(1)
     plane = rng.uniform(-1, 1, (3, 7, 2))
     shared = np.array([0.02, -0.03, -0.1, 0.7, 0.01])
-    model: models.Model
+    model: models.FrameModel
     if name == "homographies":
-        model, own = models.Homographies(), rng.normal(0, 0.1, (3, 8)) + [1, 0, 0, 0, 1, 0, 0, 0]
+        model, own = models.HomographyModel(), rng.normal(0, 0.1, (3, 8)) + [1, 0, 0, 0, 1, 0, 0, 0]
     else:
         turns = rotation_exp(rng.normal(0, 0.3, (3, 3))).reshape(3, 9)
-        model, own = models.Poses(), np.c_[turns, rng.normal(0, 0.1, (3, 2)), [1.1, 0.9, 1.0]]
-    _, by_own, by_shared = models.seen(model, shared, own, plane)
+        model, own = models.PoseModel(), np.c_[turns, rng.normal(0, 0.1, (3, 2)), [1.1, 0.9, 1.0]]
+    _, by_own, by_shared = models.project(model, shared, own, plane)
     small = 1e-6
     for k in range(by_own.shape[3]):
         step = np.zeros((3, by_own.shape[3]))
         step[:, k] = small
         after, before = (
-            models.seen(model, shared, model.moved(own, s), plane)[0] for s in (step, -step)
+            models.project(model, shared, model.retract(own, s), plane)[0] for s in (step, -step)
         )
         assert by_own[..., k] == pytest.approx((after - before) / (2 * small), abs=1e-8)
     for k in range(5):
         change = np.zeros(5)
         change[k] = small
-        after, before = (models.seen(model, shared + c, own, plane)[0] for c in (change, -change))
+        after, before = (
+            models.project(model, shared + c, own, plane)[0] for c in (change, -change)
+        )
         assert by_shared[..., k] == pytest.approx((after - before) / (2 * small), abs=1e-8)
 
 
@@ -126,7 +132,7 @@ def test_without_noise_the_camera_comes_back_exactly(k: float) -> None:
         assert fit.radial == pytest.approx(k, rel=1e-5)
         assert fit.rms < 1e-4
     assert poses.focal == pytest.approx(FOCAL, rel=1e-5)
-    assert fit_flat(seen).rms > 0.3
+    assert fit_without_lens(seen).rms > 0.3
 
 
 @pytest.mark.slow
@@ -164,7 +170,7 @@ def test_bad_frames_count_little() -> None:
     seen = views(30, seed=7)
     bad = np.arange(30) % 5 < 2
     seen.pixels[bad] += np.random.default_rng(0).normal(0, 0.12, seen.pixels[bad].shape)
-    good = Views(SIZE, *(a[~bad] for a in (seen.pixels, seen.plane, seen.valid)))
+    good = CalibrationViews(SIZE, *(a[~bad] for a in (seen.pixels, seen.plane, seen.valid)))
     with_bad, without = fit_homographies(seen), fit_homographies(good)
     assert (with_bad.sigma[:3] < 1.15 * without.sigma[:3]).all()
     # Not because their dots were taken for wrong ones.
@@ -204,8 +210,8 @@ def test_a_lens_without_bend_has_a_centre_where_frames_are_tilted() -> None:
 
 def test_a_centre_that_is_held_stays() -> None:
     seen = views(10)
-    bend = fit_homographies(seen, hold_centre=True)
-    poses = fit_poses(seen, bend, 300.0, hold_centre=True)
+    bend = fit_homographies(seen, fix_centre=True)
+    poses = fit_poses(seen, bend, 300.0, fix_centre=True)
     for fit in (bend, poses):
         assert fit.centre.tolist() == [93.5, 59.5]
         assert np.isnan(fit.sigma[:2]).all()
@@ -218,3 +224,106 @@ def test_tilts_are_those_of_the_frames() -> None:
     assert np.isnan(bend.tilt).all()
     poses = fit_poses(seen, bend, 300.0)
     assert np.degrees(poses.tilt) == pytest.approx(tilts_deg, abs=0.15)
+
+
+# ---- guards
+
+
+def test_a_start_beyond_the_fold_of_the_lens_is_refused() -> None:
+    """With so large a k the lens would not show the corners at all."""
+    seen = views(12, noise=0.0)
+    start = fit_homographies(seen)
+    folded = replace(start, radial=0.4 / HALF**2)
+    with pytest.raises(DegenerateError, match="beyond its fold"):
+        fit_poses(seen, folded, 300.0)
+
+
+def problem_of(seen: CalibrationViews) -> tuple[Any, models.CameraState]:
+    """The least-squares problem of homographies, with all dots of the same weight."""
+    observed, plane = models.normalize_views(seen)
+    free = np.array([True, True, True, False, False])
+    problem = models.CameraProblem(
+        models.HomographyModel(),
+        observed,
+        plane,
+        seen.valid,
+        seen.valid.astype(float),
+        free,
+        np.zeros(5),
+    )
+    return problem, models.CameraState(np.zeros(5), models.homographies(seen))
+
+
+def test_dots_that_the_lens_does_not_show_are_outliers() -> None:
+    problem, state = problem_of(views(4))
+    folded = models.CameraState(np.array([0, 0, 5.0, 0, 0]), state.frames)
+    equations = problem.linearize(folded, np.arange(1))
+    assert equations.cost[0] == math.inf
+    assert np.isfinite(equations.hessian).all()
+    assert np.isfinite(equations.block_gradient).all()
+    invisible = (equations.residual == models.INVISIBLE_RESIDUAL).all(axis=2)
+    assert 0 < invisible.sum() < problem.valid.sum()
+    # Without weight they are rejected outliers and cost nothing.
+    without = replace(problem, weights=np.where(invisible, 0.0, problem.weights))
+    assert np.isfinite(without.linearize(folded, np.arange(1)).cost[0])
+
+
+def test_rejected_dots_keep_their_residuals() -> None:
+    """Their weights are estimated anew from these; as zeros they would be inliers again."""
+    problem, state = problem_of(views(4))
+    rejected = np.zeros_like(problem.valid)
+    rejected[:, 3] = True
+    without = replace(problem, weights=np.where(rejected, 0.0, problem.weights))
+    before, after = (p.linearize(state, np.arange(1)) for p in (problem, without))
+    np.testing.assert_array_equal(after.residual, before.residual)
+    assert np.abs(after.residual[rejected]).max() > 0
+    assert after.cost[0] < before.cost[0]
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    problem, state = problem_of(views(3))
+    state = models.CameraState(np.array([0.01, -0.02, -0.1, 0, 0]), state.frames)
+    equations = problem.linearize(state, np.arange(1))
+    for k in range(3):
+        step = np.zeros(5)
+        step[k] = 1e-6
+        after, before = (
+            problem.linearize(models.CameraState(state.camera + s, state.frames), np.arange(1))
+            for s in (step, -step)
+        )
+        slope = (after.cost[0] - before.cost[0]) / 2e-6
+        assert equations.gradient[k] == pytest.approx(slope, rel=1e-5)
+
+
+def test_the_prior_holds_what_frames_do_not_determine() -> None:
+    """Untilted frames of a lens without distortion have neither a centre nor a focal length."""
+    fit = fit_homographies(views(6, tilt_deg=0.0, k=0.0))
+    assert fit.sigma[:2] == pytest.approx([models.CENTRE_PRIOR_SIGMA * HALF] * 2, rel=0.1)
+    assert abs(fit.centre - [93.5, 59.5]).max() < fit.sigma[0]
+
+
+def test_frames_that_are_no_poses_have_no_focal_length() -> None:
+    """Sheared frames are homographies of the sheet, but no images of a pinhole camera."""
+    seen = views(25, tilt_deg=15.0)
+    seen.pixels[..., 0] += 0.05 * (seen.pixels[..., 1] - CENTRE[1])
+    report = calibration.calibrate_views(seen, calibration.CalibrateOptions(), 25, {})
+    assert report.focal_from == "usual"
+    assert report.notes[0].startswith("the frames are not what a pinhole sees of a flat sheet")
+
+
+@pytest.mark.parametrize(
+    ("centre", "radial", "plausible"),
+    [
+        ((93.5, 59.5), -3.5e-6, True),
+        ((-1.0, 59.5), -3.5e-6, False),
+        ((93.5, 120.0), -3.5e-6, False),
+        ((93.5, 59.5), -8e-5, False),
+    ],
+)
+def test_plausible_cameras(centre: Any, radial: float, plausible: bool) -> None:
+    fit = replace(fit_homographies(views(5)), centre=np.array(centre), radial=radial)
+    if plausible:
+        assert calibration.camera_of_fit(SIZE, fit, 350.0).centre_px == centre
+    else:
+        with pytest.raises(DegenerateError, match="no lens of this kind"):
+            calibration.camera_of_fit(SIZE, fit, 350.0)

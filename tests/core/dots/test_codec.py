@@ -1,4 +1,4 @@
-"""The codecs have the properties on which reading them rests (facts/dots.md 2.3)."""
+"""Properties of the codecs that decoding depends on."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ def one_flip(bits: str) -> list[str]:
     return [bits[:i] + flipped(bits[i]) + bits[i + 1 :] for i in range(len(bits))]
 
 
-# --- the slow road: facts/dots.md 2.4 and 2.5 in plain Python, one place after the other
+# --- the definition of the pattern in plain Python, one position after the other
 
 
 def shift(name: str, place: int) -> int:
-    texts = (sequences.FIRST, sequences.SECOND, sequences.THIRD, FOURTH[name])
+    texts = (sequences.FIRST_DIGITS, sequences.SECOND_DIGITS, sequences.THIRD_DIGITS, FOURTH[name])
     a1, a2, a3, a4 = (int(text[place % len(text)]) for text in texts)
     return 5 + a1 + 3 * a2 + 9 * a3 + 18 * a4
 
@@ -69,7 +69,7 @@ def shift(name: str, place: int) -> int:
 def shifts_before(name: str, place: int) -> int:
     """Sum of all shifts before a place: whole rounds of each sequence, then what is left."""
     total = 5 * place
-    texts = (sequences.FIRST, sequences.SECOND, sequences.THIRD, FOURTH[name])
+    texts = (sequences.FIRST_DIGITS, sequences.SECOND_DIGITS, sequences.THIRD_DIGITS, FOURTH[name])
     for weight, text in zip((1, 3, 9, 18), texts, strict=True):
         digits = [int(c) for c in text]
         total += weight * (place // len(text) * sum(digits) + sum(digits[: place % len(text)]))
@@ -91,7 +91,8 @@ def slow_letters(
     return [
         "".join(
             glyphs[
-                int(sequences.MAIN[(ox[i] + y + j) % 63]), int(sequences.MAIN[(oy[j] + x + i) % 63])
+                int(sequences.MAIN_DIGITS[(ox[i] + y + j) % 63]),
+                int(sequences.MAIN_DIGITS[(oy[j] + x + i) % 63]),
             ]
             for i in range(columns)
         )
@@ -107,17 +108,17 @@ def letters(symbols: np.ndarray[Any, Any]) -> list[str]:
 
 
 def test_main_sequence_is_quasi_de_bruijn() -> None:
-    assert len(sequences.MAIN) == MAIN_SEQUENCE_LENGTH == 63
-    assert len(set(cyclic(sequences.MAIN, 6))) == 63
-    assert missing(sequences.MAIN, 6) == {"111111"}
+    assert len(sequences.MAIN_DIGITS) == MAIN_SEQUENCE_LENGTH == 63
+    assert len(set(cyclic(sequences.MAIN_DIGITS, 6))) == 63
+    assert missing(sequences.MAIN_DIGITS, 6) == {"111111"}
 
 
 @pytest.mark.parametrize(
     ("sequence", "length", "absent"),
     [
-        (sequences.FIRST, 236, 7),
-        (sequences.SECOND, 233, 10),
-        (sequences.THIRD, 31, 1),
+        (sequences.FIRST_DIGITS, 236, 7),
+        (sequences.SECOND_DIGITS, 233, 10),
+        (sequences.THIRD_DIGITS, 31, 1),
         (sequences.FOURTH_ANOTO, 241, 2),
         (sequences.FOURTH_MICRODOTS, 241, 2),
     ],
@@ -167,7 +168,7 @@ def test_lengths_are_coprime_and_make_the_range() -> None:
 def test_every_shift_has_its_own_digits() -> None:
     digits = product(range(3), range(3), range(2), range(3))
     shifts = [
-        sequences.SMALLEST_SHIFT + sum(w * a for w, a in zip(sequences.WEIGHTS, d, strict=True))
+        sequences.MIN_SHIFT + sum(w * a for w, a in zip(sequences.DIGIT_WEIGHTS, d, strict=True))
         for d in digits
     ]
     assert sorted(shifts) == list(range(5, 59))
@@ -175,13 +176,13 @@ def test_every_shift_has_its_own_digits() -> None:
 
 @pytest.mark.parametrize(("order", "both"), [(6, 62), (7, 0), (8, 0), (12, 0)])
 def test_main_sequence_tells_its_direction_from_seven_bits_on(order: int, both: int) -> None:
-    strings = cyclic(sequences.MAIN, order)
+    strings = cyclic(sequences.MAIN_DIGITS, order)
     assert sum(flipped(s[::-1]) in strings for s in strings) == both
 
 
 @pytest.mark.parametrize(("order", "unseen"), [(6, 372), (7, 92), (8, 0), (9, 0)])
 def test_main_sequence_shows_a_flipped_bit_from_eight_bits_on(order: int, unseen: int) -> None:
-    strings = set(cyclic(sequences.MAIN, order))
+    strings = set(cyclic(sequences.MAIN_DIGITS, order))
     assert sum(wrong in strings for s in strings for wrong in one_flip(s)) == unseen
 
 
@@ -189,7 +190,7 @@ def test_main_sequence_shows_a_flipped_bit_from_eight_bits_on(order: int, unseen
     ("order", "least"), [(6, 1), (7, 1), (8, 2), (9, 2), (10, 2), (11, 2), (12, 2), (16, 4)]
 )
 def test_distance_of_strings_of_the_main_sequence(order: int, least: int) -> None:
-    pairs = combinations(cyclic(sequences.MAIN, order), 2)
+    pairs = combinations(cyclic(sequences.MAIN_DIGITS, order), 2)
     assert min(sum(a != b for a, b in zip(*pair, strict=True)) for pair in pairs) == least
 
 
@@ -199,10 +200,10 @@ def test_published_digits(data: Path) -> None:
         pytest.skip(f"{file} is not there")
     published = json.loads(file.read_text(encoding="utf-8"))
     ours = {
-        "MNS": sequences.MAIN,
-        "A1": sequences.FIRST,
-        "A2": sequences.SECOND,
-        "A3": sequences.THIRD,
+        "MNS": sequences.MAIN_DIGITS,
+        "A1": sequences.FIRST_DIGITS,
+        "A2": sequences.SECOND_DIGITS,
+        "A3": sequences.THIRD_DIGITS,
         "A4_libdots": sequences.FOURTH_LIBDOTS,
         "A4_recovered": sequences.FOURTH_ANOTO,
         "A4_alt": sequences.FOURTH_MICRODOTS,
@@ -211,7 +212,7 @@ def test_published_digits(data: Path) -> None:
         assert published[key]["digits"] == text, key
     basis = published["decomposition"]
     assert basis["d_range"] == [5, 58]
-    assert tuple(basis["bases"]) == sequences.BASES
+    assert tuple(basis["bases"]) == sequences.DIGIT_BASES
     assert basis["crt_product"] == SECTION_LENGTH
     for word, bits in published["bits"]["glyph_to_(column_bit,row_bit)"].items():
         assert bits[0] + 2 * bits[1] == SYMBOL_LETTERS.index(word[0])
@@ -234,8 +235,8 @@ def test_section_of_a_sheet_that_starts_at_zero_by_itself() -> None:
     assert letters(sheet[:1, :])[0] == "".join(
         SYMBOL_LETTERS[c + 2 * r]
         for i in range(30)
-        for c in [int(sequences.MAIN[shifts_before("libdots", i) % 63])]
-        for r in [int(sequences.MAIN[i])]
+        for c in [int(sequences.MAIN_DIGITS[shifts_before("libdots", i) % 63])]
+        for r in [int(sequences.MAIN_DIGITS[i])]
     )
 
 
@@ -288,7 +289,7 @@ def test_phases_grow_by_the_shifts_between(name: str, start: int, count: int, se
 def test_place_of_residues(name: str, chosen: list[int]) -> None:
     one = codec(name)
     residues = [[p % len(digits) for digits in one.digits] for p in chosen]
-    assert one.place(residues).tolist() == chosen
+    assert one.position(residues).tolist() == chosen
 
 
 @given(names, places, places, sections, st.integers(0, 30), st.integers(0, 30))
@@ -316,7 +317,7 @@ def test_sections_lay_columns_and_rows_elsewhere() -> None:
 def test_columns_hold_the_main_sequence_and_shift_by_5_to_58(name: str) -> None:
     symbols = codec(name).symbols((184_022_430, 7200), (300, 63))
     where = ["".join(map(str, column & 1)) for column in symbols.T]
-    strings = cyclic(sequences.MAIN, 63)
+    strings = cyclic(sequences.MAIN_DIGITS, 63)
     at = [strings.index(w) for w in where]
     assert all(5 <= (b - a) % 63 <= 58 for a, b in pairwise(at))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from locatk.core import kernels
 from locatk.core.dots.codec import SECTION_LENGTH, codec
-from locatk.core.dots.codec.lookup import turn
+from locatk.core.dots.codec.lookup import rotate_symbols
 from locatk.core.dots.detection import blobs
 from locatk.core.dots.detection import lattice as grid
 from locatk.core.dots.identification import decoding as decode
@@ -53,7 +53,7 @@ def drawn(seed: int, n: int = 6) -> NDArray[np.uint8]:
     return np.array(frames).astype(np.uint8)
 
 
-def as_points(dots: blobs.Dots) -> NDArray[np.float32]:
+def as_points(dots: blobs.DetectedDots) -> NDArray[np.float32]:
     return ((dots.xy - [93.5, 59.5]) / np.hypot(188, 120) * 2).astype(np.float32)
 
 
@@ -62,7 +62,7 @@ def as_points(dots: blobs.Dots) -> NDArray[np.float32]:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_dots_are_the_same(seed: int) -> None:
     images = drawn(seed)
-    mine, twin = blobs.find_dots(images), blobs.find_dots_numpy(images)
+    mine, twin = blobs.detect_dots(images), blobs.detect_dots_numpy(images)
     assert np.array_equal(mine.valid, twin.valid)
     assert mine.counts.min() > 100
     np.testing.assert_allclose(mine.xy, twin.xy, atol=2e-3)
@@ -71,9 +71,9 @@ def test_dots_are_the_same(seed: int) -> None:
 @needs_kernels
 def test_dots_in_the_middle_are_kept() -> None:
     images = drawn(3)
-    for found in (blobs.find_dots(images, 50), blobs.find_dots_numpy(images, 50)):
+    for found in (blobs.detect_dots(images, 50), blobs.detect_dots_numpy(images, 50)):
         assert found.counts.tolist() == [50] * len(images)
-    few = blobs.find_dots(images, 50).xy, blobs.find_dots_numpy(images, 50).xy
+    few = blobs.detect_dots(images, 50).xy, blobs.detect_dots_numpy(images, 50).xy
     order = [np.lexsort(np.round(xy, 1).transpose(2, 0, 1), axis=1) for xy in few]
     rows = np.arange(len(images))[:, None]
     same = np.abs(few[0][rows, order[0]] - few[1][rows, order[1]]).max(axis=2) < 0.2
@@ -84,51 +84,71 @@ def test_dots_in_the_middle_are_kept() -> None:
 @pytest.mark.parametrize("shape", [(1, 5, 5), (2, 9, 40), (1, 48, 7), (1, 61, 200)])
 def test_dots_of_odd_sizes(shape: tuple[int, int, int]) -> None:
     images = np.random.default_rng(4).integers(0, 256, shape).astype(np.uint8)
-    mine, twin = blobs.find_dots(images), blobs.find_dots_numpy(images)
+    mine, twin = blobs.detect_dots(images), blobs.detect_dots_numpy(images)
     assert np.array_equal(mine.counts, twin.counts)
     np.testing.assert_allclose(mine.xy, twin.xy, atol=5e-3)
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 50), (1, 4, 4), (3, 60, 1), (0, 60, 60)])
 def test_images_too_small_for_a_dot_have_none(shape: tuple[int, int, int]) -> None:
-    assert blobs.find_dots(np.zeros(shape, np.uint8)).counts.tolist() == [0] * shape[0]
+    assert blobs.detect_dots(np.zeros(shape, np.uint8)).counts.tolist() == [0] * shape[0]
 
 
 @pytest.mark.slow
 @needs_kernels
 @pytest.mark.parametrize("lens", [True, False])
 def test_lattices_are_the_same(lens: bool) -> None:
-    dots = blobs.find_dots_numpy(drawn(5))
+    dots = blobs.detect_dots_numpy(drawn(5))
     points = as_points(dots)
     mine = grid.fit_lattices(points, dots.valid, lens=lens)
     twin = grid.fit_lattices_numpy(points, dots.valid, lens=lens)
-    assert mine.found.all()
-    assert np.array_equal(mine.found, twin.found)
+    assert mine.fitted.all()
+    assert np.array_equal(mine.fitted, twin.fitted)
     np.testing.assert_allclose(mine.parameters, twin.parameters, atol=1e-4)
     np.testing.assert_allclose(mine.sigma, twin.sigma, rtol=1e-3)
     np.testing.assert_allclose(mine.uv[dots.valid], twin.uv[dots.valid], atol=1e-3)
-    assert np.array_equal(mine.place[dots.valid], twin.place[dots.valid])
+    assert np.array_equal(mine.nodes[dots.valid], twin.nodes[dots.valid])
 
 
 @needs_kernels
 def test_too_few_dots_have_no_lattice_in_either() -> None:
     points = np.random.default_rng(6).normal(size=(2, 15, 2)).astype(np.float32)
     valid = np.ones((2, 15), bool)
-    assert not grid.fit_lattices(points, valid, lens=False).found.any()
-    assert not grid.fit_lattices_numpy(points, valid, lens=False).found.any()
+    assert not grid.fit_lattices(points, valid, lens=False).fitted.any()
+    assert not grid.fit_lattices_numpy(points, valid, lens=False).fitted.any()
 
 
 @needs_kernels
 def test_soft_bits_are_the_same() -> None:
-    dots = blobs.find_dots_numpy(drawn(7))
+    dots = blobs.detect_dots_numpy(drawn(7))
     lattices = grid.fit_lattices_numpy(as_points(dots), dots.valid, lens=True)
-    half = softbits.half_width(lattices)
+    half = softbits.window_half_width(lattices)
     mine = softbits.soft_bits(lattices, half)
-    scatter = np.clip(1.5 * lattices.sigma, softbits.SHARPEST, 2 * softbits.SHARPEST)
+    scatter = np.clip(
+        1.5 * lattices.sigma, softbits.MIN_BIT_SIGMA_PITCHES, 2 * softbits.MIN_BIT_SIGMA_PITCHES
+    )
     twin = softbits.soft_bits_numpy(lattices, half, scatter)
     assert np.count_nonzero(mine[0]) > 600
     for a, b in zip(mine, twin, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_of_two_dots_at_a_node_the_likelier_one_counts_without_kernels_too() -> None:
+    for order in ([0, 1, 2], [2, 1, 0], [1, 0, 2]):
+        offset = np.array([[1 / 6, 0.01], [-0.25, 0.1], [0.3, 0.3]], np.float32)[order]
+        lattices = grid.DotLattices(
+            parameters=np.zeros((1, 9)),
+            points=np.zeros((1, 3, 2), np.float32),
+            valid=np.ones((1, 3), bool),
+            uv=np.array([1, 0], np.float32) + offset[None],
+            nodes=np.tile(np.array([1, 0], np.float32), (1, 3, 1)),
+            sigma=np.array([0.02]),
+            fitted=np.ones(1, bool),
+            lens=True,
+        )
+        columns, rows = softbits.soft_bits_numpy(lattices, 5, np.array([0.03]))
+        assert np.count_nonzero(columns) == np.count_nonzero(rows) == 1
+        assert columns[0, 5, 6] < -3 < 3 < rows[0, 5, 6]  # right: column bit 0, row bit 1
 
 
 @needs_kernels
@@ -143,7 +163,9 @@ def test_readings_are_the_same(name: str, side: int, missing: float, wrong: floa
     for _ in range(60):
         x, y = (int(v) for v in rng.integers(0, SECTION_LENGTH - side, 2))
         u, v = (int(v) for v in rng.integers(0, 63, 2))
-        windows.append(turn(code.symbols((x, y), (side, side), (u, v)), int(rng.integers(4))))
+        windows.append(
+            rotate_symbols(code.symbols((x, y), (side, side), (u, v)), int(rng.integers(4)))
+        )
     symbols = np.array(windows)
     bits = []
     for bit in (1, 2):
@@ -154,23 +176,23 @@ def test_readings_are_the_same(name: str, side: int, missing: float, wrong: floa
     gone = rng.random(symbols.shape) < missing
     for table in bits:
         table[gone] = 0
-    mine, twin = reading.read(*bits, code), reading.read_numpy(*bits, code)
-    for field in ("rotation", "place", "shift", "wrong", "first", "last"):
+    mine, twin = reading.estimate_windows(*bits, code), reading.estimate_windows_numpy(*bits, code)
+    for field in ("rotation", "position", "shift", "wrong", "first", "last"):
         same = getattr(mine, field) == getattr(twin, field)
         assert same.mean() > 0.99, field  # the sums are rounded differently; ties may fall apart
-    agree = (mine.place == twin.place).all(axis=1)
-    np.testing.assert_allclose(mine.odds[agree], twin.odds[agree], atol=1e-3)
+    agree = (mine.position == twin.position).all(axis=1)
+    np.testing.assert_allclose(mine.log_odds[agree], twin.log_odds[agree], atol=1e-3)
 
 
 @needs_kernels
 def test_poses_are_the_same() -> None:
-    dots = blobs.find_dots_numpy(drawn(8))
+    dots = blobs.detect_dots_numpy(drawn(8))
     lattices = grid.fit_lattices_numpy(as_points(dots), dots.valid, lens=True)
-    half = softbits.half_width(lattices)
-    decoded = decode.decode(*softbits.soft_bits(lattices, half), ANOTO)
+    half = softbits.window_half_width(lattices)
+    decoded = decode.identify_windows(*softbits.soft_bits(lattices, half), ANOTO)
     assert (decoded.confidence > 0.999).all()
-    mine = pose.poses(lattices, half, decoded, ANOTO)
-    twin = pose.poses_numpy(lattices, half, decoded, ANOTO)
+    mine = pose.localize_windows(lattices, half, decoded, ANOTO)
+    twin = pose.localize_windows_numpy(lattices, half, decoded, ANOTO)
     np.testing.assert_allclose(mine.grid, twin.grid, atol=1e-5)
     np.testing.assert_allclose(mine.heading, twin.heading, atol=1e-6)
     np.testing.assert_allclose(mine.covariance, twin.covariance, rtol=1e-2, atol=1e-12)
@@ -178,10 +200,10 @@ def test_poses_are_the_same() -> None:
 
 def test_frames_without_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     images = drawn(9)
-    mine = locate.locate(images, ANOTO)
+    mine = locate.localize_frames(images, ANOTO)
     for module in (blobs, grid, softbits, reading, pose):
         monkeypatch.setattr(module, "kernels", None)
-    twin = locate.locate(images, ANOTO)
+    twin = locate.localize_frames(images, ANOTO)
     assert mine.accepted.all()
     assert twin.accepted.all()
     assert np.array_equal(mine.section, twin.section)
@@ -196,3 +218,18 @@ def test_the_kernels_can_be_left_out() -> None:
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert answer.stdout.strip() == "None"
+
+
+def test_dots_far_from_their_symbols_are_not_assigned() -> None:
+    dots = blobs.detect_dots_numpy(drawn(8, 1))
+    lattices = grid.fit_lattices_numpy(as_points(dots), dots.valid, lens=True)
+    half = softbits.window_half_width(lattices)
+    windows = decode.identify_windows(*softbits.soft_bits(lattices, half), ANOTO)
+    used = pose.assign_dots(lattices, half, windows, ANOTO).used[0]
+    first, second = np.flatnonzero(used)[:2]
+    lattices.uv[0, first, 0] += 1.2 * grid.SYMBOL_GATE_PITCHES
+    lattices.uv[0, second, 0] += 1e-3
+    after = pose.assign_dots(lattices, half, windows, ANOTO).used[0]
+    assert not after[first]
+    assert after[second]
+    assert (after | (np.arange(len(after)) == first))[used].all()

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from locatk.core.dots.codec import codec
 from locatk.core.dots.drawing.layout import (
     DPIS,
-    Layout,
     Raster,
+    SheetLayout,
     lay_out,
     manifest,
     pixels,
@@ -28,7 +28,7 @@ PAGES = st.tuples(st.floats(60, 3000), st.floats(60, 3000))
 
 
 def test_usual_pattern_on_the_usual_printers() -> None:
-    """facts/dots.md 5.3: 0.508 mm is 6, 12 and 24 px; offset and dot are a sixth of that."""
+    """A pitch of 0.508 mm is 6, 12 and 24 px; offset and dot are a sixth of that."""
     assert snap(0.508, None, 300) == Raster(300, 6, 1, 1)
     assert snap(0.508, None, 600) == Raster(600, 12, 2, 2)
     assert snap(0.508, None, 1200) == Raster(1200, 24, 4, 4)
@@ -158,7 +158,7 @@ def test_origins_are_checked() -> None:
         tiling(layout, (3, 1), 10).sheets("a", (410_815_348 - 400, 0))
 
 
-def floor(count: tuple[int, int] = (3, 2), overlap: float = 15) -> Layout:
+def floor(count: tuple[int, int] = (3, 2), overlap: float = 15) -> SheetLayout:
     return lay_out((148, 210), 10, snap(0.508, None, 600))
 
 

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.dots.codec import SECTION_LENGTH
-from locatk.core.dots.design.ledger import GAP, Area, allocate, check_name, free_origins, plan
+from locatk.core.dots.design.ledger import (
+    GAP_POSITIONS,
+    Area,
+    allocate,
+    check_name,
+    free_origins,
+    plan,
+)
 from locatk.core.dots.drawing.layout import lay_out, snap
 from locatk.core.dots.drawing.tiles import tiling
 from locatk.core.errors import InputError
@@ -44,10 +51,10 @@ def test_new_areas_are_free(
         assert item.origin[0] + item.size[0] <= SECTION_LENGTH
         assert item.origin[1] + item.size[1] <= SECTION_LENGTH
     for first, second in itertools.combinations(new, 2):
-        assert apart(first, second, GAP)
-        assert not first.meets(second)
+        assert apart(first, second, GAP_POSITIONS)
+        assert not first.overlaps(second)
     for first, second in itertools.product(old, new):
-        assert apart(first, second, GAP)
+        assert apart(first, second, GAP_POSITIONS)
     again = allocate(old, wanted, prefixes=["A4"] * len(wanted), codec="anoto")
     assert again == new
 
@@ -60,7 +67,7 @@ def test_meeting_is_holding_one_place(
     first: tuple[int, int, tuple[int, int]], second: tuple[int, int, tuple[int, int]]
 ) -> None:
     a, b = (area("a", x, y, *size) for x, y, size in (first, second))
-    assert a.meets(b) == b.meets(a) == (not apart(a, b))
+    assert a.overlaps(b) == b.overlaps(a) == (not apart(a, b))
 
 
 def test_one_by_one_or_all_at_once() -> None:
@@ -71,14 +78,18 @@ def test_one_by_one_or_all_at_once() -> None:
         single += allocate(single, [size], prefixes=["A4"], codec="anoto")
     assert single == together
     assert [item.id for item in together][:2] == ["A4-0001", "A4-0002"]
-    assert [item.origin[0] for item in together][:3] == [0, 374 + GAP, 2 * (374 + GAP)]
+    assert [item.origin[0] for item in together][:3] == [
+        0,
+        374 + GAP_POSITIONS,
+        2 * (374 + GAP_POSITIONS),
+    ]
 
 
 def test_sections_are_apart() -> None:
     held = [area("a", 0, 0, 500, 500)]
-    assert free_origins(held, (500, 500)) == [(500 + GAP, 0)]
+    assert free_origins(held, (500, 500)) == [(500 + GAP_POSITIONS, 0)]
     assert free_origins(held, (500, 500), (0, 1)) == [(0, 0)]
-    assert not held[0].meets(area("b", 0, 0, 500, 500, v=1))
+    assert not held[0].overlaps(area("b", 0, 0, 500, 500, v=1))
 
 
 def test_other_codecs_are_not_apart() -> None:
@@ -90,9 +101,11 @@ def test_other_codecs_are_not_apart() -> None:
 
 def test_a_full_section_is_said() -> None:
     held = [area("a", 0, 0, SECTION_LENGTH, SECTION_LENGTH - 200)]
-    assert free_origins(held, (8, 200 - GAP)) == [(0, SECTION_LENGTH - 200 + GAP)]
+    assert free_origins(held, (8, 200 - GAP_POSITIONS)) == [
+        (0, SECTION_LENGTH - 200 + GAP_POSITIONS)
+    ]
     with pytest.raises(InputError, match="no free area"):
-        free_origins(held, (8, 200 - GAP + 1))
+        free_origins(held, (8, 200 - GAP_POSITIONS + 1))
 
 
 def test_areas_by_hand() -> None:
@@ -114,7 +127,11 @@ def test_areas_by_hand() -> None:
     several = allocate(
         held, [(50, 50), (70, 50), (50, 50)], prefixes=["A4"] * 3, codec="anoto", origin=(5, 7)
     )
-    assert [item.origin for item in several] == [(5, 7), (55 + GAP, 7), (125 + 2 * GAP, 7)]
+    assert [item.origin for item in several] == [
+        (5, 7),
+        (55 + GAP_POSITIONS, 7),
+        (125 + 2 * GAP_POSITIONS, 7),
+    ]
     with pytest.raises(InputError, match="cross the border"):
         ask(SECTION_LENGTH - 49, 0)
 
@@ -165,7 +182,7 @@ def test_plan_gives_each_sheet_the_area_in_the_ledger() -> None:
         assert sheet.section == (3, 4)
         inside = area("s", *sheet.origin, *sheet.size, u=3, v=4)
         owner = next(item for item in areas if sheet.id.startswith(item.id))
-        assert [item.id for item in areas if item.meets(inside)] == [owner.id]
+        assert [item.id for item in areas if item.overlaps(inside)] == [owner.id]
         # Nothing of a sheet is outside its area.
         for axis in (0, 1):
             assert sheet.origin[axis] >= owner.origin[axis]

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.dots.calibration.printed_fields import FieldScore
-from locatk.core.dots.calibration.printer import PrinterReport, calibrate, recommend
-from locatk.core.dots.drawing.test_sheet import PrinterSheet, printer_sheet
+from locatk.core.dots.calibration.printer import PrinterReport, calibrate, find_sheet, recommend
+from locatk.core.dots.drawing.test_sheet import PrinterSheet, marker_dictionary, printer_sheet
 from locatk.core.errors import DegenerateError, InputError
 from locatk.formats.pdf.testsheet import render
 
@@ -250,3 +250,16 @@ def test_no_two_fields_share_a_place() -> None:
         printer_sheet("A4", 450)
     with pytest.raises(InputError):
         printer_sheet("A4", 600, "morse")
+
+
+@pytest.mark.parametrize(("numbers", "refused"), [((0, 5), True), ((0, 0), True), ((0, 1), False)])
+def test_markers_of_two_sheets_are_refused(numbers: tuple[int, int], refused: bool) -> None:
+    image = np.full((200, 400), 255, np.uint8)
+    for number, x in zip(numbers, (40, 240), strict=True):
+        image[50:150, x : x + 100] = cv2.aruco.generateImageMarker(marker_dictionary(), number, 100)
+    if refused:
+        with pytest.raises(InputError, match="two test sheets"):
+            find_sheet(image)
+    else:
+        with pytest.raises(DegenerateError, match="2 of the 4 corner markers"):
+            find_sheet(image)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.dots.sheet import MM_PER_INCH, OFFSET, Manifest, Sheet
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, MM_PER_INCH, Manifest, Sheet
 
 PAGE = Sheet("A4-1", (1000, 2000), (394, 565), (3, 5), (210.0, 297.0), (5.08, 4.0))
 MANIFEST = Manifest((PAGE,), pitch_mm=0.5)
@@ -108,5 +108,5 @@ def test_defaults_are_the_papers_print() -> None:
     plain = Manifest((PAGE,))
     for length, printer_dots in ((plain.pitch_mm, 6), (plain.dot_mm, 1), (plain.offset_mm, 1)):
         assert length / MM_PER_INCH * 300 == pytest.approx(printer_dots)
-    assert plain.offset_mm == pytest.approx(plain.pitch_mm * OFFSET)
+    assert plain.offset_mm == pytest.approx(plain.pitch_mm * DOT_OFFSET_PITCHES)
     assert plain.scale == (1.0, 1.0)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.sheet import Manifest, Sheet
@@ -230,3 +231,13 @@ def test_covariance_in_metres(shoot: Shoot) -> None:
     covariance = track.covariance[:, [0, 1, 5]][:, :, [0, 1, 5]]
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) / 3
     assert 0.5 < nees.mean() < 2
+
+
+def test_frames_of_another_size_than_the_cameras_are_rejected() -> None:
+    images = [np.zeros(shape, np.uint8) for shape in ((120, 188), (60, 94))]
+    frames = Frames("camera", np.arange(2), ("0", "1"), images)
+    sheet = Sheet("s", (0, 0), (100, 100), (0, 0), (60.0, 60.0), (5.0, 5.0))
+    camera = Camera((188, 120), 348.7, (93.5, 59.5))
+    solution = solve([frames], Manifest((sheet,)), SolveOptions(camera=camera))
+    outcomes = [frame.rejected for frame in solution.facts.frames]
+    assert outcomes == ["too_few_dots", "not_of_the_cameras_size"]

@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 from locatk.core.dots.calibration import camera as calibration
 from locatk.core.dots.calibration import camera_views
 from locatk.core.dots.calibration.camera import CalibrateOptions, CameraReport, calibrate
-from locatk.core.dots.calibration.camera_views import SeenFrame, spread, spread_order
+from locatk.core.dots.calibration.camera_views import (
+    CalibrationFrame,
+    select_diverse_frames,
+    spread_order,
+)
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
@@ -234,7 +238,9 @@ def test_untilted_frames_tell_the_lens_but_not_the_focal_length(
     (note,) = report.notes
     assert "do not tell the focal length: they are not tilted enough" in note
     # An answer for another camera's frame is as usual as its frame is large.
-    assert report.camera.focal_px == pytest.approx(calibration.USUAL_FOCAL * math.hypot(*SIZE))
+    assert report.camera.focal_px == pytest.approx(
+        calibration.USUAL_FOCAL_DIAGONALS * math.hypot(*SIZE)
+    )
 
 
 @pytest.mark.slow
@@ -379,7 +385,7 @@ def test_a_lens_that_no_camera_has_is_refused(
     tilted: simulate.SimulatedSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is returned that `locatk solve` could not take as a camera."""
-    monkeypatch.setattr(calibration, "LARGEST_BEND", 0.01)
+    monkeypatch.setattr(calibration, "MAX_CORNER_DISTORTION", 0.01)
     with pytest.raises(DegenerateError, match="no lens of this kind"):
         calibrate(tilted.frames, MANIFEST)
 
@@ -388,9 +394,9 @@ def test_of_long_sessions_some_frames_are_taken(
     tilted: simulate.SimulatedSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (camera_views, calibration):
-        monkeypatch.setattr(module, "MOST_FRAMES", 8)
-    monkeypatch.setattr(camera_views, "MOST_LOCATED", 16)
-    monkeypatch.setattr(camera_views, "BLOCK", 8)
+        monkeypatch.setattr(module, "MAX_FITTED_FRAMES", 8)
+    monkeypatch.setattr(camera_views, "MAX_LOCALIZED_FRAMES", 16)
+    monkeypatch.setattr(camera_views, "FRAMES_PER_BLOCK", 8)
     taken: list[int] = []
 
     class Counted(Some):
@@ -423,7 +429,7 @@ def test_any_beginning_of_the_order_is_spread() -> None:
 def test_the_few_frames_that_are_tilted_or_turned_are_among_those_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(camera_views, "MOST_FRAMES", 20)
+    monkeypatch.setattr(camera_views, "MAX_FITTED_FRAMES", 20)
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.arange(-8, 9), np.arange(-6, 7)), axis=-1).reshape(-1, 2) * 1.0
     found = []
@@ -432,12 +438,12 @@ def test_the_few_frames_that_are_tilted_or_turned_are_among_those_taken(
         towards = [2e-3, 0] if k == 71 else rng.normal(0, 1e-5, 2)
         turned = 11.0 * grid @ np.array([[c, s], [-s, c]])
         pixels = turned / (1 + turned @ towards)[:, None] + [93.5, 59.5]
-        found.append(SeenFrame(k, SIZE, pixels, grid))
-    chosen = [seen.index for seen in spread(SIZE, found, 120)]
+        found.append(CalibrationFrame(k, SIZE, pixels, grid))
+    chosen = [seen.index for seen in select_diverse_frames(SIZE, found, 120)]
     assert len(set(chosen)) == 20
     assert {37, 71} < set(chosen)
     assert np.diff([0, *chosen, 120]).max() < 30
-    assert spread(SIZE, found[:15], 120) == found[:15]
+    assert select_diverse_frames(SIZE, found[:15], 120) == found[:15]
 
 
 def test_the_same_frames_give_the_same_camera(upright: simulate.SimulatedSession) -> None:

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import MAIN_SEQUENCE, SECTION_LENGTH, codec
-from locatk.core.dots.codec.lookup import turn
+from locatk.core.dots.codec.lookup import rotate_symbols
 from locatk.core.dots.published import grid as paper_grid
 from locatk.core.dots.published.localization import (
-    PaperPose,
+    PublishedPose,
     best_window,
     correlate,
-    find_place,
-    locate_paper,
+    localize_published,
+    look_up_position,
     vote_orientation,
 )
 from locatk.core.errors import InputError
@@ -96,7 +96,7 @@ def study(count: int, seed: int, **how: Any) -> tuple[Counter[str], list[float],
         x, y = rng.uniform(100, SECTION_LENGTH - 100, 2)
         heading, (u, v) = rng.uniform(-math.pi, math.pi), rng.integers(0, 63, 2).tolist()
         frame = photograph((x, y), heading, section=(u, v), seed=k, **how)
-        pose = locate_paper(frame, codec("anoto"))
+        pose = localize_published(frame, codec("anoto"))
         error = math.hypot(pose.x - x, pose.y - y)
         if pose.rejected is not None:
             fate[pose.rejected] += 1
@@ -114,12 +114,12 @@ def study(count: int, seed: int, **how: Any) -> tuple[Counter[str], list[float],
 
 @pytest.mark.slow
 def test_frames_of_the_papers_camera() -> None:
-    # 94 % were read, none wrong, of 200 frames like these; the peer in C reads 78 %, cold.
+    # All were read of 200 frames like these; the peer in C reads 78 %, without earlier frames.
     fate, off, turn_off = study(80, 1)
-    assert fate["right"] >= 68, fate
-    assert fate["wrong"] <= 1, fate
-    assert np.sqrt(np.mean(np.square(off))) < 0.08
-    assert max(turn_off) < 3.0
+    assert fate["right"] >= 79, fate
+    assert fate["wrong"] == 0, fate
+    assert np.sqrt(np.mean(np.square(off))) < 0.02
+    assert max(turn_off) < 0.5
 
 
 def test_dots_of_a_sixth_of_the_pitch_and_missing_dots() -> None:
@@ -132,7 +132,7 @@ def test_dots_of_a_sixth_of_the_pitch_and_missing_dots() -> None:
 @pytest.mark.parametrize("quarter", range(4))
 def test_heading_is_counter_clockwise_from_the_sheets_x(quarter: int) -> None:
     heading = math.radians(5.0 + 90 * quarter)
-    pose = locate_paper(photograph((7000.3, 900.8), heading, section=(4, 60)), codec("anoto"))
+    pose = localize_published(photograph((7000.3, 900.8), heading, section=(4, 60)), codec("anoto"))
     assert pose.rejected is None
     assert math.hypot(pose.x - 7000.3, pose.y - 900.8) < 0.15
     assert turned_by(pose.heading_rad, heading) < 2.5
@@ -144,7 +144,7 @@ def test_heading_is_counter_clockwise_from_the_sheets_x(quarter: int) -> None:
 @pytest.mark.parametrize("name", ["libdots", "microdots"])
 def test_other_codecs(name: str) -> None:
     frame = photograph((250_000_000.5, 77.7), 0.1, name=name)
-    pose = locate_paper(frame, codec(name))
+    pose = localize_published(frame, codec(name))
     assert pose.rejected is None
     assert math.hypot(pose.x - 250_000_000.5, pose.y - 77.7) < 0.15
 
@@ -155,7 +155,7 @@ def test_published_frame_and_its_turns(data: Path) -> None:
         pytest.skip(f"{file} is not there")
     frame = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     for quarter in range(4):
-        pose = locate_paper(np.ascontiguousarray(np.rot90(frame, quarter)), codec("libdots"))
+        pose = localize_published(np.ascontiguousarray(np.rot90(frame, quarter)), codec("libdots"))
         assert pose.rejected is None
         assert math.hypot(pose.x - 129.168, pose.y - 3224.506) < 0.1
         assert pose.section == (24, 32)
@@ -170,7 +170,7 @@ def test_camera_undoes_the_lens_and_says_where_the_centre_is() -> None:
         at, heading = (5000.25 + 40.3 * k, 700.6 + 31.7 * k), math.radians(3 + 97 * k)
         frame = photograph(at, heading, centre=(99.0, 56.5), lens=camera.distort, seed=k)
         for known in (True, False):
-            pose = locate_paper(frame, codec("anoto"), camera if known else None)
+            pose = localize_published(frame, codec("anoto"), camera if known else None)
             right[known] += math.hypot(pose.x - at[0], pose.y - at[1]) < 0.2
     assert right[True] >= 9
     assert right[False] == 0
@@ -178,12 +178,12 @@ def test_camera_undoes_the_lens_and_says_where_the_centre_is() -> None:
 
 def test_a_mirrored_frame_is_not_read() -> None:
     frame = photograph((5000.3, 900.8), 0.1)
-    assert locate_paper(frame, codec("anoto")).rejected is None
-    mirrored = locate_paper(np.ascontiguousarray(frame[:, ::-1]), codec("anoto"))
+    assert localize_published(frame, codec("anoto")).rejected is None
+    mirrored = localize_published(np.ascontiguousarray(frame[:, ::-1]), codec("anoto"))
     assert mirrored.rejected is not None
 
 
-def rejected(pose: PaperPose, *reasons: str) -> bool:
+def rejected(pose: PublishedPose, *reasons: str) -> bool:
     return pose.rejected in reasons and math.isnan(pose.x) and pose.section == (-1, -1)
 
 
@@ -191,22 +191,24 @@ def test_what_is_no_pattern_is_rejected() -> None:
     one = codec("anoto")
     for shape in ((1, 1), (120, 188)):
         for grey in (0, 128, 255):
-            assert rejected(locate_paper(np.full(shape, grey, np.uint8), one), "no_dots")
+            assert rejected(localize_published(np.full(shape, grey, np.uint8), one), "no_dots")
     regular = np.full((120, 188), 200, np.uint8)
     for x in range(6, 188, 11):
         for y in range(6, 120, 11):
             cv2.circle(regular, (x, y), 2, 30, -1)
-    assert rejected(locate_paper(regular, one), "no_orientation")
-    assert rejected(locate_paper(regular[:80, :80].copy(), one), "no_window")
+    assert rejected(localize_published(regular, one), "no_orientation")
+    assert rejected(localize_published(regular[:80, :80].copy(), one), "no_window")
     line = np.full((120, 188), 200, np.uint8)
     line[60:63] = np.tile([30, 30, 30, 200, 200, 200, 200, 200], 24)[:188]
-    assert rejected(locate_paper(line, one), "no_grid")
+    assert rejected(localize_published(line, one), "no_grid")
     rng = np.random.default_rng(5)
     for sigma in (0.5, 1.5, 3.0):
         for _ in range(8):
             cloud = cv2.GaussianBlur(rng.normal(0, 1, (120, 188)), (0, 0), sigma)
             noise = cv2.normalize(cloud, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-            assert rejected(locate_paper(noise, one), "no_grid", "no_window", "no_orientation")
+            assert rejected(
+                localize_published(noise, one), "no_grid", "no_window", "no_orientation"
+            )
 
 
 @pytest.mark.parametrize(
@@ -221,7 +223,7 @@ def test_what_is_no_pattern_is_rejected() -> None:
 def test_what_is_no_frame_is_refused(image: Any, says: str) -> None:
     camera = Camera((188, 120), 200.0, (93.5, 59.5))
     with pytest.raises(InputError, match=says):
-        locate_paper(image, codec("anoto"), camera)
+        localize_published(image, codec("anoto"), camera)
 
 
 # --- step by step
@@ -280,8 +282,10 @@ def test_refinement_moves_the_origin_and_the_lengths() -> None:
     offsets = np.array([[0, -1], [-1, 0], [1, 0], [0, 1]])[rng.integers(0, 4, len(places))] / 6
     noise = rng.normal(0, 0.01, places.shape)
     points = np.array([90.0, 60.0]) + (places + offsets + noise) * 11.0
-    rough = paper_grid.Grid(np.array([91.0, 58.8]), np.array([11.1, 0]), np.array([0, 10.85]))
-    grid, g, delta = paper_grid.refine(rough, points)
+    rough = paper_grid.AffineGrid(np.array([91.0, 58.8]), np.array([11.1, 0]), np.array([0, 10.85]))
+    refined = paper_grid.refine_grid(rough, points)
+    assert refined is not None
+    grid, g, delta = refined
     np.testing.assert_allclose(grid.origin, [90, 60], atol=0.4)  # from 1.0 and 1.2 px off
     assert grid.u[0] == pytest.approx(11, abs=0.05)
     assert grid.v[1] == pytest.approx(11, abs=0.05)
@@ -289,11 +293,51 @@ def test_refinement_moves_the_origin_and_the_lengths() -> None:
     np.testing.assert_allclose(delta, offsets, atol=0.1)
 
 
+def test_refinement_corrects_the_direction() -> None:
+    rng = np.random.default_rng(9)
+    nodes = np.stack(np.meshgrid(np.arange(-8, 9), np.arange(-5, 6)), axis=-1).reshape(-1, 2)
+    offsets = np.array([[0, -1], [-1, 0], [1, 0], [0, 1]])[rng.integers(0, 4, len(nodes))] / 6
+    points = np.array([90.0, 60.0]) + (nodes + offsets) * 11.0
+    c, s = 11 * math.cos(math.radians(3)), 11 * math.sin(math.radians(3))
+    rotated = paper_grid.AffineGrid(np.array([90.0, 60.0]), np.array([c, s]), np.array([-s, c]))
+    refined = paper_grid.refine_grid(rotated, points)
+    assert refined is not None
+    grid, found, delta = refined
+    assert math.degrees(math.atan2(grid.u[1], grid.u[0])) == pytest.approx(0, abs=0.2)
+    assert math.degrees(math.atan2(grid.v[0], grid.v[1])) == pytest.approx(0, abs=0.2)
+    np.testing.assert_array_equal(found, nodes)
+    np.testing.assert_allclose(delta, offsets, atol=0.1)
+
+
+def test_refinement_that_degenerates_has_no_grid() -> None:
+    grid = paper_grid.AffineGrid(np.zeros(2), np.array([11.0, 0]), np.array([0, 11.0]))
+    line = np.array([[11.0 * k, 0.0] for k in range(12)])
+    assert paper_grid.refine_grid(grid, line) is None
+    # Two rows that are one blob high are no grid.
+    rows = np.array([[11.0 * k, y] for k in range(12) for y in (5.4, 5.6)])
+    assert paper_grid.refine_grid(grid, rows) is None
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "plausible"),
+    [
+        ((11, 0), (0, 11), True),
+        ((11, 0), (0, -11), False),
+        ((1.9, 0), (0, 11), False),
+        ((11, 0), (11 * math.cos(0.5), 11 * math.sin(0.5)), False),
+        ((11, 0), (11 * math.cos(0.55), 11 * math.sin(0.55)), True),
+    ],
+)
+def test_plausible_grids(u: Any, v: Any, plausible: bool) -> None:
+    grid = paper_grid.AffineGrid(np.zeros(2), np.array(u, float), np.array(v, float))
+    assert grid.is_plausible is plausible
+
+
 def test_likelihood_is_equation_9() -> None:
     r0 = 1 / 6
     r = np.array([0, r0, -r0, r0 / 2, 1.74 * r0, -2 * r0])
     np.testing.assert_allclose(
-        paper_grid.likelihood(r), [0, 1, -1, 0.75 - 1 / 16, 0, 0], atol=1e-12
+        paper_grid.quasi_probability(r), [0, 1, -1, 0.75 - 1 / 16, 0, 0], atol=1e-12
     )
 
 
@@ -327,7 +371,7 @@ def test_orientation_by_vote() -> None:
         x, y = rng.integers(0, SECTION_LENGTH - 8, 2).tolist()
         symbols = codec("anoto").symbols((x, y), (8, 8))
         for quarters in range(4):
-            window = soft(turn(symbols, quarters))
+            window = soft(rotate_symbols(symbols, quarters))
             for _ in range(3):
                 window[:, rng.integers(8), rng.integers(8)] *= rng.choice([0, -1])
             assert vote_orientation(window) == quarters
@@ -359,12 +403,12 @@ def test_place_of_eight_phases(name: str) -> None:
     one = codec(name)
     for x in [0, SECTION_LENGTH - 8, *rng.integers(0, SECTION_LENGTH - 8, 100).tolist()]:
         phases = one.phases(np.arange(x, x + 8), 17)
-        assert find_place(phases, one) == x
+        assert look_up_position(phases, one) == x
     across = one.phases(SECTION_LENGTH - 4) + np.cumsum(
         np.r_[0, one.differences((SECTION_LENGTH - 4 + np.arange(7)) % SECTION_LENGTH)]
     )
-    assert find_place(across % 63, one) is None
-    assert find_place(np.zeros(8, np.int64), one) is None
+    assert look_up_position(across % 63, one) is None
+    assert look_up_position(np.zeros(8, np.int64), one) is None
 
 
 def test_an_outer_line_may_be_wrong() -> None:
@@ -373,5 +417,5 @@ def test_an_outer_line_may_be_wrong() -> None:
     for x in range(5000, 5100):
         phases = one.phases(np.arange(x, x + 8))
         phases[0] = (phases[0] + 31) % 63
-        right += find_place(phases, one) == x
+        right += look_up_position(phases, one) == x
     assert right >= 90

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from locatk.core.dots.codec.lookup import Exact, decode_exact, digits_of, turn
+from locatk.core.dots.codec.lookup import ExactWindows, decode_exact, digits_of, rotate_symbols
 from locatk.core.dots.codec.pattern import DOWN, LEFT, RIGHT, SECTION_LENGTH, UP, codec
 from locatk.core.errors import InputError
 
@@ -42,7 +42,11 @@ def repeated(at: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def agrees(
-    found: Exact, rows: Any, at: NDArray[np.int64], sections: NDArray[np.int64], rotation: int
+    found: ExactWindows,
+    rows: Any,
+    at: NDArray[np.int64],
+    sections: NDArray[np.int64],
+    rotation: int,
 ) -> None:
     assert found.ok[rows].all()
     np.testing.assert_array_equal(found.x[rows], at[rows, 0])
@@ -51,7 +55,7 @@ def agrees(
     np.testing.assert_array_equal(found.rotation[rows], rotation)
 
 
-def nothing(found: Exact) -> None:
+def nothing(found: ExactWindows) -> None:
     """Rows that are not ok say nothing else either."""
     bad = ~found.ok
     for values in (found.x, found.y, found.section, found.rotation):
@@ -61,17 +65,17 @@ def nothing(found: Exact) -> None:
 def test_a_quarter_turn_is_counter_clockwise() -> None:
     page = np.array([[UP, UP, RIGHT], [DOWN, LEFT, LEFT]], np.uint8)
     turned = np.array([[UP, DOWN], [LEFT, DOWN], [LEFT, RIGHT]], np.uint8)
-    np.testing.assert_array_equal(turn(page, 1), turned)
-    np.testing.assert_array_equal(turn(turned, -1), page)
-    np.testing.assert_array_equal(turn(page, 2), turn(turned, 1))
-    np.testing.assert_array_equal(turn(page, 7), turn(page, -1))
+    np.testing.assert_array_equal(rotate_symbols(page, 1), turned)
+    np.testing.assert_array_equal(rotate_symbols(turned, -1), page)
+    np.testing.assert_array_equal(rotate_symbols(page, 2), rotate_symbols(turned, 1))
+    np.testing.assert_array_equal(rotate_symbols(page, 7), rotate_symbols(page, -1))
 
 
 @pytest.mark.parametrize("rotation", range(4))
 @pytest.mark.parametrize("name", NAMES)
 def test_8x8_anywhere_in_any_section_and_turn(name: str, rotation: int) -> None:
     windows, at, sections = draw(name, 400, (8, 8), 10 + rotation)
-    found = decode_exact(turn(windows, rotation), codec(name))
+    found = decode_exact(rotate_symbols(windows, rotation), codec(name))
     agrees(found, slice(None), at, sections, rotation)
 
 
@@ -84,7 +88,13 @@ def test_8x8_anywhere_in_any_section_and_turn(name: str, rotation: int) -> None:
 @settings(max_examples=40, deadline=None)
 def test_any_larger_window(name: str, size: tuple[int, int], seed: int, rotation: int) -> None:
     windows, at, sections = draw(name, 3, size, seed)
-    agrees(decode_exact(turn(windows, rotation), codec(name)), slice(None), at, sections, rotation)
+    agrees(
+        decode_exact(rotate_symbols(windows, rotation), codec(name)),
+        slice(None),
+        at,
+        sections,
+        rotation,
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -128,7 +138,7 @@ def test_small_windows_of_unknown_turn_are_right_or_not_read(
     size: tuple[int, int], rotation: int
 ) -> None:
     windows, at, sections = draw("anoto", 1500, size, 6)
-    found = decode_exact(turn(windows, rotation), codec("anoto"), (0, 1, 2, 3))
+    found = decode_exact(rotate_symbols(windows, rotation), codec("anoto"), (0, 1, 2, 3))
     assert found.ok.mean() > 0.3
     agrees(found, found.ok, at, sections, rotation)
     nothing(found)
@@ -136,7 +146,7 @@ def test_small_windows_of_unknown_turn_are_right_or_not_read(
 
 def test_only_the_turns_that_are_asked_for() -> None:
     windows, at, sections = draw("anoto", 200, (8, 8), 7)
-    half = turn(windows, 2)
+    half = rotate_symbols(windows, 2)
     agrees(decode_exact(half, codec("anoto"), (0, 2)), slice(None), at, sections, 2)
     assert not decode_exact(half, codec("anoto"), (0, 1, 3)).ok.any()
 
@@ -149,7 +159,7 @@ def test_one_wrong_bit_of_8x8_is_always_found(name: str) -> None:
         wrong = np.repeat(window[None], 128, axis=0)
         wrong[np.arange(128), rows, columns] ^= (1 + bits).astype(np.uint8)
         for rotation in range(4):
-            found = decode_exact(turn(wrong, rotation), codec(name))
+            found = decode_exact(rotate_symbols(wrong, rotation), codec(name))
             assert not found.ok.any()
             nothing(found)
 
@@ -181,7 +191,7 @@ def test_what_is_read_is_what_is_there() -> None:
     for k in np.flatnonzero(found.ok)[:300]:
         u, v = found.section[k].tolist()
         printed = one.symbols((int(found.x[k]), int(found.y[k])), (6, 6), (u, v))
-        np.testing.assert_array_equal(turn(printed, int(found.rotation[k])), noise[k])
+        np.testing.assert_array_equal(rotate_symbols(printed, int(found.rotation[k])), noise[k])
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -208,7 +218,7 @@ def test_anoto_sheet_read_as_another_codec() -> None:
     assert not (alt.ok & (alt.x == at[:, 0])).any()
     libdots = decode_exact(windows, codec("libdots"))
     right = libdots.ok & (libdots.x == at[:, 0]) & (libdots.y == at[:, 1])
-    # 217 of 241 places an axis (facts/dots.md 2.2)
+    # 217 of 241 positions per axis
     assert abs(right.mean() - (217 / 241) ** 2) < 0.05
 
 

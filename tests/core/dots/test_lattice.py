@@ -1,4 +1,4 @@
-"""Lattices, found in points whose places are known; no images here."""
+"""DotLattices, found in points whose places are known; no images here."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.dots.detection import lattice as grid
-from locatk.core.dots.detection.lattice import Lattices, fit_lattices
+from locatk.core.dots.detection.lattice import DotLattices, fit_lattices
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def cloud(
     return Cloud(seen[order], place[order])
 
 
-def fit(clouds: list[Cloud], *, lens: bool = True, half: float = HALF_DIAGONAL) -> Lattices:
+def fit(clouds: list[Cloud], *, lens: bool = True, half: float = HALF_DIAGONAL) -> DotLattices:
     most = max(len(c.points) for c in clouds)
     points = np.zeros((len(clouds), most, 2), np.float32)
     valid = np.zeros((len(clouds), most), bool)
@@ -92,12 +92,12 @@ def fit(clouds: list[Cloud], *, lens: bool = True, half: float = HALF_DIAGONAL) 
     return fit_lattices(points, valid, lens=lens)
 
 
-def agreement(lattices: Lattices, clouds: list[Cloud]) -> Array:
+def agreement(lattices: DotLattices, clouds: list[Cloud]) -> Array:
     """Share of each frame's dots whose places differ from the true ones as the others' do."""
     shares = []
     for k, c in enumerate(clouds):
         known = np.flatnonzero(np.isfinite(c.place[:, 0]))
-        place = lattices.place[k, known].astype(float)
+        place = lattices.nodes[k, known].astype(float)
         best = 0.0
         for quarter in range(4):
             a, b = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter]
@@ -108,9 +108,9 @@ def agreement(lattices: Lattices, clouds: list[Cloud]) -> Array:
     return np.array(shares)
 
 
-def assert_found(clouds: list[Cloud], share: float = 0.99, **how: Any) -> Lattices:
+def assert_found(clouds: list[Cloud], share: float = 0.99, **how: Any) -> DotLattices:
     lattices = fit(clouds, **how)
-    assert lattices.found.all()
+    assert lattices.fitted.all()
     assert agreement(lattices, clouds).min() >= share
     return lattices
 
@@ -166,7 +166,7 @@ def test_places_have_their_fractions() -> None:
         for k in range(20)
     ]
     lattices = assert_found(clouds, 1.0)
-    rest = (lattices.uv - lattices.place)[lattices.valid]
+    rest = (lattices.uv - lattices.nodes)[lattices.valid]
     longer, shorter = np.abs(rest).max(axis=1), np.abs(rest).min(axis=1)
     np.testing.assert_allclose(longer, 1 / 6, atol=0.02)
     assert shorter.max() < 0.02
@@ -202,11 +202,13 @@ def test_random_points_are_no_lattice() -> None:
     pattern = fit([cloud(rng, scatter=0.02, heading=a) for a in np.linspace(0, 6, 20)])
     near = [
         (
-            ((np.abs(rest - grid.displacement(rest)).max(axis=2) < 0.06) & one.valid).sum(axis=1)
+            ((np.abs(rest - grid.nearest_symbol_offset(rest)).max(axis=2) < 0.06) & one.valid).sum(
+                axis=1
+            )
             / one.valid.sum(axis=1)
         )
         for one in (lattices, pattern)
-        for rest in [one.uv - one.place]
+        for rest in [one.uv - one.nodes]
     ]
     assert near[0].max() < 0.6
     assert near[1].min() > 0.9
@@ -215,14 +217,14 @@ def test_random_points_are_no_lattice() -> None:
 def test_too_few_points_and_odd_ones() -> None:
     rng = np.random.default_rng(7)
     few = cloud(rng, missing=0.95)
-    assert len(few.points) < grid.FEWEST
-    assert not fit([few]).found.any()
+    assert len(few.points) < grid.MIN_LATTICE_DOTS
+    assert not fit([few]).fitted.any()
     empty = fit_lattices(np.zeros((2, 1, 2), np.float32), np.zeros((2, 1), bool), lens=True)
-    assert not empty.found.any()
+    assert not empty.fitted.any()
     line = np.stack([np.linspace(-90, 90, 60), np.zeros(60)], axis=1)
     for points in (np.zeros((50, 2)), np.repeat(rng.uniform(-50, 50, (2, 2)), 40, axis=0), line):
         lattices = fit([Cloud(points, points)])
-        assert np.isfinite(lattices.sigma[0]) or not lattices.found[0]
+        assert np.isfinite(lattices.sigma[0]) or not lattices.fitted[0]
 
 
 def test_frames_do_not_depend_on_their_company() -> None:
@@ -235,13 +237,13 @@ def test_frames_do_not_depend_on_their_company() -> None:
         n = len(one.points)
         np.testing.assert_allclose(together.uv[k, :n], alone.uv[0], atol=1e-4)
         np.testing.assert_allclose(together.parameters[k], alone.parameters[0], atol=1e-5)
-        assert together.found[k] == alone.found[0]
+        assert together.fitted[k] == alone.fitted[0]
 
 
 def test_nearest_symbol() -> None:
     rest = np.array([[0.1, 0.02], [-0.2, 0.1], [0.05, 0.3], [-0.1, -0.12], [0.16, 0.0]], np.float32)
     np.testing.assert_allclose(
-        grid.displacement(rest),
+        grid.nearest_symbol_offset(rest),
         np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 0]]) / 6,
         atol=1e-6,
     )

@@ -19,7 +19,13 @@ from locatk.core.dots.codec import (
     codec,
     sequences,
 )
-from locatk.core.dots.identification.decoding import THRESHOLD, Decoded, decode
+from locatk.core.dots.identification import decoding
+from locatk.core.dots.identification.decoding import (
+    MIN_CONFIDENCE,
+    DecodedWindows,
+    identify_windows,
+)
+from locatk.core.errors import InputError
 
 CODECS = ("anoto", "libdots", "microdots")
 UP, LEFT, RIGHT, DOWN = range(4)
@@ -70,7 +76,7 @@ class Windows:
         self.turn = (self.turn + quarters) % 4
         return self
 
-    def right(self, found: Decoded) -> NDArray[np.bool_]:
+    def right(self, found: DecodedWindows) -> NDArray[np.bool_]:
         result: NDArray[np.bool_] = (
             (found.x == self.x)
             & (found.y == self.y)
@@ -100,15 +106,15 @@ def hidden(bits: tuple[Bits, Bits], gone: NDArray[np.bool_]) -> tuple[Bits, Bits
     return np.where(gone, np.float32(0), bits[0]), np.where(gone, np.float32(0), bits[1])
 
 
-def accepted(found: Decoded) -> NDArray[np.bool_]:
+def accepted(found: DecodedWindows) -> NDArray[np.bool_]:
     """What a user takes for a place: sure enough, and in one section."""
-    result: NDArray[np.bool_] = (found.confidence >= THRESHOLD) & ~found.border
+    result: NDArray[np.bool_] = (found.confidence >= MIN_CONFIDENCE) & ~found.border
     return result
 
 
 def fate(windows: Windows, bits: tuple[Bits, Bits], one: Codec) -> tuple[int, int, int]:
     """How many windows are read right, read wrong, and refused."""
-    found = decode(*bits, one)
+    found = identify_windows(*bits, one)
     took, right = accepted(found), windows.right(found)
     return int((took & right).sum()), int((took & ~right).sum()), int((~took).sum())
 
@@ -135,7 +141,7 @@ def test_windows_of_this_test_are_the_codecs(name: str) -> None:
 @pytest.mark.parametrize("quarters", range(4))
 def test_every_place_section_and_turn(name: str, side: int, quarters: int) -> None:
     windows = Windows(name, np.random.default_rng(side), 1000, side, side).turned(quarters)
-    found = decode(*soft(windows.symbols), codec(name))
+    found = identify_windows(*soft(windows.symbols), codec(name))
     took = accepted(found)
     assert took.all()
     np.testing.assert_array_equal(windows.right(found), took)
@@ -166,10 +172,10 @@ def test_any_window(name: str, x: int, y: int, u: int, v: int, side: int, quarte
     symbols = np.rot90(codec(name).symbols((x, y), (side, side), (u, v)), quarters)
     for _ in range(quarters):
         symbols = QUARTER[symbols]
-    found = decode(*soft(symbols[None].astype(np.int64)), codec(name))
+    found = identify_windows(*soft(symbols[None].astype(np.int64)), codec(name))
     assert (found.x[0], found.y[0], *found.section[0]) == (x, y, u, v)
     assert found.rotation[0] == quarters
-    assert found.confidence[0] >= THRESHOLD
+    assert found.confidence[0] >= MIN_CONFIDENCE
 
 
 def test_windows_at_the_rim_of_the_range() -> None:
@@ -177,7 +183,7 @@ def test_windows_at_the_rim_of_the_range() -> None:
     for x in edge:
         for y in edge:
             windows = Windows("anoto", np.random.default_rng(3), 4, 12, 12, x, y)
-            found = decode(*soft(windows.symbols), codec("anoto"))
+            found = identify_windows(*soft(windows.symbols), codec("anoto"))
             assert windows.right(found).all(), (x, y)
             assert accepted(found).all(), (x, y)
 
@@ -201,9 +207,11 @@ def test_answers_do_not_depend_on_their_company() -> None:
     rng = np.random.default_rng(5)
     windows = Windows("anoto", rng, 40, 10, 10)
     bits = flip(soft(windows.symbols), 0.03, rng)
-    together = decode(*bits, codec("anoto"))
-    alone = [decode(bits[0][k : k + 1], bits[1][k : k + 1], codec("anoto")) for k in range(40)]
-    for field in Decoded.__dataclass_fields__:
+    together = identify_windows(*bits, codec("anoto"))
+    alone = [
+        identify_windows(bits[0][k : k + 1], bits[1][k : k + 1], codec("anoto")) for k in range(40)
+    ]
+    for field in DecodedWindows.__dataclass_fields__:
         parts = np.concatenate([getattr(one, field) for one in alone])
         np.testing.assert_allclose(getattr(together, field), parts, rtol=1e-6, err_msg=field)
 
@@ -211,7 +219,7 @@ def test_answers_do_not_depend_on_their_company() -> None:
 def test_nothing_to_decode() -> None:
     for n in (0, 3):
         nothing = np.zeros((n, 12, 12), np.float32)
-        found = decode(nothing, nothing, codec("anoto"))
+        found = identify_windows(nothing, nothing, codec("anoto"))
         assert len(found.x) == n
         assert not accepted(found).any()
         assert (found.dots == 0).all()
@@ -226,7 +234,7 @@ def test_missing_dots(side: int, share: float) -> None:
     rng = np.random.default_rng(6)
     windows = Windows("anoto", rng, 400, side, side).turned(1)
     gone = rng.random(windows.symbols.shape) < share
-    found = decode(*hidden(soft(windows.symbols), gone), codec("anoto"))
+    found = identify_windows(*hidden(soft(windows.symbols), gone), codec("anoto"))
     took, right = accepted(found), windows.right(found)
     assert (took & right).sum() >= 394
     assert (took & ~right).sum() == 0
@@ -244,7 +252,7 @@ def test_a_few_wrong_bits_of_8_by_8(wrong: int, least: int, most: int) -> None:
     at = rng.permuted(np.tile(np.arange(128), (400, 1)), axis=1)[:, :wrong]
     np.put_along_axis(bits, at, -np.take_along_axis(bits, at, 1), 1)
     bits = bits.reshape(400, 2, 8, 8)
-    found = decode(bits[:, 0].copy(), bits[:, 1].copy(), codec("anoto"))
+    found = identify_windows(bits[:, 0].copy(), bits[:, 1].copy(), codec("anoto"))
     took, right = accepted(found), windows.right(found)
     assert (took & right).sum() >= least
     assert (took & ~right).sum() <= most
@@ -328,7 +336,7 @@ def test_windows_that_are_half_hidden(side: int) -> None:
 
 def repeated() -> Iterator[tuple[int, int]]:
     """Places of the fourth libdots sequence where a string of so many digits occurs again."""
-    digits = sequences.FOURTH["libdots"]
+    digits = sequences.FOURTH_DIGITS["libdots"]
     for order in (5, 6):
         strings = [(digits + digits)[k : k + order] for k in range(len(digits))]
         for place, string in enumerate(strings):
@@ -339,7 +347,7 @@ def repeated() -> Iterator[tuple[int, int]]:
 def test_what_libdots_repeats_is_not_told() -> None:
     one = codec("libdots")
     places = list(repeated())
-    assert len(places) == 2 * (6 + 1)  # facts/dots.md 2.1
+    assert len(places) == 2 * (6 + 1)
     rng = np.random.default_rng(12)
     for place, order in places:
         x = rng.integers(0, SECTION_LENGTH // 241 - 1, 10) * 241 + place
@@ -364,7 +372,7 @@ def test_noise_is_refused(size: tuple[int, int], n: int) -> None:
             )[kind].astype(np.float32)
             for _ in range(2)
         ]
-        assert not accepted(decode(bits[0], bits[1], codec("anoto"))).any()
+        assert not accepted(identify_windows(bits[0], bits[1], codec("anoto"))).any()
 
 
 @pytest.mark.parametrize("side", [8, 20])
@@ -395,7 +403,7 @@ def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
         "one symbol": np.tile(np.arange(4)[:, None, None], (1, side, side)),
         "stripes": np.tile(np.arange(side) % 2 * 3, (1, side, 1)),
     }.items():
-        found = decode(*soft(np.ascontiguousarray(symbols)), one)
+        found = identify_windows(*soft(np.ascontiguousarray(symbols)), one)
         assert not accepted(found).any(), what
 
 
@@ -415,7 +423,52 @@ def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: i
     symbols = np.concatenate(parts, axis=2)
     if axis == 1:  # upright again, after the quarter turn that makes rows of columns
         symbols = QUARTER[QUARTER[QUARTER[np.rot90(symbols, 3, (1, 2))]]]
-    found = decode(*soft(symbols), codec("anoto"))
-    assert not (found.confidence >= THRESHOLD).any()
+    found = identify_windows(*soft(symbols), codec("anoto"))
+    assert not (found.confidence >= MIN_CONFIDENCE).any()
     if side == 20 and beyond == 2:  # most of it is of one section, so that its place is known
         assert found.border.all()
+
+
+# --- guards
+
+
+def estimates(**changes: Any) -> decoding.WindowEstimates:
+    """One window that was estimated beyond doubt, with some values changed."""
+    certain = {"log_odds": 100.0, "order_log_odds": 100.0, "lead": 100.0}
+    values: dict[str, Any] = {
+        name: np.array([[certain[name]] * 2]) if name in certain else np.zeros((1, 2), np.int64)
+        for name in decoding.WindowEstimates._fields
+    }
+    values["rotation"] = np.zeros(1, np.int64)
+    values["last"] = np.full((1, 2), 7, np.int64)
+    return decoding.WindowEstimates(**(values | changes))
+
+
+@pytest.mark.parametrize(
+    ("log_odds", "order_log_odds", "least", "most"),
+    [(100.0, 100.0, 0.9999999, 1), (0.0, 100.0, 0.49, 0.51), (100.0, -5.0, 0.35, 0.45)],
+)
+def test_evidence_against_random_bits_and_against_other_codecs(
+    log_odds: float, order_log_odds: float, least: float, most: float
+) -> None:
+    bits = np.ones((1, 8, 8), np.float32)
+    changes = {
+        "log_odds": np.array([[log_odds, 100.0]]),
+        "order_log_odds": np.array([[order_log_odds, 100.0]]),
+    }
+    (confidence,) = decoding.resolve_doubts(estimates(**changes), bits, bits, codec("anoto"))
+    assert least <= confidence <= most
+
+
+def test_windows_across_a_border_have_no_confidence() -> None:
+    across = estimates(position=np.array([[SECTION_LENGTH - 3, 0]]))
+    for window, border in ((across, True), (estimates(), False)):
+        found = decoding.as_decoded(window, np.array([0.9999]), np.array([64]), (0, 0))
+        assert found.border.tolist() == [border]
+        assert found.confidence.tolist() == [0.0 if border else 0.9999]
+
+
+def test_windows_of_too_many_lines_are_refused() -> None:
+    bits = np.zeros((1, 65, 8), np.float32)
+    with pytest.raises(InputError, match="8 x 65 positions, more than 64"):
+        identify_windows(bits, bits, codec("anoto"))

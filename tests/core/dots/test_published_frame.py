@@ -1,4 +1,4 @@
-"""The one public camera frame of the pattern (facts/dots.md 2.6): a libdots sheet, 320 x 241.
+"""The one public camera frame of the pattern, of cellulo-localization: a libdots sheet, 320 x 241.
 
 Its place was recovered from its dots by two other decoders; nobody measured it.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.localization.frames import locate
+from locatk.core.dots.localization.frames import localize_frames
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.solver import SolveOptions, solve
 
@@ -43,7 +43,7 @@ def turned_by(found: float, true_deg: float) -> float:
 def test_place_and_heading(frame: NDArray[np.uint8], quarters: int) -> None:
     # numpy turns the picture counter-clockwise, as if the camera had been turned clockwise.
     image = np.ascontiguousarray(np.rot90(frame, quarters))
-    found = locate(image[None], codec("libdots"))
+    found = localize_frames(image[None], codec("libdots"))
     assert found.rejected[0] == ""
     np.testing.assert_allclose(found.grid[0], PLACE, atol=0.05)
     # A heading is that of the image's right. The picture is sheared: its down is 0.15 degrees
@@ -60,7 +60,8 @@ def test_place_and_heading(frame: NDArray[np.uint8], quarters: int) -> None:
 
 def test_the_turns_agree_with_each_other(frame: NDArray[np.uint8]) -> None:
     found = [
-        locate(np.ascontiguousarray(np.rot90(frame, k))[None], codec("libdots")) for k in range(4)
+        localize_frames(np.ascontiguousarray(np.rot90(frame, k))[None], codec("libdots"))
+        for k in range(4)
     ]
     assert np.ptp([one.grid[0] for one in found], axis=0).max() < 0.01
 
@@ -69,7 +70,7 @@ def test_at_half_and_twice_its_size(frame: NDArray[np.uint8]) -> None:
     half = cv2.resize(frame[:240], (160, 120), interpolation=cv2.INTER_AREA)
     twice = cv2.resize(frame, (640, 482), interpolation=cv2.INTER_CUBIC)
     for image, middle in ((half, 119.5), (twice, 120.0)):
-        found = locate(np.asarray(image, np.uint8)[None], codec("libdots"))
+        found = localize_frames(np.asarray(image, np.uint8)[None], codec("libdots"))
         assert found.rejected[0] == ""
         # The middle of the first 240 rows is half a pixel, a 40th of a pitch, above.
         np.testing.assert_allclose(
@@ -78,7 +79,7 @@ def test_at_half_and_twice_its_size(frame: NDArray[np.uint8]) -> None:
 
 
 def test_a_microdots_reader_finds_nothing(frame: NDArray[np.uint8]) -> None:
-    found = locate(frame[None], codec("microdots"))
+    found = localize_frames(frame[None], codec("microdots"))
     assert not found.accepted[0]
 
 

@@ -19,10 +19,14 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, codec
-from locatk.core.dots.detection.lattice import Lattices
+from locatk.core.dots.detection.lattice import DotLattices
 from locatk.core.dots.identification.soft_bits import soft_bits
-from locatk.core.dots.localization.frames import locate, sightings
-from locatk.core.dots.localization.located import Located
+from locatk.core.dots.localization.frames import (
+    LocalizedFrames,
+    dot_correspondences,
+    localize_frames,
+    unlocalized_frames,
+)
 from locatk.core.errors import InputError
 
 Array = NDArray[np.float64]
@@ -47,7 +51,7 @@ class Outcome:
         return float(np.sqrt(np.mean(self.error[:, :2] ** 2)))
 
 
-def judge(found: Located, shots: list[Any]) -> Outcome:
+def judge(found: LocalizedFrames, shots: list[Any]) -> Outcome:
     fate: Counter[str] = Counter()
     errors, nees = [], []
     for k, one in enumerate(shots):
@@ -95,7 +99,7 @@ def study(
     shots = shots_of(shot, count, seed, **how)
     rng = np.random.default_rng(seed)
     images = np.stack([spoil(one.take(), rng) for one in shots])
-    return judge(locate(images, codec(shots[0].codec), camera), shots)
+    return judge(localize_frames(images, codec(shots[0].codec), camera), shots)
 
 
 # --- the table
@@ -173,7 +177,7 @@ def test_other_cameras(shot: Shots, size: tuple[int, int], pitch: float, count: 
 def test_errors_are_as_large_as_the_covariance_says(shot: Shots) -> None:
     for how in ({}, {"noise": 12.0}, {"dot": 1 / 6, "tilt": TILT_10}, {"jitter": 0.02}):
         shots = shots_of(shot, 50, 5, **how)
-        found = locate(np.stack([one.take() for one in shots]), codec("anoto"))
+        found = localize_frames(np.stack([one.take() for one in shots]), codec("anoto"))
         outcome = judge(found, shots)
         assert outcome.fate == {"right": 50}
         assert 0.5 < outcome.nees.mean() < 2
@@ -198,16 +202,16 @@ def test_a_frames_answer_does_not_depend_on_its_company(shot: Shots) -> None:
     ]
     shots = [one for k, how in enumerate(hows) for one in shots_of(shot, 8, k, **how)]
     images = np.stack([one.take() for one in shots])
-    together = locate(images, codec("anoto"))
+    together = localize_frames(images, codec("anoto"))
     assert 20 <= together.accepted.sum() < 40
     order = np.random.default_rng(6).permutation(len(images))
-    shuffled = locate(images[order], codec("anoto"))
-    alone = [locate(image[None], codec("anoto")) for image in images]
+    shuffled = localize_frames(images[order], codec("anoto"))
+    alone = [localize_frames(image[None], codec("anoto")) for image in images]
     for k in range(len(images)):
         for other in (alone[k], locate_row(shuffled, int(np.flatnonzero(order == k)[0]))):
             assert other.rejected[0] == together.rejected[k]
             if together.accepted[k]:
-                for field in fields(Located):
+                for field in fields(LocalizedFrames):
                     if field.name != "rejected":
                         np.testing.assert_allclose(
                             getattr(other, field.name)[0],
@@ -217,18 +221,20 @@ def test_a_frames_answer_does_not_depend_on_its_company(shot: Shots) -> None:
                         )
 
 
-def locate_row(found: Located, k: int) -> Located:
-    return Located(**{f.name: getattr(found, f.name)[k : k + 1] for f in fields(Located)})
+def locate_row(found: LocalizedFrames, k: int) -> LocalizedFrames:
+    return LocalizedFrames(
+        **{f.name: getattr(found, f.name)[k : k + 1] for f in fields(LocalizedFrames)}
+    )
 
 
 def test_quarter_turns_of_a_frame(shot: Shots) -> None:
     (one,) = shots_of(shot, 1, 7)
     image = one.take()
-    upright = locate(image[None], codec("anoto"))
+    upright = localize_frames(image[None], codec("anoto"))
     for quarters in (1, 2, 3):
         # The page seems turned counter-clockwise: the camera was turned clockwise.
         turned = np.ascontiguousarray(np.rot90(image, quarters))
-        found = locate(turned[None], codec("anoto"))
+        found = localize_frames(turned[None], codec("anoto"))
         assert found.accepted[0]
         np.testing.assert_allclose(found.grid, upright.grid, atol=2e-3)
         change = found.heading[0] - upright.heading[0] + quarters * math.pi / 2
@@ -240,7 +246,8 @@ def test_light_and_contrast_do_not_matter(shot: Shots) -> None:
     images = np.stack([one.take() for one in shots]).astype(float)
     for change in (images * 0.1, images * 0.3, images * 1.4, 130 + (images - 130) * 0.12):
         outcome = judge(
-            locate(np.clip(np.rint(change), 0, 255).astype(np.uint8), codec("anoto")), shots
+            localize_frames(np.clip(np.rint(change), 0, 255).astype(np.uint8), codec("anoto")),
+            shots,
         )
         assert outcome.fate == {"right": 6}
 
@@ -288,13 +295,13 @@ def test_what_is_not_sure_is_rejected_and_says_so(shot: Shots) -> None:
     shots = shots_of(shot, 40, 21)
     rng = np.random.default_rng(21)
     images = np.stack([bare(one.take(), rng, 0.62) for one in shots])
-    found = locate(images, codec("anoto"))
+    found = localize_frames(images, codec("anoto"))
     np.testing.assert_array_equal(found.accepted, found.confidence >= 0.999)
     doubtful = (found.confidence >= 0.5) & ~found.accepted
     assert doubtful.any()
     assert set(found.rejected[doubtful]) == {"low_confidence"}
     assert "low_confidence" not in found.rejected[~doubtful]
-    lenient = locate(images, codec("anoto"), threshold=0.9)
+    lenient = localize_frames(images, codec("anoto"), min_confidence=0.9)
     assert lenient.accepted.sum() > found.accepted.sum()
     np.testing.assert_array_equal(lenient.accepted, lenient.confidence >= 0.9)
 
@@ -307,10 +314,10 @@ def test_a_strip_of_few_rows_is_not_told(shot: Shots) -> None:
     for rows in (4, 5, 6):
         strips = images.copy()
         strips[:, round(rows * 11.04) :] = 205
-        assert judge(locate(strips, codec("anoto")), shots).fate["wrong"] == 0
+        assert judge(localize_frames(strips, codec("anoto")), shots).fate["wrong"] == 0
     strips = images.copy()
     strips[:, 100:] = 205
-    assert judge(locate(strips, codec("anoto")), shots).fate["right"] >= 23
+    assert judge(localize_frames(strips, codec("anoto")), shots).fate["right"] >= 23
 
 
 def vars_of(one: Any) -> dict[str, Any]:
@@ -327,13 +334,13 @@ def test_the_first_places_of_all(shot: Shots, at: tuple[float, float]) -> None:
     # The frame looks past the corner of the plane; the ledger's first sheet lies there.
     shots = [shot(at=at, heading=heading, section=(5, 9)) for heading in (0.4, 2.0, 3.5, 5.1)]
     images = np.stack([one.take() for one in shots])
-    assert judge(locate(images, codec("anoto")), shots).fate == {"right": 4}
+    assert judge(localize_frames(images, codec("anoto")), shots).fate == {"right": 4}
 
 
 def test_the_last_places_of_all(shot: Shots) -> None:
     (one,) = shots_of(shot, 1, 12)
     last = shot(**{**vars_of(one), "at": (SECTION_LENGTH - 20.0, SECTION_LENGTH - 20.0)})
-    assert judge(locate(last.take()[None], codec("anoto")), [last]).fate == {"right": 1}
+    assert judge(localize_frames(last.take()[None], codec("anoto")), [last]).fate == {"right": 1}
 
 
 @pytest.mark.parametrize("beyond", [-4, -2, 0, 2, 4])
@@ -354,7 +361,7 @@ def test_a_border_of_sections_is_rejected_and_said(shot: Shots, beyond: int) -> 
             axis=1,
         )
         images.append(shot(**{**vars_of(one), "symbols": symbols}).take())
-    found = locate(np.stack(images), codec("anoto"))
+    found = localize_frames(np.stack(images), codec("anoto"))
     assert not found.accepted.any()
     if abs(beyond) == 4:  # enough of one section to know where it ends
         assert set(found.rejected) <= {"section_border", "no_code", "low_confidence"}
@@ -373,7 +380,7 @@ def test_the_printers_raster_itself(pixels: int, dot: int) -> None:
         x, y = (column * 6 + 2 + right) * pixels // 6, (row * 6 + 2 + down) * pixels // 6
         page[y : y + dot, x : x + dot] = 0
     frame = page[3 * pixels : 30 * pixels, 4 * pixels : 40 * pixels]
-    found = locate(frame[None].copy(), codec("anoto"))
+    found = localize_frames(frame[None].copy(), codec("anoto"))
     assert found.rejected[0] == ""
     # A place is the middle of the dot that would stand on it.
     middle = np.array([4 * pixels + (36 * pixels - 1) / 2, 3 * pixels + (27 * pixels - 1) / 2])
@@ -404,22 +411,22 @@ def lattice(shot: Shots, k: int, rng: np.random.Generator, kind: str) -> Image:
 def test_grids_without_the_code(shot: Shots, kind: str) -> None:
     rng = np.random.default_rng(14)
     images = np.stack([lattice(shot, k, rng, kind) for k in range(20)])
-    found = locate(images, codec("anoto"))
+    found = localize_frames(images, codec("anoto"))
     assert not found.accepted.any()
     assert found.confidence.max() < 0.01
 
 
 def test_the_pattern_in_a_mirror_and_as_a_negative(shot: Shots) -> None:
     images = np.stack([one.take() for one in shots_of(shot, 16, 15)])
-    assert locate(images, codec("anoto")).accepted.all()
+    assert localize_frames(images, codec("anoto")).accepted.all()
     for wrong in (images[:, :, ::-1], images[:, ::-1], 255 - images):
-        assert not locate(np.ascontiguousarray(wrong), codec("anoto")).accepted.any()
+        assert not localize_frames(np.ascontiguousarray(wrong), codec("anoto")).accepted.any()
 
 
 def test_a_sheet_of_another_codec_has_its_places_elsewhere(shot: Shots) -> None:
-    # microdots and anoto share three of four sequences (facts/dots.md 2.2).
+    # microdots and anoto share three of four sequences.
     images = np.stack([one.take() for one in shots_of(shot, 20, 16, codec="microdots")])
-    assert not locate(images, codec("anoto")).accepted.any()
+    assert not localize_frames(images, codec("anoto")).accepted.any()
 
 
 def other_things(rng: np.random.Generator, kind: str, size: tuple[int, int]) -> Image:
@@ -466,7 +473,7 @@ def test_frames_of_something_else(kind: str) -> None:
     rng = np.random.default_rng(17)
     for size, count in (((188, 120), 30), ((320, 240), 3)):
         images = np.stack([other_things(rng, kind, size) for _ in range(count)])
-        found = locate(images, codec("anoto"))
+        found = localize_frames(images, codec("anoto"))
         assert not found.accepted.any()
         assert found.confidence.max() < 0.5
         assert set(found.rejected) <= {"too_few_dots", "no_grid", "no_code"}
@@ -478,11 +485,23 @@ def test_frames_of_something_else(kind: str) -> None:
 def test_frames_of_any_shape(size: tuple[int, int]) -> None:
     rng = np.random.default_rng(18)
     images = rng.integers(0, 256, (2, size[1], size[0]), np.uint8)
-    assert not locate(images, codec("anoto")).accepted.any()
+    assert not localize_frames(images, codec("anoto")).accepted.any()
 
 
 def test_no_frames() -> None:
-    assert len(locate(np.zeros((0, 120, 188), np.uint8), codec("anoto"))) == 0
+    assert len(localize_frames(np.zeros((0, 120, 188), np.uint8), codec("anoto"))) == 0
+
+
+def test_updates_keep_the_better_result() -> None:
+    result = unlocalized_frames(4, "too_few_dots")
+    result.confidence[:] = [0.5, 0.5, 0.5, 0.9]
+    part = unlocalized_frames(4, "no_code")
+    part.confidence[:] = [0.4, 0.6, 0.4, 0.9]
+    part.rejected[2] = ""
+    result.update(np.arange(4), part)
+    # Worse; better; accepted although of less confidence; equal.
+    assert result.rejected.tolist() == ["too_few_dots", "no_code", "", "no_code"]
+    assert result.confidence.tolist() == [0.5, 0.6, 0.4, 0.9]
 
 
 # --- what the dots say
@@ -492,14 +511,14 @@ def test_of_two_dots_at_a_place_the_likelier_one_speaks() -> None:
     # At place (1, 0): a dot just where "right" stands, and dust on the other side of it.
     for order in ([0, 1], [1, 0]):
         rest = np.array([[1 / 6, 0.01], [-0.25, 0.1]], np.float32)[order]
-        lattices = Lattices(
+        lattices = DotLattices(
             parameters=np.zeros((1, 9)),
             points=np.zeros((1, 2, 2), np.float32),
             valid=np.ones((1, 2), bool),
             uv=np.array([[[1, 0], [1, 0]]], np.float32) + rest,
-            place=np.array([[[1, 0], [1, 0]]], np.float32),
+            nodes=np.array([[[1, 0], [1, 0]]], np.float32),
             sigma=np.array([0.02]),
-            found=np.ones(1, bool),
+            fitted=np.ones(1, bool),
             lens=True,
         )
         column, row = soft_bits(lattices, 4)
@@ -517,7 +536,7 @@ def test_sightings_are_dots_and_where_they_stand(shot: Shots, known: bool) -> No
     (one,) = shots_of(shot, 1, 19, radial=camera.radial_px, noise=1.0)
     blank = np.full((120, 188), 200, np.uint8)
     images = np.stack([blank, one.take(), blank])
-    (seen,) = sightings(images, codec("anoto"), camera if known else None)
+    (seen,) = dot_correspondences(images, codec("anoto"), camera if known else None)
     assert len(seen.pixels) > 120
     # From the place of each dot back to its pixel, through the renderer's own lens.
     away = seen.grid + seen.origin - one.at
@@ -533,4 +552,4 @@ def test_sightings_are_dots_and_where_they_stand(shot: Shots, known: bool) -> No
 @pytest.mark.parametrize("kind", [np.uint16, np.float32])
 def test_frames_of_other_depths_are_refused(kind: type) -> None:
     with pytest.raises(InputError, match="8 bits"):
-        locate(np.zeros((1, 120, 188), kind), codec("anoto"))
+        localize_frames(np.zeros((1, 120, 188), kind), codec("anoto"))
