@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from locatk.core.drawing import Line, Point, Polygon, arrow
 from locatk.core.landmarks.drawing.landmark import bar_outlines
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, name
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, Geometry, name
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.map.grid_fit import built_poses
 
@@ -104,7 +104,7 @@ class _Drawn:
         poses = built_poses(floor)
         self.places = 1e3 * poses[:, :2] - corner
         self.headings = poses[:, 2].tolist()
-        self.shapes = [_Shape(floor.geometry, code) for code in range(CODES)]
+        self.shapes = [_Shape(floor.geometry, code) for code in range(CODE_COUNT)]
 
     def draw(self, ink: Xml.Element) -> None:
         self._walls(_layer(ink, "walls"))

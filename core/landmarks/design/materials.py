@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.materials import GRADES_T, Item
 
@@ -43,7 +43,7 @@ class PatternCount:
 def patterns(floor: FloorMap) -> tuple[PatternCount, ...]:
     """The patterns that occur, by number."""
     laid = [int(floor.codes[cell]) for cell in floor.cells()]
-    counts = {code: laid.count(code) for code in range(CODES)}
+    counts = {code: laid.count(code) for code in range(CODE_COUNT)}
     found = []
     for number, letters in enumerate(PATTERNS, 1):
         codes = [(c, n) for c, n in counts.items() if n and PATTERN_OF[c] == number]

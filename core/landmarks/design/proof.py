@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.design.bounds import readings_bound
 from locatk.core.landmarks.design.localization_steps import Localisation, Place, localise
-from locatk.core.landmarks.landmark import CODES
+from locatk.core.landmarks.landmark import CODE_COUNT
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
 from locatk.core.landmarks.map.windows import PATHS, Integers, Readings, as_read, encoded, readings
 
@@ -213,7 +213,7 @@ def _duplicates(seen: Readings, words: Integers) -> tuple[tuple[Duplicate, ...],
 def _bars(floor: FloorMap, seen: Readings, words: Integers) -> tuple[Faults, Faults]:
     """One bar flipped; one bar missing, which leaves the true word and the flipped one."""
     codes = floor.codes[seen.cells[..., 0], seen.cells[..., 1]]
-    value = CODES ** np.arange(codes.shape[1])
+    value = CODE_COUNT ** np.arange(codes.shape[1])
     valid, doubtful = _Valid(words), repeated(words)[:, None]
     flipped, missing = np.zeros(codes.shape, np.int64), np.zeros(codes.shape, np.int64)
     for bar in range(4):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.detection.explanations import GONE
-from locatk.core.landmarks.landmark import signs
+from locatk.core.landmarks.landmark import MIN_BAR_STRENGTH, signs
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
 
 Array = NDArray[np.float64]
@@ -31,6 +30,6 @@ def laid_code(floor: FloorMap, cell: Cell) -> int:
     built = floor.built.get(cell)
     if built is None:
         return int(floor.codes[cell])
-    there = np.abs(built.strength) >= GONE  # False where it is nan
+    there = np.abs(built.strength) >= MIN_BAR_STRENGTH  # False where it is nan
     north = np.where(there, built.strength, signs(floor.codes[cell])) > 0
     return int(north @ (1 << np.arange(4)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, code_of, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, code_of, rotated
 from locatk.core.landmarks.map.floor import HOLE, STEPS, FloorMap
 
 Integers = NDArray[np.int64]
@@ -24,7 +24,7 @@ PATHS: dict[str, tuple[tuple[int, int], ...]] = {
 
 ALPHABET_CODES: dict[str, tuple[int, ...]] = {
     "6": tuple(code_of(letters) for letters in PATTERNS),
-    "16": tuple(range(CODES)),
+    "16": tuple(range(CODE_COUNT)),
     "compass": tuple(code_of(letters) for letters in ("NNNS", "SSSN", "NNSS")),
 }
 """Codes with which a map of each alphabet is laid. The three of ``compass`` look different
@@ -131,4 +131,4 @@ def _moved(grid: Bools, row: int, column: int) -> Bools:
 
 def encoded(letters: Integers) -> Integers:
     """(n,) one number a reading (n, k) of letters 0 to 15."""
-    return np.asarray(letters @ (CODES ** np.arange(letters.shape[1])), np.int64)
+    return np.asarray(letters @ (CODE_COUNT ** np.arange(letters.shape[1])), np.int64)

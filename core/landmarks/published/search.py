@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.landmarks import visits
+from locatk.core.landmarks import preprocessing
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
-from locatk.core.landmarks.detection.trace import Drift, relative, sensor_places
+from locatk.core.landmarks.detection.trace import OdometryDrift, relative, sensor_positions
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, name
@@ -114,17 +114,17 @@ def sightings(
     DegenerateError
         The field of such bars does not reach the threshold.
     """
-    run = visits.driven(samples, odometry)
+    run = preprocessing.preprocess(samples, odometry)
     both = paper_first.radii(geometry)
-    found = visits.find(run, geometry, Drift())
+    found = preprocessing.segment_visits(run, geometry, OdometryDrift())
     return [_Visit(run, visit.first, visit.stop, geometry, both).sighting() for visit in found]
 
 
 def first_steps(samples: HallSamples, odometry: Trajectory, geometry: Geometry) -> list[FirstStep]:
     """The first step alone, for each visit of a recording; raises as :func:`sightings`."""
-    run = visits.driven(samples, odometry)
+    run = preprocessing.preprocess(samples, odometry)
     both = paper_first.radii(geometry)
-    found = visits.find(run, geometry, Drift())
+    found = preprocessing.segment_visits(run, geometry, OdometryDrift())
     return [_Visit(run, visit.first, visit.stop, geometry, both).first_step() for visit in found]
 
 
@@ -166,7 +166,7 @@ class _Visit:
 
     def __init__(
         self,
-        run: visits.Driven,
+        run: preprocessing.HallRecording,
         first: int,
         stop: int,
         geometry: Geometry,
@@ -177,7 +177,7 @@ class _Visit:
         self.pose = run.pose[first:stop]
         self.field = run.samples.field_t[first:stop] - run.offset_t
         self.lever = run.samples.sensors.position_m
-        self.place = sensor_places(self.pose, self.lever)
+        self.place = sensor_positions(self.pose, self.lever)
         self.spins = spins(self.pose)
         self.warnings: list[SolverWarning] = []
 
@@ -302,7 +302,7 @@ class _Visit:
         cos, sin = math.cos(turn), math.sin(turn)
         way[:, :2] = way[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
         way[:, 2] += turn
-        expected = landmark_field(self.geometry, hypothesis.code, sensor_places(way, self.lever))
+        expected = landmark_field(self.geometry, hypothesis.code, sensor_positions(way, self.lever))
         seen = self.field[start:stop]
         return math.sqrt(np.nanmean((seen - expected) ** 2) / np.nanmean(seen**2))
 

@@ -18,9 +18,9 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.detection.trace import compose, relative
 from locatk.core.landmarks.halls import HallSamples
-from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.localization.cell_filter import HALF_PI, Located
-from locatk.core.landmarks.localization.consistency import NO_MAP
+from locatk.core.landmarks.landmark import HALF_PI_RAD, Geometry
+from locatk.core.landmarks.localization.cell_filter import CellEstimate
+from locatk.core.landmarks.localization.consistency import NO_MAP_WARNING
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.published import search as paper
 from locatk.core.landmarks.published.route import locate, sequence
@@ -79,7 +79,7 @@ def solve(
             )
             warnings.append(SolverWarning("not_localised", message).about(device))
         else:
-            warnings.append(NO_MAP.about(device))
+            warnings.append(NO_MAP_WARNING.about(device))
         for n, one in enumerate(found):
             detections.append(describe_visit(one, located.get(n), floor))
             if one.refused:
@@ -97,7 +97,7 @@ def solve(
     )
 
 
-def _located(found: Sequence[VisitHypotheses], floor: FloorMap) -> dict[int, Located]:
+def _located(found: Sequence[VisitHypotheses], floor: FloorMap) -> dict[int, CellEstimate]:
     """Cells of the sightings, by their number, from the first three in a row that the map
     has only once; empty where there are none."""
     for first in range(len(found) - IN_A_ROW + 1):
@@ -120,11 +120,11 @@ def _spread(
     cell: tuple[int, int],
     arrival: int,
     floor: FloorMap,
-) -> dict[int, Located]:
+) -> dict[int, CellEstimate]:
     """Cells of all sightings, from one whose cell and heading on arrival are known."""
-    own = found[known].landmark_place() - found[known - 1].landmark_place()
-    turn = arrival * HALF_PI - math.atan2(own[1], own[0])
-    out = {known: Located(cell, _quarters(found[known], turn), 0, 1.0, 1.0)}
+    own = found[known].landmark_position() - found[known - 1].landmark_position()
+    turn = arrival * HALF_PI_RAD - math.atan2(own[1], own[0])
+    out = {known: CellEstimate(cell, _quarters(found[known], turn), 0, 1.0, 1.0)}
     for numbers in (range(known + 1, len(found)), range(known - 1, -1, -1)):
         at, swing = known, turn
         for n in numbers:
@@ -132,8 +132,8 @@ def _spread(
             if one.refused or not one.hypotheses:
                 continue
             # The last landmark tells how odometry now lies on the map.
-            swing = out[at].quarters * HALF_PI + found[at].best.pose[2] - found[at].odometry[2]
-            way = one.landmark_place() - found[at].landmark_place()
+            swing = out[at].quarters * HALF_PI_RAD + found[at].best.pose[2] - found[at].odometry[2]
+            way = one.landmark_position() - found[at].landmark_position()
             step = (
                 np.array(
                     [
@@ -147,20 +147,20 @@ def _spread(
             if np.abs(step - whole).max() > ASTRAY:
                 continue
             there = (out[at].cell[0] + int(whole[0]), out[at].cell[1] + int(whole[1]))
-            out[n] = Located(there, _quarters(one, swing), 0, 1.0, 1.0)
+            out[n] = CellEstimate(there, _quarters(one, swing), 0, 1.0, 1.0)
             at = n
     return out
 
 
 def _quarters(seen: VisitHypotheses, swing: float) -> int:
     """Turn of its frame on the map, where odometry is turned by ``swing``."""
-    return round((float(seen.odometry[2]) + swing - seen.best.pose[2]) / HALF_PI) % 4
+    return round((float(seen.odometry[2]) + swing - seen.best.pose[2]) / HALF_PI_RAD) % 4
 
 
 def _driven(
     device: str,
     found: Sequence[VisitHypotheses],
-    located: dict[int, Located],
+    located: dict[int, CellEstimate],
     odometry: Trajectory,
     floor: FloorMap,
 ) -> Trajectory:
@@ -172,7 +172,7 @@ def _driven(
     starts[0] = 0
     for k, n in enumerate(numbers):
         part = slice(starts[k], starts[k + 1] if k + 1 < len(numbers) else len(own))
-        frame = np.array([*floor.place(located[n].cell), located[n].quarters * HALF_PI])
+        frame = np.array([*floor.place(located[n].cell), located[n].quarters * HALF_PI_RAD])
         here = compose(frame, found[n].best.pose)
         pose[part] = compose(here, relative(own[part], found[n].odometry))
     return Trajectory(

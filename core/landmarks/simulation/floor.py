@@ -16,7 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_exp
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, code_of, signs
+from locatk.core.landmarks.landmark import (
+    CODE_COUNT,
+    PATTERN_OF,
+    PATTERNS,
+    Geometry,
+    code_of,
+    signs,
+)
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.landmarks.simulation.options import Errors, Faults
 from locatk.core.magnetics import MU0_4PI, dipole_field
@@ -163,7 +170,7 @@ def _others(alphabet: str, code: int) -> list[int]:
         known = [code_of(letters) for letters in PATTERNS]
         return [other for other in known if PATTERN_OF[other] != PATTERN_OF[code]]
     compass = [code_of(letters) for letters in ("NNNS", "SSSN", "NNSS")]
-    return [c for c in (compass if alphabet == "compass" else range(CODES)) if c != code]
+    return [c for c in (compass if alphabet == "compass" else range(CODE_COUNT)) if c != code]
 
 
 def scatter_bars(geometry: Geometry, draws: Array, errors: Errors) -> tuple[Array, Array, Array]:

@@ -22,14 +22,14 @@ from locatk.core.landmarks.drawing.landmark import (
 from locatk.core.landmarks.drawing.plan import nice_scale
 from locatk.core.landmarks.drawing.templates import cells_by_code, cells_text
 from locatk.core.landmarks.field import landmark_field
-from locatk.core.landmarks.landmark import CODES, PATTERNS, Geometry, code_of, name, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, Geometry, code_of, name, rotated
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
 
 OTHER = Geometry(bar_length_m=0.02, bar_width_m=0.004, radius_m=0.0315, sensor_height_m=0.01)
 
 
 @pytest.mark.parametrize("geometry", [Geometry(), OTHER])
-@pytest.mark.parametrize("code", range(CODES))
+@pytest.mark.parametrize("code", range(CODE_COUNT))
 def test_arrows_lead_to_the_poles_at_which_the_field_comes_out(
     geometry: Geometry, code: int
 ) -> None:
@@ -64,7 +64,7 @@ def test_outlines_are_the_bars(geometry: Geometry) -> None:
 def test_a_turned_landmark_is_the_turned_drawing(quarters: int) -> None:
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     turn = np.linalg.matrix_power(turn, quarters)
-    for code in range(CODES):
+    for code in range(CODE_COUNT):
         first = bar_outlines(Geometry(), code)
         second = bar_outlines(Geometry(), int(rotated(code, quarters)))
         for bar, (corners, south, north, letter) in enumerate(first):
@@ -92,7 +92,7 @@ def test_a_drawing_stays_within_what_it_says(geometry: Geometry) -> None:
     assert reach_mm(geometry) < np.abs(away).max() <= card_mm(geometry)
 
 
-@pytest.mark.parametrize("code", range(CODES))
+@pytest.mark.parametrize("code", range(CODE_COUNT))
 def test_signs_point_and_are_filled_as_the_bars_lie(code: int) -> None:
     marks = draw_symbol(code, (10.0, 20.0), 8.0)
     bars = [mark for mark in marks if isinstance(mark, Polygon)]

@@ -1,4 +1,4 @@
-"""Sensors, floors and maps that are not as said: simulated with the fault, and named."""
+"""Faulty sensors, displaced landmarks and wrong maps: simulated, and reported."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.localization import consistency as remarks
+from locatk.core.landmarks.localization import consistency
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation.session import (
     Faults,
@@ -37,52 +37,51 @@ def solved(one: SimulatedSession, floor: FloorMap = FLOOR) -> Solution:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", range(4))
-def test_a_sensor_of_the_other_sign_is_named(sensor: int) -> None:
+def test_sensor_of_opposite_sign(sensor: int) -> None:
     one = drive(strategy="paper", cells=(), seed=3, landmarks=3)
     samples = one.samples[0]
     field = samples.field_t * np.where(np.arange(4) == sensor, -1.0, 1.0)
     name = samples.sensors.names[sensor]
-    with pytest.raises(InputError, match=f"the {name} sensor of robot has the other sign"):
+    with pytest.raises(InputError, match=f"the {name} sensor of robot has the opposite sign"):
         solved(replace(one, samples=(replace(samples, field_t=field),)))
 
 
 @pytest.mark.slow
-def test_a_landmark_off_its_place_is_named_and_does_not_pull_the_others() -> None:
+def test_displaced_landmark_is_reported() -> None:
     one = drive(faults=Faults(displaced=(((3, 5), (0.012, 0.0)),)))
     found = solved(one)
-    named = [each.message for each in found.warnings if each.code == "landmark_displaced"]
-    assert len(named) == 1
-    assert "landmark at 3,5 lies" in named[0]
+    messages = [each.message for each in found.warnings if each.code == "landmark_displaced"]
+    assert len(messages) == 1
+    assert "landmark at 3,5 is displaced" in messages[0]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("wrong", "believed"), [(1, True), (3, False)])
-def test_a_map_that_is_often_wrong_is_not_believed(wrong: int, believed: bool) -> None:
+@pytest.mark.parametrize(("wrong", "accepted"), [(1, True), (3, False)])
+def test_contradicted_map_is_rejected(wrong: int, accepted: bool) -> None:
     codes = CODES.copy()
     for cell in CELLS[1::2][:wrong]:
         codes[cell] = (codes[cell] + 5) % 16
     found = solved(drive(), FloorMap(codes))
-    assert bool(found.trajectories) == believed
-    assert ("map_contradicted" in [each.code for each in found.warnings]) != believed
+    assert bool(found.trajectories) == accepted
+    assert ("map_contradicted" in [each.code for each in found.warnings]) != accepted
 
 
 @pytest.mark.parametrize(
-    ("sure", "first", "said"),
+    ("probability", "first", "message"),
     [
         (0.999990, 3, None),
         (1.0, None, None),
-        (0.99998, None, "its place on the map is all but certain (0.99998)"),
-        (0.99900, 2, "its place on the map is all but certain (0.99900)"),
-        (0.96, None, "its place on the map has a probability of 0.96000; one more landmark would "
-         "settle it"),
-        (0.96, 2, "its place on the map has a probability of 0.96000 at one landmark"),
+        (0.99998, None, "its cell on the map is almost certain (0.99998)"),
+        (0.99900, 2, "its cell on the map is almost certain (0.99900)"),
+        (0.96, None, "its cell on the map has a probability of 0.96000; visit one more landmark"),
+        (0.96, 2, "its cell on the map has a probability of 0.96000 at one landmark"),
     ],
 )  # fmt: skip
-def test_what_is_not_certain_is_said_as_loud_as_it_deserves(
-    sure: float, first: int | None, said: str | None
+def test_uncertain_cells_are_reported(
+    probability: float, first: int | None, message: str | None
 ) -> None:
-    warning = remarks.doubt(sure, first)
-    if said is None:
+    warning = consistency.warn_of_uncertain_cell(probability, first)
+    if message is None:
         assert warning is None
     else:
-        assert warning == SolverWarning("localization_uncertain", said)
+        assert warning == SolverWarning("localization_uncertain", message)

@@ -1,4 +1,4 @@
-"""Where a recording has visits, and what is taken out of it, against simulated sessions."""
+"""Preprocessing: invalid readings, odometry at each sample, and visits of simulated sessions."""
 
 from __future__ import annotations
 
@@ -8,22 +8,77 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.detection.trace import Drift
+from locatk.core.landmarks.detection.trace import OdometryDrift
+from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import (
+    SATURATION_FRACTION,
+    VisitSegment,
+    check_odometry,
+    preprocess,
+    remove_invalid_readings,
+    segment_visits,
+)
 from locatk.core.landmarks.simulation.session import (
     Errors,
     SimulatedSession,
     SimulationOptions,
     simulate,
 )
-from locatk.core.landmarks.visits import Visit, check_way, driven, find
+from locatk.core.solution import SolverWarning
+
+Array = NDArray[np.float64]
 
 CODES = np.random.default_rng(3).integers(0, 16, (6, 6))
 
 GEOMETRY = Geometry()
+
+
+# ---- invalid readings
+
+
+def recorded(field: Array) -> HallSamples:
+    time_ns = np.arange(len(field), dtype=np.int64) * 5_000_000
+    return HallSamples("robot", HallSensors(), time_ns, field)
+
+
+def waves() -> Array:
+    """Return fields of 25 mT whose peaks are about 14 samples wide, as of fast robots."""
+    rng = np.random.default_rng(2)
+    turn = np.linspace(0, 60, 400)[:, None] + np.arange(4)
+    return np.asarray(0.025 * np.sin(turn) + rng.normal(0, 1.5e-4, turn.shape))
+
+
+def test_spikes_are_removed_and_counted() -> None:
+    field = waves()
+    at = [(50, 0), (51, 2), (200, 3), (333, 0)]
+    for row, column in at:
+        field[row, column] += 0.06 if field[row, column] > 0 else -0.06
+    kept, warnings = remove_invalid_readings(recorded(field))
+    assert [tuple(where) for where in np.argwhere(np.isnan(kept))] == at
+    assert warnings == [SolverWarning("spikes", "robot: 4 single readings jump; left out")]
+
+
+def test_valid_readings_are_kept() -> None:
+    field = waves()
+    kept, warnings = remove_invalid_readings(recorded(field))
+    assert (kept == field).all()
+    assert warnings == []
+
+
+def test_unknown_range_is_detected() -> None:
+    field = np.clip(waves(), -0.02, 0.02)
+    kept, warnings = remove_invalid_readings(recorded(field))
+    assert (np.isnan(kept) == (np.abs(field) >= SATURATION_FRACTION * 0.02)).all()
+    assert [each.code for each in warnings] == ["range_from_data", "saturated"]
+    assert "readings end at 20 mT" in warnings[0].message
+
+
+# ---- visits of a recording
 
 
 @functools.cache
@@ -36,14 +91,14 @@ def session(pitch_m: float = 0.2, noise_t: float = 1.5e-4) -> SimulatedSession:
     )
 
 
-def visits_of(one: SimulatedSession) -> list[Visit]:
-    run = driven(one.samples[0], one.odometry[0])
-    return find(run, one.floor.geometry, Drift(), one.floor.pitch_m)
+def visits_of(one: SimulatedSession) -> list[VisitSegment]:
+    run = preprocess(one.samples[0], one.odometry[0])
+    return segment_visits(run, one.floor.geometry, OdometryDrift(), one.floor.pitch_m)
 
 
 @pytest.mark.parametrize("pitch_m", [0.16, 0.2, 0.3])
 @pytest.mark.parametrize("noise_t", [2e-5, 1.5e-4])
-def test_one_visit_a_landmark(pitch_m: float, noise_t: float) -> None:
+def test_one_visit_per_landmark(pitch_m: float, noise_t: float) -> None:
     one = session(pitch_m, noise_t)
     want = [(1, 1), (1, 2), (1, 3), (1, 4), (2, 4), (3, 4)]
     assert [event.cell for event in one.events] == want
@@ -56,7 +111,7 @@ def test_one_visit_a_landmark(pitch_m: float, noise_t: float) -> None:
         assert before.stop <= after.first
 
 
-def test_the_reference_is_where_the_robot_is_near() -> None:
+def test_reference_is_near_the_landmark() -> None:
     one = session()
     truth = one.truth[0]
     # The first and the last one are left or reached at rest on the landmark.
@@ -68,16 +123,16 @@ def test_the_reference_is_where_the_robot_is_near() -> None:
 
 def test_bins_are_means_of_their_samples() -> None:
     one = session()
-    run = driven(one.samples[0], one.odometry[0])
+    run = preprocess(one.samples[0], one.odometry[0])
     for visit in visits_of(one):
         assert visit.trace.weight.sum() == visit.stop - visit.first
         own = (run.samples.field_t - run.offset_t)[visit.first : visit.stop].sum(axis=0)
-        told = visit.trace.weight @ visit.trace.value_t
+        told = visit.trace.weight @ visit.trace.field_t
         np.testing.assert_allclose(told, own, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(visit.trace.pose[visit.trace.reference], 0, atol=1e-12)
 
 
-def test_standing_for_minutes_costs_no_bins() -> None:
+def test_rest_adds_no_bins() -> None:
     options = SimulationOptions(
         strategy="path", cells=((1, 1), (1, 2)), stop_s=60, rate_hz=60, seed=1
     )
@@ -85,11 +140,11 @@ def test_standing_for_minutes_costs_no_bins() -> None:
         assert len(visit.trace) < 150
 
 
-def test_offsets_and_noise_are_found() -> None:
-    """With the Earth's field, as it is in the recording; the noise where it is not told."""
+def test_offsets_and_noise_are_estimated() -> None:
+    """Offsets include the Earth's field; the noise of the sensors is not given."""
     one = session()
     silent = replace(one.samples[0], sensors=replace(one.samples[0].sensors, noise_t=float("nan")))
-    run = driven(silent, one.odometry[0])
+    run = preprocess(silent, one.odometry[0])
     assert run.noise_t == pytest.approx(1.5e-4, rel=0.25)
     away = np.hypot(
         *(one.truth[0].position[:, None, :2] - [one.floor.place(c) for c in one.floor.cells()]).T
@@ -99,7 +154,7 @@ def test_offsets_and_noise_are_found() -> None:
         np.testing.assert_allclose(run.offset_t, np.median(quiet, axis=0), atol=1e-4)
 
 
-def test_saturated_readings_are_taken_out_and_told() -> None:
+def test_saturated_readings_are_removed() -> None:
     one = session()
     limit = 0.02
     clipped = replace(
@@ -107,18 +162,18 @@ def test_saturated_readings_are_taken_out_and_told() -> None:
         sensors=replace(one.samples[0].sensors, range_t=limit),
         field_t=np.clip(one.samples[0].field_t, -limit, limit),
     )
-    run = driven(clipped, one.odometry[0])
+    run = preprocess(clipped, one.odometry[0])
     gone = np.isnan(run.samples.field_t).sum()
     assert gone == (np.abs(clipped.field_t) >= 0.999 * limit)[: len(run.samples)].sum()
     assert "saturated" in [each.code for each in run.warnings]
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e-3])
-def test_dead_sensors_are_taken_out_and_named(value: float) -> None:
+def test_dead_sensors_are_removed_and_named(value: float) -> None:
     one = session()
     field = one.samples[0].field_t.copy()
     field[:, 2] = value
-    run = driven(replace(one.samples[0], field_t=field), one.odometry[0])
+    run = preprocess(replace(one.samples[0], field_t=field), one.odometry[0])
     assert np.isnan(run.samples.field_t[:, 2]).all()
     assert not np.isnan(run.samples.field_t[:, :2]).any()
     assert any(
@@ -131,19 +186,19 @@ def test_no_sensor_at_all_is_an_error() -> None:
     one = session()
     blind = replace(one.samples[0], field_t=np.full_like(one.samples[0].field_t, np.nan))
     with pytest.raises(InputError, match="no hall sensor"):
-        driven(blind, one.odometry[0])
+        preprocess(blind, one.odometry[0])
 
 
-def test_odometry_is_wanted() -> None:
+def test_odometry_is_required() -> None:
     one = session()
     with pytest.raises(InputError, match="no odometry of robot"):
-        driven(one.samples[0], None)
+        preprocess(one.samples[0], None)
     later = replace(one.odometry[0], time_ns=one.odometry[0].time_ns + 10**12)
     with pytest.raises(InputError, match="covers none"):
-        driven(one.samples[0], later)
+        preprocess(one.samples[0], later)
 
 
-def test_samples_beyond_odometry_are_left_out_and_told() -> None:
+def test_samples_without_odometry_are_left_out() -> None:
     one, own = session(), session().odometry[0]
     half = len(own) // 2
     short = replace(
@@ -153,7 +208,7 @@ def test_samples_beyond_odometry_are_left_out_and_told() -> None:
         quaternion=own.quaternion[:half],
         covariance=own.covariance[:half],
     )
-    run = driven(one.samples[0], short)
+    run = preprocess(one.samples[0], short)
     assert run.samples.time_ns[-1] <= short.time_ns[-1]
     left = len(one.samples[0]) - len(run.samples)
     (warning,) = [each for each in run.warnings if each.code == "samples_without_odometry"]
@@ -165,8 +220,8 @@ def test_odometry_in_another_unit_is_an_error(factor: float) -> None:
     one = session()
     other = replace(one.odometry[0], position=one.odometry[0].position * factor)
     with pytest.raises(InputError):
-        check_way(driven(one.samples[0], other), GEOMETRY)
+        check_odometry(preprocess(one.samples[0], other), GEOMETRY)
 
 
-def test_odometry_in_metres_is_none() -> None:
-    check_way(driven(session().samples[0], session().odometry[0]), GEOMETRY)
+def test_odometry_in_metres_is_accepted() -> None:
+    check_odometry(preprocess(session().samples[0], session().odometry[0]), GEOMETRY)

@@ -11,20 +11,20 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.detection.explanations import (
-    Explanation,
-    _in_one_frame,
-    explain,
-    robot,
-    stand,
+from locatk.core.landmarks.detection.fit import ModelPriors
+from locatk.core.landmarks.detection.hypotheses import (
+    LandmarkFit,
+    _rotate_frames,
+    estimate_pose_at_known_landmark,
+    fit_landmarks,
+    robot_pose,
 )
-from locatk.core.landmarks.detection.fit import Priors
 from locatk.core.landmarks.detection.trace import Trace
 from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
+from locatk.core.landmarks.preprocessing import preprocess, segment_visits
 from locatk.core.landmarks.simulation.options import NONE
 from locatk.core.landmarks.simulation.passes import Pass, passes
-from locatk.core.landmarks.visits import driven, find
 
 Array = NDArray[np.float64]
 
@@ -33,32 +33,32 @@ GEOMETRY = Geometry()
 
 @dataclass(frozen=True)
 class Read:
-    """One pass, as it was read and as it was."""
+    """One pass: fits, and true code and error."""
 
     trace: Trace
-    found: list[Explanation]
+    found: list[LandmarkFit]
     right: int
     error: Array
     covariance: Array
 
 
 def read(one: Pass, geometry: Geometry = GEOMETRY) -> Read | None:
-    run = driven(one.samples, one.odometry)
-    priors = Priors(noise_t=run.noise_t)
-    visits = find(run, geometry, priors.drift)
+    run = preprocess(one.samples, one.odometry)
+    priors = ModelPriors(noise_t=run.noise_t)
+    visits = segment_visits(run, geometry, priors.drift)
     if not visits:
         return None
     visit = visits[0]
-    found = explain(visit.trace, geometry, priors)
+    found = fit_landmarks(visit.trace, geometry, priors)
     if not found:
         return None
-    seen, covariance = robot(visit.trace, found[0], visit.trace.reference)
+    seen, covariance = robot_pose(visit.trace, found[0], visit.trace.reference)
     since = one.truth.time_ns - visit.time_ns[visit.trace.reference]
     heading = np.unwrap(heading_from_quaternion(one.truth.quaternion))
     x, y, turned = (
         np.interp(0, since, column) for column in (*one.truth.position[:, :2].T, heading)
     )
-    # The frame of the reading is the landmark's but for quarter turns.
+    # The frame of the fit is the landmark's up to quarter turns.
     quarters = round((turned - seen[2]) / (math.pi / 2))
     turn = quarters * math.pi / 2
     c, s = math.cos(turn), math.sin(turn)
@@ -74,7 +74,7 @@ def nominal() -> list[Read]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", range(16))
-def test_every_code_is_read_without_errors(code: int) -> None:
+def test_codes_of_traces_without_errors(code: int) -> None:
     one = read(passes(1, code, errors=NONE, seed=5, start=(0.7 * code, 0.1))[0])
     assert one is not None
     assert one.found[0].code == one.right
@@ -93,11 +93,11 @@ def test_one_pass_with_nominal_errors() -> None:
     assert np.mean([one.found[0].code == one.right for one in nominal()]) > 0.92
 
 
-def test_probabilities_are_honest() -> None:
-    told = np.array([one.found[0].probability for one in nominal()])
+def test_probabilities_are_calibrated() -> None:
+    probability = np.array([one.found[0].probability for one in nominal()])
     right = np.array([one.found[0].code == one.right for one in nominal()])
-    assert right[told > 0.99].all()
-    assert abs(told.mean() - right.mean()) < 0.06
+    assert right[probability > 0.99].all()
+    assert abs(probability.mean() - right.mean()) < 0.06
     for one in nominal():
         assert math.fsum(e.probability for e in one.found) == pytest.approx(1, abs=1e-6)
         assert [e.probability for e in one.found] == sorted(
@@ -105,7 +105,7 @@ def test_probabilities_are_honest() -> None:
         )
 
 
-def test_covariances_are_honest() -> None:
+def test_covariances_agree_with_the_errors() -> None:
     squares = [
         one.error @ np.linalg.solve(one.covariance, one.error)
         for one in nominal()
@@ -115,7 +115,7 @@ def test_covariances_are_honest() -> None:
 
 
 @pytest.mark.slow
-def test_weak_magnets_are_doubted_not_misread() -> None:
+def test_weak_magnets_are_not_misread_with_certainty() -> None:
     weak = Geometry(remanence_t=0.4, threshold_t=1.1e-3)
     for one in passes(15, geometry=weak, seed=22):
         got = read(one, weak)
@@ -124,7 +124,7 @@ def test_weak_magnets_are_doubted_not_misread() -> None:
 
 
 @pytest.mark.slow
-def test_after_a_spin_all_is_known() -> None:
+def test_spin_determines_code_and_pose() -> None:
     for one in passes(8, then="spin", seed=23):
         got = read(one)
         assert got is not None
@@ -133,41 +133,41 @@ def test_after_a_spin_all_is_known() -> None:
         assert np.hypot(*got.error[:2]) < 1.5e-3
 
 
-def test_a_missing_bar_is_named_and_both_codes_kept() -> None:
+def test_missing_bar_leaves_both_codes() -> None:
     one = passes(1, 0b0111, then="spin", errors=NONE, seed=3)[0]
     whole = read(one)
     assert whole is not None
     bar = next(k for k in range(4) if whole.found[0].strength[k] < 0)
-    lacking = replace(
+    without_bar = replace(
         whole.trace,
-        value_t=whole.trace.value_t - field_of_bar(whole, bar),
+        field_t=whole.trace.field_t - field_of_bar(whole, bar),
     )
-    found = explain(lacking, GEOMETRY, Priors(noise_t=2e-5))
-    assert found[0].free == bar
+    found = fit_landmarks(without_bar, GEOMETRY, ModelPriors(noise_t=2e-5))
+    assert found[0].faulty_bar == bar
     assert abs(found[0].strength[bar]) < 0.1
-    told = {e.code: e.probability for e in found}
-    assert told[0b1111] == pytest.approx(0.5, abs=0.05)
-    assert told[whole.found[0].code] == pytest.approx(0.5, abs=0.05)
+    probability = {e.code: e.probability for e in found}
+    assert probability[0b1111] == pytest.approx(0.5, abs=0.05)
+    assert probability[whole.found[0].code] == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.parametrize("toward", [-0.8, -0.1, 0.0, 0.7, 0.79, 1.2])
-def test_a_landmark_is_the_same_in_the_frame_of_another_hypothesis(toward: float) -> None:
+def test_rotated_frames_give_equal_fields(toward: float) -> None:
     rng = np.random.default_rng(1)
     parameters = rng.uniform(-3, 3, (20, 5))
     strength = rng.choice([-1.0, 0.0, 1.0], (20, 4))
-    bars, turned = _in_one_frame(strength, parameters, toward)
+    bars, turned = _rotate_frames(strength, parameters, toward)
     assert np.abs(turned[:, 2] - toward).max() <= math.pi / 4 + 1e-12
     assert (turned[:, [0, 1, 3, 4]] == parameters[:, [0, 1, 3, 4]]).all()
     points = rng.uniform(-0.05, 0.05, (7, 2))
     for k in range(20):
         fields = [
-            basis(GEOMETRY, seen_under(angle, points)) @ laid
+            basis(GEOMETRY, in_frame(angle, points)) @ laid
             for angle, laid in ((parameters[k, 2], strength[k]), (turned[k, 2], bars[k]))
         ]
         assert fields[0] == pytest.approx(fields[1], abs=1e-12)
 
 
-def seen_under(angle: float, points: Array) -> Array:
+def in_frame(angle: float, points: Array) -> Array:
     """Points (n, 2) in a frame that is turned by an angle."""
     c, s = math.cos(angle), math.sin(angle)
     return points @ np.array([[c, -s], [s, c]])
@@ -176,18 +176,18 @@ def seen_under(angle: float, points: Array) -> Array:
 def field_of_bar(one: Read, bar: int) -> Array:
     """What one bar adds to a trace, laid as it was read."""
     mark = one.found[0].parameters[:3]
-    local = seen_under(mark[2], one.trace.places() - mark[:2])
+    local = in_frame(mark[2], one.trace.sensor_positions() - mark[:2])
     return np.asarray(one.found[0].strength[bar] * basis(GEOMETRY, local)[..., bar])
 
 
-def test_a_robot_that_stands_knows_its_place() -> None:
+def test_pose_at_known_landmark_at_rest() -> None:
     """To a millimetre, as the paper says of four voltages (4.1), and to what it tells.
 
     Under some headings, with a sensor over no bar, the heading shows little.
     """
     sizes, squares = [], []
     for one in passes(12, 0b0111, then="stand", aim_m=0.002, seed=24):
-        run = driven(one.samples, one.odometry)
+        run = preprocess(one.samples, one.odometry)
         still = slice(len(run.samples) - 20, None)
         value = (run.samples.field_t - run.offset_t)[still].mean(axis=0)[None]
         trace = Trace(
@@ -205,14 +205,16 @@ def test_a_robot_that_stands_knows_its_place() -> None:
         true = np.array([c * x + s * y, c * y - s * x, heading - turn])
         near = true + [0.004, -0.003, 0.08]
         laid = signs(rotated(0b0111, -quarters))
-        seen, spread = stand(trace, GEOMETRY, Priors(noise_t=run.noise_t), laid, near)
+        seen, spread = estimate_pose_at_known_landmark(
+            trace, GEOMETRY, ModelPriors(noise_t=run.noise_t), laid, near
+        )
         sizes.append(np.hypot(*(seen - true)[:2]))
         squares.append((seen - true) @ np.linalg.solve(spread, seen - true))
     assert np.mean(sizes) < 1e-3
     assert 0.5 < np.mean(squares) < 5
 
 
-def test_covariance_of_the_robot_is_that_of_the_parameters() -> None:
+def test_covariance_of_robot_pose() -> None:
     """By differences of the pose by each parameter."""
     one = nominal()[0]
     best = one.found[0]
@@ -222,9 +224,9 @@ def test_covariance_of_the_robot_is_that_of_the_parameters() -> None:
         step = np.zeros(len(best.parameters))
         step[k] = 1e-6
         ahead, behind = (
-            robot(one.trace, replace(best, parameters=best.parameters + sign * step), at)[0]
+            robot_pose(one.trace, replace(best, parameters=best.parameters + sign * step), at)[0]
             for sign in (1, -1)
         )
         slope.append((ahead - behind) / 2e-6)
     own = np.array(slope).T @ best.covariance @ np.array(slope)
-    np.testing.assert_allclose(robot(one.trace, best, at)[1], own, rtol=1e-5, atol=1e-14)
+    np.testing.assert_allclose(robot_pose(one.trace, best, at)[1], own, rtol=1e-5, atol=1e-14)
