@@ -143,7 +143,7 @@ def test_recordings_that_cannot_be_used_are_named(
     assert result.exit_code == 3
     left_out = json.loads(result.stdout)["left_out"]
     assert left_out == {
-        str(quiet): "no landmark was seen",
+        str(quiet): "no landmark was detected",
         str(lost): "no odometry of robot",
         str(strange): "another map than in the first session",
     }

@@ -71,7 +71,7 @@ def visits_of(
         c, s = math.cos(quarters * HALF_PI), math.sin(quarters * HALF_PI)
         x, y = floor.place(cell) + off[0] * np.array([c, s]) + off[1] * np.array([-s, c])
         a, b = math.cos(rotation), math.sin(rotation)
-        estimates = np.array(
+        odometry = np.array(
             [1 + a * x - b * y, 2 + b * x + a * y, quarters * HALF_PI + off[2] + rotation]
         )
         own = Hypothesis(
