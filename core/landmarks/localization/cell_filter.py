@@ -200,18 +200,18 @@ def identify_cells(
         shape = likelihood[number].shape
         likelihood[number] = np.broadcast_to(of_code[:, None, None, None], shape)
         outside_likelihood[number] = float(of_code.sum())
-    miss = _miss_likelihood(floor)
+    miss = miss_likelihood(floor)
 
     prior = (1 - START_OUTSIDE_PROBABILITY) / (4 * miss.size)
     start_outside = START_OUTSIDE_PROBABILITY * outside_likelihood[0]
     forward = [_normalized(likelihood[0] * prior, start_outside)]
     for step, now, now_outside in zip(steps, likelihood[1:], outside_likelihood[1:], strict=True):
-        belief, outside = _predict(*forward[-1], step, len(now), miss)
+        belief, outside = predict(*forward[-1], step, len(now), miss)
         forward.append(_normalized(belief * now, outside * now_outside))
     backward = [(np.ones_like(likelihood[-1]), 1.0)]
     for k in range(len(steps) - 1, -1, -1):
         belief, outside = backward[-1]
-        earlier = _predict_backward(
+        earlier = predict_backward(
             belief * likelihood[k + 1],
             outside * outside_likelihood[k + 1],
             steps[k],
@@ -285,7 +285,7 @@ def _code_likelihood(hypotheses: list[tuple[int, Hypothesis]], code: int, misrea
     )
 
 
-def _miss_likelihood(floor: FloorMap) -> Array:
+def miss_likelihood(floor: FloorMap) -> Array:
     """Return the likelihood (rows, columns) of passing a cell without a visit, with pad."""
     padded = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE)
     return np.where(padded == HOLE, 1.0, MISSED_LANDMARK_PROBABILITY)
@@ -295,7 +295,7 @@ def _miss_likelihood(floor: FloorMap) -> Array:
 
 
 @dataclass(frozen=True)
-class _CellStep:
+class CellStep:
     """Step of whole cells from one visit to the next, in the frame of the first hypothesis.
 
     Attributes
@@ -324,7 +324,7 @@ def _steps_between(
     next_hypotheses: list[tuple[int, Hypothesis]],
     pitch_m: float,
     drift: OdometryDrift,
-) -> list[_CellStep]:
+) -> list[CellStep]:
     """Enumerate the steps of whole cells that agree with the odometry between two visits."""
     shift = second.odometry[:2] - first.odometry[:2]
     rotation = float(second.odometry[2] - first.odometry[2])
@@ -365,7 +365,7 @@ def _steps_between(
                     squared = ((cells[0] - a) ** 2 + (cells[1] - b) ** 2) / sigma_cells**2
                     log_odds = -(squared + (misalignment / frame_sigma) ** 2) / 2
                     if log_odds > -MAX_STEP_LOG_ODDS:
-                        steps.append(_CellStep(i, j, (a, b), quarters, log_odds))
+                        steps.append(CellStep(i, j, (a, b), quarters, log_odds))
     # The quality of the odometry is no evidence of the cell: the best step counts in full.
     best = max((step.log_odds for step in steps), default=0.0)
     return [replace(step, log_odds=step.log_odds - best) for step in steps]
@@ -378,7 +378,7 @@ def _position_sigma(hypothesis: Hypothesis) -> float:
 
 
 def _repeated_visits(
-    followed: list[list[tuple[int, Hypothesis]]], steps: list[list[_CellStep]]
+    followed: list[list[tuple[int, Hypothesis]]], steps: list[list[CellStep]]
 ) -> dict[int, int]:
     """Find visits to landmarks that another visit determines better.
 
@@ -412,8 +412,8 @@ def _repeated_visits(
     return repeated
 
 
-def _predict(
-    belief: Array, outside: float, steps: list[_CellStep], count: int, miss: Array
+def predict(
+    belief: Array, outside: float, steps: list[CellStep], count: int, miss: Array
 ) -> tuple[Array, float]:
     """Predict the belief at the next visit.
 
@@ -422,7 +422,7 @@ def _predict(
     belief : (H, 4, rows, columns) ndarray
     outside : float
         Probability of being outside of the map.
-    steps : list of _CellStep
+    steps : list of CellStep
     count : int
         Number of hypotheses of the next visit.
     miss : (rows, columns) ndarray
@@ -447,10 +447,10 @@ def _predict(
     return predicted, max(outside, 0.0)
 
 
-def _predict_backward(
-    belief: Array, outside: float, steps: list[_CellStep], count: int, miss: Array
+def predict_backward(
+    belief: Array, outside: float, steps: list[CellStep], count: int, miss: Array
 ) -> tuple[Array, float]:
-    """Apply the transpose of :func:`_predict`."""
+    """Apply the transpose of :func:`predict`."""
     total = float(belief.sum()) / belief[0].size / len(belief)
     predicted = np.full((count, *belief.shape[1:]), KIDNAP_PROBABILITY * (total + outside))
     for step in steps:

@@ -88,8 +88,8 @@ SMOOTHED_MODEL_ERROR_T = 3e-5
 """Residual of the field model after the fields of neighbouring landmarks were subtracted."""
 
 NEIGHBOUR_RANGE_M = 0.3
-"""Distance from which on a landmark's field is neglected. It is below 20 uT there for the default
-geometry, a tenth of the noise of a sample."""
+"""Distance from which on a landmark's field is neglected: it is at most 2.3 uT there (default
+geometry), and the noise of a sample is about 150 uT."""
 
 POSE_SIZE = 3
 BAR_SIZE = 12

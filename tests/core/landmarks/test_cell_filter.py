@@ -14,12 +14,19 @@ from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypothes
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, rotated
 from locatk.core.landmarks.localization.cell_filter import (
+    KIDNAP_PROBABILITY,
     OUTSIDE_LANDMARK_PROBABILITY,
     PAD_CELLS,
     CellEstimate,
+    CellStep,
+    IdentifiedVisit,
     identify_cells,
+    predict,
+    predict_backward,
+    select_visits_on_map,
 )
 from locatk.core.landmarks.map.floor import HOLE, STEPS, Cell, FloorMap
+from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
 State = tuple[Cell, int]
@@ -237,3 +244,82 @@ def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
         assert one.cell == other.cell
         assert other.quarters == (one.quarters - number) % 4
         assert other.probability == pytest.approx(one.probability)
+
+
+# ---- guards
+
+
+@pytest.mark.parametrize(
+    ("probability", "cell", "is_used"),
+    [(0.79, (0, 0), False), (0.81, (0, 0), True), (0.81, (0, 1), False), (0.81, (-1, 0), False)],
+)
+def test_visits_on_the_map_need_a_probable_cell_with_a_landmark(
+    probability: float, cell: Cell, is_used: bool
+) -> None:
+    floor = FloorMap(np.array([[5, HOLE]]))
+    estimate = CellEstimate(cell, 0, 0, probability, probability)
+    visit = VisitHypotheses("robot", 0, 0, 1, np.zeros(3), ())
+    segment = VisitSegment(0, 1, np.arange(1), None, np.zeros(3))  # type: ignore[arg-type]
+    visits = [IdentifiedVisit(segment, visit, estimate), IdentifiedVisit(segment, visit)]
+    assert select_visits_on_map(visits, floor) == visits[:1] * is_used
+
+
+def test_visit_without_a_cell_has_no_hypothesis_on_the_map() -> None:
+    visit = VisitHypotheses("robot", 0, 0, 1, np.zeros(3), ())
+    segment = VisitSegment(0, 1, np.arange(1), None, np.zeros(3))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="no cell"):
+        _ = IdentifiedVisit(segment, visit).cell
+
+
+def test_missed_landmarks_cost_probability() -> None:
+    """Of two pairs of equal codes, the one with a hole in between is more probable."""
+    codes = np.full((1, 9), 0)
+    codes[0, [0, 2]] = codes[0, [6, 8]] = 7, 11
+    codes[0, 7] = HOLE
+    floor = FloorMap(codes)
+    path = [((0, 0), 0), ((0, 2), 0)]
+    estimates = found(floor, visits_of(floor, path, [7, 11]))
+    assert [one.cell for one in estimates] == [(0, 6), (0, 8)]
+
+
+def test_recording_may_begin_outside_of_the_map() -> None:
+    """On a map of one landmark, a visit that disagrees is not on the map with certainty."""
+    floor = FloorMap(np.full((12, 12), 3))
+    path = walk(((4, 4), 0), (0, 0, 0, 0))
+    estimates = found(floor, visits_of(floor, path, [5] * 5))
+    assert sum(one.probability for one in estimates) / 5 < 0.01
+
+
+def test_repeated_visits_are_no_evidence_of_the_cell() -> None:
+    floor = FloorMap(np.random.default_rng(8).integers(0, CODE_COUNT, (12, 12)))
+    path = walk(((4, 4), 0), (0, 2, 2, 2, 2))
+    largest = []
+    for count in (2, 6):
+        visits = visits_of(floor, path[:count], on_map(floor, path[:count]))
+        largest.append(max(one.probability for one in found(floor, visits)))
+    assert largest[0] < 0.5
+    assert largest[1] == pytest.approx(largest[0], rel=0.05)
+
+
+def test_kidnapped_robot_may_be_anywhere() -> None:
+    belief = np.zeros((1, 4, 8, 8))
+    belief[0, 1, 3, 3] = 1.0
+    predicted, outside = predict(belief, 0.0, [], 2, np.ones((8, 8)))
+    assert predicted == pytest.approx(KIDNAP_PROBABILITY / predicted.size)
+    assert outside == pytest.approx(KIDNAP_PROBABILITY)
+
+
+def test_backward_prediction_is_the_transpose() -> None:
+    random = np.random.default_rng(3)
+    miss = random.uniform(0.1, 1.0, (9, 8))
+    steps = [
+        CellStep(0, 1, (2, 0), 1, -0.3),
+        CellStep(1, 0, (0, -3), 0, 0.0),
+        CellStep(1, 1, (1, 1), 3, -2.0),
+    ]
+    before, after = random.uniform(0, 1, (2, 4, 9, 8)), random.uniform(0, 1, (3, 4, 9, 8))
+    predicted, outside = predict(before, 0.4, steps, 3, miss)
+    earlier, earlier_outside = predict_backward(after, 0.7, steps, 2, miss)
+    assert (predicted * after).sum() + 0.7 * outside == pytest.approx(
+        (before * earlier).sum() + 0.4 * earlier_outside, rel=1e-12
+    )

@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
+from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.localization import consistency
+from locatk.core.landmarks.localization.cell_filter import CellEstimate, IdentifiedVisit
+from locatk.core.landmarks.localization.smoothing import (
+    LandmarkEstimate,
+    LandmarkPrior,
+    SmoothingResult,
+)
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import VisitSegment
 from locatk.core.landmarks.simulation.session import (
     Faults,
     SimulatedSession,
@@ -85,3 +93,49 @@ def test_uncertain_cells_are_reported(
         assert warning is None
     else:
         assert warning == SolverWarning("localization_uncertain", message)
+
+
+# ---- guards
+
+
+def visits_of(misread: int, unexplained: int, correct: int) -> list[IdentifiedVisit]:
+    """Return visits of the cell (2, 2) that agree with the map or not."""
+    code = int(FLOOR.codes[2, 2])
+    visits = []
+    for refused, codes in (
+        ("not_explained", [code] * unexplained),
+        ("", [code] * correct + [(code + 1) % 16] * misread),
+    ):
+        for read in codes:
+            one = Hypothesis(read, 1.0, np.zeros(3), np.eye(3), np.ones(4), np.ones(4))
+            hypotheses = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (one,), refused=refused)
+            estimate = None if refused else CellEstimate((2, 2), 0, 0, 1.0, 1.0)
+            segment = VisitSegment(0, 5, np.arange(5), None, np.zeros(3))  # type: ignore[arg-type]
+            visits.append(IdentifiedVisit(segment, hypotheses, estimate))
+    return visits
+
+
+@pytest.mark.parametrize(
+    ("misread", "unexplained", "correct", "contradicted"),
+    [(1, 0, 0, False), (2, 0, 4, False), (2, 0, 3, True), (1, 1, 3, True), (0, 2, 0, True)],
+)
+def test_contradictions_are_counted(
+    misread: int, unexplained: int, correct: int, contradicted: bool
+) -> None:
+    visits = visits_of(misread, unexplained, correct)
+    on_map = [visit for visit in visits if visit.estimate is not None]
+    assert consistency.is_map_contradicted(visits, on_map, FLOOR) == contradicted
+
+
+@pytest.mark.parametrize(
+    ("count", "sigmas", "displaced"), [(3, 2.6, True), (3, 2.4, False), (2, 9.0, False)]
+)
+def test_displaced_landmarks_are_found(count: int, sigmas: float, displaced: bool) -> None:
+    cells = [(2, k) for k in range(count)]
+    sigma = np.array([1e-3, 1e-3, 0.01])
+    priors = {cell: LandmarkPrior(np.zeros(3), sigma, np.ones(4), np.ones(4)) for cell in cells}
+    estimates = {cell: LandmarkEstimate(np.zeros(3), np.ones(4), np.eye(7)) for cell in cells}
+    shift = np.array([0.0, -sigmas * 1e-3, 0.0])
+    estimates[2, 0] = replace(estimates[2, 0], pose=shift)
+    found = consistency.find_displaced_landmarks(priors, SmoothingResult([], estimates, 1.0))
+    assert found == ({(2, 0): pytest.approx(sigmas * 1e-3)} if displaced else {})

@@ -210,3 +210,14 @@ def test_cost_does_not_depend_on_the_frame(trace: Trace) -> None:
         problem = problem_of(one, signs(0b1011))
         costs.append(fit_visit(problem, problem.initial_parameters(mark[None])).cost[0])
     assert costs[0] == pytest.approx(costs[1], rel=2e-3)
+
+
+def test_thinned_trace_has_the_weight_of_all_samples(trace: Trace) -> None:
+    costs = []
+    for one in (trace, trace.thinned(12)):
+        problem = problem_of(one, signs(0b1011))
+        residual = problem.residuals(
+            problem.initial_parameters(MARK + [[0.003, 0.0, 0.05]]), jacobian=False
+        )[0]
+        costs.append(float((residual**2).sum()))
+    assert costs[1] == pytest.approx(costs[0], rel=0.3)

@@ -1,4 +1,4 @@
-"""What one visit tells: codes, probabilities and places against simulated truth."""
+"""Hypotheses of one visit: codes, probabilities and poses against simulated truth; guards."""
 
 from __future__ import annotations
 
@@ -10,19 +10,34 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.detection.fit import ModelPriors
+from locatk.core.landmarks.detection import hypotheses
+from locatk.core.landmarks.detection.fit import ModelPriors, ParameterLayout
 from locatk.core.landmarks.detection.hypotheses import (
+    DetectedVisit,
+    Hypothesis,
     LandmarkFit,
+    VisitHypotheses,
     _rotate_frames,
+    check_gains,
+    detect_landmark,
+    detect_visits,
     estimate_pose_at_known_landmark,
+    find_faulty_sensor,
     fit_landmarks,
     robot_pose,
 )
 from locatk.core.landmarks.detection.trace import Trace
 from locatk.core.landmarks.field import basis
+from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
-from locatk.core.landmarks.preprocessing import preprocess, segment_visits
+from locatk.core.landmarks.preprocessing import (
+    HallRecording,
+    VisitSegment,
+    preprocess,
+    segment_visits,
+)
 from locatk.core.landmarks.simulation.options import NONE
 from locatk.core.landmarks.simulation.passes import Pass, passes
 
@@ -230,3 +245,120 @@ def test_covariance_of_robot_pose() -> None:
         slope.append((ahead - behind) / 2e-6)
     own = np.array(slope).T @ best.covariance @ np.array(slope)
     np.testing.assert_allclose(robot_pose(one.trace, best, at)[1], own, rtol=1e-5, atol=1e-14)
+
+
+# ---- guards
+
+
+def line_trace(bins: int = 5) -> Trace:
+    """Return a straight pass without usable odometry errors."""
+    pose = np.column_stack([np.linspace(-0.02, 0.02, bins), np.zeros(bins), np.zeros(bins)])
+    field = np.arange(4.0 * bins).reshape(bins, 4)
+    return Trace(pose, np.zeros((bins, 3, 6)), field, circle(), np.ones(bins), bins // 2)
+
+
+def fit_of(
+    residual_sigma: float = 1.0, gain_sigmas: tuple[float, ...] = (0, 0, 0, 0)
+) -> LandmarkFit:
+    """Return a fit of the code 5 at the origin."""
+    layout = ParameterLayout.of(4, 6)
+    parameters = np.zeros(layout.size)
+    parameters[layout.gain] = gain_sigmas
+    return LandmarkFit(
+        5, 0.0, parameters, np.eye(layout.size), signs(5), np.ones(4), residual_sigma, -1, 1.0
+    )
+
+
+def segment_of(first: int = 0, bins: int = 5) -> VisitSegment:
+    time_ns = np.arange(first, first + bins, dtype=np.int64)
+    return VisitSegment(first, first + bins, time_ns, line_trace(bins), np.zeros(3))
+
+
+def recording_of() -> HallRecording:
+    samples = HallSamples("robot", HallSensors(), np.arange(9, dtype=np.int64), np.ones((9, 4)))
+    return HallRecording(samples, np.zeros((9, 3)), np.zeros(4), 1e-4)
+
+
+@pytest.mark.parametrize(("gain_sigmas", "warned"), [(3.9, False), (4.1, True), (-4.1, True)])
+def test_deviating_gain_is_reported(gain_sigmas: float, warned: bool) -> None:
+    fits = [fit_of(gain_sigmas=(0, 0, gain_sigmas, 0))] * 3
+    warnings = check_gains(fits, recording_of(), ModelPriors())
+    assert [each.code for each in warnings] == ["sensor_gain"] * warned
+    assert all("rear sensor" in each.message for each in warnings)
+
+
+def test_negative_gain_is_an_error() -> None:
+    fits = [fit_of(gain_sigmas=(0, -1.1 / ModelPriors().gain, 0, 0))]
+    with pytest.raises(InputError, match="left sensor of robot has the opposite sign"):
+        check_gains(fits, recording_of(), ModelPriors())
+
+
+@pytest.mark.parametrize(
+    ("bins", "fits", "refused"),
+    [
+        (4, [fit_of(5.9)], ""),
+        (4, [fit_of(6.1)], "not_explained"),
+        (4, [], "too_weak"),
+        (3, [fit_of(1.0)], "too_short"),
+    ],
+)
+def test_visits_are_refused_with_a_reason(
+    bins: int, fits: list[LandmarkFit], refused: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hypotheses, "fit_landmarks", lambda *_: fits)
+    visit = detect_landmark(segment_of(bins=bins), recording_of(), GEOMETRY, ModelPriors())
+    assert visit.refused == refused
+    assert bool(visit.hypotheses) == (refused in ("", "not_explained"))
+
+
+@pytest.mark.parametrize(
+    ("as_given", "without_rear", "faulty"),
+    [(20.0, 5.0, 2), (14.0, 5.0, None), (30.0, 6.5, None)],
+)
+def test_sensor_is_left_out_only_if_that_explains_the_visits(
+    as_given: float, without_rear: float, faulty: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fits(trace: Trace, *_: object, thorough: bool) -> list[LandmarkFit]:
+        assert not thorough
+        is_without_rear = np.isnan(trace.field_t[:, 2]).all()
+        return [fit_of(without_rear if is_without_rear else as_given)]
+
+    monkeypatch.setattr(hypotheses, "fit_landmarks", fits)
+    visit = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), residual_sigma=as_given)
+    visits = [DetectedVisit(segment_of(), visit)]
+    assert find_faulty_sensor(visits, recording_of(), GEOMETRY, ModelPriors()) == faulty
+
+
+@pytest.mark.parametrize("explained", [2, 3])
+def test_sensors_are_checked_only_if_many_visits_are_unexplained(
+    explained: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    monkeypatch.setattr(
+        hypotheses, "fit_landmarks", lambda *_, **__: calls.append(1) or [fit_of(20.0)]
+    )
+    visits = [
+        DetectedVisit(
+            segment_of(), VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), residual_sigma=sigma)
+        )
+        for sigma in [20.0] + [1.0] * explained
+    ]
+    assert find_faulty_sensor(visits, recording_of(), GEOMETRY, ModelPriors()) is None
+    assert bool(calls) == (explained == 2)
+
+
+@pytest.mark.parametrize(("distance_m", "count"), [(0.039, 1), (0.041, 2)])
+def test_successive_visits_to_one_landmark_are_merged(
+    distance_m: float, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def detected(segment: VisitSegment, *_: object) -> VisitHypotheses:
+        odometry = np.array([distance_m * (segment.first > 0), 0.0, 0.0])
+        one = Hypothesis(5, 1.0, np.zeros(3), np.eye(3), signs(5), np.ones(4))
+        return VisitHypotheses("robot", 0, segment.first, segment.stop, odometry, (one,))
+
+    monkeypatch.setattr(hypotheses, "segment_visits", lambda *_: [segment_of(0), segment_of(5)])
+    monkeypatch.setattr(hypotheses, "merge_segments", lambda *_: segment_of(0, 10))
+    monkeypatch.setattr(hypotheses, "detect_landmark", detected)
+    visits = detect_visits(recording_of(), GEOMETRY, ModelPriors(), 0.2)
+    assert len(visits) == count
+    assert visits[0].segment.stop == (10 if count == 1 else 5)

@@ -17,6 +17,7 @@ from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.preprocessing import (
     SATURATION_FRACTION,
+    HallRecording,
     VisitSegment,
     check_odometry,
     preprocess,
@@ -225,3 +226,52 @@ def test_odometry_in_another_unit_is_an_error(factor: float) -> None:
 
 def test_odometry_in_metres_is_accepted() -> None:
     check_odometry(preprocess(session().samples[0], session().odometry[0]), GEOMETRY)
+
+
+# ---- guards
+
+
+def line_recording(length_m: float, field_t: float) -> HallRecording:
+    """Return a straight path over one field of 40 mm half width."""
+    x = np.linspace(-length_m / 2, length_m / 2, 400)
+    pose = np.column_stack([x, np.zeros(400), np.zeros(400)])
+    time_ns = np.arange(400, dtype=np.int64) * 5_000_000
+    field = field_t * np.exp(-((np.linspace(-5, 5, 400)) ** 2))[:, None] * np.ones(4)
+    return HallRecording(
+        HallSamples("robot", HallSensors(), time_ns, field), pose, np.zeros(4), 1e-5
+    )
+
+
+@pytest.mark.parametrize(("length_m", "is_accepted"), [(0.4, True), (2e-3, True), (0.5e-3, False)])
+def test_odometry_at_rest_is_an_error_if_the_field_changes(
+    length_m: float, is_accepted: bool
+) -> None:
+    recording = line_recording(length_m, 0.01)
+    if is_accepted:
+        check_odometry(recording, GEOMETRY)
+    else:
+        with pytest.raises(InputError, match="does not move"):
+            check_odometry(recording, GEOMETRY)
+
+
+@pytest.mark.parametrize(("thresholds", "count"), [(0.45, 0), (0.55, 1)])
+def test_visits_need_a_strong_field(thresholds: float, count: int) -> None:
+    recording = line_recording(0.4, thresholds * GEOMETRY.threshold_t)
+    assert len(segment_visits(recording, GEOMETRY, OdometryDrift())) == count
+
+
+def test_steep_fields_are_no_spikes() -> None:
+    """A step between two levels is no deviation from both neighbours; a lone reading is one."""
+    field = np.full((9, 4), 1e-3)
+    field[4:] = 20e-3
+    assert not np.isnan(remove_invalid_readings(recorded(field))[0]).any()
+    field[7, 1] = 60e-3
+    assert np.argwhere(np.isnan(remove_invalid_readings(recorded(field))[0])).tolist() == [[7, 1]]
+
+
+def test_removed_sensor_is_reported() -> None:
+    recording = line_recording(0.4, 0.01).without_sensor(2)
+    assert np.isnan(recording.samples.field_t).all(axis=0).tolist() == [False, False, True, False]
+    (warning,) = recording.warnings
+    assert warning.code == "sensor_left_out"
+    assert "rear" in warning.message

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.detection.fit import ModelPriors
+from locatk.core.landmarks.detection.hypotheses import Hypothesis, LandmarkFit, VisitHypotheses
 from locatk.core.landmarks.detection.trace import (
     Trace,
     compose,
@@ -19,18 +20,21 @@ from locatk.core.landmarks.detection.trace import (
     sensor_positions,
 )
 from locatk.core.landmarks.field import landmark_field
-from locatk.core.landmarks.landmark import Geometry, signs
+from locatk.core.landmarks.landmark import Geometry, rotated, signs
+from locatk.core.landmarks.localization.cell_filter import CellEstimate, IdentifiedVisit
 from locatk.core.landmarks.localization.smoothing import (
     LandmarkPrior,
     RobotMeasurements,
     SmoothingSystem,
     VisitMeasurement,
     bin_pose_with_gradient,
+    landmark_priors,
     odometry_link,
     relative_pose_with_gradient,
     smooth,
 )
-from locatk.core.landmarks.map.floor import Cell
+from locatk.core.landmarks.map.floor import AsBuiltLandmark, Cell, FloorMap
+from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
 
@@ -214,3 +218,57 @@ def test_two_runs_share_landmarks() -> None:
     for cell in CODES:
         assert both.landmarks[cell].covariance[0, 0] < alone.landmarks[cell].covariance[0, 0]
     assert compose(both.visits[1][0].pose, np.zeros(3)).shape == (3,)
+
+
+# ---- priors of landmarks
+
+
+def identified(code: int, quarters: int, faulty_bar: int = -1) -> IdentifiedVisit:
+    """Return a visit to the cell (0, 0)."""
+    fit = LandmarkFit(
+        code, 0.0, np.zeros(30), np.eye(30), signs(code), np.ones(4), 1.0, faulty_bar, 1.0
+    )
+    one = Hypothesis(code, 1.0, np.zeros(3), np.eye(3), signs(code), np.ones(4), fit)
+    hypotheses = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (one,))
+    segment = VisitSegment(0, 5, np.arange(5), session()[0].visits[0].trace, np.zeros(3))
+    return IdentifiedVisit(segment, hypotheses, CellEstimate((0, 0), quarters, 0, 1.0, 1.0))
+
+
+def floor_with(strength: list[float], sigma: float = 0.01) -> FloorMap:
+    """Return a map of one landmark as built."""
+    built = AsBuiltLandmark(1e-3, -2e-3, 0.01, np.array(strength), np.full(7, sigma))
+    return FloorMap(np.array([[7]]), built={(0, 0): built})
+
+
+def test_prior_of_a_landmark_is_that_of_the_map() -> None:
+    prior = landmark_priors([identified(7, 0)], FloorMap(np.array([[7]])), PRIORS)[0, 0]
+    assert prior.strength.tolist() == signs(7).tolist()
+    assert prior.sigma.tolist() == [1.5e-3, 1.5e-3, 0.012]
+    built = landmark_priors([identified(7, 0)], floor_with([0.9, 1.1, 1.0, -0.8]), PRIORS)[0, 0]
+    assert built.pose == pytest.approx([1e-3, -2e-3, 0.01])
+    assert built.strength.tolist() == [0.9, 1.1, 1.0, -0.8]
+    assert built.strength_sigma.tolist() == [0.01] * 4
+    unknown = landmark_priors([identified(7, 0)], floor_with([1, 1, 1, -1], np.nan), PRIORS)[0, 0]
+    assert unknown.sigma.tolist() == [1.5e-3, 1.5e-3, 0.012]
+    assert unknown.strength_sigma.tolist() == [PRIORS.strength] * 4
+
+
+def test_strengths_as_built_are_not_used_if_the_bar_reads_otherwise() -> None:
+    floor = floor_with([-0.9, 1.1, 0.1, -0.8])
+    prior = landmark_priors([identified(7, 0)], floor, PRIORS)[0, 0]
+    assert prior.strength.tolist() == [1.0, 1.1, 0.1, -0.8]
+    assert prior.strength_sigma.tolist() == [PRIORS.strength, 0.01, 0.01, 0.01]
+
+
+def test_faulty_bar_has_a_weak_prior_in_the_frame_of_the_map() -> None:
+    floor = FloorMap(np.array([[7]]))
+    visit = identified(int(rotated(7, -1)), 1, faulty_bar=0)
+    prior = landmark_priors([visit], floor, PRIORS)[0, 0]
+    assert prior.strength.tolist() == [1.0, 0.0, 1.0, -1.0]
+    assert prior.strength_sigma.tolist() == [PRIORS.strength, 0.5, *[PRIORS.strength] * 2]
+    # A later visit that explains the landmark without a fault takes precedence.
+    both = landmark_priors([visit, identified(7, 0)], floor, PRIORS)[0, 0]
+    assert both.strength.tolist() == signs(7).tolist()
+    # A bar that is known to be missing keeps its strength.
+    missing = landmark_priors([visit], floor_with([1.0, 0.05, 1.0, -1.0]), PRIORS)[0, 0]
+    assert missing.strength.tolist() == [1.0, 0.05, 1.0, -1.0]
