@@ -127,10 +127,10 @@ def _check_same(floor: FloorMap, other: FloorMap, path: Path) -> None:
 
 def _letters(landmark: CalibratedLandmark) -> str:
     """Its bars as they lie, `-` where there is none."""
-    from locatk.core.landmarks.landmark import MIN_BAR_STRENGTH
+    from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
 
     return "".join(
-        "-" if abs(value) < MIN_BAR_STRENGTH else "N" if value > 0 else "S"
+        "-" if abs(value) < MISSING_BAR_STRENGTH else "N" if value > 0 else "S"
         for value in landmark.built.strength.tolist()
     )
 

@@ -122,14 +122,14 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
 
 
 def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    from locatk.core.landmarks.design.generation import DesignOptions, design
+    from locatk.core.landmarks.design.generation import DesignOptions, design_map
     from locatk.core.landmarks.drawing.pack import pack
     from locatk.core.landmarks.simulation import session as simulate
     from locatk.formats import halls
     from locatk.formats.output import atomic_write
     from locatk.formats.pdf import landmarks
 
-    floor = design(DesignOptions(rows=6, columns=8, seed=seed))
+    floor = design_map(DesignOptions(rows=6, columns=8, seed=seed))
     wanted = simulate.SimulationOptions(
         start=(0.3, 0.3, 0.4),
         landmarks=9,

@@ -12,7 +12,7 @@ from locatk.cli import console, map_proof, options
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.design.proof import Proof
+    from locatk.core.landmarks.design.proof import MapProof
     from locatk.core.landmarks.map.floor import FloorMap
 
 
@@ -37,15 +37,15 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
       locatk map check floors/*.toml -q && echo good
       locatk map check map.toml --json | jq '.maps[0].proof.duplicates'
     """
-    from locatk.core.landmarks.design.proof import prove
-    from locatk.core.landmarks.map.as_built import laid_codes
+    from locatk.core.landmarks.design.proof import prove_map
+    from locatk.core.landmarks.map.floor import as_built_codes
     from locatk.formats.maps import read_map
 
-    proved: list[tuple[Path, FloorMap, Proof]] = []
+    proved: list[tuple[Path, FloorMap, MapProof]] = []
     floors = [(path, read_map(path)) for path in maps]
     with console.progress(floors, "Proving") as bar:
         for path, floor in bar:
-            proved.append((path, floor, prove(replace(floor, codes=laid_codes(floor)))))
+            proved.append((path, floor, prove_map(replace(floor, codes=as_built_codes(floor)))))
     for number, (path, floor, proof) in enumerate(proved):
         if number:
             console.result("")
@@ -76,7 +76,7 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
         )
 
 
-def _tell(path: Path, floor: FloorMap, proof: Proof) -> None:
+def _tell(path: Path, floor: FloorMap, proof: MapProof) -> None:
     """The proof of one map."""
     console.result(f"{path}: {map_proof.verdict(proof)}\n")
     console.result(map_proof.lines([*map_proof.floor_lines(floor), *map_proof.proof_lines(proof)]))
@@ -96,7 +96,7 @@ def _tell(path: Path, floor: FloorMap, proof: Proof) -> None:
         )
 
 
-def _hint(proof: Proof) -> str:
-    if not proof.unique:
+def _hint(proof: MapProof) -> str:
+    if not proof.is_unique:
         return "design the map again, or forbid a cell of each duplicate"
     return "lower `detect` in the file, or design the map with --detect"

@@ -17,8 +17,8 @@ from locatk.core.errors import InputError
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.design.analysis import Analysis
-    from locatk.core.landmarks.design.proof import Proof
+    from locatk.core.landmarks.design.analysis import LandmarkAnalysis
+    from locatk.core.landmarks.design.proof import MapProof
     from locatk.core.landmarks.landmark import Geometry
     from locatk.core.landmarks.map.floor import Cell, FloorMap, Wall
 
@@ -125,13 +125,13 @@ def command(
     on_floor(size, [cell for pair in walls for cell in pair], "--wall")
     options.guard_output(output, overwrite=overwrite)
 
-    from locatk.core.landmarks.design.analysis import analyse
+    from locatk.core.landmarks.design.analysis import analyse_landmark
     from locatk.core.landmarks.design.generation import DesignOptions
-    from locatk.core.landmarks.design.proof import prove
+    from locatk.core.landmarks.design.proof import prove_map
     from locatk.formats.map_library import design
     from locatk.formats.maps import write_map
 
-    analysis = analyse(geometry)
+    analysis = analyse_landmark(geometry)
     _check_pitch(geometry, pitch_m)
     wanted = DesignOptions(
         rows=size[0],
@@ -148,7 +148,7 @@ def command(
     with _searching() as told:
         floor = replace(design(wanted, told), name=name)
     with console.working("Proving"):
-        proof = prove(floor)
+        proof = prove_map(floor)
     if not proof.holds:
         raise InputError(
             f"the map that was found is wrong: {map_proof.verdict(proof)}",
@@ -158,8 +158,10 @@ def command(
     _tell(output, floor, proof, analysis, as_json)
 
 
-def _tell(output: Path, floor: FloorMap, proof: Proof, analysis: Analysis, as_json: bool) -> None:
-    from locatk.core.landmarks.design import advice
+def _tell(
+    output: Path, floor: FloorMap, proof: MapProof, analysis: LandmarkAnalysis, as_json: bool
+) -> None:
+    from locatk.core.landmarks.design.analysis import landmark_warnings, pitch_warnings
     from locatk.core.landmarks.design.materials import patterns
 
     found = patterns(floor)
@@ -177,7 +179,7 @@ def _tell(output: Path, floor: FloorMap, proof: Proof, analysis: Analysis, as_js
             ]
         )
     )
-    said = [*advice.warnings(analysis), *advice.pitch_warnings(analysis, floor.pitch_m)]
+    said = [*landmark_warnings(analysis), *pitch_warnings(analysis, floor.pitch_m)]
     if as_json:
         console.emit_json(
             {
@@ -197,12 +199,15 @@ def _tell(output: Path, floor: FloorMap, proof: Proof, analysis: Analysis, as_js
 
 def _landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
     """The tables of one landmark."""
-    from locatk.core.landmarks.design import advice
-    from locatk.core.landmarks.design.analysis import analyse
+    from locatk.core.landmarks.design.analysis import (
+        analyse_landmark,
+        landmark_warnings,
+        pitch_warnings,
+    )
 
-    found = analyse(geometry)
+    found = analyse_landmark(geometry)
     _check_pitch(geometry, pitch_m)
-    said = [*advice.warnings(found), *advice.pitch_warnings(found, pitch_m)]
+    said = [*landmark_warnings(found), *pitch_warnings(found, pitch_m)]
     console.result(map_landmark.text(found, pitch_m))
     if as_json:
         console.emit_json({"version": 1, **map_landmark.entry(found, pitch_m), "warnings": said})

@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING, Any
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.design.analysis import Analysis, Shape
+    from locatk.core.landmarks.design.analysis import (
+        LandmarkAnalysis,
+        PatternAnalysis,
+        ToleranceEffect,
+    )
     from locatk.core.landmarks.landmark import Geometry
 
 
-def text(found: Analysis, pitch_m: float) -> str:
+def text(found: LandmarkAnalysis, pitch_m: float) -> str:
     """The tables for people, in 100 columns."""
     return "\n\n".join(
         (
@@ -21,18 +25,18 @@ def text(found: Analysis, pitch_m: float) -> str:
             "Valleys on the circle of the sensors, counter-clockwise from x:\n"
             + console.table(
                 ("no", "bars", "valleys", "at degrees, + where the field rises"),
-                (_valleys(shape) for shape in found.shapes),
+                (_valleys(pattern) for pattern in found.patterns),
             ),
             "Mountains between them, territory, and where the paper's crossing puts the centre:\n"
             + console.table(
                 ("bars", "mountains mT", "r1 mm", "r2 mm", "gulfs deg", "centre off mm"),
-                (_territory(shape) for shape in found.shapes),
+                (_territory(pattern) for pattern in found.patterns),
             ),
             "Field over the bars, along them: slope in mT/mm, zero off the bar's middle in mm, "
             "and\nthe largest error of that line, within a quarter of the bar's length:\n"
             + console.table(
                 ("bars", *(f"bar {k} at {90 * k}" for k in range(4))),
-                ((shape.letters, *_lines(shape)) for shape in found.shapes),
+                ((pattern.letters, *_lines(pattern)) for pattern in found.patterns),
             ),
             console.table(("needed", "", "because"), _needed(found, pitch_m)),
             "What a deviation does to landmark 3, NNNS:\n"
@@ -40,7 +44,7 @@ def text(found: Analysis, pitch_m: float) -> str:
                 ("", "r1 mm", "r2 mm", "centre off mm", "largest field mT"),
                 (
                     (
-                        row.what,
+                        row.deviation,
                         _number(1e3 * row.r1_m, 1),
                         _number(1e3 * row.r2_m, 1),
                         _number(1e3 * row.bias_m, 2),
@@ -53,22 +57,22 @@ def text(found: Analysis, pitch_m: float) -> str:
     )
 
 
-def entry(found: Analysis, pitch_m: float) -> dict[str, Any]:
+def entry(found: LandmarkAnalysis, pitch_m: float) -> dict[str, Any]:
     """The same for ``--json``: SI units, as each key says (docs/commands.md)."""
-    from locatk.core.landmarks.design.territory import neighbour_field
+    from locatk.core.landmarks.design.territory import max_neighbour_field
 
-    one, all_eight = neighbour_field(found.geometry, pitch_m)
+    one, all_eight = max_neighbour_field(found.geometry, pitch_m)
     hall = found.hall_class
     return {
         "geometry": asdict(found.geometry),
         "patterns": [
             {
-                **asdict(shape),
-                "valleys": len(shape.valleys_rad),
-                "collapsed": shape.collapsed,
-                "skew_rad": shape.skew_rad,
+                **asdict(pattern),
+                "valleys": len(pattern.valleys_rad),
+                "collapsed": pattern.is_collapsed,
+                "skew_rad": pattern.skew_rad,
             }
-            for shape in found.shapes
+            for pattern in found.patterns
         ],
         "sensor_heights_m": found.heights_m,
         "pitch_m": pitch_m,
@@ -80,7 +84,18 @@ def entry(found: Analysis, pitch_m: float) -> dict[str, Any]:
         "largest_t": found.largest_t,
         "hall_range_t": found.range_t,
         "hall_class": hall and {"mv_per_mt": hall[0], "range_t": hall[1]},
-        "tolerances": [asdict(row) for row in found.tolerances],
+        "tolerances": [_tolerance(row) for row in found.tolerances],
+    }
+
+
+def _tolerance(effect: ToleranceEffect) -> dict[str, Any]:
+    """Return the entry of one deviation for ``--json``."""
+    return {
+        "what": effect.deviation,
+        "r1_m": effect.r1_m,
+        "r2_m": effect.r2_m,
+        "bias_m": effect.bias_m,
+        "largest_t": effect.largest_t,
     }
 
 
@@ -103,48 +118,52 @@ def bar(geometry: Geometry) -> str:
     )
 
 
-def _valleys(shape: Shape) -> tuple[object, ...]:
-    count = str(len(shape.valleys_rad)) + (f", not {shape.expected}" if shape.collapsed else "")
+def _valleys(pattern: PatternAnalysis) -> tuple[object, ...]:
+    count = str(len(pattern.valleys_rad)) + (
+        f", not {pattern.expected}" if pattern.is_collapsed else ""
+    )
     at = (
         f"{_clean(math.degrees(angle), 2):>6}{'+' if up else '-'}"
-        for angle, up in zip(shape.valleys_rad.tolist(), shape.rising.tolist(), strict=True)
+        for angle, up in zip(pattern.valleys_rad.tolist(), pattern.rising.tolist(), strict=True)
     )
-    return shape.number, shape.letters, count, " ".join(at).ljust(63)
+    return pattern.number, pattern.letters, count, " ".join(at).ljust(63)
 
 
-def _territory(shape: Shape) -> tuple[str, ...]:
-    sizes = abs(shape.mountains_t)
+def _territory(pattern: PatternAnalysis) -> tuple[str, ...]:
+    sizes = abs(pattern.mountains_t)
     heights = sorted({f"{1e3 * size:.1f}" for size in sizes.tolist()}, key=float)
-    gulfs = sorted({f"{math.degrees(g):.0f}" for g in shape.gulfs_rad.tolist() if g == g}, key=int)
+    gulfs = sorted(
+        {f"{math.degrees(g):.0f}" for g in pattern.gulfs_rad.tolist() if g == g}, key=int
+    )
     return (
-        shape.letters,
+        pattern.letters,
         _span(heights),
-        _number(1e3 * shape.r1_m, 1),
-        _number(1e3 * shape.r2_m, 1),
+        _number(1e3 * pattern.r1_m, 1),
+        _number(1e3 * pattern.r2_m, 1),
         _span(gulfs),
-        _number(1e3 * math.hypot(*shape.bias_m.tolist()), 2),
+        _number(1e3 * math.hypot(*pattern.bias_m.tolist()), 2),
     )
 
 
-def _lines(shape: Shape) -> list[str]:
+def _lines(pattern: PatternAnalysis) -> list[str]:
     return [
         "none"
         if zero != zero
         else f"{slope:5.2f} {_clean(1e3 * zero, 1):>4} {1e3 * off:5.2f}".rjust(16)
         for slope, zero, off in zip(
-            shape.slope_t_per_m.tolist(),
-            shape.zero_m.tolist(),
-            shape.departure_m.tolist(),
+            pattern.slope_t_per_m.tolist(),
+            pattern.zero_m.tolist(),
+            pattern.departure_m.tolist(),
             strict=True,
         )
     ]
 
 
-def _needed(found: Analysis, pitch_m: float) -> list[tuple[str, str, str]]:
-    from locatk.core.landmarks.design.territory import neighbour_field
+def _needed(found: LandmarkAnalysis, pitch_m: float) -> list[tuple[str, str, str]]:
+    from locatk.core.landmarks.design.territory import max_neighbour_field
 
     low, high = found.heights_m
-    one, all_eight = (1e6 * float(field) for field in neighbour_field(found.geometry, pitch_m))
+    one, all_eight = (1e6 * float(field) for field in max_neighbour_field(found.geometry, pitch_m))
     hall = found.hall_class
     return [
         (

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.design.localization_steps import Place
-    from locatk.core.landmarks.design.proof import Faults, Proof
+    from locatk.core.landmarks.design.localization_steps import Start
+    from locatk.core.landmarks.design.proof import FaultEffects, MapProof
     from locatk.core.landmarks.map.floor import Cell, FloorMap
 
 SHOWN = 10
@@ -23,9 +23,9 @@ WINDOW_WORDS = {
 }
 
 
-def verdict(proof: Proof) -> str:
+def verdict(proof: MapProof) -> str:
     """In a few words: what is proved, or what fails."""
-    if not proof.unique:
+    if not proof.is_unique:
         count = proof.duplicate_count
         return (
             f"{count} of {proof.readings} readings {'repeats' if count == 1 else 'repeat'} another"
@@ -33,7 +33,7 @@ def verdict(proof: Proof) -> str:
     if not proof.holds:
         return (
             f"{_misread(proof.promised)} shall be noticed, but two readings differ in only "
-            f"{_landmarks(proof.least_distance or 0)}"
+            f"{_landmarks(proof.min_distance or 0)}"
         )
     if not proof.readings:
         return "unique, as it has no reading"
@@ -63,11 +63,11 @@ def floor_lines(floor: FloorMap) -> list[tuple[str, str]]:
     ]
 
 
-def proof_lines(proof: Proof) -> list[tuple[str, str]]:
+def proof_lines(proof: MapProof) -> list[tuple[str, str]]:
     """What holds: a name and what it is, line by line."""
     share = f"{proof.readings / proof.words:.0%}".replace("%", " %") if proof.words else "-"
     different = (
-        "each is unique" if proof.unique else f"{proof.duplicate_count} repeat an earlier one"
+        "each is unique" if proof.is_unique else f"{proof.duplicate_count} repeat an earlier one"
     )
     if not proof.readings:
         return [("Readings", "none: no window fits on the floor"), ("Localised", _steps(proof))]
@@ -78,18 +78,18 @@ def proof_lines(proof: Proof) -> list[tuple[str, str]]:
             f"{different}",
         )
     ]
-    if proof.least_distance is not None:
+    if proof.min_distance is not None:
         noticed = (
             f"; {_misread(proof.detects)} always noticed"
             if proof.detects
             else "; one misread may pass for another place"
-            if proof.unique
+            if proof.is_unique
             else ""
         )
         lines.append(
             (
                 "Distance",
-                f"any two differ in at least {_landmarks(proof.least_distance)}{noticed}",
+                f"any two differ in at least {_landmarks(proof.min_distance)}{noticed}",
             )
         )
     lines.append(("Localised", _steps(proof)))
@@ -102,17 +102,17 @@ def lines(pairs: list[tuple[str, str]]) -> str:
     return "\n".join(f"{name:<{width}}  {what}" for name, what in pairs)
 
 
-def duplicates(proof: Proof, floor: FloorMap) -> str:
+def duplicates(proof: MapProof, floor: FloorMap) -> str:
     """The first duplicates, with both places."""
     table = console.table(
         ("reads", "at row,column", "heading", "and at", "heading"),
         (
             (
                 read(one.letters, floor.alphabet),
-                _cell(one.one[0]),
-                _degrees(one.one[1]),
-                _cell(one.other[0]),
-                _degrees(one.other[1]),
+                _cell(one.first[0]),
+                _degrees(one.first[1]),
+                _cell(one.second[0]),
+                _degrees(one.second[1]),
             )
             for one in proof.duplicates[:SHOWN]
         ),
@@ -121,7 +121,7 @@ def duplicates(proof: Proof, floor: FloorMap) -> str:
     return table + (f"\n... and {more} more" if more > 0 else "")
 
 
-def faults(proof: Proof) -> str:
+def faults(proof: MapProof) -> str:
     """What one fault breaks."""
     rows = [
         _fault("flipped bar", proof.flipped_bar, "reads as another place, unnoticed"),
@@ -161,24 +161,24 @@ def map_entry(floor: FloorMap) -> dict[str, Any]:
     }
 
 
-def proof_entry(proof: Proof, floor: FloorMap) -> dict[str, Any]:
+def proof_entry(proof: MapProof, floor: FloorMap) -> dict[str, Any]:
     """The proof for ``--json`` (docs/commands.md)."""
-    steps = proof.localisation
+    steps = proof.localization
     return {
         "holds": proof.holds,
-        "unique": proof.unique,
+        "unique": proof.is_unique,
         "readings": proof.readings,
         "words": proof.words,
         "duplicate_count": proof.duplicate_count,
         "duplicates": [
             {
                 "reads": read(one.letters, floor.alphabet).split(),
-                "one": _place(one.one),
-                "other": _place(one.other),
+                "one": _place(one.first),
+                "other": _place(one.second),
             }
             for one in proof.duplicates
         ],
-        "least_distance": proof.least_distance,
+        "least_distance": proof.min_distance,
         "detects": proof.detects,
         "promised": proof.promised,
         "flipped_bar": _fault_entry(proof.flipped_bar),
@@ -197,8 +197,8 @@ def proof_entry(proof: Proof, floor: FloorMap) -> dict[str, Any]:
     }
 
 
-def _steps(proof: Proof) -> str:
-    steps = proof.localisation
+def _steps(proof: MapProof) -> str:
+    steps = proof.localization
     if steps is None or steps.mean is None or steps.p99 is None or steps.worst is None:
         return "never: no start can be told from all others"
     text = f"after {steps.mean:.2g} visited in the mean, {steps.p99:.0f} for 99 % of starts, "
@@ -215,27 +215,27 @@ def _steps(proof: Proof) -> str:
     return text
 
 
-def _fault(name: str, fault: Faults, what: str) -> tuple[str, ...]:
+def _fault(name: str, fault: FaultEffects, what: str) -> tuple[str, ...]:
     return (
         name,
-        f"{100 * fault.share:.3g} %",
+        f"{100 * fault.harmful_fraction:.3g} %",
         str(fault.cases),
         what if fault.harmful else "none: always noticed or right",
         "  ".join(_cell(cell) for cell in fault.worst[:3]) or "-",
     )
 
 
-def _fault_entry(fault: Faults) -> dict[str, Any]:
+def _fault_entry(fault: FaultEffects) -> dict[str, Any]:
     return {
         "cases": fault.cases,
         "harmful": fault.harmful,
-        "share": fault.share,
+        "share": fault.harmful_fraction,
         "worst_cells": fault.worst,
         "by_cell": fault.by_cell,
     }
 
 
-def _place(place: Place) -> dict[str, Any]:
+def _place(place: Start) -> dict[str, Any]:
     (row, column), heading = place
     return {"row": row, "column": column, "heading_deg": 90 * heading}
 

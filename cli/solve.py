@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -18,11 +19,33 @@ scene_option = click.option(
     help="Lighthouse: stations and geometry to assume. [default: auto, decided from the data]",
 )
 
+
+class TemplateResolution(click.ParamType):
+    """Orientations, lateral offsets and points of templates, kept as ``36,5,80``."""
+
+    name = "resolution"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        numbers = [number.strip() for number in str(value).split(",")]
+        if len(numbers) != 3 or not all(number.isdecimal() for number in numbers):
+            self.fail(f"{value!r} is not of the form 36,5,80", param, ctx)
+        return ",".join(str(int(number)) for number in numbers)
+
+
 speed_option = click.option(
     "--speed",
     type=click.FloatRange(min=0, min_open=True, max=100),
     metavar="M/S",
     help="Polaris: speed of the array over the tags, where it is known.",
+)
+
+templates_option = click.option(
+    "--templates",
+    type=TemplateResolution(),
+    metavar="ORIENTATIONS,OFFSETS,POINTS",
+    help="Polaris, --method paper: resolution of the templates, in numbers. Orientations per "
+    "360 deg, lateral offsets within half a sensor spacing to either side, and points per "
+    "template, which extends one tag spacing before and behind the magnet. [default: 36,5,80]",
 )
 
 
@@ -51,6 +74,7 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     help="Dots: the camera (.toml) to use instead of the session's.",
 )
 @speed_option
+@templates_option
 @click.option(
     "--save-scene",
     type=options.PATH,
@@ -86,6 +110,7 @@ def command(
     artifact: Path | None,
     camera: Path | None,
     speed: float | None,
+    templates: str | None,
     save_scene: Path | None,
     jobs: int,
     scheduler: str | None,
@@ -114,6 +139,7 @@ def command(
       locatk solve "s3://bucket/day/*.mcap" -o s3://bucket/solved --scheduler tcp://host:8786
       locatk solve frames.mcap -o solved.mcap --camera camera.toml
       locatk solve pass.mcap -o solved.mcap --artifact tag.toml --speed 0.105
+      locatk solve pass.mcap -o solved.mcap --speed 0.105 --method paper --templates 72,9,80
       locatk solve drive.mcap -o solved.mcap --artifact map.toml --method field
     """
     from locatk.cli import solve_batch
@@ -140,7 +166,7 @@ def command(
         given = [Path(name) for name in names]
         options.guard_output(save_scene, overwrite=overwrite, inputs=[*given, *aside])
 
-    request = Request(method, scene, artifact, camera, speed)
+    request = Request(method, scene, artifact, camera, speed, templates)
     if len(names) > 1:
         check_given(request)
     work = solve_batch.plan(

@@ -30,6 +30,7 @@ class Request:
     artifact: Path | None = None
     camera: Path | None = None
     speed: float | None = None
+    templates: str | None = None
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,9 @@ def lighthouse(session: Session, request: Request) -> Solved:
     from locatk.core.solution import SolverWarning
     from locatk.formats import artifacts, heard, observations
 
-    _check(request, "lighthouse", methods=("bundle", "paper"), refused=("camera", "speed"))
+    _check(
+        request, "lighthouse", methods=("bundle", "paper"), refused=("camera", "speed", "templates")
+    )
     sweeps = observations.read_sweeps(session)
     given = None if request.artifact is None else artifacts.read_scene(request.artifact)
     # Whatever scene it is, the stations know best how they were made.
@@ -85,7 +88,7 @@ def dots(session: Session, request: Request) -> Solved:
     from locatk.core import dots as system
     from locatk.formats import observations, sheets
 
-    _check(request, "dots", methods=("lattice", "paper"), refused=("scene", "speed"))
+    _check(request, "dots", methods=("lattice", "paper"), refused=("scene", "speed", "templates"))
     if request.artifact is not None:
         manifest = sheets.read_manifest(request.artifact)
     else:
@@ -112,6 +115,7 @@ def dots(session: Session, request: Request) -> Solved:
 def polaris(session: Session, request: Request) -> Solved:
     """Solve a session of a magnetometer array over tags."""
     from locatk.core import polaris as system
+    from locatk.core.polaris.published.templates import TemplateGrid
     from locatk.formats import observations, tags
 
     _check(request, "polaris", methods=("joint", "paper"), refused=("scene", "camera"))
@@ -119,7 +123,13 @@ def polaris(session: Session, request: Request) -> Solved:
     known = observations.read_tags(session) if given is None else tags.read_tags(given)
     samples = observations.read_samples(session)
     odometry = observations.read_odometry(session)
-    options = _given(system.SolveOptions, {"method": request.method, "speed_mps": request.speed})
+    grid = None
+    if request.templates is not None:
+        grid = TemplateGrid(*(int(number) for number in request.templates.split(",")))
+    options = _given(
+        system.SolveOptions,
+        {"method": request.method, "speed_mps": request.speed, "templates": grid},
+    )
     start = time.perf_counter()
     solution = system.solve(samples, known, options, odometry=odometry)
     return Solved(solution, time.perf_counter() - start)
@@ -130,7 +140,12 @@ def landmarks(session: Session, request: Request) -> Solved:
     from locatk.core import landmarks as system
     from locatk.formats import maps, observations
 
-    _check(request, "landmarks", methods=("field", "paper"), refused=("scene", "camera", "speed"))
+    _check(
+        request,
+        "landmarks",
+        methods=("field", "paper"),
+        refused=("scene", "camera", "speed", "templates"),
+    )
     given = request.artifact
     floor = observations.read_map(session) if given is None else maps.read_map(given)
     samples = observations.read_halls(session)

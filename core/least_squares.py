@@ -1,14 +1,14 @@
 r"""Nonlinear least squares: Levenberg-Marquardt for batches of problems, and with elimination.
 
-A solver minimizes half the sum of robustly weighted squared residuals, plus Gaussian priors,
+A solver minimizes the sum of the losses of the residuals, plus Gaussian priors,
 
-.. math:: F(x) = \tfrac12 \sum_i \rho(r_i(x)) + \tfrac12 \sum_j (x_j - \mu_j)^2 / \sigma_j^2,
+.. math:: F(x) = \sum_i \rho(r_i(x)) + \tfrac12 \sum_j (x_j - \mu_j)^2 / \sigma_j^2,
 
 by damped Gauss-Newton steps :math:`(H + \lambda\,\mathrm{diag}\,H)\,\delta = -g` with
 :math:`H = J^T W J`, :math:`g = J^T W r` (Levenberg, Q. Appl. Math. 2 (1944) 164; Marquardt, SIAM
-J. 11 (1963) 431). Robust losses enter by iterative reweighting: W holds
-:math:`\rho'(r) / r`. The damping of a problem falls tenfold after a step that lowers its cost and
-rises tenfold after one that does not.
+J. 11 (1963) 431). The loss is :math:`\rho(r) = r^2 / 2`, or a robust one by iterative
+reweighting: W holds :math:`\rho'(r) / r`. The damping of a problem falls tenfold after a step
+that lowers its cost and rises tenfold after one that does not.
 
 Two forms of normal equations share one loop, :func:`minimize`:
 
@@ -85,7 +85,7 @@ class Equations(Protocol):
         """(m,) objective of each problem."""
 
     def solve(self, damping: Array, problems: Indices) -> Any:
-        """Return the damped step of some of the problems."""
+        """Return the damped step of the problems with these indices, of all in the equations."""
 
 
 class Problem(Protocol[State]):
@@ -96,7 +96,10 @@ class Problem(Protocol[State]):
     """
 
     def linearize(self, state: State, problems: Indices) -> Any:
-        """Return the :class:`Equations` of some of the problems at their states."""
+        """Return the :class:`Equations` of the problems with indices ``problems``.
+
+        The rows of ``state`` are the states of these problems, in the same order.
+        """
 
     def retract(self, state: State, step: Any) -> State:
         """Return the state after a step of :meth:`Equations.solve`."""
@@ -122,8 +125,8 @@ class Minimum(Generic[State]):
     iterations : (m,) int ndarray
         Steps tried.
     status : (m,) int ndarray
-        :data:`SMALL_GAIN` or :data:`SMALL_STEP` if converged; :data:`MAX_DAMPING_REACHED` if no
-        step lowered the cost; :data:`RUNNING` if iterations ran out.
+        :data:`SMALL_GAIN` or :data:`SMALL_STEP`; :data:`MAX_DAMPING_REACHED` if no step lowers the
+        cost any further; :data:`RUNNING` if iterations ran out.
     """
 
     state: State
@@ -133,7 +136,7 @@ class Minimum(Generic[State]):
 
     @property
     def converged(self) -> NDArray[np.bool_]:
-        """(m,) whether each problem met a convergence criterion."""
+        """(m,) whether each problem stopped before its iterations ran out."""
         return self.status != RUNNING
 
 
@@ -167,7 +170,7 @@ def minimize(
         A problem has converged when the Euclidean norm of its step is smaller (dense equations
         only).
     inner_iterations_after : int, optional
-        From this iteration on, the eliminated blocks take a step of their own after each step
+        After this many iterations, the eliminated blocks take a step of their own after each step
         (Schur equations only; the problem is a :class:`BlockProblem`). That doubles the work of
         an iteration and shortens the path through curved valleys (inner iterations in Ceres
         Solver; Ruhe and Wedin, SIAM Rev. 22 (1980) 318).

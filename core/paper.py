@@ -1,4 +1,4 @@
-"""Sizes of paper, by name, by width and height, and rolls."""
+"""Sizes of printing paper: sheets by name or by width and height, and rolls by width."""
 
 from __future__ import annotations
 
@@ -58,9 +58,10 @@ def parse_paper(text: str) -> Paper:
     >>> parse_paper("roll:914mm").size_mm
     (914.0, inf)
     """
+    text = text.strip()
     if not text.lower().startswith("roll"):
         return Paper(*paper_size(text))
-    match = _ROLL.fullmatch(text.strip())
+    match = _ROLL.fullmatch(text)
     if match is None or not 0 < float(match[1]) <= MAX_ROLL_WIDTH_MM:
         raise InputError(f"no paper {text!r}", hint="A roll is named by its width: roll:914mm")
     return Paper(f"roll:{float(match[1]):g}mm", (float(match[1]), math.inf))
@@ -94,7 +95,9 @@ def paper_size(text: str, *, landscape: bool | None = None) -> tuple[str, tuple[
         width, height = float(match[1]), float(match[2])
         name = f"{width:g}x{height:g}"
         if not all(0 < side <= MAX_PAPER_MM for side in (width, height)):
-            raise InputError(f"a paper of {name} mm")
+            raise InputError(
+                f"a paper of {name} mm", hint=f"Sides are above 0 and up to {MAX_PAPER_MM:g} mm"
+            )
     elif text.strip().lower() in names:
         name = names[text.strip().lower()]
         width, height = PAPER_SIZES_MM[name]

@@ -35,6 +35,7 @@ MENU = {
     "Reference": [
         "Commands <commands>",
         "File formats <formats>",
+        "The four papers <papers>",
         "Benchmarks <bench>",
         "Firmware <firmware/README>",
         "Architecture <architecture>",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.map.floor import Cell, FloorMap, laid_mark
+from locatk.core.landmarks.map.floor import Cell, FloorMap, as_built_landmark
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def bars_on_floor(floor: FloorMap, cell: Cell) -> tuple[Array, Array, Array]:
         Their middles in the map's frame, in metres; the directions in which they are
         magnetised; their strengths, positive where N, 0 where missing.
     """
-    pose, strength = laid_mark(floor, cell)
+    pose, strength = as_built_landmark(floor, cell)
     at = pose[2] + np.arange(4) * np.pi / 2
     middles = pose[:2] + floor.geometry.radius_m * np.column_stack([np.cos(at), np.sin(at)])
     return middles, at + np.where(strength < 0, -np.pi / 2, np.pi / 2), strength

@@ -22,8 +22,8 @@ import os
 
 from locatk.core.errors import FormatError, error_context
 from locatk.core.landmarks.landmark import CODE_COUNT
-from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.landmarks.map.grid_fit import TOLERANCE_M, built_poses, floor_of
+from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
+from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
 from locatk.core.units import metres, mm_text
 
 HEADER = ("No", "Code", "X mm", "Y mm", "Attr1", "Attr2", "Attr3", "Attr4")
@@ -38,7 +38,7 @@ FINEST_MM = 4
 def dumps_csv(floor: FloorMap) -> str:
     """The table of a map; the same map gives the same text."""
     lines = [";".join(HEADER)]
-    poses = built_poses(floor).tolist()
+    poses = as_built_poses(floor).tolist()
     for number, (cell, (x, y, heading)) in enumerate(zip(floor.cells(), poses, strict=True)):
         turn = round(100 * math.degrees(heading))
         code = int(floor.codes[cell])
@@ -53,7 +53,7 @@ def loads_csv(
     *,
     file: str | os.PathLike[str],
     pitch_m: float | None = None,
-    tolerance_m: float = TOLERANCE_M,
+    tolerance_m: float = MAX_OFFSET_M,
 ) -> FloorMap:
     """The map of a table; pitch and cells are found from the places.
 
@@ -102,7 +102,7 @@ def loads_csv(
             "no landmarks", file=file, hint=f"Expected lines as in {';'.join(HEADER[:4])}"
         )
     with error_context(file):
-        return floor_of(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
+        return floor_from_poses(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
 
 
 class _Line:

@@ -18,8 +18,7 @@ import numpy as np
 from locatk.core.drawing import Line, Polygon, arrow
 from locatk.core.landmarks.drawing.landmark import bar_outlines
 from locatk.core.landmarks.landmark import name
-from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.landmarks.map.grid_fit import built_poses
+from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
@@ -60,7 +59,7 @@ def _draw(document: Drawing, floor: FloorMap) -> None:
     pitch = 1e3 * floor.pitch_m
     height = min(8.0, pitch / 12)
     below = 1e3 * (floor.geometry.radius_m + floor.geometry.bar_width_m / 2) + 0.3 * height
-    for cell, (x, y, heading) in zip(floor.cells(), built_poses(floor).tolist(), strict=True):
+    for cell, (x, y, heading) in zip(floor.cells(), as_built_poses(floor).tolist(), strict=True):
         letters = name(int(floor.codes[cell]))
         at = (1e3 * x, 1e3 * y)
         turn = {"rotation": math.degrees(heading)} if heading else {}

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.design.generation import DesignOptions, empty_floor, with_codes
-from locatk.core.landmarks.design.generation import design as search
-from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.design.generation import design_map as search
+from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, code_of, rotated
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES
@@ -90,7 +90,7 @@ def crop(options: DesignOptions) -> FloorMap | None:
         note = f"cut of the map {entry.file.removesuffix('.txt')} of the library"
         there = blank.codes != HOLE
         floor = with_codes(blank, np.where(there, codes, HOLE), options.seed, (note,))
-        if prove(floor, steps=False).holds:
+        if prove_map(floor, steps=False).holds:
             return floor
     return None
 
@@ -103,7 +103,7 @@ def design(
     Raises
     ------
     InputError, DegenerateError
-        See :func:`locatk.core.landmarks.design.generation.design`.
+        See :func:`locatk.core.landmarks.design.generation.design_map`.
     """
     floor = crop(options)
     return search(options, progress) if floor is None else floor

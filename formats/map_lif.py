@@ -23,8 +23,8 @@ from typing import Any
 
 from locatk.core.errors import FormatError, error_context
 from locatk.core.landmarks.landmark import code_of, name
-from locatk.core.landmarks.map.floor import Cell, FloorMap, neighbour
-from locatk.core.landmarks.map.grid_fit import TOLERANCE_M, built_poses, floor_of
+from locatk.core.landmarks.map.floor import Cell, FloorMap, as_built_poses, neighbour
+from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
 from locatk.formats.output import tool_version
 
 LIF_VERSION = "1.0.0"
@@ -59,7 +59,7 @@ def dumps_lif(floor: FloorMap, stamp: datetime) -> str:
             "nodePosition": {"x": round(x, DECIMALS), "y": round(y, DECIMALS)},
             "vehicleTypeNodeProperties": [{"vehicleTypeId": VEHICLE}],
         }
-        for cell, (x, y, _) in zip(floor.cells(), built_poses(floor).tolist(), strict=True)
+        for cell, (x, y, _) in zip(floor.cells(), as_built_poses(floor).tolist(), strict=True)
     ]
     edges = [
         {
@@ -104,7 +104,7 @@ def loads_lif(
     *,
     file: str | os.PathLike[str],
     pitch_m: float | None = None,
-    tolerance_m: float = TOLERANCE_M,
+    tolerance_m: float = MAX_OFFSET_M,
 ) -> FloorMap:
     """The map of a layout; pitch and cells are found from the places of the nodes.
 
@@ -142,7 +142,7 @@ def loads_lif(
     if not codes:
         raise read.error("a layout without nodes", "nodes")
     with error_context(file):
-        floor = floor_of(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
+        floor = floor_from_poses(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
     ways = set()
     for number, edge in enumerate(read.objects(layout, "edges")):
         ends = [read.text(edge, key, f"edges[{number}]") for key in ("startNodeId", "endNodeId")]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.field import basis
-from locatk.core.landmarks.map.floor import HOLE, FloorMap, laid_mark
+from locatk.core.landmarks.map.floor import HOLE, FloorMap, as_built_landmark
 
 RESOLUTION_M = 0.010
 
@@ -60,7 +60,7 @@ def draw(floor: FloorMap, resolution_m: float = RESOLUTION_M) -> Pixels:
     known[:rows, :columns] = floor.codes != HOLE
     upward = np.where(known[np.ix_(*cell)], FREE, UNKNOWN).astype(np.uint8)
     for at in floor.cells():
-        (x, y, heading), strength = laid_mark(floor, at)
+        (x, y, heading), strength = as_built_landmark(floor, at)
         spans = []
         for middle, count in ((y - bottom, size[0]), (x - left, size[1])):
             first, last = ((middle + s * floor.pitch_m / 2) / resolution_m for s in (-1, 1))

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.drawing import Line, Point, Polygon, arrow
 from locatk.core.landmarks.drawing.landmark import bar_outlines
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, Geometry, name
-from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.landmarks.map.grid_fit import built_poses
+from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
 
 NAMESPACE = "http://www.w3.org/2000/svg"
 INKSCAPE = "http://www.inkscape.org/namespaces/inkscape"
@@ -101,7 +100,7 @@ class _Drawn:
         rows, columns = floor.shape
         self.size_mm = (self.pitch * columns, self.pitch * rows)
         corner = 1e3 * np.array(floor.origin_m) - self.pitch / 2
-        poses = built_poses(floor)
+        poses = as_built_poses(floor)
         self.places = 1e3 * poses[:, :2] - corner
         self.headings = poses[:, 2].tolist()
         self.shapes = [_Shape(floor.geometry, code) for code in range(CODE_COUNT)]

@@ -213,6 +213,17 @@ def test_each_figure_is_explained(system: str) -> None:
     assert not gone, f"docs/bench.md tells of {sorted(gone)}, which locatk bench does not give"
 
 
+def test_papers_name_figures_of_the_bench() -> None:
+    """Names with a colon in docs/papers.md are rows that docs/bench.md explains."""
+    told = [name for system in BENCHES for name in explained(system)]
+    text = (DOCS / "papers.md").read_text(encoding="utf-8")
+    spans = {re.sub(r"<.*?>", "*", span) for span in re.findall(r"`([^`\n]+)`", text)}
+    named = {span for span in spans if ": " in span}
+    assert len(named) > 50
+    unknown = {name for name in named if not any(same(name, one) for one in told)}
+    assert not unknown, f"docs/papers.md names rows that no bench has: {sorted(unknown)}"
+
+
 def test_names_of_figures_are_found() -> None:
     """The test above must see what there is: names with what a function says of their parts."""
     body = """

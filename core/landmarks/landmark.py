@@ -26,10 +26,6 @@ CODE_COUNT = 16
 HALF_PI_RAD = np.pi / 2
 """Rotation of a landmark by one quarter turn, which maps bars onto bars."""
 
-MIN_BAR_STRENGTH = 0.25
-"""Strength of a bar, relative to the nominal one, below which its direction cannot be
-determined: it counts as missing. Chosen."""
-
 PATTERNS = ("NSNS", "SSSN", "NNNS", "NNSS", "NNNN", "SSSS")
 """By the paper's number minus one. The text of the paper does not state which of SSSN and NNNS is
 landmark 2, and which of NNNN and SSSS is landmark 5."""

@@ -20,6 +20,7 @@ from locatk.core.polaris.localization import along, corrections, joined, tag_pos
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import cleaned
 from locatk.core.polaris.published import pipeline as paper
+from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.results import HeadingCorrection, PolarisFacts, TagDetection
 from locatk.core.polaris.tag import Tags, places
 from locatk.core.solution import Solution, SolverWarning
@@ -56,10 +57,13 @@ class SolveOptions:
     speed_mps : float or None
         Speed of the array over the floor where it is known and constant; ``paper`` needs
         it. None leaves the way to odometry, else to the field itself.
+    templates : TemplateGrid or None
+        Resolution of the templates of ``paper``; None for the paper's.
     """
 
     method: str = "joint"
     speed_mps: float | None = None
+    templates: TemplateGrid | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -67,6 +71,10 @@ class SolveOptions:
         if self.speed_mps is not None and not 0 < self.speed_mps < 100:
             raise InputError(
                 f"a speed of {self.speed_mps!r} m/s cannot be", hint="Give it in metres a second"
+            )
+        if self.templates is not None and self.method != "paper":
+            raise InputError(
+                f"method {self.method} uses no templates", hint="Give them with --method paper"
             )
 
 
@@ -177,7 +185,7 @@ def _seen(
                 "the published algorithm needs the tag",
                 hint="Give it as --artifact, or import with --tag",
             )
-        sightings = paper.sightings(recording, tags, options.speed_mps)
+        sightings = paper.detect_magnets(recording, tags, options.speed_mps, options.templates)
         return [seen for sighting in sightings for seen in identify(sighting, recording, tags)], 0
     path = None
     if options.speed_mps is not None:

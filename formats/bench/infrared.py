@@ -40,6 +40,8 @@ from locatk.core.lighthouse.published.light_decoding import (
 )
 from locatk.core.lighthouse.recording import Edges
 from locatk.formats.bench import Figure
+from locatk.formats.bench.infrared_microcontroller import STAGES
+from locatk.formats.bench.infrared_microcontroller import figures as microcontroller_figures
 from locatk.formats.bench.infrared_places import figures as place_figures
 from locatk.formats.bench.infrared_survive import figures as survive_figures
 from locatk.formats.bench.timing import alone, cpu_seconds
@@ -81,6 +83,7 @@ def figures(data: Path) -> list[Figure]:
         (_windows, {"windows of 16 us read": "%"}),
         (_others, {"bursts decoded, oneLH_2D": "%", "bursts decoded, twoLH_2D": "%"}),
         (_fpga, {f"bursts read, {name}": "of 103" for name in FPGA}),
+        (microcontroller_figures, {f"microcontroller, {s.name}: mean": "us" for s in STAGES}),
     ):
         found += _or_why(measure, folder, names)
     return [*found, *place_figures(), *survive_figures(data), *_speed(data)]

@@ -23,7 +23,7 @@ from locatk.core.landmarks.localization import cell_filter as globalize
 from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY
 from locatk.core.landmarks.localization.consistency import CERTAIN_PROBABILITY
 from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
-from locatk.core.landmarks.map.windows import path, readings
+from locatk.core.landmarks.map.windows import window_path, window_readings
 from locatk.core.landmarks.simulation.options import Errors
 from locatk.core.landmarks.simulation.sensors import odometry
 from locatk.core.landmarks.solver import SolveOptions
@@ -122,8 +122,8 @@ class Walk:
 
 def windows_of(floor: FloorMap) -> list[Walk]:
     """The window from every start (cell, heading) that has one."""
-    found = readings(floor)
-    turns = np.diff(path(floor.window, 0), axis=0, prepend=[[0, -1]])
+    found = window_readings(floor)
+    turns = np.diff(window_path(floor.window, 0), axis=0, prepend=[[0, -1]])
     turn = [STEPS.index((int(a), int(b))) for a, b in turns]
     return [
         Walk(

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.kernels import kernels
 from locatk.core.landmarks import field as bars
-from locatk.core.landmarks.design.generation import DesignOptions, design
-from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.design.generation import DesignOptions, design_map
+from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.detection import fit
 from locatk.core.landmarks.detection.hypotheses import detect_landmark
 from locatk.core.landmarks.landmark import Geometry
@@ -224,11 +224,11 @@ def search_time(side: int, window: str, alphabet: str, seeds: int) -> tuple[floa
     for seed in range(seeds):
         start = process_time()
         try:
-            floor = design(DesignOptions(side, side, window, alphabet, seed=seed))
+            floor = design_map(DesignOptions(side, side, window, alphabet, seed=seed))
         except LocatkError:
             longest = math.inf
             continue
-        found += prove(floor, steps=False).unique
+        found += prove_map(floor, steps=False).is_unique
         longest = max(longest, process_time() - start)
     return float(found), longest if found == seeds else math.inf
 
@@ -241,7 +241,7 @@ def a_large_map() -> FloorMap:
 def proof_time() -> tuple[float, float]:
     """Duplicates of a map of 100 x 100, and seconds to prove it."""
     floor = a_large_map()
-    return float(prove(floor).duplicate_count), cpu_seconds(lambda: prove(floor), 3)
+    return float(prove_map(floor).duplicate_count), cpu_seconds(lambda: prove_map(floor), 3)
 
 
 def reading_time() -> tuple[float, float]:
@@ -268,6 +268,6 @@ def published_maps(folder: Path) -> Figure:
         floors = [read_published(folder, name) for name in PUBLISHED]
     except (OSError, ValueError) as error:
         return Figure(name, None, "readings", f"not measured: {error}", 0.0)
-    repeated = sum(prove(floor, steps=False).duplicate_count for floor in floors)
+    repeated = sum(prove_map(floor, steps=False).duplicate_count for floor in floors)
     return Figure(name, float(repeated), "readings",
                   f"of {len(floors)} maps: {', '.join(PUBLISHED)}", 0.0)  # fmt: skip

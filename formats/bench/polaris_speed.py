@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -12,7 +11,12 @@ from numpy.typing import NDArray
 
 from locatk.core.kernels import kernels
 from locatk.core.polaris.published import ddtw
-from locatk.core.polaris.published.templates import OFFSETS, POINTS, template_set, templates
+from locatk.core.polaris.published.cylinders import cylinder_fields
+from locatk.core.polaris.published.templates import (
+    TemplateGrid,
+    dipole_fields,
+    template_set,
+)
 from locatk.core.polaris.tag import Tags
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED, alone, cpu_seconds, measured
@@ -42,12 +46,13 @@ def speed_figures() -> list[Figure]:
     """All figures of speed but that of a run."""
     rows = []
     for count, (align_ms, make_ms) in SETS.items():
-        name = f"{count:,} templates of {POINTS} samples"
+        name = f"{count:,} templates of {TemplateGrid.points} samples"
         peer, peer_ms = ALIGNED[count]
         rows.append(
             measured(f"DDTW, {name}", "ms", f"polaris_speed.aligning({count})", 1e3,
-                     f"distances() of one window of {POINTS} x 3 samples to slopes that are ready, "
-                     f"one thread, best of 20; {KERNEL}", align_ms, peer=peer, peer_value=peer_ms)
+                     f"distances() of one window of {TemplateGrid.points} x 3 samples to slopes "
+                     f"that are ready, one thread, best of 20; {KERNEL}", align_ms,
+                     peer=peer, peer_value=peer_ms)
         )  # fmt: skip
         rows += [_beside(peer, count) for peer in PEERS]
         peer, peer_ms = MADE[count]
@@ -56,7 +61,7 @@ def speed_figures() -> list[Figure]:
                      "template_set(): dipoles, one thread, best of 20", make_ms,
                      peer=peer, peer_value=peer_ms),
             measured(f"{name} made, cylinders", "ms", f"polaris_speed.making({count}, 'cylinder')",
-                     1e3, "templates(): magpylib, two moments turned, one thread, best of 20",
+                     1e3, "template_set(): magpylib's cylinders, one thread, best of 20",
                      None, peer=peer, peer_value=peer_ms),
         ]  # fmt: skip
     return rows
@@ -78,7 +83,7 @@ def _beside(peer: str, count: int) -> Figure:
 
 def window_and_templates(count: int) -> tuple[Array, Array]:
     """A window (n, 3) in noise, and ``count`` templates (N, n, 3)."""
-    field = template_set(Tags(), orientations=count // OFFSETS).field_t
+    field = template_set(*_design(count)).field_t
     rng = np.random.default_rng(SEED)
     return field[count // 3] + rng.normal(0, 0.5e-6, field.shape[1:]), field
 
@@ -123,13 +128,11 @@ _CALLS: dict[str, Callable[[Array, Array], Callable[[], object]]] = {
 
 def making(count: int, model: str = "dipole") -> tuple[float]:
     """Seconds to make a template set of the default tag."""
-    tags, orientations = Tags(), count // OFFSETS
-    if model == "dipole":
-        return (cpu_seconds(lambda: template_set(tags, orientations=orientations), 20),)
-    along = np.linspace(-1, 1, POINTS) * tags.spacing_m
-    lateral = np.linspace(-1, 1, OFFSETS) * tags.spacing_m / 4
-    angle = np.linspace(0, math.tau, orientations, endpoint=False)
-    call = lambda: templates(  # noqa: E731
-        tags.magnet, tags.clearance_m, along, lateral, angle, "cylinder"
-    )
-    return (cpu_seconds(call, 20),)
+    fields = dipole_fields if model == "dipole" else cylinder_fields
+    return (cpu_seconds(lambda: template_set(*_design(count), fields), 20),)
+
+
+def _design(count: int) -> tuple[Tags, float, TemplateGrid]:
+    """Return the default tag, the largest lateral offset of its array, and the grid of a set."""
+    tags = Tags()
+    return tags, tags.spacing_m / 4, TemplateGrid(orientations=count // TemplateGrid.offsets)

@@ -69,10 +69,10 @@ def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
 def _landmarks(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
     """The paper's robot on a floor of 6 x 8 landmarks, of which it visits enough to be sure
     where it is."""
-    from locatk.core.landmarks.design.generation import DesignOptions, design
+    from locatk.core.landmarks.design.generation import DesignOptions, design_map
     from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
 
-    floor = design(DesignOptions(rows=6, columns=8, seed=seed))
+    floor = design_map(DesignOptions(rows=6, columns=8, seed=seed))
     simulated = simulate(floor, SimulationOptions(landmarks=6, seed=seed))
     halls.write_session(
         path,

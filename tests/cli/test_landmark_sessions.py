@@ -505,9 +505,9 @@ def test_viewers_see_the_bars(locatk, solver: Solver, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_from_a_log_to_poses(locatk, tmp_path: Path) -> None:
     """Simulated, written as a table, imported again and solved: within 2 mm of the truth."""
-    from locatk.core.landmarks.design.generation import DesignOptions, design
+    from locatk.core.landmarks.design.generation import DesignOptions, design_map
 
-    floor = design(DesignOptions(rows=4, columns=5, seed=3))
+    floor = design_map(DesignOptions(rows=4, columns=5, seed=3))
     board, run = write_map(tmp_path / "map.toml", floor), tmp_path / "run.mcap"
     args = ("--seed", 5, "--landmarks", 4, "-o", run)
     assert locatk("simulate", "landmarks", board, *args).exit_code == 0

@@ -228,7 +228,7 @@ def test_landmark_prints_the_tables(locatk) -> None:
 def test_landmark_warns_of_a_collapse(locatk) -> None:
     result = locatk("map", "design", "--landmark", "--bar", "40x10x5", "--sensor-height", 20)
     assert result.exit_code == 3
-    assert "he valleys of SSSN and NNNS collapse to 2 and not 6" in result.stderr
+    assert "he valleys of SSSN and NNNS collapse to 2 instead of 6" in result.stderr
     assert "at most 17.8 mm" in result.stderr
     assert "2, not 6" in result.stdout
     quiet = locatk("map", "design", "--landmark", "--sensor-height", 24, "-q")

@@ -389,6 +389,39 @@ def test_speed_is_refused_elsewhere(locatk, record, tmp_path: Path) -> None:
     assert "--speed means nothing to lighthouse" in result.stderr
 
 
+def test_templates_set_the_resolution_of_the_published_method(locatk, tmp_path: Path) -> None:
+    session = tmp_path / "run.mcap"
+    assert locatk("simulate", "polaris", "-o", session, "--speed", 0.1).exit_code == 0
+    args = ("solve", session, "-o", tmp_path / "solved.mcap", "--speed", 0.1, "--overwrite")
+    result = locatk(*args, "--method", "paper", "--templates", "8, 5,40", "--json")
+    assert result.exit_code in (0, 3), result.stderr
+    (entry,) = json.loads(result.stdout)["sessions"]
+    (found,) = entry["detections"]
+    steps = np.array([magnet["angle_rad"] for magnet in found["magnets"]]) / (math.pi / 4)
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)
+    command = Session.open(tmp_path / "solved.mcap").facts["command"]
+    assert command.endswith("--method paper --speed 0.1 --templates 8,5,40")
+
+
+@pytest.mark.parametrize(
+    ("args", "status", "words"),
+    [
+        (("--templates", "36,5,80"), 1, "method joint uses no templates"),
+        (("--templates", "36,5"), 2, "'36,5' is not of the form 36,5,80"),
+        (("--templates", "36,5,x"), 2, "'36,5,x' is not of the form 36,5,80"),
+        (("--templates", "36,-5,80"), 2, "'36,-5,80' is not of the form 36,5,80"),
+        (("--method", "paper", "--templates", "36,5,4"), 1, "templates with 4 points"),
+    ],
+)
+def test_templates_that_are_refused(
+    locatk, tmp_path: Path, args: tuple[str, ...], status: int, words: str
+) -> None:
+    session = record(tmp_path / "run.mcap")
+    result = locatk("solve", session, "-o", tmp_path / "solved.mcap", "--speed", 0.1, *args)
+    assert result.exit_code == status
+    assert words in " ".join(result.stderr.split())
+
+
 def test_viewers_see_the_tag_where_it_lies(locatk, solver: Solver, tmp_path: Path) -> None:
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 

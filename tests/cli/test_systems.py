@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.cli.systems import Request, solve_session
+from locatk.cli.systems import SYSTEMS, Request, solve_session
 from locatk.core import lighthouse
+from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport, Sweeps
@@ -93,3 +94,9 @@ def test_receivers_and_what_stations_sent(
     assert first.code == "other_station_id"
     assert first.message.startswith("on channel 2 the scene has the station 0000000c")
     assert second == OF_SOLVER
+
+
+@pytest.mark.parametrize("system", ["lighthouse", "dots", "landmarks"])
+def test_templates_are_for_polaris(system: str) -> None:
+    with pytest.raises(InputError, match=f"--templates means nothing to {system}"):
+        SYSTEMS[system](None, Request(templates="36,5,80"))  # type: ignore[arg-type]

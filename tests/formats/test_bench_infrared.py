@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from locatk.core.lighthouse.demodulation import identification
-from locatk.formats.bench import Figure, infrared, infrared_places, infrared_survive
+from locatk.formats.bench import (
+    Figure,
+    infrared,
+    infrared_microcontroller,
+    infrared_places,
+    infrared_survive,
+)
 from locatk.formats.importers.libsurvive import read_libsurvive
 
 
@@ -46,6 +52,33 @@ def test_strong_and_weak_recordings_of_the_deck(data: Path) -> None:
     found = infrared._fpga(data / "lighthouse")
     assert [figure.target for figure in found] == [103, 95]
     assert missed(found) == []
+
+
+def test_table_iii_of_the_paper_is_in_its_captures(data: Path) -> None:
+    """The lines of the firmware's stages stand beside that of the light."""
+    if not (data / "lighthouse/benchmarks/twoLH_2D/Logic_analyser_capture.sal").exists():
+        pytest.skip("the captures are not there")
+    found = named(infrared_microcontroller.figures(data / "lighthouse"))
+    for stage, pulses, mean_us, sd_us in (
+        ("demodulation", 10_807, 623.15, 3.65),
+        ("polynomial", 10_807, 127.42, 26.95),
+        ("LFSR index", 10_763, 157.95, 155.61),
+        ("position, one station", 261_691, 141.33, None),
+        ("position, two stations", 32_066, 143.42, None),
+    ):
+        mean = found[f"microcontroller, {stage}: mean"]
+        assert mean.value == pytest.approx(mean_us, abs=0.01)
+        assert mean.how.startswith(f"{pulses:,} pulses")
+        if sd_us is not None:
+            sd = found[f"microcontroller, {stage}: SD"]
+            assert sd.value == pytest.approx(sd_us, abs=0.01)
+    published = [row for row in found.values() if row.peer == "paper, Table III"]
+    assert len(published) == 8
+    for row in published:
+        # The paper rounds to three digits, and 143.4 to 144.
+        assert row.value == pytest.approx(row.peer_value, abs=0.7), row.name
+    assert found["microcontroller: load"].value == pytest.approx(18.14, abs=0.01)
+    assert found["microcontroller: captures with an index"].value == pytest.approx(99.59, abs=0.01)
 
 
 @pytest.mark.slow

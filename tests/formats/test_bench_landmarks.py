@@ -270,7 +270,7 @@ def floor() -> FloorMap:
 
 def test_windows_and_walks_go_from_cell_to_cell(floor: FloorMap) -> None:
     walks = landmarks_global.windows_of(floor)
-    assert len(walks) == len(windows.readings(floor)) == 4 * 23 * 23
+    assert len(walks) == len(windows.window_readings(floor)) == 4 * 23 * 23
     rng = np.random.default_rng(0)
     walks = walks[::97] + [
         landmarks_global.random_walk(floor, (r, c), h, rng) for r in (0, 9, 23) for c in (0, 23)

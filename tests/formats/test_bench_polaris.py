@@ -16,7 +16,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.published.ddtw import distances, prepare
 from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.polaris.simulation.session import SimulatedSession, SimulationOptions, simulate
-from locatk.core.polaris.tag import Tags, places
+from locatk.core.polaris.tag import Tags, angles, places
 from locatk.formats.bench import Figure, polaris, polaris_speed, polaris_study
 
 PROMISED = {
@@ -37,6 +37,18 @@ PROMISED = {
     "varying: position, rigid-aligned, --method paper": 2.36,
     "default: position, authors' metric, --method paper": 1.68,
     "varying: position, authors' metric, --method paper": 2.71,
+    "published runs: wrong bits, --method paper": 1.0,
+    "published runs: not read, --method paper": 0.0,
+    "default: read as 262143, --method paper": 90.0,
+    "varying: read as 255183, --method paper": 100.0,
+    "default: orientation scatter, --method paper": 4.7,
+    "varying: orientation scatter, --method paper": 9.8,
+    "default: orientations off by more than 90 deg, --method paper": 0.0,
+    "varying: orientations off by more than 90 deg, --method paper": 0.0,
+    "default: heading, --method paper": 1.14,
+    "varying: heading, --method paper": 1.78,
+    "default: heading of the position pattern, --method paper": 1.14,
+    "varying: heading of the position pattern, --method paper": 2.21,
     "default, known speed: every bit right": 100.0,
     "default, known speed: x over the bound": 1.15,
     "default, known speed: y over the bound": 1.15,
@@ -153,6 +165,23 @@ def test_the_authors_metric_has_two_anchors_and_no_rotation() -> None:
     assert polaris.anchored_error(turned(there, 0.01), TAG) > 0.3
     # To the right, not to the left: a mirrored layout is no match.
     assert polaris.anchored_error(there * [1, -1], TAG) > 40
+
+
+def test_half_turns_are_counted_against_the_layout() -> None:
+    layout = codec.layout_of(RELEASED, TAG)
+    true = angles(RELEASED, layout.symbols)
+    run = polaris.Run(TAG, True, 0, layout_m(), true + 0.3, 0.3, 1.0, 1.0)
+    other = replace(run, angle_rad=true + 0.3 + [0, math.pi, 1.4, -math.pi, math.tau])
+    lost = replace(run, angle_rad=np.full(5, np.nan), heading_rad=math.nan)
+    assert polaris._half_turns([run, lost]) == 0
+    assert polaris._half_turns([run, other]) == 2
+
+
+def test_heading_of_the_position_pattern_is_absolute_and_in_degrees() -> None:
+    assert polaris._pattern_heading_deg(turned(layout_m(), -0.1)) == pytest.approx(
+        math.degrees(0.1)
+    )
+    assert math.isnan(polaris._pattern_heading_deg(np.full((5, 2), np.nan)))
 
 
 def test_scatter_is_about_each_magnets_own_mean() -> None:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.design.bounds import refuse
+from locatk.core.landmarks.design.bounds import require_enough_words
 from locatk.core.landmarks.design.generation import DesignOptions
-from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, rotated
 from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, FloorMap
-from locatk.core.landmarks.map.windows import ALPHABET_CODES, readings
+from locatk.core.landmarks.map.windows import ALPHABET_CODES, window_readings
 from locatk.formats import map_library
 from locatk.formats.map_library import Entry, crop, entries, relabelling, turned
 
@@ -48,12 +48,12 @@ def test_maps_of_the_library_hold(entry: Entry) -> None:
     codes = entry.codes()
     assert codes.shape == (entry.rows, entry.columns)
     assert set(np.unique(codes)) <= set(ALPHABET_CODES[entry.alphabet])
-    seen = readings(FloorMap(codes, alphabet=entry.alphabet, window=entry.window)).letters
+    seen = window_readings(FloorMap(codes, alphabet=entry.alphabet, window=entry.window)).letters
     size = seen.shape[1]
     for lost in range(size) if entry.detect else [size]:
         rest = np.delete(seen, lost, axis=1) if entry.detect else seen
         assert len({row.tobytes() for row in rest}) == len(seen)
-    refuse(
+    require_enough_words(
         entry.rows,
         entry.columns,
         alphabet=entry.alphabet,
@@ -80,7 +80,7 @@ def test_cuts_hold_and_differ_by_seed(entry: Entry) -> None:
     rows, columns = max(1, min(9, entry.rows - 1)), min(7, entry.columns)
     floors = [crop(wanted(entry, rows, columns, seed)) for seed in range(6)]
     assert all(floor is not None and floor.shape == (rows, columns) for floor in floors)
-    assert all(prove(floor, steps=False).holds for floor in floors if floor)
+    assert all(prove_map(floor, steps=False).holds for floor in floors if floor)
     assert len({floor.codes.tobytes() for floor in floors if floor}) >= 3
     again = crop(wanted(entry, rows, columns, 3))
     assert again is not None
@@ -99,7 +99,7 @@ def test_whole_maps_are_cut_in_both_orientations() -> None:
         for seed in range(8):
             floor = crop(wanted(entry, rows, columns, seed))
             assert floor is not None
-            assert prove(floor, steps=False).unique
+            assert prove_map(floor, steps=False).is_unique
 
 
 @pytest.mark.parametrize("alphabet", ALPHABETS)
@@ -108,8 +108,8 @@ def test_a_turned_map_reads_as_before(alphabet: str, quarters: int) -> None:
     """The same letters in the same order, each under the heading that turned with it."""
     codes = np.random.default_rng(1).choice(ALPHABET_CODES[alphabet], (4, 5))
     for window in WINDOWS:
-        before = readings(FloorMap(codes, alphabet=alphabet, window=window))
-        after = readings(
+        before = window_readings(FloorMap(codes, alphabet=alphabet, window=window))
+        after = window_readings(
             FloorMap(turned(codes, quarters, alphabet), alphabet=alphabet, window=window)
         )
         letters = after.letters
@@ -151,13 +151,13 @@ def test_holes_and_walls_stay() -> None:
     assert floor is not None
     assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE).tolist()} == forbidden
     assert (floor.walls, floor.pitch_m, floor.seed) == (walls, 0.3, 4)
-    assert prove(floor).unique
+    assert prove_map(floor).is_unique
 
 
 def test_what_is_too_large_or_not_there_is_searched_for() -> None:
     corridor = DesignOptions(2, 80)
     assert crop(corridor) is None
-    assert prove(map_library.design(corridor), steps=False).unique
+    assert prove_map(map_library.design(corridor), steps=False).is_unique
     assert map_library.design(DesignOptions(6, 6)).notes != ()
     assert map_library.design(DesignOptions(2, 4, window="I2", alphabet="6")).notes == ()
 
@@ -166,7 +166,7 @@ def test_a_map_that_notices_more_serves_where_less_is_asked() -> None:
     asked = DesignOptions(5, 5, detect=1)
     floor = crop(asked)
     assert floor is not None
-    assert prove(floor, steps=False).detects >= 1
+    assert prove_map(floor, steps=False).detects >= 1
     assert crop(replace(asked, detect=2)) is None
 
 

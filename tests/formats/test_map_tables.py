@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.landmarks.landmark import signs
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
-from locatk.core.landmarks.map.grid_fit import built_poses
+from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap, as_built_poses
 from locatk.formats.map_csv import HEADER, dumps_csv, loads_csv
 from locatk.formats.map_lif import dumps_lif, loads_lif
 
@@ -85,11 +84,11 @@ def test_landmarks_as_built_come_back_where_they_lie(floor: FloorMap, data: st.D
     laid = FloorMap(floor.codes, floor.pitch_m, origin_m=floor.origin_m, built=built)
     for back, turned in ((back_from_csv(laid), True), (back_from_lif(laid), False)):
         np.testing.assert_array_equal(back.codes, laid.codes)
-        places = built_poses(back)
+        places = as_built_poses(back)
         # A place that is as near to its cell as 1 um is the cell's.
-        np.testing.assert_allclose(places[:, :2], built_poses(laid)[:, :2], atol=1.5e-6)
+        np.testing.assert_allclose(places[:, :2], as_built_poses(laid)[:, :2], atol=1.5e-6)
         if turned:
-            np.testing.assert_allclose(places[:, 2], built_poses(laid)[:, 2], atol=1e-9)
+            np.testing.assert_allclose(places[:, 2], as_built_poses(laid)[:, 2], atol=1e-9)
         for cell, found in back.built.items():
             np.testing.assert_array_equal(found.strength, signs(laid.codes[cell]))
             assert np.isnan(found.sigma).all()
@@ -143,8 +142,8 @@ def test_tables_of_others() -> None:
         ("0;1;nan;0\n", 1, "'nan' under 'X mm'"),
         ("0;1;0;1e9\n", 1, "up to 1e+07"),
         ("0;1;0;0;36000\n", 1, "'36000' under 'Attr1'"),
-        ("0;1;0;0\n", None, "one place tells no pitch"),
-        ("0;1;0;0\n1;1;200;0\n2;1;400.1;1\n3;1;402;1\n", None, "line 3 and line 4 lie in one cell"),
+        ("0;1;0;0\n", None, "one position does not give a pitch"),
+        ("0;1;0;0\n1;1;200;0\n2;1;400.1;1\n3;1;402;1\n", None, "line 3 and line 4 are in one cell"),
         ("0;1;0;0\n1;1;200;0\n2;1;311;0\n", None, "on no grid"),
     ],
 )
@@ -280,7 +279,7 @@ def test_what_is_wrong_in_a_layout_is_named(text: str, where: object, words: str
 
 def test_a_node_off_the_grid_is_named() -> None:
     text = changed(lambda d: d["layouts"][0]["nodes"][4]["nodePosition"].update(x=0.43))
-    with pytest.raises(InputError, match=r"node 'r1c2' lies .* in map\.json") as caught:
+    with pytest.raises(InputError, match=r"node 'r1c2' is .* in map\.json") as caught:
         loads_lif(text, file="map.json", pitch_m=0.2)
     assert "--tolerance" in str(caught.value.hint)
 

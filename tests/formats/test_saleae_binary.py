@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.lighthouse.recording import Edges
+from locatk.formats.bench import infrared_microcontroller
 from locatk.formats.importers import saleae_lines
 from locatk.formats.importers.saleae import read_capture, read_light
 
@@ -595,33 +596,6 @@ def test_published_captures(data: Path, name: str) -> None:
             assert line.rises == (level == 0)
 
 
-def high_us(path: Path, number: int) -> np.ndarray:
-    """How long a line was high, each time, in microseconds."""
-    (edges,) = read_light(path, [number])
-    first = 0 if edges.rises else 1
-    tick = edges.tick[first:]
-    n = len(tick) // 2
-    return (tick[1 : 2 * n : 2] - tick[: 2 * n : 2]) / 40
-
-
-def test_busy_lines_give_the_times_of_the_paper(data: Path) -> None:
-    """Table III of the paper, from lines that the reader must not take for light."""
-    folder = data / "lighthouse" / "benchmarks"
-    path = folder / "demodulation_code" / "logic_analyser_capture.sal"
-    for number, n, mean, std in (
-        (5, 10_807, 623.2, 3.7),
-        (6, 10_807, 127.4, 27.0),
-        (7, 10_763, 157.9, 155.6),
-    ):
-        high = high_us(path, number)
-        assert len(high) == n
-        assert high.mean() == pytest.approx(mean, abs=0.06)
-        assert high.std() == pytest.approx(std, abs=0.06)
-    path = folder / "oneLH_2D" / "Logic_analyser_capture.sal"
-    assert high_us(path, 5).mean() == pytest.approx(137.7, abs=0.06)
-    assert high_us(path, 6).mean() == pytest.approx(3.7, abs=0.06)
-
-
 def test_a_bit_flip_in_a_published_capture_is_found(data: Path, tmp_path: Path) -> None:
     whole = (
         data / "lighthouse" / "benchmarks" / "twoLH_2D" / "Logic_analyser_capture.sal"
@@ -633,3 +607,61 @@ def test_a_bit_flip_in_a_published_capture_is_found(data: Path, tmp_path: Path) 
         path.write_bytes(damaged)
         with pytest.raises(InputError):
             read_light(path)
+
+
+# ---- digital lines that are no light
+
+
+def pulses(widths_us: Sequence[float], pause_us: float = 1000.0) -> list[int]:
+    """Edges of a line that is high for each of ``widths_us``, in samples."""
+    steps = [step for width in widths_us for step in (pause_us, width)]
+    return np.round(np.cumsum(steps) * RATE / 1e6).astype(int).tolist()
+
+
+def test_durations_of_the_stages_of_a_firmware(tmp_path: Path) -> None:
+    """Table III of the Lighthouse paper is read from lines beside that of the light."""
+    recorded = {
+        "demodulation_code/logic": {
+            "demodulate_light()": [600.0, 650.0],
+            "determine_polynomial()": [120.0, 140.0],
+            "reverse_count_p()": [50.0],
+        },
+        "oneLH_2D/Logic": {"count_to_camera()": [137.0, 138.0], "apply_homography()": [3.5, 3.5]},
+        "twoLH_2D/Logic": {"count_to_camera()": [137.0], "twoLH_2D": [6.0]},
+    }
+    for name, lines in recorded.items():
+        path = tmp_path / "benchmarks" / f"{name}_analyser_capture.sal"
+        path.parent.mkdir(parents=True)
+        edges = {"LH2 - Data": light(), **{key: pulses(value) for key, value in lines.items()}}
+        capture(path, {key: channel(value, [0, RATE // 100]) for key, value in edges.items()})
+    found = {row.name: row for row in infrared_microcontroller.figures(tmp_path)}
+    assert {name.removeprefix("microcontroller"): row.value for name, row in found.items()} == {
+        ", demodulation: mean": pytest.approx(625.0),
+        ", demodulation: SD": pytest.approx(25.0),
+        ", polynomial: mean": pytest.approx(130.0),
+        ", polynomial: SD": pytest.approx(10.0),
+        ", LFSR index: mean": pytest.approx(50.0),
+        ", LFSR index: SD": pytest.approx(0.0),
+        ", position, one station: mean": pytest.approx(141.0),
+        ", position, two stations: mean": pytest.approx(143.0),
+        ": load": pytest.approx(100 * (1250 + 260 + 50) / 10_000),
+        ": captures with an index": pytest.approx(50.0),
+    }
+    # A capture without the line is refused, with the lines that it has.
+    (tmp_path / "benchmarks/oneLH_2D/Logic_analyser_capture.sal").write_bytes(
+        (tmp_path / "benchmarks/twoLH_2D/Logic_analyser_capture.sal").read_bytes()
+    )
+    with pytest.raises(InputError, match="apply_homography"):
+        infrared_microcontroller.figures(tmp_path)
+
+
+@pytest.mark.parametrize(("level", "widths_us"), [(0, [2.0, 3.0]), (1, [3.0])])
+def test_a_pulse_is_between_a_rising_and_a_falling_edge(
+    tmp_path: Path, level: int, widths_us: list[float]
+) -> None:
+    # Edges at 1, 3, 6 and 9 us, and one at 20 us without a following edge if the line starts low.
+    edges = [40, 120, 240, 360, 800] if level == 0 else [40, 120, 240, 360]
+    coded = channel(edges, [0, 4000], level=level)
+    (line,) = read_light(capture(tmp_path / "run.sal", {"busy": coded}), ["busy"])
+    found = infrared_microcontroller.pulse_widths_us(line)
+    assert found.tolist() == pytest.approx(widths_us)

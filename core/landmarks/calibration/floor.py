@@ -33,7 +33,7 @@ from locatk.core.landmarks.calibration.landmarks import (
     typical_strength,
     weak_priors,
 )
-from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.trace import compose
 from locatk.core.landmarks.halls import HallSamples
@@ -47,8 +47,7 @@ from locatk.core.landmarks.localization.smoothing import (
     measure_visits,
     smooth,
 )
-from locatk.core.landmarks.map.as_built import laid_codes
-from locatk.core.landmarks.map.floor import Cell, FloorMap
+from locatk.core.landmarks.map.floor import Cell, FloorMap, as_built_codes
 from locatk.core.landmarks.solver import IdentifiedRecording, SolveOptions, identify_recording
 from locatk.core.trajectory import Trajectory
 
@@ -323,11 +322,11 @@ def _notes(
 
 def _uniqueness_notes(floor: FloorMap) -> list[str]:
     """Return a note if bars differ from the design, and whether the map is still unique."""
-    codes = laid_codes(floor)
+    codes = as_built_codes(floor)
     changed = int(np.count_nonzero(codes != floor.codes))
     if not changed:
         return []
-    duplicates = prove(replace(floor, codes=codes, built={}), steps=False).duplicate_count
+    duplicates = prove_map(replace(floor, codes=codes, built={}), steps=False).duplicate_count
     differs = "1 landmark differs" if changed == 1 else f"{changed} landmarks differ"
     if not duplicates:
         return [f"{differs} from the design; the map is still unique as built"]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.calibration.datum import deviations_from_design, relative_covariances
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import FAULTY_STRENGTH_SIGMA
-from locatk.core.landmarks.landmark import MIN_BAR_STRENGTH, signs
+from locatk.core.landmarks.landmark import signs
 from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit
 from locatk.core.landmarks.localization.smoothing import (
     LANDMARK_SIGMA,
@@ -21,7 +21,7 @@ from locatk.core.landmarks.localization.smoothing import (
     LandmarkPrior,
     SmoothingResult,
 )
-from locatk.core.landmarks.map.floor import AsBuiltLandmark, Cell, FloorMap
+from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH, AsBuiltLandmark, Cell, FloorMap
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def weak_priors(visits: Sequence[IdentifiedVisit], design: FloorMap) -> dict[Cel
     priors = {}
     for cell, weighted in total.items():
         mean = weighted / weight[cell]
-        direction = np.where(np.abs(mean) < MIN_BAR_STRENGTH, 0.0, np.sign(mean))
+        direction = np.where(np.abs(mean) < MISSING_BAR_STRENGTH, 0.0, np.sign(mean))
         pose = np.array([*design.place(cell), 0.0])
         sigma = np.full(4, FAULTY_STRENGTH_SIGMA)
         priors[cell] = LandmarkPrior(pose, UNKNOWN_POSE_SIGMA, direction, sigma)
@@ -130,7 +130,7 @@ def typical_strength(smoothed: SmoothingResult) -> tuple[float, float]:
     """Return the strength of the typical bar, and the smallest standard deviation of a bar."""
     landmarks = smoothed.landmarks.values()
     strength = np.concatenate([one.strength for one in landmarks])
-    is_present = np.abs(strength) > 2 * MIN_BAR_STRENGTH
+    is_present = np.abs(strength) > 2 * MISSING_BAR_STRENGTH
     if not is_present.any():
         return 1.0, math.nan
     sigma = np.concatenate([np.sqrt(np.diag(one.covariance)[3:]) for one in landmarks])
@@ -193,7 +193,7 @@ def flag_deviations(
     flags = []
     for bar, (value, bar_sigma) in enumerate(zip(strength, sigma[3:], strict=True)):
         magnitude = abs(value)
-        if magnitude < MIN_BAR_STRENGTH:
+        if magnitude < MISSING_BAR_STRENGTH:
             flags.append(f"missing:{bar}")
             continue
         if value * designed[bar] < 0 and magnitude > MIN_FLAG_SIGMAS * bar_sigma:

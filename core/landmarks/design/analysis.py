@@ -1,11 +1,12 @@
-"""What a landmark of some bars is worth: its valleys, territory, reach and tolerances.
+"""Analysis of a landmark's geometry: valleys, territory, pitch, sensors, tolerances, warnings.
 
-Nothing here is measured; all of it follows from the field of the bars in closed form.
+Everything follows from the closed-form field of the bars; nothing is measured.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,70 +14,85 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.design.territory import (
-    contour,
-    equal_corner,
-    field_pitch,
-    gulfs,
-    largest_field,
-    radii,
+    gulf_widths,
+    is_equal_corner,
+    max_field,
+    max_neighbour_field,
+    min_pitch_for_field,
+    territory_radii,
+    threshold_contour,
 )
 from locatk.core.landmarks.design.valleys import (
-    PHASE,
-    STRENGTHS,
-    VALLEYS,
-    crossing,
-    over_bars,
-    valid_heights,
-    valleys,
+    PATTERN_STRENGTHS,
+    SAMPLE_PHASE_STEPS,
+    VALLEY_COUNTS,
+    centre_from_valleys,
+    find_valleys,
+    fit_lines_over_bars,
+    valid_sensor_heights,
 )
 from locatk.core.landmarks.landmark import PATTERNS, Geometry
 
 Array = NDArray[np.float64]
 
-NEIGHBOUR_T = 15e-6
-"""Field of a neighbouring landmark that is let pass at the circle: a half percent of the
-default threshold, and a third of the Earth's."""
+MAX_NEIGHBOUR_FIELD_T = 15e-6
+"""Default limit of the field of a neighbouring landmark at the circle of the sensors: half a
+percent of the default threshold, and a third of the Earth's field."""
 
-HEADROOM = 1.25
-"""Of the sensors' range above the largest field, for lower sensors and stronger bars."""
+SENSOR_RANGE_FACTOR = 1.25
+"""Required range of the sensors over the largest field, for lower sensors and stronger bars."""
 
-HALL_CLASSES = ((100.0, 0.021), (50.0, 0.042), (25.0, 0.085), (12.5, 0.169))
-"""mV/mT and range of linear hall sensors at 5 V: TI DRV5055 A1 to A4 (SBAS640B, 1)."""
+HALL_SENSOR_CLASSES = ((100.0, 0.021), (50.0, 0.042), (25.0, 0.085), (12.5, 0.169))
+"""Sensitivity (mV/mT) and range (T) of linear hall sensors at 5 V: Texas Instruments DRV5055 A1 to
+A4 (data sheet SBAS640B, section 1)."""
+
+MAX_REMANENCE_T = 2.0
+"""Larger values are in another unit; N52 has 1.45 T."""
+
+MAX_VALLEY_OFFSET_RAD = math.radians(15)
+"""Distance of a valley from a multiple of 45 degrees up to which the paper's rule recognises it."""
+
+MAX_EARTH_FIELD_T = 65e-6
+"""Strongest field of the Earth on its surface."""
+
+WORST_PATTERN = 2
+"""Index of landmark 3, NNNS, whose valleys are the most displaced. The radii and tolerances of a
+geometry are those of this pattern."""
 
 
 @dataclass(frozen=True)
-class Shape:
-    """What the sensors see of one pattern, laid as its letters say.
+class PatternAnalysis:
+    """Field of one pattern at the sensors.
 
     Attributes
     ----------
     number : int
-        The paper's, 1 to 6.
+        Number in the paper, 1 to 6.
     letters : str
     expected : int
-        How many valleys it must have to be told from the others.
+        Number of valleys by which the pattern is recognised.
     valleys_rad : (n,) ndarray
         Neutral valleys on the circle of the sensors, ascending from x counter-clockwise.
     rising : (n,) bool ndarray
-        Whether the field rises there, counter-clockwise.
+        True if the field increases there, counter-clockwise.
     mountains_t : (n,) ndarray
         Largest field, signed, between each valley and the next.
     gulfs_rad : (n,) ndarray
-        How wide the contour of the threshold is dented along each valley, by more than
-        :data:`.territory.GULF_M`.
+        Angular width of the gulf of the threshold contour at each valley
+        (:data:`.territory.GULF_DEPTH_M`).
     r1_m, r2_m : float
-        Radii of the half-discs of the threshold, over corners between equal and unequal
-        bars; ``nan`` where the pattern has none.
+        Radii of the quarter discs in which the field exceeds the threshold: r1 between two bars of
+        equal sign, r2 of unequal sign; ``nan`` if the pattern has none.
     bias_m : (2,) ndarray
-        Where the paper's crossing of valleys (section 3.3) puts the centre; ``nan`` where
-        the valleys are not as many as expected.
+        Centre as estimated by the paper's intersection of valleys (section 3.3); ``nan`` if the
+        number of valleys is not the expected one.
     slope_t_per_m : (4,) ndarray
-        Of the field over each bar, along it and counter-clockwise: the line that fits best
-        within a quarter of the bar's length to either side of the zero.
+        Slope of the field along each bar, counter-clockwise: that of the line fitted within a
+        quarter of the bar's length of its zero.
     zero_m : (4,) ndarray
-        From each bar's middle to that zero, counter-clockwise; ``nan`` where there is none.
+        Distance from the middle of each bar to that zero, counter-clockwise; ``nan`` without one.
     departure_m : (4,) ndarray
-        Largest error of the line within that stretch, as a length.
+        Largest error of the line within that interval, as a length.
     """
 
     number: int
@@ -94,22 +110,26 @@ class Shape:
     departure_m: Array
 
     @property
-    def collapsed(self) -> bool:
-        """Whether valleys have merged, so that it is taken for another pattern."""
+    def is_collapsed(self) -> bool:
+        """True if valleys have merged, so that the pattern is taken for another one."""
         return len(self.valleys_rad) != self.expected
 
     @property
     def skew_rad(self) -> float:
         """Largest distance of a valley from the paper's multiples of 45 degrees."""
-        off = self.valleys_rad % (math.pi / 4)
-        return float(np.minimum(off, math.pi / 4 - off).max(initial=0.0))
+        offset = self.valleys_rad % (math.pi / 4)
+        return float(np.minimum(offset, math.pi / 4 - offset).max(initial=0.0))
 
 
 @dataclass(frozen=True)
-class Tolerance:
-    """What one deviation does to landmark 3, NNNS: the same as in :class:`Shape`."""
+class ToleranceEffect:
+    """Effect of one deviation on landmark 3 (NNNS).
 
-    what: str
+    Its radii r1 and r2 and the length of its bias (:class:`PatternAnalysis`), and the largest field
+    of any pattern (:class:`LandmarkAnalysis`).
+    """
+
+    deviation: str
     r1_m: float
     r2_m: float
     bias_m: float
@@ -117,103 +137,106 @@ class Tolerance:
 
 
 @dataclass(frozen=True)
-class Analysis:
-    """What a geometry is worth.
+class LandmarkAnalysis:
+    """Properties of a geometry.
 
     Attributes
     ----------
-    shapes : tuple of Shape
-        One a pattern.
+    geometry : Geometry
+    patterns : tuple of PatternAnalysis
+        One for each of the six patterns.
     heights_m : (float, float)
-        Sensor heights between which all patterns have the valleys that tell them apart;
-        ``nan`` where there are none.
+        Sensor heights between which all patterns have the valleys by which they are recognised;
+        ``nan`` if there are none.
     contour_pitch_m : float
-        At which a robot leaves one territory with all sensors before it enters the next:
+        Pitch at which all sensors of a robot leave one territory before the first enters the next:
         twice the sum of r2 and the circle.
     field_pitch_m : float
-        At which a neighbour's field at the circle is :attr:`neighbour_t`.
+        Pitch at which the field of a neighbour at the circle is :attr:`neighbour_t`.
     neighbour_t : float
     largest_t : float
-        Largest field that any pattern has in the plane of the sensors.
+        Largest field of any pattern in the plane of the sensors.
     range_t : float
-        That the sensors need: with :data:`HEADROOM`.
-    tolerances : tuple of Tolerance
-        The first is as designed.
+        Required range of the sensors, by :data:`SENSOR_RANGE_FACTOR`.
+    tolerances : tuple of ToleranceEffect
+        The first is the design itself.
     """
 
     geometry: Geometry
-    shapes: tuple[Shape, ...]
+    patterns: tuple[PatternAnalysis, ...]
     heights_m: tuple[float, float]
     contour_pitch_m: float
     field_pitch_m: float
     neighbour_t: float
     largest_t: float
     range_t: float
-    tolerances: tuple[Tolerance, ...]
+    tolerances: tuple[ToleranceEffect, ...]
 
     @property
     def r1_m(self) -> float:
-        """Of landmark 3, the paper's hardest."""
-        return self.shapes[2].r1_m
+        """Radius r1 of landmark 3."""
+        return self.patterns[WORST_PATTERN].r1_m
 
     @property
     def r2_m(self) -> float:
-        """Of landmark 3."""
-        return self.shapes[2].r2_m
+        """Radius r2 of landmark 3."""
+        return self.patterns[WORST_PATTERN].r2_m
 
     @property
-    def least_pitch_m(self) -> float:
-        """The larger of the two least pitches; ``nan`` where the threshold is never met."""
+    def min_pitch_m(self) -> float:
+        """The larger of the two pitches; ``nan`` if the threshold is not reached."""
         return float(np.maximum(self.contour_pitch_m, self.field_pitch_m))
 
     @property
     def hall_class(self) -> tuple[float, float] | None:
-        """mV/mT and range in tesla of the most sensitive hall sensor that serves, or None."""
-        return next((item for item in HALL_CLASSES if item[1] >= self.range_t), None)
+        """Sensitivity in mV/mT and range in T of the most sensitive suitable sensor, or None."""
+        return next((item for item in HALL_SENSOR_CLASSES if item[1] >= self.range_t), None)
 
 
 def check_geometry(geometry: Geometry) -> None:
-    """Refuse bars that cannot be.
+    """Raise an error for an impossible geometry.
 
     Raises
     ------
     InputError
-        A size is no positive number, the remanence is in another unit, or bars overlap.
+        A size is not a positive number, the remanence is in another unit, or bars overlap.
     """
     g = geometry
-    for value, what in (
+    for value, quantity in (
         (g.bar_length_m, "length of the bars"),
         (g.bar_width_m, "width of the bars"),
         (g.bar_height_m, "height of the bars"),
         (g.remanence_t, "remanence"),
-        (g.radius_m, "radius of the bars' middles"),
+        (g.radius_m, "radius of the centres of the bars"),
         (g.sensor_height_m, "height of the sensors"),
         (g.circle_m, "circle of the sensors"),
         (g.threshold_t, "threshold"),
     ):
         if not (math.isfinite(value) and value > 0):
-            raise InputError(f"the {what} must be above 0, not {value:g}")
-    if g.remanence_t > 2:
+            raise InputError(f"the {quantity} must be above 0, not {value:g}")
+    if g.remanence_t > MAX_REMANENCE_T:
         raise InputError(
             f"no magnet has a remanence of {g.remanence_t:g} T",
             hint="10,000 gauss are 1 tesla; N52 has 1.45",
         )
-    least = (g.bar_length_m + g.bar_width_m) / 2
-    if g.radius_m < least - 1e-9:
+    min_radius = (g.bar_length_m + g.bar_width_m) / 2
+    if g.radius_m < min_radius - 1e-9:
         raise InputError(
             f"the bars overlap at their corners with a radius of {1e3 * g.radius_m:g} mm",
-            hint=f"take a radius of at least {1e3 * least:g} mm, or shorter bars",
+            hint=f"take a radius of at least {1e3 * min_radius:g} mm, or shorter bars",
         )
 
 
-def analyse(geometry: Geometry, neighbour_t: float = NEIGHBOUR_T) -> Analysis:
-    """Work out what a geometry is worth.
+def analyse_landmark(
+    geometry: Geometry, neighbour_t: float = MAX_NEIGHBOUR_FIELD_T
+) -> LandmarkAnalysis:
+    """Analyse a geometry by the closed-form field of its bars.
 
     Parameters
     ----------
     geometry : Geometry
     neighbour_t : float
-        Field of one neighbouring landmark that is let pass at the circle of the sensors.
+        Accepted field of one neighbouring landmark at the circle of the sensors.
 
     Raises
     ------
@@ -221,50 +244,52 @@ def analyse(geometry: Geometry, neighbour_t: float = NEIGHBOUR_T) -> Analysis:
         See :func:`check_geometry`.
     """
     check_geometry(geometry)
-    shapes = _shapes(geometry)
-    largest = largest_field(geometry)
-    return Analysis(
+    patterns = _analyse_patterns(geometry)
+    largest = max_field(geometry)
+    return LandmarkAnalysis(
         geometry=geometry,
-        shapes=shapes,
-        heights_m=valid_heights(geometry),
-        contour_pitch_m=2 * (shapes[2].r2_m + geometry.circle_m),
-        field_pitch_m=field_pitch(geometry, neighbour_t),
+        patterns=patterns,
+        heights_m=valid_sensor_heights(geometry),
+        contour_pitch_m=2 * (patterns[WORST_PATTERN].r2_m + geometry.circle_m),
+        field_pitch_m=min_pitch_for_field(geometry, neighbour_t),
         neighbour_t=neighbour_t,
         largest_t=largest,
-        range_t=HEADROOM * largest,
-        tolerances=_tolerances(geometry),
+        range_t=SENSOR_RANGE_FACTOR * largest,
+        tolerances=_tolerance_effects(geometry),
     )
 
 
-def _shapes(geometry: Geometry) -> tuple[Shape, ...]:
-    phi = np.radians(np.arange(360) + PHASE)
-    territory = contour(geometry, STRENGTHS, phi)
-    slopes, zeros, departures = over_bars(geometry)
-    shapes = []
+def _analyse_patterns(geometry: Geometry) -> tuple[PatternAnalysis, ...]:
+    phi = np.radians(np.arange(360) + SAMPLE_PHASE_STEPS)
+    contours = threshold_contour(geometry, PATTERN_STRENGTHS, phi)
+    slopes, zeros, departures = fit_lines_over_bars(geometry)
+    patterns = []
     for k, letters in enumerate(PATTERNS):
-        strengths = STRENGTHS[:, k]
-        angles, rising, mountains = valleys(geometry, strengths)
-        r1, r2 = radii(phi, territory[:, k], strengths)
-        nominal = np.where(equal_corner(np.degrees(phi), strengths), r1, r2)
-        right = len(angles) == VALLEYS[k]
-        shapes.append(
-            Shape(
+        strengths = PATTERN_STRENGTHS[:, k]
+        valleys, rising, peaks = find_valleys(geometry, strengths)
+        r1, r2 = territory_radii(phi, contours[:, k], strengths)
+        nominal = np.where(is_equal_corner(np.degrees(phi), strengths), r1, r2)
+        is_complete = len(valleys) == VALLEY_COUNTS[k]
+        patterns.append(
+            PatternAnalysis(
                 number=k + 1,
                 letters=letters,
-                expected=VALLEYS[k],
-                valleys_rad=angles,
+                expected=VALLEY_COUNTS[k],
+                valleys_rad=valleys,
                 rising=rising,
-                mountains_t=mountains,
-                gulfs_rad=gulfs(territory[:, k], nominal, angles),
+                mountains_t=peaks,
+                gulfs_rad=gulf_widths(contours[:, k], nominal, valleys),
                 r1_m=r1,
                 r2_m=r2,
-                bias_m=crossing(geometry, angles) if right else np.full(2, np.nan),
+                bias_m=centre_from_valleys(geometry, valleys)
+                if is_complete
+                else np.full(2, np.nan),
                 slope_t_per_m=slopes[k],
                 zero_m=zeros[k],
                 departure_m=departures[k],
             )
         )
-    return tuple(shapes)
+    return tuple(patterns)
 
 
 _DEVIATIONS: tuple[tuple[str, dict[str, float]], ...] = (
@@ -277,24 +302,117 @@ _DEVIATIONS: tuple[tuple[str, dict[str, float]], ...] = (
     ("bars 1 mm longer", {"bar_length_m": 1e-3}),
     ("circle 1 mm wider", {"circle_m": 1e-3}),
 )
-"""By length, or by the share of the remanence."""
+"""Changes of attributes: lengths absolute, the remanence relative."""
 
 
-def _tolerances(geometry: Geometry) -> tuple[Tolerance, ...]:
-    """What deviations do to landmark 3, all others as designed."""
-    phi = np.radians(3 * (np.arange(120) + PHASE))
-    strengths = STRENGTHS[:, 2]
-    result = []
-    for what, change in _DEVIATIONS:
+def _tolerance_effects(geometry: Geometry) -> tuple[ToleranceEffect, ...]:
+    """Evaluate deviations of one quantity of landmark 3, all others as designed."""
+    phi = np.radians(3 * (np.arange(120) + SAMPLE_PHASE_STEPS))
+    strengths = PATTERN_STRENGTHS[:, WORST_PATTERN]
+    effects = []
+    for deviation, changes in _DEVIATIONS:
         values = {
-            key: getattr(geometry, key) * (1 + by)
-            if key == "remanence_t"
-            else max(getattr(geometry, key) + by, 0.0)
-            for key, by in change.items()
+            name: getattr(geometry, name) * (1 + change)
+            if name == "remanence_t"
+            else max(getattr(geometry, name) + change, 0.0)
+            for name, change in changes.items()
         }
-        other = replace(geometry, **values)
-        r1, r2 = radii(phi, contour(other, strengths[:, None], phi)[:, 0], strengths)
-        angles = valleys(other, strengths)[0]
-        bias = crossing(other, angles) if len(angles) == VALLEYS[2] else np.full(2, np.nan)
-        result.append(Tolerance(what, r1, r2, float(np.hypot(*bias)), largest_field(other)))
-    return tuple(result)
+        changed = replace(geometry, **values)
+        contour = threshold_contour(changed, strengths[:, None], phi)[:, 0]
+        r1, r2 = territory_radii(phi, contour, strengths)
+        valleys = find_valleys(changed, strengths)[0]
+        is_complete = len(valleys) == VALLEY_COUNTS[WORST_PATTERN]
+        bias = centre_from_valleys(changed, valleys) if is_complete else np.full(2, np.nan)
+        effects.append(
+            ToleranceEffect(deviation, r1, r2, float(np.hypot(*bias)), max_field(changed))
+        )
+    return tuple(effects)
+
+
+def landmark_warnings(analysis: LandmarkAnalysis) -> Iterator[str]:
+    """Yield the problems of a geometry with their figures and remedies."""
+    geometry = analysis.geometry
+    low, high = analysis.heights_m
+    remedy = (
+        "no height of the sensors is valid for this circle; take shorter bars"
+        if math.isnan(high)
+        else f"keep the sensors {_height_range_text(low, high)} above the bars, "
+        "or take shorter bars"
+    )
+    groups: dict[tuple[int, int], list[str]] = {}
+    for pattern in analysis.patterns:
+        if pattern.is_collapsed:
+            key = (len(pattern.valleys_rad), pattern.expected)
+            groups.setdefault(key, []).append(pattern.letters)
+    for (count, expected), letters in groups.items():
+        yield (
+            f"the valleys of {_join_words(letters)} collapse to {count} instead of {expected}, so "
+            f"that the method `paper` takes them for another pattern; {remedy}"
+        )
+    skew = max(pattern.skew_rad for pattern in analysis.patterns)
+    if not groups and skew > MAX_VALLEY_OFFSET_RAD:
+        yield (
+            f"valleys are up to {math.degrees(skew):.0f} degrees from the paper's angles, and its "
+            f"rule accepts {math.degrees(MAX_VALLEY_OFFSET_RAD):.0f}; {remedy}"
+        )
+    if math.isnan(analysis.r1_m) or math.isnan(analysis.r2_m):
+        yield (
+            f"the field does not reach the threshold of {1e3 * geometry.threshold_t:.3g} mT on all "
+            "sides of a landmark, or exceeds it beyond ten times its radius; take another threshold"
+        )
+    elif analysis.r1_m < geometry.circle_m:
+        yield (
+            f"the territory is smaller than the circle of the sensors: {_mm(analysis.r1_m)} "
+            f"against {_mm(geometry.circle_m)}; take a lower threshold or a smaller circle"
+        )
+    if geometry.threshold_t < 2 * MAX_EARTH_FIELD_T:
+        yield (
+            f"the threshold of {1e6 * geometry.threshold_t:.3g} uT is less than twice the Earth's "
+            f"field, {1e6 * MAX_EARTH_FIELD_T:.0f} uT; take a higher one"
+        )
+    if analysis.hall_class is None:
+        yield (
+            f"no common hall sensor has a range of {1e3 * analysis.range_t:.0f} mT; "
+            "take sensors farther from the bars, or weaker bars"
+        )
+
+
+def pitch_warnings(analysis: LandmarkAnalysis, pitch_m: float) -> Iterator[str]:
+    """Yield the problems of landmarks at a pitch with their figures and remedies."""
+    geometry = analysis.geometry
+    if pitch_m < analysis.contour_pitch_m:
+        yield (
+            f"territories overlap at a pitch of {_mm(pitch_m)}: a sensor of the robot enters the "
+            "next one before the last has left this one; take at least "
+            f"{_mm(_round_up_mm(analysis.contour_pitch_m))}, or a higher threshold"
+        )
+    nearest, all_eight = (float(field) for field in max_neighbour_field(geometry, pitch_m))
+    if nearest > analysis.neighbour_t * (1 + 1e-9):
+        remedy = (
+            "take weaker bars"
+            if math.isnan(analysis.field_pitch_m)
+            else f"take at least {_mm(_round_up_mm(analysis.field_pitch_m))}"
+        )
+        yield (
+            f"a neighbour at a pitch of {_mm(pitch_m)} adds up to {1e6 * nearest:.0f} uT at the "
+            f"sensors, all eight up to {1e6 * all_eight:.0f} uT; the limit for one is "
+            f"{1e6 * analysis.neighbour_t:.0f} uT; {remedy}"
+        )
+
+
+def _round_up_mm(metres: float) -> float:
+    """Round a length in metres up to the next whole mm."""
+    return math.ceil(1e3 * metres - 1e-6) / 1e3
+
+
+def _height_range_text(low: float, high: float) -> str:
+    high_mm = math.floor(1e4 * high) / 10
+    return f"at most {high_mm:g} mm" if low == 0 else f"{1e3 * low:.1f} to {high_mm:g} mm"
+
+
+def _join_words(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.4g} mm"

@@ -1,4 +1,4 @@
-"""How many readings there can be: what no search needs to try."""
+"""Upper bounds on the number of different readings, which spare searches that cannot succeed."""
 
 from __future__ import annotations
 
@@ -8,49 +8,55 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, Wall
-from locatk.core.landmarks.map.windows import ALPHABET_CODES, PATHS, Integers, placements, ways
+from locatk.core.landmarks.map.windows import (
+    ALPHABET_CODES,
+    WINDOW_PATHS,
+    Integers,
+    passable_steps,
+    place_windows,
+)
 
-UPRIGHT = {"6": 6, "16": 4, "compass": 0}
-"""Letters that read the same when their landmark is turned by half a turn."""
+HALF_TURN_SYMMETRIC_LETTERS = {"6": 6, "16": 4, "compass": 0}
+"""Letters of each alphabet that do not change if their landmark is rotated by 180 degrees."""
 
 
-def readings_bound(alphabet: str, window: str, detect: int = 0) -> int:
-    """Most readings of one floor, over all headings, that can differ as wanted.
+def max_distinct_readings(alphabet: str, window: str, detect: int = 0) -> int:
+    """Return the largest number of different readings of one floor, over all headings.
 
-    A path that a robot can also go backwards (all but ``L``) reads a word and, half turned
-    about, another one. Words for which these are the same can lie nowhere: the palindromes
-    of straight paths among them (facts/landmarks.md 4 counts them for ``"6"``; read with
-    orientation, 16 of 256 words of ``I2`` and 256 of 65536 of ``2x2`` fall out too). Where
-    ``detect`` misread landmarks shall be noticed, no two readings agree in all but as many
-    (R. C. Singleton, IEEE Trans. Inf. Theory 10, 116, 1964). Each heading of ``compass``
-    has words of its own.
+    The cells of a window (of all but ``L``) are also those of a window at the opposite heading. It
+    reads the same landmarks rotated by half a turn: in reverse order, or for ``2x2`` as c, d, a, b.
+    A word that equals its counterpart cannot occur in a unique map: palindromes of straight windows
+    (of ``2x2`` abab) for ``"6"``, 16 of 256 words of ``I2`` and 256 of 65,536 words of ``2x2`` for
+    ``"16"``. If ``detect`` misread landmarks are to be detected, no two
+    readings may agree in all but that many letters (Singleton bound: R. C. Singleton, IEEE Trans.
+    Inf. Theory 10, 116, 1964). With ``compass`` each heading has words of its own.
     """
-    letters, size = len(ALPHABET_CODES[alphabet]), len(PATHS[window])
-    blocks = 4 if alphabet == "compass" else 1
+    letters, size = len(ALPHABET_CODES[alphabet]), len(WINDOW_PATHS[window])
+    headings = 4 if alphabet == "compass" else 1
     if detect:
-        return int(blocks * letters ** (size - detect))
+        return int(headings * letters ** (size - detect))
     pairs, middle = divmod(size, 2)
-    turned = letters**pairs * UPRIGHT[alphabet] ** middle
-    useless = 0 if window == "L" or alphabet == "compass" else turned
-    return int(blocks * letters**size - useless)
+    symmetric = letters**pairs * HALF_TURN_SYMMETRIC_LETTERS[alphabet] ** middle
+    unusable = 0 if window == "L" or alphabet == "compass" else symmetric
+    return int(headings * letters**size - unusable)
 
 
-def square_bound(alphabet: str, window: str, detect: int = 0) -> int:
-    """Side of the largest square floor whose readings are no more than the bound."""
-    bound = readings_bound(alphabet, window, detect)
+def max_square_side(alphabet: str, window: str, detect: int = 0) -> int:
+    """Return the side of the largest square floor whose readings do not exceed the bound."""
+    bound = max_distinct_readings(alphabet, window, detect)
     side = 1
-    while _square_readings(side + 1, window) <= bound:
+    while _readings_of_square(side + 1, window) <= bound:
         side += 1
     return side
 
 
-def _square_readings(side: int, window: str) -> int:
+def _readings_of_square(side: int, window: str) -> int:
     if window in ("I2", "I3"):
-        return 4 * side * max(0, side + 1 - len(PATHS[window]))
+        return 4 * side * max(0, side + 1 - len(WINDOW_PATHS[window]))
     return int(4 * max(0, side - (2 if window == "3x3" else 1)) ** 2)
 
 
-def refuse(
+def require_enough_words(
     rows: int,
     columns: int,
     *,
@@ -60,53 +66,58 @@ def refuse(
     forbidden: Collection[Cell] = frozenset(),
     walls: Collection[Wall] = frozenset(),
 ) -> None:
-    """Raise InputError where a floor has more readings than can differ.
+    """Raise an error for a floor with more readings than can be different.
 
-    The readings are counted on this very floor: holes and walls make them fewer.
+    The readings are counted on this floor; holes and walls reduce them.
+
+    Raises
+    ------
+    InputError
+        No map of this floor can be unique.
     """
     codes = np.zeros((rows, columns), np.int64)
     for cell in forbidden:
         codes[cell] = HOLE
     floor = FloorMap(codes, alphabet=alphabet, window=window, walls=frozenset(walls))
-    cells, heading = placements(codes != HOLE, ways(floor), window)
-    refuse_readings(cells, heading, alphabet=alphabet, window=window, detect=detect)
-
-
-def refuse_readings(
-    cells: Integers, heading: Integers, *, alphabet: str, window: str, detect: int
-) -> None:
-    """:func:`refuse`, of windows (n, k, 2) under headings (n,)."""
-    asked, bound = len(cells), readings_bound(alphabet, window, detect)
-    words = len(ALPHABET_CODES[alphabet]) ** (len(PATHS[window]) - detect)
-    under = ""
-    if alphabet == "compass":
-        # Words of another heading are of no use: the fullest one decides.
-        asked, bound, under = (
-            int(np.bincount(heading, minlength=4).max()),
-            words,
-            "under a heading ",
-        )
-    elif asked <= words and bound < words:
-        # Where a wall lets a robot pass in one direction only, no word falls out.
-        asked = _turnable(cells, heading)
-    if asked <= bound:
-        return
-    side = square_bound(alphabet, window, detect)
-    raise InputError(
-        f"this floor has {asked} readings {under}of window {window}, and there are only {bound} "
-        f"of alphabet {alphabet}" + (f" with {detect} misread noticed" if detect else ""),
-        hint=f"make the floor smaller (a square has at most {side} x {side} landmarks, before any"
-        f" search), {'' if alphabet == '16' else 'the alphabet 16, '}or the window larger",
+    cells, heading = place_windows(codes != HOLE, passable_steps(floor), window)
+    require_enough_words_for_windows(
+        cells, heading, alphabet=alphabet, window=window, detect=detect
     )
 
 
-def _turnable(cells: Integers, heading: Integers) -> int:
-    """Readings whose landmarks are also read half turned about."""
+def require_enough_words_for_windows(
+    cells: Integers, heading: Integers, *, alphabet: str, window: str, detect: int
+) -> None:
+    """Apply :func:`require_enough_words` to windows (n, k, 2) at headings (n,)."""
+    count, bound = len(cells), max_distinct_readings(alphabet, window, detect)
+    words = len(ALPHABET_CODES[alphabet]) ** (len(WINDOW_PATHS[window]) - detect)
+    at_heading = ""
+    if alphabet == "compass":
+        # The headings share no words: the heading with the most windows decides.
+        count = int(np.bincount(heading, minlength=4).max())
+        bound, at_heading = words, "at one heading "
+    elif count <= words and bound < words:
+        # A window that is passable in one direction only may read a symmetric word.
+        count = _count_reversible_readings(cells, heading)
+    if count <= bound:
+        return
+    side = max_square_side(alphabet, window, detect)
+    raise InputError(
+        f"this floor has {count} readings {at_heading}of window {window}, but only {bound} of "
+        f"alphabet {alphabet} can be different"
+        + (f" with {detect} misread landmarks detected" if detect else ""),
+        hint=f"make the floor smaller (a square has at most {side} x {side} landmarks, before any"
+        f" search), {'' if alphabet == '16' else 'use alphabet 16, '}or take a larger window",
+    )
+
+
+def _count_reversible_readings(cells: Integers, heading: Integers) -> int:
+    """Return the number of readings whose landmarks are also read at the opposite heading."""
     if not len(cells):
         return 0
     columns = int(cells[..., 1].max()) + 1
     flat = np.sort(cells[..., 0] * columns + cells[..., 1], axis=1)
-    # A straight or square window is its least and its greatest cell.
+    # The first and the last cell identify a straight or square window.
     key = np.column_stack([flat[:, 0], flat[:, -1], heading % 2])
     _, count = np.unique(key, axis=0, return_counts=True)
     return int(count[count == 2].sum())

@@ -1,4 +1,4 @@
-"""Maps by search: a letter for each cell such that no two windows of the floor read the same."""
+"""Generation of maps: a search for letters such that no two windows of the floor read the same."""
 
 from __future__ import annotations
 
@@ -8,28 +8,42 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from locatk.core.errors import DegenerateError, InputError
-from locatk.core.landmarks.design.bounds import refuse_readings
-from locatk.core.landmarks.design.search import LETTERS, problem, random_values, search, weights
+from locatk.core.landmarks.design.bounds import require_enough_words_for_windows
+from locatk.core.landmarks.design.search import (
+    LETTER_COUNTS,
+    build_problem,
+    letter_weights,
+    random_values,
+    search,
+)
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, STEPS, WINDOWS, Cell, FloorMap, Wall
-from locatk.core.landmarks.map.windows import ALPHABET_CODES, PATHS, placements, ways
+from locatk.core.landmarks.map.windows import (
+    ALPHABET_CODES,
+    WINDOW_PATHS,
+    passable_steps,
+    place_windows,
+)
 
-LADDERS = ((0.45, 0.3), (0.6, 0.4), (0.38, 0.3), (0.8, 0.5))
-"""Temperatures between which a round cools, round after round, in conflicts: loose maps fall
-into place with any, and the tighter a map is, the better one ladder suits than the others."""
+TEMPERATURE_RANGES = ((0.45, 0.3), (0.6, 0.4), (0.38, 0.3), (0.8, 0.5))
+"""Start and end temperature, in conflicts, of the cooling rounds, which take turns.
 
-LENGTHS = (1, 3, 9)
-"""Of the rounds in turn: all ladders are gone through fast before any is gone through slowly."""
+Maps with far fewer readings than words are found with any of them. Which range suits a map with
+nearly as many readings as words is not known beforehand.
+"""
 
-STAGES = 16
-"""Temperatures of a round."""
+ROUND_LENGTHS = (1, 3, 9)
+"""Relative lengths of the rounds: all ranges are tried in short rounds before longer ones."""
 
-LARGEST_CELLS = 1_000_000
+STAGES_PER_ROUND = 16
+"""Number of temperatures in a round."""
+
+MAX_CELLS = 1_000_000
 
 
 @dataclass(frozen=True)
 class DesignOptions:
-    """Which map is wanted.
+    """Requirements on a map.
 
     Attributes
     ----------
@@ -38,17 +52,17 @@ class DesignOptions:
         See :class:`.FloorMap`.
     pitch_m : float
     seed : int
-        Another one gives another map.
+        Different seeds give different maps.
     forbidden : frozenset of cell
-        Where no landmark can lie.
+        Cells without a landmark.
     walls : frozenset of (cell, cell)
         See :class:`.FloorMap`.
     detect : int
-        How many misread landmarks of a window shall always be noticed.
+        Number of misread landmarks of a window that must always be detected.
     geometry : Geometry
     evaluations : int
-        Budget of the search: so often it looks what one letter would do to one window.
-        The default takes about ten seconds compiled, and a hundred times that in Python.
+        Budget of the search: number of evaluations of one letter in one window. The default takes
+        about ten seconds compiled, and a hundred times as long in Python.
     """
 
     rows: int
@@ -64,81 +78,89 @@ class DesignOptions:
     evaluations: int = 2_500_000_000
 
 
-def design(
+def design_map(
     options: DesignOptions, progress: Callable[[float, int], None] | None = None
 ) -> FloorMap:
-    """A map as wanted; the same options give the same map, with or without compiled loops.
+    """Search for a unique map; equal options give equal maps, with or without compiled loops.
 
     Parameters
     ----------
     options : DesignOptions
     progress : function, optional
-        Called now and then with the share of the budget that is spent, and with the
-        readings that still repeat another one.
+        Called at intervals with the used fraction of the budget and the number of words that still
+        equal an earlier one; a reading has one word, or with ``detect`` one per choice of letters.
 
     Raises
     ------
     InputError
-        The options are none, or ask for more readings than can differ.
+        An option is not valid, or the floor has more readings than can be different.
     DegenerateError
-        No map was found within the budget, which does not say that there is none.
+        No map was found within the budget; one may exist.
 
     Notes
     -----
-    Min-conflicts (Minton et al., Artificial Intelligence 58, 1992) with a heat bath: only
-    cells of windows that read like another one are redrawn, and all letters of a cell are
-    weighed at once (:func:`.search.search_python`). Against plain annealing, which proposes
-    one letter for any cell, 16/L of 24 x 24 falls from 4-17 s (facts/landmarks.md 4) to 0.1-0.4 s.
+    Min-conflicts (Minton et al., Artificial Intelligence 58, 1992) with a heat bath: only cells of
+    windows that read like another one are redrawn, and all letters of a cell are weighted at once
+    (:func:`.search.search_python`). On a two-core machine a 24 x 24 map of window L and alphabet
+    16 takes 0.1 to 0.4 s; simulated annealing that proposes one letter for any cell took 4 to 17 s.
     """
     blank = empty_floor(options)
-    there = blank.codes != HOLE
-    cells, heading = placements(there, ways(blank), options.window)
+    has_landmark = blank.codes != HOLE
+    cells, heading = place_windows(has_landmark, passable_steps(blank), options.window)
     alphabet = options.alphabet
-    refuse_readings(cells, heading, alphabet=alphabet, window=options.window, detect=options.detect)
-    count, letters = there.size, LETTERS[alphabet]
+    require_enough_words_for_windows(
+        cells, heading, alphabet=alphabet, window=options.window, detect=options.detect
+    )
+    cell_count, letters = has_landmark.size, LETTER_COUNTS[alphabet]
     flat = cells[..., 0] * options.columns + cells[..., 1]
-    task = problem(count, flat, heading, options.window, alphabet, options.detect)
-    each = len(task.use_item) * letters / max(1, count)
-    unit = options.evaluations / max(1.0, each) / STAGES / len(LADDERS) / sum(LENGTHS)
-    turns = len(LENGTHS) * len(LADDERS) * STAGES
-    fewest = len(task.item_cells)
-    values = random_values(count, letters, options.seed)
-    for turn in range(turns):
-        of_round, stage = divmod(turn, STAGES)
-        steps = max(1, round(unit * LENGTHS[of_round // len(LADDERS)]))
-        hot, cold = LADDERS[of_round % len(LADDERS)]
-        if stage == 0 and of_round:
-            values = random_values(count, letters, _seed(options.seed, turn, 1))
-        heat = weights(hot + (cold - hot) * stage / (STAGES - 1))
-        left = search(task, values, heat, _seed(options.seed, turn, 2), steps)
-        if left == 0:
-            codes = np.array(ALPHABET_CODES[alphabet])[values].reshape(there.shape)
-            return with_codes(blank, np.where(there, codes, HOLE), options.seed)
-        fewest = min(fewest, left)
+    problem = build_problem(cell_count, flat, heading, options.window, alphabet, options.detect)
+    evaluations_per_step = len(problem.use_item) * letters / max(1, cell_count)
+    steps_per_stage = options.evaluations / max(1.0, evaluations_per_step) / STAGES_PER_ROUND
+    steps_per_stage = steps_per_stage / len(TEMPERATURE_RANGES) / sum(ROUND_LENGTHS)
+    stages = len(ROUND_LENGTHS) * len(TEMPERATURE_RANGES) * STAGES_PER_ROUND
+    fewest_repeats, used = len(problem.item_cells), 0
+    values = random_values(cell_count, letters, options.seed)
+    for index in range(stages):
+        number, stage = divmod(index, STAGES_PER_ROUND)
+        length = ROUND_LENGTHS[number // len(TEMPERATURE_RANGES)]
+        hot, cold = TEMPERATURE_RANGES[number % len(TEMPERATURE_RANGES)]
+        if stage == 0 and number:
+            values = random_values(cell_count, letters, _stage_seed(options.seed, index, 1))
+        weights = letter_weights(hot + (cold - hot) * stage / (STAGES_PER_ROUND - 1))
+        steps = max(1, round(steps_per_stage * length))
+        repeats = search(problem, values, weights, _stage_seed(options.seed, index, 2), steps)
+        if repeats == 0:
+            codes = np.array(ALPHABET_CODES[alphabet])[values].reshape(has_landmark.shape)
+            return with_codes(blank, np.where(has_landmark, codes, HOLE), options.seed)
+        fewest_repeats = min(fewest_repeats, repeats)
+        used += length
         if progress is not None:
-            progress((turn + 1) / turns, left)
+            progress(
+                used / (STAGES_PER_ROUND * len(TEMPERATURE_RANGES) * sum(ROUND_LENGTHS)), repeats
+            )
     raise DegenerateError(
-        f"no map was found: of {len(cells)} readings at best {fewest} repeat another one",
-        hint="try another seed, a row fewer, a larger window, the alphabet 16, or more holes",
+        f"no map was found: at best {fewest_repeats} of {len(problem.item_cells)} words of its "
+        "readings repeat another one",
+        hint="try another seed, a row less, a larger window, the alphabet 16, or more holes",
     )
 
 
 def empty_floor(options: DesignOptions) -> FloorMap:
-    """The floor that the options describe, with code 0 in each cell that bears a landmark.
+    """Return the floor of the options with code 0 in each cell that has a landmark.
 
     Raises
     ------
     InputError
-        The options are none.
+        An option is not valid.
     """
     rows, columns = options.rows, options.columns
     if options.alphabet not in ALPHABETS:
         raise InputError(f"alphabet {options.alphabet!r} is none of {', '.join(ALPHABETS)}")
     if options.window not in WINDOWS:
         raise InputError(f"window {options.window!r} is none of {', '.join(WINDOWS)}")
-    if rows < 1 or columns < 1 or rows * columns > LARGEST_CELLS:
-        raise InputError(f"a floor of {rows} x {columns} cells is not from 1 to {LARGEST_CELLS}")
-    size = len(PATHS[options.window])
+    if rows < 1 or columns < 1 or rows * columns > MAX_CELLS:
+        raise InputError(f"a floor of {rows} x {columns} cells is not from 1 to {MAX_CELLS}")
+    size = len(WINDOW_PATHS[options.window])
     if not 0 <= options.detect < size:
         raise InputError(
             f"detect is {options.detect}, and a window {options.window} has {size} landmarks",
@@ -147,20 +169,20 @@ def empty_floor(options: DesignOptions) -> FloorMap:
     if not 0 < options.pitch_m < float("inf"):
         raise InputError(f"a pitch of {options.pitch_m} m is not above 0")
 
-    def on_floor(cell: Cell) -> bool:
+    def is_on_floor(cell: Cell) -> bool:
         return 0 <= cell[0] < rows and 0 <= cell[1] < columns
 
     codes = np.zeros((rows, columns), np.int64)
     for cell in options.forbidden:
-        if not on_floor(cell):
+        if not is_on_floor(cell):
             raise InputError(f"forbidden cell {cell[0]},{cell[1]} is not on the floor")
         codes[cell] = HOLE
-    for one, other in options.walls:
-        step = (other[0] - one[0], other[1] - one[1])
-        if not (on_floor(one) and on_floor(other) and step in STEPS):
+    for first, second in options.walls:
+        step = (second[0] - first[0], second[1] - first[1])
+        if not (is_on_floor(first) and is_on_floor(second) and step in STEPS):
             raise InputError(
-                f"wall {one[0]},{one[1]} {other[0]},{other[1]} is not between two neighbouring"
-                " cells of the floor"
+                f"wall {first[0]},{first[1]} {second[0]},{second[1]} is not between two"
+                " neighbouring cells of the floor"
             )
     return FloorMap(
         codes,
@@ -176,10 +198,14 @@ def empty_floor(options: DesignOptions) -> FloorMap:
 def with_codes(
     floor: FloorMap, codes: np.ndarray, seed: int, notes: tuple[str, ...] = ()
 ) -> FloorMap:
-    """The same floor with landmarks laid as ``codes``."""
+    """Return the floor with other codes, and with the seed and notes of these codes."""
     return replace(floor, codes=np.asarray(codes, np.int64), seed=seed, notes=notes)
 
 
-def _seed(seed: int, turn: int, use: int) -> int:
-    # Far from each other: the generator's own states count up by one odd number.
-    return (seed + 1) * 0xD1342543DE82EF95 + (turn << 8 | use) * 0xAF251AF3B0F025B5
+def _stage_seed(seed: int, stage: int, purpose: int) -> int:
+    """Return a seed whose random numbers do not overlap those of other stages.
+
+    SplitMix64 advances its state by :data:`.search.GOLDEN_GAMMA`; seeds must not differ by few such
+    steps. The purpose is 1 for initial letters and 2 for the search.
+    """
+    return (seed + 1) * 0xD1342543DE82EF95 + (stage << 8 | purpose) * 0xAF251AF3B0F025B5

@@ -1,10 +1,10 @@
-"""How many landmarks a robot must visit until it knows where it is, from each start.
+"""Number of landmarks that a robot must visit until it knows its position, from each start.
 
-The drive is deterministic. The robot follows the path of the map's window; after that the
-same path mirrored, and so on, so that it does not go in circles. Where the way is not free,
-it goes ahead instead if it can, else left, else right, else back, and begins a new window.
-It knows its turns, and notices where it cannot go. All starts are hypotheses at first;
-those are dropped that would have read, or had to do, something else.
+The drive is deterministic. The robot follows the path of the map's window, then the same path
+mirrored, and so on, so that it does not drive in circles. If the next step is not passable, it
+goes ahead if it can, otherwise left, right or back, and begins a new window. It knows its turns,
+and notices steps that are not passable. All starts are hypotheses at first; those that would have
+read something else, or turned differently, are dropped.
 """
 
 from __future__ import annotations
@@ -15,164 +15,180 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.map.floor import HOLE, STEPS, Cell, FloorMap
-from locatk.core.landmarks.map.windows import PATHS, Integers, as_read, ways
+from locatk.core.landmarks.map.windows import (
+    WINDOW_PATHS,
+    Integers,
+    letters_as_read,
+    passable_steps,
+)
 
-Place = tuple[Cell, int]
-"""A cell, and the heading at it in quarter turns."""
+Start = tuple[Cell, int]
+"""Cell and heading, in quarter turns, at which a robot starts."""
 
-LISTED = 10
-"""Starts that are named."""
+MAX_LISTED_STARTS = 10
+"""Starts that are listed by name."""
 
-PATIENCE = 40
-"""Landmarks after which it is asked which starts can be told apart at all."""
+MAX_LANDMARKS_UNCHECKED = 40
+"""Landmarks after which the starts that this drive never distinguishes are determined and
+dropped."""
 
-STAY = 4
+LETTER_RANGE = 32
+"""Letters are smaller than this number: an observation is ``turn * LETTER_RANGE + letter``."""
+
+NO_TURN = 4
+"""Value of a turn if the robot cannot leave its cell."""
+
+NEVER_LOCALIZED = -1
+"""Number of landmarks of a start that cannot be distinguished from another one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Localisation:
-    """Landmarks to visit until one hypothesis is left, the first one included.
+class LocalizationSteps:
+    """Number of landmarks to visit until one hypothesis is left, including the first landmark.
 
     Attributes
     ----------
     landmarks : (rows, columns, 4) int64 ndarray
-        By start; 0 where there is no landmark, :data:`NEVER` where the start can never be
-        told from another.
+        By start; 0 in holes, :data:`NEVER_LOCALIZED` for starts that cannot be distinguished.
     mean, p99 : float or None
-        Over the starts that can be told apart; None where there is none.
+        Over the starts that can be distinguished; None if there are none.
     worst : int or None
     worst_starts : tuple of (cell, heading)
-        The first ones that need the most.
+        First starts that need the most landmarks.
     never : int
-        Starts that this drive can never tell apart.
+        Number of starts that this drive cannot distinguish.
     never_starts : tuple of (cell, heading)
-        The first of them.
+        First of them.
     """
 
     landmarks: Integers
     mean: float | None
     p99: float | None
     worst: int | None
-    worst_starts: tuple[Place, ...]
+    worst_starts: tuple[Start, ...]
     never: int
-    never_starts: tuple[Place, ...]
+    never_starts: tuple[Start, ...]
 
 
-NEVER = -1
-
-
-def localise(floor: FloorMap) -> Localisation:
-    """Landmarks to visit from each start on a floor without faults."""
-    drive = Drive.of(floor)
+def count_localization_steps(floor: FloorMap) -> LocalizationSteps:
+    """Return the number of landmarks to visit from each start on a floor without faults."""
+    drive = LocalizationDrive.on(floor)
     landmarks = np.zeros(4 * floor.codes.size, np.int64)
     start = np.flatnonzero(np.repeat(floor.codes.reshape(-1) != HOLE, 4))
-    landmarks[start] = NEVER
+    landmarks[start] = NEVER_LOCALIZED
+    # Starts that agree in everything read so far form a group of hypotheses.
     state, group = start * drive.phases, drive.letter[start]
-    apart: NDArray[np.bool_] | None = None
+    is_distinguishable: NDArray[np.bool_] | None = None
     visited = 1
     while len(start):
         _, group, count = np.unique(group, return_inverse=True, return_counts=True)
-        alone = count[group] == 1
-        landmarks[start[alone]] = visited
-        keep = ~alone
-        if visited == PATIENCE and keep.any():
-            apart = drive.told_apart(np.flatnonzero(landmarks != 0))
-        if apart is not None:
-            # A group goes on while one of it can still be told from the others.
-            keep &= np.bincount(group, apart[start])[group] > 0
-        start, state, group = start[keep], state[keep], group[keep]
-        group = group * ((STAY + 1) * 32) + drive.seen[state]
-        state = drive.follow[state]
+        is_localized = count[group] == 1
+        landmarks[start[is_localized]] = visited
+        remaining = ~is_localized
+        if visited == MAX_LANDMARKS_UNCHECKED and remaining.any():
+            is_distinguishable = drive.distinguishable(np.flatnonzero(landmarks != 0))
+        if is_distinguishable is not None:
+            # A group continues while one of its starts can be distinguished from the others.
+            remaining &= np.bincount(group, is_distinguishable[start])[group] > 0
+        start, state, group = start[remaining], state[remaining], group[remaining]
+        group = group * ((NO_TURN + 1) * LETTER_RANGE) + drive.observation[state]
+        state = drive.next_state[state]
         visited += 1
-    return _summary(landmarks.reshape(*floor.shape, 4))
+    return _summarize(landmarks.reshape(*floor.shape, 4))
 
 
-def _summary(landmarks: Integers) -> Localisation:
-    told = landmarks[landmarks > 0]
-    worst = int(told.max()) if len(told) else None
-    return Localisation(
+def _summarize(landmarks: Integers) -> LocalizationSteps:
+    localized = landmarks[landmarks > 0]
+    worst = int(localized.max()) if len(localized) else None
+    return LocalizationSteps(
         landmarks,
-        float(told.mean()) if len(told) else None,
-        float(np.percentile(told, 99)) if len(told) else None,
+        float(localized.mean()) if len(localized) else None,
+        float(np.percentile(localized, 99)) if len(localized) else None,
         worst,
-        () if worst is None else _places(landmarks == worst),
-        int((landmarks == NEVER).sum()),
-        _places(landmarks == NEVER),
+        () if worst is None else _first_starts(landmarks == worst),
+        int((landmarks == NEVER_LOCALIZED).sum()),
+        _first_starts(landmarks == NEVER_LOCALIZED),
     )
 
 
-def _places(which: NDArray[np.bool_]) -> tuple[Place, ...]:
-    return tuple(((int(r), int(c)), int(h)) for r, c, h in np.argwhere(which)[:LISTED])
+def _first_starts(mask: NDArray[np.bool_]) -> tuple[Start, ...]:
+    return tuple(((int(r), int(c)), int(h)) for r, c, h in np.argwhere(mask)[:MAX_LISTED_STARTS])
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class LocalizationDrive:
     """The drive as an automaton over states ``(4 cell + heading) * phases + phase``.
 
     Attributes
     ----------
     phases : int
+        Steps of the window's path and of its mirror image.
     letter : (4 cells,) int64 ndarray
-        Read at a cell under a heading.
-    follow : (states,) int64 ndarray
-    seen : (states,) int64 ndarray
-        What the robot learns of the step to the next state: its turn, and the letter there.
+        Letter that is read in a cell at a heading.
+    next_state : (states,) int64 ndarray
+    observation : (states,) int64 ndarray
+        Observation of the step to the next state: the robot's turn, and the letter there.
     """
 
     phases: int
     letter: Integers
-    follow: Integers
-    seen: Integers
+    next_state: Integers
+    observation: Integers
 
     @classmethod
-    def of(cls, floor: FloorMap) -> Drive:
-        """The drive of a floor's window on this floor."""
-        turns = wanted_turns(floor.window)
-        free = ways(floor).reshape(-1, 4)
-        count, phases = len(free), len(turns)
+    def on(cls, floor: FloorMap) -> LocalizationDrive:
+        """Build the automaton of a floor and its window."""
+        wanted = np.asarray(window_turns(floor.window))
+        passable = passable_steps(floor).reshape(-1, 4)
+        count, phases = len(passable), len(wanted)
         codes = floor.codes.reshape(-1, 1)
         heading = np.arange(4)
-        letter = as_read(np.where(codes == HOLE, 0, codes), heading, floor.alphabet).reshape(-1)
-        ahead = np.array([row * floor.shape[1] + column for row, column in STEPS])
+        letter = letters_as_read(np.where(codes == HOLE, 0, codes), heading, floor.alphabet)
+        letter = letter.reshape(-1)
         cell = np.arange(count)[:, None, None]
-        turn = np.full((count, 4, phases), STAY)
-        for other in (2, 3, 1, 0):
-            turn[np.broadcast_to(free[:, (heading + other) % 4, None], turn.shape)] = other
-        wanted = np.asarray(turns)
-        goes = free[cell, (heading[:, None] + wanted) % 4]
-        turn = np.where(goes, wanted % 4, turn)
-        to = (heading[:, None] + turn) % 4
-        there = np.where(turn == STAY, cell, cell + ahead[to])
-        phase = np.where(goes, (np.arange(phases) + 1) % phases, 0)
-        place = np.where(turn == STAY, 0, there) * 4 + to
-        place = np.where(turn == STAY, cell * 4 + heading[:, None], place)
-        seen = turn * 32 + letter[place]
-        return cls(phases, letter, (place * phases + phase).reshape(-1), seen.reshape(-1))
+        turn = np.full((count, 4, phases), NO_TURN)
+        # Each overwrites the one before: ahead is preferred, then left, right, back.
+        for fallback in (2, 3, 1, 0):
+            is_passable = passable[:, (heading + fallback) % 4, None]
+            turn[np.broadcast_to(is_passable, turn.shape)] = fallback
+        follows_window = passable[cell, (heading[:, None] + wanted) % 4]
+        turn = np.where(follows_window, wanted % 4, turn)
+        next_heading = (heading[:, None] + turn) % 4
+        cell_step = np.array([row * floor.shape[1] + column for row, column in STEPS])
+        next_cell = cell + cell_step[next_heading]
+        next_pose = np.where(
+            turn == NO_TURN, cell * 4 + heading[:, None], next_cell * 4 + next_heading
+        )
+        next_phase = np.where(follows_window, (np.arange(phases) + 1) % phases, 0)
+        observation = turn * LETTER_RANGE + letter[next_pose]
+        next_state = next_pose * phases + next_phase
+        return cls(phases, letter, next_state.reshape(-1), observation.reshape(-1))
 
-    def told_apart(self, start: Integers) -> NDArray[np.bool_]:
-        """(4 cells,) whether a start can be told from all others of ``start``, however long.
+    def distinguishable(self, start: Integers) -> NDArray[np.bool_]:
+        """Return (4 cells,) whether a start differs from all others of ``start`` at some time.
 
-        What is seen over twice as many steps is what is seen over the first half and, from
-        where that leads, over the second; when twice as many tell no more, none ever will
-        (E. F. Moore, Gedanken-experiments on sequential machines, 1956).
+        The observations of 2 n steps are those of the first n and, from the state there, of n
+        more. Once twice as many steps distinguish no more states, no number of steps will (E. F.
+        Moore, Gedanken-experiments on sequential machines, 1956).
         """
-        _, group = np.unique(self.seen, return_inverse=True)
-        jump, known = self.follow, 0
-        while (groups := int(group.max()) + 1) > known:
-            known = groups
-            _, group = np.unique(group * groups + group[jump], return_inverse=True)
+        _, group = np.unique(self.observation, return_inverse=True)
+        jump, group_count = self.next_state, 0
+        while (count := int(group.max()) + 1) > group_count:
+            group_count = count
+            _, group = np.unique(group * count + group[jump], return_inverse=True)
             jump = jump[jump]
-        kind = self.letter[start] * known + group[start * self.phases]
-        _, kind, count = np.unique(kind, return_inverse=True, return_counts=True)
-        apart = np.zeros(len(self.letter), bool)
-        apart[start] = count[kind] == 1
-        return apart
+        behaviour = self.letter[start] * group_count + group[start * self.phases]
+        _, behaviour, count_of = np.unique(behaviour, return_inverse=True, return_counts=True)
+        result = np.zeros(len(self.letter), bool)
+        result[start] = count_of[behaviour] == 1
+        return result
 
 
-def wanted_turns(window: str) -> tuple[int, ...]:
-    """Quarter turns before each step of a window's path, and of its mirror image."""
-    steps = np.diff(np.array(PATHS[window]), axis=0)
+def window_turns(window: str) -> tuple[int, ...]:
+    """Return the quarter turns before each step of a window's path and of its mirror image."""
+    steps = np.diff(np.array(WINDOW_PATHS[window]), axis=0)
+    # At heading 0, ahead is along the columns and left along the rows.
     directions = [STEPS.index((int(left), int(ahead))) for ahead, left in steps]
     turns = [after - before for before, after in zip([0, *directions], directions, strict=False)]
-    folded = [(turn + 1) % 4 - 1 for turn in turns]
-    return (*folded, *(-turn for turn in folded))
+    signed_turns = [(turn + 1) % 4 - 1 for turn in turns]
+    return (*signed_turns, *(-turn for turn in signed_turns))

@@ -1,4 +1,4 @@
-"""The proof of a map: that no two readings are the same, and what faults would do to it."""
+"""Proof of a map: all readings are different; effects of single faults on them."""
 
 from __future__ import annotations
 
@@ -10,42 +10,55 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.design.bounds import readings_bound
-from locatk.core.landmarks.design.localization_steps import Localisation, Place, localise
+from locatk.core.landmarks.design.bounds import max_distinct_readings
+from locatk.core.landmarks.design.localization_steps import (
+    LocalizationSteps,
+    Start,
+    count_localization_steps,
+)
 from locatk.core.landmarks.landmark import CODE_COUNT
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
-from locatk.core.landmarks.map.windows import PATHS, Integers, Readings, as_read, encoded, readings
+from locatk.core.landmarks.map.windows import (
+    WINDOW_PATHS,
+    Integers,
+    WindowReadings,
+    encode_readings,
+    letters_as_read,
+    window_readings,
+)
 
-LISTED_DUPLICATES = 1000
+MAX_LISTED_DUPLICATES = 1000
+"""Duplicates that are listed; all are counted."""
 
-LISTED_CELLS = 5
+MAX_LISTED_CELLS = 5
+"""Cells that are listed as the worst for a fault."""
 
-TABLE = 1 << 22
-"""Words that are marked in a table; more are sorted."""
+MAX_TABLE_WORDS = 1 << 22
+"""Words up to which membership is looked up in a table; beyond, in a sorted array."""
 
 
-class Duplicate(NamedTuple):
-    """Two places that read the same."""
+class DuplicateReading(NamedTuple):
+    """Two starts at which a robot reads the same."""
 
-    one: Place
-    other: Place
+    first: Start
+    second: Start
     letters: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Faults:
-    """What one fault, at any place, would do.
+class FaultEffects:
+    """Effects of a single fault, tried at each landmark of each reading.
 
     Attributes
     ----------
     cases : int
-        Readings over which the fault was tried, at each of their landmarks.
+        Number of tried combinations of reading and fault.
     harmful : int
-        Cases after which the reading is of another place, or may be.
+        Cases in which the reading is, or may be, that of another position.
     by_cell : (rows, columns) int64 ndarray
         Harmful cases by the cell of the fault.
     worst : tuple of cell
-        Those with the most, where there are any.
+        Cells with the most harmful cases, if there are any.
     """
 
     cases: int
@@ -54,117 +67,117 @@ class Faults:
     worst: tuple[Cell, ...]
 
     @property
-    def share(self) -> float:
-        """Of the cases, those that are harmful."""
+    def harmful_fraction(self) -> float:
+        """Fraction of the cases that are harmful."""
         return self.harmful / self.cases if self.cases else 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class Proof:
-    """What holds for a map.
+class MapProof:
+    """Properties of a map, by exhaustive enumeration.
 
     Attributes
     ----------
     readings : int
-        Windows of the floor, each under each heading.
+        Number of windows of the floor, over all headings.
     words : int
-        Readings that are possible at all (:func:`.readings_bound`).
+        Number of readings that can be different (:func:`.max_distinct_readings`).
     duplicate_count : int
-        Readings that an earlier place has too.
-    duplicates : tuple of Duplicate
-        The first :data:`LISTED_DUPLICATES` of them.
-    least_distance : int or None
-        Landmarks in which any two readings differ at least; None below two readings.
+        Number of readings that equal an earlier one.
+    duplicates : tuple of DuplicateReading
+        The first :data:`MAX_LISTED_DUPLICATES` of them.
+    min_distance : int or None
+        Smallest number of letters in which two readings differ; None for fewer than two readings.
     detects : int
-        How many misread landmarks of a window are always noticed.
+        Number of misread landmarks of a window that are always detected.
     promised : int
-        How many the map says.
-    flipped_bar : Faults
-        One bar lies the wrong way round: harmful where the window then reads as another
-        place, silently; else it reads as none, which is noticed.
-    missing_bar : Faults
-        One bar is not there, and seen to be missing: the landmark is one of two. Harmful
-        where the window does not tell its place any more.
-    missing_landmark : Faults
-        The same of a landmark that cannot be read at all.
-    localisation : Localisation or None
-        None where it was not asked for.
+        The same number as stated by the map.
+    flipped_bar : FaultEffects
+        One bar is flipped: harmful if the window then reads like another one, which is not
+        noticed; otherwise it reads like none, which is.
+    missing_bar : FaultEffects
+        One bar is missing and known to be missing: the landmark is one of two. Harmful if the
+        window is no longer unique.
+    missing_landmark : FaultEffects
+        The same for a landmark that cannot be read at all.
+    localization : LocalizationSteps or None
+        None if it was not requested.
     fingerprint : str
-        SHA-256 of :func:`canonical`.
+        SHA-256 of :func:`canonical_text`.
     """
 
     readings: int
     words: int
     duplicate_count: int
-    duplicates: tuple[Duplicate, ...]
-    least_distance: int | None
+    duplicates: tuple[DuplicateReading, ...]
+    min_distance: int | None
     detects: int
     promised: int
-    flipped_bar: Faults
-    missing_bar: Faults
-    missing_landmark: Faults
-    localisation: Localisation | None
+    flipped_bar: FaultEffects
+    missing_bar: FaultEffects
+    missing_landmark: FaultEffects
+    localization: LocalizationSteps | None
     fingerprint: str
 
     @property
-    def unique(self) -> bool:
-        """Whether each reading belongs to one place only."""
+    def is_unique(self) -> bool:
+        """True if no two windows read the same."""
         return self.duplicate_count == 0
 
     @property
     def holds(self) -> bool:
-        """Whether the map is what it says: unique, and misreadings noticed as promised."""
-        return self.unique and self.detects >= self.promised
+        """True if the map is unique and detects as many misread landmarks as it states."""
+        return self.is_unique and self.detects >= self.promised
 
     @property
     def landmarks_mean(self) -> float | None:
-        """Landmarks to visit until the place is known, over all starts."""
-        return self.localisation.mean if self.localisation else None
+        """Mean number of landmarks to visit, over the starts that can be distinguished."""
+        return self.localization.mean if self.localization else None
 
     @property
     def landmarks_p99(self) -> float | None:
-        """The same, for all but one start in a hundred."""
-        return self.localisation.p99 if self.localisation else None
+        """99th percentile of that number, interpolated."""
+        return self.localization.p99 if self.localization else None
 
     @property
     def landmarks_worst(self) -> int | None:
-        """The same, for the worst start that can be told from the others."""
-        return self.localisation.worst if self.localisation else None
+        """Number of landmarks for the worst start that can be distinguished."""
+        return self.localization.worst if self.localization else None
 
 
-def prove(floor: FloorMap, *, steps: bool = True) -> Proof:
-    """Everything that can be said of a map, exactly.
+def prove_map(floor: FloorMap, *, steps: bool = True) -> MapProof:
+    """Prove or refute the uniqueness of a map, and evaluate single faults.
 
     Parameters
     ----------
     floor : FloorMap
-        Any; what it promises is not believed.
+        Map as designed: as-built records are ignored. Its ``detect`` is checked, not assumed.
     steps : bool
-        Whether landmarks to localise are counted from each start too.
+        Count the landmarks until localization from each start too.
     """
-    seen = readings(floor)
-    words = encoded(seen.letters)
-    duplicates, count = _duplicates(seen, words)
-    distance = least_distance(seen.letters)
-    flipped, missing = _bars(floor, seen, words)
-    return Proof(
-        readings=len(seen),
-        words=readings_bound(floor.alphabet, floor.window),
+    readings = window_readings(floor)
+    words = encode_readings(readings.letters)
+    duplicates, count = _find_duplicates(readings, words)
+    distance = min_hamming_distance(readings.letters)
+    flipped, missing = _bar_faults(floor, readings, words)
+    return MapProof(
+        readings=len(readings),
+        words=max_distinct_readings(floor.alphabet, floor.window),
         duplicate_count=count,
         duplicates=duplicates,
-        least_distance=distance,
-        detects=len(PATHS[floor.window]) if distance is None else max(0, distance - 1),
+        min_distance=distance,
+        detects=len(WINDOW_PATHS[floor.window]) if distance is None else max(0, distance - 1),
         promised=floor.detect,
         flipped_bar=flipped,
         missing_bar=missing,
-        missing_landmark=_landmarks(floor, seen),
-        localisation=localise(floor) if steps else None,
-        fingerprint=hashlib.sha256(canonical(floor).encode()).hexdigest(),
+        missing_landmark=_missing_landmarks(floor, readings),
+        localization=count_localization_steps(floor) if steps else None,
+        fingerprint=hashlib.sha256(canonical_text(floor).encode()).hexdigest(),
     )
 
 
-def canonical(floor: FloorMap) -> str:
-    """What the proof is about, as text: codes as hexadecimal digits, a dot for a hole."""
+def canonical_text(floor: FloorMap) -> str:
+    """Return the proven map as text: codes as hexadecimal digits, a dot for a hole, and walls."""
     rows, columns = floor.shape
     lines = [f"locatk floor {rows}x{columns} {floor.window} {floor.alphabet} {floor.detect}"]
     lines += ["".join("." if c == HOLE else f"{c:x}" for c in row) for row in floor.codes.tolist()]
@@ -172,92 +185,103 @@ def canonical(floor: FloorMap) -> str:
     return "\n".join(lines) + "\n"
 
 
-def least_distance(letters: Integers) -> int | None:
-    """Places in which any two rows of letters (n, k) differ at least; None below two rows.
+def min_hamming_distance(letters: Integers) -> int | None:
+    """Return the smallest Hamming distance of two rows (n, k); None for fewer than two rows.
 
-    Two rows differ in at most j places where they agree in some k - j.
+    Two rows differ in at most j letters if they agree in some k - j.
     """
     size = letters.shape[1]
     if len(letters) < 2:
         return None
     for dropped in range(size):
         for kept in itertools.combinations(range(size), size - dropped):
-            if repeated(encoded(letters[:, kept])).any():
+            if is_repeated(encode_readings(letters[:, kept])).any():
                 return dropped
     return size
 
 
-def repeated(words: Integers) -> NDArray[np.bool_]:
-    """(n,) whether another one is the same."""
-    if len(words) and words.max() < TABLE:
+def is_repeated(words: Integers) -> NDArray[np.bool_]:
+    """Return for each word (n,) whether another one equals it."""
+    if len(words) and words.max() < MAX_TABLE_WORDS:
         return np.asarray(np.bincount(words)[words] > 1)
     _, group, count = np.unique(words, return_inverse=True, return_counts=True)
     return np.asarray(count[group] > 1)
 
 
-def _duplicates(seen: Readings, words: Integers) -> tuple[tuple[Duplicate, ...], int]:
+def _find_duplicates(
+    readings: WindowReadings, words: Integers
+) -> tuple[tuple[DuplicateReading, ...], int]:
     _, first, group = np.unique(words, return_index=True, return_inverse=True)
-    again = np.flatnonzero(first[group] != np.arange(len(words)))
+    repeats = np.flatnonzero(first[group] != np.arange(len(words)))
 
-    def place(k: int) -> Place:
-        row, column = seen.cells[k, 0].tolist()
-        return (row, column), int(seen.heading[k])
+    def start(k: int) -> Start:
+        row, column = readings.cells[k, 0].tolist()
+        return (row, column), int(readings.heading[k])
 
     listed = tuple(
-        Duplicate(place(first[group[k]]), place(k), tuple(seen.letters[k].tolist()))
-        for k in again[:LISTED_DUPLICATES].tolist()
+        DuplicateReading(start(first[group[k]]), start(k), tuple(readings.letters[k].tolist()))
+        for k in repeats[:MAX_LISTED_DUPLICATES].tolist()
     )
-    return listed, len(again)
+    return listed, len(repeats)
 
 
-def _bars(floor: FloorMap, seen: Readings, words: Integers) -> tuple[Faults, Faults]:
-    """One bar flipped; one bar missing, which leaves the true word and the flipped one."""
-    codes = floor.codes[seen.cells[..., 0], seen.cells[..., 1]]
+def _bar_faults(
+    floor: FloorMap, readings: WindowReadings, words: Integers
+) -> tuple[FaultEffects, FaultEffects]:
+    """Evaluate a flipped bar, and a missing one, which leaves the true word and the flipped one."""
+    codes = floor.codes[readings.cells[..., 0], readings.cells[..., 1]]
     value = CODE_COUNT ** np.arange(codes.shape[1])
-    valid, doubtful = _Valid(words), repeated(words)[:, None]
+    valid, is_ambiguous = _WordSet(words), is_repeated(words)[:, None]
     flipped, missing = np.zeros(codes.shape, np.int64), np.zeros(codes.shape, np.int64)
     for bar in range(4):
-        wrong = as_read(codes ^ (1 << bar), seen.heading[:, None], floor.alphabet)
-        elsewhere = valid.has(words[:, None] + (wrong - seen.letters) * value)
-        flipped += elsewhere
-        missing += elsewhere | doubtful
+        misread = letters_as_read(codes ^ (1 << bar), readings.heading[:, None], floor.alphabet)
+        is_other_word = valid.contains(words[:, None] + (misread - readings.letters) * value)
+        flipped += is_other_word
+        missing += is_other_word | is_ambiguous
     cases = 4 * codes.size
-    return _faults(floor, seen, flipped, cases), _faults(floor, seen, missing, cases)
+    return (
+        _fault_effects(floor, readings, flipped, cases),
+        _fault_effects(floor, readings, missing, cases),
+    )
 
 
-def _landmarks(floor: FloorMap, seen: Readings) -> Faults:
-    size = seen.letters.shape[1]
-    harmful = np.zeros(seen.letters.shape, np.int64)
-    for lost in range(size):
-        kept = [place for place in range(size) if place != lost]
-        harmful[:, lost] = repeated(encoded(seen.letters[:, kept]))
-    return _faults(floor, seen, harmful, harmful.size)
+def _missing_landmarks(floor: FloorMap, readings: WindowReadings) -> FaultEffects:
+    size = readings.letters.shape[1]
+    harmful = np.zeros(readings.letters.shape, np.int64)
+    for missing in range(size):
+        kept = [k for k in range(size) if k != missing]
+        harmful[:, missing] = is_repeated(encode_readings(readings.letters[:, kept]))
+    return _fault_effects(floor, readings, harmful, harmful.size)
 
 
-def _faults(floor: FloorMap, seen: Readings, harmful: Integers, cases: int) -> Faults:
-    """``harmful`` (n, k) counts the harmful cases by reading and landmark."""
+def _fault_effects(
+    floor: FloorMap, readings: WindowReadings, harmful: Integers, cases: int
+) -> FaultEffects:
+    """Sum the harmful cases (n, k) by reading and landmark over the cells."""
     columns = floor.shape[1]
-    at = (seen.cells[..., 0] * columns + seen.cells[..., 1]).reshape(-1)
-    total = np.bincount(at, harmful.reshape(-1), minlength=floor.codes.size).astype(np.int64)
-    worst = np.argsort(-total, kind="stable")[:LISTED_CELLS]
+    cell_index = (readings.cells[..., 0] * columns + readings.cells[..., 1]).reshape(-1)
+    total = np.bincount(cell_index, harmful.reshape(-1), minlength=floor.codes.size)
+    total = total.astype(np.int64)
+    worst = np.argsort(-total, kind="stable")[:MAX_LISTED_CELLS]
     cells = tuple((int(k) // columns, int(k) % columns) for k in worst if total[k])
-    return Faults(cases, int(total.sum()), total.reshape(floor.shape), cells)
+    return FaultEffects(cases, int(total.sum()), total.reshape(floor.shape), cells)
 
 
-class _Valid:
-    """The words of a floor, to be asked for."""
+class _WordSet:
+    """Set of the words of a floor with a vectorised membership test."""
 
     def __init__(self, words: Integers) -> None:
         self.words = np.unique(words)
         self.table: NDArray[np.bool_] | None = None
-        if len(words) and words.max() < TABLE:
-            self.table = np.zeros(TABLE, bool)
+        if len(words) and words.max() < MAX_TABLE_WORDS:
+            self.table = np.zeros(MAX_TABLE_WORDS, bool)
             self.table[words] = True
 
-    def has(self, words: Integers) -> NDArray[np.bool_]:
+    def contains(self, words: Integers) -> NDArray[np.bool_]:
         if self.table is not None:
-            return np.asarray((words < TABLE) & self.table[np.minimum(words, TABLE - 1)])
-        at = np.minimum(np.searchsorted(self.words, words), len(self.words) - 1)
-        return (
-            np.asarray(self.words[at] == words) if len(self.words) else np.zeros(words.shape, bool)
-        )
+            in_table = self.table[np.minimum(words, MAX_TABLE_WORDS - 1)]
+            return np.asarray((words < MAX_TABLE_WORDS) & in_table)
+        if not len(self.words):
+            return np.zeros(words.shape, bool)
+        index = np.minimum(np.searchsorted(self.words, words), len(self.words) - 1)
+        return np.asarray(self.words[index] == words)

@@ -43,10 +43,10 @@ from locatk.core.landmarks.detection.trace import Trace, planar_rotation
 from locatk.core.landmarks.landmark import (
     CODE_COUNT,
     HALF_PI_RAD,
-    MIN_BAR_STRENGTH,
     Geometry,
     signs,
 )
+from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
 from locatk.core.landmarks.preprocessing import (
     HallRecording,
     VisitSegment,
@@ -473,7 +473,7 @@ def _fit_faulty(
     ):
         bar = fit.faulty_bar
         log_odds = fit.log_odds + math.log(priors.fault_probability)
-        if abs(fit.strength[bar]) > MIN_BAR_STRENGTH:
+        if abs(fit.strength[bar]) > MISSING_BAR_STRENGTH:
             fits.append(replace(fit, log_odds=log_odds))
         else:
             # The direction of a missing bar is unknown: both codes are equally probable.

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.detection.hypotheses import DetectedVisit, Hypothesis, VisitHypotheses
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, rotated
-from locatk.core.landmarks.map.as_built import laid_code, laid_codes
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, as_built_code, as_built_codes
 from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
@@ -156,7 +155,7 @@ def select_visits_on_map(
         for visit in visits
         if visit.estimate is not None
         and visit.estimate.probability >= MIN_CELL_PROBABILITY
-        and laid_code(floor, visit.cell) != HOLE
+        and as_built_code(floor, visit.cell) != HOLE
     ]
 
 
@@ -189,7 +188,7 @@ def identify_cells(
             pairwise(visits), pairwise(followed), strict=True
         )
     ]
-    codes = laid_codes(floor)
+    codes = as_built_codes(floor)
     map_likelihood = [_map_likelihood(hypotheses, codes, misread) for hypotheses in followed]
     likelihood = list(map_likelihood)
     outside_likelihood = [sum(one.probability for _, one in h) / CODE_COUNT for h in followed]

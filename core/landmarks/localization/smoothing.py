@@ -51,13 +51,18 @@ from locatk.core.landmarks.detection.trace import (
 from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.landmark import (
     HALF_PI_RAD,
-    MIN_BAR_STRENGTH,
     Geometry,
     rotated,
     signs,
 )
 from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, laid_mark
+from locatk.core.landmarks.map.floor import (
+    HOLE,
+    MISSING_BAR_STRENGTH,
+    Cell,
+    FloorMap,
+    as_built_landmark,
+)
 from locatk.core.landmarks.preprocessing import VisitSegment, planar_poses
 from locatk.core.trajectory import Trajectory
 
@@ -213,7 +218,7 @@ def subtract_neighbours(
         for column in range(max(0, cell[1] - span), min(columns, cell[1] + span + 1)):
             if (row, column) == cell or floor.codes[row, column] == HOLE:
                 continue
-            landmark, strength = laid_mark(floor, (row, column))
+            landmark, strength = as_built_landmark(floor, (row, column))
             offset = position - landmark[:2]
             is_near = np.hypot(offset[..., 0], offset[..., 1]) < NEIGHBOUR_RANGE_M
             if is_near.any():
@@ -265,7 +270,7 @@ def landmark_priors(
             pose = pose + [built.x_m, built.y_m, built.heading_rad]
             is_known = ~np.isnan(built.sigma)
             sigma = np.where(is_known[:3], np.fmax(built.sigma[:3], MIN_POSE_SIGMA), sigma)
-            is_missing = np.abs(built.strength) < MIN_BAR_STRENGTH
+            is_missing = np.abs(built.strength) < MISSING_BAR_STRENGTH
             agrees = (np.sign(built.strength) == strength) | is_missing
             built_strength_sigma = np.fmax(built.sigma[3:], MIN_STRENGTH_SIGMA)
             is_used = agrees & is_known[3:]

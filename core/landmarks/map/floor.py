@@ -1,7 +1,7 @@
-"""The floor: which landmark lies in which cell, and how it was really laid.
+"""Floor of landmarks: the map as designed, and its landmarks as built.
 
-Map frame: x right along the columns, y up along the rows, in metres; cell (row, column) is
-at ``origin + pitch * (column, row)``. Landmarks lie with their axes along the map's.
+Map frame: x right along the columns, y up along the rows, in metres. Cell (row, column) is at
+``origin + pitch * (column, row)``. The axes of designed landmarks are parallel to those of the map.
 """
 
 from __future__ import annotations
@@ -19,43 +19,49 @@ Cell = tuple[int, int]
 Wall = tuple[Cell, Cell]
 
 HOLE = -1
+"""Code of a cell without a landmark."""
 
 ALPHABETS = ("6", "16", "compass")
-"""What of a landmark is read: its pattern; its pattern and orientation; the same of the
-three patterns that tell the heading alone, all laid in one orientation."""
+"""What a robot reads of a landmark. ``"6"``: which of the paper's six patterns, equal up to
+rotation, it is. ``"16"``: the polarity of each bar. ``"compass"``: the same, but the map has only
+three patterns, all in the same orientation, each of which gives the heading."""
 
 WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
+"""Names of the windows; their cells are in :data:`.windows.WINDOW_PATHS`."""
 
 STEPS: tuple[Cell, ...] = ((0, 1), (1, 0), (0, -1), (-1, 0))
-"""(row, column) of one step under the heading of 0, 1, 2, 3 quarter turns from x."""
+"""(row, column) of one step at a heading of 0, 1, 2, 3 quarter turns from x."""
+
+MISSING_BAR_STRENGTH = 0.25
+"""Relative strength below which the orientation of a bar is unknown: it counts as missing."""
 
 
 def neighbour(cell: Cell, heading: int) -> Cell:
-    """The next cell in a heading of so many quarter turns."""
+    """Return the next cell at a heading given in quarter turns."""
     row, column = STEPS[heading % 4]
     return cell[0] + row, cell[1] + column
 
 
 @dataclass(frozen=True)
 class AsBuiltLandmark:
-    """How one landmark really lies, from ``locatk calibrate map``.
+    """Offset from the design, and bar strengths, of one landmark (``locatk calibrate map``).
 
     Attributes
     ----------
     x_m, y_m : float
-        From the cell's place to the landmark's centre, in the map's frame.
+        Offset of the landmark's centre from its cell, in the map frame.
     heading_rad : float
-        From the map's x to the landmark's.
+        Rotation of the landmark from the axes of the map.
     strength : (4,) ndarray
-        Of the bars in units of the nominal one, signed as the bar really lies: positive N,
-        negative S, 0 missing.
+        Strengths of the bars relative to the nominal one: positive for N, negative for S, 0 for a
+        missing bar.
     sigma : (7,) ndarray
-        Standard deviations of x, y, heading and the strengths; ``nan`` where unknown.
+        Standard deviations of x, y, heading and the strengths; ``nan`` if unknown.
     visits : int
-        How many visits it was fitted to.
+        Number of visits in the fit.
     flags : tuple of str
-        ``"flipped:2"``, ``"weak:0"``, ``"missing:3"``, ``"displaced"``: what is wrong, of
-        which bar.
+        Defects and the bars concerned: ``"flipped:2"``, ``"weak:0"``, ``"missing:3"``,
+        ``"displaced"``.
     """
 
     x_m: float
@@ -69,30 +75,29 @@ class AsBuiltLandmark:
 
 @dataclass(frozen=True)
 class FloorMap:
-    """A floor of landmarks: the artifact ``map.toml``.
+    """Floor of landmarks: the artifact ``map.toml``.
 
     Attributes
     ----------
     codes : (rows, columns) int64 ndarray
-        How the landmark of each cell is laid (:mod:`.landmark`); :data:`HOLE` where there
-        is none. Row 0 is at the least y.
+        Code of each cell's landmark (:mod:`.landmark`) or :data:`HOLE`. Row 0 has the smallest y.
     pitch_m : float
-        Between neighbouring cells.
+        Distance of neighbouring cells.
     alphabet : str
         One of :data:`ALPHABETS`.
     window : str
-        One of :data:`WINDOWS`: after which landmarks a robot knows where it is.
+        One of :data:`WINDOWS`: the landmarks after which a robot knows its position.
     detect : int
-        How many misread landmarks of a window are always noticed.
+        Number of misread landmarks of a window that are always detected.
     geometry : Geometry
     origin_m : (float, float)
-        Place of cell (0, 0) in the map's frame.
+        Position of cell (0, 0) in the map frame.
     walls : frozenset of (cell, cell)
-        Pairs of neighbouring cells between which no robot can go, each sorted.
-    built : mapping of cell to AsBuilt
+        Pairs of neighbouring cells between which robots cannot drive, each pair sorted.
+    built : mapping of cell to AsBuiltLandmark
     name : str
     seed : int or None
-        With which the map was found.
+        Seed of the search that generated the map.
     notes : tuple of str
     """
 
@@ -115,29 +120,35 @@ class FloorMap:
         return int(self.codes.shape[0]), int(self.codes.shape[1])
 
     def cells(self) -> list[Cell]:
-        """Cells that bear a landmark, row by row."""
+        """Return the cells that have a landmark, row by row."""
         return [(int(r), int(c)) for r, c in np.argwhere(self.codes != HOLE)]
 
     def place(self, cell: Cell) -> tuple[float, float]:
-        """Nominal place of a cell in the map's frame, in metres."""
+        """Return the nominal position of a cell in the map frame, in metres."""
         x, y = self.origin_m
         return x + self.pitch_m * cell[1], y + self.pitch_m * cell[0]
 
     def open(self, cell: Cell, heading: int) -> bool:
-        """Whether a robot at ``cell`` can go one cell on under ``heading`` quarter turns."""
+        """Return whether a robot can drive from ``cell`` to the next one at a heading.
+
+        The heading is in quarter turns. Holes, walls and the border are not passable; ``cell``
+        itself may be a hole.
+        """
         row, column = neighbour(cell, heading)
         rows, columns = self.shape
         if not (0 <= row < rows and 0 <= column < columns):
             return False
         if self.codes[row, column] == HOLE:
             return False
-        one, other = sorted([cell, (row, column)])
-        return (one, other) not in self.walls
+        first, second = sorted([cell, (row, column)])
+        return (first, second) not in self.walls
 
 
-def laid_mark(floor: FloorMap, cell: Cell) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pose (3,) in the map's frame and signed strengths (4,) of a landmark, as built as far as
-    that is known."""
+def as_built_landmark(floor: FloorMap, cell: Cell) -> tuple[Array, Array]:
+    """Return the pose (3,) in the map frame and the signed bar strengths (4,) of a landmark.
+
+    What was not measured is as designed.
+    """
     pose = np.array([*floor.place(cell), 0.0])
     strength = signs(floor.codes[cell])
     built = floor.built.get(cell)
@@ -145,3 +156,36 @@ def laid_mark(floor: FloorMap, cell: Cell) -> tuple[NDArray[np.float64], NDArray
         pose = pose + [built.x_m, built.y_m, built.heading_rad]
         strength = np.where(np.isfinite(built.strength), built.strength, strength)
     return pose, strength
+
+
+def as_built_poses(floor: FloorMap) -> Array:
+    """Return x, y in metres and heading (n, 3) of the landmarks of :meth:`FloorMap.cells`.
+
+    Landmarks that were not measured have their designed pose.
+    """
+    return np.array([as_built_landmark(floor, cell)[0] for cell in floor.cells()])
+
+
+def as_built_codes(floor: FloorMap) -> NDArray[np.int64]:
+    """Return the codes (rows, columns) that robots read.
+
+    They differ from the designed codes where bars are flipped. The orientation of a missing bar
+    is unknown; its bit is the designed one.
+    """
+    codes = floor.codes.copy()
+    for cell in floor.built:
+        codes[cell] = as_built_code(floor, cell)
+    return codes
+
+
+def as_built_code(floor: FloorMap, cell: Cell) -> int:
+    """Return the code that robots read in one cell; :data:`HOLE` outside the map."""
+    rows, columns = floor.shape
+    if not (0 <= cell[0] < rows and 0 <= cell[1] < columns) or floor.codes[cell] == HOLE:
+        return HOLE
+    built = floor.built.get(cell)
+    if built is None:
+        return int(floor.codes[cell])
+    is_present = np.abs(built.strength) >= MISSING_BAR_STRENGTH  # False if it is nan
+    is_north = np.where(is_present, built.strength, signs(floor.codes[cell])) > 0
+    return int(is_north @ (1 << np.arange(4)))

@@ -1,8 +1,8 @@
-"""The grid on which places lie: from a list of surveyed landmarks back to a floor.
+"""Fit of a grid to surveyed positions: from a list of landmarks to a floor.
 
-Other tools keep places, not cells. The pitch is the largest one of which all distances
-between columns and between rows are multiples; pitch and origin are then fitted, and taken
-as round as the places' scatter lets them be.
+Other tools store positions, not cells. The pitch is the largest length of which all distances
+between columns and between rows are multiples. Pitch and origin are then fitted by least squares,
+and rounded as far as the scatter of the positions allows.
 """
 
 from __future__ import annotations
@@ -21,34 +21,38 @@ from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
 
 Array = NDArray[np.float64]
 
-TOLERANCE_M = 0.010
-"""How far a landmark may lie off its cell, along x or y."""
+MAX_OFFSET_M = 0.010
+"""Default of the largest offset of a landmark from its cell, along x or y."""
 
-EXACT_M = 1e-6
-"""A place that is as near to its cell is that of the design."""
+DESIGN_OFFSET_M = 1e-6
+"""Largest offset from the cell of a landmark that counts as being as designed."""
 
-FINEST = 12
-"""The pitch is searched down to this part of the smallest distance."""
+MAX_PITCH_DIVISOR = 12
+"""The smallest pitch that is tried is the smallest distance divided by this number."""
 
-LARGEST_SIDE = 2_000
+MAX_CELLS_PER_SIDE = 2_000
+"""Largest number of rows or columns; more come from positions that are no landmarks."""
 
-_DIGITS = (-1, 0, 1, 2, 3, 6)
-"""Decimals of mm to which pitch and origin are rounded, the first that fits."""
+ROUNDING_SIGMAS = 3.0
+"""Pitch and origin are rounded within this many of their standard deviations."""
+
+_DECIMALS_MM = (-1, 0, 1, 2, 3, 6)
+"""Decimals of mm to which pitch and origin are rounded; the first that is close enough."""
 
 
 @dataclass(frozen=True)
-class Grid:
-    """A grid along the axes and the cells of the places on it.
+class FittedGrid:
+    """Grid parallel to the axes, and the cells of the positions on it.
 
     Attributes
     ----------
     pitch_m : float
     origin_m : (float, float)
-        Of cell (0, 0), which has the least row and column of all places.
+        Position of cell (0, 0), which has the smallest row and column of all positions.
     cells : (n, 2) int64 ndarray
-        Row and column of each place.
+        Row and column of each position.
     offset_m : (n, 2) ndarray
-        From each place's cell to the place, x and y.
+        Offset (x, y) of each position from its cell.
     """
 
     pitch_m: float
@@ -57,28 +61,15 @@ class Grid:
     offset_m: Array
 
 
-def built_poses(floor: FloorMap) -> Array:
-    """(n, 3) x, y in metres and heading of the landmarks of :meth:`FloorMap.cells`, as built
-    where that is known, else as designed."""
-    poses = []
-    for cell in floor.cells():
-        x, y = floor.place(cell)
-        built = floor.built.get(cell)
-        poses.append(
-            (x, y, 0.0) if built is None else (x + built.x_m, y + built.y_m, built.heading_rad)
-        )
-    return np.array(poses)
-
-
-def floor_of(
+def floor_from_poses(
     codes: Sequence[int],
     poses: ArrayLike,
     names: Sequence[str],
     *,
     pitch_m: float | None = None,
-    tolerance_m: float = TOLERANCE_M,
+    tolerance_m: float = MAX_OFFSET_M,
 ) -> FloorMap:
-    """The floor of landmarks that are known by their places.
+    """Return the floor of landmarks whose poses are known.
 
     Parameters
     ----------
@@ -86,159 +77,163 @@ def floor_of(
     poses : (n, 3) ndarray
         x and y in metres, heading in radians.
     names : n strings
-        What errors call the landmarks.
+        Names of the landmarks in error messages.
     pitch_m, tolerance_m
         See :func:`fit_grid`.
 
     Returns
     -------
     FloorMap
-        With the defaults of all that places do not tell. A landmark that lies off its cell
-        or is turned is known as built: with bars of nominal strength, and an unknown
-        standard deviation.
+        A landmark that is off its cell or rotated has an as-built record with bars of nominal
+        strength and unknown standard deviations. Everything that poses do not contain has its
+        default.
 
     Raises
     ------
     InputError
-        As :func:`fit_grid`; two landmarks in one cell.
+        As :func:`fit_grid`; or two landmarks are in one cell.
     """
-    at = np.asarray(poses, float).reshape(-1, 3)
-    grid = fit_grid(at[:, :2], names, pitch_m=pitch_m, tolerance_m=tolerance_m)
-    laid = np.full(grid.cells.max(0) + 1, HOLE, np.int64)
+    pose = np.asarray(poses, float).reshape(-1, 3)
+    grid = fit_grid(pose[:, :2], names, pitch_m=pitch_m, tolerance_m=tolerance_m)
+    floor_codes = np.full(grid.cells.max(0) + 1, HOLE, np.int64)
     built = {}
-    first: dict[tuple[int, int], str] = {}
-    for code, cell, offset, heading, name in zip(
-        codes, grid.cells.tolist(), grid.offset_m.tolist(), at[:, 2].tolist(), names, strict=True
+    name_of_cell: dict[tuple[int, int], str] = {}
+    for code, (row, column), offset, heading, name in zip(
+        codes, grid.cells.tolist(), grid.offset_m.tolist(), pose[:, 2].tolist(), names, strict=True
     ):
-        key = (cell[0], cell[1])
-        if key in first:
+        cell = (row, column)
+        if cell in name_of_cell:
             raise InputError(
-                f"{first[key]} and {name} lie in one cell, row {key[0]}, column {key[1]}"
+                f"{name_of_cell[cell]} and {name} are in one cell, row {row}, column {column}"
             )
-        first[key] = name
-        laid[key] = code
-        if heading or max(map(abs, offset)) > EXACT_M:
+        name_of_cell[cell] = name
+        floor_codes[cell] = code
+        if heading or max(map(abs, offset)) > DESIGN_OFFSET_M:
             x, y = offset
-            built[key] = AsBuiltLandmark(x, y, heading, signs(code), np.full(7, np.nan))
-    return FloorMap(laid, pitch_m=grid.pitch_m, origin_m=grid.origin_m, built=built)
+            built[cell] = AsBuiltLandmark(x, y, heading, signs(code), np.full(7, np.nan))
+    return FloorMap(floor_codes, pitch_m=grid.pitch_m, origin_m=grid.origin_m, built=built)
 
 
 def fit_grid(
-    places: ArrayLike,
+    positions_m: ArrayLike,
     names: Sequence[str],
     *,
     pitch_m: float | None = None,
-    tolerance_m: float = TOLERANCE_M,
-) -> Grid:
-    """The grid of places (n, 2) in metres.
+    tolerance_m: float = MAX_OFFSET_M,
+) -> FittedGrid:
+    """Fit a grid to positions.
 
     Parameters
     ----------
-    places : (n, 2) ndarray
-        Along the axes of the map: a survey in a turned frame has no grid.
+    positions_m : (n, 2) ndarray
+        In a frame whose axes are parallel to the rows and columns.
     names : n strings
-        What errors call the places.
+        Names of the positions in error messages.
     pitch_m : float, optional
-        The pitch, where it is known; else the largest that fits.
+        Pitch, if it is known; otherwise the largest that fits.
     tolerance_m : float
-        How far a place may lie off its cell, along x or y; at most a quarter of the pitch.
+        Largest offset of a position from its cell, along x or y; at most a quarter of the pitch.
 
     Raises
     ------
     InputError
-        There are no places; they tell no pitch; no pitch fits; the tolerance is too large; a
-        place is off by more than
-        the tolerance (the worst is named); the grid is very large.
+        There are no positions, or too few for the pitch; no pitch fits; the tolerance is too
+        large; a position is off by more than the tolerance (the worst is named); the grid is very
+        large.
     """
-    at = np.asarray(places, float).reshape(-1, 2)
-    if not len(at):
+    position = np.asarray(positions_m, float).reshape(-1, 2)
+    if not len(position):
         raise InputError("no landmarks")
-    groups = [_groups(axis, 2 * tolerance_m) for axis in at.T]
-    gaps = np.sort(np.concatenate([np.diff(middle) for _, middle in groups]))
-    pitch = _pitch(gaps, tolerance_m) if pitch_m is None else pitch_m
+    groups = [_group_coordinates(axis, 2 * tolerance_m) for axis in position.T]
+    gaps = np.sort(np.concatenate([np.diff(centres) for _, centres in groups]))
+    pitch = _largest_common_pitch(gaps, tolerance_m) if pitch_m is None else pitch_m
     if pitch < 4 * tolerance_m:
         raise InputError(
             f"a tolerance of {1e3 * tolerance_m:g} mm is too large for a pitch of "
             f"{1e3 * pitch:g} mm, expected less than a quarter"
         )
-    columns, rows = (_indices(group, middle, pitch) for group, middle in groups)
+    columns, rows = (_cell_indices(group, centres, pitch) for group, centres in groups)
     cells = np.column_stack([rows, columns])
-    if cells.max() >= LARGEST_SIDE:
+    if cells.max() >= MAX_CELLS_PER_SIDE:
         raise InputError(
-            f"the places lie on {cells[:, 0].max() + 1} x {cells[:, 1].max() + 1} cells of "
-            f"{1e3 * pitch:g} mm, more than {LARGEST_SIDE} a side",
-            hint="Give the --pitch, and leave out what is no landmark",
+            f"the positions are on {cells[:, 0].max() + 1} x {cells[:, 1].max() + 1} cells of "
+            f"{1e3 * pitch:g} mm, more than {MAX_CELLS_PER_SIDE} per side",
+            hint="Give the --pitch, and leave out positions that are no landmarks",
         )
     steps = cells[:, ::-1].astype(float)  # along x, y
-    spread = steps - steps.mean(0)
-    lever = (spread**2).sum()
+    centred_steps = steps - steps.mean(0)
+    sum_of_squares = (centred_steps**2).sum()
     if pitch_m is None:
-        pitch = float((spread * at).sum() / lever)
-    origin = (at - pitch * steps).mean(0)
-    offset = at - origin - pitch * steps
-    _check(offset, names, pitch, tolerance_m)
+        pitch = float((centred_steps * position).sum() / sum_of_squares)
+    origin = (position - pitch * steps).mean(0)
+    offset = position - origin - pitch * steps
+    _check_offsets(offset, names, pitch, tolerance_m)
+    # Three parameters are fitted: the pitch and the origin.
     scatter = math.sqrt((offset**2).sum() / max(offset.size - 3, 1))
     if pitch_m is None:
-        pitch = _round(pitch, 3 * scatter / math.sqrt(lever))
-    slack = 3 * scatter / math.sqrt(len(at))
-    x, y = (_round(value, slack) for value in (at - pitch * steps).mean(0).tolist())
-    return Grid(pitch, (x, y), cells, at - [x, y] - pitch * steps)
+        pitch = _round_mm(pitch, ROUNDING_SIGMAS * scatter / math.sqrt(sum_of_squares))
+    rounding = ROUNDING_SIGMAS * scatter / math.sqrt(len(position))
+    x, y = (_round_mm(value, rounding) for value in (position - pitch * steps).mean(0).tolist())
+    return FittedGrid(pitch, (x, y), cells, position - [x, y] - pitch * steps)
 
 
-def _groups(values: Array, gap_m: float) -> tuple[NDArray[np.int64], Array]:
-    """Values that belong together: the group of each, and the groups' middles, ascending."""
+def _group_coordinates(values: Array, gap_m: float) -> tuple[NDArray[np.int64], Array]:
+    """Group coordinates that no gap separates; return group indices and centres, ascending."""
     order = np.argsort(values, kind="stable")
-    number = np.concatenate([[0], np.cumsum(np.diff(values[order]) > gap_m)])
+    sorted_groups = np.concatenate([[0], np.cumsum(np.diff(values[order]) > gap_m)])
     group = np.empty(len(values), np.int64)
-    group[order] = number
+    group[order] = sorted_groups
     return group, np.bincount(group, values) / np.bincount(group)
 
 
-def _indices(group: NDArray[np.int64], middle: Array, pitch_m: float) -> NDArray[np.int64]:
-    """Column (or row) of each place."""
-    steps = np.rint(np.diff(middle) / pitch_m)
-    whole = np.concatenate([[0.0], np.cumsum(np.minimum(steps, LARGEST_SIDE))])
-    return np.asarray(whole.astype(np.int64)[group])
+def _cell_indices(group: NDArray[np.int64], centres: Array, pitch_m: float) -> NDArray[np.int64]:
+    """Return the column (or row) of each position."""
+    steps = np.rint(np.diff(centres) / pitch_m)
+    index = np.concatenate([[0.0], np.cumsum(np.minimum(steps, MAX_CELLS_PER_SIDE))])
+    return np.asarray(index.astype(np.int64)[group])
 
 
-def _pitch(gaps: Array, tolerance_m: float) -> float:
-    """The largest pitch of which all gaps, ascending, are multiples."""
+def _largest_common_pitch(gaps: Array, tolerance_m: float) -> float:
+    """Return the largest pitch of which all gaps, given in ascending order, are multiples."""
     if not len(gaps):
-        raise InputError("one place tells no pitch", hint="Give the --pitch")
-    for part in range(1, FINEST + 1):
-        pitch = float(gaps[0]) / part
+        raise InputError("one position does not give a pitch", hint="Give the --pitch")
+    for divisor in range(1, MAX_PITCH_DIVISOR + 1):
+        pitch = float(gaps[0]) / divisor
         if pitch < 4 * tolerance_m:
-            break  # any place would fit
-        top = bottom = 0.0
-        for gap in gaps.tolist():  # the longer the gap, the better the pitch must be known
+            break  # Any position would fit.
+        numerator = denominator = 0.0
+        # A longer gap needs a better pitch, which the shorter ones provide.
+        for gap in gaps.tolist():
             count = max(round(gap / pitch), 1)
             if abs(gap - count * pitch) > 2 * tolerance_m:
                 break
-            top, bottom = top + gap * count, bottom + count * count
-            pitch = top / bottom
+            numerator, denominator = numerator + gap * count, denominator + count * count
+            pitch = numerator / denominator
         else:
             return pitch
     raise InputError(
-        "the places lie on no grid along the axes",
-        hint="Give the --pitch to see which place is off, or a larger --tolerance",
+        "the positions are on no grid parallel to the axes",
+        hint="Give the --pitch to find the position that is off, or a larger --tolerance",
     )
 
 
-def _check(offset: Array, names: Sequence[str], pitch: float, tolerance_m: float) -> None:
-    off = np.abs(offset).max(1)
-    worst = int(np.argmax(off))
-    if off[worst] > tolerance_m:
+def _check_offsets(offset: Array, names: Sequence[str], pitch: float, tolerance_m: float) -> None:
+    """Raise an error that names the worst position if it is farther off than the tolerance."""
+    largest = np.abs(offset).max(1)
+    worst = int(np.argmax(largest))
+    if largest[worst] > tolerance_m:
         raise InputError(
-            f"{names[worst]} lies {1e3 * off[worst]:.1f} mm off the grid of {1e3 * pitch:.6g} mm, "
-            f"more than {1e3 * tolerance_m:g}; so do {int((off > tolerance_m).sum()) - 1} others",
-            hint="Correct the place, or give the --pitch or a larger --tolerance",
+            f"{names[worst]} is {1e3 * largest[worst]:.1f} mm off the grid of "
+            f"{1e3 * pitch:.6g} mm, more than {1e3 * tolerance_m:g}; so are "
+            f"{int((largest > tolerance_m).sum()) - 1} others",
+            hint="Correct the position, or give the --pitch or a larger --tolerance",
         )
 
 
-def _round(value_m: float, slack_m: float) -> float:
-    """The roundest number of mm within the slack, in metres."""
-    for digits in _DIGITS:
-        near = float(Decimal(repr(round(1e3 * value_m, digits))).scaleb(-3))
-        if abs(near - value_m) <= slack_m + 1e-10:
-            return near + 0.0
+def _round_mm(value_m: float, tolerance_m: float) -> float:
+    """Return the length with the fewest decimals of mm within the tolerance, in metres."""
+    for decimals in _DECIMALS_MM:
+        rounded = float(Decimal(repr(round(1e3 * value_m, decimals))).scaleb(-3))
+        if abs(rounded - value_m) <= tolerance_m + 1e-10:
+            return rounded + 0.0  # 0.0 instead of -0.0
     return value_m

@@ -52,8 +52,8 @@ def radii(geometry: Geometry) -> tuple[float, float]:
     """
     angles = np.radians(np.arange(0, 360, 1.5) + 0.75)
     strengths = signs(code_of("NNNS"))
-    found = territory.contour(geometry, strengths[:, None], angles)[:, 0]
-    both = territory.radii(angles, found, strengths)
+    found = territory.threshold_contour(geometry, strengths[:, None], angles)[:, 0]
+    both = territory.territory_radii(angles, found, strengths)
     if not np.isfinite(both).all():
         raise DegenerateError(
             f"no field of {geometry.threshold_t * 1e3:g} mT around the landmark",

@@ -9,10 +9,11 @@ The paper's image axes are x right, y up, and z ahead, a left-handed frame; imag
 z = 1. Solving in it is consistent, and the results are converted to station axes (x forward,
 y left, z up) at the end.
 
-Two departures, without which the method yields no poses: the image points have one factor
-1/cos(theta) instead of two (:func:`paper_image_points`), and the solution among the candidates of
-Eq. 5 to 10 is selected automatically by the paper's own conditions, not by hand as in the
-authors' scripts (DotBots/alvarado23lighthouse).
+Departures from the printed text, which docs/lighthouse.md lists with their effects: the image
+points have one factor 1/cos(theta) instead of two (:func:`paper_image_points`), Eq. 4 is a
+difference, Eq. 8 has the factor that makes its matrix a rotation by the right angle, and the
+solution among the candidates of Eq. 5 to 10 is selected automatically by the paper's own
+conditions, not by hand as in the authors' scripts (DotBots/alvarado23lighthouse).
 """
 
 from __future__ import annotations
@@ -149,7 +150,8 @@ def two_planar(image: Array) -> PaperScene:
     # Eq. 4 is printed as a quotient; the authors' code has the difference.
     zeta = s1 - s3
     a, b = _unit(np.sqrt(max(1 - s3**2, 0)), np.sqrt(max(s1**2 - 1, 0)))  # Eq. 6
-    c, d = _unit(1 + s1 * s3, a * b * (s1**2 - s3**2))  # Eq. 8
+    # Eq. 8 is printed as d = a b.
+    c, d = _unit(1 + s1 * s3, a * b * (s1**2 - s3**2))
     e, f = _unit(-b / s1, -a / s3)  # Eq. 10
     candidates = []
     for sign in (1.0, -1.0):

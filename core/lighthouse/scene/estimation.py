@@ -64,15 +64,16 @@ from locatk.core.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 SCENE_KINDS = ("auto", "one-planar", "two-planar", "two-3d")
-"""Kinds of scenes; ``"auto"`` is decided from the stations and the data."""
+"""Kinds of scenes; ``two-`` means two or more stations, ``"auto"`` is decided from the stations and
+the data."""
 
 MAX_BUNDLE_KEYFRAMES = 1500
-"""Number of keyframes in the bundle adjustment. More do not make the scene more accurate, because
-its error is that of the calibrations, and they cost time."""
+"""Largest number of keyframes in the bundle adjustment. More cost time and do not make the scene
+more accurate, because its error is that of the calibrations."""
 
 MAX_START_PAIRS = 3
-"""Number of pairs of stations to start from. Further ones are tried if the first leads to less
-than half of the stations."""
+"""Number of pairs of stations to start from. Further ones are tried if the first registers no more
+than half of the group of linked stations."""
 
 MIN_START_KEYFRAMES_RATIO = 0.25
 """Smallest number of common keyframes of a pair to start from, relative to the best pair."""
@@ -82,8 +83,8 @@ MIN_PLANE_TEST_KEYFRAMES = 20
 """Number of pairs on which a plane is tested, and their fewest common keyframes."""
 
 MIN_SPATIAL_PAIR_FRACTION = 0.25
-"""Fraction of these pairs off any plane from which the scene is in space. The common keyframes
-of a single pair may be of a flat part of the drive only."""
+"""The scene is spatial if at least this fraction of the tested pairs fits no plane. The common
+keyframes of a single pair may be of a flat part of the drive only."""
 
 MIN_SHARED_KEYFRAMES = 4
 """Fewest common keyframes that link two stations to one group."""
@@ -178,7 +179,7 @@ def estimate_scene(
     if kind == "one-planar":
         return _estimate_one_station(epochs, prior)
     require_two_stations(kind, epochs)
-    return _estimate_stations_of(epochs, prior, kind, odometry, seed)
+    return _estimate_several_stations(epochs, prior, kind, odometry, seed)
 
 
 def resolve_scene_kind(kind: str, prior: Scene, epochs: Epochs) -> str:
@@ -264,7 +265,7 @@ def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
 # ---- two stations or more
 
 
-def _estimate_stations_of(
+def _estimate_several_stations(
     epochs: Epochs, prior: Scene, kind: str, odometry: Sequence[Trajectory], seed: int
 ) -> SceneEstimate:
     """Estimate two or more stations of a recording and fix their gauge."""
@@ -297,7 +298,7 @@ def _estimate_stations_of(
     )
     warnings = (
         *_left_out_warnings(estimate, epochs),
-        *_plane_warnings(estimate, decided_by_data=planar is None),
+        *_assumption_warnings(estimate, decided_by_data=planar is None),
         *framed.warnings,
         *generic_calibration_warnings(kept.channels.tolist(), framed.state.calibrations),
     )
@@ -332,7 +333,9 @@ def _left_out_warnings(estimate: StationsEstimate, epochs: Epochs) -> list[Solve
     return warnings
 
 
-def _plane_warnings(estimate: StationsEstimate, *, decided_by_data: bool) -> list[SolverWarning]:
+def _assumption_warnings(
+    estimate: StationsEstimate, *, decided_by_data: bool
+) -> list[SolverWarning]:
     """Return the assumptions about a plane, and evidence against them."""
     warnings = []
     facts = estimate.facts

@@ -11,8 +11,13 @@ from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import code_of, rotated, signs
 from locatk.core.landmarks.localization.cell_filter import identify_cells
 from locatk.core.landmarks.localization.smoothing import subtract_neighbours
-from locatk.core.landmarks.map.as_built import laid_codes
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap, laid_mark
+from locatk.core.landmarks.map.floor import (
+    HOLE,
+    AsBuiltLandmark,
+    FloorMap,
+    as_built_codes,
+    as_built_landmark,
+)
 from locatk.core.landmarks.simulation.floor import floor_field, lay
 from locatk.core.landmarks.simulation.options import NONE, Faults
 
@@ -26,23 +31,23 @@ def built(
 
 
 def test_codes_are_the_designs_where_nothing_else_is_known() -> None:
-    assert np.array_equal(laid_codes(FloorMap(CODES)), CODES)
+    assert np.array_equal(as_built_codes(FloorMap(CODES)), CODES)
     sound = {(1, 1): built(0.97 * signs(7)), (0, 1): built([np.nan] * 4)}
-    assert np.array_equal(laid_codes(FloorMap(CODES, built=sound)), CODES)
+    assert np.array_equal(as_built_codes(FloorMap(CODES, built=sound)), CODES)
 
 
 def test_flipped_bars_change_codes_and_missing_ones_do_not() -> None:
     one = {(0, 0): built([-1.0, 0.02, 1.0, -0.1])}  # designed NSNN
-    assert laid_codes(FloorMap(CODES, built=one))[0, 0] == code_of("SSNN")
+    assert as_built_codes(FloorMap(CODES, built=one))[0, 0] == code_of("SSNN")
     assert CODES[0, 0] == 13
 
 
 def test_a_mark_is_where_and_what_was_built() -> None:
     floor = FloorMap(CODES, built={(1, 2): built([np.nan, 0.5, 0.0, -1.1], 2e-3, -1e-3, 0.02)})
-    pose, strength = laid_mark(floor, (1, 2))
+    pose, strength = as_built_landmark(floor, (1, 2))
     assert pose == pytest.approx([0.402, 0.199, 0.02])
     assert strength == pytest.approx([signs(2)[0], 0.5, 0.0, -1.1])
-    pose, strength = laid_mark(floor, (0, 1))
+    pose, strength = as_built_landmark(floor, (0, 1))
     assert pose == pytest.approx([0.2, 0, 0])
     assert np.array_equal(strength, signs(5))
 

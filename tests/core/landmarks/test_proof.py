@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.design.proof import least_distance, prove
+from locatk.core.landmarks.design.proof import min_hamming_distance, prove_map
 from locatk.core.landmarks.landmark import PATTERNS, code_of
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
-from locatk.core.landmarks.map.windows import readings
+from locatk.core.landmarks.map.windows import window_readings
 
 Walk = Callable[[FloorMap], dict[Any, Any]]
 
@@ -49,14 +49,14 @@ def published(folder: Path, name: str) -> FloorMap:
 def test_published_maps_are_unique(data: Path, walked: Walk, name: str) -> None:
     """facts/landmarks.md 4: found and verified by other programs."""
     floor = published(data, name)
-    proof = prove(floor)
+    proof = prove_map(floor)
     by_letters = {letters for _, letters in walked(floor).values()}
-    assert proof.unique
+    assert proof.is_unique
     assert proof.holds
     assert len(by_letters) == proof.readings
-    assert proof.least_distance == 1
-    assert proof.localisation is not None
-    assert proof.localisation.never == 0
+    assert proof.min_distance == 1
+    assert proof.localization is not None
+    assert proof.localization.never == 0
     assert (proof.landmarks_worst or 99) <= 5
 
 
@@ -69,9 +69,9 @@ def test_a_changed_letter_is_found_with_both_places(data: Path, walked: Walk, na
         codes = floor.codes.copy()
         codes[cell] = codes[0, 5] if codes[cell] != codes[0, 5] else codes[0, 6]
         spoiled = replace(floor, codes=codes)
-        proof = prove(spoiled, steps=False)
+        proof = prove_map(spoiled, steps=False)
         walks = walked(spoiled)
-        found += not proof.unique
+        found += not proof.is_unique
         assert proof.duplicate_count == len(walks) - len({w for _, w in walks.values()})
         for one, other, letters in proof.duplicates:
             assert one != other
@@ -86,14 +86,14 @@ def test_as_slow_passes_say(
     seed: int, random_floor: Callable[[int], FloorMap], walked: Walk
 ) -> None:
     floor = random_floor(seed)
-    proof = prove(floor)
+    proof = prove_map(floor)
     walks = list(walked(floor).values())
     words = [letters for _, letters in walks]
     apart = [sum(a != b for a, b in zip(x, y, strict=True)) for x, y in combinations(words, 2)]
     assert proof.readings == len(words)
-    assert proof.unique == (len(set(words)) == len(words))
-    assert proof.least_distance == (min(apart) if apart else None)
-    assert proof.unique == (proof.duplicate_count == 0) == (not proof.duplicates)
+    assert proof.is_unique == (len(set(words)) == len(words))
+    assert proof.min_distance == (min(apart) if apart else None)
+    assert proof.is_unique == (proof.duplicate_count == 0) == (not proof.duplicates)
     if apart:
         assert proof.detects == max(0, min(apart) - 1)
     silent = np.zeros(floor.shape, int)
@@ -130,35 +130,35 @@ def test_as_slow_passes_say(
 
 
 def walked_word(floor: FloorMap, place: tuple[tuple[int, int], int]) -> tuple[int, ...]:
-    seen = readings(floor)
+    seen = window_readings(floor)
     (row,) = np.flatnonzero((seen.cells[:, 0] == place[0]).all(1) & (seen.heading == place[1]))
     return tuple(seen.letters[row].tolist())
 
 
 def test_least_distance_is_told_beyond_one() -> None:
     words = np.array([[0, 0, 0, 0], [1, 2, 3, 0], [15, 15, 0, 15]])
-    assert least_distance(words) == 3
-    assert least_distance(words[[0, 0]]) == 0
-    assert least_distance(np.array([[0, 0], [1, 1]])) == 2
-    assert least_distance(words[:1]) is None
+    assert min_hamming_distance(words) == 3
+    assert min_hamming_distance(words[[0, 0]]) == 0
+    assert min_hamming_distance(np.array([[0, 0], [1, 1]])) == 2
+    assert min_hamming_distance(words[:1]) is None
 
 
 def test_what_is_promised_is_not_believed() -> None:
     floor = FloorMap(np.array([[0, 1], [3, 7]]), alphabet="16", detect=1)
-    proof = prove(floor)
-    assert proof.unique
+    proof = prove_map(floor)
+    assert proof.is_unique
     assert proof.promised == 1
     assert proof.holds == (proof.detects >= 1)
-    assert not prove(replace(floor, codes=np.zeros((2, 2), int))).holds
+    assert not prove_map(replace(floor, codes=np.zeros((2, 2), int))).holds
 
 
 def test_floors_without_a_window_are_proved_too() -> None:
     for codes in ([[5]], [[HOLE]], [[3, HOLE], [HOLE, 3]]):
-        proof = prove(FloorMap(np.array(codes)))
+        proof = prove_map(FloorMap(np.array(codes)))
         assert proof.readings == 0
-        assert proof.unique
-        assert proof.least_distance is None
-        assert proof.flipped_bar.share == 0
+        assert proof.is_unique
+        assert proof.min_distance is None
+        assert proof.flipped_bar.harmful_fraction == 0
 
 
 def test_fingerprint_tells_maps_apart() -> None:
@@ -172,7 +172,7 @@ def test_fingerprint_tells_maps_apart() -> None:
         replace(floor, window="I2"),
         replace(floor, walls=frozenset({((0, 0), (0, 1))})),
     ]
-    prints = [prove(other, steps=False).fingerprint for other in others]
+    prints = [prove_map(other, steps=False).fingerprint for other in others]
     assert len(set(prints)) == len(others)
     # What a proof is not about leaves it as it is.
-    assert prove(replace(floor, pitch_m=0.3, name="x"), steps=False).fingerprint == prints[0]
+    assert prove_map(replace(floor, pitch_m=0.3, name="x"), steps=False).fingerprint == prints[0]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from locatk.core.landmarks.landmark import code_of
 from locatk.core.landmarks.map.floor import HOLE, WINDOWS, FloorMap
-from locatk.core.landmarks.map.windows import readings, ways
+from locatk.core.landmarks.map.windows import passable_steps, window_readings
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -23,7 +23,7 @@ def test_as_a_robot_walks(
     seed: int, random_floor: Callable[[int], FloorMap], walked: Callable[[FloorMap], Any]
 ) -> None:
     floor = random_floor(seed)
-    seen = readings(floor)
+    seen = window_readings(floor)
     found = {
         (tuple(cells[0].tolist()), int(heading)): (
             [tuple(cell) for cell in cells.tolist()],
@@ -41,7 +41,7 @@ def test_ways_are_where_the_floor_is_open(
     seed: int, random_floor: Callable[[int], FloorMap]
 ) -> None:
     floor = random_floor(seed)
-    free = ways(floor)
+    free = passable_steps(floor)
     for cell in floor.cells():
         assert [floor.open(cell, heading) for heading in range(4)] == free[cell].tolist()
     assert not free[floor.codes == HOLE].any()
@@ -50,7 +50,7 @@ def test_ways_are_where_the_floor_is_open(
 def test_a_left_turn_by_hand() -> None:
     """Facing up the rows, left is towards lower columns."""
     codes = np.array([[0, code_of("NSSS")], [code_of("SSNS"), code_of("NNSS")]])
-    seen = readings(FloorMap(codes, window="L"))
+    seen = window_readings(FloorMap(codes, window="L"))
     (up,) = np.flatnonzero((seen.heading == 1) & (seen.cells[:, 0] == [0, 1]).all(1))
     assert seen.cells[up].tolist() == [[0, 1], [1, 1], [1, 0]]
     # Bar 0 is on the map's right side, which is this robot's right too: its bar 3.
@@ -68,4 +68,4 @@ def test_counts_are_those_of_the_facts(window: str) -> None:
     }
     for k in (2, 3):
         counts[f"I{k}"] = 2 * (m * (n - k + 1) + n * (m - k + 1))
-    assert len(readings(FloorMap(np.zeros((m, n), int), window=window))) == counts[window]
+    assert len(window_readings(FloorMap(np.zeros((m, n), int), window=window))) == counts[window]

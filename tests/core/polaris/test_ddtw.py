@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from locatk.core import kernels
 from locatk.core.errors import InputError
 from locatk.core.polaris.published import ddtw
-from locatk.core.polaris.published.templates import template_set, templates
+from locatk.core.polaris.published.templates import TemplateGrid, template_set, templates
 from locatk.core.polaris.tag import Tags
 
 Array = NDArray[np.float64]
@@ -31,15 +31,16 @@ def by_definition(a: Array, b: Array) -> float:
     """Written from Keogh and Pazzani's text, number by number."""
 
     def slopes(series: Array) -> list[list[float]]:
-        scale = math.sqrt(sum(float(np.var(series[:, axis])) for axis in range(3)))
-        return [
+        found = [
             [
                 ((series[i][axis] - series[i - 1][axis])
-                 + (series[i + 1][axis] - series[i - 1][axis]) / 2) / 2 / scale
+                 + (series[i + 1][axis] - series[i - 1][axis]) / 2) / 2
                 for axis in range(3)
             ]
             for i in range(1, len(series) - 1)
         ]  # fmt: skip
+        scale = math.sqrt(sum(math.hypot(*slope) ** 2 for slope in found) / len(found))
+        return [[value / scale for value in slope] for slope in found]
 
     q, c = slopes(a), slopes(b)
     total: dict[tuple[int, int], float] = {}
@@ -86,8 +87,22 @@ def test_offset_and_scale_of_a_sensor_do_not_matter() -> None:
     )
 
 
+def test_slopes_keep_their_size_at_any_sampling_density() -> None:
+    # The standard deviation of the samples would not do: the derivative is one per sample.
+    coarse, fine = (template_set(Tags(), 0.01, TemplateGrid(points=n)).field_t for n in (40, 160))
+    for series in (coarse, fine):
+        size = np.square(ddtw.normalised_slopes(series)).sum(axis=-1).mean(axis=-1)
+        np.testing.assert_allclose(size, 1, rtol=1e-9)
+
+
+def test_the_axes_keep_their_proportions() -> None:
+    series = walk(10, 30, 3) * [1.0, 2.0, 5.0]
+    ratio = ddtw.normalised_slopes(series) / ddtw.derivative(series)
+    np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-9)
+
+
 def test_a_template_is_nearest_to_itself_at_other_speeds() -> None:
-    made = template_set(Tags(), orientations=18)
+    made = template_set(Tags(), 0.01, TemplateGrid(orientations=18))
     slopes = ddtw.prepare(made.field_t)
     for k in range(0, 90, 7):
         assert ddtw.distances(made.field_t[k], slopes)[k] == 0

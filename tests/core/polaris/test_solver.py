@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
+from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import Placed, TagLayout, Tags
@@ -308,6 +309,9 @@ def test_bad_input_is_named(world: Any) -> None:
         SolveOptions(method="best")
     with pytest.raises(InputError, match="speed"):
         SolveOptions(speed_mps=-1.0)
+    with pytest.raises(InputError, match="joint uses no templates") as error:
+        SolveOptions(templates=TemplateGrid())
+    assert "--method paper" in str(error.value.hint)
     backwards = replace(recording, time_ns=recording.time_ns[::-1].copy())
     with pytest.raises(InputError, match="time stamps"):
         solve([backwards], TAGS)

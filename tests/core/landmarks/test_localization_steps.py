@@ -9,7 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.core.landmarks.design.localization_steps import NEVER, localise, wanted_turns
+from locatk.core.landmarks.design.localization_steps import (
+    NEVER_LOCALIZED,
+    count_localization_steps,
+    window_turns,
+)
 from locatk.core.landmarks.landmark import PATTERN_OF, rotated
 from locatk.core.landmarks.map.floor import STEPS, WINDOWS, Cell, FloorMap
 
@@ -53,7 +57,7 @@ class Robot:
 @settings(deadline=None, max_examples=40)
 def test_as_robots_with_lists(seed: int, random_floor: Callable[[int], FloorMap]) -> None:
     floor = random_floor(seed)
-    result = localise(floor)
+    result = count_localization_steps(floor)
     robots = {(c, h): Robot(floor, c, h) for c in floor.cells() for h in range(4)}
     starts = dict.fromkeys(robots, 0)
     for steps in range(1, 60):
@@ -70,7 +74,7 @@ def test_as_robots_with_lists(seed: int, random_floor: Callable[[int], FloorMap]
         if wanted:
             assert got == wanted
         else:
-            assert got == NEVER or got >= 60
+            assert got == NEVER_LOCALIZED or got >= 60
     assert (result.landmarks[floor.codes == -1] == 0).all()
     told = [n for n in starts.values() if n]
     assert result.never + len(told) == len(starts) or not all(starts.values())
@@ -82,12 +86,12 @@ def test_as_robots_with_lists(seed: int, random_floor: Callable[[int], FloorMap]
 
 @pytest.mark.parametrize("window", WINDOWS)
 def test_turns_of_the_windows(window: str) -> None:
-    assert wanted_turns(window) == TURNS[window]
+    assert window_turns(window) == TURNS[window]
 
 
 def test_starts_that_look_alike_for_ever() -> None:
     """On a square of equal landmarks all corners and headings are four kinds of start."""
-    result = localise(FloorMap(np.zeros((3, 3), int), alphabet="6"))
+    result = count_localization_steps(FloorMap(np.zeros((3, 3), int), alphabet="6"))
     assert result.never == 36
     assert result.worst is None
     assert result.mean is None
@@ -98,6 +102,6 @@ def test_starts_that_are_told_apart_late() -> None:
     """A corridor that differs at its far end only."""
     codes = np.zeros((1, 60), int)
     codes[0, -1] = 15
-    result = localise(FloorMap(codes, alphabet="6", window="I2"))
+    result = count_localization_steps(FloorMap(codes, alphabet="6", window="I2"))
     assert result.landmarks[0, 59].min() == 2
     assert (result.landmarks[0, 0, 0], result.never) == (60, 0)

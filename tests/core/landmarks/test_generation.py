@@ -11,11 +11,11 @@ import pytest
 
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.landmarks.design import search
-from locatk.core.landmarks.design.generation import DesignOptions, design
-from locatk.core.landmarks.design.proof import prove
+from locatk.core.landmarks.design.generation import DesignOptions, design_map
+from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
-from locatk.core.landmarks.map.windows import ALPHABET_CODES, placements, ways
+from locatk.core.landmarks.map.windows import ALPHABET_CODES, passable_steps, place_windows
 
 MODES = [
     (5, 6, "6", "L", 0),
@@ -45,12 +45,12 @@ def options(rows: int, columns: int, alphabet: str, window: str, detect: int) ->
 
 @pytest.mark.parametrize("mode", MODES)
 def test_maps_hold_what_they_promise(mode: Any, walked: Callable[[FloorMap], Any]) -> None:
-    floor = design(options(*mode))
+    floor = design_map(options(*mode))
     words = [letters for _, letters in walked(floor).values()]
     assert len(set(words)) == len(words)
     assert floor.shape == mode[:2]
     assert set(np.unique(floor.codes)) <= set(ALPHABET_CODES[mode[2]])
-    assert prove(floor, steps=False).holds
+    assert prove_map(floor, steps=False).holds
     for place in range(len(words[0]) if words and mode[4] else 0):
         rest = {word[:place] + word[place + 1 :] for word in words}
         assert len(rest) == len(words)
@@ -71,12 +71,12 @@ def test_maps_hold_what_they_promise(mode: Any, walked: Callable[[FloorMap], Any
     ],
 )
 def test_sizes_of_the_facts_are_found(mode: Any) -> None:
-    assert prove(design(options(*mode)), steps=False).holds
+    assert prove_map(design_map(options(*mode)), steps=False).holds
 
 
 def test_same_seed_same_map() -> None:
     wanted = options(12, 9, "16", "L", 0)
-    maps = [design(replace(wanted, seed=seed)) for seed in (0, 0, 1, -5, 2**40)]
+    maps = [design_map(replace(wanted, seed=seed)) for seed in (0, 0, 1, -5, 2**40)]
     assert (maps[0].codes == maps[1].codes).all()
     assert all((maps[0].codes != other.codes).mean() > 0.5 for other in maps[2:])
     assert [floor.seed for floor in maps] == [0, 0, 1, -5, 2**40]
@@ -89,23 +89,25 @@ def test_what_was_asked_for_is_on_the_map() -> None:
     wanted = DesignOptions(
         6, 7, alphabet="6", pitch_m=0.25, forbidden=forbidden, walls=walls, geometry=geometry
     )
-    floor = design(wanted)
+    floor = design_map(wanted)
     assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE).tolist()} == forbidden
     assert floor.walls == {((1, 1), (1, 2)), ((4, 3), (5, 3))}
     assert (floor.pitch_m, floor.geometry, floor.window) == (0.25, geometry, "L")
-    assert prove(floor).unique
+    assert prove_map(floor).is_unique
 
 
 def test_more_than_the_bound_is_refused() -> None:
     with pytest.raises(InputError, match="only 4096"):
-        design(DesignOptions(40, 40))
+        design_map(DesignOptions(40, 40))
 
 
 def test_a_spent_budget_says_what_is_left() -> None:
     """34 x 34 less one is within the bound, and none is known."""
     seen: list[tuple[float, int]] = []
-    with pytest.raises(DegenerateError, match=r"of 3844 readings at best \d+ repeat") as error:
-        design(DesignOptions(32, 32, evaluations=100_000), lambda *told: seen.append(told))
+    options = DesignOptions(32, 32, evaluations=100_000)
+    message = r"at best \d+ of 3844 words of its readings repeat"
+    with pytest.raises(DegenerateError, match=message) as error:
+        design_map(options, lambda *report: seen.append(report))
     assert "seed" in str(error.value.hint)
     shares = [share for share, _ in seen]
     assert shares == sorted(shares)
@@ -131,7 +133,7 @@ def test_a_spent_budget_says_what_is_left() -> None:
 )
 def test_options_that_are_none(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        design(replace(DesignOptions(5, 5), **change))
+        design_map(replace(DesignOptions(5, 5), **change))
 
 
 @pytest.mark.skipif(search.kernels is None, reason="the compiled twin is not built")
@@ -139,12 +141,12 @@ def test_options_that_are_none(change: dict[str, Any], message: str) -> None:
 def test_twins_draw_the_same(mode: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, columns, alphabet, window, detect = mode
     there = np.ones((rows, columns), bool)
-    cells, heading = placements(there, ways(FloorMap(there.astype(np.int64))), window)
+    cells, heading = place_windows(there, passable_steps(FloorMap(there.astype(np.int64))), window)
     flat = cells[..., 0] * columns + cells[..., 1]
-    task = search.problem(rows * columns, flat, heading, window, alphabet, detect)
-    one = search.random_values(rows * columns, search.LETTERS[alphabet], 4)
+    task = search.build_problem(rows * columns, flat, heading, window, alphabet, detect)
+    one = search.random_values(rows * columns, search.LETTER_COUNTS[alphabet], 4)
     other = one.copy()
-    heat = search.weights(1.5)
+    heat = search.letter_weights(1.5)
     left = search.search(task, one, heat, 9, 150)
     monkeypatch.setattr(search, "kernels", None)
     assert search.search(task, other, heat, 9, 150) == left
@@ -157,13 +159,23 @@ def test_twins_draw_the_same(mode: Any, monkeypatch: pytest.MonkeyPatch) -> None
 def test_the_map_does_not_depend_on_compiled_loops(
     mode: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compiled = design(options(*mode)).codes
+    compiled = design_map(options(*mode)).codes
     monkeypatch.setattr(search, "kernels", None)
-    assert (design(options(*mode)).codes == compiled).all()
+    assert (design_map(options(*mode)).codes == compiled).all()
 
 
 def test_weights_are_those_of_a_heat_bath() -> None:
-    heat = search.weights(0.5).astype(float)
-    assert heat[0] == 2**search.SHIFT
+    heat = search.letter_weights(0.5).astype(float)
+    assert heat[0] == 2**search.WEIGHT_BITS
     assert heat[1:4] / heat[:3] == pytest.approx(np.exp(-2), rel=1e-3)
     assert heat[-1] <= 2
+
+
+def test_progress_is_the_used_fraction_of_the_budget() -> None:
+    fractions: list[float] = []
+    options = DesignOptions(32, 32, evaluations=2_000_000)
+    with pytest.raises(DegenerateError):
+        design_map(options, lambda fraction, repeats: fractions.append(fraction))
+    assert fractions[-1] == pytest.approx(1.0)
+    # The first third of the stages are the short rounds: 1 of 13 parts of the budget.
+    assert fractions[len(fractions) // 3 - 1] == pytest.approx(1 / 13)

@@ -7,8 +7,8 @@ import pytest
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.landmark import signs
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
-from locatk.core.landmarks.map.grid_fit import built_poses, fit_grid, floor_of
+from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap, as_built_poses
+from locatk.core.landmarks.map.grid_fit import fit_grid, floor_from_poses
 
 
 def names(count: int) -> list[str]:
@@ -61,7 +61,7 @@ def test_what_is_off_is_named() -> None:
     at = places([(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)], 0.2)
     at[4, 1] += 0.03
     at[2, 0] += 0.016
-    with pytest.raises(InputError, match=r"p4 lies .* mm off the grid of 200 mm"):
+    with pytest.raises(InputError, match=r"p4 is .* mm off the grid of 200 mm"):
         fit_grid(at, names(6), pitch_m=0.2)
     with pytest.raises(InputError, match="no grid"):
         fit_grid(at, names(6))
@@ -69,7 +69,7 @@ def test_what_is_off_is_named() -> None:
     assert found.cells[4].tolist() == [1, 1]
     for wrong, words in (
         ({"tolerance_m": 0.06, "pitch_m": 0.2}, "tolerance of 60 mm is too large"),
-        ({"pitch_m": 5e-5, "tolerance_m": 1e-6}, "more than 2000 a side"),
+        ({"pitch_m": 5e-5, "tolerance_m": 1e-6}, "more than 2000 per side"),
     ):
         with pytest.raises(InputError, match=words):
             fit_grid(at, names(6), **wrong)
@@ -92,7 +92,7 @@ def test_poses_are_as_built() -> None:
         built={(1, 0): AsBuiltLandmark(0.003, -0.002, 0.1, signs(7), np.full(7, np.nan))},
     )
     wanted = [(1, 2, 0), (1.003, 2.198, 0.1), (1.2, 2.2, 0)]
-    np.testing.assert_allclose(built_poses(floor), wanted, atol=1e-15)
-    back = floor_of([5, 7, 1], built_poses(floor), names(3), pitch_m=0.2)
+    np.testing.assert_allclose(as_built_poses(floor), wanted, atol=1e-15)
+    back = floor_from_poses([5, 7, 1], as_built_poses(floor), names(3), pitch_m=0.2)
     np.testing.assert_array_equal(back.codes, floor.codes)
-    np.testing.assert_allclose(built_poses(back), wanted, atol=1e-12)
+    np.testing.assert_allclose(as_built_poses(back), wanted, atol=1e-12)
