@@ -166,7 +166,7 @@ def describe_landmarks(
             x, y, heading = (float(value) for value in deviation[k])
             flags = flag_deviations(signs(design.codes[cell]), deviation[k], strength, sigma)
             built = AsBuiltLandmark(x, y, heading, strength, sigma, count[cell], flags)
-            landmarks[cell] = CalibratedLandmark(cell, built, _refusal(sigma))
+            landmarks[cell] = CalibratedLandmark(cell, built, refusal_reason(sigma))
     return landmarks
 
 
@@ -209,7 +209,7 @@ def flag_deviations(
     return tuple(flags)
 
 
-def _refusal(sigma: Array) -> str:
+def refusal_reason(sigma: Array) -> str:
     """Return the reason for which a landmark is not written to the map, or ``""``."""
     if np.any(sigma[:3] > MAX_REPORTED_SIGMA):
         return "its pose is too uncertain"

@@ -21,7 +21,11 @@ from locatk.core.landmarks.calibration.floor import (
     calibrate,
     read_drive,
 )
-from locatk.core.landmarks.calibration.landmarks import describe_landmarks, flag_deviations
+from locatk.core.landmarks.calibration.landmarks import (
+    describe_landmarks,
+    flag_deviations,
+    refusal_reason,
+)
 from locatk.core.landmarks.landmark import signs
 from locatk.core.landmarks.localization import smoothing
 from locatk.core.landmarks.map.floor import Cell, FloorMap
@@ -354,3 +358,17 @@ def test_relative_covariances_have_no_gauge_part() -> None:
     for k in range(5):
         part = slice(3 * k, 3 * k + 3)
         assert own[k] == pytest.approx(4 * whole[part, part], rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("position_m", "strength", "reason"),
+    [
+        (1.4e-3, 0.14, ""),
+        (1.6e-3, 0.14, "its pose is too uncertain"),
+        (1.4e-3, 0.16, "the strength of bar 2 is too uncertain"),
+        (np.nan, 0.14, ""),
+    ],
+)
+def test_uncertain_landmarks_are_refused(position_m: float, strength: float, reason: str) -> None:
+    sigma = np.array([position_m, 1e-4, 1e-3, 0.01, 0.01, strength, 0.01])
+    assert refusal_reason(sigma) == reason

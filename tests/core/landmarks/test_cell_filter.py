@@ -291,13 +291,16 @@ def test_recording_may_begin_outside_of_the_map() -> None:
 
 
 def test_repeated_visits_are_no_evidence_of_the_cell() -> None:
-    floor = FloorMap(np.random.default_rng(8).integers(0, CODE_COUNT, (12, 12)))
-    path = walk(((4, 4), 0), (0, 2, 2, 2, 2))
+    """The only landmark of its code on the map, or another one that is misread."""
+    codes = np.zeros((12, 12), np.int64)
+    codes[5, 5] = 7
+    floor = FloorMap(codes)
+    path = walk(((5, 5), 0), (0, 2, 2, 2, 2))
     largest = []
     for count in (2, 6):
         visits = visits_of(floor, path[:count], on_map(floor, path[:count]))
         largest.append(max(one.probability for one in found(floor, visits)))
-    assert largest[0] < 0.5
+    assert largest[0] < 0.9
     assert largest[1] == pytest.approx(largest[0], rel=0.05)
 
 

@@ -15,6 +15,7 @@ from locatk.core.landmarks.detection.hypotheses import Hypothesis, LandmarkFit, 
 from locatk.core.landmarks.detection.trace import (
     Trace,
     compose,
+    correct_constant_errors,
     odometry_corrections,
     relative,
     sensor_positions,
@@ -218,6 +219,24 @@ def test_two_runs_share_landmarks() -> None:
     for cell in CODES:
         assert both.landmarks[cell].covariance[0, 0] < alone.landmarks[cell].covariance[0, 0]
     assert compose(both.visits[1][0].pose, np.zeros(3)).shape == (3,)
+
+
+def test_links_take_large_constant_errors_exactly() -> None:
+    """Curvature of eight standard deviations, and a second visit where the path then ends."""
+    robot, landmarks = session()
+    system = SmoothingSystem([robot], landmarks, GEOMETRY, PRIORS)
+    state = system.initial_state()
+    constant = np.array([0.0, 0.0, 8.0])
+    state[system.robot_columns[0][-3:]] = constant
+    first, second = robot.visits[:2]
+    start = bin_pose_with_gradient(first.trace, -1, state[system.visit_columns[0][0]], constant)[0]
+    path = correct_constant_errors(robot.links[0].pose, constant, PRIORS.drift)
+    end = compose(start, path[-1])
+    local = second.trace.pose[0] + second.trace.correction[0][:, :3] @ constant
+    pose = np.array([0.0, 0.0, end[2] - local[2]])
+    pose[:2] = end[:2] - compose(pose, local)[:2]
+    state[system.visit_columns[0][1][:3]] = pose
+    assert np.abs(system.link_rows(state, 0, 0)[2]).max() < 1e-6
 
 
 # ---- priors of landmarks

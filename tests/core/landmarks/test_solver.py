@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
+from locatk.core.landmarks import solver
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import pattern
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
@@ -324,3 +325,24 @@ def test_options_out_of_range_are_refused() -> None:
         SolveOptions(method="magic")
     with pytest.raises(InputError, match="misread"):
         SolveOptions(misread=0.0)
+
+
+@pytest.mark.parametrize(
+    ("residual_sigma", "warned", "poses"),
+    [(1.9, False, True), (2.1, True, True), (11.9, True, True), (12.1, True, False)],
+)
+def test_residuals_of_the_fields_limit_the_poses(
+    residual_sigma: float, warned: bool, poses: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    smooth = solver.smooth
+    monkeypatch.setattr(
+        solver,
+        "smooth",
+        lambda *given: replace(smooth(*given), residual_sigma=residual_sigma),
+    )
+    solution = solved(session())
+    assert ("field_misfit" in warning_codes(solution)) == warned
+    assert bool(solution.trajectories) == poses
+    facts = solution.facts.robots["robot"]
+    assert facts.localised == poses
+    assert facts.misfit_sigma == residual_sigma
