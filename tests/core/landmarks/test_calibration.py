@@ -282,6 +282,7 @@ def test_no_usable_recording() -> None:
         ({"strength": [1, -1, -0.75, 1], "sigma": 0.1}, ()),
         ({"strength": [1, 0.9, -1, 1]}, ("flipped:1",)),
         ({"strength": [1, 0.5, -1, 1]}, ("flipped:1", "weak:1")),
+        ({"strength": [1, 0.3, -1, 1], "sigma": 0.15}, ("weak:1",)),
         ({"strength": [0.2, -1, -1, -0.1]}, ("missing:0", "missing:3")),
         ({"left": [3e-3, 3e-3, 0]}, ()),
         ({"left": [4e-3, 4e-3, 0]}, ("displaced",)),
