@@ -13,7 +13,7 @@ from locatk.cli.solve import speed_option
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.calibration import CalibrationReport, Pass
+    from locatk.core.polaris.calibration import TagCalibrationReport, TagPass
     from locatk.core.polaris.tag import Tags
 
 
@@ -76,7 +76,7 @@ def _attached(path: Path) -> Tags:
 
 def _passes(
     sessions: tuple[Path, ...], tags: Tags, speed: float | None, same: bool
-) -> tuple[list[Pass], dict[str, str]]:
+) -> tuple[list[TagPass], dict[str, str]]:
     """The passes of all sessions, and what is none: name to why.
 
     With ``same``, each session must hold the design of ``tags``.
@@ -84,14 +84,14 @@ def _passes(
     from dataclasses import replace
 
     from locatk.core import polaris
-    from locatk.core.polaris.calibration import pass_of
+    from locatk.core.polaris.calibration import tag_pass
     from locatk.formats import observations
     from locatk.formats.session import Session
 
     # What an earlier calibration says must not come back as if it had been seen.
     design = replace(tags, built={}, site={})
     wanted = polaris.SolveOptions(method="joint", speed_mps=speed)
-    passes: list[Pass] = []
+    passes: list[TagPass] = []
     left_out: dict[str, str] = {}
     with recordings.walk(sessions, "Solving") as bar:
         for path in bar:
@@ -109,7 +109,7 @@ def _passes(
                 left_out[str(path)] = "no tag was seen"
             for detection in solution.detections:
                 name = f"{path} at {detection.time_s:.3f} s"
-                found = pass_of(design, detection, name)
+                found = tag_pass(design, detection, name)
                 if isinstance(found, str):
                     left_out[name] = found
                 else:
@@ -128,12 +128,12 @@ def _check_same(tags: Tags, other: Tags, path: Path) -> None:
             )
 
 
-def _text(output: Path, report: CalibrationReport) -> str:
+def _text(output: Path, report: TagCalibrationReport) -> str:
     """The magnets for people: a table for each tag."""
     from locatk.core.polaris.codec import layout_of
 
     lines = []
-    for found in report.found:
+    for found in report.calibrated:
         cells = layout_of(report.tags, found.tag_id).cells
         rows = [
             (
@@ -154,12 +154,14 @@ def _text(output: Path, report: CalibrationReport) -> str:
     return "\n".join([*lines, f"Wrote {output}"])
 
 
-def _entry(sessions: tuple[Path, ...], output: Path, report: CalibrationReport) -> dict[str, Any]:
+def _entry(
+    sessions: tuple[Path, ...], output: Path, report: TagCalibrationReport
+) -> dict[str, Any]:
     """The one object of ``--json``; docs/formats.md."""
     from locatk.core.polaris.codec import layout_of
 
     tags = []
-    for found in report.found:
+    for found in report.calibrated:
         layout = layout_of(report.tags, found.tag_id)
         magnets = [
             {

@@ -126,6 +126,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join(line(row) for row in [list(header), *cells])
 
 
+def labelled(rows: Sequence[tuple[str, str]]) -> str:
+    """Format pairs of a label and a text as aligned lines, two spaces between them."""
+    width = max(len(label) for label, _ in rows)
+    return "\n".join(f"{label:<{width}}  {text}" for label, text in rows)
+
+
 def _numeric(cell: str) -> bool:
     return cell in ("", "-") or cell.lstrip("<>=~+- ")[:1].isdigit()
 

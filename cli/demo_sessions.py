@@ -79,18 +79,18 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     from math import radians
 
     from locatk.core.polaris.codec import layout_of
-    from locatk.core.polaris.drawing import cards
+    from locatk.core.polaris.drawing.cards import draw_tag_cards
     from locatk.core.polaris.simulation import session as simulate
-    from locatk.core.polaris.tag import Placed, Tags
+    from locatk.core.polaris.tag import PlanarPose, Tags
     from locatk.formats import arrays
     from locatk.formats.output import atomic_write
-    from locatk.formats.pdf import tag
+    from locatk.formats.pdf.drawings import render_pages
 
     ids = (262_143, 77, 123_456)
     tags = Tags(
         codec="polaris-released",
         site={
-            number: Placed(0.5 * k, 0.02 * k, radians(turn))
+            number: PlanarPose(0.5 * k, 0.02 * k, radians(turn))
             for k, (number, turn) in enumerate(zip(ids, (0.0, 90.0, 200.0), strict=True))
         },
     )
@@ -115,19 +115,20 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
         odometry=() if simulated.odometry is None else (simulated.odometry,),
         overwrite=overwrite,
     )
-    drawn = cards.draw(tags, [(number, layout_of(tags, number)) for number in ids], (210.0, 297.0))
+    layouts = [(number, layout_of(tags, number)) for number in ids]
+    drawn = draw_tag_cards(tags, layouts, (210.0, 297.0))
     with atomic_write(folder / PRINTED["polaris"], overwrite=overwrite) as stream:
-        stream.write(tag.render(drawn.pages, "locatk demo"))
+        stream.write(render_pages(drawn.pages, "locatk demo"))
     return (simulated.truth,)
 
 
 def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     from locatk.core.landmarks.design.generation import DesignOptions, design_map
-    from locatk.core.landmarks.drawing.pack import pack
+    from locatk.core.landmarks.drawing.pack import draw_installation_pack
     from locatk.core.landmarks.simulation import session as simulate
     from locatk.formats import halls
     from locatk.formats.output import atomic_write
-    from locatk.formats.pdf import landmarks
+    from locatk.formats.pdf.drawings import render_pages
 
     floor = design_map(DesignOptions(rows=6, columns=8, seed=seed))
     wanted = simulate.SimulationOptions(
@@ -146,9 +147,9 @@ def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...
         odometry=simulated.odometry,
         overwrite=overwrite,
     )
-    made = pack(floor, (210.0, 297.0), paper_name="A4")
+    made = draw_installation_pack(floor, (210.0, 297.0), paper_name="A4")
     with atomic_write(folder / PRINTED["landmarks"], overwrite=overwrite) as stream:
-        stream.write(landmarks.render(made.pages, "locatk demo"))
+        stream.write(render_pages(made.pages, "locatk demo"))
     return simulated.truth
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import errno
 import os
 import traceback
+from collections.abc import Sequence
 
 import click
 
@@ -40,6 +41,22 @@ class Incomplete(click.ClickException):
     """The command finished, but something was lost or left unsolved; says what."""
 
     exit_code = 3
+
+
+def finish_with_warnings(warnings: Sequence[str]) -> None:
+    """Print the warnings of a report, and end the command as incomplete if there are any.
+
+    The first warning is the reason in the last line of the output.
+
+    Raises
+    ------
+    Incomplete
+        There is a warning.
+    """
+    for text in warnings[1:]:
+        console.warn(f"{text[0].upper()}{text[1:]}.")
+    if warnings:
+        raise Incomplete(warnings[0])
 
 
 def report(error: BaseException) -> int:

@@ -79,7 +79,7 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
 def _tell(path: Path, floor: FloorMap, proof: MapProof) -> None:
     """The proof of one map."""
     console.result(f"{path}: {map_proof.verdict(proof)}\n")
-    console.result(map_proof.lines([*map_proof.floor_lines(floor), *map_proof.proof_lines(proof)]))
+    console.result(console.labelled([*map_proof.floor_lines(floor), *map_proof.proof_lines(proof)]))
     if proof.duplicates:
         console.result("\n" + map_proof.duplicates(proof, floor))
     if proof.readings:

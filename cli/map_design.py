@@ -162,14 +162,14 @@ def _tell(
     output: Path, floor: FloorMap, proof: MapProof, analysis: LandmarkAnalysis, as_json: bool
 ) -> None:
     from locatk.core.landmarks.design.analysis import landmark_warnings, pitch_warnings
-    from locatk.core.landmarks.design.materials import patterns
+    from locatk.core.landmarks.design.materials import count_patterns
 
-    found = patterns(floor)
+    found = count_patterns(floor)
     counts = ", ".join(f"{item.landmarks} {item.letters}" for item in found)
     bars = 4 * len(floor.cells())
     console.result(f"Wrote {output}\n")
     console.result(
-        map_proof.lines(
+        console.labelled(
             [
                 *map_proof.floor_lines(floor),
                 *map_proof.proof_lines(proof),
@@ -194,7 +194,7 @@ def _tell(
         )
     for note in floor.notes:
         console.detail(f"{note[0].upper()}{note[1:]}.")
-    _warn(said)
+    failures.finish_with_warnings(said)
 
 
 def _landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
@@ -211,7 +211,7 @@ def _landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
     console.result(map_landmark.text(found, pitch_m))
     if as_json:
         console.emit_json({"version": 1, **map_landmark.entry(found, pitch_m), "warnings": said})
-    _warn(said)
+    failures.finish_with_warnings(said)
 
 
 def _check_pitch(geometry: Geometry, pitch_m: float) -> None:
@@ -221,13 +221,6 @@ def _check_pitch(geometry: Geometry, pitch_m: float) -> None:
             f"bars of neighbouring landmarks overlap at a pitch of {1e3 * pitch_m:g} mm",
             hint=f"give at least {1e3 * least:g} mm",
         )
-
-
-def _warn(said: list[str]) -> None:
-    for text in said[1:]:
-        console.warn(f"{text[0].upper()}{text[1:]}.")
-    if said:
-        raise failures.Incomplete(said[0])
 
 
 @contextmanager

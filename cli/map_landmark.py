@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console
+from locatk.core.units import length_text
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.design.analysis import (
@@ -102,10 +103,15 @@ def _tolerance(effect: ToleranceEffect) -> dict[str, Any]:
 def head(geometry: Geometry) -> str:
     """The landmark in two lines."""
     g = geometry
-    return (
-        f"Landmark  four bars of {bar(g)}, {_mm(g.radius_m)} from the middle\n"
-        f"Sensors   {_mm(g.sensor_height_m)} above the bars, on a circle of {_mm(g.circle_m)}, "
-        f"threshold {1e3 * g.threshold_t:.4g} mT"
+    return console.labelled(
+        (
+            ("Landmark", f"four bars of {bar(g)}, {_mm(g.radius_m)} from the middle"),
+            (
+                "Sensors",
+                f"{_mm(g.sensor_height_m)} above the bars, on a circle of {_mm(g.circle_m)}, "
+                f"threshold {1e3 * g.threshold_t:.4g} mT",
+            ),
+        )
     )
 
 
@@ -213,4 +219,4 @@ def _clean(value: float, digits: int) -> str:
 
 
 def _mm(metres: float) -> str:
-    return f"{1e3 * metres:.4g} mm"
+    return length_text(metres, 4)

@@ -96,12 +96,6 @@ def proof_lines(proof: MapProof) -> list[tuple[str, str]]:
     return lines
 
 
-def lines(pairs: list[tuple[str, str]]) -> str:
-    """Names and what they are, aligned."""
-    width = max(len(name) for name, _ in pairs)
-    return "\n".join(f"{name:<{width}}  {what}" for name, what in pairs)
-
-
 def duplicates(proof: MapProof, floor: FloorMap) -> str:
     """The first duplicates, with both places."""
     table = console.table(

@@ -11,10 +11,10 @@ from locatk.cli import console, options
 from locatk.core.errors import OutputExistsError, error_context
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.drawing.pack import Pack
-    from locatk.core.landmarks.drawing.true_size import Tile
+    from locatk.core.landmarks.drawing.pack import InstallationPack
+    from locatk.core.landmarks.drawing.true_size import FloorPage
     from locatk.core.landmarks.map.floor import FloorMap
-    from locatk.core.materials import Item
+    from locatk.core.materials import BillItem
     from locatk.core.paper import Paper
 
 
@@ -105,7 +105,7 @@ def landmarks(
       locatk print landmarks map.toml -o floor.pdf --floor --paper roll:914mm --overlap 20
       locatk print landmarks map.toml -o pack.pdf --spares 10 --bom parts.csv
     """
-    from locatk.core.landmarks.design.materials import bill
+    from locatk.core.landmarks.design.materials import bill_of_materials
     from locatk.core.paper import parse_paper
     from locatk.formats.maps import read_map
     from locatk.formats.materials import write_bill
@@ -124,7 +124,7 @@ def landmarks(
         if bom.resolve() == output.resolve():
             raise OutputExistsError("drawing and materials would be one file", file=bom)
     floor = read_map(map_file)
-    items = bill(floor, spares_percent)
+    items = bill_of_materials(floor, spares_percent)
     with error_context(map_file):
         if whole_floor:
             data, answer = _floor(floor, on, margin_mm, 10.0 if overlap_mm is None else overlap_mm)
@@ -156,41 +156,41 @@ def _pack(
     floor: FloorMap, on: Paper, margin_mm: float, spares_percent: float, templates_only: bool
 ) -> tuple[bytes, dict[str, Any]]:
     """The PDF, and what is in it."""
-    from locatk.core.landmarks.drawing.pack import PARTS, pack
-    from locatk.formats.pdf.landmarks import render
+    from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pack
+    from locatk.formats.pdf.drawings import render_pages
 
-    made = pack(
+    made = draw_installation_pack(
         floor,
         on.size_mm,
-        parts=("templates",) if templates_only else PARTS,
+        parts=("templates",) if templates_only else PACK_PARTS,
         paper_name=on.name,
         margin_mm=margin_mm,
         spares_percent=spares_percent,
     )
     with console.steps(len(made.pages), "Drawing") as done:
-        data = render(made.pages, _title(floor), done=done)
+        data = render_pages(made.pages, _title(floor), done=done)
     return data, _pack_entry(made)
 
 
 def _floor(
     floor: FloorMap, on: Paper, margin_mm: float, overlap_mm: float
 ) -> tuple[bytes, dict[str, Any]]:
-    from locatk.core.landmarks.drawing.true_size import floor_tiles
-    from locatk.formats.pdf.landmarks import render_floor
+    from locatk.core.landmarks.drawing.true_size import draw_floor
+    from locatk.formats.pdf.drawings import render_floor
 
-    tiles = floor_tiles(floor, on, margin_mm=margin_mm, overlap_mm=overlap_mm)
-    with console.steps(len(tiles), "Drawing") as done:
-        data = render_floor(tiles, _title(floor), done=done)
-    return data, _floor_entry(tiles)
+    pages = draw_floor(floor, on, margin_mm=margin_mm, overlap_mm=overlap_mm)
+    with console.steps(len(pages), "Drawing") as done:
+        data = render_floor(pages, _title(floor), done=done)
+    return data, _floor_entry(pages)
 
 
 def _title(floor: FloorMap) -> str:
     return f"locatk landmarks {floor.name}".strip()
 
 
-def _pack_entry(made: Pack) -> dict[str, Any]:
+def _pack_entry(made: InstallationPack) -> dict[str, Any]:
     """What ``--json`` says of a pack (docs/formats.md)."""
-    from locatk.core.landmarks.drawing.landmark import digit
+    from locatk.core.landmarks.drawing.landmark import code_digit
     from locatk.core.landmarks.landmark import name
 
     return {
@@ -199,7 +199,7 @@ def _pack_entry(made: Pack) -> dict[str, Any]:
         "parts": {part: [first + 1, end] for part, (first, end) in made.parts.items()},
         "templates": [
             {
-                "code": digit(item.code),
+                "code": code_digit(item.code),
                 "bars": name(item.code),
                 "cells": item.cells,
                 "page": item.page + 1,
@@ -211,26 +211,30 @@ def _pack_entry(made: Pack) -> dict[str, Any]:
     }
 
 
-def _floor_entry(tiles: list[Tile]) -> dict[str, Any]:
+def _floor_entry(pages: list[FloorPage]) -> dict[str, Any]:
     """What ``--json`` says of a floor at true size (docs/formats.md)."""
     return {
-        "pages": len(tiles),
-        "page_mm": tiles[0].size_mm,
+        "pages": len(pages),
+        "page_mm": pages[0].size_mm,
         "tiles": [
             {
-                "id": tile.name,
+                "id": page.tile.name,
                 "page": number,
-                "x_mm": round(tile.corner_mm[0], 6),
-                "y_mm": round(tile.corner_mm[1], 6),
-                "box_mm": tile.box,
+                "x_mm": round(page.tile.corner_mm[0], 6),
+                "y_mm": round(page.tile.corner_mm[1], 6),
+                "box_mm": page.tile.box,
             }
-            for number, tile in enumerate(tiles, 1)
+            for number, page in enumerate(pages, 1)
         ],
     }
 
 
 def _text(
-    output: Path, bom: Path | None, floor: FloorMap, items: tuple[Item, ...], answer: dict[str, Any]
+    output: Path,
+    bom: Path | None,
+    floor: FloorMap,
+    items: tuple[BillItem, ...],
+    answer: dict[str, Any],
 ) -> str:
     """What was drawn, for people."""
     width, height = answer["page_mm"]

@@ -14,7 +14,7 @@ from locatk.core.errors import InputError, error_context
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from locatk.core.polaris.drawing.cards import Template
+    from locatk.core.polaris.drawing.cards import TagPages
     from locatk.core.polaris.tag import TagLayout, Tags
 
 FORMATS = ("pdf", "svg")
@@ -93,13 +93,13 @@ def tag(
       locatk print tag tag.toml --id 7 -o below.pdf --mirror
     """
     from locatk.core.paper import paper_size
-    from locatk.core.polaris.drawing import cards
+    from locatk.core.polaris.drawing.cards import draw_tag_cards
     from locatk.formats.tags import read_tags
 
     format_name = format_name or _ending(output)
     tags = read_tags(tag_file)
     _, paper_mm = paper_size(size)
-    template = cards.draw(
+    drawn = draw_tag_cards(
         tags,
         _layouts(tag_file, tags, ids),
         paper_mm,
@@ -107,14 +107,14 @@ def tag(
         margin_mm=margin_mm,
         mirror=mirror,
     )
-    files = _files(output, format_name, len(template.pages))
+    files = _files(output, format_name, len(drawn.pages))
     for path in files:
         options.guard_output(path, overwrite=overwrite, inputs=[tag_file])
-    _write(files, format_name, template, overwrite=overwrite)
-    console.result(_text(files, template))
+    _write(files, format_name, drawn, overwrite=overwrite)
+    console.result(_text(files, drawn))
     console.say("Print at 100 %, without scaling to fit, and measure the rulers.")
     if as_json:
-        console.emit_json(_entry(files, template))
+        console.emit_json(_entry(files, drawn))
 
 
 def _ending(output: Path) -> str:
@@ -149,44 +149,45 @@ def _files(output: Path, format_name: str, pages: int) -> list[Path]:
     return [output.with_stem(f"{output.stem}-{n:0{digits}}") for n in range(1, pages + 1)]
 
 
-def _write(files: Sequence[Path], format_name: str, template: Template, *, overwrite: bool) -> None:
+def _write(files: Sequence[Path], format_name: str, drawn: TagPages, *, overwrite: bool) -> None:
     """All is written whole before anything appears."""
     from locatk.formats.output import atomic_write
 
-    ids = {item.tag_id for item in template.tags}
+    ids = {item.tag_id for item in drawn.tags}
     title = f"locatk tag {min(ids)}" if len(ids) == 1 else f"locatk, {len(ids)} tags"
     if format_name == "pdf":
-        from locatk.formats.pdf.tag import render  # reportlab: not for the other format
+        from locatk.formats.pdf.drawings import render_pages  # reportlab: not for the other format
 
-        drawn = [render(template.pages, title)]
+        hint = "Use a smaller paper, or --format svg"
+        contents = [render_pages(drawn.pages, title, hint=hint)]
     else:
         from locatk.formats import tag_svg
 
-        drawn = [tag_svg.render(page, title) for page in template.pages]
+        contents = [tag_svg.render(page, title) for page in drawn.pages]
     with contextlib.ExitStack() as stack:
-        for path, data in zip(files, drawn, strict=True):
+        for path, data in zip(files, contents, strict=True):
             stack.enter_context(atomic_write(path, overwrite=overwrite)).write(data)
 
 
-def _text(files: Sequence[Path], template: Template) -> str:
+def _text(files: Sequence[Path], drawn: TagPages) -> str:
     """What was drawn, for people."""
-    count, pages = len(template.tags), len(template.pages)
+    count, pages = len(drawn.tags), len(drawn.pages)
     names = str(files[0]) if len(files) == 1 else f"{files[0]} to {files[-1].name}"
-    width, height = template.pages[0].size_mm
+    width, height = drawn.pages[0].size_mm
     return (
         f"Wrote {names}: {count} tag{'s' * (count > 1)} on {pages} page{'s' * (pages > 1)} of "
         f"{width:g} x {height:g} mm"
     )
 
 
-def _entry(files: Sequence[Path], template: Template) -> dict[str, Any]:
+def _entry(files: Sequence[Path], drawn: TagPages) -> dict[str, Any]:
     """The same as ``--json`` (docs/commands.md)."""
     return {
         "version": 1,
         "outputs": list(files),
-        "page_mm": template.pages[0].size_mm,
+        "page_mm": drawn.pages[0].size_mm,
         "tags": [
             {"id": item.tag_id, "page": item.page + 1, "origin_mm": item.origin_mm}
-            for item in template.tags
+            for item in drawn.tags
         ],
     }

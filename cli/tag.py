@@ -78,11 +78,11 @@ def encode(
       locatk tag encode 262143 --codec polaris-released
     """
     from locatk.core.polaris import codec as codecs
-    from locatk.core.polaris.tag import angles, places
+    from locatk.core.polaris.tag import cell_positions, symbol_angles
 
     tags = design_of(tag, order, magnets, orientations, codec)
     layout = codecs.layout_of(tags, number)
-    place, angle = places(tags, layout.cells), angles(tags, layout.symbols)
+    place, angle = cell_positions(tags, layout.cells), symbol_angles(tags, layout.symbols)
     degrees = [symbol * 360 / tags.orientations for symbol in layout.symbols]
     console.result(f"Tag {number} of {codecs.capacity(tags)}, codec {tags.codec}\n")
     console.result(_drawing(tags, layout, degrees) + "\n")
@@ -148,11 +148,13 @@ def decode(
       locatk tag decode 0,0:3 1,1:41 0,2:-5 1,2:90 2,2:2 --tag tag.toml
       locatk tag decode 0,0:1 0,2:2 2,2:7 --symbols --order 3 --magnets 3
     """
-    from locatk.core.polaris.identification.decoding import read
+    from locatk.core.polaris.identification.decoding import decode_tag
 
     tags = design_of(tag, order, magnets, orientations, codec)
     step = 1.0 if symbols else 360 / tags.orientations
-    found = read(tags, [cell for cell, _ in magnets_at], [turn / step for _, turn in magnets_at])
+    found = decode_tag(
+        tags, [cell for cell, _ in magnets_at], [turn / step for _, turn in magnets_at]
+    )
     if as_json:
         console.emit_json(
             {

@@ -15,7 +15,7 @@ from locatk.core.errors import OutputExistsError
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.design.planning import Plan
+    from locatk.core.polaris.design.planning import DesignReport
     from locatk.core.polaris.tag import Magnet
 
 GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
@@ -87,7 +87,7 @@ def design(
       locatk tag design -o tag.toml --spacing 16 --osr 2 --rate 100 --speed 0.3
     """
     from locatk.core.polaris.codec import families
-    from locatk.core.polaris.design.planning import compact_spacing, plan
+    from locatk.core.polaris.design.planning import compact_spacing, evaluate_design
     from locatk.core.polaris.tag import Tags
     from locatk.formats.materials import write_bill
     from locatk.formats.tags import write_tags
@@ -118,11 +118,13 @@ def design(
     )
     if count is not None:
         with console.working("Generating"):
-            tags = replace(tags, ids=families.generate(tags, count, min_distance))
-        tags = replace(tags, notes=(f"family of rule {families.VERSION}, count {count}",))
-    families.check(tags)
+            tags = replace(tags, ids=families.generate_family(tags, count, min_distance))
+        tags = replace(
+            tags, notes=(f"family of rule {families.FAMILY_RULE_VERSION}, count {count}",)
+        )
+    families.check_family(tags)
     with console.working("Planning"):
-        planned = plan(tags, use_of(**use), count=len(tags.ids or (0,)))
+        planned = evaluate_design(tags, use_of(**use), count=len(tags.ids or (0,)))
     write_tags(output, tags, overwrite=overwrite)
     if bom is not None:
         write_bill(bom, planned.materials, overwrite=overwrite)
@@ -149,16 +151,16 @@ def check(tag: Path, as_json: bool, **use: Any) -> None:
       locatk tag check tag.toml --placement-error 2 --json
     """
     from locatk.core.polaris.codec import families
-    from locatk.core.polaris.design.planning import plan
+    from locatk.core.polaris.design.planning import evaluate_design
     from locatk.formats.tags import read_tags
 
     tags = read_tags(tag)
     with console.working("Planning"):
-        planned = plan(tags, use_of(**use), count=len(tags.ids or (0,)))
+        planned = evaluate_design(tags, use_of(**use), count=len(tags.ids or (0,)))
     warnings = list(planned.warnings)
     found: int | None = None
     if tags.ids is not None and len(tags.ids) > 1:
-        found, pair = families.closest(tags, tags.ids)
+        found, pair = families.closest_pair(tags, tags.ids)
         console.result(
             f"Smallest distance in the family: {found} (ids {pair[0]} and {pair[1]}), "
             f"{tags.min_distance} is asked for\n"
@@ -172,14 +174,14 @@ def check(tag: Path, as_json: bool, **use: Any) -> None:
 
 
 def _magnet(diameter: float, height: float, grade: str | None, remanence: float | None) -> Magnet:
-    from locatk.core.polaris.design.materials import disc
+    from locatk.core.polaris.design.materials import disc_magnet
 
     if grade is None and remanence is None:
         grade = "N52"
-    return disc(metres(diameter), metres(height), grade=grade or "", remanence_t=remanence)
+    return disc_magnet(metres(diameter), metres(height), grade=grade or "", remanence_t=remanence)
 
 
-def _tell(planned: Plan, warnings: list[str], more: dict[str, Any], as_json: bool) -> None:
+def _tell(planned: DesignReport, warnings: list[str], more: dict[str, Any], as_json: bool) -> None:
     """The plan and its notes, the warnings, and the exit status they mean."""
     from locatk.cli import tag_plan
 
@@ -188,7 +190,4 @@ def _tell(planned: Plan, warnings: list[str], more: dict[str, Any], as_json: boo
         console.say(note)
     if as_json:
         console.emit_json({"version": 1, **more, **tag_plan.entry(planned), "warnings": warnings})
-    for warning in warnings[1:]:
-        console.warn(f"{warning[0].upper()}{warning[1:]}.")
-    if warnings:
-        raise failures.Incomplete(warnings[0])
+    failures.finish_with_warnings(warnings)

@@ -13,7 +13,7 @@ from locatk.cli.options import number, together
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.polaris.design.planning import Use
+    from locatk.core.polaris.design.planning import ReadingConditions
     from locatk.core.polaris.tag import Tags
 
 CODECS = ("mosk", "redundant", "polaris-released")
@@ -95,12 +95,12 @@ def use_of(
     rate: float | None,
     speed: float,
     placement_error: float | None,
-) -> Use:
+) -> ReadingConditions:
     """How tags are to be read, after :data:`use_options`."""
-    from locatk.core.polaris.design.planning import Use
+    from locatk.core.polaris.design.planning import ReadingConditions
     from locatk.core.polaris.mlx90393 import Settings
 
-    return Use(
+    return ReadingConditions(
         sensors=sensors,
         sensor_spacing_m=metres(sensor_spacing),
         settings=Settings(gain, resolution, osr, filt),

@@ -194,6 +194,11 @@ def heading_from_quaternion(quaternion: ArrayLike) -> Array:
     return np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
+def wrap_angle(angle_rad: ArrayLike) -> Array:
+    """Return the equivalent angles (...) in [-pi, pi)."""
+    return np.asarray(np.remainder(np.asarray(angle_rad, float) + np.pi, 2 * np.pi) - np.pi)
+
+
 def rotation_exp(vectors: ArrayLike) -> Array:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) (axis times angle).
 

@@ -13,6 +13,17 @@ def metres(millimetres: float) -> float:
     return float(Decimal(repr(millimetres)).scaleb(-3))
 
 
+def length_text(value_m: float, digits: int = 3) -> str:
+    """Format a length in metres as mm with ``digits`` significant digits and the unit.
+
+    Examples
+    --------
+    >>> length_text(0.01234), length_text(0.2, 4)
+    ('12.3 mm', '200 mm')
+    """
+    return f"{1e3 * value_m:.{digits}g} mm"
+
+
 def mm_text(value_m: float, decimals: int = 1) -> str:
     """Format a length in metres as mm with at most ``decimals`` decimals and no trailing zeros.
 

@@ -13,10 +13,8 @@ import io
 import math
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from locatk.core.drawing import Line, Polygon, arrow
-from locatk.core.landmarks.drawing.landmark import bar_outlines
+from locatk.core.drawing import Line, Polygon
+from locatk.core.landmarks.drawing.landmark import bar_outlines, pole_arrow, pole_letters
 from locatk.core.landmarks.landmark import name
 from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
 
@@ -86,19 +84,16 @@ def _block(document: Drawing, floor: FloorMap, code: int) -> None:
 
     block = document.blocks.new(f"LANDMARK_{name(code)}")
     width = 1e3 * floor.geometry.bar_width_m
-    for corners, south, north, _ in bar_outlines(floor.geometry, code):
-        block.add_lwpolyline(corners.tolist(), close=True, dxfattribs={"layer": "BARS"})
-        along = np.subtract(north, south)
-        start, tip = (tuple(np.add(south, part * along).tolist()) for part in (0.28, 0.72))
-        head = min(0.5 * width, 0.2 * math.dist(south, north))
-        for mark in arrow(start, tip, head):
+    for bar in bar_outlines(floor.geometry, code):
+        block.add_lwpolyline(bar.corners.tolist(), close=True, dxfattribs={"layer": "BARS"})
+        for mark in pole_arrow(floor.geometry, bar):
             if isinstance(mark, Line):
                 block.add_line(mark.start, mark.end, dxfattribs={"layer": "POLES"})
             elif isinstance(mark, Polygon):
                 block.add_solid(mark.corners, dxfattribs={"layer": "POLES"})
-        for letter, part in (("S", 0.13), ("N", 0.87)):
+        for letter, position in pole_letters(bar):
             block.add_text(letter, height=0.4 * width, dxfattribs={"layer": "POLES"}).set_placement(
-                tuple(np.add(south, part * along).tolist()), align=TextEntityAlignment.MIDDLE_CENTER
+                position, align=TextEntityAlignment.MIDDLE_CENTER
             )
 
 

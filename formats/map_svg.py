@@ -15,8 +15,8 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.drawing import Line, Point, Polygon, arrow
-from locatk.core.landmarks.drawing.landmark import bar_outlines
+from locatk.core.drawing import Line, Point, Polygon
+from locatk.core.landmarks.drawing.landmark import bar_outlines, pole_arrow, pole_letters
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, Geometry, name
 from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
 
@@ -75,19 +75,15 @@ class _Shape:
             stop = sum(map(len, points))
             return slice(stop - len(points[-1]), stop)
 
-        for corners, south, north, _ in bar_outlines(geometry, code):
-            self.outlines.append(add(corners))
-            along = np.subtract(north, south)
-            # The arrow takes the middle of the bar, the letters its two ends.
-            start, tip = (tuple(np.add(south, part * along).tolist()) for part in (0.28, 0.72))
-            head = min(0.5e3 * geometry.bar_width_m, 0.2 * math.dist(south, north))
-            for mark in arrow(start, tip, head):
+        for bar in bar_outlines(geometry, code):
+            self.outlines.append(add(bar.corners))
+            for mark in pole_arrow(geometry, bar):
                 if isinstance(mark, Line):
                     self.shafts.append(add((mark.start, mark.end)))
                 elif isinstance(mark, Polygon):
                     self.heads.append(add(mark.corners))
-            for letter, part in (("S", 0.13), ("N", 0.87)):
-                self.letters.append((letter, add(np.add(south, part * along)).start))
+            for letter, position in pole_letters(bar):
+                self.letters.append((letter, add(position).start))
         self.points = np.concatenate(points)
 
 

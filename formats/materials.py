@@ -6,13 +6,13 @@ import csv
 import os
 from collections.abc import Sequence
 
-from locatk.core.materials import Item
+from locatk.core.materials import BillItem
 from locatk.formats.output import atomic_write
 
 COLUMNS = ("part", "count", "detail", "price_usd", "source")
 
 
-def write_bill(path: str | os.PathLike[str], items: Sequence[Item], *, overwrite: bool) -> None:
+def write_bill(path: str | os.PathLike[str], items: Sequence[BillItem], *, overwrite: bool) -> None:
     """Write items as CSV, one a line under :data:`COLUMNS`; a price that is not known stays
     empty.
 

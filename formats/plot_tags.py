@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import Similarity
 from locatk.core.polaris import codec
 from locatk.core.polaris.results import TagDetection
-from locatk.core.polaris.tag import Placed, Tags, built_magnets
+from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets
 from locatk.core.solution import Solution
 from locatk.formats.viewers import tags_in_frames
 
@@ -25,7 +25,7 @@ class Arrows:
     tip: Array
 
     @classmethod
-    def of(cls, place: Array, angle: Array, length: float, on: Placed) -> Arrows:
+    def of(cls, place: Array, angle: Array, length: float, on: PlanarPose) -> Arrows:
         """``place`` (M, 2) and ``angle`` (M,) in the frame that lies at ``on``."""
         c, s = np.cos(on.heading_rad), np.sin(on.heading_rad)
         tail = np.zeros((len(place), 3))
@@ -62,7 +62,7 @@ def tags_of(solution: Solution) -> tuple[Tag, ...]:
     length = tags.spacing_m / 3
     drawn = []
     for number, frame, on in tags_in_frames(tags, solution.trajectories):
-        place, angle = built_magnets(tags, number, codec.layout_of(tags, number))
+        place, angle = as_built_magnets(tags, number, codec.layout_of(tags, number))
         found = tuple(
             _found(seen, length, on) for seen in solution.detections if seen.tag_id == number
         )
@@ -70,13 +70,13 @@ def tags_of(solution: Solution) -> tuple[Tag, ...]:
     return tuple(drawn)
 
 
-def _found(seen: TagDetection, length: float, on: Placed) -> Arrows:
+def _found(seen: TagDetection, length: float, on: PlanarPose) -> Arrows:
     """Return the magnets of one detection, which are in the array's frame."""
     array, magnets = seen.array_pose, seen.magnets
     assert array is not None  # of a tag that was read
     place = np.array([[m.x_m, m.y_m] for m in magnets])
     angle = np.array([m.angle_rad for m in magnets])
-    at = Placed(array.x_m, array.y_m, array.heading_rad)
+    at = PlanarPose(array.x_m, array.y_m, array.heading_rad)
     in_tag = Arrows.of(place, angle, length, at)
     heading = np.arctan2(*(in_tag.tip - in_tag.tail).T[1::-1])
     return Arrows.of(in_tag.tail[:, :2], heading, length, on)

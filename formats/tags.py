@@ -15,7 +15,7 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.polaris.array import Array, SensorArray
-from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, Placed, Tags
+from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, PlanarPose, Tags
 from locatk.formats import toml
 from locatk.formats.toml import Degrees, Shifted, Table
 from locatk.formats.toml_checks import above, check_remanence, twin
@@ -215,8 +215,8 @@ def _built(table: Table, tags: Tags) -> AsBuiltTag:
     return built
 
 
-def _placed(table: Table) -> Placed:
-    place = Placed(
+def _placed(table: Table) -> PlanarPose:
+    place = PlanarPose(
         x_m=table.number("x_mm", shift=_METRES),
         y_m=table.number("y_mm", shift=_METRES),
         heading_rad=table.angle("heading_deg"),

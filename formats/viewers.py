@@ -32,7 +32,7 @@ from locatk.core.landmarks.landmark import name
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris import codec
-from locatk.core.polaris.tag import Placed, Tags, built_magnets, places, vertices
+from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets, cell_positions, vertices
 from locatk.core.trajectory import Trajectory
 from locatk.formats.floor_bars import WEAK, bars_on_floor, cells_near
 from locatk.formats.messages import timestamp
@@ -140,7 +140,9 @@ def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: 
     return SceneUpdate(entities=entities)
 
 
-def tags_in_frames(tags: Tags, trajectories: Sequence[Trajectory]) -> list[tuple[int, str, Placed]]:
+def tags_in_frames(
+    tags: Tags, trajectories: Sequence[Trajectory]
+) -> list[tuple[int, str, PlanarPose]]:
     """Ids of the tags whose place is known, the frame of that place, and the place.
 
     Those of the site; where there is none, the tags in whose frames there are poses.
@@ -149,7 +151,7 @@ def tags_in_frames(tags: Tags, trajectories: Sequence[Trajectory]) -> list[tuple
         return [(number, "site", placed) for number, placed in sorted(tags.site.items())]
     frames = sorted({t.frame for t in trajectories})
     numbers = [(frame.removeprefix("tag-"), frame) for frame in frames if frame[:4] == "tag-"]
-    return [(int(n), frame, Placed(0.0, 0.0, 0.0)) for n, frame in numbers if n.isdecimal()]
+    return [(int(n), frame, PlanarPose(0.0, 0.0, 0.0)) for n, frame in numbers if n.isdecimal()]
 
 
 def trajectory(session: Session, topic: str, device: str) -> Trajectory:
@@ -267,12 +269,12 @@ def _sheet(manifest: Manifest, number: int, time_ns: int) -> SceneEntity:
     )
 
 
-def _tag(tags: Tags, tag_id: int, frame: str, placed: Placed, time_ns: int) -> SceneEntity:
+def _tag(tags: Tags, tag_id: int, frame: str, placed: PlanarPose, time_ns: int) -> SceneEntity:
     """The magnets, each with an arrow in its direction, in the rim of the grid."""
-    place, angle = built_magnets(tags, tag_id, codec.layout_of(tags, tag_id))
+    place, angle = as_built_magnets(tags, tag_id, codec.layout_of(tags, tag_id))
     c, s = np.cos(placed.heading_rad), np.sin(placed.heading_rad)
     turn, origin = np.array([[c, -s], [s, c]]), np.array([placed.x_m, placed.y_m])
-    corners = places(tags, vertices(tags.order)) @ turn.T + origin
+    corners = cell_positions(tags, vertices(tags.order)) @ turn.T + origin
     headings = quaternion_from_heading(angle + placed.heading_rad).tolist()
     magnet, length = tags.magnet, tags.spacing_m / 3
     poses = [

@@ -190,7 +190,11 @@ def test_core_is_pure_computation(root: Path) -> None:
 
 def test_commands_import_little_at_import_time(root: Path) -> None:
     """Commands start fast: numpy and the like are imported inside their functions."""
-    light_modules = {"locatk.core.errors", "locatk.core.units"}
+    light_modules = {
+        "locatk.core.errors",
+        "locatk.core.units",
+        "locatk.formats.simulation.settings",
+    }
     light = {"click", "locatk.cli", *light_modules} | set(sys.stdlib_module_names)
     for module in light_modules:
         path = root / module.removeprefix("locatk.").replace(".", "/")

@@ -1,4 +1,4 @@
-"""Tags of passive disc magnets: from a magnetometer bar's samples to tags and poses."""
+"""Polaris: tags of passive disc magnets, observed by an array of magnetometers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["SolveOptions", "solve"]
 
 
 def __getattr__(name: str) -> Any:
-    # scipy belongs to the call, not to `import locatk.core.polaris`.
+    # The solver imports scipy, which many users of this package do not need.
     if name in __all__:
         from locatk.core.polaris import solver
 

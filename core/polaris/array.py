@@ -1,4 +1,4 @@
-"""The sensor array, and what it has measured."""
+"""Array of magnetometers, and its samples."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SensorArray:
-    """A bar of triaxial magnetometers, and how they measure.
+    """Bar of triaxial magnetometers.
 
-    Its frame: x forward (the direction of travel), y left, z up; the origin is the middle
-    of the sensors. Vectors "by axis" are of the array's axes x, y, z.
+    Its frame: x forward (the direction of travel), y left, z up; the origin is the middle of the
+    sensors. Vectors "by axis" are in the order of the array's axes x, y, z.
 
     Attributes
     ----------
     position_m : (N, 3) ndarray
-        Of the sensors, in the array's frame.
+        Positions of the sensors in the array's frame.
     noise_t : (3,) ndarray
-        Standard deviation of a sample by axis, in tesla; ``nan`` where unknown.
+        Standard deviation of a sample by axis [T]; ``nan`` if unknown.
     delay_s : (3,) ndarray
-        When each axis is converted, from the sample's time on: the MLX90393 converts its
+        Time of conversion of each axis minus the time of the sample [s]: the MLX90393 converts its
         X, Y and Z one after the other.
     quantum_t : (3,) ndarray
-        Tesla of a count by axis, 0 where unknown.
+        Field per count by axis [T]; 0 if unknown.
     range_t : (3,) ndarray
-        Largest field that can be told, by axis; ``inf`` where unknown.
+        Largest measurable field by axis [T]; ``inf`` if unknown.
     sensor : str
-        Its name and settings, for people.
+        Name and settings of the sensors, for reports.
     """
 
     position_m: Array
@@ -46,8 +46,10 @@ class SensorArray:
 
 
 def bar(count: int, spacing_m: float) -> Array:
-    """Positions (count, 3) of a straight bar across the direction of travel; sensor 0 is
-    the rightmost."""
+    """Return the positions (count, 3) of a straight bar across the direction of travel.
+
+    Sensor 0 is the rightmost.
+    """
     position = np.zeros((count, 3))
     position[:, 1] = (np.arange(count) - (count - 1) / 2) * spacing_m
     return position
@@ -55,7 +57,7 @@ def bar(count: int, spacing_m: float) -> Array:
 
 @dataclass(frozen=True)
 class Samples:
-    """What one array measured, sample by sample.
+    """Samples of one array.
 
     Attributes
     ----------
@@ -64,7 +66,7 @@ class Samples:
     time_ns : (n,) int64 ndarray
         Strictly ascending.
     field_t : (n, N, 3) ndarray
-        Tesla in the array's axes; ``nan`` where a sensor gave nothing or was saturated.
+        Field in the array's axes [T]; ``nan`` if a sensor gave no sample or was saturated.
     """
 
     device: str
@@ -73,9 +75,9 @@ class Samples:
     field_t: Array
 
     def __post_init__(self) -> None:
-        wanted = (len(self.time_ns), len(self.array), 3)
-        if self.field_t.shape != wanted:
-            raise ValueError(f"field_t has shape {self.field_t.shape}, not {wanted}")
+        expected = (len(self.time_ns), len(self.array), 3)
+        if self.field_t.shape != expected:
+            raise ValueError(f"field_t has shape {self.field_t.shape}, not {expected}")
 
     def __len__(self) -> int:
         return len(self.time_ns)

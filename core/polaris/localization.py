@@ -1,239 +1,282 @@
-"""The array's way over the floor: poses by each tag, between tags, and what to steer."""
+"""Localization of an array: poses over each tag and between tags, and headings to steer."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading, wrap_angle
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.identification.tags import Seen
+from locatk.core.polaris.identification.tags import TagObservation
 from locatk.core.polaris.results import HeadingCorrection
-from locatk.core.polaris.tag import Placed, Tags
+from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-UNSURE_M = 0.01
-"""No poses are given where the way is not known to this standard deviation."""
+MAX_PATH_SIGMA_M = 0.01
+"""Standard deviation of the path from which no pose is returned [m]."""
 
-NEAR_M = 0.03
-"""Poses are given up to so far before the first and after the last magnet."""
+POSE_MARGIN_M = 0.03
+"""Distance before the first and after the last magnet of a tag within which poses are returned."""
 
-SCALE_SIGMA = 0.025
-"""Share by which a height may be wrong besides its noise: it has the scale of the way, and
-of every published run the way from the field alone is 2.5 % short; wheels are no better."""
+HEIGHT_SCALE_SIGMA = 0.025
+"""Standard deviation of the scale of a height, besides its noise. The height has the scale of the
+path, and on each of the published recordings a path from the field alone is 2.5 % short
+(docs/polaris.md); wheels are no better."""
 
+MIN_GAP_PERIODS = 5
+"""Time between poses, in usual intervals, from which odometry fills the gap."""
 
-def along(driven: Trajectory, time_ns: NDArray[np.int64]) -> Array:
-    """How far (n,) a robot had driven by its odometry at each time, in m.
-
-    Backwards counts as negative, by the heading of the odometry; before its first and after
-    its last pose the robot is taken to stand.
-    """
-    step = np.diff(driven.position[:, :2], axis=0)
-    heading = heading_from_quaternion(driven.quaternion)
-    forward = np.column_stack([np.cos(heading), np.sin(heading)])
-    ahead = (step * (forward[1:] + forward[:-1]) / 2).sum(axis=1)
-    way = np.concatenate([[0.0], np.cumsum(ahead)])
-    return np.asarray(np.interp(time_ns, driven.time_ns, way))
+PLANAR_COMPONENTS = (0, 1, 5)
+"""Indices of x, y and heading in the covariance of a pose."""
 
 
-def tag_poses(
-    recording: Samples, read: Sequence[Seen], tags: Tags | None
-) -> tuple[list[Trajectory], list[SolverWarning]]:
-    """Poses of the array while it was over tags that were read.
+@dataclass(frozen=True)
+class Localization:
+    """Poses of one array.
 
-    In the frame of the site where tags have places on it, else in that of the first tag.
-
-    Returns
-    -------
-    poses : list of Trajectory
+    Attributes
+    ----------
+    trajectories : tuple of Trajectory
         One or none.
-    warnings : list of SolverWarning
-        Tags whose place is not known.
+    heading_corrections : tuple of HeadingCorrection
+    warnings : tuple of SolverWarning
     """
-    if tags is None or not read:
-        return [], []
-    frame, site = "site", dict(tags.site)
-    if not site:
-        assert read[0].tag_id is not None
-        frame, site = f"tag-{read[0].tag_id}", {read[0].tag_id: Placed(0.0, 0.0, 0.0)}
+
+    trajectories: tuple[Trajectory, ...] = ()
+    heading_corrections: tuple[HeadingCorrection, ...] = ()
+    warnings: tuple[SolverWarning, ...] = ()
+
+
+def localize(
+    samples: Samples,
+    observations: Sequence[TagObservation],
+    tags: Tags | None,
+    odometry: Trajectory | None = None,
+) -> Localization:
+    """Estimate the poses of an array while it was over identified tags.
+
+    The frame is that of the site if tags have positions on it, else that of the first tag.
+
+    Parameters
+    ----------
+    samples : Samples
+    observations : sequence of TagObservation
+        Identified tags in order of time.
+    tags : Tags or None
+    odometry : Trajectory, optional
+        It fills the gaps between tags.
+    """
+    if tags is None or not observations:
+        return Localization()
+    first_id = observations[0].tag_id
+    frame, site = "site", tags.site
+    if not site and first_id is not None:
+        frame, site = f"tag-{first_id}", {first_id: PlanarPose(0.0, 0.0, 0.0)}
     parts, warnings = [], []
-    for seen in read:
-        assert seen.tag_id is not None
-        placed = site.get(seen.tag_id)
-        if placed is None:
-            where = "on the site" if frame == "site" else f"in the frame of {frame}"
-            message = f"tag {seen.tag_id} has no place {where}"
-            warnings.append(SolverWarning("tag_not_on_site", message).about(recording.device))
+    for observation in observations:
+        if observation.tag_id is not None and observation.tag_id in site:
+            parts.append(_poses_over_tag(samples, observation, site[observation.tag_id]))
         else:
-            parts.append(_over(recording, seen, placed))
+            location = "on the site" if frame == "site" else f"in the frame of {frame}"
+            message = f"tag {observation.tag_id} has no position {location}"
+            warnings.append(SolverWarning("tag_not_on_site", message).about(samples.device))
     if not parts:
-        return [], warnings
-    time, position, heading, covariance = (
-        np.concatenate([part[k] for part in parts]) for k in range(4)
-    )
-    _, first = np.unique(time, return_index=True)  # the passes of two tags may overlap
-    poses = Trajectory(
-        recording.device,
-        frame,
-        time[first],
-        position[first],
-        quaternion_from_heading(heading[first]),
-        covariance[first],
-    )
-    return [poses], warnings
+        return Localization(warnings=tuple(warnings))
+    poses = _concatenate(samples.device, frame, parts)
+    if odometry is not None:
+        poses = _fill_gaps(poses, odometry)
+    corrections = _heading_corrections(samples, observations, tags)
+    return Localization((poses,), corrections, tuple(warnings))
 
 
-def _over(
-    recording: Samples, seen: Seen, placed: Placed
-) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Times (n,), positions (n, 3), headings (n,) and covariances (n, 6, 6) over one tag."""
-    sighting, match = seen.sighting, seen.match
-    assert match is not None
-    near = sighting.path_m >= sighting.place_m[:, 0].min() - NEAR_M
-    near &= sighting.path_m <= sighting.place_m[:, 0].max() + NEAR_M
-    near &= np.nan_to_num(sighting.path_sigma_m) < UNSURE_M
-    way = sighting.path_m[near]
-    heading = placed.heading_rad - match.heading_rad
+def distance_along(odometry: Trajectory, time_ns: NDArray[np.int64]) -> Array:
+    """Return the distance (n,) that a robot had driven forward by its odometry [m].
+
+    Driving backward counts as negative, by the heading of the odometry. Before its first and after
+    its last pose the robot is assumed to rest.
+    """
+    step = np.diff(odometry.position[:, :2], axis=0)
+    heading = heading_from_quaternion(odometry.quaternion)
+    forward = np.column_stack([np.cos(heading), np.sin(heading)])
+    forward_step = (step * (forward[1:] + forward[:-1]) / 2).sum(axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(forward_step)])
+    return np.asarray(np.interp(time_ns, odometry.time_ns, distance))
+
+
+@dataclass(frozen=True)
+class _PlanarPoses:
+    """Times (n,), positions (n, 3), headings (n,) and covariances (n, 6, 6)."""
+
+    time_ns: NDArray[np.int64]
+    position: Array
+    heading: Array
+    covariance: Array
+
+
+def _poses_over_tag(
+    samples: Samples, observation: TagObservation, tag_pose: PlanarPose
+) -> _PlanarPoses:
+    """Return the poses of an array over one tag, with the covariance of match and path."""
+    magnets, match = observation.magnets, observation.match
+    if match is None:
+        raise ValueError("an identified tag has a match")
+    is_over = magnets.path_m >= magnets.position_m[:, 0].min() - POSE_MARGIN_M
+    is_over &= magnets.path_m <= magnets.position_m[:, 0].max() + POSE_MARGIN_M
+    is_over &= np.nan_to_num(magnets.path_sigma_m) < MAX_PATH_SIGMA_M
+    path = magnets.path_m[is_over]
+    n = len(path)
+    heading = tag_pose.heading_rad - match.heading_rad
     cos, sin = np.cos(heading), np.sin(heading)
     rotation = np.array([[cos, -sin], [sin, cos]])
-    turned = np.array([[-sin, -cos], [cos, -sin]])
-    course = np.array([1.0, np.tan(sighting.crab_rad)])
-    offset = way[:, None] * course - [match.x_m, match.y_m]
-    position = np.empty((len(way), 3))
-    position[:, :2] = offset @ rotation.T + [placed.x_m, placed.y_m]
-    position[:, 2] = sighting.height_m
-    jacobian = np.zeros((len(way), 3, 4))  # of x, y, heading by the match's and the way
+    by_heading = np.array([[-sin, -cos], [cos, -sin]])
+    direction = np.array([1.0, np.tan(magnets.crab_rad)])
+    offset = path[:, None] * direction - [match.x_m, match.y_m]
+    position = np.empty((n, 3))
+    position[:, :2] = offset @ rotation.T + [tag_pose.x_m, tag_pose.y_m]
+    position[:, 2] = magnets.height_m
+    # Derivative of x, y and heading by the match (x, y, heading) and the path.
+    jacobian = np.zeros((n, 3, 4))
     jacobian[:, :2, :2] = -rotation
-    jacobian[:, :2, 2] = -offset @ turned.T
-    jacobian[:, :2, 3] = rotation @ course
+    jacobian[:, :2, 2] = -offset @ by_heading.T
+    jacobian[:, :2, 3] = rotation @ direction
     jacobian[:, 2, 2] = -1.0
-    inner = np.zeros((len(way), 4, 4))
+    inner = np.zeros((n, 4, 4))
     inner[:, :3, :3] = match.covariance
-    inner[:, 3, 3] = np.nan_to_num(sighting.path_sigma_m[near]) ** 2
-    planar = jacobian @ inner @ jacobian.transpose(0, 2, 1)
-    covariance = np.full((len(way), 6, 6), np.nan)
-    plane = [0, 1, 5]
-    covariance[np.ix_(range(len(way)), plane, plane)] = planar
+    inner[:, 3, 3] = np.nan_to_num(magnets.path_sigma_m[is_over]) ** 2
+    covariance = np.full((n, 6, 6), np.nan)
+    covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] = (
+        jacobian @ inner @ jacobian.transpose(0, 2, 1)
+    )
     covariance[:, 2, :], covariance[:, :, 2] = 0.0, 0.0
     covariance[:, 2, 3:5] = covariance[:, 3:5, 2] = np.nan
-    scale = SCALE_SIGMA * sighting.height_m
-    covariance[:, 2, 2] = sighting.height_sigma_m**2 + scale**2
-    time = recording.time_ns[sighting.first : sighting.stop][near]
-    return time, position, np.full(len(way), heading), covariance
+    scale_sigma_m = HEIGHT_SCALE_SIGMA * magnets.height_m
+    covariance[:, 2, 2] = magnets.height_sigma_m**2 + scale_sigma_m**2
+    time = samples.time_ns[magnets.first : magnets.stop][is_over]
+    return _PlanarPoses(time, position, np.full(n, heading), covariance)
 
 
-def joined(poses: list[Trajectory], driven: Trajectory) -> list[Trajectory]:
-    """Poses with those between two tags filled in from odometry.
-
-    Odometry carries on from the last pose over a tag; what it is off at the next tag is
-    spread over the way between them.
-    """
-    return [_filled(trajectory, driven) for trajectory in poses]
-
-
-def _filled(poses: Trajectory, driven: Trajectory) -> Trajectory:
-    usual = np.median(np.diff(poses.time_ns)) if len(poses) > 1 else 0
-    gaps = np.flatnonzero(np.diff(poses.time_ns) > 5 * usual)
-    heading = heading_from_quaternion(poses.quaternion)
-    own = np.unwrap(heading_from_quaternion(driven.quaternion))
-    way = along(driven, driven.time_ns)
-    times, places, turns, covariances = (
-        [poses.time_ns],
-        [poses.position],
-        [heading],
-        [poses.covariance],
+def _concatenate(device: str, frame: str, parts: Sequence[_PlanarPoses]) -> Trajectory:
+    """Join the poses over all tags in order of time; of equal times the first pose is kept."""
+    time_ns = np.concatenate([part.time_ns for part in parts])
+    _, first = np.unique(time_ns, return_index=True)  # The passes of two tags may overlap.
+    heading = np.concatenate([part.heading for part in parts])
+    return Trajectory(
+        device,
+        frame,
+        time_ns[first],
+        np.concatenate([part.position for part in parts])[first],
+        quaternion_from_heading(heading[first]),
+        np.concatenate([part.covariance for part in parts])[first],
     )
+
+
+def _fill_gaps(poses: Trajectory, odometry: Trajectory) -> Trajectory:
+    """Fill the gaps between tags by odometry."""
+    interval = np.median(np.diff(poses.time_ns)) if len(poses) > 1 else 0
+    gaps = np.flatnonzero(np.diff(poses.time_ns) > MIN_GAP_PERIODS * interval)
+    heading = heading_from_quaternion(poses.quaternion)
+    parts = [_PlanarPoses(poses.time_ns, poses.position, heading, poses.covariance)]
     for gap in gaps:
-        ends = poses.time_ns[[gap, gap + 1]]
-        if ends[0] < driven.time_ns[0] or ends[1] > driven.time_ns[-1]:
-            continue
-        inside = (driven.time_ns > ends[0]) & (driven.time_ns < ends[1])
-        time = np.concatenate([[ends[0]], driven.time_ns[inside], [ends[1]]])
-        x, y, turn, gone = (
-            np.interp(time, driven.time_ns, column)
-            for column in (driven.position[:, 0], driven.position[:, 1], own, way)
-        )
-        start = heading[gap] - turn[0]
-        cos, sin = np.cos(start), np.sin(start)
-        place = poses.position[gap, :2] + np.column_stack(
-            [cos * (x - x[0]) - sin * (y - y[0]), sin * (x - x[0]) + cos * (y - y[0])]
-        )
-        turned = turn + start
-        share = np.abs(gone - gone[0]) / max(abs(gone[-1] - gone[0]), 1e-9)
-        share = np.clip(share, 0, 1)
-        miss = poses.position[gap + 1, :2] - place[-1]
-        twist = np.remainder(heading[gap + 1] - turned[-1] + np.pi, 2 * np.pi) - np.pi
-        place, turned = place + share[:, None] * miss, turned + share * twist
-        inner = slice(1, -1)
-        position = np.column_stack(
-            [place, poses.position[gap, 2] + share * np.diff(poses.position[gap : gap + 2, 2])]
-        )[inner]
-        # Known at both ends; in between, what odometry was off by may be anywhere.
-        loose = (share * (1 - share))[inner]
-        weight = share[inner, None, None]
-        spread = (1 - weight) * poses.covariance[gap] + weight * poses.covariance[gap + 1]
-        spread[:, 0, 0] += loose * (miss @ miss)
-        spread[:, 1, 1] += loose * (miss @ miss)
-        spread[:, 5, 5] += loose * twist**2
-        times.append(time[inner])
-        places.append(position)
-        turns.append(turned[inner])
-        covariances.append(spread)
-    time = np.concatenate(times)
-    order = np.argsort(time, kind="stable")
+        start_ns, end_ns = poses.time_ns[[gap, gap + 1]]
+        if odometry.time_ns[0] <= start_ns and end_ns <= odometry.time_ns[-1]:
+            parts.append(_poses_in_gap(poses, heading, int(gap), odometry))
+    order = np.argsort(np.concatenate([part.time_ns for part in parts]), kind="stable")
     return replace(
         poses,
-        time_ns=time[order],
-        position=np.concatenate(places)[order],
-        quaternion=quaternion_from_heading(np.concatenate(turns)[order]),
-        covariance=np.concatenate(covariances)[order],
+        time_ns=np.concatenate([part.time_ns for part in parts])[order],
+        position=np.concatenate([part.position for part in parts])[order],
+        quaternion=quaternion_from_heading(np.concatenate([part.heading for part in parts])[order]),
+        covariance=np.concatenate([part.covariance for part in parts])[order],
     )
 
 
-def corrections(
-    recording: Samples, read: Sequence[Seen], tags: Tags | None
-) -> list[HeadingCorrection]:
-    """What to turn by at each tag so as to come straight to the next one (paper 8.3.7).
+def _poses_in_gap(
+    poses: Trajectory, heading: Array, gap: int, odometry: Trajectory
+) -> _PlanarPoses:
+    """Return the poses of odometry between the poses ``gap`` and ``gap + 1``.
 
-    One entry for each two tags in a row that have places on the site: by how much the
-    robot must turn at the end of the first, counter-clockwise, and how far it is.
+    Odometry continues from the pose before the gap. Its error at the pose after the gap is
+    distributed over the distance.
     """
-    if tags is None:
-        return []
-    placed = [seen for seen in read if seen.tag_id in tags.site]
-    found = []
-    for here, there in itertools.pairwise(placed):
-        assert here.tag_id is not None
-        assert there.tag_id is not None
-        if here.tag_id == there.tag_id:
+    start_ns, end_ns = poses.time_ns[[gap, gap + 1]]
+    is_inside = (odometry.time_ns > start_ns) & (odometry.time_ns < end_ns)
+    time = np.concatenate([[start_ns], odometry.time_ns[is_inside], [end_ns]])
+    x, y, odometry_heading, distance = (
+        np.interp(time, odometry.time_ns, values)
+        for values in (
+            odometry.position[:, 0],
+            odometry.position[:, 1],
+            np.unwrap(heading_from_quaternion(odometry.quaternion)),
+            distance_along(odometry, odometry.time_ns),
+        )
+    )
+    rotation = heading[gap] - odometry_heading[0]
+    cos, sin = np.cos(rotation), np.sin(rotation)
+    dx, dy = x - x[0], y - y[0]
+    planar = poses.position[gap, :2] + np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy])
+    propagated_heading = odometry_heading + rotation
+    total = max(abs(distance[-1] - distance[0]), 1e-9)
+    fraction = np.clip(np.abs(distance - distance[0]) / total, 0, 1)
+    position_error = poses.position[gap + 1, :2] - planar[-1]
+    heading_error = wrap_angle(heading[gap + 1] - propagated_heading[-1])
+    height = poses.position[gap, 2] + fraction * np.diff(poses.position[gap : gap + 2, 2])
+    # Known at both ends; in between, the error of odometry may have any distribution.
+    inside = slice(1, -1)
+    weight = fraction[inside, None, None]
+    covariance = (1 - weight) * poses.covariance[gap] + weight * poses.covariance[gap + 1]
+    spread = (fraction * (1 - fraction))[inside]
+    covariance[:, 0, 0] += spread * (position_error @ position_error)
+    covariance[:, 1, 1] += spread * (position_error @ position_error)
+    covariance[:, 5, 5] += spread * heading_error**2
+    return _PlanarPoses(
+        time[inside],
+        np.column_stack([planar + fraction[:, None] * position_error, height])[inside],
+        (propagated_heading + fraction * heading_error)[inside],
+        covariance,
+    )
+
+
+def _heading_corrections(
+    samples: Samples, observations: Sequence[TagObservation], tags: Tags
+) -> tuple[HeadingCorrection, ...]:
+    """Return the rotations that point the robot from each tag to the next one.
+
+    One for every two different tags in a row that have positions on the site (Polaris, section
+    8.3.7).
+    """
+    on_site = [
+        (o, o.tag_id) for o in observations if o.tag_id is not None and o.tag_id in tags.site
+    ]
+    corrections = []
+    for (observation, from_tag), (_, to_tag) in itertools.pairwise(on_site):
+        if from_tag == to_tag:
             continue
-        time, position, heading, covariance = _over(recording, here, tags.site[here.tag_id])
-        goal = tags.site[there.tag_id]
-        way = np.array([goal.x_m, goal.y_m]) - position[-1, :2]
-        distance = float(np.hypot(*way))
+        poses = _poses_over_tag(samples, observation, tags.site[from_tag])
+        target = tags.site[to_tag]
+        offset = np.array([target.x_m, target.y_m]) - poses.position[-1, :2]
+        distance = float(np.hypot(*offset))
         if distance == 0:
             continue
-        turn = np.arctan2(way[1], way[0]) - heading[-1]
-        # The bearing changes with the place, the heading by itself.
-        change = np.array([way[1], -way[0], -(distance**2)]) / distance**2
-        spread = covariance[-1][np.ix_([0, 1, 5], [0, 1, 5])]
-        found.append(
+        rotation = np.arctan2(offset[1], offset[0]) - poses.heading[-1]
+        # Derivative of the rotation by position and heading.
+        gradient = np.array([offset[1], -offset[0], -(distance**2)]) / distance**2
+        covariance = poses.covariance[-1][np.ix_(PLANAR_COMPONENTS, PLANAR_COMPONENTS)]
+        corrections.append(
             HeadingCorrection(
-                device=recording.device,
-                time_s=float(time[-1]) * 1e-9,
-                from_tag=here.tag_id,
-                to_tag=there.tag_id,
-                rotation_rad=float(np.remainder(turn + np.pi, 2 * np.pi) - np.pi),
-                sigma_rotation_rad=float(np.sqrt(change @ spread @ change)),
+                device=samples.device,
+                time_s=float(poses.time_ns[-1]) * 1e-9,
+                from_tag=from_tag,
+                to_tag=to_tag,
+                rotation_rad=float(wrap_angle(rotation)),
+                sigma_rotation_rad=float(np.sqrt(gradient @ covariance @ gradient)),
                 distance_m=distance,
             )
         )
-    return found
+    return tuple(corrections)

@@ -1,4 +1,4 @@
-"""What one pass over a tag has shown, before and after it is read as a tag."""
+"""Magnets that were detected in one pass of an array over them."""
 
 from __future__ import annotations
 
@@ -14,45 +14,44 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DetectedMagnets:
-    """Magnets that were found in one pass of the array over them.
+    """Magnets of one pass, before and after they are identified as a tag.
 
-    All places are in the array's frame at ``time_ns``; over a pass the array is taken to
-    move straight, without turning.
+    Positions are in the array's frame at ``time_ns``; during a pass the array is assumed to move
+    straight, without rotation.
 
     Attributes
     ----------
     time_ns : int
-        Of the sample to which the frame belongs, near the middle of the pass.
+        Time of the sample to which the frame belongs, near the middle of the pass.
     first, stop : int
-        The pass: samples ``first`` to ``stop - 1``.
+        Range of the samples of the pass: ``first`` to ``stop - 1``.
     path_m : (stop - first,) ndarray
-        How far the array has moved along its x since ``time_ns``, sample by sample.
-    place_m : (M, 2) ndarray
-        Of the magnets.
+        Distance along x that the array has moved since ``time_ns``, for each sample.
+    position_m : (M, 2) ndarray
     angle_rad : (M,) ndarray
         Direction of the moments, counter-clockwise from x.
     moment_am2 : (M,) ndarray
-        Their size.
+        Their magnitude.
     covariance : (3 M, 3 M) ndarray
-        Of x, y, angle of the first magnet, of the second, ... in m and rad; ``nan`` where
-        the method knows none.
+        Of x, y, angle of the first magnet, of the second, ... in m and rad; ``nan`` if the method
+        does not estimate it.
     path_sigma_m : (stop - first,) ndarray
-        Standard deviation of ``path_m``; ``nan`` where the method knows none.
+        Standard deviation of ``path_m``; ``nan`` likewise.
     crab_rad : float
-        Direction of the way, counter-clockwise from the array's x.
-    free_path : bool
-        Whether ``path_m`` was found from the field alone, without a known speed.
+        Direction of the path, counter-clockwise from the array's x.
+    is_path_estimated : bool
+        True if ``path_m`` was estimated from the field alone, without speed or odometry.
     height_m, height_sigma_m : float
-        From the magnets to the sensors, as found; ``nan`` where it was not asked.
+        Height of the sensors over the magnets; ``nan`` if it was not estimated.
     residual_sigma : float
-        Rms of what the model leaves, in standard deviations of the noise; ``nan`` where
-        the method has no model of the samples.
-    usual_sigma : float
-        The same by the median, which no outlier moves.
+        Rms residual of the samples in standard deviations of the noise; ``nan`` if the method has
+        no model of the samples.
+    robust_residual_sigma : float
+        The same from the median, which outliers do not change.
     origin_m : (2,) ndarray
-        Where the array was at ``time_ns``, in the coordinates of the fit.
-    others : int
-        Further sources that are no magnets of a tag (debris).
+        Position of the array at ``time_ns`` in the coordinates of the fit.
+    other_sources : int
+        Number of further sources that are no magnets of a tag (debris).
     warnings : tuple of SolverWarning
         Without the name of the device.
     """
@@ -61,20 +60,20 @@ class DetectedMagnets:
     first: int
     stop: int
     path_m: Array
-    place_m: Array
+    position_m: Array
     angle_rad: Array
     moment_am2: Array
     covariance: Array
     path_sigma_m: Array
     crab_rad: float = 0.0
-    free_path: bool = False
+    is_path_estimated: bool = False
     height_m: float = np.nan
     height_sigma_m: float = np.nan
     residual_sigma: float = np.nan
-    usual_sigma: float = np.nan
+    robust_residual_sigma: float = np.nan
     origin_m: Array = field(default_factory=lambda: np.zeros(2))
-    others: int = 0
+    other_sources: int = 0
     warnings: tuple[SolverWarning, ...] = ()
 
     def __len__(self) -> int:
-        return len(self.place_m)
+        return len(self.position_m)

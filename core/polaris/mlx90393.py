@@ -1,7 +1,8 @@
-"""The magnetometer of the published arrays, Melexis MLX90393, from its data sheet.
+"""Melexis MLX90393, the magnetometer of the published arrays.
 
-Figures come from Melexis' data sheet 3901090393 as the drivers of Adafruit and T. Yapo
-carry them; the noise is the one measured in the published recordings.
+Figures are those of Melexis' data sheet 3901090393, as in the drivers of Adafruit
+(github.com/adafruit/Adafruit_MLX90393_Library) and T. Yapo; the noise was measured in the published
+recordings.
 """
 
 from __future__ import annotations
@@ -27,38 +28,38 @@ QUANTUM_UT = (
     (0.200, 0.323),
     (0.150, 0.242),
 )
-"""Of a count, of X and Y and of Z, by GAIN_SEL 0 to 7, at resolution 0 and HALLCONF 0xC.
-GAIN_SEL 7, which drivers call "1x", is the most sensitive."""
+"""Field per count of X and Y, and of Z [uT], by GAIN_SEL 0 to 7, at resolution 0 and HALLCONF 0xC
+(data sheet). GAIN_SEL 7, which drivers call "1x", is the most sensitive."""
 
 HALLCONF_SCALE = {0xC: 1.0, 0x0: 98 / 75}
-"""Of a count against HALLCONF 0xC. The data sheet has 0.196 uT for 0x0, some drivers less
-(Adafruit_MLX90393_Library issue 7)."""
+"""Field per count relative to HALLCONF 0xC. The data sheet gives 0.196 uT for 0x0, some drivers
+less (Adafruit_MLX90393_Library issue 7)."""
 
-STANDS_STILL = frozenset({(0, 0), (0, 1), (1, 0)})
-"""Oversampling and filter that the part does not convert with (Melexis' getting-started
-note; Adafruit_MLX90393_Library issue 11 shows what it measures then)."""
+INVALID_OSR_AND_FILTER = frozenset({(0, 0), (0, 1), (1, 0)})
+"""Pairs of oversampling and filter with which the part does not convert (Melexis' getting-started
+note; Adafruit_MLX90393_Library issue 11 shows the effect)."""
 
-OVERHEAD_S = 491e-6
-"""Of a conversion of all three axes, besides the axes' own time."""
+CONVERSION_OVERHEAD_S = 491e-6
+"""Duration of a conversion of all three axes, besides that of the axes themselves (data sheet)."""
 
 READOUT_S = 0.3e-3
-"""From the end of a conversion to the start of the next, as in the published firmware."""
+"""Time from the end of a conversion to the start of the next, as in the published firmware."""
 
 MEASURED_NOISE_UT = (0.86, 0.89, 1.24)
-"""Standard deviation of X, Y, Z in the published recordings while the car stood: gain 7,
-resolution 0, oversampling 3, filter 3; the median sensor. It is white."""
+"""Standard deviation of X, Y, Z in the published recordings while the car was at rest (gain 7,
+resolution 0, oversampling 3, filter 3): the median of the sensors. The noise is white."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Registers of the part; the published arrays have the defaults.
+    """Register settings of the part; the published arrays have the defaults.
 
     Attributes
     ----------
     gain : int
         GAIN_SEL, 0 to 7.
     resolution : int
-        RES_XYZ, 0 to 3: doubles a count at each step.
+        RES_XYZ, 0 to 3: each step doubles the field per count.
     osr, filt : int
         OSR, 0 to 3, and DIG_FILT, 0 to 7.
     hallconf : int
@@ -67,8 +68,8 @@ class Settings:
     Raises
     ------
     InputError
-        A value that the part does not have, or a pair of oversampling and filter that it
-        does not convert with.
+        A value is out of range, or the part does not convert with this pair of oversampling and
+        filter.
     """
 
     gain: int = 7
@@ -84,7 +85,7 @@ class Settings:
                 raise InputError(f"{name} of the MLX90393 is {value}, not 0 to {last}")
         if self.hallconf not in HALLCONF_SCALE:
             raise InputError(f"hallconf of the MLX90393 is {self.hallconf:#x}, not 0xc or 0x0")
-        if (self.osr, self.filt) in STANDS_STILL:
+        if (self.osr, self.filt) in INVALID_OSR_AND_FILTER:
             raise InputError(
                 f"the MLX90393 does not convert with osr {self.osr} and filt {self.filt}",
                 hint="Take a larger filt",
@@ -92,43 +93,43 @@ class Settings:
 
     @property
     def quantum_t(self) -> Array:
-        """Tesla of a count of the part's X, Y, Z."""
+        """Field per count of the part's X, Y, Z [T]."""
         xy, z = QUANTUM_UT[self.gain]
         scale = HALLCONF_SCALE[self.hallconf] * 2**self.resolution * 1e-6
         return np.array([xy, xy, z]) * scale
 
     @property
     def range_t(self) -> Array:
-        """Largest field of the part's X, Y, Z that its 16 bits can tell.
+        """Largest field of the part's X, Y, Z that its 16 bits represent [T].
 
-        At resolution 3, zero is at a quarter of the scale, not in its middle.
+        At resolution 3, zero is at a quarter of the scale instead of its middle.
         """
         return self.quantum_t * (2**14 if self.resolution == 3 else 2**15)
 
     @property
     def axis_s(self) -> float:
-        """Time to convert one axis; X, Y and Z follow one another.
+        """Time to convert one axis; X, Y and Z are converted one after the other.
 
-        With :data:`OVERHEAD_S` the formula gives each of the 32 times for three axes that
-        the data sheet lists, to its last digit.
+        With :data:`CONVERSION_OVERHEAD_S` the formula reproduces each of the 32 times for three
+        axes in the data sheet to its last digit.
         """
         return (67 + 64 * 2**self.osr * (2 + 2**self.filt)) * 1e-6
 
     @property
     def conversion_s(self) -> float:
         """Time to convert X, Y and Z."""
-        return 3 * self.axis_s + OVERHEAD_S
+        return 3 * self.axis_s + CONVERSION_OVERHEAD_S
 
     @property
     def max_rate_hz(self) -> float:
-        """Samples a second, with the time to read one out."""
+        """Maximum number of samples per second, including the readout."""
         return 1 / (self.conversion_s + READOUT_S)
 
     @property
     def noise_t(self) -> Array:
-        """Measured standard deviation of the part's X, Y, Z; ``nan`` where none is known.
+        """Measured standard deviation of the part's X, Y, Z [T]; ``nan`` if none is known.
 
-        Known at the settings of the published recordings, :data:`MEASURED_NOISE_UT`.
+        It is known for the settings of the published recordings (:data:`MEASURED_NOISE_UT`).
         """
         if self == Settings():
             return np.array(MEASURED_NOISE_UT) * 1e-6
@@ -136,11 +137,11 @@ class Settings:
 
     @property
     def assumed_noise_t(self) -> Array:
-        """Noise of the part's X, Y, Z to plan with where none was measured.
+        """Noise of the part's X, Y, Z for planning, also with settings that were not measured [T].
 
-        White noise averages out over the time of a conversion, so a shorter one than the
-        measured one is taken to be noisier; a longer one is not trusted to be quieter. At
-        least the noise of rounding to a count.
+        White noise averages out over the time of a conversion, so that a shorter conversion than
+        the measured one is assumed to be noisier; a longer one is not assumed to be quieter. It is
+        at least the noise of rounding to a count.
         """
         ratio = Settings().axis_s / self.axis_s
         white = np.array(MEASURED_NOISE_UT) * 1e-6 * max(1.0, math.sqrt(ratio))
@@ -153,24 +154,19 @@ class Settings:
         )
 
 
-def settings(
-    gain: int = 7, resolution: int = 0, osr: int = 3, filt: int = 3, hallconf: int = 0xC
-) -> Settings:
-    """The part with these registers; see :class:`Settings`."""
-    return Settings(gain, resolution, osr, filt, hallconf)
+def settings_for_rate(rate_hz: float, like: Settings) -> Settings | None:
+    """Return the settings with the longest conversion that allow a sample rate.
 
-
-def for_rate(rate_hz: float, like: Settings) -> Settings | None:
-    """The settings with the longest conversion that still give ``rate_hz``, else as
-    ``like``; None where there are none."""
+    Gain, resolution and HALLCONF are those of ``like``. None if no settings allow the rate.
+    """
     choices = [
         Settings(like.gain, like.resolution, osr, filt, like.hallconf)
         for osr in range(4)
         for filt in range(8)
-        if (osr, filt) not in STANDS_STILL
+        if (osr, filt) not in INVALID_OSR_AND_FILTER
     ]
-    able = [choice for choice in choices if choice.max_rate_hz >= rate_hz]
-    return max(able, key=lambda choice: (choice.axis_s, choice.osr), default=None)
+    allowed = [choice for choice in choices if choice.max_rate_hz >= rate_hz]
+    return max(allowed, key=lambda choice: (choice.axis_s, choice.osr), default=None)
 
 
 def published_bar(
@@ -179,27 +175,27 @@ def published_bar(
     settings: Settings | None = None,
     noise_t: Array | None = None,
 ) -> SensorArray:
-    """A bar of these magnetometers, mounted as on the published arrays.
+    """Return a bar of these magnetometers, mounted as on the published arrays.
 
-    The part's X looks to the right, Y back and Z down, sensor 0 is the rightmost. The time
-    of a sample is the middle of its conversion, which is that of Y: X lies one
+    The part's X points to the right, Y back and Z down; sensor 0 is the rightmost. The time of a
+    sample is the middle of its conversion, which is that of Y: X is converted one
     :attr:`Settings.axis_s` before it (5.19 ms as published), Z one after it.
 
     Parameters
     ----------
     count, spacing_m : int, float
     settings : Settings, optional
-        As published where left out.
+        By default those of the published arrays.
     noise_t : (3,) ndarray, optional
-        Of the part's X, Y, Z; :attr:`Settings.noise_t` where left out.
+        Noise of the part's X, Y, Z; by default :attr:`Settings.noise_t`.
 
     Raises
     ------
     InputError
-        No sensor, or no distance between them.
+        There is no sensor, or the spacing is not positive.
     """
     if count < 1 or not (spacing_m > 0 and math.isfinite(spacing_m)):
-        raise InputError(f"no bar of {count} sensors {spacing_m * 1e3:g} mm apart")
+        raise InputError(f"no bar of {count} sensors at a spacing of {spacing_m * 1e3:g} mm")
     part = settings or Settings()
     noise = part.noise_t if noise_t is None else np.asarray(noise_t, float)
     # Axes of the array from those of the part: x = -Y, y = -X, z = -Z.

@@ -1,78 +1,238 @@
-"""What no sensor can have measured is taken out before anything is estimated."""
+"""Preprocessing of samples: implausible values are removed, the noise is estimated, passes found.
+
+A *pass* is a range of samples in which the field along the bar changes by more than noise and
+more than a field that all sensors share: the array moves over magnets.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import InputError
 from locatk.core.polaris.array import Samples
 from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
-STUCK = 25
-"""Samples in a row that are the same in all three axes: no noisy sensor repeats itself so."""
+MIN_SAMPLES = 20
+"""Least number of samples of a recording; a tag needs as many."""
 
-SPIKE = 10.0
-"""A sample is a spike that is so many standard deviations of the noise away from its
-neighbours, beyond what those differ by themselves."""
+MIN_STUCK_SAMPLES = 25
+"""Number of equal samples in a row, in all three axes, from which a sensor counts as stuck: the
+noise of a working sensor is several counts (:data:`~locatk.core.polaris.mlx90393.QUANTUM_UT`)."""
 
-BESIDE = 2
-"""Neighbours on each side."""
+SPIKE_SIGMAS = 10.0
+"""Distance from all neighbours in time, beyond the difference of these, from which a value is a
+spike, in standard deviations of the noise. The protocol of the published array has no sync word,
+so that misframed messages occur."""
+
+SPIKE_NEIGHBOURS = 2
+"""Number of neighbours of a value on each side with which it is compared."""
+
+CHANGE_LAGS_SAMPLES = (1, 2, 4, 8, 16)
+"""Lags over which changes of the field are tested: short ones for fast robots, long ones for slow
+ones."""
+
+MIN_CHANGE_SIGMAS = 8.0
+"""Change of the bar's field from which a sample belongs to a pass, in standard deviations of the
+sum of squares that noise alone gives."""
+
+MIN_PASS_MARGIN_SAMPLES = 10
+"""Least margin of a pass, before its first change and after its last one."""
+
+PASS_TO_MARGIN_RATIO = 6
+"""Duration of a pass relative to its margins, whose samples determine the background."""
+
+MIN_NOISE_T = 2e-8
+"""Noise assumed of an array without noise and without known quantum [T]."""
+
+MIN_NOISE_SAMPLES = 20
+"""Number of second differences from which the noise of a sensor is estimated."""
+
+NOISE_QUANTILE, NORMAL_QUANTILE = 0.3, 0.38532
+"""Quantile of the absolute second differences from which the noise is estimated, and its value for
+a standard normal distribution. It is a low one, so that passes over magnets may fill most of a
+recording."""
 
 
-def cleaned(samples: Samples, noise_t: Array) -> tuple[Samples, tuple[SolverWarning, ...]]:
-    """The samples without what was stuck, spiked or not finite, and what was left out.
+@dataclass(frozen=True)
+class PassRange:
+    """Range of the samples of one pass: ``first`` to ``stop - 1``."""
 
-    A sensor that repeats the same triple is stuck (a bus that hangs); a value far from
-    those before and after it comes of a misframed message. Neither is rare (facts: the
-    published bar has no sync word), and one of them outweighs a whole pass.
+    first: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class PreprocessedSamples:
+    """Samples without implausible values.
+
+    Attributes
+    ----------
+    samples : Samples
+    noise_t : (N, 3) ndarray
+        Standard deviation of the noise of each sensor and axis [T].
+    warnings : tuple of SolverWarning
+        Values that were removed or are missing.
     """
-    field = np.where(np.isfinite(samples.field_t), samples.field_t, np.nan)
+
+    samples: Samples
+    noise_t: Array
+    warnings: tuple[SolverWarning, ...]
+
+
+def preprocess(samples: Samples) -> PreprocessedSamples:
+    """Remove stuck, spiked and non-finite values, and estimate the noise of the rest.
+
+    A sensor that repeats the same triple is stuck (its bus hangs); a value far from those before
+    and after it is a spike (a misframed message). One of them can outweigh a whole pass.
+
+    Raises
+    ------
+    InputError
+        There are too few samples, no sensor has a value, or time stamps do not ascend.
+    """
+    _check(samples)
     warnings = []
-    stuck = _stuck(field)
-    for sensor in np.flatnonzero(stuck.any(axis=0)):
-        share = 100 * stuck[:, sensor].mean()
-        message = f"sensor {sensor + 1} was stuck ({share:.0f} % of the time)"
+    field = np.where(np.isfinite(samples.field_t), samples.field_t, np.nan)
+    is_stuck = _stuck_samples(field)
+    for sensor in np.flatnonzero(is_stuck.any(axis=0)):
+        percentage = 100 * is_stuck[:, sensor].mean()
+        message = f"sensor {sensor + 1} was stuck ({percentage:.0f} % of the time)"
         warnings.append(SolverWarning("sensor_stuck", message).about(samples.device))
-    field = np.where(stuck[..., None], np.nan, field)
-    spikes = _spikes(field, noise_t)
-    if spikes.any():
-        message = f"{int(spikes.sum())} values were spikes"
+    # The noise is estimated without stuck samples, which have none.
+    field = np.where(is_stuck[..., None], np.nan, field)
+    is_spike = _spikes(field, estimate_noise(replace(samples, field_t=field)))
+    if is_spike.any():
+        message = f"{int(is_spike.sum())} values were spikes"
         warnings.append(SolverWarning("spikes", message).about(samples.device))
-        field = np.where(spikes, np.nan, field)
-    return replace(samples, field_t=field), tuple(warnings)
+    field = np.where(is_spike, np.nan, field)
+    missing = np.isnan(field).any(axis=2).mean()
+    if missing > 0:
+        message = f"{100 * missing:.2g} % of the sensors' samples missing"
+        warnings.append(SolverWarning("samples_missing", message).about(samples.device))
+    cleaned = replace(samples, field_t=field)
+    return PreprocessedSamples(cleaned, estimate_noise(cleaned), tuple(warnings))
 
 
-def _stuck(field: Array) -> NDArray[np.bool_]:
-    """Where (n, N) a sensor repeats itself while others do not."""
+def _check(samples: Samples) -> None:
+    """Raise an error if samples cannot hold a tag."""
+    if len(samples) < MIN_SAMPLES:
+        raise InputError(
+            f"{len(samples)} samples of {samples.device}; a tag needs at least {MIN_SAMPLES}",
+            hint="Record from before the tag to after it",
+        )
+    if not np.isfinite(samples.field_t).any():
+        raise InputError(
+            f"no sensor of {samples.device} gave a sample", hint="Check wiring and range"
+        )
+    if np.any(np.diff(samples.time_ns) < 0) or samples.time_ns[0] == samples.time_ns[-1]:
+        raise InputError(
+            f"the time stamps of {samples.device} do not ascend", hint="Check the recording"
+        )
+
+
+def _stuck_samples(field: Array) -> NDArray[np.bool_]:
+    """Return a mask (n, N) of the samples that a sensor repeats while others do not."""
     n, sensors, _ = field.shape
-    stuck = np.zeros((n, sensors), bool)
-    if n <= STUCK:
-        return stuck
-    same = np.all(np.diff(field, axis=0) == 0, axis=2)
-    # Runs of STUCK - 1 equal steps, and all samples that belong to one.
-    counts = np.cumsum(np.vstack([np.zeros((1, sensors), int), same]), axis=0)
-    whole = counts[STUCK - 1 :] - counts[: -(STUCK - 1)] == STUCK - 1
-    for sensor in np.flatnonzero(whole.any(axis=0)):
-        for first in np.flatnonzero(whole[:, sensor]):
-            stuck[first : first + STUCK, sensor] = True
-    still = np.isfinite(field).all(axis=2)
-    return stuck & ~np.all(stuck | ~still, axis=1, keepdims=True)
+    is_stuck = np.zeros((n, sensors), bool)
+    if n <= MIN_STUCK_SAMPLES:
+        return is_stuck
+    is_repeated = np.all(np.diff(field, axis=0) == 0, axis=2)
+    # Runs of equal steps, one fewer than samples, and all samples of such a run.
+    repeats = np.cumsum(np.vstack([np.zeros((1, sensors), int), is_repeated]), axis=0)
+    steps = MIN_STUCK_SAMPLES - 1
+    is_run = repeats[steps:] - repeats[:-steps] == steps
+    for first, sensor in np.argwhere(is_run):
+        is_stuck[first : first + MIN_STUCK_SAMPLES, sensor] = True
+    # An array of which all sensors repeat themselves has no noise (a simulated one).
+    is_missing = ~np.isfinite(field).all(axis=2)
+    return is_stuck & ~np.all(is_stuck | is_missing, axis=1, keepdims=True)
 
 
 def _spikes(field: Array, noise_t: Array) -> NDArray[np.bool_]:
-    """Values (n, N, 3) that are far from all their neighbours in time."""
-    n = len(field)
-    if n < 2 * BESIDE + 1:
+    """Return a mask (n, N, 3) of the values that are far from all their neighbours in time."""
+    n, width = len(field), SPIKE_NEIGHBOURS
+    if n < 2 * width + 1:
         return np.zeros(field.shape, bool)
-    padded = np.pad(field, ((BESIDE, BESIDE), (0, 0), (0, 0)), mode="reflect")
-    beside = [
-        padded[BESIDE + shift : BESIDE + shift + n] for shift in range(-BESIDE, BESIDE + 1) if shift
-    ]
-    high, low = np.fmax.reduce(beside), np.fmin.reduce(beside)
-    away = np.fmax(field - high, low - field)
+    padded = np.pad(field, ((width, width), (0, 0), (0, 0)), mode="reflect")
+    neighbours = [padded[width + lag : width + lag + n] for lag in range(-width, width + 1) if lag]
+    high, low = np.fmax.reduce(neighbours), np.fmin.reduce(neighbours)
+    distance = np.fmax(field - high, low - field)
     with np.errstate(invalid="ignore"):
-        return np.asarray(away > SPIKE * noise_t + (high - low))
+        return np.asarray(distance > SPIKE_SIGMAS * noise_t + (high - low))
+
+
+def estimate_noise(samples: Samples) -> Array:
+    """Estimate the standard deviation (N, 3) of the noise of each sensor and axis [T].
+
+    From second differences, most of which a smooth field hardly changes. The noise that the array
+    states is returned if there are too few samples.
+    """
+    stated = np.broadcast_to(samples.array.noise_t, (len(samples.array), 3))
+    least = np.maximum(samples.array.quantum_t / 4, MIN_NOISE_T)
+    second_difference = np.abs(np.diff(samples.field_t, n=2, axis=0))
+    count = np.isfinite(second_difference).sum(axis=0)
+    noise = np.array(stated)
+    if len(second_difference) >= MIN_NOISE_SAMPLES:
+        ascending = np.sort(
+            np.where(np.isfinite(second_difference), second_difference, np.inf), axis=0
+        )
+        rank = (NOISE_QUANTILE * count).astype(int)
+        quantile = np.take_along_axis(ascending, rank[None], axis=0)[0]
+        # The second difference of white noise has six times its variance.
+        noise = np.where(
+            count >= MIN_NOISE_SAMPLES, quantile / NORMAL_QUANTILE / np.sqrt(6), stated
+        )
+    # A sensor without samples is assumed to be like the others.
+    is_known = np.isfinite(noise)
+    for axis in range(3):
+        known = noise[is_known[:, axis], axis]
+        noise[~is_known[:, axis], axis] = np.median(known) if len(known) else 0.0
+    return np.maximum(noise, least)
+
+
+def find_passes(samples: Samples, noise_t: Array) -> list[PassRange]:
+    """Return the passes over magnets in order of time; none if the field never changes."""
+    changing = np.flatnonzero(_field_change(samples, noise_t) > MIN_CHANGE_SIGMAS)
+    if len(changing) == 0:
+        return []
+    passes: list[PassRange] = []
+    max_gap = max(CHANGE_LAGS_SAMPLES)
+    for group in np.split(changing, np.flatnonzero(np.diff(changing) > max_gap) + 1):
+        first, stop = int(group[0]), int(group[-1]) + 1
+        margin = max(MIN_PASS_MARGIN_SAMPLES, (stop - first) // PASS_TO_MARGIN_RATIO)
+        first, stop = max(0, first - margin), min(len(samples), stop + margin)
+        if passes and first <= passes[-1].stop:
+            passes[-1] = PassRange(passes[-1].first, stop)
+        else:
+            passes.append(PassRange(first, stop))
+    return passes
+
+
+def _field_change(samples: Samples, noise_t: Array) -> Array:
+    """Return the change of the bar's field around each sample (n,), in sigmas of pure noise.
+
+    A field that all sensors share (the Earth's, while the robot rotates) does not count.
+    """
+    n = len(samples)
+    scaled = samples.field_t / noise_t
+    is_finite = np.isfinite(scaled)
+    scaled = np.nan_to_num(scaled)
+    degrees_of_freedom = 3 * len(samples.array)
+    if len(samples.array) > 2:
+        count = np.maximum(is_finite.sum(axis=1, keepdims=True), 1)
+        scaled = np.where(is_finite, scaled - scaled.sum(axis=1, keepdims=True) / count, 0.0)
+        degrees_of_freedom -= 3
+    largest = np.zeros(n)
+    for lag in CHANGE_LAGS_SAMPLES:
+        if lag >= n:
+            break
+        squares = ((scaled[lag:] - scaled[:-lag]) ** 2).sum(axis=(1, 2)) / 2
+        change = (squares - degrees_of_freedom) / np.sqrt(2 * degrees_of_freedom)
+        middle = slice(lag // 2, lag // 2 + n - lag)
+        largest[middle] = np.maximum(largest[middle], change)
+    return largest

@@ -1,28 +1,14 @@
 """Typed results of the Polaris solver: detections of tags, and facts of a run.
 
-The names of JSON keys are stable (docs/formats.md); where a field has another name, its key is
-declared beside it.
+The names of JSON keys are stable (docs/formats.md). If the name of a field differs from its key,
+the key is declared with it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-
-@dataclass(frozen=True)
-class PlanarPose:
-    """Position and heading on the floor.
-
-    Attributes
-    ----------
-    x_m, y_m : float
-    heading_rad : float
-        Counter-clockwise from x.
-    """
-
-    x_m: float
-    y_m: float
-    heading_rad: float
+from locatk.core.polaris.tag import PlanarPose
 
 
 @dataclass(frozen=True)

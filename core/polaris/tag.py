@@ -1,10 +1,9 @@
-"""The tag: a grid of disc magnets, and all that is known of a user's set of tags.
+"""Tags: grids of disc magnets, with all that is known of a user's set of tags.
 
-Frame of a tag: its origin is the middle of the grid, x points from v1 to v2 (the
-direction of orientation 0), y from v4 to v1, z up. Cells are counted (column, row) from
-v1: columns to the right (-y), rows forward (x), so that v1 = (0, 0), v2 = (0, K - 1),
-v3 = (K - 1, K - 1) and the corner that stays empty, v4 = (K - 1, 0): the paper's
-clockwise order (Polaris section 5.1).
+Frame of a tag: the origin is the middle of the grid, x points from v1 to v2 (the direction of
+orientation 0), y from v4 to v1, z up. Cells are counted (column, row) from v1: columns to the
+right (-y), rows forward (x), so that v1 = (0, 0), v2 = (0, K - 1), v3 = (K - 1, K - 1) and the
+corner that stays empty, v4 = (K - 1, 0): the paper's clockwise order (Polaris, section 5.1).
 """
 
 from __future__ import annotations
@@ -20,14 +19,30 @@ Array = NDArray[np.float64]
 Cell = tuple[int, int]
 
 MU0 = 4e-7 * math.pi
-"""Vacuum permeability in T m/A, to the nine digits that matter nowhere here."""
+"""Vacuum permeability in T m/A (the value before 2019; it differs in the tenth digit)."""
 
 CODECS = ("mosk", "redundant", "polaris-released")
 
 
 @dataclass(frozen=True)
+class PlanarPose:
+    """Position and heading on the floor.
+
+    Attributes
+    ----------
+    x_m, y_m : float
+    heading_rad : float
+        Counter-clockwise from x.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True)
 class Magnet:
-    """A disc, magnetised across (diametrically).
+    """Disc that is magnetised diametrically.
 
     Attributes
     ----------
@@ -35,7 +50,7 @@ class Magnet:
     remanence_t : float
         Br of the material in tesla.
     grade : str
-        As it is bought, ``"N52"``; "" where only the remanence is known.
+        Grade under which it is sold, as in ``"N52"``; "" if only the remanence is known.
     """
 
     diameter_m: float = 2e-3
@@ -51,7 +66,7 @@ class Magnet:
 
 @dataclass(frozen=True)
 class TagLayout:
-    """What one tag's id means: a magnet's cell and its orientation, magnet by magnet.
+    """Magnets that represent one id: the cell and the orientation of each.
 
     Attributes
     ----------
@@ -67,17 +82,17 @@ class TagLayout:
 
 @dataclass(frozen=True)
 class AsBuiltTag:
-    """How the magnets of one tag really lie, from ``locatk calibrate tag``.
+    """Deviations of the magnets of one tag from its design, from ``locatk calibrate tag``.
 
     Attributes
     ----------
     offset_m : (M, 2) ndarray
-        From the cell's place to the magnet, in the tag's frame; in the order of the
+        From the nominal position to the magnet, in the tag's frame and in the order of the
         layout's cells.
     angle_rad : (M,) ndarray
         From the nominal orientation to the magnet's, counter-clockwise.
     passes : int
-        How many passes it was fitted to.
+        Number of passes that it was estimated from.
     """
 
     offset_m: Array
@@ -86,37 +101,29 @@ class AsBuiltTag:
 
 
 @dataclass(frozen=True)
-class Placed:
-    """Where a tag lies on the floor: metres and radians in the site's frame."""
-
-    x_m: float
-    y_m: float
-    heading_rad: float
-
-
-@dataclass(frozen=True)
 class Tags:
-    """A set of tags of one design: the artifact ``tag.toml``.
+    """Set of tags of one design: the artifact ``tag.toml``.
 
     Attributes
     ----------
     order, magnets, orientations : int
         K, M and P of the paper.
     spacing_m : float
-        d: between neighbouring cells.
+        Distance d of neighbouring cells.
     codec : str
         One of :data:`CODECS`.
     magnet : Magnet
     clearance_m : float
-        From the magnets' middle to the sensors.
+        Height of the sensors over the middle of the magnets.
     ids : tuple of int or None
-        Members of the family; None where every id of the codec may occur.
+        Members of the family; None if every id of the codec may occur.
     min_distance : int
-        Between members of the family (``families.distance``); 1 where every id may occur.
-    built : mapping of int to AsBuilt
+        Least distance of two members of the family (``families.distance``); 1 if every id may
+        occur.
+    built : mapping of int to AsBuiltTag
         By id.
-    site : mapping of int to Placed
-        By id.
+    site : mapping of int to PlanarPose
+        Poses of the tags on the floor, by id, in the site's frame.
     notes : tuple of str
     """
 
@@ -130,45 +137,47 @@ class Tags:
     ids: tuple[int, ...] | None = None
     min_distance: int = 1
     built: Mapping[int, AsBuiltTag] = field(default_factory=dict)
-    site: Mapping[int, Placed] = field(default_factory=dict)
+    site: Mapping[int, PlanarPose] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @property
     def step_rad(self) -> float:
-        """Between neighbouring orientations."""
+        """Angle between neighbouring orientations."""
         return math.tau / self.orientations
 
 
 def vertices(order: int) -> tuple[Cell, Cell, Cell, Cell]:
-    """Cells of v1, v2, v3 and of v4, which stays empty."""
+    """Return the cells of v1, v2, v3 and of v4, which stays empty."""
     last = order - 1
     return (0, 0), (0, last), (last, last), (last, 0)
 
 
 def free_cells(order: int) -> tuple[Cell, ...]:
-    """The K^2 - 4 cells that are no corner, row by row from v1."""
+    """Return the K^2 - 4 cells that are no corner, row by row from v1."""
     corners = vertices(order)
     cells = [(column, row) for row in range(order) for column in range(order)]
     return tuple(cell for cell in cells if cell not in corners)
 
 
-def places(tags: Tags, cells: tuple[Cell, ...]) -> Array:
-    """Nominal places (M, 2) of cells in the tag's frame, in metres."""
+def cell_positions(tags: Tags, cells: tuple[Cell, ...]) -> Array:
+    """Return the nominal positions (M, 2) of cells in the tag's frame [m]."""
     grid = np.asarray(cells, float).reshape(-1, 2)
     middle = (tags.order - 1) / 2
     return np.column_stack([grid[:, 1] - middle, middle - grid[:, 0]]) * tags.spacing_m
 
 
-def angles(tags: Tags, symbols: tuple[int, ...]) -> Array:
-    """Nominal orientations (M,) in the tag's frame: radians, counter-clockwise from x."""
+def symbol_angles(tags: Tags, symbols: tuple[int, ...]) -> Array:
+    """Return the nominal angles (M,) of symbols in the tag's frame [rad], counter-clockwise."""
     return -tags.step_rad * np.asarray(symbols, float)
 
 
-def built_magnets(tags: Tags, tag_id: int, layout: TagLayout) -> tuple[Array, Array]:
-    """Places (M, 2) and angles (M,) of the magnets of ``tag_id`` as it was built, where
-    that was measured, else as designed."""
-    place, angle = places(tags, layout.cells), angles(tags, layout.symbols)
+def as_built_magnets(tags: Tags, tag_id: int, layout: TagLayout) -> tuple[Array, Array]:
+    """Return positions (M, 2) and angles (M,) of the magnets of a tag, in its frame.
+
+    They are those as built if the tag was measured, else those of its design.
+    """
+    position, angle = cell_positions(tags, layout.cells), symbol_angles(tags, layout.symbols)
     built = tags.built.get(tag_id)
     if built is not None:
-        place, angle = place + built.offset_m, angle + built.angle_rad
-    return place, angle
+        position, angle = position + built.offset_m, angle + built.angle_rad
+    return position, angle

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from locatk.core.dots.drawing import layout
 from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation import session as simulate
-from locatk.core.dots.simulation.paths import Course
+from locatk.core.dots.simulation.paths import CameraPath
 from locatk.core.dots.solver import METHODS, SolveOptions, solve
 from locatk.core.paper import paper_size
 from locatk.formats.bench import Figure
@@ -63,8 +63,8 @@ def _study(manifest: Manifest, spots: Array, heading: Array, method: str) -> Arr
     position, turned = (np.repeat(part, SAMPLES, axis=0) for part in (spots, heading))
     n = len(position)
     options = simulate.SimulationOptions(frames=n, jitter_m=JITTER_M, seed=SEED + 500)
-    course = Course(position, turned, np.zeros((n, 2)), np.zeros(n))
-    simulated = simulate.over(manifest, options, course)
+    course = CameraPath(position, turned, np.zeros((n, 2)), np.zeros(n))
+    simulated = simulate.simulate_path(manifest, options, course)
     solution = solve([simulated.frames], manifest, SolveOptions(method, simulated.camera))
     errors = np.full((n, 3), np.nan)
     for found in solution.detections:

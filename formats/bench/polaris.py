@@ -32,7 +32,7 @@ from locatk.core.polaris.codec import layout_of
 from locatk.core.polaris.published.pipeline import pattern_heading
 from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
-from locatk.core.polaris.tag import angles, places
+from locatk.core.polaris.tag import cell_positions, symbol_angles
 from locatk.formats.bench import Figure
 from locatk.formats.bench.polaris_speed import speed_figures
 from locatk.formats.bench.polaris_study import study_figures
@@ -170,7 +170,7 @@ def rigid_error(place_m: Array, tag_id: int) -> float:
     translation; ``nan`` where they were not found."""
     if not np.isfinite(place_m).all():
         return math.nan
-    nominal = places(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, tag_id).cells)
+    nominal = cell_positions(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, tag_id).cells)
     aligned = umeyama(place_m, nominal, with_scale=False).apply(place_m)
     return 1e3 * float(np.linalg.norm(aligned - nominal, axis=1).mean())
 
@@ -264,7 +264,7 @@ def _half_turns(runs: Sequence[Run]) -> float:
     """Number of orientations that are off by more than a quarter of a circle."""
     count = 0
     for run in runs:
-        nominal = angles(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, run.tag_id).symbols)
+        nominal = symbol_angles(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, run.tag_id).symbols)
         off = np.angle(np.exp(1j * (run.angle_rad - run.heading_rad - nominal)))
         count += int((np.abs(off) > math.pi / 2).sum())
     return float(count)

@@ -144,7 +144,7 @@ def _true(made: SimulatedSession, time_s: float) -> tuple[Array, Array]:
     at = int(np.argmin(np.abs(time_ns - round(time_s * 1e9))))
     heading = float(heading_from_quaternion(made.truth.quaternion[at : at + 1])[0])
     cos, sin = math.cos(heading), math.sin(heading)
-    points = np.vstack([made.magnets.place_m, np.zeros(2)]) - made.truth.position[at, :2]
+    points = np.vstack([made.magnets.position_m, np.zeros(2)]) - made.truth.position[at, :2]
     turned = points @ np.array([[cos, -sin], [sin, cos]])
     angle = np.r_[made.magnets.angle_rad, 0.0] - heading
     every = np.column_stack([turned, angle])
@@ -245,7 +245,7 @@ def _by_heading(known_speed: bool) -> list[tuple[Outcome, Array, Array]]:
             # The tag lies to the right of an array that passes to its left.
             covariance = magnet_covariance(
                 tags, layout_of(tags, tag_id), options.array, step_m=step, heading_rad=-heading,
-                offset_m=-lateral, unknown="strength" if known_speed else "steps",
+                offset_m=-lateral, nuisance="strength" if known_speed else "steps",
             )  # fmt: skip
             pose = pose_covariance(tags, layout_of(tags, tag_id), covariance, -heading)
             found.append((outcome, np.diag(covariance).reshape(-1, 3), np.diag(pose)))

@@ -50,10 +50,10 @@ def simulate_session(
 def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
     """The paper's bar over three tags, from rest."""
     from locatk.core.polaris.simulation.session import SimulationOptions, simulate
-    from locatk.core.polaris.tag import Placed, Tags
+    from locatk.core.polaris.tag import PlanarPose, Tags
 
     places = enumerate(zip(IDS, (0.0, 90.0, 200.0), strict=True))
-    site = {number: Placed(0.5 * k, 0.02 * k, radians(turn)) for k, (number, turn) in places}
+    site = {number: PlanarPose(0.5 * k, 0.02 * k, radians(turn)) for k, (number, turn) in places}
     tags = Tags(codec="polaris-released", site=site)
     simulated = simulate(tags, SimulationOptions(route=IDS, rest_s=1.0, odometry=True, seed=seed))
     arrays.write_session(

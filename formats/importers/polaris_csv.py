@@ -135,7 +135,7 @@ def _settings(rate_hz: float, warnings: list[str]) -> mlx90393.Settings:
     published = mlx90393.Settings()
     if rate_hz <= published.max_rate_hz:
         return published
-    part = mlx90393.for_rate(rate_hz, published)
+    part = mlx90393.settings_for_rate(rate_hz, published)
     if part is None:
         raise InputError(
             f"no MLX90393 gives {rate_hz:g} samples a second",

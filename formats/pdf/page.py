@@ -96,7 +96,7 @@ def start_page(
     canvas.setPageSize(tuple(_points(side) for side in size_mm))
     canvas.setFillColor(BLACK)
     canvas.setStrokeColor(BLACK)
-    canvas.setLineWidth(drawing.LINE_MM * mm)
+    canvas.setLineWidth(drawing.LINE_WIDTH_MM * mm)
 
 
 def _points(side_mm: float) -> float:

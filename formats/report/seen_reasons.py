@@ -92,7 +92,7 @@ def _dots() -> dict[str, Reason]:
 
 
 def _polaris() -> dict[str, Reason]:
-    from locatk.core.polaris.identification import decoding as reading
+    from locatk.core.polaris.identification import decoding
 
     return _of(
         "passes",
@@ -106,8 +106,8 @@ def _polaris() -> dict[str, Reason]:
             "too_many_magnets": "More magnets were found on the grid than a tag has.",
             "not_in_family": "It is farther from all tags of the family than may be corrected.",
             "beyond_code": "It has more errors than the redundant code is made for.",
-            "tie": f"Two ids are as near, to within {reading.TIE:g} steps of orientation or "
-            f"{reading.TIE_SIGMA:g} standard deviations.",
+            "tie": f"Two ids are as near, to within {decoding.MAX_TIE_STEPS:g} steps of "
+            f"orientation or {decoding.MAX_TIE_SIGMAS:g} standard deviations.",
             "ambiguous": "The magnets can be read as different ids, or one id seems to lie in two "
             "places.",
             "misfit": "The magnets miss their cells, or the scale of the way is far off: tags of "

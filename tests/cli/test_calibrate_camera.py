@@ -13,6 +13,7 @@ import pytest
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.session import SimulationOptions
+from locatk.core.simulation import SESSION_START_NS
 from locatk.formats import frames as files
 from locatk.formats import sheets
 
@@ -166,7 +167,7 @@ def test_blank_frames_are_counted(locatk, tmp_path: Path) -> None:
     session = seen(8)
     blank = np.full((120, 188), 200, np.uint8)
     images = [*session.frames.images, blank, blank]
-    time_ns = simulate.EPOCH_NS + 20_000_000 * np.arange(10)
+    time_ns = SESSION_START_NS + 20_000_000 * np.arange(10)
     frames = replace(
         session.frames, time_ns=time_ns, names=tuple(map(str, range(10))), images=images
     )

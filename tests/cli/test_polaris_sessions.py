@@ -16,8 +16,15 @@ import pytest
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.results import MagnetDetection, PlanarPose, TagDetection
-from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags, angles, built_magnets, places
+from locatk.core.polaris.results import MagnetDetection, TagDetection
+from locatk.core.polaris.tag import (
+    AsBuiltTag,
+    PlanarPose,
+    Tags,
+    as_built_magnets,
+    cell_positions,
+    symbol_angles,
+)
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import arrays, observations, solutions, tags
@@ -157,7 +164,8 @@ def test_info_tells_artifacts(locatk, tmp_path: Path) -> None:
     path = tmp_path / "tag.toml"
     built = AsBuiltTag(np.full((5, 2), 1e-4), np.full(5, math.radians(3)), 7)
     tags.write_tags(
-        path, replace(TAGS, ids=(3, 9), built={9: built}, site={3: Placed(1.5, -0.2, math.pi / 2)})
+        path,
+        replace(TAGS, ids=(3, 9), built={9: built}, site={3: PlanarPose(1.5, -0.2, math.pi / 2)}),
     )
     facts = json.loads(locatk("info", path, "--json").stdout)
     assert (facts["kind"], facts["capacity"], facts["family"]) == ("tag", 327_680, 2)
@@ -219,7 +227,7 @@ def detection(
 ) -> TagDetection:
     """What a solver says of the tag ``tag_id`` of ``known``, seen at ``pose``."""
     layout = layout_of(known, ID if tag_id is None else tag_id)
-    place, angle = built_magnets(known, -1 if tag_id is None else tag_id, layout)
+    place, angle = as_built_magnets(known, -1 if tag_id is None else tag_id, layout)
     x, y, heading = pose
     c, s = math.cos(heading), math.sin(heading)
     place = place @ np.array([[c, s], [-s, c]]) + [x, y]
@@ -427,7 +435,7 @@ def test_viewers_see_the_tag_where_it_lies(locatk, solver: Solver, tmp_path: Pat
 
     for site, frame, corner in (
         ({}, f"tag-{ID}", (-0.04, 0.04)),
-        ({ID: Placed(1.0, 2.0, math.pi / 2)}, "site", (0.96, 1.96)),
+        ({ID: PlanarPose(1.0, 2.0, math.pi / 2)}, "site", (0.96, 1.96)),
     ):
         session, out = tmp_path / f"{frame}.mcap", tmp_path / f"{frame}-solved.mcap"
         record(session, replace(TAGS, site=site))
@@ -458,7 +466,7 @@ def passes(count: int = 4) -> list[list[TagDetection]]:
 def true_shape() -> np.ndarray:
     """(5, 3) places and angles of the magnets, where the mean offset and turn are none."""
     layout = layout_of(TAGS, ID)
-    nominal = places(TAGS, layout.cells)
+    nominal = cell_positions(TAGS, layout.cells)
     place = nominal + BUILT.offset_m
     u, _, vt = np.linalg.svd((place - place.mean(0)).T @ (nominal - nominal.mean(0)))
     turn = u @ vt
@@ -492,13 +500,13 @@ def test_passes_say_how_a_tag_was_built(locatk, solver: Solver, tmp_path: Path) 
 
 def test_the_mean_offset_and_turn_are_none() -> None:
     layout = layout_of(TAGS, ID)
-    nominal = places(TAGS, layout.cells)
+    nominal = cell_positions(TAGS, layout.cells)
     offset = true_shape()[:, :2]
     np.testing.assert_allclose(offset.mean(axis=0), 0, atol=1e-15)
     arms = nominal - nominal.mean(axis=0)
     turn = arms[:, 0] * offset[:, 1] - arms[:, 1] * offset[:, 0]
     assert abs(turn.sum()) < 1e-12
-    assert angles(TAGS, layout.symbols).shape == (5,)
+    assert symbol_angles(TAGS, layout.symbols).shape == (5,)
 
 
 def test_a_pass_that_disagrees_is_named_and_left_out(

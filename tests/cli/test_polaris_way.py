@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.tag import Tags, places
+from locatk.core.polaris.tag import Tags, cell_positions
 from locatk.formats import solutions, tags
 
 DEFAULT_ID = 262_143
@@ -74,11 +74,16 @@ def test_published_runs_teach_how_their_tag_was_built(
 
 def test_a_simulated_tag_is_measured_as_it_was_built(locatk, tmp_path: Path) -> None:
     """From four sides; the simulation knows finite magnets, and where it put them."""
+    config = tmp_path / "sim.toml"
+    config.write_text(
+        'format = "locatk-simulation-polaris"\nformat_version = 1\n'
+        "[build]\nangle_deg = 5\nposition_mm = 0.3\nseed = 3\n"
+    )
     sessions = [tmp_path / f"side{k}.mcap" for k in range(4)]
     for k, session in enumerate(sessions):
         result = locatk(
             "simulate", "polaris", "-o", session, "--id", 77, "--heading", 90 * k + 10,
-            "--build-angle", 5, "--build-place", 0.3, "--build-seed", 3, "--seed", k,
+            "--config", config, "--seed", k,
         )  # fmt: skip
         assert result.exit_code == 0, result.stderr
     out = tmp_path / "built.toml"
@@ -92,7 +97,7 @@ def test_a_simulated_tag_is_measured_as_it_was_built(locatk, tmp_path: Path) -> 
     place = np.array([[magnet["x_m"], magnet["y_m"]] for magnet in lying])
     angle = np.array([magnet["angle_rad"] for magnet in lying])
     layout = layout_of(Tags(), 77)
-    nominal = places(Tags(), layout.cells)
+    nominal = cell_positions(Tags(), layout.cells)
     u, _, vt = np.linalg.svd((place - place.mean(0)).T @ (nominal - nominal.mean(0)))
     turn = u @ vt
     moved = (place - place.mean(0)) @ turn + nominal.mean(0)
@@ -106,9 +111,9 @@ def test_a_simulated_tag_is_measured_as_it_was_built(locatk, tmp_path: Path) -> 
 
 
 def test_a_simulated_tour_is_solved_on_its_site(locatk, tmp_path: Path) -> None:
-    from locatk.core.polaris.tag import Placed
+    from locatk.core.polaris.tag import PlanarPose
 
-    site = {5: Placed(0.0, 0.0, 0.0), 9: Placed(0.5, 0.05, 2.0)}
+    site = {5: PlanarPose(0.0, 0.0, 0.0), 9: PlanarPose(0.5, 0.05, 2.0)}
     artifact, tour, out = (tmp_path / name for name in ("tag.toml", "tour.mcap", "solved.mcap"))
     tags.write_tags(artifact, replace(Tags(), site=site))
     args = ("--id", 5, "--id", 9, "--odometry", "--seed", 2)

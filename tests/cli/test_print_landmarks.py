@@ -116,7 +116,7 @@ def test_same_map_same_bytes(locatk, map_file: Path, tmp_path: Path) -> None:
         (["--floor", "--paper", "roll:wide"], 1, "roll:914mm"),
         (["--paper", "A17"], 1, "A17"),
         (["--size", "A5"], 0, "148 x 210"),
-        (["--paper", "105x105mm"], 1, "more than paper 105x105"),
+        (["--paper", "105x105mm"], 1, "which paper 105x105"),
         (["--floor", "--margin", 2], 1, "joining marks"),
         (["--spares", -1], 2, "--spares"),
         (["--bom", "same"], 1, "one file"),

@@ -150,6 +150,7 @@ def test_nothing_is_replaced_unasked(locatk, family_file: Path, tmp_path: Path) 
         (["--id", 1, "--size", "90x90mm"], 1, "larger than the paper"),
         (["--id", 1, "--size", "A17"], 1, "A17"),
         (["--id", 1, "--margin", 110], 1, "margin"),
+        (["--id", 1, "--size", "200x6000mm"], 1, "--format svg"),
     ],
 )
 def test_what_is_asked_wrongly_is_told(

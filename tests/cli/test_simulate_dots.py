@@ -17,6 +17,36 @@ from locatk.formats.frames import read_frames
 from locatk.formats.session import Session
 from locatk.formats.tracks import read_truth
 
+SETTINGS = """
+format = "locatk-simulation-dots"
+format_version = 1
+
+[sheet]
+file = "sheet.toml"
+
+[path]
+frames = 7
+
+[print]
+dot_pitches = 0.25
+dust_fraction = 0.05
+jitter_um = 8
+
+[camera]
+file = "camera.toml"
+calibrated = false
+pitch_deg = 2
+roll_deg = -3
+tilt_deg = 5
+blur_px = 0.9
+
+[light]
+contrast_fraction = 0.5
+vignette_fraction = 0.2
+gradient_fraction = 0.1
+"""
+"""Settings that have no option of their own, and some that options override."""
+
 
 def test_a_session_holds_frames_sheet_camera_and_truth(locatk, tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
@@ -55,13 +85,12 @@ def test_each_option_reaches_the_frames(locatk, tmp_path: Path) -> None:
     camera = Camera((160, 100), 300.0, (80.0, 50.0), -0.2)
     sheets.write_manifest(printed, manifest)
     sheets.write_camera(lens, camera)
-    out = tmp_path / "run.mcap"
+    out, config = tmp_path / "run.mcap", tmp_path / "sim.toml"
+    config.write_text(SETTINGS)
     given = (
-        *("--sheet", printed, "--id", "second", "--camera", lens, "--duration", "0.2"),
-        *("--rate", 20, "--path", "random", "--speed", 0.3, "--motion", 2, "--dot", 0.25),
-        *("--missing", 0.1, "--dust", 0.05, "--jitter", 8, "--printer-scale", "1.002,0.999"),
-        *("--scale-known", "--blur", 0.9, "--noise", 4, "--contrast", 0.5, "--vignette", 0.2),
-        *("--gradient", 0.1, "--tilt", 5, "--askew", "2,-3", "--uncalibrated", "--seed", 8),
+        *("--config", config, "--id", "second", "--duration", "0.2"),
+        *("--rate", 20, "--path", "random", "--speed", 0.3, "--motion", 2, "--missing", 0.1),
+        *("--printer-scale", "1.002,0.999", "--scale-known", "--noise", 4, "--seed", 8),
     )
     result = locatk("simulate", "dots", "-o", out, *given)
     assert result.exit_code == 0, result.stderr
@@ -110,13 +139,12 @@ def test_a_scale_that_nobody_measured_stays_out_of_the_manifest(locatk, tmp_path
     ("options", "status", "said"),
     [
         (("--frames", 3, "--duration", 2), 2, "not both"),
-        (("--scale-known",), 2, "--printer-scale"),
-        (("--printer-scale", "1.002"), 2, "two numbers"),
+        (("--scale-known",), 2, "--scale-known needs --printer-scale"),
+        (("--printer-scale", "1.002"), 2, "X,Y"),
         (("--id", "other"), 2, "simulated"),
         (("--missing", 1.5), 2, "--missing"),
-        (("--codec", "qr"), 2, "libdots"),
-        (("--dot", 0.9), 1, "dot 0.9"),
-        (("--tilt", 60), 2, "--tilt"),
+        (("--codec", "libdots"), 2, "codec in [sheet]"),
+        (("--askew", "2,3"), 2, "pitch_deg in [camera] and roll_deg in [camera]"),
         (("--rate", 10000), 1, "exposure_s"),
     ],
 )
@@ -128,6 +156,23 @@ def test_what_cannot_be_is_one_line(
     assert said in result.stderr
     assert "Traceback" not in result.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[sheet]\ncodec = "qr"', "libdots"),
+        ("[print]\ndot_pitches = 0.9", "dot 0.9"),
+        ("[camera]\ntilt_deg = 60", "camera.tilt_deg"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(locatk, tmp_path: Path, text: str, said: str) -> None:
+    config, out = tmp_path / "sim.toml", tmp_path / "run.mcap"
+    config.write_text(f'format = "locatk-simulation-dots"\nformat_version = 1\n{text}\n')
+    result = locatk("simulate", "dots", "-o", out, "--config", config)
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert not out.exists()
 
 
 def test_nothing_is_overwritten_unasked(locatk, tmp_path: Path) -> None:

@@ -39,6 +39,61 @@ def floor(tmp_path: Path) -> Path:
     return path
 
 
+SETTINGS = """
+format = "locatk-simulation-landmarks"
+format_version = 1
+
+[robot]
+start = { x_mm = 100, y_mm = 100, heading_deg = 20 }
+landmarks = 2
+spins = 1
+acceleration_mps2 = 0.5
+turn_rate_dps = 120
+turn_acceleration_dps2 = 500
+rest_s = 0.2
+
+[aims]
+first_mm = 5
+second_mm = 1
+step_mm = 2
+heading_deg = 0.5
+
+[sensors]
+range_mt = 20
+quantum_mt = 0.02
+
+[errors]
+offset_mt = 0.2
+gain_fraction = 0.02
+earth_ut = -30
+height_mm = 1
+bar_strength_fraction = 0.05
+bar_position_mm = 0.4
+bar_angle_deg = 2
+bar_tilt_deg = 1
+landmark_position_mm = 2
+landmark_angle_deg = 1
+
+[odometry]
+rate_hz = 40
+scale_fraction = 0.02
+rotation_fraction = 0.03
+drift_deg_per_m = 2
+wheel_noise_mm = 0.1
+slips_per_m = 1
+slip_mm = 3
+
+[faults]
+missing_bars = [{ cell = [1, 2], bar = 3 }]
+displaced_landmarks = [{ cell = [0, 0], x_mm = 4, y_mm = -2.5 }]
+misread_fraction = 0.1
+dead_sensors = ["rear"]
+stuck_sensors = ["right"]
+swapped_sensors = [["front", "left"]]
+"""
+"""Settings that have no option of their own, and one that has."""
+
+
 def holds(path: Path, wanted: SimulatedSession) -> Session:
     """The session at ``path``, which holds what was simulated."""
     session = Session.open(path)
@@ -95,21 +150,13 @@ def test_a_session_holds_samples_map_odometry_and_truth(locatk, floor: Path) -> 
 
 
 def test_each_option_reaches_the_session(locatk, floor: Path) -> None:
-    out = floor.with_name("run.mcap")
+    out, config = floor.with_name("run.mcap"), floor.with_name("sim.toml")
+    config.write_text(SETTINGS)
     given = (
-        *("--start", "100,100,20", "--landmarks", 4, "--spins", 1, "--speed", 0.2),
-        *("--acceleration", 0.5, "--turn-rate", 120, "--turn-acceleration", 500),
-        *("--rest", 0.2, "--stop", 0.3, "--aim-first", 5, "--aim-second", 1, "--aim-step", 2),
-        *("--aim-heading", 0.5, "--rate", 120, "--odometry-rate", 40, "--range", 20),
-        *("--quantum", 0.02, "--noise", 0.1, "--offset", 0.2, "--gain", 0.02, "--earth", -30),
-        *("--height", 1, "--bar-strength", 0.05, "--bar-place", 0.4, "--bar-turn", 2),
-        *("--bar-lean", 1, "--landmark-place", 2, "--landmark-turn", 1, "--odometry-scale"),
-        *(0.02, "--odometry-turn", 0.03, "--odometry-drift", 2, "--wheel-noise", 0.1),
-        *("--slips", 1, "--slip", 3, "--flip", "0,1:2", "--flip", "1,1:0"),
-        *("--missing", "1,2:3", "--displace", "0,0:4,-2.5", "--misread-rate", 0.1),
-        *("--dead", "rear", "--stuck", "right", "--swap", "front:left", "--seed", 8),
+        *("--landmarks", 4, "--speed", 0.2, "--stop", 0.3, "--rate", 120, "--noise", 0.1),
+        *("--flip", "0,1:2", "--flip", "1,1:0", "--seed", 8),
     )
-    result = locatk("simulate", "landmarks", floor, "-o", out, *given)
+    result = locatk("simulate", "landmarks", floor, "--config", config, "-o", out, *given)
     assert result.exit_code == 0, result.stderr
     errors = Errors(
         noise_t=1e-4,
@@ -179,7 +226,11 @@ def test_each_option_reaches_the_session(locatk, floor: Path) -> None:
 def test_a_path_from_a_file(locatk, floor: Path) -> None:
     way, out = floor.with_name("way.csv"), floor.with_name("run.mcap")
     way.write_text("name,x_mm,y_mm\na,0,0\n\nb,400,0\nc,400.5,200\n")
-    given = ("--strategy", "path", "--path", way, "--errors", 0, "--earth", 0)
+    config = floor.with_name("sim.toml")
+    config.write_text(
+        'format = "locatk-simulation-landmarks"\nformat_version = 1\n[errors]\nearth_ut = 0\n'
+    )
+    given = ("--strategy", "path", "--path", way, "--errors", 0, "--config", config)
     result = locatk("simulate", "landmarks", floor, "-o", out, *given)
     assert result.exit_code == 0, result.stderr
     assert "over landmarks 0,0 0,1 0,2 1,2," in result.stdout
@@ -207,10 +258,14 @@ def test_a_path_of_cells_and_a_pass_with_other_sensors(locatk, floor: Path) -> N
     assert "over landmarks 0,0 0,1 0,2 0,3 1,3," in result.stdout
     sensors = HallSensors(position_m=circle(0.03), range_t=0.015, noise_t=1e-4)
     maps.write_halls(file, sensors)
-    given = ("--strategy", "pass", "--cell", "1,1", "--lateral", 5, "--approach", 90)
-    result = locatk(
-        "simulate", "landmarks", floor, "-o", out, *given, "--sensors", file, "--overwrite"
+    config = floor.with_name("sim.toml")
+    config.write_text(
+        'format = "locatk-simulation-landmarks"\nformat_version = 1\n'
+        '[robot]\nstrategy = "pass"\nlateral_mm = 5\napproach_deg = 90\n'
+        '[sensors]\nfile = "halls.toml"\n'
     )
+    given = ("--config", config, "--cell", "1,1")
+    result = locatk("simulate", "landmarks", floor, "-o", out, *given, "--overwrite")
     assert result.exit_code == 0, result.stderr
     assert "readings are at the end of the sensors' range" in result.stderr
     options = SimulationOptions(
@@ -232,26 +287,18 @@ def test_what_was_hardly_meant_is_warned_of(locatk, floor: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "status", "said"),
     [
-        (("--cell", "0,0"), 2, "One --cell is for a pass"),
+        (("--cell", "0,0"), 2, "--cell needs --strategy path or pass"),
+        (("--strategy", "pass", "--cell", "0,0", "--cell", "0,1"), 2, "one cell"),
         (("--strategy", "path"), 2, "--path or --cell"),
         (("--strategy", "path", "--cell", "0,0"), 1, "two waypoints"),
         (("--strategy", "path", "--cell", "0,0", "--cell", "2,1"), 1, "cell 2,1"),
-        (("--strategy", "pass", "--landmarks", 2), 2, "--landmarks is of --strategy paper"),
-        (("--lateral", 2), 2, "--lateral is of --strategy pass"),
-        (("--strategy", "pass", "--lateral", 200), 1, "lateral_m"),
-        (("--strategy", "pass", "--pattern", "NSN"), 1, "NSNS"),
-        (("--strategy", "pass", "--pattern", "SSSS", "--cell", "0,0"), 1, "no landmark SSSS"),
-        (("--start", "5"), 2, "X,Y,DEG"),
-        (("--start", "-50,-50,225"), 1, "meets no landmark"),
+        (("--strategy", "pass", "--landmarks", 2), 2, "--landmarks needs --strategy paper"),
         (("--flip", "0,1"), 2, "ROW,COLUMN:BAR"),
         (("--flip", "2,1:0"), 1, "no landmark"),
-        (("--missing", "0,1:4"), 1, "bar 4"),
-        (("--displace", "0,1:4"), 2, "ROW,COLUMN:DX,DY"),
-        (("--dead", "top"), 1, "front, left, rear, right"),
-        (("--swap", "front"), 2, "NAME:NAME"),
-        (("--height", -12), 1, "top faces"),
-        (("--misread-rate", 2), 2, "--misread-rate"),
+        (("--flip", "0,1:4"), 1, "bar 4"),
+        (("--noise", -2), 2, "--noise"),
         (("--rate", 1e6), 1, "samples"),
+        (("--dead", "rear"), 2, "dead_sensors in [faults]"),
     ],
 )
 def test_what_cannot_be_is_one_line(
@@ -262,6 +309,47 @@ def test_what_cannot_be_is_one_line(
     assert said in result.stderr
     assert "Traceback" not in result.stderr
     assert [path.name for path in floor.parent.iterdir()] == ["map.toml"]
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "status", "said"),
+    [
+        ("[robot]\nlateral_mm = 2", (), 2, "lateral_mm of [robot] needs --strategy pass"),
+        ("[robot]\nlateral_mm = 200", ("--strategy", "pass"), 1, "lateral_m"),
+        ('[robot]\npattern = "NSN"', ("--strategy", "pass"), 1, "NSNS"),
+        (
+            '[robot]\nstrategy = "pass"\npattern = "SSSS"\ncells = [[0, 0]]',
+            (),
+            1,
+            "no landmark SSSS",
+        ),
+        ("[robot]\nstart = { x_mm = 5 }", (), 1, "robot.start"),
+        (
+            "[robot]\nstart = { x_mm = -50, y_mm = -50, heading_deg = 225 }",
+            (),
+            1,
+            "meets no landmark",
+        ),
+        ("[faults]\ndisplaced_landmarks = [{ cell = [0, 1], x_mm = 4 }]", (), 1, "'y_mm'"),
+        ('[faults]\ndead_sensors = ["top"]', (), 1, "front, left, rear, right"),
+        ('[faults]\nswapped_sensors = [["front"]]', (), 1, "a list of 2"),
+        ("[errors]\nheight_mm = -12", (), 1, "top faces"),
+        ("[faults]\nmisread_fraction = 2", (), 1, "a number from 0 to 1"),
+        ('[sensors]\nfile = "halls.toml"\nrange_mt = 20', (), 2, "not both"),
+        ('[sensors]\nfile = "nowhere.toml"', (), 1, "nowhere.toml"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(
+    locatk, floor: Path, text: str, given: tuple[object, ...], status: int, said: str
+) -> None:
+    config = floor.with_name("sim.toml")
+    config.write_text(f'format = "locatk-simulation-landmarks"\nformat_version = 1\n{text}\n')
+    out = floor.with_name("run.mcap")
+    result = locatk("simulate", "landmarks", floor, "-o", out, "--config", config, *given)
+    assert result.exit_code == status, result.stderr
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not out.exists()
 
 
 def test_a_map_must_be_one(locatk, floor: Path) -> None:

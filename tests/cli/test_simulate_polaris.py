@@ -13,13 +13,67 @@ import pytest
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.simulation.session import CARS, SimulationOptions, simulate, usual_bar
-from locatk.core.polaris.tag import Placed, Tags
+from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.formats import tags as artifacts
 from locatk.formats.arrays import read_samples
 from locatk.formats.session import Session
 from locatk.formats.tracks import read_odometry, read_truth
 
-SITE = Tags(ids=(3, 7), site={3: Placed(0.0, 0.0, 0.0), 7: Placed(0.4, 0.0, 1.0)})
+SITE = Tags(ids=(3, 7), site={3: PlanarPose(0.0, 0.0, 0.0), 7: PlanarPose(0.4, 0.0, 1.0)})
+
+
+SETTINGS = """
+format = "locatk-simulation-polaris"
+format_version = 1
+
+[robot]
+tag_ids = [3]
+rest_s = 0.3
+acceleration_mps2 = 0.5
+crab_deg = 3
+yaw_wobble_deg = 1
+clearance_mm = 11
+height_wobble_mm = 0.5
+
+[sensors]
+count = 7
+spacing_mm = 18
+gain = 6
+resolution = 1
+
+[errors]
+measured_noise = true
+offset_ut = 12
+drift_ut = 0.2
+
+[faults]
+clipped = true
+dead_sensors = [2]
+stuck_sensors = [5]
+lost_fraction = 0.03
+
+[environment]
+earth_ut = 45
+dip_deg = 60
+north_deg = 20
+debris_count = 12
+debris_size_mm = 1.5
+debris_magnetised_fraction = 0.6
+motor_ut = 8
+motor_gradient_per_m = 2
+
+[build]
+angle_deg = 5
+position_mm = 0.4
+strength_fraction = 0.05
+seed = 9
+
+[odometry]
+recorded = false
+scale_fraction = 0.02
+heading_deg = 2
+"""
+"""Settings that have no option of their own, and three that options override."""
 
 
 def test_a_session_holds_samples_bar_tag_and_truth(locatk, tmp_path: Path) -> None:
@@ -61,26 +115,20 @@ def test_a_session_holds_samples_bar_tag_and_truth(locatk, tmp_path: Path) -> No
     assert json.loads(facts["simulated_crossings"]) == [crossing]
     magnets = json.loads(facts["simulated_magnets"])
     assert [[magnet["x_m"], magnet["y_m"]] for magnet in magnets] == pytest.approx(
-        wanted.magnets.place_m
+        wanted.magnets.position_m
     )
 
 
 def test_each_option_reaches_the_samples(locatk, tmp_path: Path) -> None:
-    tag, out = tmp_path / "site.toml", tmp_path / "run.mcap"
+    tag, out, config = (tmp_path / name for name in ("site.toml", "run.mcap", "sim.toml"))
     artifacts.write_tags(tag, SITE)
+    config.write_text(SETTINGS)
     given = (
         *("--id", 7, "--id", 3, "--heading", 200, "--lateral", 5, "--run-up", 80),
-        *("--speed", 0.12, "--rest", 0.3, "--acceleration", 0.5, "--speed-wobble", 0.2),
-        *("--crab", 3, "--yaw-wobble", 1, "--clearance", 11, "--height-wobble", 0.5),
-        *("--sensors", 7, "--spacing", 18, "--rate", 60, "--noise", 0.7, "--gain", 6),
-        *("--resolution", 1, "--clipped", "--offset", 12, "--drift", 0.2, "--dead", 2),
-        *("--stuck", 5, "--lost", 0.03, "--earth", 45, "--dip", 60, "--north", 20),
-        *("--debris", 12, "--debris-size", 1.5, "--debris-magnetised", 0.6, "--motor", 8),
-        *("--motor-gradient", 2, "--build-angle", 5, "--build-place", 0.4),
-        *("--build-strength", 0.05, "--build-seed", 9, "--odometry", "--odometry-scale", 0.02),
-        *("--odometry-turn", 2, "--seed", 8),
+        *("--speed", 0.12, "--speed-wobble", 0.2, "--rate", 60, "--noise", 0.7),
+        *("--odometry", "--seed", 8),
     )
-    result = locatk("simulate", "polaris", tag, "-o", out, *given)
+    result = locatk("simulate", "polaris", tag, "-o", out, "--config", config, *given)
     assert result.exit_code == 0, result.stderr
     options = SimulationOptions(
         array=usual_bar(7, 0.018, 60.0, 0.7e-6, 6, 1),
@@ -172,7 +220,11 @@ def test_what_was_hardly_meant_is_warned_of(locatk, tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert "no tag" in result.stdout
     assert "over no tag" in result.stderr
-    result = locatk("simulate", "polaris", "-o", out, "--clearance", 1, "--overwrite")
+    config = tmp_path / "sim.toml"
+    config.write_text(
+        'format = "locatk-simulation-polaris"\nformat_version = 1\n[robot]\nclearance_mm = 1\n'
+    )
+    result = locatk("simulate", "polaris", "-o", out, "--config", config, "--overwrite")
     assert result.exit_code == 0
     assert "beyond the sensors' range" in result.stderr
 
@@ -184,9 +236,8 @@ def test_what_was_hardly_meant_is_warned_of(locatk, tmp_path: Path) -> None:
         (("--id", 1, "--id", 2), 1, "no site"),
         (("--noise", 1, "--measured-noise"), 2, "not both"),
         (("--speed-wobble", 1.5), 2, "--speed-wobble"),
-        (("--dead", 9), 1, "dead (9,)"),
         (("--rate", 5000), 1, "5000 Hz"),
-        (("--clearance", 0.1), 1, "magnet"),
+        (("--dead", 9), 2, "dead_sensors in [faults]"),
         (("--array", "nowhere.toml"), 1, "nowhere.toml"),
         (("nowhere.toml",), 1, "nowhere.toml"),
         (("--car", "truck"), 2, "mini"),
@@ -202,14 +253,41 @@ def test_what_cannot_be_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_array_of_its_own_has_no_other_sensors(locatk, tmp_path: Path) -> None:
-    file = tmp_path / "array.toml"
-    artifacts.write_array(file, replace(usual_bar(), sensor="mine"))
-    out = tmp_path / "run.mcap"
-    result = locatk("simulate", "polaris", "-o", out, "--array", file, "--sensors", 3)
-    assert result.exit_code == 2
-    assert "--array" in result.stderr
+@pytest.mark.parametrize(
+    ("text", "status", "said"),
+    [
+        ("[faults]\ndead_sensors = [9]", 1, "dead (9,)"),
+        ("[robot]\nclearance_mm = 0.1", 1, "magnet"),
+        ('[sensors]\narray_file = "array.toml"\ncount = 3', 2, "--array or count of [sensors]"),
+        ('[sensors]\narray_file = "array.toml"\n[errors]\nmeasured_noise = true', 2, "--array"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(
+    locatk, tmp_path: Path, text: str, status: int, said: str
+) -> None:
+    artifacts.write_array(tmp_path / "array.toml", replace(usual_bar(), sensor="mine"))
+    config, out = tmp_path / "sim.toml", tmp_path / "run.mcap"
+    config.write_text(f'format = "locatk-simulation-polaris"\nformat_version = 1\n{text}\n')
+    result = locatk("simulate", "polaris", "-o", out, "--config", config)
+    assert result.exit_code == status, result.stderr
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
     assert not out.exists()
+
+
+def test_an_array_of_the_command_line_replaces_the_sensors_of_the_file(
+    locatk, tmp_path: Path
+) -> None:
+    file, config, out = (tmp_path / name for name in ("array.toml", "sim.toml", "run.mcap"))
+    own = replace(usual_bar(5), sensor="mine")
+    artifacts.write_array(file, own)
+    config.write_text(
+        'format = "locatk-simulation-polaris"\nformat_version = 1\n[sensors]\ncount = 3\n'
+    )
+    result = locatk("simulate", "polaris", "-o", out, "--config", config, "--array", file)
+    assert result.exit_code == 0, result.stderr
+    (samples,) = read_samples(Session.open(out))
+    assert len(samples.array) == 5
 
 
 def test_nothing_is_overwritten_unasked(locatk, tmp_path: Path) -> None:

@@ -98,6 +98,7 @@ def test_what_will_not_work_is_written_and_told(locatk, tmp_path: Path) -> None:
     assert read_tags(path).orientations == 16
     assert "Warning: 16 orientations are too many" in result.stderr
     assert result.stderr.splitlines()[-1].startswith("Incomplete: 100 Hz is too fast")
+    assert result.stderr.count("100 Hz is too fast") == 1
 
 
 def test_json_is_all_that_is_printed(locatk, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.published.ddtw import distances, prepare
 from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.polaris.simulation.session import SimulatedSession, SimulationOptions, simulate
-from locatk.core.polaris.tag import Tags, angles, places
+from locatk.core.polaris.tag import Tags, cell_positions, symbol_angles
 from locatk.formats.bench import Figure, polaris, polaris_speed, polaris_study
 
 PROMISED = {
@@ -132,7 +132,7 @@ def test_published_runs_are_as_promised(data: Path, monkeypatch: pytest.MonkeyPa
 
 
 def layout_m() -> np.ndarray:
-    return places(RELEASED, codec.layout_of(RELEASED, TAG).cells)
+    return cell_positions(RELEASED, codec.layout_of(RELEASED, TAG).cells)
 
 
 def turned(points: np.ndarray, angle: float) -> np.ndarray:
@@ -169,7 +169,7 @@ def test_the_authors_metric_has_two_anchors_and_no_rotation() -> None:
 
 def test_half_turns_are_counted_against_the_layout() -> None:
     layout = codec.layout_of(RELEASED, TAG)
-    true = angles(RELEASED, layout.symbols)
+    true = symbol_angles(RELEASED, layout.symbols)
     run = polaris.Run(TAG, True, 0, layout_m(), true + 0.3, 0.3, 1.0, 1.0)
     other = replace(run, angle_rad=true + 0.3 + [0, math.pi, 1.4, -math.pi, math.tau])
     lost = replace(run, angle_rad=np.full(5, np.nan), heading_rad=math.nan)
@@ -225,7 +225,7 @@ def detection(tag_id: int | None, cells: Any) -> TagDetection:
     """As a solver would tell it; magnets the other way round than in the layout."""
     magnets = [
         magnet(2 * x, y, 0.1 * k, cell)
-        for k, (cell, (x, y)) in enumerate(zip(cells, places(RELEASED, cells), strict=True))
+        for k, (cell, (x, y)) in enumerate(zip(cells, cell_positions(RELEASED, cells), strict=True))
     ]
     return replace(DETECTION, tag_id=tag_id, magnets=tuple(magnets[::-1]))
 
@@ -261,7 +261,7 @@ def told(made: SimulatedSession, tag_id: int | None, refused: str | None = None)
     """The truth at some sample, as a detection."""
     at = 150
     heading = heading_from_quaternion(made.truth.quaternion[at : at + 1])[0]
-    magnets = turned(made.magnets.place_m - made.truth.position[at, :2], -heading)
+    magnets = turned(made.magnets.position_m - made.truth.position[at, :2], -heading)
     x, y = turned(-made.truth.position[at, :2][None], -heading)[0]
     return replace(
         DETECTION,
@@ -347,7 +347,7 @@ def test_random_designs_fit_under_the_bar() -> None:
     for seed in range(200):
         tags, heading = polaris_study.random_design(np.random.default_rng(seed))
         grid = tuple((c, r) for c in range(tags.order) for r in range(tags.order))
-        across = turned(places(tags, grid), -heading)[:, 1]
+        across = turned(cell_positions(tags, grid), -heading)[:, 1]
         assert np.abs(across).max() < 0.0826
         assert 0.016 <= tags.spacing_m <= 0.040
         assert 4 <= tags.magnets <= min(13, tags.order**2 - 1)

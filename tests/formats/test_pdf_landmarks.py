@@ -20,13 +20,14 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.drawing import Line, Page, Text
+from locatk.core.drawing.tiles import Tile
 from locatk.core.errors import InputError
-from locatk.core.landmarks.drawing.pack import PARTS, pack
-from locatk.core.landmarks.drawing.true_size import Tile, floor_tiles
+from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pack
+from locatk.core.landmarks.drawing.true_size import draw_floor
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
 from locatk.core.paper import parse_paper
-from locatk.formats.pdf.landmarks import render, render_floor
+from locatk.formats.pdf.drawings import render_floor, render_pages
 
 DPI = 300
 PX = DPI / 25.4
@@ -126,10 +127,10 @@ def test_templates_have_their_bars_at_true_size(
 ) -> None:
     if code is not None:
         floor = replace(floor, codes=np.full((2, 2), code))
-    made = pack(floor, size, parts=("templates",))
+    made = draw_installation_pack(floor, size, parts=("templates",))
     laid = {int(value) for value in floor.codes.ravel()} - {HOLE}
     assert [item.code for item in made.templates] == sorted(laid)
-    data = render(made.pages, "t")
+    data = render_pages(made.pages, "t")
     for item in made.templates[:: 1 if code is not None else 3]:
         dark = ink(data, item.page)
         errors = measure(dark, floor.geometry, item.code, item.centre_mm)
@@ -139,7 +140,7 @@ def test_templates_have_their_bars_at_true_size(
 
 def test_templates_end_half_way_to_the_next_cell_where_there_is_room() -> None:
     for size, side in ((A3, 180.0), (A4, None)):
-        made = pack(HALL, size, parts=("templates",))
+        made = draw_installation_pack(HALL, size, parts=("templates",))
         assert made.templates[0].side_mm == side or side is None
         x, y = made.templates[0].centre_mm
         half = made.templates[0].side_mm / 2
@@ -172,9 +173,9 @@ def text_of(data: bytes, number: int) -> str:
 @pytest.mark.parametrize("code", [0b0111, 0b1001, 0b0000])
 def test_poles_are_lettered(code: int) -> None:
     floor = replace(HALL, codes=np.array([[code]]), walls=frozenset())
-    made = pack(floor, A4, parts=("templates",))
+    made = draw_installation_pack(floor, A4, parts=("templates",))
     (item,) = made.templates
-    data = render(made.pages, "t")
+    data = render_pages(made.pages, "t")
     letters = [(c, x, y) for c, x, y, height in words(data, item.page) if height > 3.5]
     assert len(letters) == 8
     for middle, _, north, _ in bars(floor.geometry, code):
@@ -213,19 +214,19 @@ def check_rulers(data: bytes, number: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", PACK_PARTS)
 def test_rulers_are_100_mm(part: str) -> None:
-    check_rulers(render(pack(HALL, A4, parts=(part,)).pages, "t"), 0)
+    check_rulers(render_pages(draw_installation_pack(HALL, A4, parts=(part,)).pages, "t"), 0)
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (24, 24), (3, 28)])
 def test_the_plan_shows_each_code_in_its_place(shape: tuple[int, int]) -> None:
     floor = some_floor(*shape)
-    pages = pack(floor, A4, parts=("plan",)).pages
+    pages = draw_installation_pack(floor, A4, parts=("plan",)).pages
     (plan,) = [group for page in pages for group in page.groups if group.name == "plan"]
     scale = float(next(m.text for m in all_words(pages) if m.text.startswith("Scale"))[10:])
     cell = 200 / scale
-    data = render(pages, "t")
+    data = render_pages(pages, "t")
     height = max(mark.points for mark in plan.marks if isinstance(mark, Text) and mark.bold)
     low = 0.85 * height * 0.5 * 25.4 / 72
     digits = [found for found in words(data) if found[3] > low and found[0] in "0123456789abcdef"]
@@ -254,7 +255,7 @@ def all_words(pages: tuple[Page, ...]) -> list[Text]:
 @pytest.mark.slow
 def test_large_plans_are_cut_into_pages_that_hold_each_cell_once() -> None:
     floor = some_floor(70, 61)
-    pages = pack(floor, A4, parts=("plan",)).pages
+    pages = draw_installation_pack(floor, A4, parts=("plan",)).pages
     assert len(pages) > 3
     seen = sum(
         isinstance(mark, Text) and mark.bold and len(mark.text) == 1 and mark.points != 6
@@ -264,16 +265,16 @@ def test_large_plans_are_cut_into_pages_that_hold_each_cell_once() -> None:
         for mark in group.marks
     )
     assert seen == floor.codes.size
-    said = text_of(render(pages, "t"), 0)
+    said = text_of(render_pages(pages, "t"), 0)
     assert "c1r1" in said
-    corner = text_of(render(pages[1:2], "t"), 0)
+    corner = text_of(render_pages(pages[1:2], "t"), 0)
     assert "rows" in corner
     assert "to 69" in corner, "the first is the upper left one"
     assert "13800" in corner
 
 
 def test_holes_walls_and_axes_are_on_the_plan() -> None:
-    pages = pack(HALL, A4, parts=("plan",)).pages
+    pages = draw_installation_pack(HALL, A4, parts=("plan",)).pages
     plan = next(group for group in pages[0].groups if group.name == "plan")
     thick = [m for m in plan.marks if isinstance(m, Line) and m.width_mm > 0.8]
     assert len(thick) == 2
@@ -287,7 +288,7 @@ def test_holes_walls_and_axes_are_on_the_plan() -> None:
         and abs(abs(m.start[0] - m.end[0]) - abs(m.start[1] - m.end[1])) < 1e-6
     ]
     assert len(slanted) == 2, "a hole is crossed"
-    said = text_of(render(pages, "t"), 0)
+    said = text_of(render_pages(pages, "t"), 0)
     for part in (
         "map +y",
         "+x",
@@ -312,8 +313,9 @@ FLOORS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("floor", "name", "overlap"), FLOORS)
 def test_the_floor_at_true_size_is_whole(floor: FloorMap, name: str, overlap: float) -> None:
-    tiles = floor_tiles(floor, parse_paper(name), overlap_mm=overlap)
-    data = render_floor(tiles, "t")
+    pages = draw_floor(floor, parse_paper(name), overlap_mm=overlap)
+    tiles = [page.tile for page in pages]
+    data = render_floor(pages, "t")
     assert len(pypdfium2.PdfDocument(data)) == len(tiles)
     whole = set()
     for number in range(0, len(tiles), max(1, len(tiles) // 4)):
@@ -326,7 +328,10 @@ def test_the_floor_at_true_size_is_whole(floor: FloorMap, name: str, overlap: fl
     for axis in (0, 1):
         edges = sorted(
             {
-                (round(tile.corner_mm[axis], 6), round(tile.corner_mm[axis] + span(tile, axis), 6))
+                (
+                    round(tile.corner_mm[axis], 6),
+                    round(tile.corner_mm[axis] + span(tile, axis), 6),
+                )
                 for tile in tiles
             }
         )
@@ -377,7 +382,7 @@ def check_tile(floor: FloorMap, tile: Tile, dark: Places) -> None:
 
 
 def test_floors_have_rulers() -> None:
-    tiles = floor_tiles(HALL, parse_paper("A3"))
+    tiles = draw_floor(HALL, parse_paper("A3"))
     dark = ink(render_floor(tiles[:1], "t"), dpi=600) > 0.5
     px = 600 / 25.4
     length, _, _ = longest_runs(dark[-round(9.5 * px) : -round(3 * px), : round(140 * px)])
@@ -385,12 +390,12 @@ def test_floors_have_rulers() -> None:
 
 
 def test_a_roll_is_as_long_as_it_needs_to_be() -> None:
-    (tile,) = floor_tiles(HALL, parse_paper("roll:914mm"))
+    (tile,) = draw_floor(HALL, parse_paper("roll:914mm"))
     # 4 x 5 cells of 180 mm and what is drawn around them; the roll may lie either way.
     assert 914.0 in tile.size_mm
     assert 540 + 110 < min(tile.size_mm) < 914
     long = some_floor(60, 2)
-    strips = floor_tiles(long, parse_paper("roll:914mm"))
+    strips = draw_floor(long, parse_paper("roll:914mm"))
     assert len(strips) == 3
     assert max(max(strip.size_mm) for strip in strips) <= 5080
 
@@ -402,9 +407,9 @@ def test_papers_that_are_none(text: str) -> None:
 
 
 def test_tables_say_what_the_map_says() -> None:
-    made = pack(HALL, A4)
-    data = render(made.pages, "t")
-    assert tuple(made.parts) == PARTS
+    made = draw_installation_pack(HALL, A4)
+    data = render_pages(made.pages, "t")
+    assert tuple(made.parts) == PACK_PARTS
     assert made.parts["list"][1] == len(made.pages)
     listed = text_of(data, made.parts["list"][0])
     for row, column in HALL.cells():
@@ -424,9 +429,9 @@ def test_tables_say_what_the_map_says() -> None:
 
 def test_the_list_of_a_large_floor_is_whole() -> None:
     floor = some_floor(30, 31)
-    made = pack(floor, A4, parts=("list",))
+    made = draw_installation_pack(floor, A4, parts=("list",))
     assert len(made.pages) > 3
-    data = render(made.pages, "t")
+    data = render_pages(made.pages, "t")
     said = [text_of(data, number) for number in range(len(made.pages))]
     assert sum(text.count("[ ]") for text in said) == 930
 
@@ -444,7 +449,7 @@ def nothing_drawn_over(pages: tuple[Page, ...], thin: float) -> float:
             )
             for page in pages
         )
-        return ink(render(kept, "t"), dpi=150)
+        return ink(render_pages(kept, "t"), dpi=150)
 
     letters = only(lambda mark: isinstance(mark, Text))
     rest = only(
@@ -459,11 +464,11 @@ def nothing_drawn_over(pages: tuple[Page, ...], thin: float) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("part", PACK_PARTS)
 @pytest.mark.parametrize("size", [A4, A3])
 def test_words_are_not_drawn_over(part: str, size: tuple[float, float]) -> None:
     for origin in ((-0.4, 1.0), (-0.18, -0.36)):
-        pages = pack(replace(HALL, origin_m=origin), size, parts=(part,)).pages
+        pages = draw_installation_pack(replace(HALL, origin_m=origin), size, parts=(part,)).pages
         assert nothing_drawn_over(pages[:1], 0.07) < 0.3
 
 
@@ -475,13 +480,13 @@ def test_words_are_not_drawn_over(part: str, size: tuple[float, float]) -> None:
             ((rows, columns), "plan")
             for rows, columns in ((1, 1), (7, 7), (24, 24), (1, 30), (30, 1))
         ),
-        *(((20, 20), part) for part in PARTS),
+        *(((20, 20), part) for part in PACK_PARTS),
         ((60, 60), "plan"),
     ],
 )
 def test_pages_keep_their_margins(shape: tuple[int, int], part: str) -> None:
     floor = some_floor(*shape, origin_m=(-12.3456, 0.1))
-    data = render(pack(floor, A4, parts=(part,)).pages[:2], "t")
+    data = render_pages(draw_installation_pack(floor, A4, parts=(part,)).pages[:2], "t")
     for number in range(len(pypdfium2.PdfDocument(data))):
         dark = ink(data, number, dpi=75)
         rim = math.floor(10 / 25.4 * 75) - 1
@@ -492,29 +497,29 @@ def test_pages_keep_their_margins(shape: tuple[int, int], part: str) -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(InputError, match="more than paper A6 ") as caught:
-        pack(HALL, (105.0, 148.0), paper_name="A6", parts=("templates",))
+    with pytest.raises(InputError, match="paper A6 ") as caught:
+        draw_installation_pack(HALL, (105.0, 148.0), paper_name="A6", parts=("templates",))
     assert caught.value.hint is not None
     wide, high = caught.value.hint.split()[-1].removesuffix("mm").split("x")
-    assert pack(HALL, (float(wide), float(high)), parts=("templates",)).templates
+    assert draw_installation_pack(HALL, (float(wide), float(high)), parts=("templates",)).templates
     with pytest.raises(InputError, match="margin"):
-        pack(HALL, A4, margin_mm=100)
+        draw_installation_pack(HALL, A4, margin_mm=100)
     with pytest.raises(InputError, match="pages of A4"):
-        floor_tiles(some_floor(40, 40), parse_paper("A4"))
+        draw_floor(some_floor(40, 40), parse_paper("A4"))
     with pytest.raises(InputError, match="overlap"):
-        floor_tiles(HALL, parse_paper("A4"), overlap_mm=150)
+        draw_floor(HALL, parse_paper("A4"), overlap_mm=150)
     with pytest.raises(InputError, match="joining marks"):
-        floor_tiles(HALL, parse_paper("A4"), margin_mm=3)
+        draw_floor(HALL, parse_paper("A4"), margin_mm=3)
     with pytest.raises(InputError, match="overlap at a pitch"):
-        floor_tiles(replace(HALL, pitch_m=0.03), parse_paper("A4"))
+        draw_floor(replace(HALL, pitch_m=0.03), parse_paper("A4"))
 
 
 @pytest.mark.slow
 def test_same_input_same_bytes_in_one_ink() -> None:
     floor = replace(HALL, name="Лаборатория (1)")
-    first, second = (render(pack(floor, A4).pages, "t") for _ in range(2))
+    first, second = (render_pages(draw_installation_pack(floor, A4).pages, "t") for _ in range(2))
     assert first == second
-    tiles = [floor_tiles(floor, parse_paper("A3")) for _ in range(2)]
+    tiles = [draw_floor(floor, parse_paper("A3")) for _ in range(2)]
     assert render_floor(tiles[0], "t") == render_floor(tiles[1], "t")
     for data in (first, render_floor(tiles[0], "t")):
         with pikepdf.open(io.BytesIO(data)) as pdf:

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from locatk.core.drawing import Group, Line, Mark, Page, Text
 from locatk.core.errors import InputError
-from locatk.core.polaris.drawing import cards
+from locatk.core.polaris.drawing.cards import draw_tag_cards
 from locatk.core.polaris.tag import AsBuiltTag, Magnet, TagLayout, Tags, free_cells
 from locatk.formats import tag_svg
-from locatk.formats.pdf import tag as tag_pdf
+from locatk.formats.pdf.drawings import render_pages
 
 DPI = 300
 A4, LETTER = (210.0, 297.0), (215.9, 279.4)
@@ -85,7 +85,7 @@ def only(pages: tuple[Page, ...], *, words: bool) -> tuple[Page, ...]:
 
 def ink(pages: tuple[Page, ...], number: int = 0, dpi: float = DPI) -> Places:
     """How dark each pixel is, 0 to 1, row 0 at the top."""
-    sheet = pypdfium2.PdfDocument(tag_pdf.render(pages, "test"))[number]
+    sheet = pypdfium2.PdfDocument(render_pages(pages, "test"))[number]
     grey = sheet.render(scale=dpi / 72, grayscale=True).to_numpy().squeeze()
     return (255.0 - grey) / (255 - 32)
 
@@ -141,7 +141,7 @@ def test_magnets_lie_and_point_where_the_id_says(
     tags: Tags, paper: tuple[float, float], mirror: bool, reach: tuple[float, float], dpi: int
 ) -> None:
     wanted = some(tags, 2)
-    made = cards.draw(tags, wanted, paper, mirror=mirror)
+    made = draw_tag_cards(tags, wanted, paper, mirror=mirror)
     assert [(item.tag_id, item.page) for item in made.tags] == [(1000, 0), (1001, 0)]
     # Some letters are rings of 1 mm, too.
     dark = ink(only(made.pages, words=False), dpi=dpi)
@@ -162,7 +162,7 @@ def test_magnets_lie_and_point_where_the_id_says(
 
 @pytest.mark.parametrize("paper", [A4, LETTER])
 def test_rulers_are_100_mm(paper: tuple[float, float]) -> None:
-    made = cards.draw(MINI, some(MINI, 1), paper)
+    made = draw_tag_cards(MINI, some(MINI, 1), paper)
     dark = ink(made.pages, dpi=600) > 0.5
     px = 600 / 25.4
     below, beside = dark[-round(16 * px) :], dark[:, : round(15.9 * px)].T[::-1]
@@ -208,7 +208,7 @@ def group_box(group: Xml.Element) -> tuple[float, float, float, float]:
 def test_tags_share_pages_without_touching(
     tags: Tags, count: int, paper: tuple[float, float], mirror: bool
 ) -> None:
-    made = cards.draw(tags, some(tags, count), paper, mirror=mirror)
+    made = draw_tag_cards(tags, some(tags, count), paper, mirror=mirror)
     seen = []
     for number, page in enumerate(made.pages):
         dark = ink(made.pages, number, dpi=100)
@@ -244,7 +244,7 @@ def test_words_are_not_drawn_over(tags: Tags, mirror: bool) -> None:
         (symbol, TagLayout(some_layout(tags, 7).cells, (symbol,) * tags.magnets))
         for symbol in range(tags.orientations)
     ]
-    (page,) = cards.draw(tags, turns, (600.0, 600.0), mirror=mirror).pages
+    (page,) = draw_tag_cards(tags, turns, (600.0, 600.0), mirror=mirror).pages
 
     words, rest = only((page,), words=True), only((page,), words=False)
     both = np.minimum(ink(words, dpi=150), ink(rest, dpi=150))
@@ -253,7 +253,7 @@ def test_words_are_not_drawn_over(tags: Tags, mirror: bool) -> None:
 
 
 def test_svg_is_what_the_pdf_shows_in_mm() -> None:
-    made = cards.draw(FULL, some(FULL, 2), A4)
+    made = draw_tag_cards(FULL, some(FULL, 2), A4)
     data = tag_svg.render(made.pages[0], "two tags")
     root = Xml.fromstring(data)
     assert (root.attrib["width"], root.attrib["height"]) == ("210mm", "297mm")
@@ -276,7 +276,7 @@ def test_svg_is_what_the_pdf_shows_in_mm() -> None:
         assert math.hypot(x2 - x1, y2 - y1) == pytest.approx(100, abs=1e-3)
     # Text is text, and the same text.
     texts = [item.text or "" for item in root.findall(".//s:text", SVG)]
-    shown = pypdfium2.PdfDocument(tag_pdf.render(made.pages, ""))[0].get_textpage()
+    shown = pypdfium2.PdfDocument(render_pages(made.pages, ""))[0].get_textpage()
     assert sorted("".join(texts).replace(" ", "")) == sorted(
         "".join(shown.get_text_bounded().split())
     )
@@ -288,8 +288,8 @@ def test_svg_is_what_the_pdf_shows_in_mm() -> None:
 def test_labels_say_what_it_is() -> None:
     tags = replace(FULL, codec="polaris-released")
     layout = TagLayout(((0, 0), (1, 0), (1, 1), (0, 2), (2, 2)), (0, 1, 2, 3, 7))
-    made = cards.draw(tags, [(262143, layout)], A4)
-    page = pypdfium2.PdfDocument(tag_pdf.render(made.pages, "t"))[0]
+    made = draw_tag_cards(tags, [(262143, layout)], A4)
+    page = pypdfium2.PdfDocument(render_pages(made.pages, "t"))[0]
     words = page.get_textpage().get_text_bounded()
     for part in (
         "id 262143", "polaris-released", "K=3", "M=5", "P=8", "d=40 mm", "D2 x 0.5 mm N52",
@@ -298,19 +298,19 @@ def test_labels_say_what_it_is() -> None:
         assert part in words, part
     assert [words.count(f"{angle}\u00b0") for angle in (45, 90, 135, 315)] == [1, 1, 1, 1]
     assert "MIRRORED" not in words
-    below = cards.draw(tags, [(262143, layout)], A4, mirror=True)
-    page = pypdfium2.PdfDocument(tag_pdf.render(below.pages, "t"))[0]
+    below = draw_tag_cards(tags, [(262143, layout)], A4, mirror=True)
+    page = pypdfium2.PdfDocument(render_pages(below.pages, "t"))[0]
     assert "MIRRORED" in page.get_textpage().get_text_bounded()
 
 
 def test_long_ids_are_written_whole_within_their_card() -> None:
     number = 3**300
-    made = cards.draw(MINI, [(number, some_layout(MINI, 1)), (5, some_layout(MINI, 2))], A4)
+    made = draw_tag_cards(MINI, [(number, some_layout(MINI, 1)), (5, some_layout(MINI, 2))], A4)
     _, group, other = made.pages[0].groups
     texts = [mark for mark in group.marks if isinstance(mark, Text) and mark.bold]
     digits = "".join(mark.text for mark in texts if mark.text != "N")
     assert digits.replace(" ", "") == f"id{number}"
-    page = pypdfium2.PdfDocument(tag_pdf.render(made.pages, "t"))[0].get_textpage()
+    page = pypdfium2.PdfDocument(render_pages(made.pages, "t"))[0].get_textpage()
     boxes = [page.get_charbox(at) for at in range(page.count_chars())]
     cut = max(mark.end[0] for mark in group.marks if isinstance(mark, Line)) - 3.0
     rims = (cut, min(mark.start[0] for mark in other.marks if isinstance(mark, Line)))
@@ -324,14 +324,14 @@ def test_tags_are_drawn_as_designed_and_always_the_same() -> None:
     wanted = some(FULL, 3)
     built = AsBuiltTag(np.full((5, 2), 3e-3), np.full(5, 0.2), 4)
     again = replace(FULL, built={1000: built})
-    first, second = (cards.draw(tags, wanted, A4).pages for tags in (FULL, again))
-    assert tag_pdf.render(first, "t") == tag_pdf.render(second, "t")
+    first, second = (draw_tag_cards(tags, wanted, A4).pages for tags in (FULL, again))
+    assert render_pages(first, "t") == render_pages(second, "t")
     assert tag_svg.render(first[1], "t") == tag_svg.render(second[1], "t")
 
 
 def test_one_ink_and_no_scaling() -> None:
-    made = cards.draw(FULL, some(FULL, 1), A4)
-    with pikepdf.open(io.BytesIO(tag_pdf.render(made.pages, "t"))) as pdf:
+    made = draw_tag_cards(FULL, some(FULL, 1), A4)
+    with pikepdf.open(io.BytesIO(render_pages(made.pages, "t"))) as pdf:
         assert pdf.Root.ViewerPreferences.PrintScaling == "/None"
         for operands, operator in pikepdf.parse_content_stream(pdf.pages[0]):
             assert str(operator) not in {"g", "G", "rg", "RG", "cs", "CS", "sc", "scn"}
@@ -341,33 +341,33 @@ def test_one_ink_and_no_scaling() -> None:
 
 def test_paper_is_turned_where_that_saves_pages() -> None:
     wide = Tags(spacing_m=0.06)
-    (page,) = cards.draw(wide, some(wide, 1), A4).pages
+    (page,) = draw_tag_cards(wide, some(wide, 1), A4).pages
     assert page.size_mm == A4
-    (page,) = cards.draw(DENSE, some(DENSE, 1), (160.0, 150.0)).pages
+    (page,) = draw_tag_cards(DENSE, some(DENSE, 1), (160.0, 150.0)).pages
     assert page.size_mm == (160.0, 150.0)
-    (page,) = cards.draw(DENSE, some(DENSE, 2), (150.0, 225.0)).pages
+    (page,) = draw_tag_cards(DENSE, some(DENSE, 2), (150.0, 225.0)).pages
     assert page.size_mm == (225.0, 150.0)
-    assert len(cards.draw(DENSE, some(DENSE, 2), (225.0, 150.0), landscape=False).pages) == 2
+    assert len(draw_tag_cards(DENSE, some(DENSE, 2), (225.0, 150.0), landscape=False).pages) == 2
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
     large = Tags(order=5, magnets=8)
     wanted = some(large, 1)
     with pytest.raises(InputError, match="larger than the paper") as refused:
-        cards.draw(large, wanted, (180.0, 180.0))
+        draw_tag_cards(large, wanted, (180.0, 180.0))
     # The paper of the hint is enough, and hardly more.
     hint = refused.value.hint or ""
     width, height = map(float, hint.split("--size ")[1].removesuffix("mm").split("x"))
-    assert len(cards.draw(large, wanted, (width, height)).pages) == 1
+    assert len(draw_tag_cards(large, wanted, (width, height)).pages) == 1
     for less in ((width, height - 5), (width - 5, height)):
         with pytest.raises(InputError):
-            cards.draw(large, wanted, less, landscape=less[0] > less[1])
+            draw_tag_cards(large, wanted, less, landscape=less[0] > less[1])
     with pytest.raises(InputError, match="margin"):
-        cards.draw(FULL, some(FULL, 1), A4, margin_mm=105)
+        draw_tag_cards(FULL, some(FULL, 1), A4, margin_mm=105)
     with pytest.raises(InputError, match="no tag"):
-        cards.draw(FULL, [], A4)
+        draw_tag_cards(FULL, [], A4)
     with pytest.raises(InputError, match="pages"):
-        cards.draw(FULL, some(FULL, 1) * 401, A4)
+        draw_tag_cards(FULL, some(FULL, 1) * 401, A4)
     with pytest.raises(InputError, match="5080") as refused:
-        tag_pdf.render(cards.draw(FULL, some(FULL, 1), (200.0, 6000.0)).pages, "t")
-    assert "svg" in (refused.value.hint or "")
+        render_pages(draw_tag_cards(FULL, some(FULL, 1), (200.0, 6000.0)).pages, "t", hint="cut it")
+    assert refused.value.hint == "cut it"

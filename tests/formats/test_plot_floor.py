@@ -82,11 +82,11 @@ def test_bars_lie_as_in_the_installation_pack(code: int, x: float, y: float, tur
         middle, way, strength = bars_on_floor(laid, (0, 0))
         c, s = math.cos(heading), math.sin(heading)
         rotation = np.array([[c, -s], [s, c]])
-        for k, (_, south, north, letter) in enumerate(bar_outlines(Geometry(), code)):
-            poles = np.array([south, north]) * 1e-3 @ rotation.T + [0.3, 0.4] + shift
+        for k, bar in enumerate(bar_outlines(Geometry(), code)):
+            poles = np.array([bar.south, bar.north]) * 1e-3 @ rotation.T + [0.3, 0.4] + shift
             half = 0.015 * np.array([math.cos(way[k]), math.sin(way[k])])
             np.testing.assert_allclose([middle[k] - half, middle[k] + half], poles, atol=1e-12)
-            assert (strength[k] > 0) == (letter == "N")
+            assert (strength[k] > 0) == (bar.letter == "N")
 
 
 def test_halves_of_bars_are_north_and_south() -> None:
@@ -95,11 +95,11 @@ def test_halves_of_bars_are_north_and_south() -> None:
     assert floor.north.shape == floor.south.shape == (12, 4, 3)
     assert floor.names == ("0,0", "1,0", "1,1")
     assert floor.met.tolist() == [True, False, False]
-    _, south, north, _ = bar_outlines(Geometry(), 7)[1]
+    bar = bar_outlines(Geometry(), 7)[1]
     # The middle of each half is halfway between the bar's middle and its pole.
     middle = floor.north[1].mean(axis=0)[:2] - [1.0, -2.0]
     np.testing.assert_allclose(
-        middle, 1e-3 * (np.array(north) * 0.75 + np.array(south) * 0.25), atol=1e-12
+        middle, 1e-3 * (np.array(bar.north) * 0.75 + np.array(bar.south) * 0.25), atol=1e-12
     )
     area = np.ptp(floor.north, axis=1)
     np.testing.assert_allclose(np.sort(area[:, :2], axis=1), [[0.01, 0.015]] * 12, atol=1e-12)

@@ -12,8 +12,8 @@ from matplotlib.text import Text
 
 from locatk.core.geometry import Similarity, quaternion_from_heading
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.results import MagnetDetection, PlanarPose, TagDetection
-from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags, built_magnets
+from locatk.core.polaris.results import MagnetDetection, TagDetection
+from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, Tags, as_built_magnets
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plot import draw
@@ -25,7 +25,7 @@ BUILT = Tags(built={ID: AsBuiltTag(np.full((5, 2), 1e-3), np.full(5, 0.1), 3)})
 
 def detection(tags: Tags, x: float, y: float, heading: float) -> TagDetection:
     """The tag seen at that pose, without error."""
-    place, angle = built_magnets(tags, ID, layout_of(tags, ID))
+    place, angle = as_built_magnets(tags, ID, layout_of(tags, ID))
     c, s = math.cos(heading), math.sin(heading)
     place = place @ np.array([[c, s], [-s, c]]) + [x, y]
     magnets = tuple(
@@ -71,8 +71,8 @@ def solution(tags: Tags, frame: str, n: int = 20) -> Solution:
     )
 
 
-@pytest.mark.parametrize("placed", [None, Placed(1.2, -0.3, 2.5)])
-def test_magnets_were_found_where_they_lie(placed: Placed | None) -> None:
+@pytest.mark.parametrize("placed", [None, PlanarPose(1.2, -0.3, 2.5)])
+def test_magnets_were_found_where_they_lie(placed: PlanarPose | None) -> None:
     tags = BUILT if placed is None else replace(BUILT, site={ID: placed})
     frame = f"tag-{ID}" if placed is None else "site"
     (tag,) = tags_of(solution(tags, frame))
@@ -98,7 +98,7 @@ def test_the_map_shows_all_magnets() -> None:
     figure = draw(solution(BUILT, f"tag-{ID}"))
     ground = figure.axes[0]
     known, found = figure.findobj(Quiver)
-    place = 1e3 * built_magnets(BUILT, ID, layout_of(BUILT, ID))[0]  # a small map is in mm
+    place = 1e3 * as_built_magnets(BUILT, ID, layout_of(BUILT, ID))[0]  # a small map is in mm
     np.testing.assert_allclose(known.XY, place)
     np.testing.assert_allclose(found.XY, place)
     assert ground.get_xlabel() == "x [mm]"
@@ -112,7 +112,7 @@ def test_the_map_shows_all_magnets() -> None:
 def test_a_solution_without_poses_shows_the_site() -> None:
     empty = replace(solution(BUILT, "site", n=0), trajectories=(), detections=())
     assert tags_of(empty) == ()
-    site = replace(empty, artifact=replace(BUILT, site={ID: Placed(3.0, 4.0, 0.0)}))
+    site = replace(empty, artifact=replace(BUILT, site={ID: PlanarPose(3.0, 4.0, 0.0)}))
     ground = draw(site).axes[0]
     assert ground.get_xlim()[0] < 3000 < ground.get_xlim()[1]  # mm
     assert ground.get_ylim()[0] < 4000 < ground.get_ylim()[1]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.codec import capacity
-from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, Placed, Tags
+from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, PlanarPose, Tags
 from locatk.formats import tags as files
 from locatk.formats.tags import dumps_array, dumps_tags, loads_array, loads_tags
 
@@ -71,7 +71,7 @@ def tag_sets(draw: st.DrawFn) -> Tags:
         dict(
             sorted(
                 draw(
-                    st.dictionaries(some, st.builds(Placed, finite, finite, finite), max_size=2)
+                    st.dictionaries(some, st.builds(PlanarPose, finite, finite, finite), max_size=2)
                 ).items()
             )
         ),
@@ -117,7 +117,7 @@ def test_every_array_comes_back_to_the_last_bit(array: SensorArray) -> None:
 
 @given(st.floats(-7, 7), st.decimals(-360, 360, places=2))
 def test_degrees_stay_as_they_were_written(angle: float, degrees: Decimal) -> None:
-    tags = Tags(site={0: Placed(0.0, 0.0, angle)})
+    tags = Tags(site={0: PlanarPose(0.0, 0.0, angle)})
     assert loads_tags(dumps_tags(tags)).site[0].heading_rad == angle
     text = f"{dumps_tags(tags).split('heading_deg = ')[0]}heading_deg = {degrees}\n"
     again = loads_tags(dumps_tags(loads_tags(text)))
@@ -161,7 +161,7 @@ def test_tags_by_hand() -> None:
     assert (tags.ids, tags.min_distance) == ((3, 7), 2)
     assert tags.built[7].offset_m[0, 1] == 0.5e-3
     assert tags.built[7].angle_rad[2] == math.radians(13)
-    assert tags.site == {7: Placed(1.5, -0.0205, math.pi / 2)}
+    assert tags.site == {7: PlanarPose(1.5, -0.0205, math.pi / 2)}
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from locatk.core.geometry import quaternion_from_heading
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.scene import Marker, Scene, Station
-from locatk.core.polaris.tag import Placed, Tags
+from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import frames, viewer_points, viewers
@@ -49,7 +49,7 @@ TILES = Manifest(
     ),
     codec="libdots",
 )
-SITE = Tags(site={0: Placed(0.0, 0.0, 0.0), 7: Placed(0.5, 0.1, 1.0)})
+SITE = Tags(site={0: PlanarPose(0.0, 0.0, 0.0), 7: PlanarPose(0.5, 0.1, 1.0)})
 FLOOR = FloorMap(np.array([[3, 9], [5, 0]]), pitch_m=0.2)
 
 ARTIFACTS: dict[str, tuple[object, str, set[str]]] = {

@@ -1,9 +1,10 @@
-"""Frames without the pattern: what a reader of dots must refuse."""
+"""Frames without the pattern, which a solver of dots must reject."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,14 +15,14 @@ Image = NDArray[np.float32]
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.,:;!?-"
 
 PITCH_PX = 0.508 / 0.046
-"""Of the pattern, in the paper's camera; decoys that look like it are on this scale."""
+"""Pitch of the pattern in the paper's camera, for decoys that resemble it."""
 
-DRAWN = 4
-"""Figures are drawn so many times larger than they are needed, then averaged."""
+DRAWING_SCALE = 4
+"""Scale at which figures are drawn before they are averaged to pixels."""
 
 
 def decoys(kind: str, n: int, seed: int, size: tuple[int, int] = (188, 120)) -> NDArray[np.uint8]:
-    """Frames of something else.
+    """Return frames of something else.
 
     Parameters
     ----------
@@ -29,11 +30,11 @@ def decoys(kind: str, n: int, seed: int, size: tuple[int, int] = (188, 120)) -> 
         One of :data:`KINDS`.
 
         ``"noise"``: independent grey values, soft or hard; ``"blank"``: paper, dark, or
-        overexposed; ``"text"``: printed lines; ``"checkerboard"`` and ``"lines"``: of any
-        pitch; ``"halftone"``: a regular screen of dots; ``"texture"``: clouds whose
-        spectrum falls as in photographs; ``"random dots"``: dots of the pattern's size
-        anywhere; ``"random symbols"``: the pattern's own lattice with a symbol drawn by lot
-        at each place, so that all but the code is right.
+        overexposed; ``"text"``: printed lines; ``"checkerboard"`` and ``"lines"``: with a
+        random pitch; ``"halftone"``: a regular screen of dots; ``"texture"``: clouds with the
+        spectrum of photographs; ``"random dots"``: dots of the pattern's size at random
+        positions; ``"random symbols"``: the lattice of the pattern with random symbols, so that
+        all except the code is correct.
     n : int
     seed : int
         The same arguments give the same frames.
@@ -55,10 +56,8 @@ def decoys(kind: str, n: int, seed: int, size: tuple[int, int] = (188, 120)) -> 
     return np.array(frames).reshape(n, size[1], size[0])
 
 
-def _finished(ink: Image, rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Ink (0 paper, 1 black) as a camera gives it: any contrast, blur, light and noise."""
-    import cv2
-
+def _photographed(ink: Image, rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Convert ink (0 paper, 1 black) to a frame with random contrast, blur, light and noise."""
     if ink.shape != size[::-1]:
         ink = cv2.resize(ink, size, interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(ink, (0, 0), rng.uniform(0.4, 1.5))
@@ -90,8 +89,6 @@ def _blank(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]
 
 
 def _text(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
-    import cv2
-
     width, height = 2 * size[0], 2 * size[0]
     page = np.zeros((height, width), np.uint8)
     scale = rng.uniform(0.3, 1.6)
@@ -100,23 +97,24 @@ def _text(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
         line = "".join(rng.choice(list(LETTERS + " " * 8), 60))
         weight = int(rng.integers(1, 4))
         cv2.putText(page, line, (-10, int(y)), font, scale, (255,), weight, cv2.LINE_AA)
-    return _finished(_turned(page, rng, size), rng, size)
+    return _photographed(_rotated(page, rng, size), rng, size)
 
 
-def _turned(page: NDArray[np.uint8], rng: np.random.Generator, size: tuple[int, int]) -> Image:
-    """The middle of a page, turned by any angle and at half its scale."""
-    import cv2
-
+def _rotated(page: NDArray[np.uint8], rng: np.random.Generator, size: tuple[int, int]) -> Image:
+    """Return the middle of a page, rotated by a random angle, at twice the scale of the frame."""
     middle = ((page.shape[1] - 1) / 2, (page.shape[0] - 1) / 2)
-    turn = cv2.getRotationMatrix2D(middle, rng.uniform(0, 360), 1.0)
-    turn[:, 2] += [size[0] - middle[0], size[1] - middle[1]]
-    doubled = cv2.warpAffine(page, turn, (2 * size[0], 2 * size[1]))
+    transform = cv2.getRotationMatrix2D(middle, rng.uniform(0, 360), 1.0)
+    transform[:, 2] += [size[0] - middle[0], size[1] - middle[1]]
+    doubled = cv2.warpAffine(page, transform, (2 * size[0], 2 * size[1]))
     return np.divide(doubled, 255, dtype=np.float32)
 
 
 def _axes(rng: np.random.Generator, size: tuple[int, int]) -> tuple[Image, Image]:
-    """Coordinates in px of the drawn frame along two axes turned by any angle."""
-    y, x = np.mgrid[: DRAWN * size[1], : DRAWN * size[0]].astype(np.float32) / DRAWN
+    """Return coordinates in px of the drawn frame along two axes at a random angle."""
+    y, x = (
+        np.mgrid[: DRAWING_SCALE * size[1], : DRAWING_SCALE * size[0]].astype(np.float32)
+        / DRAWING_SCALE
+    )
     angle = rng.uniform(0, 2 * np.pi)
     c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
     return c * x + s * y, c * y - s * x
@@ -126,7 +124,7 @@ def _checkerboard(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np
     u, v = _axes(rng, size)
     field = rng.uniform(3, 40)
     dark = (np.floor(u / field) + np.floor(v / field)).astype(np.int32) & 1
-    return _finished(dark.astype(np.float32), rng, size)
+    return _photographed(dark.astype(np.float32), rng, size)
 
 
 def _lines(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -135,21 +133,21 @@ def _lines(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]
     dark = (u / pitch) % 1 < width
     if rng.random() < 0.5:
         dark |= (v / pitch) % 1 < width
-    return _finished(dark.astype(np.float32), rng, size)
+    return _photographed(dark.astype(np.float32), rng, size)
 
 
 def _halftone(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
     u, v = _axes(rng, size)
     pitch, radius = float(rng.choice([PITCH_PX, rng.uniform(4, 25)])), rng.uniform(0.08, 0.4)
     u, v = (a / pitch - np.rint(a / pitch) for a in (u, v))
-    return _finished((u * u + v * v < radius**2).astype(np.float32), rng, size)
+    return _photographed((u * u + v * v < radius**2).astype(np.float32), rng, size)
 
 
 def _texture(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
     width, height = size
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
     frequency[0, 0] = 1 / max(size)
-    # Photographs: amplitudes fall with about the first power of frequency.
+    # In photographs, amplitudes fall with about the first power of the frequency.
     amplitude = frequency ** -rng.uniform(0.5, 1.6)
     phases = np.exp(2j * np.pi * rng.random(frequency.shape))
     clouds = np.fft.irfft2(amplitude * phases, s=(height, width))
@@ -158,32 +156,33 @@ def _texture(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint
 
 
 def _discs(
-    at: NDArray[np.float64], diameter_px: float, rng: np.random.Generator, size: tuple[int, int]
+    centres: NDArray[np.float64],
+    diameter_px: float,
+    rng: np.random.Generator,
+    size: tuple[int, int],
 ) -> NDArray[np.uint8]:
-    import cv2
-
-    page = np.zeros((DRAWN * size[1], DRAWN * size[0]), np.uint8)
-    for x, y in np.rint(((at + 0.5) * DRAWN - 0.5) * 16).astype(int):
-        radius = round(diameter_px / 2 * DRAWN * 16)
+    page = np.zeros((DRAWING_SCALE * size[1], DRAWING_SCALE * size[0]), np.uint8)
+    for x, y in np.rint(((centres + 0.5) * DRAWING_SCALE - 0.5) * 16).astype(int):
+        radius = round(diameter_px / 2 * DRAWING_SCALE * 16)
         cv2.circle(page, (int(x), int(y)), radius, (255,), -1, cv2.LINE_AA, 4)
-    return _finished(np.divide(page, 255, dtype=np.float32), rng, size)
+    return _photographed(np.divide(page, 255, dtype=np.float32), rng, size)
 
 
 def _random_dots(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
     count = rng.poisson(size[0] * size[1] / PITCH_PX**2 * rng.uniform(0.3, 2))
-    at = rng.uniform(0, size, (count, 2))
-    return _discs(at, PITCH_PX * rng.uniform(0.15, 0.4), rng, size)
+    centres = rng.uniform(0, size, (count, 2))
+    return _discs(centres, PITCH_PX * rng.uniform(0.15, 0.4), rng, size)
 
 
 def _random_symbols(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.uint8]:
-    reach = int(np.hypot(*size) / 2 / PITCH_PX) + 2
-    x, y = (a.ravel() for a in np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(float))
-    quarter = rng.integers(0, 4, len(x)) * np.pi / 2
-    grid = np.stack([x + np.cos(quarter) / 6, y + np.sin(quarter) / 6], axis=1)
+    half = int(np.hypot(*size) / 2 / PITCH_PX) + 2
+    x, y = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1].astype(float))
+    symbol_rad = rng.integers(0, 4, len(x)) * np.pi / 2
+    grid = np.stack([x + np.cos(symbol_rad) / 6, y + np.sin(symbol_rad) / 6], axis=1)
     angle = rng.uniform(0, 2 * np.pi)
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    at = (grid + rng.uniform(-0.5, 0.5, 2)) @ turn * PITCH_PX + np.array(size) / 2
-    return _discs(at, PITCH_PX * rng.uniform(0.2, 0.35), rng, size)
+    rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    centres = (grid + rng.uniform(-0.5, 0.5, 2)) @ rotation * PITCH_PX + np.array(size) / 2
+    return _discs(centres, PITCH_PX * rng.uniform(0.2, 0.35), rng, size)
 
 
 KINDS: dict[str, Callable[[np.random.Generator, tuple[int, int]], NDArray[np.uint8]]] = {

@@ -1,13 +1,14 @@
-"""The paper as a printer left it: dots, dots that are missing or astray, and dust.
+"""Simulated print: dots with errors, missing dots, and dust.
 
-All of it is drawn from a hash of the place, not from a stream of random numbers: a dot
-that is missing is missing in every frame that shows its place.
+Random numbers are a hash of the position on the grid instead of a stream: a missing dot is missing
+in every frame that shows its position.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,31 +18,38 @@ from locatk.core.dots.sheet import Manifest
 
 Array = NDArray[np.float64]
 
-DUST_RADIUS = (0.05, 0.2)
-"""Of a speck, in pitches: from a grain of toner to something larger than a dot."""
+DUST_RADIUS_PITCHES = (0.05, 0.2)
+"""Range of the radius of a speck, from a grain of toner to more than a dot."""
 
-MISSING, JITTER, SPECK, SPECK_PLACE, SPECK_SIZE = range(5)
-"""What a hash is for."""
+
+class HashPurpose(IntEnum):
+    """Quantities that are drawn from hashes of a position."""
+
+    MISSING = 0
+    JITTER = 1
+    SPECK = 2
+    SPECK_POSITION = 3
+    SPECK_SIZE = 4
 
 
 @dataclass(frozen=True)
-class Paper:
-    """Sheets of a manifest as they lie there.
+class PrintedPaper:
+    """Printed sheets of a manifest.
 
     Attributes
     ----------
     manifest : Manifest
-        Its scale is the paper's true one.
+        Its scale is the true one of the paper.
     sheets : tuple of int
-        Numbers of the sheets that lie in one frame; a later one hides those below it.
+        Numbers of the sheets in one frame; each covers those before it.
     dot : float
-        Diameter of a dot in pitches, as it is on the paper.
+        Diameter of a dot on the paper in pitches.
     missing : float
-        Share of the dots that are not there.
+        Fraction of the dots that are missing.
     dust : float
-        Specks as dark as dots, per dot.
+        Number of specks as dark as dots, relative to the number of dots.
     jitter_m : float
-        Standard deviation of a dot's place along each axis.
+        Standard deviation of the position of a dot along each axis.
     seed : int
     """
 
@@ -54,41 +62,41 @@ class Paper:
     seed: int = 0
 
     def marks(self, middle_m: Array, radius_m: float) -> tuple[Array, Array]:
-        """Dark discs about a point of the frame.
+        """Return the dark discs around a point.
 
         Parameters
         ----------
         middle_m : (2,) ndarray
-            In metres, in the frame of the sheets.
+            The point in the frame of the sheets.
         radius_m : float
-            At least all marks that come nearer than this are given.
+            All marks within this distance are returned, and possibly more.
 
         Returns
         -------
         centres : (n, 2) ndarray
-            Relative to ``middle_m``, in metres.
+            Positions relative to ``middle_m`` in metres.
         radii : (n,) ndarray
-            In metres.
+            Radii in metres.
         """
         centres, radii = [np.zeros((0, 2))], [np.zeros(0)]
         for number in self.sheets:
-            for at, radius in self._marks_of(number, middle_m, radius_m):
-                shown = ~self._hidden(number, at + middle_m)
-                centres.append(at[shown])
-                radii.append(radius[shown])
+            for centre, radius in self._marks_of_sheet(number, middle_m, radius_m):
+                is_visible = ~self._is_covered(number, centre + middle_m)
+                centres.append(centre[is_visible])
+                radii.append(radius[is_visible])
         return np.concatenate(centres), np.concatenate(radii)
 
-    def _marks_of(
+    def _marks_of_sheet(
         self, number: int, middle_m: Array, radius_m: float
     ) -> Iterator[tuple[Array, Array]]:
-        """Centres and radii in metres of the dots, then of the dust, of one sheet."""
+        """Yield centres and radii in metres of the dots, then of the dust, of one sheet."""
         sheet, to_metres = self.manifest.sheets[number], self.manifest.jacobian(number)
         to_grid = np.linalg.inv(to_metres)
-        middle = self._grid(number, middle_m)
-        reach = radius_m * np.linalg.norm(to_grid, axis=1) + 1.0
-        low = np.maximum(np.floor(middle - reach).astype(np.int64), sheet.origin)
+        middle = self._to_grid(number, middle_m)
+        half_width = radius_m * np.linalg.norm(to_grid, axis=1) + 1.0
+        low = np.maximum(np.floor(middle - half_width).astype(np.int64), sheet.origin)
         last = np.array(sheet.origin) + sheet.size - 1
-        high = np.minimum(np.ceil(middle + reach).astype(np.int64), last)
+        high = np.minimum(np.ceil(middle + half_width).astype(np.int64), last)
         columns, rows = (int(n) for n in high - low + 1)
         if columns < 1 or rows < 1:
             return
@@ -96,62 +104,66 @@ class Paper:
             (int(low[0]), int(low[1])), (columns, rows), sheet.section
         )
         x, y = np.meshgrid(np.arange(columns), np.arange(rows))
-        places = np.stack([x.ravel(), y.ravel()], axis=1) + low
-        # Subtracted as integers: far out on the plane a float would lose the fraction.
-        near = (places - low).astype(float) + (low - middle)
+        nodes = np.stack([x.ravel(), y.ravel()], axis=1) + low
+        # Integers are subtracted: far from the origin a float would lose the fraction.
+        offsets = (nodes - low).astype(float) + (low - middle)
         pitch_m = self.manifest.pitch_mm * 1e-3
-        offset = self.manifest.offset_mm / self.manifest.pitch_mm
+        displacement = self.manifest.offset_mm / self.manifest.pitch_mm
 
-        there = self._hash(MISSING, number, places) >= self.missing
-        dots = (near + DOT_DIRECTIONS[window.ravel()] * offset)[there] @ to_metres.T
+        is_printed = self._hash(HashPurpose.MISSING, number, nodes) >= self.missing
+        dots = (offsets + DOT_DIRECTIONS[window.ravel()] * displacement)[is_printed] @ to_metres.T
         if self.jitter_m > 0:
-            dots += self.jitter_m * self._normal(JITTER, number, places[there])
+            dots += self.jitter_m * self._normal(HashPurpose.JITTER, number, nodes[is_printed])
         yield dots, np.full(len(dots), self.dot / 2 * pitch_m)
 
-        dusty = self._hash(SPECK, number, places) < self.dust
-        if dusty.any():
-            spots = places[dusty]
-            place = np.stack([self._hash(SPECK_PLACE, number, spots, k) for k in (0, 1)], axis=1)
-            size = self._hash(SPECK_SIZE, number, spots)
-            low_radius, high_radius = DUST_RADIUS
-            specks = (near[dusty] + place - 0.5) @ to_metres.T
+        is_dusty = self._hash(HashPurpose.SPECK, number, nodes) < self.dust
+        if is_dusty.any():
+            dusty = nodes[is_dusty]
+            position = np.stack(
+                [self._hash(HashPurpose.SPECK_POSITION, number, dusty, k) for k in (0, 1)], axis=1
+            )
+            size = self._hash(HashPurpose.SPECK_SIZE, number, dusty)
+            low_radius, high_radius = DUST_RADIUS_PITCHES
+            specks = (offsets[is_dusty] + position - 0.5) @ to_metres.T
             yield specks, (low_radius + (high_radius - low_radius) * size) * pitch_m
 
-    def _grid(self, number: int, at_m: Array) -> Array:
-        """(..., 2) metres in the frame to fractional grid coordinates of a sheet."""
+    def _to_grid(self, number: int, position_m: Array) -> Array:
+        """Convert positions (..., 2) in the frame to fractional grid coordinates of a sheet."""
         origin = np.array(self.manifest.sheets[number].origin)
         start = self.manifest.to_metres(number, origin)
         to_grid = np.linalg.inv(self.manifest.jacobian(number))
-        result: Array = origin + (at_m - start) @ to_grid.T
+        result: Array = origin + (position_m - start) @ to_grid.T
         return result
 
-    def _hidden(self, number: int, at_m: Array) -> NDArray[np.bool_]:
-        """Which points (n, 2) of sheet ``number`` the printed area of a later one covers."""
-        hidden = np.zeros(len(at_m), bool)
+    def _is_covered(self, number: int, position_m: Array) -> NDArray[np.bool_]:
+        """Return a mask of points (n, 2) that the printed area of a later sheet covers."""
+        is_covered = np.zeros(len(position_m), bool)
         for later in self.sheets[self.sheets.index(number) + 1 :]:
             sheet = self.manifest.sheets[later]
-            inside = self._grid(later, at_m) - sheet.origin + 0.5
-            hidden |= ((inside >= 0) & (inside < sheet.size)).all(axis=1)
-        return hidden
+            relative = self._to_grid(later, position_m) - sheet.origin + 0.5
+            is_covered |= ((relative >= 0) & (relative < sheet.size)).all(axis=1)
+        return is_covered
 
-    def _hash(self, use: int, number: int, places: NDArray[np.int64], draw: int = 0) -> Array:
-        """Uniform numbers (n,) in 0 to 1 that depend on nothing but the arguments."""
-        state = np.uint64((self.seed * 64 + use * 8 + draw) & 0xFFFFFFFFFFFFFFFF)
-        words = (places[:, 0], places[:, 1], np.full(len(places), number))
-        mixed = np.full(len(places), state)
+    def _hash(
+        self, purpose: HashPurpose, number: int, nodes: NDArray[np.int64], draw: int = 0
+    ) -> Array:
+        """Return uniform numbers (n,) from 0 to 1 that depend on the arguments and the seed."""
+        state = np.uint64((self.seed * 64 + int(purpose) * 8 + draw) & 0xFFFFFFFFFFFFFFFF)
+        words = (nodes[:, 0], nodes[:, 1], np.full(len(nodes), number))
+        mixed = np.full(len(nodes), state)
         for word in words:
             mixed = _mix(mixed ^ word.astype(np.uint64))
         return (mixed >> np.uint64(11)).astype(float) * 2.0**-53
 
-    def _normal(self, use: int, number: int, places: NDArray[np.int64]) -> Array:
-        """Standard normal numbers (n, 2), by Box and Muller."""
-        radius = np.sqrt(-2 * np.log1p(-self._hash(use, number, places, 0)))
-        angle = 2 * np.pi * self._hash(use, number, places, 1)
+    def _normal(self, purpose: HashPurpose, number: int, nodes: NDArray[np.int64]) -> Array:
+        """Return standard normal numbers (n, 2), by the method of Box and Muller."""
+        radius = np.sqrt(-2 * np.log1p(-self._hash(purpose, number, nodes, 0)))
+        angle = 2 * np.pi * self._hash(purpose, number, nodes, 1)
         return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def _mix(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The finalizer of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014, section 5)."""
+    """Apply the finalizer of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014, section 5)."""
     words = words + np.uint64(0x9E3779B97F4A7C15)
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

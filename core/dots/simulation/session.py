@@ -1,9 +1,9 @@
-"""Frames of a camera over printed dots, with all that is true of them.
+"""Simulation of the frames of a camera over printed dots, with ground truth.
 
-The camera is the paper's (papers/dots.txt III-A): 188 x 120 px that are 0.046 mm wide on
-the paper. What is simulated is light: ink lies where the printer left it, is seen through
-pinhole and lens, blurred, lit unevenly, and counted with noise. Not simulated are gloss,
-show-through and the light and shade of wrinkled paper.
+The camera is that of the paper (section III-A): 188 x 120 px that are 0.046 mm wide on the paper.
+Light is simulated: the ink as printed is projected through pinhole and lens, blurred, unevenly
+illuminated, and converted to grey values with noise. Not simulated are gloss, show-through, and
+the shading of wrinkled paper.
 """
 
 from __future__ import annotations
@@ -21,61 +21,67 @@ from locatk.core.dots.drawing import layout
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation.decoys import decoys as decoys
-from locatk.core.dots.simulation.optics import Exposer, Optics, Stand
-from locatk.core.dots.simulation.paths import PATHS, Course, course
-from locatk.core.dots.simulation.printed_paper import Paper
+from locatk.core.dots.simulation.optics import CameraPose, Exposer, Optics
+from locatk.core.dots.simulation.paths import PATHS, CameraPath, RandomSource, camera_path
+from locatk.core.dots.simulation.printed_paper import PrintedPaper
 from locatk.core.errors import InputError
-from locatk.core.geometry import quaternion_from_heading
 from locatk.core.paper import paper_size
-from locatk.core.simulation import check_options
+from locatk.core.simulation import (
+    check_options,
+    exact_trajectory,
+    random_stream,
+    require_fraction,
+    require_not_negative,
+    require_positive,
+    stamps_ns,
+)
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-EPOCH_NS = 1_767_225_600_000_000_000
-"""Start of every simulated session: 2026-01-01T00:00:00Z."""
+FRAME_SIZE_PX = (188, 120)
+"""Width and height of the paper's frames (III-A)."""
 
-SIZE_PX = (188, 120)
 METRES_PER_PX = 0.046e-3
+"""Width of a pixel on the paper (III-A)."""
 
 LENS_MM, PIXEL_MM = 5.5, 0.024
-"""Focal length of the paper's lens, and its sensor's 6 um binned by four."""
+"""Focal length of the paper's lens, and pixel of its sensor: 6 um, binned by four."""
 
 FOCAL_PX = LENS_MM * (1 + PIXEL_MM / (METRES_PER_PX * 1e3)) / PIXEL_MM
 """Distance from lens to sensor, 348.7 px.
 
-A thin lens that makes 0.024 mm of 0.046 mm stands 8.4 mm before the sensor and 16.0 mm
-over the paper: 24.4 mm together, where the paper measures d = 24.0 mm. Its s1 = 9.7 and
-s2 = 12.7 mm (Fig. 12) add up as well, but would make 0.046 mm 2.5 or 1.5 pixels wide.
+A thin lens that images 0.046 mm onto 0.024 mm is 8.4 mm from the sensor and 16.0 mm above the
+paper: 24.4 mm in total, where the paper measures d = 24.0 mm. Its s1 = 9.7 and s2 = 12.7 mm
+(Fig. 12) have a similar sum, but 0.046 mm would then be 2.5 or 1.5 pixels wide.
 """
 
 LENS_DISTORTION = 0.045
-"""How much nearer to the centre the paper's lens draws a corner of the frame.
+"""Relative displacement of a corner of the frame towards the centre by the paper's lens.
 
-Its nominal 54 degrees over the 5.35 mm diagonal of the MT9V034: 5.5 mm times tan 27
-degrees are 2.80 mm, and the corner lies at 2.68 mm.
+Its nominal field of view is 54 degrees over the 5.35 mm diagonal of the MT9V034: 5.5 mm times
+tan 27 degrees are 2.80 mm, and the corner is at 2.68 mm.
 """
 
 EXPOSURE_S = 1 / 7684
-"""The paper's (III-A.2): 0.35 m/s smear a dot by one pixel."""
+"""Exposure time of the paper (III-A.2): at 0.35 m/s a dot is blurred by one pixel."""
 
-LARGEST_TILT = np.pi / 4
-LARGEST_DOT = 2 / 3
-"""Of the pitch: neighbours whose dots lean to each other touch beyond that."""
+MAX_TILT_RAD = np.pi / 4
+"""Largest angle between the optical axis and the vertical."""
+
+MAX_DOT_PITCHES = 2 / 3
+"""Largest diameter of a dot: dots that are displaced towards each other touch beyond that."""
 
 
 def camera(distortion: float = LENS_DISTORTION) -> Camera:
-    """The paper's camera; ``distortion`` is by which share its corners are drawn in."""
-    centre = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
+    """Return the paper's camera; ``distortion`` displaces its corners towards the centre."""
+    centre = ((FRAME_SIZE_PX[0] - 1) / 2, (FRAME_SIZE_PX[1] - 1) / 2)
     corner_square = centre[0] ** 2 + centre[1] ** 2
-    return Camera(SIZE_PX, FOCAL_PX, centre, -distortion * FOCAL_PX**2 / corner_square)
+    return Camera(FRAME_SIZE_PX, FOCAL_PX, centre, -distortion * FOCAL_PX**2 / corner_square)
 
 
 def sheet(codec: str = "anoto") -> Manifest:
-    """An A4 sheet as ``locatk print pattern`` prints it.
-
-    It lies in the middle of the plane, where each digit sequence is under way.
-    """
+    """Return an A4 sheet as ``locatk print pattern`` prints it, in the middle of the plane."""
     raster = layout.snap(0.508, None, 300)
     _, page_mm = paper_size("A4")
     page = layout.lay_out(page_mm, 5.0, raster)
@@ -86,49 +92,48 @@ def sheet(codec: str = "anoto") -> Manifest:
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What to simulate.
+    """Options of simulated frames.
 
     Attributes
     ----------
     frames : int
-        At least 1.
+        Number of frames, at least 1.
     rate_hz : float
     path : str
         ``"curve"``, ``"random"`` or ``"still"``; see :mod:`~locatk.core.dots.simulation.paths`.
     speed_mps : float
-        Along the curve.
+        Speed along the curve.
     exposure_s : float
-        Speed and turning blur a frame over this time.
+        Exposure time, for the blur by motion and rotation.
     motion_px : float or None
-        Smear of every frame in pixels instead, along its way (at rest: along any direction).
+        Motion blur of every frame instead, along the path (at rest: in a random direction).
     camera : Camera
     metres_per_px : float
-        On the paper, at the camera's centre, where it looks straight down.
+        Width of a pixel on the paper at the camera's centre, if it looks straight down.
     pitch_rad, roll_rad : float
-        How the camera is mounted askew: turns about its axes to the right and down in the
-        image.
+        Rotations of the mounted camera about the right and the downward axis of the image.
     tilt_rad : float
-        Each frame is tilted by up to this besides, in any direction.
+        Largest additional tilt of a frame, in a random direction.
     dot : float
         Diameter in pitches; the paper's 1/6 grows in print and on rough paper.
     missing, dust : float
-        Dots that are not there, and specks that should not be, as a share of the dots.
+        Numbers of missing dots and of specks, as fractions of the number of dots.
     jitter_m : float
-        Standard deviation of a dot's place along each axis.
+        Standard deviation of the position of a dot along each axis.
     printer_scale : (x, y) or None
-        True over nominal length on the paper; None for what the manifest says.
+        True over nominal length on the paper; None for that of the manifest.
     blur_px : float
         Standard deviation of the defocus.
     noise : float
-        Standard deviation in grey values.
+        Standard deviation of a pixel in grey values.
     paper_level : float
-        Grey value of well lit paper.
+        Grey value of well illuminated paper.
     contrast : float
-        How much darker ink is; 1 is black.
+        Contrast of the ink; 1 is black.
     vignette, gradient : float
-        By how much a corner and a rim are darker than the middle.
+        Relative loss of light in the corners, and on one side.
     sheet : int
-        Number of the sheet of the manifest; of tiles, all are seen.
+        Number of the sheet of the manifest; all tiles of its floor are visible.
     device : str
     seed : int
         At least 0.
@@ -168,53 +173,46 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         tilt = np.hypot(self.pitch_rad, self.roll_rad) + abs(self.tilt_rad)
         scale = self.printer_scale or (1.0, 1.0)
-        # Beyond the rim as well, from where light is blurred into the frame.
-        rim_px = 0.75 * float(np.linalg.norm(self.camera.size))
-        bend = 1 + min(self.camera.radial_px, 0.0) * rim_px**2
+        # Light from beyond the frame is blurred into it, so that the lens is evaluated there, too.
+        margin_px = 0.75 * float(np.linalg.norm(self.camera.size))
+        lens_slope = 1 + min(self.camera.radial_px, 0.0) * margin_px**2
         check_options(
             self,
             (
                 ("frames", self.frames >= 1, "at least 1"),
-                ("rate_hz", 0 < self.rate_hz < np.inf, "a number above 0"),
+                *require_positive(self, "rate_hz", "metres_per_px"),
+                *require_not_negative(self, "speed_mps", "noise", "seed"),
+                *require_fraction(self, "missing", "dust", "contrast", "vignette", "gradient"),
                 ("path", self.path in PATHS, "one of " + ", ".join(PATHS)),
-                ("speed_mps", 0 <= self.speed_mps < np.inf, "0 or more"),
                 ("exposure_s", 0 <= self.exposure_s * self.rate_hz < 1, "less than a frame's time"),
                 ("motion_px", self.motion_px is None or 0 <= self.motion_px <= 100, "0 to 100"),
-                ("camera", bend > 0.2, "a camera whose lens does not fold the frame"),
-                ("metres_per_px", 0 < self.metres_per_px < np.inf, "a number above 0"),
+                ("camera", lens_slope > 0.2, "a camera whose lens does not fold the frame"),
                 (
                     "tilt_rad",
-                    tilt <= LARGEST_TILT,
-                    f"at most {LARGEST_TILT:.4g} with pitch and roll",
+                    tilt <= MAX_TILT_RAD,
+                    f"at most {MAX_TILT_RAD:.4g} with pitch and roll",
                 ),
-                ("dot", 0 < self.dot <= LARGEST_DOT, "a share of the pitch of at most 2/3"),
-                ("missing", 0 <= self.missing <= 1, "0 to 1"),
-                ("dust", 0 <= self.dust <= 1, "0 to 1"),
+                ("dot", 0 < self.dot <= MAX_DOT_PITCHES, "a fraction of the pitch of at most 2/3"),
                 ("jitter_m", 0 <= self.jitter_m < 1e-3, "0 to below 0.001"),
                 ("printer_scale", all(0.5 < s < 2 for s in scale), "two numbers about 1"),
                 ("blur_px", 0 <= self.blur_px <= 20, "0 to 20"),
-                ("noise", 0 <= self.noise < np.inf, "0 or more"),
                 ("paper_level", 0 < self.paper_level <= 255, "up to 255"),
-                ("contrast", 0 <= self.contrast <= 1, "0 to 1"),
-                ("vignette", 0 <= self.vignette <= 1, "0 to 1"),
-                ("gradient", 0 <= self.gradient <= 1, "0 to 1"),
-                ("seed", self.seed >= 0, "0 or more"),
             ),
         )
 
 
 @dataclass(frozen=True)
 class SimulatedSession:
-    """A session that never was.
+    """Simulated frames and their ground truth.
 
     Attributes
     ----------
     frames : Frames
-        Its images are rendered when they are asked for, each time anew.
+        Each access to an image renders it again.
     truth : Trajectory
-        Where the optical axis met the paper, and where the image's right pointed there.
+        Intersections of the optical axis with the paper, and headings of the image's right there.
     manifest : Manifest
-        As it was given; it knows a ``printer_scale`` of the options only if it says so.
+        Knowledge of a user: without a ``printer_scale`` of the options unless it was stated.
     camera : Camera
     """
 
@@ -224,17 +222,19 @@ class SimulatedSession:
     camera: Camera
 
 
-class Rendered(Sequence[NDArray[np.uint8]]):
-    """Images (height, width) uint8 that are made when they are taken.
+class RenderedImages(Sequence[NDArray[np.uint8]]):
+    """Images (height, width) uint8 that are rendered on access.
 
-    The noise of one depends on its number alone, so that any may be taken at any time.
+    The noise of an image depends on its number alone, so that they can be accessed in any order.
     """
 
-    def __init__(self, exposer: Exposer, paper: Paper, at: Course, stands: list[Stand]) -> None:
-        self._exposer, self._paper, self._course, self._stands = exposer, paper, at, stands
+    def __init__(
+        self, exposer: Exposer, paper: PrintedPaper, path: CameraPath, poses: list[CameraPose]
+    ) -> None:
+        self._exposer, self._paper, self._path, self._poses = exposer, paper, path, poses
 
     def __len__(self) -> int:
-        return len(self._stands)
+        return len(self._poses)
 
     @overload
     def __getitem__(self, number: int) -> NDArray[np.uint8]: ...
@@ -244,11 +244,11 @@ class Rendered(Sequence[NDArray[np.uint8]]):
         if isinstance(number, slice):
             return [self[k] for k in range(*number.indices(len(self)))]
         number = range(len(self))[number]
-        stand = self._stands[number]
-        reach = self._exposer.reach_m(stand) + float(np.linalg.norm(stand.shift_m))
-        centres, radii = self._paper.marks(self._course.position[number], reach)
-        rng = np.random.default_rng([self._paper.seed, 2, number])
-        return self._exposer.expose(stand, centres, radii, rng)
+        pose = self._poses[number]
+        radius_m = self._exposer.visible_radius_m(pose) + float(np.linalg.norm(pose.shift_m))
+        centres, radii = self._paper.marks(self._path.position_m[number], radius_m)
+        rng = random_stream(self._paper.seed, RandomSource.PIXELS, number)
+        return self._exposer.expose(pose, centres, radii, rng)
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
         return (self[k] for k in range(len(self)))
@@ -268,21 +268,25 @@ def simulate(
     """
     options, manifest = options or SimulationOptions(), manifest or sheet()
     time_s = np.arange(options.frames) / options.rate_hz
-    numbers = _seen(manifest, options.sheet)
-    paper = replace(manifest, scale=options.printer_scale or manifest.scale)
-    corners = np.concatenate([_corners(paper, number) for number in numbers])
+    numbers = _visible_sheets(manifest, options.sheet)
+    true_manifest = replace(manifest, scale=options.printer_scale or manifest.scale)
+    corners = np.concatenate([_corners(true_manifest, number) for number in numbers])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    # A frame at the rim is full of dots all the same, where the sheet is large enough.
-    inset = np.minimum(options.metres_per_px * np.linalg.norm(options.camera.size) / 2 * 1.2,
-                       (high - low) / 2)  # fmt: skip
-    at = course(options.path, time_s, low + inset, high - inset, options.speed_mps, options.seed)
-    return over(manifest, options, at)
+    # Frames at the edge are full of dots if the sheet is large enough.
+    half_diagonal_m = options.metres_per_px * np.linalg.norm(options.camera.size) / 2
+    inset = np.minimum(half_diagonal_m * 1.2, (high - low) / 2)
+    path = camera_path(
+        options.path, time_s, low + inset, high - inset, options.speed_mps, options.seed
+    )
+    return simulate_path(manifest, options, path)
 
 
-def over(manifest: Manifest, options: SimulationOptions, at: Course) -> SimulatedSession:
-    """The same for a course of one's own, which may leave the sheet."""
-    numbers = _seen(manifest, options.sheet)
-    paper = Paper(
+def simulate_path(
+    manifest: Manifest, options: SimulationOptions, path: CameraPath
+) -> SimulatedSession:
+    """Simulate a session along a given path, which may leave the sheet; see :func:`simulate`."""
+    numbers = _visible_sheets(manifest, options.sheet)
+    paper = PrintedPaper(
         replace(manifest, scale=options.printer_scale or manifest.scale),
         numbers,
         options.dot,
@@ -291,9 +295,9 @@ def over(manifest: Manifest, options: SimulationOptions, at: Course) -> Simulate
         options.jitter_m,
         options.seed,
     )
-    # A stream of random numbers for each matter: more noise leaves the poses as they are.
-    tilting, aside = (np.random.default_rng([options.seed, k]) for k in (3, 4))
-    light = np.random.default_rng([options.seed, 5]).uniform(-np.pi, np.pi)
+    tilt_rng = random_stream(options.seed, RandomSource.TILT)
+    blur_rng = random_stream(options.seed, RandomSource.BLUR_DIRECTION)
+    light_rad = random_stream(options.seed, RandomSource.LIGHT).uniform(-np.pi, np.pi)
     optics = Optics(
         options.camera,
         options.metres_per_px,
@@ -302,55 +306,53 @@ def over(manifest: Manifest, options: SimulationOptions, at: Course) -> Simulate
         options.contrast,
         options.vignette,
         options.gradient,
-        light,
+        light_rad,
         options.noise,
     )
-    count = len(at.position)
-    lean = tilting.uniform(0, 1, count) * options.tilt_rad
-    towards = tilting.uniform(-np.pi, np.pi, count)
-    any_way = aside.uniform(-np.pi, np.pi, count)
-    stands = [
-        Stand(
-            float(at.heading[k]),
-            options.pitch_rad + lean[k] * np.cos(towards[k]),
-            options.roll_rad + lean[k] * np.sin(towards[k]),
-            *_motion(options, at.velocity[k], at.turn_rate[k], any_way[k]),
+    count = len(path.position_m)
+    tilt = tilt_rng.uniform(0, 1, count) * options.tilt_rad
+    tilt_direction = tilt_rng.uniform(-np.pi, np.pi, count)
+    blur_direction = blur_rng.uniform(-np.pi, np.pi, count)
+    poses = [
+        CameraPose(
+            float(path.heading_rad[k]),
+            options.pitch_rad + tilt[k] * np.cos(tilt_direction[k]),
+            options.roll_rad + tilt[k] * np.sin(tilt_direction[k]),
+            *_motion(options, path.velocity_mps[k], path.yaw_rate_rps[k], blur_direction[k]),
         )
         for k in range(count)
     ]
-    time_ns = EPOCH_NS + np.rint(np.arange(count) / options.rate_hz * 1e9).astype(np.int64)
+    time_ns = stamps_ns(np.arange(count) / options.rate_hz)
     frames = Frames(
         options.device,
         time_ns,
         tuple(map(str, range(count))),
-        Rendered(Exposer(optics), paper, at, stands),
+        RenderedImages(Exposer(optics), paper, path, poses),
     )
-    truth = Trajectory(
-        options.device,
-        manifest.frame(numbers[0]),
-        time_ns,
-        np.c_[at.position, np.zeros(count)],
-        quaternion_from_heading(at.heading),
-        np.zeros((count, 6, 6)),
-    )
+    frame = manifest.frame(numbers[0])
+    truth = exact_trajectory(options.device, frame, time_ns, path.position_m, path.heading_rad)
     return SimulatedSession(frames, truth, manifest, options.camera)
 
 
 def _motion(
-    options: SimulationOptions, velocity: Array, turn_rate: float, any_way: float
+    options: SimulationOptions, velocity: Array, yaw_rate: float, rest_direction: float
 ) -> tuple[tuple[float, float], float]:
-    """Shift in metres and turn in radians while the shutter is open."""
+    """Return the shift in metres and the rotation in radians during the exposure."""
     if options.motion_px is None:
         shift = velocity * options.exposure_s
-        return (float(shift[0]), float(shift[1])), float(turn_rate * options.exposure_s)
+        return (float(shift[0]), float(shift[1])), float(yaw_rate * options.exposure_s)
     speed = np.linalg.norm(velocity)
-    way = velocity / speed if speed > 0 else np.array([np.cos(any_way), np.sin(any_way)])
-    shift = way * options.motion_px * options.metres_per_px
+    direction = (
+        velocity / speed
+        if speed > 0
+        else np.array([np.cos(rest_direction), np.sin(rest_direction)])
+    )
+    shift = direction * options.motion_px * options.metres_per_px
     return (float(shift[0]), float(shift[1])), 0.0
 
 
-def _seen(manifest: Manifest, number: int) -> tuple[int, ...]:
-    """Numbers of the sheets in the frame of this one."""
+def _visible_sheets(manifest: Manifest, number: int) -> tuple[int, ...]:
+    """Return the numbers of the sheets in the frame of this one."""
     if not 0 <= number < len(manifest.sheets):
         raise InputError(
             f"no sheet number {number}", hint=f"The manifest has 0 to {len(manifest.sheets) - 1}"
@@ -360,8 +362,8 @@ def _seen(manifest: Manifest, number: int) -> tuple[int, ...]:
 
 
 def _corners(manifest: Manifest, number: int) -> Array:
-    """(4, 2) corners of the dots of a sheet in metres of its frame."""
-    one = manifest.sheets[number]
-    low, high = np.array(one.origin), np.array(one.origin) + one.size - 1
+    """Return the corners (4, 2) of the dots of a sheet in metres of its frame."""
+    sheet = manifest.sheets[number]
+    low, high = np.array(sheet.origin), np.array(sheet.origin) + sheet.size - 1
     grid = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
     return manifest.to_metres(number, grid)

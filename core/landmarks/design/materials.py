@@ -1,33 +1,37 @@
-"""What a floor of landmarks is made of: a bill of materials, and counts by pattern."""
+"""Bill of materials of a floor of landmarks, and the number of landmarks of each pattern."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS
+from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.materials import GRADES_T, Item
-
-FERRITE_T = (0.20, 0.45)
-"""Remanence of sintered hard ferrite, Y8T to Y40 (SJ/T 10410-2000, as makers list
-it: http://magneticalloy.com/ferrite-magnet.htm)."""
+from locatk.core.materials import BillItem, magnet_material, size_mm_text
 
 SPARES_PERCENT = 5.0
+"""Default of the bars to buy in addition, in percent of the bars of the floor."""
+
+MAX_SPARES_PERCENT = 1000.0
+"""Largest percentage of spare bars; a larger one is probably a number of bars."""
+
+EPOXY_G_PER_CM2 = 0.03
+"""Mass of a layer of epoxy 0.3 mm thick, at 1 g/cm3."""
 
 
 @dataclass(frozen=True)
 class PatternCount:
-    """How often a pattern is laid.
+    """Number of landmarks of one pattern on a floor.
 
     Attributes
     ----------
     number : int
-        The paper's, 1 to 6.
+        Number of the pattern in the paper, 1 to 6.
     letters : str
     codes : tuple of (code, count)
-        In which orientations, ascending.
+        Orientations that occur, in ascending order of the codes.
     """
 
     number: int
@@ -36,79 +40,63 @@ class PatternCount:
 
     @property
     def landmarks(self) -> int:
-        """Of all orientations."""
+        """Number of landmarks in all orientations."""
         return sum(count for _, count in self.codes)
 
 
-def patterns(floor: FloorMap) -> tuple[PatternCount, ...]:
-    """The patterns that occur, by number."""
-    laid = [int(floor.codes[cell]) for cell in floor.cells()]
-    counts = {code: laid.count(code) for code in range(CODE_COUNT)}
-    found = []
+def count_patterns(floor: FloorMap) -> tuple[PatternCount, ...]:
+    """Count the landmarks of each pattern that occurs, in the order of the patterns' numbers."""
+    counts = Counter(int(floor.codes[cell]) for cell in floor.cells())
+    patterns = []
     for number, letters in enumerate(PATTERNS, 1):
-        codes = [(c, n) for c, n in counts.items() if n and PATTERN_OF[c] == number]
+        codes = [(code, counts[code]) for code in sorted(counts) if PATTERN_OF[code] == number]
         if codes:
-            found.append(PatternCount(number, letters, tuple(codes)))
-    return tuple(found)
+            patterns.append(PatternCount(number, letters, tuple(codes)))
+    return tuple(patterns)
 
 
-def material(remanence_t: float) -> str:
-    """What kind of magnet has this remanence, to ask a shop for.
-
-    Examples
-    --------
-    >>> material(1.2), material(0.4)
-    ('NdFeB N35', 'ferrite')
-    """
-    near = 0.005
-    grades = [
-        grade for grade, (low, high) in GRADES_T.items() if low - near <= remanence_t <= high + near
-    ]
-    if grades:
-        return f"NdFeB {' or '.join(grades)}"
-    if FERRITE_T[0] <= remanence_t <= FERRITE_T[1]:
-        return "ferrite"
-    return "magnet"
-
-
-def bill(floor: FloorMap, spares_percent: float = SPARES_PERCENT) -> tuple[Item, ...]:
-    """What it takes to lay the floor: four bars a landmark, spares, and how to fix them.
+def bill_of_materials(
+    floor: FloorMap, spares_percent: float = SPARES_PERCENT
+) -> tuple[BillItem, ...]:
+    """List the parts of a floor: four bars for each landmark, spares, and means of fixing them.
 
     Raises
     ------
     InputError
-        Spares of less than nothing, or of more than ten times the bars.
+        The spares are negative or more than :data:`MAX_SPARES_PERCENT`.
     """
-    if not 0 <= spares_percent <= 1000:
-        raise InputError(f"spares of {spares_percent:g} %", hint="Give 0 to 1000")
+    if not 0 <= spares_percent <= MAX_SPARES_PERCENT:
+        raise InputError(
+            f"spares of {spares_percent:g} %", hint=f"Give 0 to {MAX_SPARES_PERCENT:g}"
+        )
     geometry, landmarks = floor.geometry, len(floor.cells())
-    length, width, height = (
-        1e3 * side for side in (geometry.bar_length_m, geometry.bar_width_m, geometry.bar_height_m)
-    )
+    length, width = 1e3 * geometry.bar_length_m, 1e3 * geometry.bar_width_m
     bars = 4 * landmarks
     spares = math.ceil(bars * spares_percent / 100 - 1e-9)
-    size = (
-        f"{length:g} x {width:g} x {height:g} mm {material(geometry.remanence_t)}, Br "
-        f"{geometry.remanence_t:g} T, magnetised along its {length:g} mm"
+    size = size_mm_text(geometry.bar_length_m, geometry.bar_width_m, geometry.bar_height_m)
+    bar = (
+        f"{size} {magnet_material(geometry.remanence_t)}, Br {geometry.remanence_t:g} T, "
+        f"magnetised along its {length:g} mm"
     )
     area_cm2 = (bars + spares) * length * width / 100
     tape_m = (bars + spares) * length / 1e3
-    items = [Item("bar magnet", bars, f"{size}; {landmarks} landmarks of 4")]
+    items = [BillItem("bar magnet", bars, f"{bar}; {landmarks} landmarks of 4")]
     if spares:
+        interval = 100 / spares_percent
         items.append(
-            Item(
-                "bar magnet, spare", spares, f"{size}; one for each {100 / spares_percent:.3g} bars"
-            )
+            BillItem("bar magnet, spare", spares, f"{bar}; one for each {interval:.3g} bars")
         )
     return (
         *items,
-        Item(
+        BillItem(
             "adhesive",
             1,
-            f"two-part epoxy for {area_cm2:.0f} cm2 (about {area_cm2 * 0.03:.0f} g at 0.3 mm), or "
-            f"double-sided tape {width:g} mm wide, {tape_m:.1f} m",
+            f"two-part epoxy for {area_cm2:.0f} cm2 (about {area_cm2 * EPOXY_G_PER_CM2:.0f} g at "
+            f"0.3 mm), or double-sided tape {width:g} mm wide, {tape_m:.1f} m",
         ),
-        Item("compass", 1, "or a bar whose north pole is marked, to test polarity"),
-        Item("marker", 1, "to mark the north end of each bar before it is laid"),
-        Item("chalk line", 1, f"with a tape measure; cells are {1e3 * floor.pitch_m:g} mm apart"),
+        BillItem("compass", 1, "or a bar whose north pole is marked, to test polarity"),
+        BillItem("marker", 1, "to mark the north end of each bar before it is laid"),
+        BillItem(
+            "chalk line", 1, f"with a tape measure; cells are {1e3 * floor.pitch_m:g} mm apart"
+        ),
     )

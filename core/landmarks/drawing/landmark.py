@@ -1,11 +1,13 @@
-"""Landmarks as line drawings in mm, for the installation pack and for CAD.
+"""Line drawings of landmarks in mm, for the installation pack and for CAD.
 
-The map's x is to the right on the paper and its y up; landmarks lie with their axes along
-the map's, and are drawn as designed, not as built.
+The x axis of the map points to the right on the paper and its y axis up. Landmarks are drawn as
+designed, with their axes parallel to those of the map, not as built.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -21,6 +23,9 @@ from locatk.core.drawing import (
     Polygon,
     Text,
     arrow,
+    capital_height,
+    cross,
+    line_height,
     text_width,
 )
 from locatk.core.errors import InputError
@@ -29,22 +34,46 @@ from locatk.core.landmarks.map.floor import FloorMap
 
 Array = NDArray[np.float64]
 
+BAR_LABEL_GAP_MM = 3.0
+"""Distance of the label of a bar from the bars."""
 
-def bar_outlines(geometry: Geometry, code: int) -> list[tuple[Array, Point, Point, str]]:
-    """The four bars of a landmark, seen from above, in its frame in mm.
+BAR_LABEL_POINTS = 7.0
+"""Font size of the labels of the bars."""
 
-    Returns
-    -------
-    list of (corners, south, north, letter)
-        Of bar 0 to 3. ``corners`` (4, 2) counter-clockwise; ``south`` and ``north`` the
-        middles of the bar's two pole faces, so that an arrow from one to the other is the
-        direction of magnetisation; ``letter`` N where that is counter-clockwise around the
-        landmark, S where clockwise.
+MAX_NOTE_POINTS = 10.0
+"""Largest font size of the notes within a landmark."""
+
+NOTE_SPACING_EM = 1.25
+"""Line height of the notes within a landmark, as a fraction of the font size."""
+
+
+@dataclass(frozen=True)
+class BarOutline:
+    """Outline of a bar seen from above, in the frame of its landmark, in mm.
+
+    Attributes
+    ----------
+    corners : (4, 2) ndarray
+        Counter-clockwise.
+    south, north : (x, y)
+        Centres of the pole faces; the magnetization points from south to north.
+    letter : str
+        "N" if the magnetization is counter-clockwise around the landmark, "S" if clockwise.
+    """
+
+    corners: Array
+    south: Point
+    north: Point
+    letter: str
+
+
+def bar_outlines(geometry: Geometry, code: int) -> list[BarOutline]:
+    """Return the outlines of bars 0 to 3 of a landmark.
 
     Examples
     --------
-    >>> corners, south, north, letter = bar_outlines(Geometry(), 0b0001)[0]
-    >>> south, north, letter
+    >>> bar = bar_outlines(Geometry(), 0b0001)[0]
+    >>> bar.south, bar.north, bar.letter
     ((25.0, -15.0), (25.0, 15.0), 'N')
     """
     length, width = 1e3 * geometry.bar_length_m, 1e3 * geometry.bar_width_m
@@ -52,40 +81,42 @@ def bar_outlines(geometry: Geometry, code: int) -> list[tuple[Array, Point, Poin
     across = radius + width / 2 * np.array([-1.0, 1.0, 1.0, -1.0])
     along = length / 2 * np.array([-1.0, -1.0, 1.0, 1.0])
     bars = []
-    for bar, letter in enumerate(name(code)):
+    for number, letter in enumerate(name(code)):
         ends = [(radius, -length / 2), (radius, length / 2)]
-        south, north = (_turned(end, bar) for end in (ends if letter == "N" else ends[::-1]))
-        corners = [_turned(corner, bar) for corner in zip(across, along, strict=True)]
-        bars.append((np.array(corners), south, north, letter))
+        poles = ends if letter == "N" else ends[::-1]
+        south, north = (_rotate(end, number) for end in poles)
+        corners = [_rotate(corner, number) for corner in zip(across, along, strict=True)]
+        bars.append(BarOutline(np.array(corners), south, north, letter))
     return bars
 
 
-def _turned(point: Point, quarters: int) -> Point:
-    """A point counter-clockwise about the origin, without rounding."""
+def _rotate(point: Point, quarters: int) -> Point:
+    """Rotate a point counter-clockwise about the origin by quarter turns, without rounding."""
     x, y = (round(float(value), 9) + 0.0 for value in point)
     for _ in range(quarters % 4):
         x, y = 0.0 - y, x
     return x, y
 
 
-def reach_mm(geometry: Geometry) -> float:
-    """From a landmark's centre to the farthest side of its bars along x or y."""
+def bars_half_side(geometry: Geometry) -> float:
+    """Return half of the side of the square around the bars of a landmark, in mm."""
     radius, half = geometry.radius_m + geometry.bar_width_m / 2, geometry.bar_length_m / 2
     return 1e3 * max(radius, half)
 
 
-def card_mm(geometry: Geometry) -> float:
-    """From a landmark's centre to where :func:`draw_landmark` ends, on all four sides."""
-    return reach_mm(geometry) + _OUT_MM + text_width(_label(0, "S"), _LABEL)
+def drawing_half_side(geometry: Geometry) -> float:
+    """Return half of the side of the square around a drawing of :func:`draw_landmark`, in mm."""
+    label_width = text_width(_bar_label(0, "S"), BAR_LABEL_POINTS)
+    return bars_half_side(geometry) + BAR_LABEL_GAP_MM + label_width
 
 
-def check(floor: FloorMap) -> None:
-    """Refuse a floor whose bars cannot be laid.
+def check_buildable(floor: FloorMap) -> None:
+    """Check that the bars of a floor do not overlap.
 
     Raises
     ------
     InputError
-        Bars overlap, those of one landmark or of two neighbours, or no cell has a landmark.
+        Bars of one landmark or of neighbouring landmarks overlap, or no cell has a landmark.
     """
     geometry = floor.geometry
     inner = geometry.radius_m - geometry.bar_width_m / 2
@@ -95,9 +126,9 @@ def check(floor: FloorMap) -> None:
             f"radius of {1e3 * geometry.radius_m:g} mm overlap at the landmark's corners",
             hint="Use shorter bars or a larger radius",
         )
-    if 1e3 * floor.pitch_m < 2 * reach_mm(geometry) - 1e-6:
+    if 1e3 * floor.pitch_m < 2 * bars_half_side(geometry) - 1e-6:
         raise InputError(
-            f"landmarks of {2 * reach_mm(geometry):g} mm overlap at a pitch of "
+            f"landmarks of {2 * bars_half_side(geometry):g} mm overlap at a pitch of "
             f"{1e3 * floor.pitch_m:g} mm",
             hint="Use a larger pitch",
         )
@@ -106,118 +137,148 @@ def check(floor: FloorMap) -> None:
 
 
 def draw_landmark(
-    geometry: Geometry, code: int, centre: Point, words: tuple[str, ...] = ()
+    geometry: Geometry, code: int, centre: Point, notes: tuple[str, ...] = ()
 ) -> list[Mark]:
-    """A landmark at true size, to lay its bars on.
+    """Draw a landmark at true size, for placing its bars.
 
-    Each bar has its outline, an arrow within to its north pole with the poles' letters
-    beside, and lines along and across its middle that reach out of it, to drill by or to
-    align a bar that covers its outline.
+    Each bar has its outline, an arrow to its north pole, the letters of its poles, and lines along
+    and across its centre that extend beyond it, for drilling and for aligning a bar that covers its
+    outline.
 
     Parameters
     ----------
     geometry : Geometry
     code : int
     centre : (x, y)
-        On the page; what is drawn ends :func:`card_mm` from it.
-    words : tuple of str
-        Lines in the upper left of the square's inside.
+        Position on the page. The drawing ends :func:`drawing_half_side` from it on all sides.
+    notes : tuple of str
+        Lines of text in the upper left part of the square between the bars.
     """
-    x, y = centre
     marks: list[Mark] = []
-    length, width = 1e3 * geometry.bar_length_m, 1e3 * geometry.bar_width_m
-    capital = min(4.0, 0.5 * width, 0.13 * length)
-    for bar, (corners, south, north, letter) in enumerate(bar_outlines(geometry, code)):
-        middle = ((south[0] + north[0]) / 2, (south[1] + north[1]) / 2)
-        u, v = ((north[0] - south[0]) / length, (north[1] - south[1]) / length)
-        marks.append(Polygon(tuple((x + a, y + b) for a, b in corners.tolist()), width_mm=0.2))
-        for half, (p, q) in ((length / 2, (u, v)), (width / 2, (-v, u))):
-            for side in (-1.0, 1.0):
-                # Along a bar the inside is the arrow's, so only what reaches out.
-                start, end = side * (half - (0 if half == length / 2 else half)), side * (half + 2)
-                marks.append(
-                    Line(
-                        (x + middle[0] + start * p, y + middle[1] + start * q),
-                        (x + middle[0] + end * p, y + middle[1] + end * q),
-                        0.1,
-                    )
-                )
-        room = length / 2 - 1.7 * capital
-        tail, tip = (
-            (x + middle[0] + side * room * u, y + middle[1] + side * room * v) for side in (-1, 1)
-        )
-        marks += arrow(tail, tip, min(0.45 * width, 0.6 * room), 0.06 * min(width, 10.0))
-        points = capital / (CAPITAL_HEIGHT_EM * MM_PER_POINT)
-        for pole, side in (("S", -1), ("N", 1)):
-            at = side * (length / 2 - 0.9 * capital)
-            place = (x + middle[0] + at * u, y + middle[1] + at * v - capital / 2)
-            marks.append(Text(pole, place, points, "middle", bold=True))
-        marks.append(_bar_label(bar, letter, centre, reach_mm(geometry) + _OUT_MM))
+    label_distance = bars_half_side(geometry) + BAR_LABEL_GAP_MM
+    for number, bar in enumerate(bar_outlines(geometry, code)):
+        marks += _draw_bar(geometry, bar, centre)
+        marks.append(_draw_bar_label(number, bar.letter, centre, label_distance))
     inner = 1e3 * (geometry.radius_m - geometry.bar_width_m / 2)
     arm = min(6.0, 0.5 * inner)
-    marks += [
-        Line((x - arm, y), (x + arm, y), 0.2),
-        Line((x, y - arm), (x, y + arm), 0.2),
-        Circle(centre, arm / 3, 0.2),
-    ]
-    longest = max((len(text) for text in words), default=1)
-    points = min(10.0, 0.85 * inner / text_width("x" * longest, 1.0))
-    for index, text in enumerate(words):
-        up = inner - 2.6 - (index + 1) * 1.25 * points * MM_PER_POINT
-        marks.append(Text(text, (x - 1.5, y + up), points, "end", bold=index == 0))
+    marks += [*cross(centre, arm, 0.2), Circle(centre, arm / 3, 0.2)]
+    return [*marks, *_draw_notes(notes, centre, inner)]
+
+
+def _draw_bar(geometry: Geometry, bar: BarOutline, centre: Point) -> list[Mark]:
+    """Draw the outline of a bar, its centre lines, its arrow and the letters of its poles."""
+    length, width = 1e3 * geometry.bar_length_m, 1e3 * geometry.bar_width_m
+    (south_x, south_y), (north_x, north_y) = bar.south, bar.north
+    x, y = centre[0] + (south_x + north_x) / 2, centre[1] + (south_y + north_y) / 2
+    u, v = (north_x - south_x) / length, (north_y - south_y) / length
+    corners = tuple((centre[0] + a, centre[1] + b) for a, b in bar.corners.tolist())
+    marks: list[Mark] = [Polygon(corners, width_mm=0.2)]
+    # The line along the bar is drawn outside only, because the arrow fills the inside.
+    for inner_end, outer_end, (p, q) in (
+        (length / 2, length / 2 + 2, (u, v)),
+        (0.0, width / 2 + 2, (-v, u)),
+    ):
+        for side in (-1.0, 1.0):
+            start, end = side * inner_end, side * outer_end
+            marks.append(Line((x + start * p, y + start * q), (x + end * p, y + end * q), 0.1))
+    letter_mm = min(4.0, 0.5 * width, 0.13 * length)
+    half_arrow = length / 2 - 1.7 * letter_mm
+    tail, tip = ((x + side * half_arrow * u, y + side * half_arrow * v) for side in (-1, 1))
+    marks += arrow(tail, tip, min(0.45 * width, 0.6 * half_arrow), 0.06 * min(width, 10.0))
+    points = letter_mm / (CAPITAL_HEIGHT_EM * MM_PER_POINT)
+    for pole, side in (("S", -1), ("N", 1)):
+        offset = side * (length / 2 - 0.9 * letter_mm)
+        position = (x + offset * u, y + offset * v - letter_mm / 2)
+        marks.append(Text(pole, position, points, "middle", bold=True))
     return marks
 
 
-_OUT_MM, _LABEL = 3.0, 7.0
+def _bar_label(number: int, letter: str) -> str:
+    return f"bar {number}: {letter} ({'ccw' if letter == 'N' else 'cw'})"
 
 
-def _label(bar: int, letter: str) -> str:
-    return f"bar {bar}: {letter} ({'ccw' if letter == 'N' else 'cw'})"
-
-
-def _bar_label(bar: int, letter: str, centre: Point, out: float) -> Text:
-    """Outside of a bar, beside the line that the cell's neighbours lie on."""
-    up = 1.2
-    capital = CAPITAL_HEIGHT_EM * _LABEL * MM_PER_POINT
+def _draw_bar_label(number: int, letter: str, centre: Point, distance: float) -> Text:
+    """Draw the label of a bar outside of it, next to the line to the neighbouring cell."""
+    gap = 1.2
     x, y = (
-        (out, up),
-        (up, out),
-        (-out, up),
-        (up, -out - capital),
-    )[bar]
-    anchor: Literal["start", "end"] = "end" if bar == 2 else "start"
-    return Text(_label(bar, letter), (centre[0] + x, centre[1] + y), _LABEL, anchor)
+        (distance, gap),
+        (gap, distance),
+        (-distance, gap),
+        (gap, -distance - capital_height(BAR_LABEL_POINTS)),
+    )[number]
+    anchor: Literal["start", "end"] = "end" if number == 2 else "start"
+    position = (centre[0] + x, centre[1] + y)
+    return Text(_bar_label(number, letter), position, BAR_LABEL_POINTS, anchor)
+
+
+def _draw_notes(notes: tuple[str, ...], centre: Point, inner_mm: float) -> list[Mark]:
+    """Draw right-aligned lines of text in the upper left part of the square between the bars."""
+    longest = max((len(text) for text in notes), default=1)
+    points = min(MAX_NOTE_POINTS, 0.85 * inner_mm / text_width("x" * longest, 1.0))
+    top = centre[1] + inner_mm - 2.6
+    step = line_height(points, NOTE_SPACING_EM)
+    return [
+        Text(text, (centre[0] - 1.5, top - number * step), points, "end", bold=number == 1)
+        for number, text in enumerate(notes, 1)
+    ]
+
+
+def pole_arrow(geometry: Geometry, bar: BarOutline) -> list[Mark]:
+    """Draw a short arrow in the middle of a bar to its north pole, with space for the letters."""
+    start, tip = (_along_bar(bar, fraction) for fraction in (0.28, 0.72))
+    head = min(0.5e3 * geometry.bar_width_m, 0.2 * math.dist(bar.south, bar.north))
+    return arrow(start, tip, head)
+
+
+def pole_letters(bar: BarOutline) -> list[tuple[str, Point]]:
+    """Return the letters of the poles of a bar with their positions, for :func:`pole_arrow`."""
+    return [("S", _along_bar(bar, 0.13)), ("N", _along_bar(bar, 0.87))]
+
+
+def _along_bar(bar: BarOutline, fraction: float) -> Point:
+    """Return the point of a bar at a fraction of the way from its south to its north pole."""
+    x, y = np.add(bar.south, fraction * np.subtract(bar.north, bar.south)).tolist()
+    return x, y
 
 
 def draw_symbol(code: int, centre: Point, cell_mm: float) -> list[Mark]:
-    """A landmark as a sign on a plan, not to scale, in a cell of this side.
+    """Draw a landmark as a symbol on a plan, not to scale, in a cell with sides of ``cell_mm``.
 
-    Bars point to their north poles; those that are N are filled. The code, as the digit of
-    the map's file, is in the middle.
+    Bars point to their north poles and bars of letter N are filled. The code, as the digit of the
+    map's file, is in the centre.
     """
     x, y = centre
     marks: list[Mark] = []
     for bar, letter in enumerate(name(code)):
         sign = 1.0 if letter == "N" else -1.0
         outline = [(0.215, -0.15), (0.295, -0.15), (0.295, 0.07), (0.255, 0.15), (0.215, 0.07)]
-        corners = [_turned((cell_mm * a, cell_mm * sign * b), bar) for a, b in outline]
-        places = tuple((x + a, y + b) for a, b in corners)
-        marks.append(Polygon(places, letter == "N", min(0.2, 0.012 * cell_mm)))
+        corners = [_rotate((cell_mm * a, cell_mm * sign * b), bar) for a, b in outline]
+        positions = tuple((x + a, y + b) for a, b in corners)
+        marks.append(Polygon(positions, letter == "N", min(0.2, 0.012 * cell_mm)))
     points = 0.2 * cell_mm / (CAPITAL_HEIGHT_EM * MM_PER_POINT)
-    marks.append(Text(digit(code), (x, y - 0.1 * cell_mm), points, "middle", bold=True))
+    marks.append(Text(code_digit(code), (x, y - 0.1 * cell_mm), points, "middle", bold=True))
     return marks
 
 
-def digit(code: int) -> str:
-    """Of a code, as in the files of maps."""
+def draw_hole(centre: Point, half_mm: float, width_mm: float) -> list[Mark]:
+    """Draw the diagonal cross of a cell without landmark."""
+    x, y = centre
+    return [
+        Line((x - half_mm, y - half_mm), (x + half_mm, y + half_mm), width_mm),
+        Line((x - half_mm, y + half_mm), (x + half_mm, y - half_mm), width_mm),
+    ]
+
+
+def code_digit(code: int) -> str:
+    """Return the hexadecimal digit of a code, as in the files of maps."""
     return f"{code:x}"
 
 
-def north_mark(at: Point, height_mm: float, text: str = "map +y") -> list[Mark]:
-    """An arrow up the page from ``at``, with its words at the right."""
-    x, y = at
+def north_mark(start: Point, height_mm: float, text: str = "map +y") -> list[Mark]:
+    """Draw an arrow up the page from ``start``, with a text at its right."""
+    x, y = start
     points = min(9.0, 1.1 * height_mm)
     return [
-        *arrow(at, (x, y + height_mm), 0.45 * height_mm, 0.06 * height_mm),
+        *arrow(start, (x, y + height_mm), 0.45 * height_mm, 0.06 * height_mm),
         Text(text, (x + 0.2 * height_mm + 0.5, y + 0.3 * height_mm), points, bold=True),
     ]

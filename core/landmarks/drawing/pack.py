@@ -1,4 +1,4 @@
-"""The installation pack of a floor: all that a person needs who lays its magnets."""
+"""Installation pack of a floor: all pages that a person needs to place its magnets."""
 
 from __future__ import annotations
 
@@ -6,36 +6,40 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from locatk.core.drawing import Page, Point
+from locatk.core.drawing.pages import UnnumberedPage, check_margin, number_pages, printable
 from locatk.core.errors import InputError
-from locatk.core.landmarks.design.materials import SPARES_PERCENT, bill
-from locatk.core.landmarks.drawing.landmark import check
-from locatk.core.landmarks.drawing.page import Leaf, bind, check_margin, printable
-from locatk.core.landmarks.drawing.plan import plan_leaves
-from locatk.core.landmarks.drawing.templates import PlacedTemplate, template_leaves
-from locatk.core.landmarks.drawing.texts import bill_leaves, checklist_leaves, list_leaves
+from locatk.core.landmarks.design.materials import SPARES_PERCENT, bill_of_materials
+from locatk.core.landmarks.drawing.landmark import check_buildable
+from locatk.core.landmarks.drawing.plan import draw_plan
+from locatk.core.landmarks.drawing.templates import PlacedTemplate, draw_templates
+from locatk.core.landmarks.drawing.texts import bill_pages, checklist_pages, marking_list_pages
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.paper import PAPER_SIZES_MM
 
-PARTS = ("plan", "templates", "materials", "checklist", "list")
-"""In the order of the pages."""
+PACK_PARTS = ("plan", "templates", "materials", "checklist", "list")
+"""Parts of a pack, in the order of their pages."""
 
-MOST_PAGES = 500
+MAX_PAGES = 500
+"""Largest number of pages of a pack."""
 
-_LARGEST_WORDS_MM2 = 297.0 * 420.0
-_WORDS_MM = (210.0, 297.0)
-"""Words are no larger on a large paper: they go on A4 then."""
+TEXT_PAPER_MM = PAPER_SIZES_MM["A4"]
+"""Paper for the pages of text of a pack on large paper."""
+
+MAX_TEXT_PAPER_MM2 = 1.001 * PAPER_SIZES_MM["A3"][0] * PAPER_SIZES_MM["A3"][1]
+"""Largest area of a paper on which text is still printed."""
 
 
 @dataclass(frozen=True)
-class Pack:
-    """An installation pack.
+class InstallationPack:
+    """Pages of an installation pack.
 
     Attributes
     ----------
     pages : tuple of Page
     parts : dict of str to (int, int)
-        First page, counted from 0, and the one after the last, of each part.
+        First page, counted from 0, and the page after the last one of each part.
     templates : tuple of PlacedTemplate
-        Their pages are those of the whole pack.
+        Their pages are counted from the beginning of the pack.
     """
 
     pages: tuple[Page, ...]
@@ -43,62 +47,65 @@ class Pack:
     templates: tuple[PlacedTemplate, ...]
 
 
-def pack(
+def draw_installation_pack(
     floor: FloorMap,
     paper_mm: Point,
     *,
-    parts: Sequence[str] = PARTS,
+    parts: Sequence[str] = PACK_PARTS,
     paper_name: str = "",
     margin_mm: float = 10.0,
     spares_percent: float = SPARES_PERCENT,
-) -> Pack:
-    """An installation pack, as designed, not as built.
+) -> InstallationPack:
+    """Draw the installation pack of a floor as designed, not as built.
 
     Parameters
     ----------
     floor : FloorMap
     paper_mm : (width, height)
-        Of plan and templates, and of the words where it is no larger than A3.
+        Paper of plan and templates, and also of the pages of text if it is not larger than A3.
     parts : sequence of str
-        Some of :data:`PARTS`.
+        Parts to draw, of :data:`PACK_PARTS`.
     paper_name : str
-        For what is said of a paper that is too small.
-    margin_mm, spares_percent : float
+        Name of the paper in error messages.
+    margin_mm : float
+    spares_percent : float
+        Bars to buy in addition, in percent of the bars of the floor.
 
     Raises
     ------
     InputError
-        Bars overlap or there are none, a template is larger than the paper, or there are
-        more than :data:`MOST_PAGES` pages.
+        Bars overlap or there are none, a template is larger than the paper, or there are more
+        than :data:`MAX_PAGES` pages.
     """
-    check(floor)
+    check_buildable(floor)
     check_margin(paper_mm, margin_mm)
     title = printable(floor.name) or "Landmarks"
-    large = paper_mm[0] * paper_mm[1] > _LARGEST_WORDS_MM2 * 1.001
-    small = _WORDS_MM if large else paper_mm
-    leaves: list[Leaf] = []
-    found: dict[str, tuple[int, int]] = {}
-    templates: tuple[PlacedTemplate, ...] = ()
-    for part in PARTS:
+    is_large = paper_mm[0] * paper_mm[1] > MAX_TEXT_PAPER_MM2
+    text_paper_mm = TEXT_PAPER_MM if is_large else paper_mm
+    pages: list[UnnumberedPage] = []
+    page_ranges: dict[str, tuple[int, int]] = {}
+    templates: list[PlacedTemplate] = []
+    for part in PACK_PARTS:
         if part not in parts:
             continue
-        first = len(leaves)
+        first = len(pages)
         if part == "plan":
-            leaves += plan_leaves(floor, title, paper_mm, margin_mm)
+            pages += draw_plan(floor, title, paper_mm, margin_mm)
         elif part == "templates":
-            drawn, placed = template_leaves(floor, title, paper_mm, margin_mm, paper_name)
-            templates = tuple(replace(item, page=item.page + first) for item in placed)
-            leaves += drawn
+            drawn, placed = draw_templates(floor, title, paper_mm, margin_mm, paper_name)
+            pages += drawn
+            templates = [replace(item, page=item.page + first) for item in placed]
         elif part == "materials":
-            leaves += bill_leaves(floor, bill(floor, spares_percent), title, small, margin_mm)
+            items = bill_of_materials(floor, spares_percent)
+            pages += bill_pages(floor, items, title, text_paper_mm, margin_mm)
         elif part == "checklist":
-            leaves += checklist_leaves(floor, title, small, margin_mm)
+            pages += checklist_pages(floor, title, text_paper_mm, margin_mm)
         else:
-            leaves += list_leaves(floor, title, small, margin_mm)
-        found[part] = (first, len(leaves))
-    if len(leaves) > MOST_PAGES:
+            pages += marking_list_pages(floor, title, text_paper_mm, margin_mm)
+        page_ranges[part] = (first, len(pages))
+    if len(pages) > MAX_PAGES:
         raise InputError(
-            f"the pack would take {len(leaves)} pages, and {MOST_PAGES} are the most",
+            f"the pack takes {len(pages)} pages; at most {MAX_PAGES} are possible",
             hint="Use a larger paper, or the templates and an exported list of the map",
         )
-    return Pack(bind(leaves), found, templates)
+    return InstallationPack(number_pages(pages), page_ranges, tuple(templates))

@@ -1,4 +1,4 @@
-"""The plan of a floor, to a scale that fits the page, over several pages where it is large."""
+"""Plan of a floor, to a scale that fits the page; large floors are divided over several pages."""
 
 from __future__ import annotations
 
@@ -6,263 +6,303 @@ import math
 from dataclasses import dataclass
 
 from locatk.core.drawing import (
-    CAPITAL_HEIGHT_EM,
     MM_PER_POINT,
+    Box,
     Circle,
     Group,
     Line,
     Mark,
     Point,
-    Polygon,
     Text,
     arrow,
+    capital_height,
+    line_height,
+    rectangle,
     text_width,
 )
-from locatk.core.landmarks.drawing.landmark import draw_symbol, north_mark
-from locatk.core.landmarks.drawing.legend import LEGEND_MM, legend
-from locatk.core.landmarks.drawing.page import SMALL, TEXT, Frame, Leaf, line_mm
+from locatk.core.drawing.pages import SMALL_TEXT_POINTS, TEXT_POINTS, PageFrame, UnnumberedPage
+from locatk.core.drawing.tiles import tile_name
+from locatk.core.landmarks.drawing.landmark import draw_hole, draw_symbol, north_mark
+from locatk.core.landmarks.drawing.legend import LEGEND_HEIGHT_MM, draw_legend
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
 from locatk.core.units import mm_text
 
-SMALLEST_MM, LARGEST_MM = 6.5, 45.0
-"""Sides of a cell on the paper before its scale is rounded."""
+MIN_CELL_MM = 6.5
+"""Side of a cell on the paper below which a plan is divided over several pages."""
 
-_STEPS = (1, 1.25, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 6, 7, 7.5, 8, 9)
-_AXIS_MM = 7.0
-_WORDS_MM = 20.0
-"""Side of a cell above which it bears its numbers and place."""
+MAX_CELL_MM = 45.0
+"""Largest side of a cell on the paper; larger symbols show nothing more."""
+
+MIN_LABELLED_CELL_MM = 20.0
+"""Side of a cell on the paper above which it contains its row, column and position."""
+
+AXIS_SPACE_MM = 7.0
+"""Space for the arrows of the axes at the left of and below the numbers."""
+
+SCALE_STEPS = (1, 1.25, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 6, 7, 7.5, 8, 9, 10)
+"""Leading digits of the denominators of scales."""
 
 _KEY = (
     "Bars point to their north poles; filled: N (counter-clockwise), hollow: S. In the middle "
     "the code as in the map's file. Crossed: no landmark. Thick: wall. Circle: the map's origin."
 )
 
-Block = tuple[int, int, int, int]
-"""First row, first column, and the row and column after the last."""
 
+@dataclass(frozen=True)
+class CellBlock:
+    """Rectangle of cells; the ends are the row and the column after the last."""
 
-def nice_scale(least: float) -> float:
-    """The n of the next scale 1 : n that is a round number."""
-    power = 10.0 ** math.floor(math.log10(least) + 1e-9)
-    fits = [step * power for step in (*_STEPS, 10) if step * power >= least * (1 - 1e-9)]
-    return round(fits[0], 6)
+    first_row: int
+    first_column: int
+    end_row: int
+    end_column: int
+
+    @property
+    def rows(self) -> range:
+        return range(self.first_row, self.end_row)
+
+    @property
+    def columns(self) -> range:
+        return range(self.first_column, self.end_column)
+
+    def __contains__(self, cell: Cell) -> bool:
+        return cell[0] in self.rows and cell[1] in self.columns
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """How a floor is cut over pages."""
+class _PlanLayout:
+    """Division of a plan over pages of one orientation; ``scale`` is the n of 1 : n."""
 
-    frame: Frame
-    blocks: tuple[Block, ...]
-    across: int
+    frame: PageFrame
+    blocks: tuple[CellBlock, ...]
+    blocks_across: int
     scale: float
 
 
-def plan_leaves(floor: FloorMap, title: str, paper_mm: Point, margin_mm: float) -> list[Leaf]:
-    """Pages of the plan: one with its legend, or a key to the pages and a page a block.
+def draw_plan(
+    floor: FloorMap, title: str, paper_mm: Point, margin_mm: float
+) -> list[UnnumberedPage]:
+    """Draw the plan on one page with its legend, or on an overview and one page for each block.
 
-    Raises
-    ------
-    InputError
-        See :func:`locatk.core.landmarks.drawing.page.check_margin`.
+    The orientation of the paper is the one with the fewest pages, then the largest scale.
     """
-    ways = [_layout(floor, title, size, margin_mm) for size in (paper_mm, paper_mm[::-1])]
-    best = min(ways, key=lambda way: (len(way.blocks), way.scale))
-    drawn = _Drawn(floor, 1e3 * floor.pitch_m / best.scale)
-    frame = best.frame
-    left, bottom, right, top = frame.box
-    key = Group("legend", tuple(legend(floor, best.scale, (left, bottom), right - left)))
-    upper = (left, bottom + LEGEND_MM, right, top)
-    if len(best.blocks) == 1:
-        return [Leaf(frame, (key, Group("plan", tuple(drawn.block(best.blocks[0], upper)))))]
-    leaves = [Leaf(frame, (key, Group("key", tuple(_key_map(floor, best, upper)))))]
-    for number, block in enumerate(best.blocks):
-        words = (
-            f"{block_name(number, best.across)}: rows {block[0]} to {block[2] - 1}, columns "
-            f"{block[1]} to {block[3] - 1}. Scale 1 : {best.scale:g}. {_KEY}",
+    layouts = [_lay_out_plan(floor, title, size, margin_mm) for size in (paper_mm, paper_mm[::-1])]
+    layout = min(layouts, key=lambda item: (len(item.blocks), item.scale))
+    frame = layout.frame
+    cell_mm = 1e3 * floor.pitch_m / layout.scale
+    left, bottom, right, top = frame.content_box
+    legend = Group("legend", tuple(draw_legend(floor, layout.scale, (left, bottom), right - left)))
+    above_legend = (left, bottom + LEGEND_HEIGHT_MM, right, top)
+    if len(layout.blocks) == 1:
+        plan = _BlockDrawing.in_box(floor, cell_mm, layout.blocks[0], above_legend)
+        return [UnnumberedPage(frame, (legend, Group("plan", tuple(plan.marks()))))]
+    overview = Group("key", tuple(_draw_overview(floor, layout, above_legend)))
+    pages = [UnnumberedPage(frame, (legend, overview))]
+    for number, block in enumerate(layout.blocks):
+        notes = (
+            f"{tile_name(number, layout.blocks_across)}: rows {block.first_row} to "
+            f"{block.end_row - 1}, columns {block.first_column} to {block.end_column - 1}. "
+            f"Scale 1 : {layout.scale:g}. {_KEY}",
         )
-        page = Frame(frame.size, margin_mm, frame.title, words)
-        leaves.append(Leaf(page, (Group("plan", tuple(drawn.block(block, page.box))),)))
-    return leaves
+        block_frame = PageFrame(frame.size_mm, margin_mm, frame.title, notes)
+        plan = _BlockDrawing.in_box(floor, cell_mm, block, block_frame.content_box)
+        pages.append(UnnumberedPage(block_frame, (Group("plan", tuple(plan.marks())),)))
+    return pages
 
 
-def block_name(number: int, across: int) -> str:
-    """Of a part of a plan or of a tile: ``c1r1`` is the upper left one."""
-    return f"c{number % across + 1}r{number // across + 1}"
+def round_scale(min_scale: float) -> float:
+    """Return the smallest round n for a scale 1 : n that is at least ``min_scale``."""
+    power = 10.0 ** math.floor(math.log10(min_scale) + 1e-9)
+    scales = (step * power for step in SCALE_STEPS)
+    return round(next(scale for scale in scales if scale >= min_scale * (1 - 1e-9)), 6)
 
 
-def _layout(floor: FloorMap, title: str, size: Point, margin: float) -> _Layout:
+def _lay_out_plan(floor: FloorMap, title: str, size_mm: Point, margin_mm: float) -> _PlanLayout:
     rows, columns = floor.shape
-    name = f"{title}: floor plan"
-    count = len(floor.cells())
-    words = (
-        f"{_count(rows, 'row')} x {_count(columns, 'column')}, {_count(count, 'landmark')}, "
+    notes = (
+        f"{_count(rows, 'row')} x {_count(columns, 'column')}, "
+        f"{_count(len(floor.cells()), 'landmark')}, "
         f"pitch {mm_text(floor.pitch_m)} mm, alphabet {floor.alphabet}, "
         f"window {floor.window}. {_KEY}",
     )
-    frame = Frame(size, margin, name, words)
-    left, bottom, right, top = frame.box
-    label = _labels_mm(floor)
-    room = (right - left - label[0], top - bottom - label[1])
-    one = (room[0], room[1] - LEGEND_MM)
-    cell = min(one[0] / columns, one[1] / rows, LARGEST_MM)
+    frame = PageFrame(size_mm, margin_mm, f"{title}: floor plan", notes)
+    left, bottom, right, top = frame.content_box
+    label_width, label_height = _label_space(floor)
+    width, height = right - left - label_width, top - bottom - label_height
+    cell_mm = min(width / columns, (height - LEGEND_HEIGHT_MM) / rows, MAX_CELL_MM)
     across = down = 1
-    if cell < SMALLEST_MM:
-        across = math.ceil(columns / max(1, int(room[0] / SMALLEST_MM)))
-        down = math.ceil(rows / max(1, int(room[1] / SMALLEST_MM)))
-        # The key has a page of its own, so one block here is two pages.
+    if cell_mm < MIN_CELL_MM:
+        # The legend is on the page of the overview, so the blocks have the whole height.
+        across = math.ceil(columns / max(1, int(width / MIN_CELL_MM)))
+        down = math.ceil(rows / max(1, int(height / MIN_CELL_MM)))
         columns, rows = math.ceil(columns / across), math.ceil(rows / down)
         across, down = math.ceil(floor.shape[1] / columns), math.ceil(floor.shape[0] / rows)
-        cell = min(room[0] / columns, room[1] / rows, LARGEST_MM)
-    blocks = []
-    for upper in range(down):
-        first = max(0, floor.shape[0] - (upper + 1) * rows)
-        last = floor.shape[0] - upper * rows
-        for column in range(across):
-            end = min(floor.shape[1], (column + 1) * columns)
-            blocks.append((first, column * columns, last, end))
-    return _Layout(frame, tuple(blocks), across, nice_scale(1e3 * floor.pitch_m / cell))
+        cell_mm = min(width / columns, height / rows, MAX_CELL_MM)
+    blocks = [
+        CellBlock(
+            first_row=max(0, floor.shape[0] - (row + 1) * rows),
+            first_column=column * columns,
+            end_row=floor.shape[0] - row * rows,
+            end_column=min(floor.shape[1], (column + 1) * columns),
+        )
+        for row in range(down)
+        for column in range(across)
+    ]
+    return _PlanLayout(frame, tuple(blocks), across, round_scale(1e3 * floor.pitch_m / cell_mm))
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
-def _labels_mm(floor: FloorMap) -> Point:
-    """Room at the left of and below the cells, for numbers, places and the axes."""
+def _label_space(floor: FloorMap) -> Point:
+    """Return the space in mm for numbers and axes at the left of and below the cells."""
     rows, columns = floor.shape
     (x0, y0), (x1, y1) = floor.place((0, 0)), floor.place((rows - 1, columns - 1))
-    longest = max(text_width(mm_text(value), SMALL) for value in (x0, y0, x1, y1))
-    return (_AXIS_MM + longest + 6.0, _AXIS_MM + longest + 5.0)
+    longest = max(text_width(mm_text(value), SMALL_TEXT_POINTS) for value in (x0, y0, x1, y1))
+    return AXIS_SPACE_MM + longest + 6.0, AXIS_SPACE_MM + longest + 5.0
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    """A floor whose cells have this side on the paper."""
+class _BlockDrawing:
+    """Plan of a block of cells on a page.
+
+    ``origin`` is the lower left corner of cell (0, 0) on the page, which may be outside of it.
+    """
 
     floor: FloorMap
-    cell: float
+    cell_mm: float
+    block: CellBlock
+    origin: Point
 
-    def block(self, block: Block, box: tuple[float, float, float, float]) -> list[Mark]:
-        """Cells of a block with their numbers and places, in the middle of a box."""
-        label = _labels_mm(self.floor)
-        width, height = (block[3] - block[1]) * self.cell, (block[2] - block[0]) * self.cell
-        left = max(box[0] + label[0], (box[0] + box[2] - width + label[0]) / 2)
-        bottom = max(box[1] + label[1], box[3] - height)
-        # Where cell (0, 0) would have its lower left corner.
-        zero = (left - block[1] * self.cell, bottom - block[0] * self.cell)
-        marks = [*self._grid(block, zero), *self._labels(block, zero)]
-        for row in range(block[0], block[2]):
-            for column in range(block[1], block[3]):
-                marks += self._cell((row, column), zero)
-        return [*marks, *self._walls(block, zero), *self._origin(block, zero)]
+    @classmethod
+    def in_box(cls, floor: FloorMap, cell_mm: float, block: CellBlock, box: Box) -> _BlockDrawing:
+        """Centre a block with its labels in a box, at the upper edge."""
+        label_width, label_height = _label_space(floor)
+        width, height = len(block.columns) * cell_mm, len(block.rows) * cell_mm
+        left = max(box[0] + label_width, (box[0] + box[2] - width + label_width) / 2)
+        bottom = max(box[1] + label_height, box[3] - height)
+        origin = (left - block.first_column * cell_mm, bottom - block.first_row * cell_mm)
+        return cls(floor, cell_mm, block, origin)
 
-    def _middle(self, cell: Cell, zero: Point) -> Point:
-        return zero[0] + (cell[1] + 0.5) * self.cell, zero[1] + (cell[0] + 0.5) * self.cell
-
-    def _cell(self, cell: Cell, zero: Point) -> list[Mark]:
-        middle, half = self._middle(cell, zero), 0.5 * self.cell
-        x, y = middle
-        code = int(self.floor.codes[cell])
-        if code == HOLE:
-            return [
-                Line((x - half, y - half), (x + half, y + half), 0.1),
-                Line((x - half, y + half), (x + half, y - half), 0.1),
-            ]
-        if self.cell <= _WORDS_MM:
-            return draw_symbol(code, middle, 1.2 * self.cell)
-        marks = draw_symbol(code, middle, self.cell)
-        place = ", ".join(mm_text(value) for value in self.floor.place(cell))
-        points = SMALL * min(1.4, self.cell / 25)
-        left, top = x - half + 1.2, y + half - line_mm(points) - 0.2
+    def marks(self) -> list[Mark]:
+        cells = [(row, column) for row in self.block.rows for column in self.block.columns]
         return [
-            *marks,
-            Text(f"row {cell[0]}, column {cell[1]}", (left, top), points),
-            Text(place, (left, y - half + 1.2), points),
+            *self._grid(),
+            *self._numbers(),
+            *self._axes(),
+            *(mark for cell in cells for mark in self._cell(cell)),
+            *self._walls(),
+            *self._map_origin(),
         ]
 
-    def _grid(self, block: Block, zero: Point) -> list[Mark]:
-        """Borders of cells, and of the floor, thicker where the floor ends."""
+    def _point(self, row: float, column: float) -> Point:
+        """Return the point on the page of a cell's lower left corner, or in between."""
+        return self.origin[0] + column * self.cell_mm, self.origin[1] + row * self.cell_mm
+
+    def _centre(self, cell: Cell) -> Point:
+        return self._point(cell[0] + 0.5, cell[1] + 0.5)
+
+    def _grid(self) -> list[Mark]:
+        """Draw the borders of the cells, thicker at the border of the floor."""
         rows, columns = self.floor.shape
-        left, right = zero[0] + block[1] * self.cell, zero[0] + block[3] * self.cell
-        bottom, top = zero[1] + block[0] * self.cell, zero[1] + block[2] * self.cell
+        left, bottom = self._point(self.block.first_row, self.block.first_column)
+        right, top = self._point(self.block.end_row, self.block.end_column)
         marks: list[Mark] = []
-        for column in range(block[1], block[3] + 1):
-            x = zero[0] + column * self.cell
+        for column in (*self.block.columns, self.block.end_column):
+            x, _ = self._point(0, column)
             marks.append(Line((x, bottom), (x, top), 0.3 if column in (0, columns) else 0.06))
-        for row in range(block[0], block[2] + 1):
-            y = zero[1] + row * self.cell
+        for row in (*self.block.rows, self.block.end_row):
+            _, y = self._point(row, 0)
             marks.append(Line((left, y), (right, y), 0.3 if row in (0, rows) else 0.06))
         return marks
 
-    def _labels(self, block: Block, zero: Point) -> list[Mark]:
-        """Numbers of rows and columns, their places in mm, and the axes' arrows."""
-        left, bottom = zero[0] + block[1] * self.cell, zero[1] + block[0] * self.cell
-        top = zero[1] + block[2] * self.cell
-        capital = CAPITAL_HEIGHT_EM * SMALL * MM_PER_POINT
+    def _numbers(self) -> list[Mark]:
+        """Write the numbers of rows and columns with their positions in mm."""
+        left, bottom = self._point(self.block.first_row, self.block.first_column)
+        capital = capital_height(SMALL_TEXT_POINTS)
+        number_points = SMALL_TEXT_POINTS + 1
         marks: list[Mark] = []
-        turned = _labels_mm(self.floor)[1] - _AXIS_MM - 4.0 > self.cell
-        for row in range(block[0], block[2]):
-            y = zero[1] + (row + 0.5) * self.cell - capital / 2
-            place = mm_text(self.floor.place((row, 0))[1])
-            marks.append(Text(str(row), (left - 1.2, y), SMALL + 1, "end", bold=True))
-            marks.append(Text(place, (left - 5.5, y), SMALL, "end"))
-        for column in range(block[1], block[3]):
-            x = zero[0] + (column + 0.5) * self.cell
-            place = mm_text(self.floor.place((0, column))[0])
-            at = bottom - 1.2 - 1.2 * capital
-            marks.append(Text(str(column), (x, at), SMALL + 1, "middle", bold=True))
-            if turned:
-                spot = (x + capital / 2, at - 1.2)
-                marks.append(Text(place, spot, SMALL, "end", angle_deg=90))
+        for row in self.block.rows:
+            y = self._centre((row, 0))[1] - capital / 2
+            position = mm_text(self.floor.place((row, 0))[1])
+            marks.append(Text(str(row), (left - 1.2, y), number_points, "end", bold=True))
+            marks.append(Text(position, (left - 5.5, y), SMALL_TEXT_POINTS, "end"))
+        longest = _label_space(self.floor)[1] - AXIS_SPACE_MM - 4.0
+        is_upright = longest > self.cell_mm
+        for column in self.block.columns:
+            x, _ = self._centre((0, column))
+            y = bottom - 1.2 - 1.2 * capital
+            position = mm_text(self.floor.place((0, column))[0])
+            marks.append(Text(str(column), (x, y), number_points, "middle", bold=True))
+            if is_upright:
+                corner = (x + capital / 2, y - 1.2)
+                marks.append(Text(position, corner, SMALL_TEXT_POINTS, "end", angle_deg=90))
             else:
-                marks.append(Text(place, (x, at - 1.0 - capital), SMALL, "middle"))
-        out = _labels_mm(self.floor)
-        x, y = left - out[0] + 3.0, bottom - out[1] + 2.0
-        length = min(25.0, max(10.0, top - bottom))
-        # On a low floor the words would reach into the page's title.
-        word = "+y, rows, mm" if top - y > length + 25.0 else "+y"
-        return [
-            *marks,
-            *arrow((x, y), (x + length, y), 2.5, 0.3),
-            Text("+x, columns, mm", (x + length + 1.0, y - 0.8), TEXT),
-            *arrow((x, y), (x, y + length), 2.5, 0.3),
-            Text(word, (x + 0.8, y + length + 1.0), TEXT, angle_deg=90),
-        ]
-
-    def _walls(self, block: Block, zero: Point) -> list[Mark]:
-        marks: list[Mark] = []
-        for one, other in sorted(self.floor.walls):
-            if not any(_within(cell, block) for cell in (one, other)):
-                continue
-            a, b = self._middle(one, zero), self._middle(other, zero)
-            middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2)
-            u, v = (b[0] - a[0]) / 2, (b[1] - a[1]) / 2
-            start, end = (middle[0] - v, middle[1] - u), (middle[0] + v, middle[1] + u)
-            marks.append(Line(start, end, min(1.2, 0.1 * self.cell)))
+                below = (x, y - 1.0 - capital)
+                marks.append(Text(position, below, SMALL_TEXT_POINTS, "middle"))
         return marks
 
-    def _origin(self, block: Block, zero: Point) -> list[Mark]:
-        x0, y0 = self.floor.origin_m
-        pitch = self.floor.pitch_m
-        row, column = -y0 / pitch, -x0 / pitch
-        if not (
-            block[0] - 0.5 <= row < block[2] - 0.5 and block[1] - 0.5 <= column < block[3] - 0.5
-        ):
+    def _axes(self) -> list[Mark]:
+        left, bottom = self._point(self.block.first_row, self.block.first_column)
+        _, top = self._point(self.block.end_row, self.block.end_column)
+        label_width, label_height = _label_space(self.floor)
+        x, y = left - label_width + 3.0, bottom - label_height + 2.0
+        length = min(25.0, max(10.0, top - bottom))
+        # On a low floor the long label would extend into the page's title.
+        label = "+y, rows, mm" if top - y > length + 25.0 else "+y"
+        return [
+            *arrow((x, y), (x + length, y), 2.5, 0.3),
+            Text("+x, columns, mm", (x + length + 1.0, y - 0.8), TEXT_POINTS),
+            *arrow((x, y), (x, y + length), 2.5, 0.3),
+            Text(label, (x + 0.8, y + length + 1.0), TEXT_POINTS, angle_deg=90),
+        ]
+
+    def _cell(self, cell: Cell) -> list[Mark]:
+        centre, half = self._centre(cell), 0.5 * self.cell_mm
+        code = int(self.floor.codes[cell])
+        if code == HOLE:
+            return draw_hole(centre, half, 0.1)
+        if self.cell_mm <= MIN_LABELLED_CELL_MM:
+            return draw_symbol(code, centre, 1.2 * self.cell_mm)
+        points = SMALL_TEXT_POINTS * min(1.4, self.cell_mm / 25)
+        left = centre[0] - half + 1.2
+        first_baseline = centre[1] + half - line_height(points) - 0.2
+        position = ", ".join(mm_text(value) for value in self.floor.place(cell))
+        return [
+            *draw_symbol(code, centre, self.cell_mm),
+            Text(f"row {cell[0]}, column {cell[1]}", (left, first_baseline), points),
+            Text(position, (left, centre[1] - half + 1.2), points),
+        ]
+
+    def _walls(self) -> list[Mark]:
+        marks: list[Mark] = []
+        for first, second in sorted(self.floor.walls):
+            if first not in self.block and second not in self.block:
+                continue
+            (x1, y1), (x2, y2) = self._centre(first), self._centre(second)
+            x, y = (x1 + x2) / 2, (y1 + y2) / 2
+            u, v = (x2 - x1) / 2, (y2 - y1) / 2
+            marks.append(Line((x - v, y - u), (x + v, y + u), min(1.2, 0.1 * self.cell_mm)))
+        return marks
+
+    def _map_origin(self) -> list[Mark]:
+        """Draw a circle at the origin of the map if it is on this page."""
+        column, row = (-value / self.floor.pitch_m for value in self.floor.origin_m)
+        block = self.block
+        is_on_page = (
+            block.first_row - 0.5 <= row < block.end_row - 0.5
+            and block.first_column - 0.5 <= column < block.end_column - 0.5
+        )
+        if not is_on_page:
             return []
-        x, y = zero[0] + (column + 0.5) * self.cell, zero[1] + (row + 0.5) * self.cell
-        radius = (0.33 if self.cell > _WORDS_MM else 0.42) * self.cell
-        return [Circle((x, y), radius, 0.2)]
+        relative_radius = 0.33 if self.cell_mm > MIN_LABELLED_CELL_MM else 0.42
+        centre = self._point(row + 0.5, column + 0.5)
+        return [Circle(centre, relative_radius * self.cell_mm, 0.2)]
 
 
-def _within(cell: Cell, block: Block) -> bool:
-    return block[0] <= cell[0] < block[2] and block[1] <= cell[1] < block[3]
-
-
-def _key_map(
-    floor: FloorMap, layout: _Layout, box: tuple[float, float, float, float]
-) -> list[Mark]:
-    """The whole floor in small, with the names of the pages."""
+def _draw_overview(floor: FloorMap, layout: _PlanLayout, box: Box) -> list[Mark]:
+    """Draw the whole floor with the names of the blocks, which have a page each."""
     rows, columns = floor.shape
     cell = min((box[2] - box[0] - 10) / columns, (box[3] - box[1] - 10) / rows)
     left = (box[0] + box[2] - cell * columns) / 2
@@ -271,23 +311,25 @@ def _key_map(
     holes = [(r, c) for r in range(rows) for c in range(columns) if floor.codes[r, c] == HOLE]
     for row, column in holes:
         x, y = left + column * cell, bottom + row * cell
-        # One thin diagonal only, as names of pages may lie over it.
+        # A single thin diagonal, because the name of a block may be over it.
         marks.append(Line((x, y), (x + cell, y + cell), 0.05))
-    for one, other in sorted(floor.walls):
-        x, y = left + max(one[1], other[1]) * cell, bottom + max(one[0], other[0]) * cell
-        end = (x, y + cell) if one[0] == other[0] else (x + cell, y)
+    for first, second in sorted(floor.walls):
+        x, y = left + max(first[1], second[1]) * cell, bottom + max(first[0], second[0]) * cell
+        end = (x, y + cell) if first[0] == second[0] else (x + cell, y)
         marks.append(Line((x, y), end, 0.8))
     for number, block in enumerate(layout.blocks):
-        x, y = left + block[1] * cell, bottom + block[0] * cell
-        width, height = (block[3] - block[1]) * cell, (block[2] - block[0]) * cell
-        corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
-        marks.append(Polygon(corners, width_mm=0.25))
-        name = block_name(number, layout.across)
+        x, y = left + block.first_column * cell, bottom + block.first_row * cell
+        width, height = len(block.columns) * cell, len(block.rows) * cell
+        marks.append(rectangle((x, y, x + width, y + height), 0.25))
+        name = tile_name(number, layout.blocks_across)
         points = min(14.0, 0.5 * height / MM_PER_POINT, 0.8 * width / text_width(name, 1.0))
-        middle = (x + width / 2, y + height / 2)
-        marks.append(Text(name, middle, points, "middle", bold=True))
-        cells = f"rows {block[0]}-{block[2] - 1}, columns {block[1]}-{block[3] - 1}"
-        small = min(TEXT, 0.9 * width / text_width(cells, 1.0))
-        below = (middle[0], middle[1] - 1.3 * line_mm(small))
-        marks.append(Text(cells, below, small, "middle"))
+        centre = (x + width / 2, y + height / 2)
+        marks.append(Text(name, centre, points, "middle", bold=True))
+        cells = (
+            f"rows {block.first_row}-{block.end_row - 1}, "
+            f"columns {block.first_column}-{block.end_column - 1}"
+        )
+        cells_points = min(TEXT_POINTS, 0.9 * width / text_width(cells, 1.0))
+        below = (centre[0], centre[1] - 1.3 * line_height(cells_points))
+        marks.append(Text(cells, below, cells_points, "middle"))
     return [*marks, *north_mark((left - 5.0, bottom), 8.0, "")]

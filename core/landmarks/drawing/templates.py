@@ -1,4 +1,4 @@
-"""Placement templates at true size: one for each way in which a landmark is laid."""
+"""Placement templates at true size: one card for each code that occurs on a floor."""
 
 from __future__ import annotations
 
@@ -6,46 +6,59 @@ import math
 from dataclasses import dataclass
 
 from locatk.core.drawing import (
-    CAPITAL_HEIGHT_EM,
     CUT_MARK_MM,
-    MM_PER_POINT,
-    TRUE_SIZE,
+    TRUE_SIZE_INSTRUCTION,
     Group,
     Line,
     Mark,
     Point,
     Polygon,
     Text,
+    capital_height,
     cut_marks,
+    line_height,
+    paragraph,
     text_width,
     wrap,
 )
-from locatk.core.errors import InputError
-from locatk.core.landmarks.drawing.landmark import card_mm, digit, draw_landmark, north_mark
-from locatk.core.landmarks.drawing.page import (
-    SMALL,
-    TEXT,
-    TITLE,
-    Frame,
-    Leaf,
-    line_mm,
+from locatk.core.drawing.cards import CardGrid, cards_along
+from locatk.core.drawing.pages import (
+    SMALL_TEXT_POINTS,
+    TEXT_POINTS,
+    TITLE_POINTS,
+    PageFrame,
+    UnnumberedPage,
+    larger_paper_text,
     size_text,
+)
+from locatk.core.errors import InputError
+from locatk.core.landmarks.drawing.landmark import (
+    code_digit,
+    draw_landmark,
+    drawing_half_side,
+    north_mark,
 )
 from locatk.core.landmarks.landmark import PATTERN_OF, name
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.units import mm_text
 
-LARGEST_MM = 100.0
-"""From a template's centre to its edge; a longer line turns a landmark no more exactly."""
+MAX_HALF_SIDE_MM = 100.0
+"""Largest distance of an edge from the centre: longer lines do not align a landmark any better."""
 
-LIST_LINES = 6
-"""For the cells of a template, where the paper has no room for more."""
+CELL_LIST_LINES = 6
+"""Lines of text that are reserved for the cells of a template when several share a page."""
 
-_GAP_MM = 2 * CUT_MARK_MM + 2.0
-_NORTH_MM = 11.0
+MIN_CELL_LIST_LINES = 2
+"""Lines of text that are reserved for the cells of a template that has a page of its own."""
 
-WORDS = (
-    f"{TRUE_SIZE} Outlines: the bars; cut them out, or drill by the crosses. "
+CARD_GAP_MM = 2.0
+"""Distance of the cut marks of neighbouring templates."""
+
+NORTH_MARK_MM = 11.0
+"""Height of the north mark in a corner of the template."""
+
+NOTES = (
+    f"{TRUE_SIZE_INSTRUCTION} Outlines: the bars; cut them out, or drill by the crosses. "
     "Arrow: to the bar's north pole, magnetised along it. "
     "A bar is N where that is counter-clockwise (ccw) around the landmark, else S.",
     "Lay the centre cross on the cell, the marks at the edges on the lines to its neighbours, "
@@ -55,19 +68,19 @@ WORDS = (
 
 @dataclass(frozen=True)
 class PlacedTemplate:
-    """Which template lies where.
+    """Position of a template in a pack.
 
     Attributes
     ----------
     code : int
     cells : int
-        How many it is for.
+        Number of cells with this code.
     page : int
-        Of the templates' pages, counted from 0.
+        Page, counted from 0.
     centre_mm : (x, y)
-        Of the landmark, from the page's lower left corner.
+        Centre of the landmark, from the lower left corner of the page.
     side_mm : float
-        Of the square that is cut out around it.
+        Side of the square that is cut out.
     """
 
     code: int
@@ -77,100 +90,112 @@ class PlacedTemplate:
     side_mm: float
 
 
-def template_leaves(
+def draw_templates(
     floor: FloorMap, title: str, paper_mm: Point, margin_mm: float, paper_name: str
-) -> tuple[list[Leaf], list[PlacedTemplate]]:
-    """Pages with a template for each code that occurs, in their order, to be cut out.
+) -> tuple[list[UnnumberedPage], list[PlacedTemplate]]:
+    """Draw a template for each code that occurs, in ascending order of the codes.
 
-    As many as fit share a page; each says how many cells it is for and which.
+    As many templates as possible share a page. The orientation of the paper is the one with the
+    larger templates; if these are equal, the one with more templates on a page.
 
     Raises
     ------
     InputError
         A template is larger than the paper.
     """
-    cells = cells_by_code(floor)
-    least = card_mm(floor.geometry)
-    # A template that ends half way to the next cell meets its neighbour's edge.
-    wanted = max(least + _NORTH_MM, min(LARGEST_MM, 0.5e3 * floor.pitch_m))
     frames = [
-        Frame(size, margin_mm, f"{title}: placement templates, 1 : 1", WORDS)
-        for size in (paper_mm, paper_mm[::-1])
+        PageFrame(size_mm, margin_mm, f"{title}: placement templates, 1 : 1", NOTES)
+        for size_mm in (paper_mm, paper_mm[::-1])
     ]
-    roomy = [(frame, half) for frame in frames if (half := min(wanted, _most(frame))) >= least]
-    if not roomy:
-        box = frames[0].box
-        lost = (paper_mm[0] - (box[2] - box[0]), paper_mm[1] - (box[3] - box[1]))
-        enough = [math.ceil(2 * least + 2 * CUT_MARK_MM + side) for side in lost]
-        enough[1] = math.ceil(enough[1] + _head_mm() + _list_mm(2))
-        raise InputError(
-            f"a template needs {2 * least:.0f} x {2 * least:.0f} mm and words beside it, more than "
-            f"paper {paper_name} of {size_text(paper_mm)} has room for",
-            hint=f"Use a larger paper, as in --paper {enough[0]}x{enough[1]}mm",
-        )
-    # The larger template first, then the fewer pages, then the paper as it is.
-    frame, half = min(roomy, key=lambda way: (-way[1], -math.prod(_grid(*way))))
-    across, down = _grid(frame, half)
-    left, bottom, right, top = frame.box
-    height = (top - bottom) / down
-    cards = [_Card(floor, code, found, half) for code, found in cells.items()]
-    leaves: list[Leaf] = []
+    min_half = drawing_half_side(floor.geometry)
+    # Templates that end half way to the next cell touch each other when they are laid out.
+    best_half = max(min_half + NORTH_MARK_MM, min(MAX_HALF_SIDE_MM, 0.5e3 * floor.pitch_m))
+    halves = [min(best_half, _max_half_side(frame)) for frame in frames]
+    choices = [
+        (half, _template_grid(frame, half), frame)
+        for frame, half in zip(frames, halves, strict=True)
+        if half >= min_half
+    ]
+    if not choices:
+        raise _too_small(frames[0], min_half, paper_name)
+    half, grid, frame = max(choices, key=lambda choice: (choice[0], choice[1].cards_per_page))
+    templates = [
+        _Template(floor, code, cells, half) for code, cells in cells_by_code(floor).items()
+    ]
+    width, height = grid.card_mm
+    groups: list[list[Group]] = [[] for _ in range(grid.page_count(len(templates)))]
     placed = []
-    for start in range(0, len(cards), across * down):
-        groups = []
-        for index, card in enumerate(cards[start : start + across * down]):
-            row, column = divmod(index, across)
-            above = (left + (right - left) * (column + 0.5) / across, top - row * height)
-            groups.append(card.group(above, height))
-            centre = card.centre(above)
-            placed.append(PlacedTemplate(card.code, len(card.cells), len(leaves), centre, 2 * half))
-        leaves.append(Leaf(frame, tuple(groups)))
-    return leaves, placed
+    for template, slot in zip(templates, grid.slots(len(templates)), strict=True):
+        top = (slot.corner_mm[0] + width / 2, slot.corner_mm[1])
+        groups[slot.page].append(template.draw(top, height))
+        centre = template.centre(top)
+        placed.append(
+            PlacedTemplate(template.code, len(template.cells), slot.page, centre, 2 * half)
+        )
+    return [UnnumberedPage(frame, tuple(page)) for page in groups], placed
 
 
-def _most(frame: Frame) -> float:
-    """Half of the side of the largest template that a page holds with its words."""
-    left, bottom, right, top = frame.box
-    room = (right - left, top - bottom - _head_mm() - _list_mm(2))
-    return math.floor(min(room) - 2 * CUT_MARK_MM) / 2
+def _max_half_side(frame: PageFrame) -> float:
+    """Return half of the side of the largest template that a page holds with its texts."""
+    available = _available_mm(frame)
+    return math.floor(min(available)) / 2
 
 
-def _grid(frame: Frame, half: float) -> tuple[int, int]:
-    """Templates across and down."""
-    left, bottom, right, top = frame.box
-    across = int((right - left + 2.0) // (2 * half + _GAP_MM))
-    down = int((top - bottom) // (2 * half + _GAP_MM + _head_mm() + _list_mm()))
-    return max(1, across), max(1, down)
+def _available_mm(frame: PageFrame) -> Point:
+    """Return width and height that a page leaves for one template, without its texts."""
+    left, bottom, right, top = frame.content_box
+    texts = _title_height() + _cell_list_height(MIN_CELL_LIST_LINES)
+    return right - left - 2 * CUT_MARK_MM, top - bottom - texts - 2 * CUT_MARK_MM
+
+
+def _too_small(frame: PageFrame, min_half: float, paper_name: str) -> InputError:
+    side = 2 * min_half
+    paper = larger_paper_text(frame.size_mm, (side, side), _available_mm(frame))
+    return InputError(
+        f"a template needs {side:.0f} x {side:.0f} mm and space for its texts, which paper "
+        f"{paper_name} of {size_text(frame.size_mm)} does not have",
+        hint=f"Use a larger paper, as in --paper {paper}",
+    )
+
+
+def _template_grid(frame: PageFrame, half: float) -> CardGrid:
+    """Distribute templates evenly over a page; the space that is left lists their cells."""
+    left, bottom, right, top = frame.content_box
+    side, gap = 2 * half, 2 * CUT_MARK_MM + CARD_GAP_MM
+    columns = max(1, cards_along(right - left - 2 * CUT_MARK_MM, side, gap))
+    row_height = side + gap + _title_height() + _cell_list_height(CELL_LIST_LINES)
+    rows = max(1, cards_along(top - bottom, row_height, 0.0))
+    slot_mm = ((right - left) / columns, (top - bottom) / rows)
+    return CardGrid(frame.content_box, slot_mm, 0.0, columns, rows)
 
 
 def cells_by_code(floor: FloorMap) -> dict[int, list[Cell]]:
-    """Codes that are laid, ascending, and the cells of each, row by row."""
-    found: dict[int, list[Cell]] = {}
+    """Return the codes that occur, ascending, with the cells of each, row by row."""
+    cells: dict[int, list[Cell]] = {}
     for cell in floor.cells():
-        found.setdefault(int(floor.codes[cell]), []).append(cell)
-    return dict(sorted(found.items()))
+        cells.setdefault(int(floor.codes[cell]), []).append(cell)
+    return dict(sorted(cells.items()))
 
 
 def cells_text(cells: list[Cell]) -> str:
-    """Cells in short: ``row 0: 3, 5; row 2: 4``, the numbers being columns."""
+    """Format cells by row, as in ``row 0: 3, 5; row 2: 4``; the numbers are columns."""
     rows: dict[int, list[str]] = {}
     for row, column in cells:
         rows.setdefault(row, []).append(str(column))
     return "; ".join(f"row {row}: {', '.join(columns)}" for row, columns in rows.items())
 
 
-def _head_mm() -> float:
-    return line_mm(TITLE) + 1.0
+def _title_height() -> float:
+    return line_height(TITLE_POINTS) + 1.0
 
 
-def _list_mm(lines: int = LIST_LINES) -> float:
-    return (lines + 0.5) * line_mm(TEXT)
+def _cell_list_height(lines: int) -> float:
+    return (lines + 0.5) * line_height(TEXT_POINTS)
 
 
 @dataclass(frozen=True)
-class _Card:
-    """A square that is cut out, from ``-half`` to ``half`` mm, its title above and its cells
-    below."""
+class _Template:
+    """Square of ``2 * half`` mm that is cut out, with a title above and its cells below."""
 
     floor: FloorMap
     code: int
@@ -178,89 +203,74 @@ class _Card:
     half: float
 
     def centre(self, top: Point) -> Point:
-        """Of the landmark, where the middle of the upper edge is at ``top``."""
-        return round(top[0], 3), round(top[1] - _head_mm() - CUT_MARK_MM - self.half, 3)
+        """Return the centre of the landmark if ``top`` is the middle of the upper edge."""
+        return round(top[0], 3), round(top[1] - _title_height() - CUT_MARK_MM - self.half, 3)
 
-    def group(self, top: Point, height: float) -> Group:
-        """With the middle of its upper edge at ``top`` and this much room below."""
-        x, y = self.centre(top)
-        edges = (x - self.half, y - self.half, x + self.half, y + self.half)
-        words = (f"code {digit(self.code)}", name(self.code))
+    def draw(self, top: Point, height: float) -> Group:
+        """Draw the template with the middle of its upper edge at ``top`` and this total height."""
+        centre = self.centre(top)
+        left, bottom = centre[0] - self.half, centre[1] - self.half
+        notes = (f"code {code_digit(self.code)}", name(self.code))
         marks: list[Mark] = [
-            Text(self._title(), (edges[0], top[1] - line_mm(TITLE)), TITLE, bold=True),
-            *cut_marks(*edges),
-            *self._lines((x, y)),
-            *draw_landmark(self.floor.geometry, self.code, (x, y), words),
-            *self._corners((x, y)),
-            *self._list((edges[0], edges[1] - CUT_MARK_MM), top[1] - height),
+            *paragraph([self._title()], (left, top[1]), TITLE_POINTS, bold=True),
+            *cut_marks(left, bottom, centre[0] + self.half, centre[1] + self.half),
+            *self._lines_to_neighbours(centre),
+            *draw_landmark(self.floor.geometry, self.code, centre, notes),
+            *self._corner_notes(centre),
+            *self._cell_list((left, bottom - CUT_MARK_MM), top[1] - height),
         ]
-        return Group(f"code-{digit(self.code)}", tuple(marks))
+        return Group(f"code-{code_digit(self.code)}", tuple(marks))
 
     def _title(self) -> str:
         count = len(self.cells)
         number = int(PATTERN_OF[self.code])
         return (
-            f"Code {digit(self.code)} = {name(self.code)} (pattern {number}): "
+            f"Code {code_digit(self.code)} = {name(self.code)} (pattern {number}): "
             f"{count} cell{'s' * (count != 1)}"
         )
 
-    def _lines(self, centre: Point) -> list[Mark]:
-        """To the neighbours, with marks at the edges, half way and at the next cell."""
+    def _lines_to_neighbours(self, centre: Point) -> list[Mark]:
+        """Draw dashed lines, with marks at the edges, half way to the next cell and at it."""
         x, y = centre
         half, pitch = self.half, 1e3 * self.floor.pitch_m
         marks: list[Mark] = []
         for u, v in ((1, 0), (0, 1), (-1, 0), (0, -1)):
             tip = (x + half * u, y + half * v)
             marks.append(Line((x, y), tip, 0.1, dash_mm=2.0))
-            base = half - 3.0
-            corners = (
-                tip,
-                (x + base * u - v, y + base * v - u),
-                (x + base * u + v, y + base * v + u),
-            )
-            marks.append(Polygon(corners, filled=True))
-            for at, arm in ((pitch / 2, 3.0), (pitch, 5.0)):
-                if card_mm(self.floor.geometry) < at < half - 1e-6:
-                    place = (x + at * u, y + at * v)
-                    marks.append(
-                        Line(
-                            (place[0] - arm * v, place[1] - arm * u),
-                            (place[0] + arm * v, place[1] + arm * u),
-                            0.2,
-                        )
-                    )
+            base_x, base_y = x + (half - 3.0) * u, y + (half - 3.0) * v
+            triangle = (tip, (base_x - v, base_y - u), (base_x + v, base_y + u))
+            marks.append(Polygon(triangle, filled=True))
+            for distance, arm in ((pitch / 2, 3.0), (pitch, 5.0)):
+                if drawing_half_side(self.floor.geometry) < distance < half - 1e-6:
+                    tick_x, tick_y = x + distance * u, y + distance * v
+                    start = (tick_x - arm * v, tick_y - arm * u)
+                    end = (tick_x + arm * v, tick_y + arm * u)
+                    marks.append(Line(start, end, 0.2))
         return marks
 
-    def _corners(self, centre: Point) -> list[Mark]:
-        """North mark and what the edges are, in the corners, which are always free."""
-        x, y = centre[0] - self.half + 2.0, centre[1] + self.half - 1.0 - _NORTH_MM
+    def _corner_notes(self, centre: Point) -> list[Mark]:
+        """Draw north mark and meaning of the edges in the corners, which are always free."""
+        x, y = centre[0] - self.half + 2.0, centre[1] + self.half - 1.0 - NORTH_MARK_MM
+        marks = north_mark((x + 2.5, y), NORTH_MARK_MM)
+        width = max(self.half - 8.0, text_width("x" * 20, SMALL_TEXT_POINTS))
+        lines = wrap(self._edge_note(), SMALL_TEXT_POINTS, width)
+        bottom = centre[1] - self.half + 1.0 + capital_height(SMALL_TEXT_POINTS)
+        top = bottom + len(lines) * line_height(SMALL_TEXT_POINTS)
+        marks += paragraph(lines, (x, top), SMALL_TEXT_POINTS)
+        axis_label = (centre[0] + self.half - 4.5, centre[1] - capital_height(TEXT_POINTS) - 1.2)
+        return [*marks, Text("+x", axis_label, TEXT_POINTS, "end", bold=True)]
+
+    def _edge_note(self) -> str:
         pitch = mm_text(self.floor.pitch_m)
-        ends = (
-            f"edge half way to the next cell ({pitch} mm)"
-            if abs(self.half - 0.5e3 * self.floor.pitch_m) < 1e-6
-            else f"edge {mm_text(1e-3 * self.half)} mm from the centre, next cell {pitch} mm"
-        )
-        lines = wrap(ends, SMALL, max(self.half - 8.0, text_width("x" * 20, SMALL)))
-        marks = north_mark((x + 2.5, y), _NORTH_MM)
-        low = centre[1] - self.half + 1.0 + CAPITAL_HEIGHT_EM * SMALL * MM_PER_POINT
-        for index, text in enumerate(reversed(lines)):
-            up = low + index * line_mm(SMALL)
-            marks.append(Text(text, (x, up), SMALL))
-        right = (
-            centre[0] + self.half - 4.5,
-            centre[1] - CAPITAL_HEIGHT_EM * TEXT * MM_PER_POINT - 1.2,
-        )
-        marks.append(Text("+x", right, TEXT, "end", bold=True))
-        return marks
+        if abs(self.half - 0.5e3 * self.floor.pitch_m) < 1e-6:
+            return f"edge half way to the next cell ({pitch} mm)"
+        return f"edge {mm_text(1e-3 * self.half)} mm from the centre, next cell {pitch} mm"
 
-    def _list(self, start: Point, bottom: float) -> list[Mark]:
-        """As many lines of cells as there is room for."""
+    def _cell_list(self, corner: Point, bottom: float) -> list[Text]:
+        """List the cells in as many lines as fit between ``corner`` and ``bottom``."""
         text = f"For the cells (row: columns) {cells_text(self.cells)}"
-        lines = wrap(text, TEXT, 2 * self.half)
-        most = max(1, int((start[1] - bottom) / line_mm(TEXT) - 0.3))
-        if len(lines) > most:
-            lines = [*lines[: most - 1], "... and more: see the marking list"]
-        return [
-            Text(line, (start[0], start[1] - (index + 1) * line_mm(TEXT)), TEXT)
-            for index, line in enumerate(lines)
-        ]
+        lines = wrap(text, TEXT_POINTS, 2 * self.half)
+        max_lines = max(1, int((corner[1] - bottom) / line_height(TEXT_POINTS) - 0.3))
+        if len(lines) > max_lines:
+            lines = [*lines[: max_lines - 1], "... and more: see the marking list"]
+        return paragraph(lines, corner, TEXT_POINTS)

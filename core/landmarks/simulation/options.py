@@ -1,9 +1,10 @@
-"""What is simulated, and within which bounds."""
+"""Options of a simulated robot on landmarks, and their valid ranges."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass, field, fields, replace
+from enum import IntEnum
 
 from locatk.core.landmarks.halls import NAMES, HallSensors
 from locatk.core.landmarks.landmark import PATTERNS
@@ -11,53 +12,68 @@ from locatk.core.landmarks.map.floor import Cell
 from locatk.core.landmarks.simulation.robot import Limits
 from locatk.core.simulation import check_options
 
+
+class RandomSource(IntEnum):
+    """Sources of random errors, each with a stream of its own."""
+
+    GAINS = 10
+    NOISE = 11
+    STRATEGY = 20
+    ODOMETRY = 21
+    STUDY_CODES = 30
+    STUDY_PATHS = 31
+    STUDY_BARS = 32
+    STUDY_READINGS = 33
+    STUDY_WHEELS = 34
+    LANDMARK = 40
+
+
 PASS_M = 0.23
-"""Way of one pass in facts/landmarks.md 3, on which the heading drifts by one degree."""
+"""Length of one of the paper's passes, twice :data:`START_M`."""
 
 START_M = 0.115
 """Radius of the circle of starts of the paper's passes (section 3.5.1)."""
 
 ASIDE_RAD = math.pi / 4
-"""How far their heading is off the landmark's centre, at most."""
+"""Largest angle between the heading of a pass and the direction of the landmark's centre."""
 
 STRATEGIES = ("paper", "path", "pass")
 
 
 @dataclass(frozen=True)
 class Errors:
-    """How large errors are: standard deviations, unless said otherwise.
+    """Errors of sensors, landmarks and odometry: standard deviations, unless stated otherwise.
 
-    The defaults are the nominal ones of facts/landmarks.md 3, which has none of the wheels'
-    turn, noise and slip, nor of how landmarks are placed.
+    The defaults are assumptions for inexpensive parts: no recordings of such a floor are published.
 
     Attributes
     ----------
     noise_t : float
-        Of a sample.
+        Noise of a sample.
     offset_t, gain : float
-        Of each sensor; the gain as a share.
+        Offset of each sensor, and relative error of its gain.
     earth_t : float
-        Upright part of the Earth's field, positive upward; itself and the same everywhere.
+        Vertical component of the Earth's field, positive upward: a value, the same everywhere.
     quantum_t : float
-        Least step of a reading; 0 for none.
+        Resolution of a reading; 0 for none.
     height_m : float
-        By how much all sensors are too high; no standard deviation.
+        Height of all sensors above their nominal height: a value.
     bar_strength : float
-        Of each bar, as a share.
+        Relative error of the strength of each bar.
     bar_place_m, bar_turn_rad, bar_lean_rad : float
-        Of each bar: along both axes of the floor, about the upright, and about the two
-        level axes.
+        Errors of each bar: position along both axes of the floor, rotation about the vertical, and
+        rotation about the two horizontal axes.
     landmark_place_m, landmark_turn_rad : float
-        Of each landmark as a whole, along both axes and about the upright.
+        Errors of each landmark as a whole: position along both axes, rotation about the vertical.
     odometry_scale, odometry_turn : float
-        By which share it tells too long a way, and too much of a turn, for a whole session.
+        Relative errors of distances and of rotations, constant for a session.
     odometry_drift_rad_per_m : float
-        By how much its heading turns away on a metre, for a whole session.
+        Drift of the heading, constant for a session.
     wheel_noise_m : float
-        Of the way of each wheel on a metre, as a random walk.
+        Error of the distance of each wheel after a metre, as a random walk.
     slips_per_m, slip_m : float
-        How often a wheel slips on a metre that the wheels go, and how far it turns too
-        much then; no standard deviations.
+        Mean number of slips in a metre of the wheels, and excess distance of the wheel in a slip:
+        values.
     """
 
     noise_t: float = 0.15e-3
@@ -95,7 +111,7 @@ class Errors:
         )
 
     def scaled(self, factor: float) -> Errors:
-        """All errors ``factor`` times as large, but for the Earth's field."""
+        """Return the errors multiplied by ``factor``, except the Earth's field."""
         return replace(
             self,
             **{
@@ -107,25 +123,25 @@ class Errors:
 
 
 NONE = Errors(**{item.name: 0.0 for item in fields(Errors)})
-"""No errors at all, and no Earth."""
+"""No errors, and no field of the Earth."""
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What is broken or wrong, beyond errors.
+    """Faults of landmarks and sensors.
 
     Attributes
     ----------
     flipped, missing : tuple of (cell, bar)
-        Bars that lie the wrong way round, and that do not lie there.
+        Bars with exchanged poles, and bars that are missing.
     displaced : tuple of (cell, (dx, dy))
-        Landmarks that lie elsewhere, in metres of the map's frame.
+        Landmarks with a displacement in metres of the map's frame.
     misread_rate : float
-        Chance of a landmark to be laid as another one of the alphabet.
+        Probability that a landmark is installed as another one of the alphabet.
     dead, stuck : tuple of str
-        Sensors that give nothing, and that give their offset for ever.
+        Sensors that give nothing, and that always give their offset.
     swapped : tuple of (name, name)
-        Sensors whose wires were exchanged.
+        Sensors with exchanged wires.
     """
 
     flipped: tuple[tuple[Cell, int], ...] = ()
@@ -139,16 +155,16 @@ class Faults:
 
 @dataclass(frozen=True)
 class Aims:
-    """How well the robot hits what it aims for, which it finds without any solver.
+    """Errors of the targets to which the robot drives; no solver is involved.
 
     Attributes
     ----------
     first_m, second_m, step_m : float
-        Mean distance between a landmark's centre and where the robot takes it to be: after
-        the first pass, after a spin, and where it comes from the last landmark or follows a
-        path. The defaults are about what the paper reports (sections 3.5.2 and 5.2.2).
+        Mean distance between a landmark's centre and the target: after the first pass, after a
+        spin, and from landmark to landmark or on a path. The defaults are close to the results of
+        the paper (sections 3.5.2 and 5.2.2).
     heading_rad : float
-        Standard deviation of its heading when it has aligned with a landmark (5.2.3).
+        Standard deviation of the heading after the alignment with a landmark (5.2.3).
     """
 
     first_m: float = 0.007
@@ -159,7 +175,7 @@ class Aims:
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What to simulate.
+    """Options of a simulated session.
 
     Attributes
     ----------
@@ -193,14 +209,15 @@ class SimulationOptions:
     sensors : HallSensors or None
         None for four on the circle of the map's geometry.
     range_t : float
-        Greatest field that they tell, where ``sensors`` is None.
+        Largest field that they measure if ``sensors`` is None.
     rate_hz, odometry_hz : float
+        Rates of the samples and of the odometry.
     rest_s, stop_s : float
-        Standing at the start and at the end, and on each landmark.
+        Rests at the start and at the end, and on each landmark.
     device : str
     seed : int
     floor_seed : int or None
-        Of how the bars lie, where it is another one: several drives over the same floor.
+        Seed of the errors of the floor, for several drives over the same floor; None for ``seed``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What hall sensors and wheels make of the truth: noise, gains, saturation, drift, slip."""
+"""Simulated hall sensors and wheels: noise, gains, saturation, odometry with drift and slips."""
 
 from __future__ import annotations
 
@@ -6,72 +6,69 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.halls import HallSensors
-from locatk.core.landmarks.simulation.options import Errors, Faults
+from locatk.core.landmarks.simulation.options import Errors, Faults, RandomSource
+from locatk.core.simulation import quantize, random_stream
 
 Array = NDArray[np.float64]
 
 TRACK_M = 0.1
-"""Between the wheels of the robot."""
+"""Distance between the wheels of the robot."""
 
-SLIP_M = 0.03
-"""Way over which a wheel that slips turns too far."""
+SLIP_DISTANCE_M = 0.03
+"""Distance of the robot over which a slipping wheel rotates too far."""
 
 
 def gains(sensors: int, errors: Errors, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Gains and offsets in tesla (sensors,) of the sensors of one robot."""
+    """Draw the gains and the offsets in tesla (sensors,) of the sensors of one robot."""
     return 1 + rng.normal(0.0, errors.gain, sensors), rng.normal(0.0, errors.offset_t, sensors)
 
 
 def measure(
     field_t: Array, sensors: HallSensors, errors: Errors, faults: Faults, seed: int
 ) -> tuple[Array, int]:
-    """Readings (n, N) of upright fields (n, N), and how many of them are saturated.
-
-    Each matter has random numbers of its own: more noise leaves the gains as they are.
-    """
-    gain, offset = gains(len(sensors), errors, np.random.default_rng([seed, 10]))
-    noise = np.random.default_rng([seed, 11]).normal(0.0, errors.noise_t, field_t.shape)
-    still = np.isin(sensors.names, faults.stuck)
-    read = gain * (field_t + errors.earth_t) + offset + noise
-    read[:, still] = offset[still]
-    read, saturated = digitise(read, sensors.range_t, errors.quantum_t)
+    """Return the readings (n, N) of vertical fields (n, N), and the number of saturated ones."""
+    gain, offset = gains(len(sensors), errors, random_stream(seed, RandomSource.GAINS))
+    noise = random_stream(seed, RandomSource.NOISE).normal(0.0, errors.noise_t, field_t.shape)
+    readings = gain * (field_t + errors.earth_t) + offset + noise
+    is_stuck = np.isin(sensors.names, faults.stuck)
+    readings[:, is_stuck] = offset[is_stuck]
+    readings, saturated = digitise(readings, sensors.range_t, errors.quantum_t)
     order = list(range(len(sensors)))
-    for one, other in faults.swapped:
-        a, b = sensors.names.index(one), sensors.names.index(other)
+    for first, second in faults.swapped:
+        a, b = sensors.names.index(first), sensors.names.index(second)
         order[a], order[b] = order[b], order[a]
-    read = read[:, order]
-    read[:, np.isin(sensors.names, faults.dead)] = np.nan
-    return read, saturated
+    readings = readings[:, order]
+    readings[:, np.isin(sensors.names, faults.dead)] = np.nan
+    return readings, saturated
 
 
-def digitise(read: Array, range_t: float, quantum_t: float) -> tuple[Array, int]:
-    """Readings in steps of ``quantum_t`` within the range, and how many were beyond it."""
-    if quantum_t > 0:
-        read = np.rint(read / quantum_t) * quantum_t
-    return np.clip(read, -range_t, range_t), int(np.count_nonzero(np.abs(read) >= range_t))
+def digitise(readings: Array, range_t: float, quantum_t: float) -> tuple[Array, int]:
+    """Quantize readings and clip them to the range; return also the number of clipped ones."""
+    readings = quantize(readings, quantum_t)
+    saturated = int(np.count_nonzero(np.abs(readings) >= range_t))
+    return np.clip(readings, -range_t, range_t), saturated
 
 
 def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Array, list[int]]:
-    """Poses (n, 3) as the wheels tell them, from (0, 0, 0), and where they slipped.
+    """Return the poses (n, 3) of the wheel odometry, from (0, 0, 0), and the slips.
 
     Parameters
     ----------
     poses : (n, 3) ndarray
-        True x, y and heading (without jumps of a turn), near enough to each other for a
-        step to be an arc.
+        True x, y and unwrapped heading, so close to each other that each step is an arc.
     errors : Errors
     rng : Generator
 
     Returns
     -------
-    (n, 3) ndarray, and the numbers of the poses at which a wheel began to slip.
+    (n, 3) ndarray, and the indices of the poses at which a wheel began to slip.
 
     Notes
     -----
-    Errors are those of Borenstein and Feng (IEEE Trans. Robotics and Automation 12, 869,
-    1996): the mean diameter of the wheels (scale), their difference (drift along the way)
-    and the track (turns), the same for the whole session; and, beside them, noise of each
-    wheel and slip.
+    The errors are those of Borenstein and Feng (IEEE Trans. Robotics and Automation 12, 869,
+    1996): the mean diameter of the wheels (scale), its difference (drift along the path) and
+    the track (rotations), constant for the whole session; and in addition noise and slips of
+    each wheel.
     """
     step = np.diff(poses, axis=0)
     half = poses[:-1, 2] + step[:, 2] / 2
@@ -90,8 +87,8 @@ def odometry(poses: Array, errors: Errors, rng: np.random.Generator) -> tuple[Ar
         count = rng.poisson(errors.slips_per_m * travelled[-1])
         for start in np.sort(rng.uniform(0, travelled[-1], count)):
             wheel = int(rng.integers(2))
-            within = (travelled >= start) & (travelled < start + SLIP_M)
-            told[within, wheel] += wheels[within, wheel] * errors.slip_m / SLIP_M
+            within = (travelled >= start) & (travelled < start + SLIP_DISTANCE_M)
+            told[within, wheel] += wheels[within, wheel] * errors.slip_m / SLIP_DISTANCE_M
             slips.append(int(np.argmax(within)))
     ahead = told.mean(axis=1)
     turned = (told[:, 1] - told[:, 0]) / TRACK_M * (1 + turn) + drift * ahead

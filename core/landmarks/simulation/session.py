@@ -1,9 +1,8 @@
-"""Robots with four hall sensors on a floor of landmarks, with all that is true of them.
+"""Simulation of robots with four hall sensors on a floor of landmarks, with ground truth.
 
-What is simulated is the field of every bar as a cuboid (magpylib) at its own place, sensor
-by sensor, and a differential drive whose odometry errs. Nothing that a solver takes for
-granted is used. Not simulated are a robot that tilts, fields of its motors, sensors that
-lean, and a field that takes its time to be read.
+The field of every bar as a cuboid (magpylib) with errors is evaluated at each sensor, and the
+odometry of a differential drive has errors. The assumptions of the solver are not used. Not
+simulated are a tilted robot, the fields of its motors, tilted sensors, and delays of readings.
 """
 
 from __future__ import annotations
@@ -66,20 +65,20 @@ class Visit(NamedTuple):
 
 @dataclass(frozen=True)
 class SimulatedSession:
-    """A session that never was.
+    """Simulated recording and its ground truth.
 
     Attributes
     ----------
     samples : tuple of HallSamples
-        One a robot.
+        One for each robot.
     truth : tuple of Trajectory
-        In the frame ``"map"``; one pose a sample.
+        In the frame ``"map"``; one pose for each sample.
     odometry : tuple of Trajectory
         In the frame ``"odometry"``, which is the robot's at the start.
     floor : FloorMap
-        As it was given: what a user knows of it.
+        Knowledge of a user: the map as designed.
     floor_as_laid : tuple of Laid
-        What is true of it, row by row.
+        The landmarks as installed, row by row.
     events : tuple of Visit
         In the order of time.
     saturated : int

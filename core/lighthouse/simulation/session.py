@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import quaternion_from_heading, rotation_exp
+from locatk.core.geometry import rotation_exp
 from locatk.core.lighthouse.calibration import (
     FACTORY_UNITS,
     GENERIC_CALIBRATION,
@@ -34,14 +34,18 @@ from locatk.core.lighthouse.simulation.optics import (
     observe_reports,
 )
 from locatk.core.lighthouse.simulation.paths import RobotPath
-from locatk.core.simulation import check_options
+from locatk.core.simulation import (
+    check_options,
+    exact_trajectory,
+    require_fraction_below_1,
+    require_not_negative,
+    require_positive,
+    stamps_ns,
+)
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-START_NS = 1_767_225_600_000_000_000
-"""Start of every simulated session, 2026-01-01T00:00:00Z [ns since 1970]."""
 
 CALIBRATIONS = ("units", "generic", "ideal")
 """Choices of :attr:`SimulationOptions.calibration`."""
@@ -125,17 +129,14 @@ class SimulationOptions:
             (
                 ("robots", self.robots >= 1, "at least 1"),
                 ("stations", 1 <= self.stations <= 16, "1 to 16"),
-                ("duration_s", 0 < self.duration_s < np.inf, "a number above 0"),
-                ("report_hz", 0 < self.report_hz < np.inf, "a number above 0"),
-                ("noise_rad", 0 <= self.noise_rad < np.inf, "0 or more"),
-                ("occlusion", 0 <= self.occlusion < 1, "0 to below 1"),
-                ("outliers", 0 <= self.outliers < 1, "0 to below 1"),
+                *require_positive(self, "duration_s", "report_hz"),
+                *require_not_negative(self, "noise_rad", "seed"),
+                *require_fraction_below_1(self, "occlusion", "outliers"),
                 (
                     "calibration",
                     self.calibration in CALIBRATIONS,
                     "one of " + ", ".join(CALIBRATIONS),
                 ),
-                ("seed", self.seed >= 0, "0 or more"),
             ),
         )
 
@@ -311,7 +312,7 @@ def _to_sweeps(
 ) -> tuple[Sweeps, Mask]:
     """Return the received sweeps in order of time, and a mask of the outliers among them."""
     is_received = np.isfinite(pairs.count)
-    time_ns = START_NS + np.rint(pairs.time_s[is_received] * 1e9).astype(np.int64)
+    time_ns = stamps_ns(pairs.time_s[is_received])
     order = np.argsort(time_ns, kind="stable")
     robot = np.array([link.robot for link in links], np.int32)[pairs.link]
     device = np.broadcast_to(robot[:, None], is_received.shape)[is_received][order]
@@ -333,7 +334,7 @@ def _to_sweeps(
 
 def _visited_markers(markers_m: Array, device: str, visits_s: Array) -> tuple[Marker, ...]:
     """Return markers that a device visited at ``visits_s`` (k, 2), starts and ends."""
-    visits_ns = START_NS + np.rint(visits_s * 1e9).astype(np.int64)
+    visits_ns = stamps_ns(visits_s)
     return tuple(
         Marker(f"marker-{k + 1}", position, (MarkerVisit(device, int(start), int(end)),))
         for k, (position, (start, end)) in enumerate(zip(markers_m, visits_ns, strict=True))
@@ -344,11 +345,6 @@ def _truth(device: str, path: RobotPath, duration_s: float) -> Trajectory:
     """Return the true poses of one robot, except while it is carried."""
     time_s = np.arange(int(np.ceil(duration_s * TRUTH_RATE_HZ)) + 1) / TRUTH_RATE_HZ
     time_s = time_s[np.searchsorted(path.carry_edges_s, time_s) % 2 == 0]
-    return Trajectory(
-        device,
-        "floor",
-        START_NS + np.rint(time_s * 1e9).astype(np.int64),
-        path.position(time_s),
-        quaternion_from_heading(path.heading(time_s)),
-        np.zeros((len(time_s), 6, 6)),
+    return exact_trajectory(
+        device, "floor", stamps_ns(time_s), path.position(time_s), path.heading(time_s)
     )

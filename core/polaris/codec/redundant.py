@@ -1,32 +1,30 @@
-"""Codec ``redundant``: orientations only, all places fixed, four magnets' worth of checks.
+"""Codec ``redundant``: orientations in fixed cells, with check symbols of four magnets.
 
-A tag is a word of M symbols, its orientations in the order of the layout, over the field of
-``q`` elements, q being the largest prime or power of two that is no larger than P. The words
-are those that the checks annul::
+A word is the orientations of the M magnets in the order of the layout, as symbols of the finite
+field of ``q`` elements; q is the largest prime or power of two that is not larger than P. The words
+satisfy four checks::
 
     sum_i w_i x_i^j = 0,   j = 0, 1, 2, 3,     x_i = 0, 1, 2, ... q - 1, infinity
 
-(the place at infinity, which only a tag of q + 1 magnets has, counts in the last check
-alone). It is the doubly extended Reed-Solomon code: any four columns ``(1, x, x^2, x^3)``
-and ``(0, 0, 0, 1)`` are independent (Vandermonde), so two words differ in five places at
-least, as many as four checks can give (Singleton).
+The position at infinity exists only in a tag of q + 1 magnets and counts in the last check alone.
+This is the doubly extended Reed-Solomon code. Any four columns ``(1, x, x^2, x^3)`` and
+``(0, 0, 0, 1)`` are independent (Vandermonde), so two words differ in at least five positions, the
+most that four checks permit (Singleton bound).
 
-The promise. Let f magnets be missing and e misread, by however many steps. A word is
-accepted only where ``2 e + f <= 3``: one missing together with one misread, or up to three
-missing. Without the missing places, words still differ in ``5 - f`` places. Words within
-``r = (3 - f) // 2`` places of what was seen: two of them would differ in at most ``2 r <=
-3 - f`` places, so there is one at most, and it is the right one where ``e <= r``. Where
-``e = r + 1``, another word is at least ``5 - f - e = 4 - f - r >= r + 1`` away: nothing is
-accepted, so one misread more is always noticed (and a third too where nothing is missing).
-Beyond that the code refuses most, not all: of random words it accepts about
-``(1 + M (q - 1)) / q^4``.
+Guarantee. Let f magnets be missing (erasures) and e be misread (errors), each by any number of
+steps. A word is accepted only if ``2 e + f <= 3``: one misread and up to one missing, or up to
+three missing. Without the missing positions, words still differ in ``5 - f`` positions. Two words
+within ``r = (3 - f) // 2`` positions of the observation would differ in at most ``2 r <= 3 - f``
+positions, so there is at most one; it is the correct one if ``e <= r``. If ``e = r + 1``, any other
+word is at least ``5 - f - e = 4 - f - r >= r + 1`` away and nothing is accepted, so one more error
+is always detected (and also a third error if nothing is missing). Beyond that the code detects most
+errors, not all: it accepts about ``(1 + M (q - 1)) / q^4`` of random words.
 
-Why not a library: reedsolo 1.7.0 decodes to the full ``2 e + f <= 4`` and notices nothing
-beyond. Of 1000 random words with four checks, M = 7 at P = 8, it answered wrong without a
-word to 131 with three misread (this code: 0), 258 with four (12), 103 with two misread and
-one missing (0), 439 with one misread and three missing (0). The price: it corrects two
-misread where nothing is missing, and one beside two missing, which are refused here. Also,
-it has no field but GF(2^m) and no words of length q + 1.
+Why no library: reedsolo 1.7.0 decodes up to ``2 e + f <= 4`` and detects no error beyond. Of 1000
+random words with four checks, M = 7 and P = 8, it decoded wrongly 131 with three errors (this code:
+0), 258 with four errors (12), 103 with two errors and one erasure (0), and 439 with one error and
+three erasures (0). In return it corrects two errors without erasure, and one error with two
+erasures, which are rejected here. It has no fields but GF(2^m) and no words of length q + 1.
 """
 
 from __future__ import annotations
@@ -39,117 +37,126 @@ from locatk.core.errors import InputError
 from locatk.core.polaris.codec import mosk
 from locatk.core.polaris.tag import Cell, TagLayout, Tags
 
-CHECKS = 4
-"""Check symbols of a word."""
+CHECK_SYMBOLS = 4
+"""Number of check symbols of a word."""
 
-DISTANCE = CHECKS + 1
-"""Places in which two words differ at least."""
+MIN_WORD_DISTANCE = CHECK_SYMBOLS + 1
+"""Smallest number of positions in which two words differ."""
 
-BUDGET = 3
-"""Twice the misread and once the missing magnets that are accepted, at most."""
+MAX_DECODING_WEIGHT = 3
+"""Largest sum of twice the misread and once the missing magnets that is accepted."""
 
 
 def check(tags: Tags) -> None:
-    """Refuse a design for which there is no such code.
+    """Check that a code exists for a design.
 
     Raises
     ------
     InputError
-        Fewer than five magnets, or more than the field's size and one.
+        There are fewer than five magnets, or more than the size of the field plus one.
     """
-    if tags.magnets <= CHECKS:
+    if tags.magnets <= CHECK_SYMBOLS:
         raise InputError(
-            f"codec 'redundant' spends {CHECKS} magnets on checks, the tag has {tags.magnets}",
-            hint=f"Use at least {DISTANCE} magnets",
+            f"codec 'redundant' needs {CHECK_SYMBOLS} magnets for checks; "
+            f"the tag has {tags.magnets}",
+            hint=f"Use at least {MIN_WORD_DISTANCE} magnets",
         )
-    longest = field_size(tags.orientations) + 1
-    if tags.magnets > longest:
+    max_magnets = field_size(tags.orientations) + 1
+    if tags.magnets > max_magnets:
         raise InputError(
-            f"codec 'redundant' with {tags.orientations} orientations has room for {longest} "
+            f"codec 'redundant' with {tags.orientations} orientations permits {max_magnets} "
             f"magnets, not {tags.magnets}",
             hint="Use fewer magnets or more orientations",
         )
 
 
 def capacity(tags: Tags) -> int:
-    """Number of ids: ``q^(M - 4)``."""
-    return field_size(tags.orientations) ** (tags.magnets - CHECKS)
+    """Return the number of ids, ``q^(M - 4)``."""
+    return field_size(tags.orientations) ** (tags.magnets - CHECK_SYMBOLS)
 
 
 def cells(tags: Tags) -> tuple[Cell, ...]:
-    """Where the magnets of each tag lie: the first placement of codec ``mosk``."""
+    """Return the cells of the magnets of every tag: the first placement of codec ``mosk``."""
     return mosk.placement(tags.order, tags.magnets, 0)
 
 
 def layout(tags: Tags, tag_id: int) -> TagLayout:
-    """Cells and orientations of an id: its digits to the base q, most significant first,
-    are the orientations of the first M - 4 magnets; the checks follow."""
-    code = code_of(tags)
+    """Return the cells and orientations of an id.
+
+    The digits of the id to the base q, most significant first, are the orientations of the first
+    M - 4 magnets. The check symbols follow.
+    """
+    code = code_of_design(tags)
     digits = []
-    rest = tag_id
-    for _ in range(tags.magnets - CHECKS):
-        rest, digit = divmod(rest, code.field.size)
+    remaining = tag_id
+    for _ in range(tags.magnets - CHECK_SYMBOLS):
+        remaining, digit = divmod(remaining, code.field.size)
         digits.append(digit)
-    word = digits[::-1] + [0] * CHECKS
-    places = range(tags.magnets - CHECKS, tags.magnets)
-    filled = code.fill(word, places)
-    assert filled is not None  # four unknowns, four independent checks
-    return TagLayout(cells(tags), filled)
+    symbols = digits[::-1] + [0] * CHECK_SYMBOLS
+    check_positions = range(tags.magnets - CHECK_SYMBOLS, tags.magnets)
+    word = code.complete(symbols, check_positions)
+    assert word is not None  # Four unknowns have a solution of four independent checks.
+    return TagLayout(cells(tags), word)
 
 
 def tag_id(tags: Tags, layout: TagLayout) -> int:
-    """The id of a layout; the inverse of :func:`layout`.
+    """Return the id of a layout; the inverse of :func:`layout`.
 
     Raises
     ------
     InputError
-        Magnets lie elsewhere, or the orientations are no word of the code.
+        The cells are not those of the codec, or the orientations are not a word of the code.
     """
     if layout.cells != cells(tags):
         raise InputError(f"codec 'redundant' has its magnets in the cells {list(cells(tags))}")
-    code = code_of(tags)
-    if max(layout.symbols) >= code.field.size or code.fill(layout.symbols, ()) is None:
+    code = code_of_design(tags)
+    if max(layout.symbols) >= code.field.size or code.complete(layout.symbols, ()) is None:
         raise InputError("the orientations are no word of codec 'redundant'")
-    return message(tags, layout.symbols)
+    return id_of_word(tags, layout.symbols)
 
 
-def message(tags: Tags, word: Sequence[int]) -> int:
-    """The id that a word of the code bears."""
+def id_of_word(tags: Tags, word: Sequence[int]) -> int:
+    """Return the id that a word of the code encodes."""
     size = field_size(tags.orientations)
     result = 0
-    for symbol in word[: tags.magnets - CHECKS]:
+    for symbol in word[: tags.magnets - CHECK_SYMBOLS]:
         result = result * size + symbol
     return result
 
 
-def decode(tags: Tags, seen: Sequence[int | None]) -> tuple[int, ...] | None:
-    """The word that was meant, or None beyond the promise above.
+def decode_word(tags: Tags, observed: Sequence[int | None]) -> tuple[int, ...] | None:
+    """Correct missing and misread orientations.
 
     Parameters
     ----------
-    seen : sequence of M int or None
-        Orientations in the order of the layout; None where a magnet is missing, or has one
-        of the orientations from q on, which no word has.
+    observed : sequence of M int or None
+        Orientations in the order of the layout; None for a missing magnet. Orientations from q on,
+        which no word has, count as missing.
+
+    Returns
+    -------
+    tuple of M int or None
+        The word within the guarantee of the module, or None.
     """
-    code = code_of(tags)
-    missing = [i for i, s in enumerate(seen) if s is None or s >= code.field.size]
-    if len(missing) > BUDGET:
+    code = code_of_design(tags)
+    erased = [i for i, s in enumerate(observed) if s is None or s >= code.field.size]
+    if len(erased) > MAX_DECODING_WEIGHT:
         return None
-    word = [0 if s is None or i in missing else s for i, s in enumerate(seen)]
-    filled = code.fill(word, missing)
-    if filled is not None or len(missing) + 2 > BUDGET:
-        return filled
-    for place in range(len(word)):
-        if place not in missing:
-            filled = code.fill(word, [*missing, place])
-            if filled is not None:
-                return filled
+    symbols = [0 if s is None or i in erased else s for i, s in enumerate(observed)]
+    word = code.complete(symbols, erased)
+    if word is not None or len(erased) + 2 > MAX_DECODING_WEIGHT:
+        return word
+    for position in range(len(symbols)):
+        if position not in erased:
+            word = code.complete(symbols, [*erased, position])
+            if word is not None:
+                return word
     return None
 
 
 @functools.cache
 def field_size(orientations: int) -> int:
-    """q: the largest prime or power of two that is no larger than ``orientations``."""
+    """Return q, the largest prime or power of two that is not larger than ``orientations``."""
     for size in range(orientations, 2, -1):
         if size & (size - 1) == 0 or all(size % d for d in range(2, int(size**0.5) + 1)):
             return size
@@ -157,114 +164,134 @@ def field_size(orientations: int) -> int:
 
 
 @dataclass(frozen=True)
-class Field:
-    """Arithmetic on ``0 .. size - 1``: modulo a prime, or polynomials over GF(2) whose
-    coefficients are the number's bits, modulo the least primitive polynomial.
+class FiniteField:
+    """Arithmetic of a finite field on the numbers ``0 .. size - 1``.
 
-    ``power[i]`` is the i-th power of a generator, over two rounds; ``log`` its inverse.
+    A field of prime size is arithmetic modulo the prime. In a field of size 2^m the bits of a
+    number are the coefficients of a polynomial over GF(2), modulo the smallest primitive
+    polynomial.
+
+    Attributes
+    ----------
+    size : int
+    power : tuple of int
+        Powers of a generator with exponents ``0 .. 2 (size - 1) - 1``, which are two periods.
+    log : tuple of int
+        Exponent of each element but 0, for the generator of ``power``.
     """
 
     size: int
     power: tuple[int, ...]
     log: tuple[int, ...]
 
-    def subtract(self, one: int, other: int) -> int:
+    def subtract(self, a: int, b: int) -> int:
         if self.size & (self.size - 1) == 0:
-            return one ^ other
-        return (one - other) % self.size
+            return a ^ b
+        return (a - b) % self.size
 
-    def multiply(self, one: int, other: int) -> int:
-        if one == 0 or other == 0:
+    def multiply(self, a: int, b: int) -> int:
+        if a == 0 or b == 0:
             return 0
-        return self.power[self.log[one] + self.log[other]]
+        return self.power[self.log[a] + self.log[b]]
 
-    def divide(self, one: int, other: int) -> int:
-        if one == 0:
+    def divide(self, a: int, b: int) -> int:
+        if a == 0:
             return 0
-        return self.power[self.log[one] - self.log[other] + self.size - 1]
+        return self.power[self.log[a] - self.log[b] + self.size - 1]
 
 
 @functools.cache
-def field(size: int) -> Field:
-    """The field of ``size`` elements, a prime or a power of two of at least 3."""
-    binary = size & (size - 1) == 0
-    # In turn: primitive polynomials of this degree, or generators modulo the prime.
-    for choice in range(size, 2 * size) if binary else range(2, size):
+def finite_field(size: int) -> FiniteField:
+    """Return the field of ``size`` elements, a prime or a power of two of at least 3.
+
+    Raises
+    ------
+    ValueError
+        The size is neither a prime nor a power of two.
+    """
+    is_binary = size & (size - 1) == 0
+    # Candidates are polynomials of the degree of the field, or generators modulo the prime.
+    for candidate in range(size, 2 * size) if is_binary else range(2, size):
         powers = [1]
         while len(powers) < size - 1:
-            if binary:
+            if is_binary:
                 shifted = powers[-1] << 1
-                following = shifted ^ choice if shifted >= size else shifted
+                next_power = shifted ^ candidate if shifted >= size else shifted
             else:
-                following = powers[-1] * choice % size
-            if following <= 1:
+                next_power = powers[-1] * candidate % size
+            if next_power <= 1:
                 break
-            powers.append(following)
+            powers.append(next_power)
         if len(set(powers)) == size - 1:
             log = [0] * size
             for exponent, element in enumerate(powers):
                 log[element] = exponent
-            return Field(size, tuple(powers * 2), tuple(log))
+            return FiniteField(size, tuple(powers * 2), tuple(log))
     raise ValueError(f"{size} is neither a prime nor a power of two")
 
 
 @dataclass(frozen=True)
-class Code:
-    """The words that the checks annul.
+class CheckCode:
+    """Linear code of the words that satisfy four checks.
 
     Attributes
     ----------
-    field : Field
+    field : FiniteField
     columns : tuple of 4-tuples
-        What each place counts in the four checks.
+        Coefficients of each position in the four checks.
     """
 
-    field: Field
+    field: FiniteField
     columns: tuple[tuple[int, ...], ...]
 
-    def fill(self, word: Sequence[int], places: Sequence[int]) -> tuple[int, ...] | None:
-        """The one word that agrees with ``word`` except on ``places`` (four at most), or
-        None where there is none."""
+    def complete(self, symbols: Sequence[int], unknown: Sequence[int]) -> tuple[int, ...] | None:
+        """Solve the checks for the symbols at up to four ``unknown`` positions.
+
+        Returns
+        -------
+        tuple of int or None
+            The unique word that agrees with ``symbols`` at all other positions, or None.
+        """
         field = self.field
-        rows = [[*(self.columns[p][j] for p in places), 0] for j in range(CHECKS)]
-        for place, symbol in enumerate(word):
-            if place not in places:
+        rows = [[*(self.columns[p][j] for p in unknown), 0] for j in range(CHECK_SYMBOLS)]
+        for position, symbol in enumerate(symbols):
+            if position not in unknown:
                 for j, row in enumerate(rows):
-                    term = field.multiply(symbol, self.columns[place][j])
+                    term = field.multiply(symbol, self.columns[position][j])
                     row[-1] = field.subtract(row[-1], term)
-        for k in range(len(places)):  # Gauss-Jordan
-            pivot = next(j for j in range(k, CHECKS) if rows[j][k])
+        for k in range(len(unknown)):  # Gauss-Jordan elimination
+            pivot = next(j for j in range(k, CHECK_SYMBOLS) if rows[j][k])
             rows[k], rows[pivot] = rows[pivot], rows[k]
             rows[k] = [field.divide(value, rows[k][k]) for value in rows[k]]
-            for j in range(CHECKS):
+            for j in range(CHECK_SYMBOLS):
                 factor = rows[j][k]
                 if j != k and factor:
                     rows[j] = [
-                        field.subtract(value, field.multiply(factor, top))
-                        for value, top in zip(rows[j], rows[k], strict=True)
+                        field.subtract(value, field.multiply(factor, pivot_value))
+                        for value, pivot_value in zip(rows[j], rows[k], strict=True)
                     ]
-        if any(row[-1] for row in rows[len(places) :]):
+        if any(row[-1] for row in rows[len(unknown) :]):
             return None
-        filled = list(word)
-        for place, row in zip(places, rows, strict=False):
-            filled[place] = row[-1]
-        return tuple(filled)
+        word = list(symbols)
+        for position, row in zip(unknown, rows, strict=False):
+            word[position] = row[-1]
+        return tuple(word)
+
+
+def code_of_design(tags: Tags) -> CheckCode:
+    """Return the code of a design; a word has one symbol for each magnet."""
+    return _check_code(field_size(tags.orientations), tags.magnets)
 
 
 @functools.cache
-def _code(size: int, length: int) -> Code:
-    arithmetic = field(size)
+def _check_code(size: int, length: int) -> CheckCode:
+    field = finite_field(size)
     columns = []
     for x in range(min(length, size)):
         column = [1]
-        while len(column) < CHECKS:
-            column.append(arithmetic.multiply(column[-1], x))
+        while len(column) < CHECK_SYMBOLS:
+            column.append(field.multiply(column[-1], x))
         columns.append(tuple(column))
     if length > size:
-        columns.append((0,) * (CHECKS - 1) + (1,))
-    return Code(arithmetic, tuple(columns))
-
-
-def code_of(tags: Tags) -> Code:
-    """The code of a design, one word symbol a magnet."""
-    return _code(field_size(tags.orientations), tags.magnets)
+        columns.append((0,) * (CHECK_SYMBOLS - 1) + (1,))
+    return CheckCode(field, tuple(columns))

@@ -1,8 +1,8 @@
-"""Cramer-Rao bound: how well a tag can be measured at best, by any method.
+"""Cramer-Rao bound of the pose of a tag: the best accuracy of any unbiased method.
 
-Model: dipoles at one height, a bar that passes straight over them, white noise, and a
-constant offset of each axis of each sensor that nobody knows. The information is that of
-all samples of all sensors; what is not asked for is marginalised (Schur complement).
+Model: dipoles at one height below a bar of sensors that passes straight over them, white noise, and
+an unknown constant offset of each axis of each sensor. The information is that of all samples of
+all sensors; nuisance parameters are marginalized (Schur complement).
 """
 
 from __future__ import annotations
@@ -18,33 +18,41 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.errors import InputError
 from locatk.core.magnetics import MU0_4PI, dipole_tensor
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.tag import TagLayout, Tags, angles, places
+from locatk.core.polaris.tag import TagLayout, Tags, cell_positions, symbol_angles
 
 Array = NDArray[np.float64]
 
-Unknown = Literal["magnets", "strength", "speed", "steps"]
-"""What is unknown besides places, angles and offsets, each with what precedes it: nothing;
-the height and each magnet's moment; a constant speed; the length of every step, of which
-the nominal one and :data:`STEP_SIGMA_M` are known."""
+NuisanceModel = Literal["magnets", "strength", "speed", "steps"]
+"""Unknowns besides positions and angles of the magnets and the offsets of the sensors.
 
-UNKNOWNS: tuple[Unknown, ...] = ("magnets", "strength", "speed", "steps")
+"magnets": none. "strength": the height, and the moment of each magnet. "speed": these, and a
+constant speed. "steps": those of "strength", and the length of every step, with the nominal length
+and :data:`STEP_SIGMA_M` as a prior."""
+
+NUISANCE_MODELS: tuple[NuisanceModel, ...] = ("magnets", "strength", "speed", "steps")
 
 STEP_SIGMA_M = 1e-3
-"""Standard deviation of a step from one sample to the next, as in the published runs."""
+"""Standard deviation of a step from one sample to the next: 1.05 to 1.15 mm were measured on the
+recordings published with the Polaris paper."""
 
-MARGIN = 4.0
-"""The bar passes from this many clearances before the tag to as many behind it."""
+PASS_MARGIN_CLEARANCES = 4.0
+"""Length of the pass before and behind the tag, in clearances."""
 
-MOST_SAMPLES = 400
-"""More of them are taken together by threes, fours, ...: a bound does not feel that."""
+MAX_SAMPLES = 400
+"""Largest number of samples of a pass. Denser samples are averaged in groups, which changes the
+bounds of the angle and across the track by less than 2 %."""
 
 
 @dataclass(frozen=True)
-class Bound:
-    """Standard deviations (rms over magnets and layouts), in metres and radians.
+class AccuracyBound:
+    """Smallest standard deviations, as rms over magnets and layouts.
 
-    ``x``, ``y`` and ``angle`` are those of one magnet in the array's frame (x along the
-    track), ``pose_*`` those of the tag, from the places of its magnets.
+    Attributes
+    ----------
+    x_m, y_m, angle_rad : float
+        Position and angle of one magnet in the frame of the array; x is along the track.
+    pose_x_m, pose_y_m, pose_heading_rad : float
+        Pose of the tag, from the positions of its magnets.
     """
 
     x_m: float
@@ -56,14 +64,14 @@ class Bound:
 
 
 def dipole_gradient(offsets: ArrayLike, moments: ArrayLike) -> Array:
-    """Derivatives of a dipole's field with respect to the offset.
+    """Return the derivatives of the field of dipoles with respect to the offset.
 
     Parameters
     ----------
     offsets : (..., 3) ndarray
-        From dipole to sensor, in metres.
+        Vectors from the dipole to the sensor, in metres.
     moments : (..., 3) ndarray
-        In A m^2; broadcast against ``offsets``.
+        Magnetic moments in A m^2; broadcast against ``offsets``.
 
     Returns
     -------
@@ -72,16 +80,16 @@ def dipole_gradient(offsets: ArrayLike, moments: ArrayLike) -> Array:
 
     Notes
     -----
-    The tensor of third derivatives of 1/r, contracted with the moment.
+    This is the tensor of third derivatives of 1/r, contracted with the moment.
     """
     r, m = np.broadcast_arrays(np.asarray(offsets, float), np.asarray(moments, float))
     square = np.einsum("...i,...i->...", r, r)
-    along = np.einsum("...i,...i->...", r, m)
+    projection = np.einsum("...i,...i->...", r, m)
     mixed = r[..., :, None] * m[..., None, :]
     gradient = mixed + np.swapaxes(mixed, -1, -2)
-    gradient += along[..., None, None] * np.eye(3)
+    gradient += projection[..., None, None] * np.eye(3)
     outer = r[..., :, None] * r[..., None, :]
-    gradient -= (5 * along / square)[..., None, None] * outer
+    gradient -= (5 * projection / square)[..., None, None] * outer
     return np.asarray(gradient * (3 * MU0_4PI / square**2.5)[..., None, None])
 
 
@@ -93,79 +101,79 @@ def magnet_covariance(
     step_m: float,
     heading_rad: float = 0.0,
     offset_m: float = 0.0,
-    unknown: Unknown = "steps",
+    nuisance: NuisanceModel = "steps",
 ) -> Array:
-    """Smallest covariance of the magnets' places and angles in one pass.
+    """Return the smallest covariance of positions and angles of the magnets in one pass.
 
     Parameters
     ----------
-    tags, layout : Tags, Layout
-        The magnets, at ``tags.clearance_m`` below the bar.
+    tags, layout : Tags, TagLayout
+        Magnets, ``tags.clearance_m`` below the bar.
     array : SensorArray
-        Its ``noise_t`` must be known; the delays of its axes do not matter here.
+        Sensors with known ``noise_t``; the delays of their axes are ignored.
     step_m : float
-        Of the bar along its x from sample to sample. The array's frame is that of the
-        sample in the middle of the pass.
+        Distance along x from sample to sample. The frame is that of the array at the sample in the
+        middle of the pass.
     heading_rad, offset_m : float
-        Of the tag in the array's frame, and how far to its left.
-    unknown : {"magnets", "strength", "speed", "steps"}
-        See :data:`Unknown`.
+        Heading of the tag in this frame, and its distance to the left.
+    nuisance : {"magnets", "strength", "speed", "steps"}
+        See :data:`NuisanceModel`.
 
     Returns
     -------
     (3 M, 3 M) ndarray
-        Of x, y, angle of the first magnet, of the second, ..., in m and rad, as in
-        :attr:`locatk.core.polaris.magnets.Sighting.covariance`.
+        Covariance of x, y and angle of the first magnet, of the second, ..., in m and rad, as in
+        :attr:`locatk.core.polaris.magnets.DetectedMagnets.covariance`.
 
     Raises
     ------
     InputError
-        The noise is not known, the step is not positive, or the samples do not determine
-        the magnets.
+        The noise is unknown, the step is not positive, or the samples do not determine the
+        magnets.
     """
     noise = np.asarray(array.noise_t, float)
     if not (np.isfinite(noise).all() and (noise > 0).all()):
-        raise InputError("the noise of the array is not known", hint="Give its noise")
+        raise InputError("the noise of the array is unknown", hint="Give its noise")
     if not (step_m > 0 and math.isfinite(step_m)):
-        raise InputError(f"a step of {step_m} m from sample to sample is no pass")
-    place = turn(places(tags, layout.cells), heading_rad) + [0.0, offset_m]
-    angle = angles(tags, layout.symbols) + heading_rad
-    path, merged = _path(place, step_m, MARGIN * tags.clearance_m)
-    noise = noise / math.sqrt(merged)
+        raise InputError(f"a step of {step_m} m from sample to sample is not positive")
+    position_m = rotate(cell_positions(tags, layout.cells), heading_rad) + [0.0, offset_m]
+    angle_rad = symbol_angles(tags, layout.symbols) + heading_rad
+    path_m, group = _sample_path(position_m, step_m, PASS_MARGIN_CLEARANCES * tags.clearance_m)
+    noise = noise / math.sqrt(group)
 
-    columns, travel = _derivatives(tags, place, angle, array, path, unknown)
-    columns, travel = columns / noise, travel / noise
-    # Offsets are linear: to marginalise them is to take the mean off, sensor by sensor.
+    columns, path_column = _derivatives(tags, position_m, angle_rad, array, path_m, nuisance)
+    columns, path_column = columns / noise, path_column / noise
+    # Offsets are linear unknowns: subtracting the mean of each sensor's axis marginalizes them.
     columns = columns - columns.mean(1, keepdims=True)
     flat = columns.reshape(len(columns), -1)
     information = flat @ flat.T
-    if unknown == "steps":
-        information -= _lost_to_steps(columns, travel, path, merged)
-    wanted = 3 * len(place)
-    return _inverse(information)[:wanted, :wanted]
+    if nuisance == "steps":
+        information -= _information_lost_to_steps(columns, path_column, path_m, group)
+    parameters = 3 * len(position_m)
+    return _inverse(information)[:parameters, :parameters]
 
 
 def pose_covariance(tags: Tags, layout: TagLayout, covariance: Array, heading_rad: float) -> Array:
-    """Covariance (3, 3) of the tag's x, y, heading from that of its magnets.
+    """Return the covariance (3, 3) of the tag's x, y and heading from that of its magnets.
 
-    The weighted fit of the layout to the magnets' places. Their angles would add little,
-    and hand-placed ones mislead (they are off by degrees).
+    The pose is the weighted fit of the layout to the positions of the magnets. Their angles would
+    add little information, and those of magnets placed by hand are wrong by degrees.
 
     Raises
     ------
     InputError
         The magnets do not determine a pose.
     """
-    place = turn(places(tags, layout.cells), heading_rad)
-    keep = np.arange(len(covariance)) % 3 < 2
-    slope = np.zeros((2 * len(place), 3))
-    slope[0::2, 0] = slope[1::2, 1] = 1
-    slope[0::2, 2], slope[1::2, 2] = -place[:, 1], place[:, 0]
-    weight = _inverse(covariance[np.ix_(keep, keep)])
-    return _inverse(slope.T @ weight @ slope)
+    position_m = rotate(cell_positions(tags, layout.cells), heading_rad)
+    is_position = np.arange(len(covariance)) % 3 < 2
+    jacobian = np.zeros((2 * len(position_m), 3))
+    jacobian[0::2, 0] = jacobian[1::2, 1] = 1
+    jacobian[0::2, 2], jacobian[1::2, 2] = -position_m[:, 1], position_m[:, 0]
+    weight = _inverse(covariance[np.ix_(is_position, is_position)])
+    return _inverse(jacobian.T @ weight @ jacobian)
 
 
-def bound(
+def accuracy_bound(
     tags: Tags,
     layouts: Sequence[TagLayout],
     array: SensorArray,
@@ -173,15 +181,15 @@ def bound(
     step_m: float,
     heading_rad: float = 0.0,
     offset_m: float = 0.0,
-    unknown: Unknown = "steps",
-) -> Bound:
-    """The bound, rms over the magnets of all ``layouts``.
+    nuisance: NuisanceModel = "steps",
+) -> AccuracyBound:
+    """Return the bound as rms over the magnets of all ``layouts``.
 
-    Under a sensor a magnet is known better than between two, so the layouts are spread
-    evenly over the sensors' spacing, about ``offset_m``; a single one passes there. Else
-    parameters and errors are those of :func:`magnet_covariance`.
+    A magnet below a sensor is measured better than one between two sensors. The layouts are
+    therefore distributed evenly over the spacing of the sensors, around ``offset_m``. The other
+    parameters and the errors are those of :func:`magnet_covariance`.
     """
-    between = float(np.diff(array.position_m[:2, 1])[0]) if len(array) > 1 else 0.0
+    spacing_m = float(np.diff(array.position_m[:2, 1])[0]) if len(array) > 1 else 0.0
     count = len(layouts)
     magnets, poses = [], []
     for number, layout in enumerate(layouts):
@@ -191,75 +199,99 @@ def bound(
             array,
             step_m=step_m,
             heading_rad=heading_rad,
-            offset_m=offset_m + ((number + 0.5) / count - 0.5) * between,
-            unknown=unknown,
+            offset_m=offset_m + ((number + 0.5) / count - 0.5) * spacing_m,
+            nuisance=nuisance,
         )
         magnets.append(np.diag(covariance).reshape(-1, 3).mean(0))
         poses.append(np.diag(pose_covariance(tags, layout, covariance, heading_rad)))
-    return Bound(*np.sqrt(np.concatenate([np.mean(magnets, 0), np.mean(poses, 0)])).tolist())
+    variances = np.concatenate([np.mean(magnets, 0), np.mean(poses, 0)])
+    return AccuracyBound(*np.sqrt(variances).tolist())
 
 
-def turn(points: Array, angle_rad: float) -> Array:
-    """Points (n, 2) turned counter-clockwise."""
+def rotate(points: Array, angle_rad: float) -> Array:
+    """Rotate points (n, 2) counter-clockwise about the origin."""
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     return points @ np.array([[cos, sin], [-sin, cos]])
 
 
-def _path(place: Array, step_m: float, margin_m: float) -> tuple[Array, int]:
-    """Where the bar is at each sample, 0 in the middle, and how many samples one stands for."""
-    low, high = place[:, 0].min() - margin_m, place[:, 0].max() + margin_m
-    merged = max(1, math.ceil((high - low) / step_m / MOST_SAMPLES))
-    step = step_m * merged
-    return np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step, merged
+def _sample_path(position_m: Array, step_m: float, margin_m: float) -> tuple[Array, int]:
+    """Return the x of the bar (n,) at each sample, and the number of samples averaged in each.
+
+    One of the samples is at 0, the origin of the frame.
+    """
+    low, high = position_m[:, 0].min() - margin_m, position_m[:, 0].max() + margin_m
+    group = max(1, math.ceil((high - low) / step_m / MAX_SAMPLES))
+    step = step_m * group
+    return np.arange(math.floor(low / step), math.ceil(high / step) + 1) * step, group
 
 
 def _derivatives(
-    tags: Tags, place: Array, angle: Array, array: SensorArray, path: Array, unknown: Unknown
+    tags: Tags,
+    position_m: Array,
+    angle_rad: Array,
+    array: SensorArray,
+    path_m: Array,
+    nuisance: NuisanceModel,
 ) -> tuple[Array, Array]:
-    """Derivatives of all samples (n, N, 3).
+    """Return the derivatives of all samples of n positions of the bar and N sensors.
 
-    Returns (p, n, N, 3) with respect to x, y, angle of each magnet and whatever else is
-    unknown, and (n, N, 3) with respect to the bar's way at the sample.
+    Returns
+    -------
+    (p, n, N, 3) ndarray
+        Derivatives with respect to x, y and angle of each magnet and to the nuisance parameters.
+    (n, N, 3) ndarray
+        Derivatives with respect to the position of the bar at the sample.
     """
-    sensors = array.position_m[None, :, :] + path[:, None, None] * [1.0, 0.0, 0.0]
-    source = np.column_stack([place, np.full(len(place), -tags.clearance_m)])
+    sensors = array.position_m[None, :, :] + path_m[:, None, None] * [1.0, 0.0, 0.0]
+    source = np.column_stack([position_m, np.full(len(position_m), -tags.clearance_m)])
     offset = sensors[None] - source[:, None, None, :]
-    direction = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-    across = np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
+    cos, sin, zero = np.cos(angle_rad), np.sin(angle_rad), 0 * angle_rad
+    direction, normal = np.column_stack([cos, sin, zero]), np.column_stack([-sin, cos, zero])
     moment = tags.magnet.moment
-    slope = dipole_gradient(offset, moment * direction[:, None, None, :])
+    gradient = dipole_gradient(offset, moment * direction[:, None, None, :])
     tensor = dipole_tensor(offset)
-    turned = np.einsum("mnsij,mj->mnsi", tensor, moment * across)
-    own = np.stack([-slope[..., 0], -slope[..., 1], turned], 1)
-    travel = slope[..., 0].sum(0)
-    columns = [own.reshape(-1, *own.shape[2:])]
-    if unknown != "magnets":
-        columns += [np.einsum("mnsij,mj->mnsi", tensor, moment * direction)]  # relative moment
-        columns += [slope[..., 2].sum(0)[None]]
-    if unknown == "speed":
-        columns += [(path[:, None, None] * travel)[None]]
-    return np.concatenate(columns), travel
+    by_angle = np.einsum("mnsij,mj->mnsi", tensor, moment * normal)
+    by_magnet = np.stack([-gradient[..., 0], -gradient[..., 1], by_angle], 1)
+    by_path = gradient[..., 0].sum(0)
+    columns = [by_magnet.reshape(-1, *by_magnet.shape[2:])]
+    if nuisance != "magnets":
+        by_relative_moment = np.einsum("mnsij,mj->mnsi", tensor, moment * direction)
+        by_height = gradient[..., 2].sum(0)[None]
+        columns += [by_relative_moment, by_height]
+    if nuisance == "speed":
+        columns += [(path_m[:, None, None] * by_path)[None]]
+    return np.concatenate(columns), by_path
 
 
-def _lost_to_steps(columns: Array, travel: Array, path: Array, merged: int) -> Array:
-    """Information that is lost where every step of the way is unknown.
+def _information_lost_to_steps(
+    columns: Array, path_column: Array, path_m: Array, group: int
+) -> Array:
+    """Return the information that is lost if every step of the path is unknown.
 
-    The way at sample k is only felt by sample k: but for the offsets' share the block of
-    the ways is diagonal. To it comes what is known of the steps, a random walk.
+    The position of the bar at a sample affects that sample only. The information of the positions
+    is therefore diagonal, except for the marginalized offsets. The prior of the steps, a random
+    walk, is added.
     """
-    n = len(path)
-    flat = travel.reshape(n, -1)
+    n = len(path_m)
+    flat = path_column.reshape(n, -1)
     block = np.diag((flat * flat).sum(1)) - flat @ flat.T / n
-    walk = np.diff(np.eye(n), axis=0) / (STEP_SIGMA_M * math.sqrt(merged))
-    block += walk.T @ walk
-    mixed = np.einsum("pnsi,nsi->pn", columns, travel)
-    moving = path != 0  # the frame of the answer is the bar's at path 0
-    block, mixed = block[np.ix_(moving, moving)], mixed[:, moving]
+    step_prior = np.diff(np.eye(n), axis=0) / (STEP_SIGMA_M * math.sqrt(group))
+    block += step_prior.T @ step_prior
+    mixed = np.einsum("pnsi,nsi->pn", columns, path_column)
+    # The position at path 0 is not an unknown, because it defines the frame.
+    is_unknown = path_m != 0
+    block, mixed = block[np.ix_(is_unknown, is_unknown)], mixed[:, is_unknown]
     return np.asarray(mixed @ np.linalg.solve(block, mixed.T))
 
 
 def _inverse(information: Array) -> Array:
-    """Inverse of a positive definite matrix whose unknowns have different units."""
+    """Invert a positive definite matrix of unknowns with different units.
+
+    Raises
+    ------
+    InputError
+        The matrix is singular.
+    """
     scale = np.sqrt(np.diag(information))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
         raise InputError("the samples do not determine the magnets")

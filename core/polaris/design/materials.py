@@ -1,60 +1,78 @@
-"""What a tag is made of: discs, and a bill of materials."""
+"""Magnets and bill of materials of a tag."""
 
 from __future__ import annotations
 
+import math
+
 from locatk.core.errors import InputError
-from locatk.core.materials import Item, remanence
+from locatk.core.materials import MAX_REMANENCE_T, BillItem, remanence_of_grade, size_mm_text
 from locatk.core.polaris.tag import Magnet, Tags
 
-_PAPER_DISCS_M = ((2e-3, 0.5e-3), (1e-3, 0.5e-3))
+PAPER_DISCS_M = ((2e-3, 0.5e-3), (1e-3, 0.5e-3))
+"""Diameter and height of the discs of the Polaris paper (section 7.2)."""
+
+PAPER_DISC_PRICE_USD = 0.015
+"""Upper limit of the price of these discs (Polaris paper, section 7.2)."""
+
+MAGNETOMETER_PRICE_USD = 2.0
+"""Upper limit of the price of an MLX90393 (Polaris paper, section 7.1)."""
+
+SUBSTRATE = "PVC sheet 0.2 mm"
+"""Substrate of the tags of the Polaris paper (section 7.2)."""
+
+MAX_DISC_SIDE_M = 1.0
+"""Size above any disc magnet; a larger value is probably in another unit."""
 
 
-def disc(
+def disc_magnet(
     diameter_m: float,
     height_m: float,
     *,
     grade: str = "",
     remanence_t: float | None = None,
 ) -> Magnet:
-    """A disc of a grade, of a remanence, or of a grade whose remanence was measured.
+    """Return a disc magnet of a grade, or with a measured remanence.
 
     Raises
     ------
     InputError
-        A size or a remanence that cannot be, or neither grade nor remanence.
+        A size or the remanence is impossible, or neither grade nor remanence is given.
     """
     if remanence_t is None:
-        remanence_t = remanence(grade)
-    if not (0 < diameter_m < 1 and 0 < height_m < 1):
-        raise InputError(f"no disc of {diameter_m * 1e3:g} x {height_m * 1e3:g} mm")
-    if not 0 < remanence_t <= 2:
+        remanence_t = remanence_of_grade(grade)
+    if not (0 < diameter_m < MAX_DISC_SIDE_M and 0 < height_m < MAX_DISC_SIDE_M):
+        raise InputError(f"no disc of {size_mm_text(diameter_m, height_m)}")
+    if not 0 < remanence_t <= MAX_REMANENCE_T:
         raise InputError(
-            f"a remanence of {remanence_t:g} T is that of no magnet",
+            f"no magnet has a remanence of {remanence_t:g} T",
             hint="Give tesla: N52 has 1.45",
         )
     return Magnet(diameter_m, height_m, remanence_t, grade)
 
 
-def bill(tags: Tags, sensors: int, sensor: str, count: int = 1) -> tuple[Item, ...]:
-    """What ``count`` tags and one array of ``sensors`` take (Polaris sections 7.1 and 7.2)."""
+def bill_of_materials(
+    tags: Tags, sensors: int, sensor: str, count: int = 1
+) -> tuple[BillItem, ...]:
+    """List the parts of tags and one array of sensors (Polaris paper, sections 7.1 and 7.2)."""
     magnet = tags.magnet
-    size = f"{magnet.diameter_m * 1e3:g} x {magnet.height_m * 1e3:g} mm"
-    known = any(
-        abs(magnet.diameter_m - d) < 1e-6 and abs(magnet.height_m - h) < 1e-6
-        for d, h in _PAPER_DISCS_M
+    is_paper_disc = any(
+        math.isclose(magnet.diameter_m, diameter_m, abs_tol=1e-6)
+        and math.isclose(magnet.height_m, height_m, abs_tol=1e-6)
+        for diameter_m, height_m in PAPER_DISCS_M
     )
-    side = tags.order * tags.spacing_m * 1e3
+    side_mm = tags.order * tags.spacing_m * 1e3
     strength = magnet.grade or f"of {magnet.remanence_t:g} T"
     return (
-        Item(
+        BillItem(
             "disc magnet",
             tags.magnets * count,
-            f"{size} NdFeB {strength}, magnetised across, north marked",
-            0.015 if known else None,
-            "Polaris 7.2" if known else "",
+            f"{size_mm_text(magnet.diameter_m, magnet.height_m)} NdFeB {strength}, magnetised "
+            "across, north marked",
+            PAPER_DISC_PRICE_USD if is_paper_disc else None,
+            "Polaris 7.2" if is_paper_disc else "",
         ),
-        Item("substrate", count, f"{side:.0f} x {side:.0f} mm, PVC sheet 0.2 mm"),
-        Item("glue", 1, "industrial, thin"),
-        Item("magnetometer", sensors, sensor, 2.0, "Polaris 7.1"),
-        Item("microcontroller", 1, "SPI at 2 MHz; USB or Bluetooth LE to the computer"),
+        BillItem("substrate", count, f"{side_mm:.0f} x {side_mm:.0f} mm, {SUBSTRATE}"),
+        BillItem("glue", 1, "industrial, thin"),
+        BillItem("magnetometer", sensors, sensor, MAGNETOMETER_PRICE_USD, "Polaris 7.1"),
+        BillItem("microcontroller", 1, "SPI at 2 MHz; USB or Bluetooth LE to the computer"),
     )

@@ -1,7 +1,8 @@
-"""Will it work? Field, noise, accuracy and limits of a design, before a tag is made.
+"""Evaluation of the design of a tag: field, noise, accuracy and limits, before the tag is made.
 
-The field is magpylib's, of the disc as it is; the accuracy is the Cramer-Rao bound. What
-will not work becomes a warning with numbers and what to do; what is good to know, a note.
+The field is that of a disc (closed form of magpylib) and the accuracy is the Cramer-Rao bound. A
+limit that the design exceeds becomes a warning with figures and a remedy; an assumption becomes a
+note.
 """
 
 from __future__ import annotations
@@ -18,62 +19,75 @@ from scipy.optimize import brentq
 
 from locatk.core.errors import InputError
 from locatk.core.magnetics import dipole_field
-from locatk.core.materials import Item
+from locatk.core.materials import BillItem
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.design.accuracy_bound import Bound, Unknown, bound
-from locatk.core.polaris.design.materials import bill
-from locatk.core.polaris.mlx90393 import Settings, for_rate, published_bar
+from locatk.core.polaris.design.accuracy_bound import (
+    AccuracyBound,
+    NuisanceModel,
+    accuracy_bound,
+)
+from locatk.core.polaris.design.materials import bill_of_materials
+from locatk.core.polaris.mlx90393 import Settings, published_bar, settings_for_rate
 from locatk.core.polaris.tag import Magnet, TagLayout, Tags
+from locatk.core.units import length_text
 
 Array = NDArray[np.float64]
 
-WIDTH_LEVEL = 0.1
-"""Two magnets are apart where the field of one, along its moment, has fallen to this part
-of its peak half a spacing away: the rule that gives the paper's spacings."""
+SEPARATION_FIELD_FRACTION = 0.1
+"""Fraction of its peak to which the field of a magnet, along the moment, falls half a spacing away
+from it if two magnets are separate. This rule reproduces the spacings of the Polaris paper."""
 
-COMPACT = 0.8
-"""The paper's smallest spacing against that (Polaris section 5.2.3)."""
+COMPACT_SPACING_FRACTION = 0.8
+"""Smallest spacing as a fraction of that of separate magnets (Polaris paper, section 5.2.3)."""
 
-PLACEMENT_RAD = math.radians(6)
-"""Error of hand placement, rms: that of the published tags, worst 13 degrees."""
+PLACEMENT_SIGMA_RAD = math.radians(6)
+"""Standard deviation of the orientation of magnets placed by hand, as measured on the recordings of
+the published tags (github.com/wjk5117/Polaris); the worst of their ten magnets is off by 13
+degrees."""
 
-MERGED = 1.5
-"""Clearances between two magnets up to which their peaks merge for some orientations."""
+MERGED_PEAK_SPACING_CLEARANCES = 1.5
+"""Largest spacing, in clearances, at which the peaks of two magnets merge for some orientations:
+for 10 of 256 pairs of orientations of dipoles (:func:`neighbour_error`)."""
 
-SIGMAS = 3.0
-"""Standard deviations of a magnet's angle that must fit into half a step of orientation."""
+ORIENTATION_MARGIN_SIGMAS = 3.0
+"""Standard deviations of the angle of a magnet that half a step of orientation must exceed."""
 
-WEAKEST = 6.0
-"""Signal to noise midway between two sensors below which noise looks like magnets."""
+MIN_SIGNAL_TO_NOISE = 6.0
+"""Smallest ratio of signal to noise midway between two sensors at which noise is not detected as
+magnets."""
 
-FEWEST_SAMPLES, PEAK_SAMPLES = 2.0, 5.0
-"""Over the half-width of a magnet's field: at least, and to find a peak in them."""
+MIN_SAMPLES_PER_FIELD = 2.0
+"""Smallest number of samples over the half-width of the field of a magnet."""
 
-EARTH_T = 65e-6
-"""The strongest field of the Earth on its surface."""
+MIN_SAMPLES_PER_PEAK = 5.0
+"""Number of samples over the half-width of a field from which peaks are found reliably."""
 
-_LAYOUTS = 8
+MAX_EARTH_FIELD_T = 65e-6
+"""Strongest magnetic field of the Earth on its surface (near the poles)."""
+
+SAMPLED_LAYOUTS = 8
+"""Number of layouts of a family over which the accuracy is averaged."""
 
 
 @dataclass(frozen=True)
-class Use:
-    """How tags are to be read.
+class ReadingConditions:
+    """Conditions under which tags are read.
 
     Attributes
     ----------
     sensors, sensor_spacing_m : int, float
-        The bar.
+        Number and spacing of the sensors of the bar.
     settings : Settings
-        Of its magnetometers.
+        Settings of the magnetometers.
     noise_t : float or None
-        Standard deviation of every axis; None for that of the magnetometer.
+        Standard deviation of a sample on each axis; by default that of the magnetometer.
     rate_hz : float or None
-        Samples a second; None for as many as the magnetometer gives.
+        Sampling rate; by default the highest of the magnetometer.
     speed_mps : float
     placement_rad : float or None
-        Standard deviation of the magnets' orientations as laid; None for what was measured
-        of the tags as built, else :data:`PLACEMENT_RAD`.
+        Standard deviation of the orientations of the placed magnets; by default as measured on the
+        tags as built, otherwise :data:`PLACEMENT_SIGMA_RAD`.
     """
 
     sensors: int = 9
@@ -86,50 +100,59 @@ class Use:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What to expect of a design.
+class DesignReport:
+    """Expected performance of a design. The names of the fields are keys of the JSON output.
 
     Attributes
     ----------
+    tags : Tags
+    use : ReadingConditions
     capacity : int
-        Ids of the codec.
+        Number of ids of the codec.
     peak_t, between_t : float
-        Field of one magnet straight above it, and midway between two sensors.
+        Field of one magnet directly above it, and midway between two sensors.
     half_along_m, half_across_m : float
-        Full width at half of the peak, along the moment and across it.
+        Full width of the field at half of the peak, along the moment and across it.
     min_spacing_m, compact_spacing_m : float
-        By the rule of :data:`WIDTH_LEVEL`, and :data:`COMPACT` of it.
+        Spacing by :data:`SEPARATION_FIELD_FRACTION`, and :data:`COMPACT_SPACING_FRACTION` of it.
     neighbour_angle_rad, neighbour_shift_m : float
-        How far off a method is at worst that looks at one magnet at a time, because of one
-        neighbour; ``nan`` where the peaks merge.
+        Largest errors of a method that evaluates one magnet at a time, due to one neighbour;
+        ``nan`` if the peaks merge.
     noise_t : (3,) ndarray
-        By axis of the array; and ``noise_from``: "given", "measured" or "assumed".
+        Standard deviation of a sample by axis of the array.
+    noise_from : {"given", "measured", "assumed"}
+        Origin of ``noise_t``.
     signal_to_noise, between_to_noise : float
         ``peak_t`` and ``between_t`` over the noise of the horizontal axes.
     max_rate_hz, rate_hz : float
-        Of the magnetometer; and what is planned with.
-    step_m, samples, max_speed_mps : float
-        From sample to sample; samples over ``half_across_m``; and the speed at which these
-        are as few as will do.
+        Highest rate of the magnetometer, and the rate of this report.
+    step_m : float
+        Distance from sample to sample.
+    samples : float
+        Number of samples over ``half_across_m``.
+    max_speed_mps : float
+        Speed at which ``samples`` is :data:`MIN_SAMPLES_PER_FIELD`.
     range_t : float
-        The smallest of the axes.
-    known_speed, free_speed : Bound
-        Accuracy of one pass where the speed is known, and where each step is free; ``nan``
-        where the samples are too few.
+        Smallest range of the axes.
+    known_speed, free_speed : AccuracyBound
+        Accuracy of one pass if the speed is known, and if each step is unknown; ``nan`` if there
+        are too few samples.
     placement_rad : float
-        What is planned with.
+        Standard deviation of the orientations of the placed magnets.
     max_orientations : int
-        The largest P that the placement's error allows.
+        Largest P that this error permits.
     misread : float
-        Chance that a tag has a magnet more than half a step off.
-    array_m, tag_m, diagonal_m, play_m : float
-        Widths; and how far to either side a tag may lie.
-    materials : tuple of Item
+        Probability that the orientation of any magnet of a tag is off by more than half a step.
+    array_m, tag_m, diagonal_m : float
+        Widths of the array, of the tag, and of the tag at 45 degrees.
+    play_m : float
+        Largest lateral offset of the tag at which all magnets are below the array.
+    materials : tuple of BillItem
     warnings, notes : tuple of str
     """
 
     tags: Tags
-    use: Use
+    use: ReadingConditions
     capacity: int
     peak_t: float
     between_t: float
@@ -149,8 +172,8 @@ class Plan:
     samples: float
     max_speed_mps: float
     range_t: float
-    known_speed: Bound
-    free_speed: Bound
+    known_speed: AccuracyBound
+    free_speed: AccuracyBound
     placement_rad: float
     max_orientations: int
     misread: float
@@ -158,14 +181,17 @@ class Plan:
     tag_m: float
     diagonal_m: float
     play_m: float
-    materials: tuple[Item, ...]
+    materials: tuple[BillItem, ...]
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
 
 def disc_field(magnet: Magnet, points: Array) -> Array:
-    """Flux density (n, 3) in tesla of a disc at the origin whose moment is along x, at
-    ``points`` (n, 3) in metres (magpylib, closed form of a cylinder)."""
+    """Return the flux density (n, 3) in tesla of a disc at ``points`` (n, 3) in metres.
+
+    The disc is at the origin with its moment along x. The field is the closed form of a cylinder of
+    magpylib.
+    """
     source = magpylib.magnet.Cylinder(
         polarization=(magnet.remanence_t, 0, 0),
         dimension=(magnet.diameter_m, magnet.height_m),
@@ -173,71 +199,87 @@ def disc_field(magnet: Magnet, points: Array) -> Array:
     return np.asarray(source.getB(points), float).reshape(-1, 3)
 
 
-def width(magnet: Magnet, clearance_m: float, level: float, *, across: bool = False) -> float:
-    """Full width in metres at which the field, ``clearance_m`` above the magnet's middle,
-    is ``level`` of its peak: along the moment or across it."""
+def field_width(
+    magnet: Magnet, clearance_m: float, fraction: float, *, across: bool = False
+) -> float:
+    """Return the full width in metres at which the field falls to a fraction of its peak.
+
+    The width is along the moment or across it, ``clearance_m`` above the centre of the magnet.
+    """
     axis = np.array([0.0, 1.0, 0.0]) if across else np.array([1.0, 0.0, 0.0])
-    peak = _size(magnet, [0, 0, clearance_m])
+    peak = _field_strength(magnet, [0, 0, clearance_m])
 
-    def above(way: float) -> float:
-        return _size(magnet, way * axis + [0, 0, clearance_m]) - level * peak
+    def excess(distance: float) -> float:
+        return _field_strength(magnet, distance * axis + [0, 0, clearance_m]) - fraction * peak
 
-    far = clearance_m + magnet.diameter_m
-    while above(far) > 0:
-        far *= 2
-    return float(2 * brentq(above, 0, far, xtol=1e-7))
+    outer = clearance_m + magnet.diameter_m
+    while excess(outer) > 0:
+        outer *= 2
+    return float(2 * brentq(excess, 0, outer, xtol=1e-7))
 
 
 def compact_spacing(magnet: Magnet, clearance_m: float) -> float:
-    """The smallest spacing by the paper, rounded up to a whole mm.
+    """Return the smallest spacing by the rule of the Polaris paper, rounded up to whole mm.
 
     Raises
     ------
     InputError
-        The sensors would be in the magnet.
+        The sensors would be within the magnet.
     """
     _check_clearance(magnet, clearance_m)
-    exact = COMPACT * width(magnet, clearance_m, WIDTH_LEVEL)
+    exact = COMPACT_SPACING_FRACTION * field_width(magnet, clearance_m, SEPARATION_FIELD_FRACTION)
     return math.ceil(exact * 1e3 - 1e-6) / 1e3
 
 
 def neighbour_error(spacing_m: float, clearance_m: float) -> tuple[float, float]:
-    """Worst error of angle (rad) and place (m) of a magnet that is read at the peak of its
-    field, because of one equal neighbour.
+    """Return the largest errors of angle (rad) and position (m) due to one equal neighbour.
 
-    Over 16 x 16 orientations, dipoles. ``nan`` up to :data:`MERGED` clearances apart.
+    They are those of a magnet that is evaluated at the peak of its field, as by the Polaris paper,
+    over 16 x 16 orientations of dipoles. Both are ``nan`` for spacings of up to
+    :data:`MERGED_PEAK_SPACING_CLEARANCES` clearances.
     """
-    if spacing_m <= MERGED * clearance_m:
+    if spacing_m <= MERGED_PEAK_SPACING_CLEARANCES * clearance_m:
         return math.nan, math.nan
-    turns = np.arange(16) * math.tau / 16
-    moments = np.column_stack([np.cos(turns), np.sin(turns), 0 * turns])
-    at = np.zeros((1, 1, 1, 3))
-    for reach, count in ((0.4 * clearance_m, 41), (0.02 * clearance_m, 9)):
-        line = np.linspace(-reach, reach, count)
+    angle_rad = np.arange(16) * math.tau / 16
+    moments = np.column_stack([np.cos(angle_rad), np.sin(angle_rad), 0 * angle_rad])
+    peak_position = np.zeros((1, 1, 1, 3))
+    for half_side, count in ((0.4 * clearance_m, 41), (0.02 * clearance_m, 9)):
+        line = np.linspace(-half_side, half_side, count)
         x, y = np.meshgrid(line, line)
-        points = at + np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
+        points = peak_position + np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
         points[..., 2] = clearance_m
-        own = dipole_field(points, moments[:, None, None])
-        total = own + dipole_field(points - [spacing_m, 0, 0], moments[None, :, None])
+        own_field = dipole_field(points, moments[:, None, None])
+        neighbour_field = dipole_field(points - [spacing_m, 0, 0], moments[None, :, None])
+        total = own_field + neighbour_field
         peak = np.einsum("abpi,abpi->abp", total, total).argmax(-1)[..., None, None]
-        at = np.take_along_axis(points, peak, 2)
-    seen = -np.take_along_axis(total, peak, 2)[:, :, 0]
-    off = np.arctan2(seen[..., 1], seen[..., 0]) - turns[:, None]
-    off = np.abs((off + math.pi) % math.tau - math.pi)
-    return float(off.max()), float(np.hypot(at[..., 0], at[..., 1]).max())
+        peak_position = np.take_along_axis(points, peak, 2)
+    peak_field = -np.take_along_axis(total, peak, 2)[:, :, 0]
+    error_rad = np.arctan2(peak_field[..., 1], peak_field[..., 0]) - angle_rad[:, None]
+    error_rad = np.abs((error_rad + math.pi) % math.tau - math.pi)
+    shift_m = np.hypot(peak_position[..., 0], peak_position[..., 1])
+    return float(error_rad.max()), float(shift_m.max())
 
 
-def plan(tags: Tags, use: Use | None = None, count: int = 1) -> Plan:
-    """What to expect of ``count`` tags of a design; see :class:`Plan`.
+def evaluate_design(
+    tags: Tags, use: ReadingConditions | None = None, count: int = 1
+) -> DesignReport:
+    """Evaluate the design of tags for the conditions under which they are read.
+
+    Parameters
+    ----------
+    tags : Tags
+    use : ReadingConditions, optional
+    count : int
+        Number of tags in the bill of materials.
 
     Raises
     ------
     InputError
-        A design that cannot be: see :func:`locatk.core.polaris.codec.check_design`; a
-        spacing, clearance, speed, rate, noise or error that is not positive; magnets in each
-        other or in the sensors; a bar without sensors.
+        The design is impossible (:func:`locatk.core.polaris.codec.check_design`); spacing,
+        clearance, speed, rate, noise or placement error is not positive; magnets overlap or extend
+        into the sensors; or the bar has no sensors.
     """
-    use = use or Use()
+    use = use or ReadingConditions()
     capacity = codec.capacity(tags)
     magnet, clearance, part = tags.magnet, tags.clearance_m, use.settings
     _check_clearance(magnet, clearance)
@@ -249,125 +291,135 @@ def plan(tags: Tags, use: Use | None = None, count: int = 1) -> Plan:
         ("placement error", use.placement_rad),
     ):
         if value is not None and not (value > 0 and math.isfinite(value)):
-            raise InputError(f"the {name} is {value:g}, not above 0")
+            raise InputError(f"the {name} is {value:g} and must be positive")
     if magnet.diameter_m > tags.spacing_m:
         raise InputError(
             f"magnets of {magnet.diameter_m * 1e3:g} mm do not fit a spacing of "
             f"{tags.spacing_m * 1e3:g} mm"
         )
 
-    array, noise_from = _array(use)
-    horizontal = float(np.sqrt(np.mean(array.noise_t[:2] ** 2)))
-    beside = use.sensor_spacing_m / 2 if use.sensors > 1 else 0.0
-    peak = _size(magnet, [0, 0, clearance])
-    between = min(_size(magnet, [beside, 0, clearance]), _size(magnet, [0, beside, clearance]))
-    wide = width(magnet, clearance, WIDTH_LEVEL)
-    across = width(magnet, clearance, 0.5, across=True)
+    array, noise_from = _sensor_array(use)
+    horizontal_noise = float(np.sqrt(np.mean(array.noise_t[:2] ** 2)))
+    midway = use.sensor_spacing_m / 2 if use.sensors > 1 else 0.0
+    peak = _field_strength(magnet, [0, 0, clearance])
+    between = min(
+        _field_strength(magnet, [midway, 0, clearance]),
+        _field_strength(magnet, [0, midway, clearance]),
+    )
+    separate_spacing = field_width(magnet, clearance, SEPARATION_FIELD_FRACTION)
+    half_across = field_width(magnet, clearance, 0.5, across=True)
     rate = min(use.rate_hz or math.inf, part.max_rate_hz)
     step = use.speed_mps / rate
-    layouts = some_layouts(tags, _LAYOUTS)
-    free = _accuracy(tags, layouts, array, step, "steps")
-    placement = _placement(tags) if use.placement_rad is None else use.placement_rad
-    spread = math.hypot(placement, free.angle_rad if math.isfinite(free.angle_rad) else 0.0)
-    reach = math.pi / tags.orientations / spread
-    neighbour = neighbour_error(tags.spacing_m, clearance)
-    side = (tags.order - 1) * tags.spacing_m
-    bar = (use.sensors - 1) * use.sensor_spacing_m
-    result = Plan(
+    layouts = sample_layouts(tags, SAMPLED_LAYOUTS)
+    free_speed = _accuracy(tags, layouts, array, step, "steps")
+    placement = _placement_sigma(tags) if use.placement_rad is None else use.placement_rad
+    reading = free_speed.angle_rad if math.isfinite(free_speed.angle_rad) else 0.0
+    angle_sigma = math.hypot(placement, reading)
+    half_step_sigmas = math.pi / tags.orientations / angle_sigma
+    neighbour_angle, neighbour_shift = neighbour_error(tags.spacing_m, clearance)
+    tag_width = (tags.order - 1) * tags.spacing_m
+    array_width = (use.sensors - 1) * use.sensor_spacing_m
+    report = DesignReport(
         tags=tags,
         use=use,
         capacity=capacity,
         peak_t=peak,
         between_t=between,
-        half_along_m=width(magnet, clearance, 0.5),
-        half_across_m=across,
-        min_spacing_m=wide,
-        compact_spacing_m=COMPACT * wide,
-        neighbour_angle_rad=neighbour[0],
-        neighbour_shift_m=neighbour[1],
+        half_along_m=field_width(magnet, clearance, 0.5),
+        half_across_m=half_across,
+        min_spacing_m=separate_spacing,
+        compact_spacing_m=COMPACT_SPACING_FRACTION * separate_spacing,
+        neighbour_angle_rad=neighbour_angle,
+        neighbour_shift_m=neighbour_shift,
         noise_t=array.noise_t,
         noise_from=noise_from,
-        signal_to_noise=peak / horizontal,
-        between_to_noise=between / horizontal,
+        signal_to_noise=peak / horizontal_noise,
+        between_to_noise=between / horizontal_noise,
         max_rate_hz=part.max_rate_hz,
         rate_hz=rate,
         step_m=step,
-        samples=across / step,
-        max_speed_mps=across * rate / FEWEST_SAMPLES,
+        samples=half_across / step,
+        max_speed_mps=half_across * rate / MIN_SAMPLES_PER_FIELD,
         range_t=float(np.min(array.range_t)),
         known_speed=_accuracy(tags, layouts, array, step, "strength"),
-        free_speed=free,
+        free_speed=free_speed,
         placement_rad=placement,
-        max_orientations=int(math.pi / (SIGMAS * spread)),
-        misread=1 - math.erf(reach / math.sqrt(2)) ** tags.magnets,
-        array_m=bar,
-        tag_m=side,
-        diagonal_m=math.sqrt(2) * side,
-        play_m=(bar - side) / 2,
-        materials=bill(tags, use.sensors, "Melexis MLX90393", count),
+        max_orientations=int(math.pi / (ORIENTATION_MARGIN_SIGMAS * angle_sigma)),
+        misread=1 - math.erf(half_step_sigmas / math.sqrt(2)) ** tags.magnets,
+        array_m=array_width,
+        tag_m=tag_width,
+        diagonal_m=math.sqrt(2) * tag_width,
+        play_m=(array_width - tag_width) / 2,
+        materials=bill_of_materials(tags, use.sensors, "Melexis MLX90393", count),
     )
-    return replace(result, warnings=tuple(_warnings(result)), notes=tuple(_notes(result)))
+    return replace(report, warnings=tuple(_warnings(report)), notes=tuple(_notes(report)))
 
 
-def some_layouts(tags: Tags, count: int) -> list[TagLayout]:
-    """Layouts of ``count`` tags of the family, drawn the same way every time."""
-    draw = random.Random(0)
+def sample_layouts(tags: Tags, count: int) -> list[TagLayout]:
+    """Return the layouts of ``count`` random tags of the family, the same ones at every call."""
+    generator = random.Random(0)
     total = codec.capacity(tags) if tags.ids is None else len(tags.ids)
-    numbers = [draw.randrange(total) for _ in range(count)]
+    numbers = [generator.randrange(total) for _ in range(count)]
     return [codec.layout_of(tags, n if tags.ids is None else tags.ids[n]) for n in numbers]
 
 
 def _accuracy(
-    tags: Tags, layouts: list[TagLayout], array: SensorArray, step_m: float, unknown: Unknown
-) -> Bound:
-    """The bound; ``nan`` where there are too few samples to tell the magnets."""
+    tags: Tags,
+    layouts: list[TagLayout],
+    array: SensorArray,
+    step_m: float,
+    nuisance: NuisanceModel,
+) -> AccuracyBound:
+    """Return the accuracy bound; ``nan`` if there are too few samples to determine the magnets."""
     try:
-        return bound(tags, layouts, array, step_m=step_m, unknown=unknown)
+        return accuracy_bound(tags, layouts, array, step_m=step_m, nuisance=nuisance)
     except InputError:
-        return Bound(*[math.nan] * 6)
+        return AccuracyBound(*[math.nan] * 6)
 
 
-def _placement(tags: Tags) -> float:
-    """How well the magnets are laid: as measured where tags are calibrated."""
+def _placement_sigma(tags: Tags) -> float:
+    """Return the rms orientation error of the tags as built, or the default if none is known."""
     if not tags.built:
-        return PLACEMENT_RAD
-    off = np.concatenate([built.angle_rad for built in tags.built.values()])
-    return float(np.sqrt(np.mean(off**2)))
+        return PLACEMENT_SIGMA_RAD
+    errors_rad = np.concatenate([built.angle_rad for built in tags.built.values()])
+    return float(np.sqrt(np.mean(errors_rad**2)))
 
 
-def _array(use: Use) -> tuple[SensorArray, str]:
-    """The bar with a noise to plan with, and where that comes from."""
-    part = use.settings
+def _sensor_array(use: ReadingConditions) -> tuple[SensorArray, str]:
+    """Return the bar with its noise, and the origin of the noise."""
+    settings = use.settings
     if use.noise_t is not None:
-        noise, source = np.full(3, use.noise_t), "given"
-    elif np.isfinite(part.noise_t).all():
-        noise, source = part.noise_t, "measured"
+        noise_t, origin = np.full(3, use.noise_t), "given"
+    elif np.isfinite(settings.noise_t).all():
+        noise_t, origin = settings.noise_t, "measured"
     else:
-        noise, source = part.assumed_noise_t, "assumed"
-    return published_bar(use.sensors, use.sensor_spacing_m, part, noise), source
+        noise_t, origin = settings.assumed_noise_t, "assumed"
+    return published_bar(use.sensors, use.sensor_spacing_m, settings, noise_t), origin
 
 
 def _check_clearance(magnet: Magnet, clearance_m: float) -> None:
+    """Check that the sensors are above the magnet."""
     if not clearance_m > magnet.height_m / 2 or not math.isfinite(clearance_m):
         raise InputError(
-            f"the clearance is {clearance_m * 1e3:g} mm from the middle of a magnet "
+            f"the clearance is {clearance_m * 1e3:g} mm from the centre of a magnet "
             f"{magnet.height_m * 1e3:g} mm high",
-            hint="Give the way from the magnets' middle to the sensors",
+            hint="Give the distance from the centre of the magnets to the sensors",
         )
 
 
-def _size(magnet: Magnet, point: Array | list[float]) -> float:
+def _field_strength(magnet: Magnet, point: Array | list[float]) -> float:
+    """Return the magnitude of the flux density of a disc at one point, in tesla."""
     return float(np.linalg.norm(disc_field(magnet, np.asarray(point, float)[None])))
 
 
 # ---- warnings and notes
 
 
-def _warnings(plan: Plan) -> Iterator[str]:
+def _warnings(report: DesignReport) -> Iterator[str]:
     """Describe the limits that a design exceeds, with figures and remedies."""
-    tags, use = plan.tags, plan.use
-    if use.rate_hz is not None and use.rate_hz > plan.max_rate_hz:
-        faster = for_rate(use.rate_hz, use.settings)
+    tags, use = report.tags, report.use
+    if use.rate_hz is not None and use.rate_hz > report.max_rate_hz:
+        faster = settings_for_rate(use.rate_hz, use.settings)
         remedy = (
             "no osr and filt are that fast"
             if faster is None
@@ -376,97 +428,99 @@ def _warnings(plan: Plan) -> Iterator[str]:
         yield (
             f"{use.rate_hz:g} Hz is too fast: three axes take "
             f"{use.settings.conversion_s * 1e3:.2f} ms at osr {use.settings.osr} filt "
-            f"{use.settings.filt}, at most {plan.max_rate_hz:.1f} Hz, with which the rest is "
-            f"planned; {remedy}"
+            f"{use.settings.filt}, at most {report.max_rate_hz:.1f} Hz, which the other figures "
+            f"assume; {remedy}"
         )
-    if plan.samples < FEWEST_SAMPLES:
+    if report.samples < MIN_SAMPLES_PER_FIELD:
         yield (
-            f"{use.speed_mps:g} m/s is too fast: {plan.samples:.1f} samples over a magnet's "
-            f"field of {_mm(plan.half_across_m)}; drive at most {plan.max_speed_mps:.2f} m/s, "
-            "or sample faster"
+            f"{use.speed_mps:g} m/s is too fast: {report.samples:.1f} samples over a magnet's "
+            f"field of {length_text(report.half_across_m)}; drive at most "
+            f"{report.max_speed_mps:.2f} m/s, or sample faster"
         )
-    if plan.between_to_noise < WEAKEST:
+    if report.between_to_noise < MIN_SIGNAL_TO_NOISE:
         yield (
-            f"the field is too weak: {plan.between_t * 1e6:.2g} uT midway between two sensors, "
-            f"{plan.between_to_noise:.1f} times the noise and not {WEAKEST:g}; take larger "
-            "magnets, less clearance or sensors closer together"
+            f"the field is too weak: {report.between_t * 1e6:.2g} uT midway between two sensors, "
+            f"{report.between_to_noise:.1f} times the noise and not {MIN_SIGNAL_TO_NOISE:g}; take "
+            "larger magnets, less clearance or sensors closer together"
         )
-    if plan.peak_t + EARTH_T > plan.range_t:
+    if report.peak_t + MAX_EARTH_FIELD_T > report.range_t:
         yield (
-            f"the sensors saturate: {plan.peak_t * 1e6:.0f} uT above a magnet and up to "
-            f"{EARTH_T * 1e6:.0f} uT of the Earth, but they tell "
-            f"{plan.range_t * 1e6:.0f} uT; take a lower gain, a higher resolution or more "
+            f"the sensors saturate: {report.peak_t * 1e6:.0f} uT above a magnet and up to "
+            f"{MAX_EARTH_FIELD_T * 1e6:.0f} uT of the Earth exceed their range of "
+            f"{report.range_t * 1e6:.0f} uT; take a lower gain, a higher resolution or more "
             "clearance"
         )
     if tags.magnet.diameter_m > tags.clearance_m:
         yield (
-            f"the magnets are too wide for the clearance: {_mm(tags.magnet.diameter_m)} at "
-            f"{_mm(tags.clearance_m)}, where they are no points to the solver and have two "
-            "peaks or a flat one; keep the sensors at least a diameter away"
+            f"the magnets are too wide for the clearance: {length_text(tags.magnet.diameter_m)} at "
+            f"{length_text(tags.clearance_m)}; their field has two peaks or a flat one, which the "
+            "solver's dipoles do not have; keep the sensors at least a diameter away"
         )
-    if tags.orientations > plan.max_orientations:
+    if tags.orientations > report.max_orientations:
+        max_sigma_deg = 180 / ORIENTATION_MARGIN_SIGMAS / tags.orientations
         yield (
             f"{tags.orientations} orientations are too many: half a step is "
-            f"{180 / tags.orientations:.3g} degrees, the magnets are laid to "
-            f"{math.degrees(plan.placement_rad):.2g} and read to "
-            f"{math.degrees(plan.free_speed.angle_rad):.2g} degrees rms, so that "
-            f"{plan.misread:.0%} of the tags have one that reads wrong; take at most "
-            f"{max(plan.max_orientations, 1)}, or come to {180 / SIGMAS / tags.orientations:.2g} "
-            "degrees with a jig or by calibration"
+            f"{180 / tags.orientations:.3g} degrees, the magnets are placed to "
+            f"{math.degrees(report.placement_rad):.2g} and read to "
+            f"{math.degrees(report.free_speed.angle_rad):.2g} degrees rms, so that "
+            f"{report.misread:.0%} of the tags have a misread magnet; take at most "
+            f"{max(report.max_orientations, 1)}, or come to {max_sigma_deg:.2g} degrees with a jig "
+            "or by calibration"
         )
-    if tags.spacing_m <= MERGED * tags.clearance_m:
+    merged_spacing_m = MERGED_PEAK_SPACING_CLEARANCES * tags.clearance_m
+    if tags.spacing_m <= merged_spacing_m:
         yield (
-            f"the magnets are too close: {_mm(tags.spacing_m)} at a clearance of "
-            f"{_mm(tags.clearance_m)}, where two peaks may merge; keep them more than "
-            f"{_mm(MERGED * tags.clearance_m)} apart"
+            f"the magnets are too close: {length_text(tags.spacing_m)} at a clearance of "
+            f"{length_text(tags.clearance_m)}, so that two peaks may merge; keep them more than "
+            f"{length_text(merged_spacing_m)} apart"
         )
-    if plan.play_m < -1e-9:
+    if report.play_m < -1e-9:
+        sensors = math.ceil(report.tag_m / use.sensor_spacing_m - 1e-9) + 1
         yield (
-            f"the tag is wider than the array: {_mm(plan.tag_m)} against {_mm(plan.array_m)}; "
-            f"take {math.ceil(plan.tag_m / use.sensor_spacing_m - 1e-9) + 1} sensors or a "
-            "smaller tag"
+            f"the tag is wider than the array: {length_text(report.tag_m)} against "
+            f"{length_text(report.array_m)}; take {sensors} sensors or a smaller tag"
         )
 
 
-def _notes(plan: Plan) -> Iterator[str]:
+def _notes(report: DesignReport) -> Iterator[str]:
     """Describe the assumptions and restrictions of a design that works."""
-    tags, use = plan.tags, plan.use
-    if plan.noise_from == "assumed":
+    tags, use = report.tags, report.use
+    if report.noise_from == "assumed":
         yield (
             f"The noise at osr {use.settings.osr} filt {use.settings.filt} was never measured; "
-            f"{plan.noise_t[0] * 1e6:.2g} uT is assumed. Record a minute of standing still and "
-            "give what you find."
+            f"{report.noise_t[0] * 1e6:.2g} uT is assumed. Record a minute at standstill and give "
+            "the noise of that recording."
         )
-    if MERGED * tags.clearance_m < tags.spacing_m < plan.compact_spacing_m - 1e-9:
+    merged_spacing_m = MERGED_PEAK_SPACING_CLEARANCES * tags.clearance_m
+    if merged_spacing_m < tags.spacing_m < report.compact_spacing_m - 1e-9:
         yield (
-            f"The spacing is below the paper's rule of {_mm(plan.compact_spacing_m)}: solve by "
-            "the method `joint`; one that takes magnets one at a time is up to "
-            f"{math.degrees(plan.neighbour_angle_rad):.1f} degrees and "
-            f"{_mm(plan.neighbour_shift_m)} off."
+            "The spacing is below the paper's rule of "
+            f"{length_text(report.compact_spacing_m)}: solve by the method `joint`. A method that "
+            "evaluates one magnet at a time has errors of up to "
+            f"{math.degrees(report.neighbour_angle_rad):.1f} degrees and "
+            f"{length_text(report.neighbour_shift_m)}."
         )
     if use.sensors > 1 and use.sensor_spacing_m > tags.spacing_m / 2 + 1e-9:
         yield (
-            f"The sensors are {_mm(use.sensor_spacing_m)} apart, more than half the tag's "
-            f"spacing ({_mm(tags.spacing_m / 2)}): the method `paper` needs two to a magnet."
+            f"The sensors are {length_text(use.sensor_spacing_m)} apart, more than half the tag's "
+            f"spacing ({length_text(tags.spacing_m / 2)}): the method `paper` needs two sensors "
+            "for each magnet."
         )
-    if FEWEST_SAMPLES <= plan.samples < PEAK_SAMPLES:
+    if MIN_SAMPLES_PER_FIELD <= report.samples < MIN_SAMPLES_PER_PEAK:
         yield (
-            f"With {plan.samples:.1f} samples over a magnet's field, peaks are hard to find: "
+            f"With {report.samples:.1f} samples over a magnet's field, peaks are hard to find: "
             "solve by the method `joint`."
         )
-    if -1e-9 <= plan.play_m < tags.spacing_m / 2:
-        yield f"The robot must meet the tag's middle to within {_mm(max(plan.play_m, 0))}."
-    if plan.play_m >= 0 and plan.diagonal_m > plan.array_m + 1e-9:
+    if -1e-9 <= report.play_m < tags.spacing_m / 2:
+        play = length_text(max(report.play_m, 0))
+        yield f"The robot must meet the centre of the tag to within {play}."
+    if report.play_m >= 0 and report.diagonal_m > report.array_m + 1e-9:
         yield (
-            f"Driven across at 45 degrees the tag is {_mm(plan.diagonal_m)} wide, more than the "
-            f"array's {_mm(plan.array_m)}: keep its heading near 0, 90, 180 or 270."
+            f"Crossed at 45 degrees the tag is {length_text(report.diagonal_m)} wide, more than "
+            f"the array's {length_text(report.array_m)}: keep its heading near 0, 90, 180 or 270."
         )
     if tags.codec == "mosk" and tags.min_distance < 2:
         yield (
-            "Any id may occur, so one misread orientation is another tag: a family with a "
-            "smallest distance, or the codec `redundant`, tells or corrects it."
+            "Any id may occur, so one misread orientation is another tag: a family with a minimum "
+            "distance detects it, and the codec `redundant` corrects it."
         )
-
-
-def _mm(metres: float) -> str:
-    return f"{metres * 1e3:.3g} mm"

@@ -1,1 +1,1 @@
-"""Detection of magnets: maximum-likelihood fit of dipoles to one pass of the array."""
+"""Detection of magnets: matched filter and maximum-likelihood fit of dipoles to one pass."""

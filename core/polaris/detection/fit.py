@@ -1,251 +1,721 @@
-"""Maximum likelihood of one pass: magnets, height and the way of the array, all at once."""
+r"""Maximum-likelihood fit of one pass: magnets, height and path of the array together.
+
+Problem
+-------
+The samples of a pass are the fields of M magnets, measured by an array that moves along its x axis
+by an unknown step between samples, on a background of its own for each sensor and axis. Unknowns:
+
+- positions of the magnets (2 M), height, skew (time between the conversions of two axes) and crab
+  angle (between the array's x axis and its path): the nonlinear ones;
+- moments (3 M) and backgrounds (a few Legendre polynomials per channel), which enter linearly;
+- the path (n) and its mean step.
+
+Method
+------
+Moments and backgrounds are solved for whenever the other unknowns are tried (variable projection;
+Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413). The path couples only neighbouring samples,
+so that its block of the normal equations is tridiagonal; it is eliminated before the rest is
+solved, and an iteration costs little more than one evaluation of the field::
+
+              others   path
+            [  G       C    ]   others: positions, height, skew, crab, moments, mean step,
+            [  C^T     T    ]           backgrounds; T is tridiagonal
+
+:func:`locatk.core.least_squares.minimize` runs the damped iterations.
+
+Priors: a step has about the mean length unless samples were lost (a Cauchy distribution: the
+published recordings step by 2.1 mm, and by 9 mm when the host was busy); magnets are flat, and the
+array moves along its x axis. The last two are *nuisances*: they are fixed at zero until a score
+test shows that the samples contradict that, because each costs accuracy if it is zero.
+
+Outliers are down-weighted by Student's t distribution after the first convergence.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.linalg.lapack import dposv
+from scipy.ndimage import median_filter
 
 from locatk.core.errors import DegenerateError
-from locatk.core.polaris.detection.fit_problem import (
-    FIXED,
-    GLOBALS,
-    NUISANCES,
-    Normal,
-    Problem,
-    Trial,
-    solve_scaled,
-)
-from locatk.core.polaris.detection.window import Priors, State, Window
-from locatk.core.robust import robust_sigma
+from locatk.core.least_squares import Indices, cauchy_loss, minimize
+from locatk.core.polaris.detection.field_model import MagnetOffsets
+from locatk.core.polaris.detection.window import PassPriors, PassWindow, trend_basis
+from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE, robust_sigma
 
 Array = NDArray[np.float64]
 
-ROBUST_FREEDOM = 4.0
-"""Degrees of freedom of Student's t by which samples are weighted once the fit stands."""
+NUISANCES = ("crab", "tilt")
+"""Unknowns that are fixed at zero until the samples contradict that: a path that is oblique to the
+bar, and magnets that are not flat."""
 
-REWEIGHTED = 2
-"""How often."""
+GLOBAL_UNKNOWNS = ("height_m", "skew_periods", "crab_rad")
+"""Attributes of :class:`PassState` that hold one number for the whole pass."""
 
-SEEN = 9.0
-"""Squares, in units of the noise, by which a nuisance must explain the samples better to be
-believed. Before that it only widens the covariance: none of them is the rule, and each
-costs accuracy where it is none."""
+FIXING_WEIGHT = 1e18
+"""Information that fixes an unknown: far above that of any sample, in the units used here."""
+
+FIXED_SIGMA_FRACTION = 1e-6
+"""Standard deviation of a nuisance that is fixed, relative to the prior one."""
+
+MAX_STEP_HEIGHTS = 0.7
+"""Largest change of a magnet's position in one step of the fit, in heights: the derivatives are
+useless farther away."""
+
+HEIGHT_STEP_RATIOS = (0.7, 1.4)
+"""Range of the height after a step of the fit, relative to the height before."""
+
+MOMENT_SIGMA_FACTOR = 3.0
+"""Standard deviation of the horizontal components of a moment, relative to the expected one."""
+
+STUDENT_FREEDOM = 4.0
+"""Degrees of freedom of Student's t distribution, by which samples are weighted."""
+
+REWEIGHTING_ROUNDS = 2
+"""Number of fits with reweighted samples."""
+
+OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
+"""Residual beyond which a sample is an outlier, and the fraction of such samples from which they
+are reweighted: four times that of a normal distribution."""
+
+MIN_NUISANCE_GAIN = 9.0
+"""Decrease of the cost beyond one per unknown, in units of the noise, from which a nuisance is
+estimated: three standard deviations."""
+
+COARSE_ITERATIONS, COARSE_GAIN_FRACTION = 12, 1e-3
+"""Iterations of a coarse fit, and the relative decrease of the cost that ends it."""
+
+FINE_ITERATIONS, FINE_GAIN_FRACTION = 30, 4e-5
+"""The same for the final fit."""
+
+REWEIGHTED_ITERATIONS, NUISANCE_ITERATIONS = 5, 10
+"""Iterations of a fit that continues from a minimum: with new weights, with another nuisance."""
+
+RELATIVE_RIDGE = 1e-13
+"""Added to the unit diagonal of scaled normal equations."""
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """The best of the hypotheses near a start.
+class PassState:
+    """Unknowns of one pass.
 
     Attributes
     ----------
-    state : State
+    position_m : (M, 2) ndarray
+        Positions of the magnets.
+    moment_am2 : (M, 3) ndarray
+    path_m : (n,) ndarray
+        Position of the array along the track at each sample.
+    mean_step_m : float
+        Mean distance moved in a sample period.
+    height_m, skew_periods, crab_rad : float
+        See :class:`~locatk.core.polaris.detection.window.PassPriors`.
+    """
+
+    position_m: Array
+    moment_am2: Array
+    path_m: Array
+    mean_step_m: float
+    height_m: float
+    skew_periods: float = 0.0
+    crab_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class PassFit:
+    """Result of a fit.
+
+    Attributes
+    ----------
+    state : PassState
     residual : (n, N, 3) ndarray
-        In standard deviations of the noise; ``nan`` where there is no sample.
-    cost : float
-        Weighted squares and priors.
-    sigma : float
-        Rms of the residual over the degrees of freedom.
-    usual_sigma : float
-        The same by the median, which no outlier moves.
-    shared : float
-        Mean square of what all sensors share of it, in units of the noise: 1 where that is
-        noise alone.
+        In standard deviations of the noise; ``nan`` if there is no sample.
+    rms_sigma : float
+        Rms of the residual, corrected for the number of unknowns.
+    robust_sigma : float
+        The same from the median, which outliers do not change.
+    shared_square : float
+        Mean square of the part of the residual that all sensors share, in units of the noise; 1
+        if that is noise alone.
     covariance : (3 M, 3 M) ndarray
-        Of x, y and angle of each magnet, in m and rad, with the noise as stated.
+        Of x, y and angle of each magnet, in m and rad, for the noise as stated; ``nan`` after a
+        coarse fit, like the next two.
     path_sigma_m : (n,) ndarray
-        Of the path against where most is felt, with the noise as stated; 0 where it is known.
+        Of the path relative to the sample with the strongest field; 0 if the path is known.
     height_sigma_m : float
     converged : bool
     """
 
-    state: State
+    state: PassState
     residual: Array
-    cost: float
-    sigma: float
-    usual_sigma: float
-    shared: float
+    rms_sigma: float
+    robust_sigma: float
+    shared_square: float
     covariance: Array
     path_sigma_m: Array
     height_sigma_m: float
     converged: bool
 
 
-def fit(
-    window: Window,
-    start: State,
-    priors: Priors,
-    *,
-    iterations: int = 30,
-    tolerance: float = 4e-5,
-    final: bool = True,
-) -> Fitted:
-    """The most likely state near ``start``.
-
-    ``final`` asks for all of it: outliers weighted down, nuisances where the samples show
-    any, and the covariance.
+def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> PassFit:
+    """Improve an initial guess, without outlier rejection, nuisances and covariance.
 
     Raises
     ------
     DegenerateError
-        The samples do not determine it.
+        The samples do not determine the magnets.
     """
-    weight = np.isfinite(window.field_t) * window.counts[:, None, None] / window.noise_t**2
+    weight = sample_weights(window)
+    with _degenerate_on_numerical_errors():
+        problem = PassProblem(window, priors, weight, start)
+        equations, converged = _minimize(problem, start, COARSE_ITERATIONS, COARSE_GAIN_FRACTION)
+        return _result(problem, equations.projected, weight, converged, reduced=None)
+
+
+def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFit:
+    """Return the most likely state near an initial guess, with its covariance.
+
+    Outliers are down-weighted, and nuisances are estimated if the samples show any.
+
+    Raises
+    ------
+    DegenerateError
+        The samples do not determine the magnets.
+    """
+    weight = sample_weights(window)
+    gain = FINE_GAIN_FRACTION
+    with _degenerate_on_numerical_errors():
+        problem = PassProblem(window, priors, weight, start)
+        equations, converged = _minimize(problem, start, FINE_ITERATIONS, gain)
+        if _has_outliers(problem.residual(equations.projected)):
+            for _ in range(REWEIGHTING_ROUNDS):
+                factor = _student_weights(problem, equations.projected, weight)
+                problem = PassProblem(window, priors, weight * factor, start)
+                state = equations.projected.state
+                equations, converged = _minimize(problem, state, REWEIGHTED_ITERATIONS, gain)
+        while True:
+            projected = equations.projected
+            reduced = problem.with_free(frozenset(NUISANCES)).reduce(projected)
+            nuisance = _significant_nuisance(problem, reduced, len(start.position_m))
+            if nuisance is None:
+                return _result(problem, projected, weight, converged, reduced)
+            problem = problem.with_free(problem.free | {nuisance})
+            equations, converged = _minimize(problem, projected.state, NUISANCE_ITERATIONS, gain)
+
+
+@contextmanager
+def _degenerate_on_numerical_errors() -> Iterator[None]:
+    """Raise :class:`DegenerateError` for singular matrices and for overflows."""
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
-            return _fit(window, start, priors, weight, iterations, tolerance, final)
+            yield
     except (np.linalg.LinAlgError, FloatingPointError):
         raise DegenerateError("the samples do not determine the magnets") from None
 
 
-def _fit(
-    window: Window,
-    start: State,
-    priors: Priors,
-    weight: Array,
-    iterations: int,
-    tolerance: float,
-    final: bool,
-) -> Fitted:
-    problem = Problem(window, priors, weight, start)
-    trial, converged = _descend(problem, problem.project(start), iterations, tolerance)
-    if not final:
-        return _fitted(problem, trial, weight, converged, None)
-    if _outliers(_residual(problem, trial)):
-        for _ in range(REWEIGHTED):
-            problem = _reweighted(problem, trial, weight, start)
-            trial, converged = _descend(problem, problem.project(trial.state), 5, tolerance)
-    while True:
-        normal = _all_free(problem, trial)
-        seen = _seen(problem, normal, len(start.place_m))
-        if not seen:
-            return _fitted(problem, trial, weight, converged, normal)
-        problem.free |= {seen}
-        trial, converged = _descend(problem, problem.project(trial.state), 10, tolerance)
+def sample_weights(window: PassWindow) -> Array:
+    """Return the inverse variances (n, N, 3) of the averaged samples; 0 if missing."""
+    is_finite = np.isfinite(window.field_t)
+    return np.asarray(is_finite * window.counts[:, None, None] / window.noise_t**2)
 
 
-def _descend(
-    problem: Problem, trial: Trial, iterations: int, tolerance: float
-) -> tuple[Trial, bool]:
-    damping = 1e-3
-    for _ in range(iterations):
-        normal = problem.normal(trial)
-        while True:
-            fresh = problem.project(problem.step(trial, normal, damping))
-            if fresh.cost <= trial.cost:
-                break
-            damping *= 8
-            if damping > 1e6:
-                return trial, True
-        gain = trial.cost - fresh.cost
-        trial, damping = fresh, max(damping / 10, 1e-9)
-        if gain < tolerance * trial.cost:
-            return trial, True
-    return trial, False
+def _minimize(
+    problem: PassProblem, start: PassState, max_iterations: int, min_gain: float
+) -> tuple[PassEquations, bool]:
+    """Return the equations at the minimum near ``start``, and whether the fit converged."""
+    minimum = minimize(problem, start, max_iterations=max_iterations, min_gain=min_gain)
+    return minimum.equations, bool(minimum.converged[0])
 
 
-def _residual(problem: Problem, trial: Trial) -> Array:
-    """(n, N, 3) residual in standard deviations, ``nan`` where there is no sample."""
-    shown = np.where(problem.root > 0, trial.residual, np.nan)
-    return shown.T.reshape(problem.window.field_t.shape)
+# ---- the model and its normal equations
 
 
-def _unweighted(problem: Problem, trial: Trial, weight: Array) -> Array:
-    """The residual (n, N, 3) as if no sample had been weighted down."""
-    used = problem.root.T.reshape(weight.shape)
-    return _residual(problem, trial) * np.sqrt(weight) / np.where(used > 0, used, 1.0)
+@dataclass(frozen=True)
+class ProjectedState:
+    """State with the best moments and backgrounds, and its residual.
 
-
-def _outliers(residual: Array) -> bool:
-    """Whether samples stand out that a normal distribution does not have."""
-    z = np.abs(residual[np.isfinite(residual)])
-    return bool(np.mean(z > 3.5 * max(1.0, 1.4826 * float(np.median(z)))) > 0.002)
-
-
-def _reweighted(problem: Problem, trial: Trial, weight: Array, start: State) -> Problem:
-    """The same with samples weighted by Student's t of their own residual."""
-    z = np.nan_to_num(_unweighted(problem, trial, weight))
-    scale = max(1.0, float(np.median(np.abs(z[weight > 0])) * 1.4826))
-    share = (ROBUST_FREEDOM + 1) / (ROBUST_FREEDOM + (z / scale) ** 2)
-    return Problem(problem.window, problem.priors, weight * share, start)
-
-
-def _all_free(problem: Problem, trial: Trial) -> Normal:
-    """Normal equations in which no nuisance is taken for zero."""
-    closed, problem.free = problem.free, frozenset(NUISANCES)
-    normal = problem.normal(trial)
-    problem.free = closed
-    return normal
-
-
-def _seen(problem: Problem, normal: Normal, magnets: int) -> str:
-    """The nuisance that would explain the samples best, "" where none is needed.
-
-    A score test: the fall of the cost is predicted from the normal equations in which it
-    is free.
+    Attributes
+    ----------
+    state : PassState
+    offsets : MagnetOffsets
+    unit_fields : (3 N, n, 3 M) ndarray
+        Fields of unit moments in units of the noise.
+    cross : (3 N, D, 3 M) ndarray
+        Their products with the backgrounds.
+    residual : (3 N, n) ndarray
+        In units of the noise.
+    cost : float
+        Weighted squares and priors.
     """
-    places = {
-        "crab": [2 * magnets + GLOBALS.index("crab_rad")],
-        "tilt": [normal.moments + 3 * k + 2 for k in range(magnets)],
-    }
-    closed = [name for name in NUISANCES if name not in problem.free]
-    gains = {}
-    for name in closed:
-        gram = normal.gram.copy()
-        for other in closed:
-            if other != name:
-                at = places[other]
-                gram[at, at] *= FIXED
-        gain = float(normal.side @ solve_scaled(gram, normal.side))
-        gains[name] = gain - len(places[name])
-    best = max(gains, key=gains.__getitem__, default="")
-    return best if best and gains[best] > SEEN else ""
+
+    state: PassState
+    offsets: MagnetOffsets
+    unit_fields: Array
+    cross: Array
+    residual: Array
+    cost: float
 
 
-def _fitted(
-    problem: Problem, trial: Trial, weight: Array, converged: bool, normal: Normal | None
-) -> Fitted:
-    window, state = problem.window, trial.state
-    residual = _unweighted(problem, trial, weight)
-    count = int(np.isfinite(residual).sum())
-    unknowns = 5 * len(state.place_m) + len(problem.background_gram)
-    if window.path_m is None:
-        unknowns += len(window.frames)
-    share = np.sqrt(count / max(count - unknowns, 1))
-    sigma = float(np.sqrt(np.nansum(residual**2) / max(count, 1)) * share)
-    usual = robust_sigma(residual) * float(share)
-    shared = problem.shared_square(trial)
-    if normal is None:
-        size = 3 * len(state.place_m)
-        nothing = np.full((size, size), np.nan)
-        path = np.full(len(window.frames), np.nan)
-        return Fitted(
-            state, residual, trial.cost, sigma, usual, shared, nothing, path, np.nan, converged
+@dataclass(frozen=True)
+class ReducedEquations:
+    """Normal equations at a state, from which the path is eliminated.
+
+    Attributes
+    ----------
+    hessian, descent : (q, q), (q,) ndarray
+        Unknowns: x of the magnets, their y, :data:`GLOBAL_UNKNOWNS`, moments, the mean step,
+        backgrounds. The descent is the negative gradient.
+    first_moment : int
+        Index of the first moment.
+    full_diagonal : (q,) ndarray
+        Diagonal of the Hessian before the path was eliminated; the damping is relative to it.
+    path, coupling : (n,), (n, q) ndarray or None
+        The path's step is ``path - coupling @ x``; None if the path is known.
+    band : (2, n) ndarray or None
+        Tridiagonal block of the path.
+    """
+
+    hessian: Array
+    descent: Array
+    first_moment: int
+    full_diagonal: Array
+    path: Array | None = None
+    coupling: Array | None = None
+    band: Array | None = None
+
+
+class PassEquations:
+    """Equations of one pass for :func:`~locatk.core.least_squares.minimize`.
+
+    The derivatives are computed only if a step is asked for: not for trials that are rejected.
+    """
+
+    def __init__(self, problem: PassProblem, projected: ProjectedState) -> None:
+        self.problem, self.projected = problem, projected
+        self.cost = np.array([projected.cost])
+
+    @functools.cached_property
+    def reduced(self) -> ReducedEquations:
+        """Normal equations without the path."""
+        return self.problem.reduce(self.projected)
+
+    def solve(self, damping: Array, problems: Indices) -> PassStep:
+        """Return the damped step."""
+        reduced = self.reduced
+        hessian = reduced.hessian.copy()
+        hessian[np.diag_indices(len(hessian))] += damping[0] * reduced.full_diagonal
+        change = solve_scaled(hessian, reduced.descent)
+        m = len(self.projected.state.position_m)
+        largest = np.abs(change[: 2 * m]).max(initial=0.0)
+        limit = MAX_STEP_HEIGHTS * self.projected.state.height_m
+        change *= min(1.0, limit / max(largest, 1e-12))
+        if reduced.path is None or reduced.coupling is None:
+            return PassStep(change, None, 0.0)
+        path = reduced.path - reduced.coupling @ change
+        return PassStep(change, path, change[reduced.first_moment + 3 * m])
+
+
+@dataclass(frozen=True)
+class PassStep:
+    """Step of the positions and global unknowns (first in ``change``), path and mean step."""
+
+    change: Array
+    path_m: Array | None
+    mean_step_m: float
+
+
+class PassProblem:
+    """Fit of one pass as a problem for :func:`~locatk.core.least_squares.minimize`.
+
+    Rows are ordered by channel (sensor and axis), then by sample, so that each channel's
+    background is a block of its own.
+
+    Parameters
+    ----------
+    window : PassWindow
+    priors : PassPriors
+    weight : (n, N, 3) ndarray
+        Inverse variance of each sample, 0 if missing.
+    start : PassState
+        Its mean step determines how much steps may differ.
+    """
+
+    def __init__(
+        self, window: PassWindow, priors: PassPriors, weight: Array, start: PassState
+    ) -> None:
+        self.window, self.priors = window, priors
+        self.jitter_m = priors.jitter_fraction * abs(start.mean_step_m) + 1e-6
+        self.free: frozenset[str] = frozenset()
+        self.gaps = np.diff(window.time_periods)
+        n, sensors, _ = window.field_t.shape
+        self.shape = (3 * sensors, n)
+        self.root = np.ascontiguousarray(np.sqrt(weight).reshape(n, -1).T)
+        # A shared field has covariance tau^2 u u^T besides the unit noise of each axis; a mean of
+        # several samples has less of both.
+        information = (self.root.reshape(-1, 3, n) ** 2).sum(axis=0)
+        self.shared_excess = window.common_t**2 / window.counts * information
+        self.shared_factor = (1 - 1 / np.sqrt(1 + self.shared_excess)) / np.maximum(
+            information, 1e-300
         )
-    covariance, path, height = _covariances(normal, state)
-    return Fitted(
-        state, residual, trial.cost, sigma, usual, shared, covariance, path, height, converged
+        # The fields are used near zero, where weights that change from sample to sample cannot
+        # turn a level into a signal.
+        field = np.nan_to_num(window.field_t).reshape(n, -1).T
+        level = (field * self.root).sum(axis=1) / np.maximum(self.root.sum(axis=1), 1e-300)
+        self.target = self.whiten(field - level[:, None])
+        # Positions are relative to the sample with the strongest field; the variance of the path
+        # is zero there.
+        self.reference = int(np.argmax(median_filter((self.target**2).sum(axis=0), 5)))
+        # (C, n, D). The ridge serves channels without samples, whose background is undetermined.
+        basis = trend_basis(window.time_periods, window.trend_terms)
+        self.background = self.root[:, :, None] * basis
+        gram = self.background.transpose(0, 2, 1) @ self.background
+        gram += 1e-9 * max(float(gram.max(initial=0.0)), 1e-300) * np.eye(window.trend_terms)
+        self.background_inverse = np.linalg.inv(gram)
+        self.background_hessian = np.zeros((gram[..., 0].size, gram[..., 0].size))
+        for channel, block in enumerate(gram):
+            inside = slice(channel * window.trend_terms, (channel + 1) * window.trend_terms)
+            self.background_hessian[inside, inside] = block
+
+    def with_free(self, free: frozenset[str]) -> PassProblem:
+        """Return the same problem with other nuisances estimated."""
+        problem = copy.copy(self)
+        problem.free = free
+        return problem
+
+    def linearize(self, state: PassState, problems: Indices) -> PassEquations:
+        """Return the equations at a state."""
+        return PassEquations(self, self.project(state))
+
+    def retract(self, state: PassState, step: PassStep) -> PassState:
+        """Return the state after a step."""
+        m = len(state.position_m)
+        values = {
+            name: getattr(state, name) + step.change[2 * m + k]
+            for k, name in enumerate(GLOBAL_UNKNOWNS)
+        }
+        low, high = (ratio * state.height_m for ratio in HEIGHT_STEP_RATIOS)
+        values["height_m"] = float(np.clip(values["height_m"], low, high))
+        return replace(
+            state,
+            position_m=state.position_m + step.change[: 2 * m].reshape(2, m).T,
+            path_m=state.path_m if step.path_m is None else state.path_m + step.path_m,
+            mean_step_m=state.mean_step_m + step.mean_step_m,
+            **values,
+        )
+
+    def whiten(self, rows: Array) -> Array:
+        """Scale rows (C, n) or (C, n, k) to unit noise, and reduce the part that sensors share.
+
+        A background of each channel remains one of each channel.
+        """
+        is_wide = rows.ndim == 3
+        root = self.root[..., None] if is_wide else self.root
+        scaled = rows * root
+        if not self.window.common_t:
+            return scaled
+        scaled = scaled.reshape(-1, 3, *rows.shape[1:])
+        root = root.reshape(-1, 3, *root.shape[1:])
+        factor = self.shared_factor[..., None] if is_wide else self.shared_factor
+        shared = factor * (root * scaled).sum(axis=0)
+        return np.asarray((scaled - root * shared).reshape(rows.shape))
+
+    def shared_square(self, projected: ProjectedState) -> float:
+        """Return the mean square of the part of the residual that all sensors share.
+
+        It is in units of the noise, as it was before :meth:`whiten` reduced it.
+        """
+        n = self.shape[1]
+        root = self.root.reshape(-1, 3, n)
+        information = (root**2).sum(axis=0)
+        square = (root * projected.residual.reshape(-1, 3, n)).sum(axis=0) ** 2
+        square *= 1 + self.shared_excess
+        is_observed = information > 0
+        return float((square[is_observed] / information[is_observed]).mean())
+
+    def residual(self, projected: ProjectedState) -> Array:
+        """Return the weighted residual (n, N, 3), ``nan`` if there is no sample."""
+        observed = np.where(self.root > 0, projected.residual, np.nan)
+        return observed.T.reshape(self.window.field_t.shape)
+
+    def unweighted_residual(self, projected: ProjectedState, weight: Array) -> Array:
+        """Return the residual (n, N, 3) as if all samples had the given weights."""
+        used = self.root.T.reshape(weight.shape)
+        return self.residual(projected) * np.sqrt(weight) / np.where(used > 0, used, 1.0)
+
+    def magnet_offsets(self, state: PassState) -> MagnetOffsets:
+        """Return the offsets from the magnets to the sensors at each sample."""
+        sensors = self.window.sensors_m
+        skew = np.outer(self.window.axis_order * state.skew_periods, self.local_step(state))
+        along = state.path_m + skew
+        across = np.tan(state.crab_rad) * (state.path_m if state.crab_rad else np.zeros(1))
+        position = state.position_m
+        return MagnetOffsets.from_components(
+            along[:, :, None] + (sensors[:, 0, None] - position[:, 0])[:, None, None],
+            across[:, None] + (sensors[:, 1, None] - position[:, 1])[:, None, None],
+            state.height_m,
+        )
+
+    def local_step(self, state: PassState) -> Array:
+        """Return the step (n,) of a sample period around each sample, by a running median."""
+        if len(state.path_m) < 3:
+            return np.full(len(state.path_m), state.mean_step_m)
+        steps = np.diff(state.path_m) / self.gaps
+        padded = np.concatenate([steps[:1], steps[:1], steps, steps[-1:], steps[-1:]])
+        return np.median(np.lib.stride_tricks.sliding_window_view(padded, 4), axis=1)
+
+    def project(self, state: PassState) -> ProjectedState:
+        """Solve for the moments and backgrounds, given all other unknowns."""
+        offsets = self.magnet_offsets(state)
+        fields = offsets.unit_fields(self.window.disc_correction_m2)
+        m = fields.shape[3]
+        unit_fields = self.whiten(fields.reshape(*self.shape, 3 * m))
+        transposed = self.background.transpose(0, 2, 1)
+        cross, level = transposed @ unit_fields, transposed @ self.target[:, :, None]
+        solved = self.background_inverse @ np.concatenate([cross, level], axis=2)
+        flat, flat_cross = unit_fields.reshape(-1, 3 * m), cross.reshape(-1, 3 * m)
+        hessian = flat.T @ flat - flat_cross.T @ solved[..., :-1].reshape(-1, 3 * m)
+        hessian[np.diag_indices(3 * m)] += self.moment_information(m)
+        right = flat.T @ self.target.ravel() - flat_cross.T @ solved[..., -1].ravel()
+        moments = np.linalg.solve(hessian, right)
+        levels = solved[..., -1:] - solved[..., :-1] @ moments[:, None]
+        residual = self.target - unit_fields @ moments - (self.background @ levels)[..., 0]
+        state = replace(state, moment_am2=moments.reshape(m, 3))
+        cost = (residual**2).sum() + self.moment_information(m) @ moments**2
+        cost += self.prior_cost(state)
+        return ProjectedState(state, offsets, unit_fields, cross, residual, float(cost))
+
+    def moment_information(self, m: int) -> Array:
+        """Return the prior inverse variances (3 M,) of the moments."""
+        horizontal = MOMENT_SIGMA_FACTOR * self.priors.moment_am2
+        tilt = self.priors.tilt_sigma * (1.0 if "tilt" in self.free else FIXED_SIGMA_FRACTION)
+        vertical = tilt * self.priors.moment_am2
+        return np.tile(1 / np.array([horizontal, horizontal, vertical]) ** 2, m)
+
+    def global_prior(self, name: str) -> tuple[float, float]:
+        """Return mean and standard deviation of a global unknown."""
+        priors = self.priors
+        if name == "height_m":
+            return priors.height_m
+        if name == "skew_periods":
+            return priors.skew_periods if np.any(self.window.axis_order) else (0.0, 1e-9)
+        return 0.0, priors.crab_sigma_rad * (1.0 if "crab" in self.free else FIXED_SIGMA_FRACTION)
+
+    def prior_cost(self, state: PassState) -> float:
+        """Return the cost of the priors, except for that of the moments."""
+        cost = 0.0
+        for name in GLOBAL_UNKNOWNS:
+            mean, sigma = self.global_prior(name)
+            cost += ((getattr(state, name) - mean) / sigma) ** 2
+        if self.window.path_m is None:
+            excess, scale = self.excess_steps(state)
+            cost += 2 * float(np.log1p(excess**2 / scale**2).sum())
+        return cost
+
+    def excess_steps(self, state: PassState) -> tuple[Array, Array]:
+        """Return the deviations (n - 1,) of the steps from the mean one, and their half widths."""
+        excess = np.diff(state.path_m) - state.mean_step_m * self.gaps
+        return excess, self.jitter_m * np.sqrt(self.gaps)
+
+    def reduce(self, projected: ProjectedState) -> ReducedEquations:
+        """Return the normal equations at a state, from which the path is eliminated."""
+        channels, n = self.shape
+        state = projected.state
+        m = len(state.position_m)
+        by_x, by_y, by_z = projected.offsets.gradients(state.moment_am2)
+        # Sums over few magnets: a product takes a quarter of the time of a sum.
+        total_x, total_y, total_z = (by @ np.ones(m) for by in (by_x, by_y, by_z))
+        tangent = np.tan(state.crab_rad)
+        p = 2 * m + len(GLOBAL_UNKNOWNS)
+        columns = np.empty((*total_x.shape, p))
+        np.negative(by_x, out=columns[..., :m])
+        np.negative(by_y, out=columns[..., m : 2 * m])
+        columns[..., 2 * m] = total_z
+        columns[..., 2 * m + 1] = total_x * np.outer(self.window.axis_order, self.local_step(state))
+        columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
+        inner = np.concatenate(
+            [self.whiten(columns.reshape(channels, n, p)), projected.unit_fields], axis=2
+        )
+        along = self.whiten((total_x + tangent * total_y).reshape(channels, n))
+        # Order: positions and globals (p), moments (up to q), the mean step, backgrounds.
+        q = inner.shape[2]
+        size = q + 1 + len(self.background_hessian)
+        hessian, descent = np.zeros((size, size)), np.zeros(size)
+        flat = inner.reshape(-1, q)
+        hessian[:q, :q] = flat.T @ flat
+        transposed = self.background.transpose(0, 2, 1)
+        cross = np.concatenate([transposed @ inner[..., :p], projected.cross], axis=2)
+        cross = cross.reshape(-1, q)
+        hessian[:q, q + 1 :], hessian[q + 1 :, :q] = cross.T, cross
+        hessian[q + 1 :, q + 1 :] = self.background_hessian
+        descent[:q] = flat.T @ projected.residual.ravel()
+        descent[q + 1 :] = (transposed @ projected.residual[:, :, None]).ravel()
+        for index, name in enumerate(GLOBAL_UNKNOWNS, 2 * m):
+            mean, sigma = self.global_prior(name)
+            hessian[index, index] += 1 / sigma**2
+            descent[index] -= (getattr(state, name) - mean) / sigma**2
+        moments = np.arange(p, q)
+        hessian[moments, moments] += self.moment_information(m)
+        descent[p:q] -= self.moment_information(m) * state.moment_am2.ravel()
+        if self.window.path_m is not None:
+            hessian[q, q] += FIXING_WEIGHT
+            return ReducedEquations(hessian, descent, p, np.diag(hessian))
+        # The path: a tridiagonal block, coupled with all other unknowns.
+        coupling = np.zeros((size, n))
+        coupling[:q] = np.einsum("cn,cnq->qn", along, inner)
+        coupling[q + 1 :] = (along[:, :, None] * self.background).transpose(0, 2, 1).reshape(-1, n)
+        excess, scale = self.excess_steps(state)
+        weight = 2 / (scale**2 + excess**2)
+        band = np.zeros((2, n))
+        band[1] = (along**2).sum(axis=0)
+        band[1, :-1] += weight
+        band[1, 1:] += weight
+        band[0, 1:] = -weight
+        band[1, self.reference] += FIXING_WEIGHT
+        path_descent = (along * projected.residual).sum(axis=0)
+        path_descent[:-1] += weight * excess
+        path_descent[1:] -= weight * excess
+        hessian[q, q] += weight @ self.gaps**2
+        descent[q] += weight @ (self.gaps * excess)
+        coupling[q, :-1] += weight * self.gaps
+        coupling[q, 1:] -= weight * self.gaps
+        solved = solveh_banded(
+            band, np.column_stack([coupling.T, path_descent]), check_finite=False
+        )
+        return ReducedEquations(
+            hessian=hessian - coupling @ solved[:, :-1],
+            descent=descent - coupling @ solved[:, -1],
+            first_moment=p,
+            full_diagonal=np.diag(hessian),
+            path=solved[:, -1],
+            coupling=solved[:, :-1],
+            band=band,
+        )
+
+
+def solve_scaled(matrix: Array, right: Array) -> Array:
+    """Solve a positive definite system whose unknowns have very different units.
+
+    Raises
+    ------
+    LinAlgError
+        The matrix is not positive definite.
+    """
+    diagonal = np.diag(matrix)
+    if not (np.all(np.isfinite(matrix)) and np.all(diagonal > 0)):
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    scale = 1 / np.sqrt(diagonal)
+    scaled = matrix * scale[:, None] * scale
+    scaled[np.diag_indices(len(matrix))] += RELATIVE_RIDGE
+    # LAPACK itself: for a hundred unknowns scipy's wrappers take longer than the solution.
+    _, solved, info = dposv(scaled, (right.T * scale).T)
+    if info:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return np.asarray((solved.T * scale).T)
+
+
+# ---- outliers, nuisances, covariance
+
+
+def _has_outliers(residual: Array) -> bool:
+    """Return whether more samples are far off than in a normal distribution."""
+    size = np.abs(residual[np.isfinite(residual)])
+    limit = OUTLIER_SIGMAS * max(1.0, SIGMA_PER_MEDIAN_ABSOLUTE * float(np.median(size)))
+    return bool(np.mean(size > limit) > MAX_OUTLIER_FRACTION)
+
+
+def _student_weights(problem: PassProblem, projected: ProjectedState, weight: Array) -> Array:
+    """Return weights (n, N, 3) of samples by Student's t distribution of their residuals.
+
+    They are those of a Cauchy loss whose scale is the square root of the degrees of freedom.
+    """
+    residual = np.nan_to_num(problem.unweighted_residual(projected, weight))
+    sigma = max(1.0, robust_sigma(residual[weight > 0]))
+    _, factor = cauchy_loss(residual, np.sqrt(STUDENT_FREEDOM) * sigma)
+    return (STUDENT_FREEDOM + 1) / STUDENT_FREEDOM * factor
+
+
+def _significant_nuisance(
+    problem: PassProblem, reduced: ReducedEquations, magnets: int
+) -> str | None:
+    """Return the fixed nuisance that would explain the samples best; None if none is needed.
+
+    A score test: the decrease of the cost is predicted from normal equations in which all
+    nuisances are free.
+    """
+    indices = {
+        "crab": [2 * magnets + GLOBAL_UNKNOWNS.index("crab_rad")],
+        "tilt": [reduced.first_moment + 3 * k + 2 for k in range(magnets)],
+    }
+    fixed = [name for name in NUISANCES if name not in problem.free]
+    gains = {}
+    for name in fixed:
+        hessian = reduced.hessian.copy()
+        for other in fixed:
+            if other != name:
+                hessian[indices[other], indices[other]] *= FIXING_WEIGHT
+        gain = float(reduced.descent @ solve_scaled(hessian, reduced.descent))
+        gains[name] = gain - len(indices[name])
+    best = max(gains, key=gains.__getitem__, default=None)
+    return best if best is not None and gains[best] > MIN_NUISANCE_GAIN else None
+
+
+def _result(
+    problem: PassProblem,
+    projected: ProjectedState,
+    weight: Array,
+    converged: bool,
+    reduced: ReducedEquations | None,
+) -> PassFit:
+    """Collect the result of a fit; without ``reduced`` there are no covariances."""
+    window, state = problem.window, projected.state
+    m, n = len(state.position_m), len(window.time_periods)
+    residual = problem.unweighted_residual(projected, weight)
+    count = int(np.isfinite(residual).sum())
+    unknowns = 5 * m + len(problem.background_hessian)
+    if window.path_m is None:
+        unknowns += n
+    correction = float(np.sqrt(count / max(count - unknowns, 1)))
+    covariance, path_sigma = np.full((3 * m, 3 * m), np.nan), np.full(n, np.nan)
+    height_sigma = np.nan
+    if reduced is not None:
+        covariance, path_sigma, height_sigma = _covariances(reduced, state)
+    return PassFit(
+        state=state,
+        residual=residual,
+        rms_sigma=float(np.sqrt(np.nansum(residual**2) / max(count, 1))) * correction,
+        robust_sigma=robust_sigma(residual) * correction,
+        shared_square=problem.shared_square(projected),
+        covariance=covariance,
+        path_sigma_m=path_sigma,
+        height_sigma_m=height_sigma,
+        converged=converged,
     )
 
 
-def _covariances(normal: Normal, state: State) -> tuple[Array, Array, float]:
-    """Covariance (3 M, 3 M) of places and angles; standard deviations of path and height."""
-    m = len(state.place_m)
-    full = solve_scaled(normal.gram, np.eye(len(normal.gram)))
+def _covariances(reduced: ReducedEquations, state: PassState) -> tuple[Array, Array, float]:
+    """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height."""
+    m = len(state.position_m)
+    full = solve_scaled(reduced.hessian, np.eye(len(reduced.hessian)))
     # From x, y and moment to x, y and angle.
     jacobian = np.zeros((3 * m, len(full)))
     square = (state.moment_am2[:, :2] ** 2).sum(axis=1)
     for k in range(m):
         jacobian[3 * k, k] = jacobian[3 * k + 1, m + k] = 1.0
-        at = normal.moments + 3 * k
-        jacobian[3 * k + 2, at] = -state.moment_am2[k, 1] / square[k]
-        jacobian[3 * k + 2, at + 1] = state.moment_am2[k, 0] / square[k]
+        moment = reduced.first_moment + 3 * k
+        jacobian[3 * k + 2, moment] = -state.moment_am2[k, 1] / square[k]
+        jacobian[3 * k + 2, moment + 1] = state.moment_am2[k, 0] / square[k]
     path = np.zeros(len(state.path_m))
-    if normal.band is not None and normal.coupling is not None:
-        own = solveh_banded(normal.band, np.eye(len(path)), check_finite=False)
-        through = np.einsum("nq,qr,nr->n", normal.coupling, full, normal.coupling, optimize=True)
-        path = np.sqrt(np.maximum(np.diag(own) + through, 0.0))
+    if reduced.band is not None and reduced.coupling is not None:
+        own = solveh_banded(reduced.band, np.eye(len(path)), check_finite=False)
+        coupled = np.einsum("nq,qr,nr->n", reduced.coupling, full, reduced.coupling, optimize=True)
+        path = np.sqrt(np.maximum(np.diag(own) + coupled, 0.0))
     height = float(np.sqrt(full[2 * m, 2 * m]))
     return jacobian @ full @ jacobian.T, path, height

@@ -1,9 +1,12 @@
-"""One pass over unknown magnets, from samples to a sighting, by maximum likelihood.
+"""Detection of the magnets of one pass: matched filter, then maximum-likelihood fits.
 
-Magnets are looked for by the scan, fitted together with the way of the array, looked for
-again in what is left, and those that turn out to be too weak (iron debris, a magnet of
-another kind) are kept in the fit but not taken for a tag's. Where the residual is not
-white the search begins again from another speed or height.
+Several speeds and heights are tried. For each, a matched filter proposes magnets, the fit improves
+them together with the path of the array, and the filter searches the residual for more. The
+hypotheses that explain the samples best are refined first. Sources that turn out to be too weak
+(iron debris, a magnet of another kind) stay in the fit but are not reported as magnets.
+
+All lengths of the matched filter are in units of the height over the magnets, so that one set of
+templates serves every speed: the pass is resampled to rows of a quarter of the height.
 """
 
 from __future__ import annotations
@@ -17,322 +20,639 @@ from scipy.ndimage import median_filter
 
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.detection.fit import Fitted, fit
-from locatk.core.polaris.detection.scan import BESIDE, FEW_SENSORS, Atom, Scanner
-from locatk.core.polaris.detection.task import Task, clocks
-from locatk.core.polaris.detection.window import Priors, State, Window, trends
+from locatk.core.polaris.detection.field_model import MagnetOffsets
+from locatk.core.polaris.detection.fit import PassFit, PassState, fit_coarse, fit_pass
+from locatk.core.polaris.detection.window import (
+    PassPriors,
+    PassWindow,
+    PreparedPass,
+    prepare_pass,
+    time_hypotheses,
+    trend_basis,
+)
 from locatk.core.polaris.magnets import DetectedMagnets
+from locatk.core.polaris.preprocessing import PassRange, PreprocessedSamples
+from locatk.core.polaris.tag import Tags
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
-STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
-"""Steps of a sample period that are tried."""
+ROW_HEIGHTS = 0.25
+"""Distance of the rows along the track, in heights: a magnet's field is smooth over it."""
 
-COMMON_T = 3e-6
-"""Shared field that is allowed for while magnets are looked for."""
+TEMPLATE_HALF_LENGTH_HEIGHTS = 3.0
+"""Half length of a template along the track, in heights; the field has fallen to some percent."""
 
-ENOUGH = 0.95
-"""Share of its residual above which one more round of sources was not worth it."""
+COLUMN_HEIGHTS = 0.5
+"""Distance of the candidate positions across the track, in heights."""
 
-BAD = 3.0
-"""Rms of a residual that has nothing to do with the samples."""
+SIDE_MARGIN_HEIGHTS = 1.5
+"""Distance beyond the last sensor up to which magnets are searched for, in heights."""
 
-MOST_STARTS = 4
+MIN_SENSORS_WITH_SHARED_FIELD = 5
+"""Number of sensors from which a field that all share is separated from magnets: each magnet is
+out of range of some of them."""
 
-LONGEST_M = 2.0
-"""A pass is never longer than this."""
+MIN_MAGNET_ENERGY = 80.0
+"""Least sum of squares of the samples, in units of their noise, that a magnet must explain. Noise
+alone reaches 45 among the thousands of positions of a pass."""
 
-WHITE = 1.6
-"""Rms of a residual, in standard deviations of the noise, that needs no other start."""
+MIN_ENERGY_FRACTION = 0.02
+"""Least energy of a magnet relative to the one found before it."""
 
-DEBRIS = 1.3
-"""Rms of a residual above which weak sources are looked for as well."""
+SPEED_MAGNETS = 3
+"""Number of magnets by which speeds and heights are compared."""
 
-TRENDS = 5
-"""Terms of a background that drifts more than a slope."""
+TRIED_STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
+"""Distances moved in a sample period that are tried [m]."""
 
-UNEVEN = 6.0
-"""Mean square of a residual's slow part, in units of the noise, that is not left to it."""
+MAX_PASS_LENGTH_M = 2.0
+"""Maximum length of a pass [m]."""
 
-SHARED = 2.0
-"""The same of the part that all sensors share."""
+MAX_INITIAL_GUESSES = 4
+"""Number of initial guesses that are refined, per direction of travel."""
 
-WEAK = 0.4
-"""A magnet has at least this share of the median moment."""
+SEARCH_SHARED_FIELD_T = 3e-6
+"""Standard deviation of a field that all sensors share (motors, rotation in the Earth's field) that
+is allowed for while magnets are searched for [T]."""
 
-SAME_M = 0.6
-"""Sources nearer to each other than this share of the height are one."""
+MAX_GROWTH_ROUNDS = 4
+"""Maximum number of searches of the residual for more magnets."""
 
-LEAST_ENERGY = 80.0
-"""Squares of the samples, in units of their noise, that a magnet must explain; noise alone
-reaches 45 among the some thousand places of a pass."""
+MAX_NEW_SOURCES = 4
+"""Maximum number of sources that are added at once."""
+
+MIN_IMPROVEMENT_RATIO = 0.95
+"""Ratio of the rms residual after to before above which a further attempt is not worthwhile."""
+
+WHITE_RESIDUAL_SIGMAS = 1.6
+"""Rms residual, in standard deviations of the noise, up to which no other guess is needed."""
+
+UNRELATED_RESIDUAL_SIGMAS = 3.0
+"""Rms residual from which a model does not describe the samples at all."""
+
+DEBRIS_RESIDUAL_SIGMAS = 1.3
+"""Rms residual above which weak sources are added as well."""
+
+NEW_SOURCE_RESIDUAL_FACTOR = 12.0
+"""Least energy of a source in a residual, relative to its mean square."""
+
+DRIFT_TREND_TERMS = 5
+"""Terms of a background that drifts more than a straight line."""
+
+MAX_DRIFT_SQUARE = 6.0
+"""Mean square of the slow part of a residual, in units of the noise, from which the background gets
+more terms; 1 is expected of noise."""
+
+MAX_SHARED_SQUARE = 2.0
+"""Mean square of the part of a residual that all sensors share, in units of the noise, from which a
+shared field is estimated; 1 is expected of noise."""
+
+MIN_MOMENT_RATIO = 0.4
+"""Least moment of a magnet relative to the median of the tag's magnets; weaker ones are debris."""
+
+MIN_INITIAL_MOMENT_RATIO = 0.25
+"""Least moment of an initial magnet relative to the strongest."""
+
+MIN_SOURCE_MOMENT_RATIO = 0.03
+"""Least moment of any source relative to the strongest."""
+
+MAX_MOMENT_RATIO = 3.0
+"""Largest moment, relative to the expected one, that enters the median of the tag's magnets."""
+
+MERGE_DISTANCE_HEIGHTS = 0.6
+"""Distance of two sources below which they are one, in heights."""
+
+INITIAL_SEPARATION_HEIGHTS = 1.2
+"""Least distance of two initial magnets, in heights: a closer one only corrects the shape of the
+other's field."""
+
+DEFAULT_SKEW_PERIODS = 0.2
+"""Initial skew if the expected one is half a sample period or more."""
+
+PATH_CONTRADICTED = SolverWarning(
+    "path_contradicted", "the speed or odometry given does not explain the samples of a pass"
+)
 
 
 @dataclass(frozen=True)
-class _Start:
-    priors: Priors
-    state: State
-    left: float
-    scanner: Scanner
+class MagnetHypothesis:
+    """Explanation of one pass by magnets.
 
-
-def starts(task: Task, sign: float = 1.0) -> list[_Start]:
-    """Speeds and heights to begin with.
-
-    ``sign`` is 1 for an array that drives forward, -1 for one that drives backward.
+    Attributes
+    ----------
+    prepared : PreparedPass
+    fit : PassFit
+    magnets : DetectedMagnets
+        The magnets of the fit in the array's frame.
     """
-    found = []
-    window = task.window
-    for priors in task.priors:
-        height = priors.height_m[0]
-        scanner = Scanner(window.sensors_m, window.noise_t, height)
-        if window.path_m is not None:
-            paths = [(window.path_m, _mean_step(window))]
-        else:
-            span = window.frames[-1] - window.frames[0]
-            paths = [
-                (sign * speed * (window.frames - window.frames.mean()), sign * speed)
-                for speed in STEPS_M
-                if 2 * height < speed * span < LONGEST_M
-            ]
-        for path, speed in paths:
-            atoms, left = scanner.atoms(path, task.scaled, 3, LEAST_ENERGY)
-            if atoms:
-                found.append(_Start(priors, _state(atoms, path, speed, priors), left, scanner))
-    return found
+
+    prepared: PreparedPass
+    fit: PassFit
+    magnets: DetectedMagnets
 
 
-def _mean_step(window: Window) -> float:
-    assert window.path_m is not None
-    return float(np.ptp(window.path_m) / max(np.ptp(window.frames), 1e-9))
+def detect_magnets(
+    preprocessed: PreprocessedSamples,
+    part: PassRange,
+    tags: Tags | None,
+    path_m: Array | None = None,
+) -> Iterator[MagnetHypothesis]:
+    """Yield explanations of one pass by magnets, the most promising first.
 
+    Nothing is yielded if the pass holds no magnet. If the samples contradict the given path (lost
+    samples, a start from rest), the path is estimated from the field as well.
 
-def _state(atoms: list[Atom], path: Array, speed: float, priors: Priors) -> State:
-    moments = np.array([[*atom.moment_am2, 0.0] for atom in atoms])
-    return State(
-        place_m=np.array([atom.place_m for atom in atoms]),
-        moment_am2=moments,
-        path_m=path - path[int(np.argmin(np.abs(path - np.median(path))))],
-        speed_m=speed,
-        height_m=priors.height_m[0],
-        skew=priors.skew[0] if priors.skew[0] < 0.5 else 0.2,
-    )
-
-
-def fits(task: Task) -> Iterator[Fitted]:
-    """Fits of a pass, from one start after the other; nothing where it holds no magnet.
-
-    Of all speeds, heights and clocks those come first that explain the samples best. An
-    array that drives backward is thought of last, and only where nothing else will do.
+    Parameters
+    ----------
+    preprocessed : PreprocessedSamples
+    part : PassRange
+    tags : Tags or None
+        Their clearance, magnet and spacing are expected.
+    path_m : (n,) ndarray, optional
+        Distance that the array had moved at each sample of the recording.
     """
-    best = np.inf
-    for sign in (1.0, -1.0):
-        tried = [(clocked, start) for clocked in clocks(task) for start in starts(clocked, sign)]
-        tried.sort(key=lambda pair: pair[1].left)
-        for clocked, start in tried[:MOST_STARTS]:
+    for path in (path_m, None) if path_m is not None else (None,):
+        prepared = prepare_pass(preprocessed.samples, part, preprocessed.noise_t, tags, path)
+        for fit in _pass_fits(prepared):
             try:
-                fitted = _grow(clocked, start)
+                magnets = _to_array_frame(preprocessed.samples, prepared, fit)
             except DegenerateError:
                 continue
-            yield fitted
-            if WHITE < best < BAD and fitted.sigma > ENOUGH * best:
-                return  # what is left is not for want of a better start
-            best = min(best, fitted.sigma)
-        if task.window.path_m is not None or best < BAD:
-            return
+            if path is None and path_m is not None:
+                magnets = replace(magnets, warnings=(PATH_CONTRADICTED,))
+            yield MagnetHypothesis(prepared, fit, magnets)
 
 
-def _grow(task: Task, start: _Start) -> Fitted:
-    """Fit from one start, with magnets added from the residual until it holds none."""
-    window, priors = task.window, start.priors
-    coarse = replace(window, common_t=COMMON_T if len(window.sensors_m) >= FEW_SENSORS else 0.0)
-    path = start.state.path_m
-    atoms, _ = start.scanner.atoms(path, task.scaled, task.most, LEAST_ENERGY)
-    state = _state(_distinct(atoms, start.state.height_m), path, start.state.speed_m, priors)
-    fitted = fit(coarse, state, priors, iterations=12, tolerance=1e-3, final=False)
-    for _ in range(4):
-        state = _with(fitted.state, _missed(task, fitted))
-        if len(state.place_m) == len(fitted.state.place_m):
-            break
-        before = fitted
-        fitted = fit(coarse, state, priors, iterations=12, tolerance=1e-3, final=False)
-        if fitted.sigma > ENOUGH * before.sigma:
-            break
-    if window.path_m is not None and fitted.sigma > BAD:
-        raise DegenerateError("the samples contradict the way that was given")
-    # Whether the bar sees a field that all sensors share is told by the fit that allows it.
-    if coarse.common_t and fitted.shared > max(SHARED, 2 * fitted.sigma**2):
-        information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
-        size = np.sqrt((fitted.shared - 1) / information)
-        window = replace(window, common_t=float(size))
-    while True:
-        state = _without_ghosts(fitted.state, task)
-        fitted = fit(window, state, priors)
-        if _drifts(window, fitted):
-            window = replace(window, trends=TRENDS)
-            fitted = fit(window, fitted.state, priors)
-        if len(_without_ghosts(fitted.state, task).place_m) == len(state.place_m):
-            return fitted
+def detect_magnets_at(
+    samples: Samples, hypothesis: MagnetHypothesis, positions_m: Array
+) -> MagnetHypothesis:
+    """Fit a pass again with a source at each given position; weak ones are dropped.
 
-
-def seeded(task: Task, fitted: Fitted, places_m: Array) -> Fitted:
-    """Fit again with a source at each of ``places_m`` (M, 2), in the frame of the fit: those
-    that are no magnets drop out by themselves.
+    Parameters
+    ----------
+    samples : Samples
+    hypothesis : MagnetHypothesis
+        Explanation whose path and height are the initial guess.
+    positions_m : (K, 2) ndarray
+        In the frame of the hypothesis' magnets.
 
     Raises
     ------
     DegenerateError
-        The samples do not determine it.
+        The samples do not determine the magnets.
     """
-    window, priors = task.window, task.priors[0]
-    moments = np.full((len(places_m), 3), 0.0)
-    state = replace(fitted.state, place_m=places_m, moment_am2=moments)
-    coarse = fit(window, state, priors, iterations=12, tolerance=1e-3, final=False)
-    size = _sizes(coarse.state)
-    strong = size > WEAK * np.median(np.sort(size)[-3:])
+    prepared, magnets = hypothesis.prepared, hypothesis.magnets
+    window, priors = prepared.window, prepared.priors[0]
     state = replace(
-        coarse.state,
-        place_m=coarse.state.place_m[strong],
-        moment_am2=coarse.state.moment_am2[strong],
+        hypothesis.fit.state,
+        position_m=positions_m + magnets.origin_m,
+        moment_am2=np.zeros((len(positions_m), 3)),
     )
-    return fit(window, _without_ghosts(state, task), priors)
+    coarse = fit_coarse(window, state, priors)
+    moment = _horizontal_moments(coarse.state)
+    is_strong = moment > MIN_MOMENT_RATIO * np.median(np.sort(moment)[-3:])
+    state = _select_sources(coarse.state, is_strong)
+    fit = fit_pass(window, _without_spurious_sources(state, prepared), priors)
+    again = replace(_to_array_frame(samples, prepared, fit), warnings=magnets.warnings)
+    return MagnetHypothesis(prepared, fit, again)
 
 
-def _missed(task: Task, fitted: Fitted) -> list[Atom]:
-    """Sources that the residual still holds."""
-    window, state = task.window, fitted.state
-    scanner = Scanner(window.sensors_m, window.noise_t, state.height_m)
-    residual = np.nan_to_num(fitted.residual / np.sqrt(window.counts)[:, None, None])
-    residual = residual.reshape(len(window.frames), -1)
-    room = min(4, task.most - len(state.place_m))
-    new, _ = scanner.atoms(state.path_m, residual, room, max(LEAST_ENERGY, 12 * fitted.sigma**2))
-    # What is weak is looked at where it is needed only.
-    least = 0.0 if fitted.sigma > DEBRIS else 0.5 * WEAK * np.median(_sizes(state))
+# ---- matched filter
+
+
+@dataclass(frozen=True)
+class MagnetCandidate:
+    """Magnet found by the matched filter.
+
+    Attributes
+    ----------
+    position_m, moment_am2 : (2,) ndarray
+    energy : float
+        Squares of the samples, in units of their noise, that it explains.
+    """
+
+    position_m: Array
+    moment_am2: Array
+    energy: float
+
+
+def subtract_shared_field(fields: Array) -> Array:
+    """Subtract from fields (N, ...) the part that all sensors of the bar share.
+
+    It is the Earth's field, which rotates with the robot, and that of its motors. Fields of a bar
+    with few sensors are returned unchanged.
+    """
+    if len(fields) < MIN_SENSORS_WITH_SHARED_FIELD:
+        return fields
+    return fields - fields.mean(axis=0)
+
+
+class MatchedFilter:
+    """Templates of one magnet for an array at one height.
+
+    Parameters
+    ----------
+    sensors_m : (N, 3) ndarray
+    noise_t : (N, 3) ndarray
+    height_m : float
+    """
+
+    def __init__(self, sensors_m: Array, noise_t: Array, height_m: float) -> None:
+        self.row_m = ROW_HEIGHTS * height_m
+        self.half_rows = round(TEMPLATE_HALF_LENGTH_HEIGHTS / ROW_HEIGHTS)
+        self.channels = 3 * len(sensors_m)
+        along = np.arange(-self.half_rows, self.half_rows + 1) * self.row_m
+        left, right = sensors_m[:, 1].max(), sensors_m[:, 1].min()
+        margin = SIDE_MARGIN_HEIGHTS * height_m
+        count = int(np.ceil((left - right + 2 * margin) / (COLUMN_HEIGHTS * height_m))) + 1
+        self.across_m = np.linspace(right - margin, left + margin, count)
+        shape = (len(sensors_m), 3, len(along), count)
+        offsets = MagnetOffsets.from_components(
+            np.broadcast_to((sensors_m[:, 0, None] + along)[:, None, :, None], shape),
+            (sensors_m[:, 1:2] - self.across_m)[:, None, None],
+            height_m,
+        )
+        fields = offsets.unit_fields()[..., :2] / noise_t[:, :, None, None, None]
+        # From (N, axis, rows, columns, moment) to columns x (rows, N, axis) x moment.
+        templates = subtract_shared_field(fields).transpose(2, 0, 1, 3, 4)
+        templates = np.ascontiguousarray(templates.reshape(-1, count, 2).transpose(1, 0, 2))
+        # Orthonormal for each position, so that energies are sums of squares.
+        self.triangle = np.linalg.cholesky(templates.transpose(0, 2, 1) @ templates)
+        templates = templates @ np.linalg.inv(self.triangle).transpose(0, 2, 1)
+        self.templates = np.hstack([templates[:, :, 0].T, templates[:, :, 1].T]).astype(np.float32)
+
+    def find_magnets(
+        self, path_m: Array, scaled: Array, max_count: int, min_energy: float
+    ) -> tuple[list[MagnetCandidate], float]:
+        """Find magnets one after the other, the strongest first (matching pursuit).
+
+        Parameters
+        ----------
+        path_m : (n,) ndarray
+            Position of the array along the track.
+        scaled : (n, 3 N) ndarray
+            Samples in units of their noise, without background.
+        max_count : int
+        min_energy : float
+            Energy of the weakest magnet.
+
+        Returns
+        -------
+        candidates : list of MagnetCandidate
+        remaining : float
+            Fraction of the samples' squares that they do not explain.
+        """
+        row_path, rows = self._resample(path_m, scaled)
+        total = float((rows.astype(float) ** 2).sum())
+        candidates: list[MagnetCandidate] = []
+        columns = len(self.across_m)
+        residual = rows.copy()
+        while len(candidates) < max_count:
+            products = self._correlate(residual)
+            energies = products[:, 0] ** 2 + products[:, 1] ** 2
+            row, column = divmod(int(np.argmax(energies)), columns)
+            energy = float(energies[row, column])
+            if energy < min_energy:
+                break
+            min_energy = max(min_energy, MIN_ENERGY_FRACTION * energy)
+            product = products[row, :, column]
+            position = np.array([row_path[row], self.across_m[column]])
+            moment = np.linalg.solve(self.triangle[column].T, product)
+            candidates.append(MagnetCandidate(position, moment, energy))
+            explained = self.templates[:, [column, column + columns]] @ product
+            low, high = max(row - self.half_rows, 0), min(row + self.half_rows + 1, len(residual))
+            start = low - row + self.half_rows
+            explained = explained.reshape(-1, self.channels)
+            residual[low:high] -= explained[start : start + high - low]
+        remaining = float((residual.astype(float) ** 2).sum())
+        return candidates, remaining / max(total, 1e-30)
+
+    def _resample(self, path_m: Array, scaled: Array) -> tuple[Array, NDArray[np.float32]]:
+        """Return the positions of rows (R,) along the track, and mean samples (R, 3 N) there."""
+        order = np.argsort(path_m, kind="stable")
+        by_sensor = scaled[order].reshape(len(order), -1, 3).swapaxes(0, 1)
+        scaled = subtract_shared_field(by_sensor).swapaxes(0, 1).reshape(len(order), -1)
+        # Strictly ascending, also while the array rests.
+        path = path_m[order] + 1e-9 * np.arange(len(path_m))
+        count = max(int((path[-1] - path[0]) / self.row_m), 1)
+        edges = path[0] + self.row_m * np.arange(count + 1)
+        middle = (path[1:] + path[:-1]) / 2
+        borders = np.concatenate([[path[0]], middle, [path[-1]]])
+        width = np.diff(borders)[:, None]
+        integral = np.vstack([np.zeros(scaled.shape[1]), np.cumsum(scaled * width, axis=0)])
+        sample = np.clip(np.searchsorted(borders, edges, "right") - 1, 0, len(scaled) - 1)
+        value = integral[sample] + scaled[sample] * (edges - borders[sample])[:, None]
+        rows = np.diff(value, axis=0) / self.row_m
+        return (edges[1:] + edges[:-1]) / 2, rows.astype(np.float32)
+
+    def _correlate(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the products (R, 2, columns) of the templates with the samples around each row.
+
+        Their squares are the energy that a magnet there would explain.
+        """
+        padded = np.pad(rows, ((self.half_rows, self.half_rows), (0, 0)))
+        size = (2 * self.half_rows + 1) * self.channels
+        windows = np.lib.stride_tricks.as_strided(
+            padded, (len(rows), size), (padded.strides[0], padded.strides[1])
+        )
+        return (windows @ self.templates).reshape(len(rows), 2, -1)
+
+
+# ---- initial guesses
+
+
+@dataclass(frozen=True)
+class _InitialGuess:
+    """Speed and height, with the fraction of the samples' squares that they leave unexplained."""
+
+    priors: PassPriors
+    state: PassState
+    remaining: float
+    matched_filter: MatchedFilter
+
+
+def _initial_guesses(prepared: PreparedPass, direction: float) -> list[_InitialGuess]:
+    """Return an initial guess for each speed and height.
+
+    ``direction`` is 1 for an array that moves forward, -1 for one that moves backward.
+    """
+    guesses = []
+    window = prepared.window
+    for priors in prepared.priors:
+        height = priors.height_m[0]
+        matched_filter = MatchedFilter(window.sensors_m, window.noise_t, height)
+        if window.path_m is not None:
+            duration = max(np.ptp(window.time_periods), 1e-9)
+            paths = [(window.path_m, float(np.ptp(window.path_m) / duration))]
+        else:
+            duration = window.time_periods[-1] - window.time_periods[0]
+            time = window.time_periods - window.time_periods.mean()
+            paths = [
+                (direction * step * time, direction * step)
+                for step in TRIED_STEPS_M
+                if 2 * height < step * duration < MAX_PASS_LENGTH_M
+            ]
+        for path, step in paths:
+            candidates, remaining = matched_filter.find_magnets(
+                path, prepared.scaled, SPEED_MAGNETS, MIN_MAGNET_ENERGY
+            )
+            if candidates:
+                state = _initial_state(candidates, path, step, priors)
+                guesses.append(_InitialGuess(priors, state, remaining, matched_filter))
+    return guesses
+
+
+def _initial_state(
+    candidates: list[MagnetCandidate], path: Array, mean_step: float, priors: PassPriors
+) -> PassState:
+    """Return the state with the magnets of the matched filter; its path is 0 in the middle."""
+    middle = int(np.argmin(np.abs(path - np.median(path))))
+    skew = priors.skew_periods[0]
+    return PassState(
+        position_m=np.array([candidate.position_m for candidate in candidates]),
+        moment_am2=np.array([[*candidate.moment_am2, 0.0] for candidate in candidates]),
+        path_m=path - path[middle],
+        mean_step_m=mean_step,
+        height_m=priors.height_m[0],
+        skew_periods=skew if skew < 0.5 else DEFAULT_SKEW_PERIODS,
+    )
+
+
+def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
+    """Yield fits of a pass, one per initial guess; nothing if the pass holds no magnet.
+
+    The speeds, heights and time axes that explain the samples best come first. An array that moves
+    backward is considered last, and only if nothing else describes the samples.
+    """
+    least = np.inf
+    for direction in (1.0, -1.0):
+        guesses = [
+            (timed, guess)
+            for timed in time_hypotheses(prepared)
+            for guess in _initial_guesses(timed, direction)
+        ]
+        guesses.sort(key=lambda pair: pair[1].remaining)
+        for timed, guess in guesses[:MAX_INITIAL_GUESSES]:
+            try:
+                fit = _grow_fit(timed, guess)
+            except DegenerateError:
+                continue
+            yield fit
+            is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
+            if is_residual_moderate and fit.rms_sigma > MIN_IMPROVEMENT_RATIO * least:
+                return  # Another initial guess does not reduce the residual.
+            least = min(least, fit.rms_sigma)
+        if prepared.window.path_m is not None or least < UNRELATED_RESIDUAL_SIGMAS:
+            return
+
+
+# ---- growing a fit
+
+
+def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
+    """Fit from one initial guess; magnets are added until the residual holds no more."""
+    window, priors, state = prepared.window, guess.priors, guess.state
+    has_shared_field = len(window.sensors_m) >= MIN_SENSORS_WITH_SHARED_FIELD
+    coarse = replace(window, common_t=SEARCH_SHARED_FIELD_T if has_shared_field else 0.0)
+    candidates, _ = guess.matched_filter.find_magnets(
+        state.path_m, prepared.scaled, prepared.max_sources, MIN_MAGNET_ENERGY
+    )
+    separate = _separate_candidates(candidates, state.height_m)
+    state = _initial_state(separate, state.path_m, state.mean_step_m, priors)
+    fit = fit_coarse(coarse, state, priors)
+    for _ in range(MAX_GROWTH_ROUNDS):
+        missed = _find_missed_sources(prepared, fit)
+        if not missed:
+            break
+        before = fit
+        fit = fit_coarse(coarse, _with_sources(fit.state, missed), priors)
+        if fit.rms_sigma > MIN_IMPROVEMENT_RATIO * before.rms_sigma:
+            break
+    if window.path_m is not None and fit.rms_sigma > UNRELATED_RESIDUAL_SIGMAS:
+        raise DegenerateError("the samples contradict the given path")
+    # Only a fit that allows for a shared field shows how large it is.
+    if coarse.common_t and fit.shared_square > max(MAX_SHARED_SQUARE, 2 * fit.rms_sigma**2):
+        information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
+        window = replace(window, common_t=float(np.sqrt((fit.shared_square - 1) / information)))
+    while True:
+        state = _without_spurious_sources(fit.state, prepared)
+        fit = fit_pass(window, state, priors)
+        if _has_drift(window, fit):
+            window = replace(window, trend_terms=DRIFT_TREND_TERMS)
+            fit = fit_pass(window, fit.state, priors)
+        if len(_without_spurious_sources(fit.state, prepared).position_m) == len(state.position_m):
+            return fit
+
+
+def _separate_candidates(
+    candidates: list[MagnetCandidate], height_m: float
+) -> list[MagnetCandidate]:
+    """Return candidates, ordered by strength, without weak ones and neighbours of stronger ones."""
+    separate: list[MagnetCandidate] = []
+    strongest = np.hypot(*candidates[0].moment_am2)
+    limit = INITIAL_SEPARATION_HEIGHTS * height_m
+    for candidate in candidates:
+        is_near = any(
+            np.linalg.norm(candidate.position_m - other.position_m) < limit for other in separate
+        )
+        is_strong = np.hypot(*candidate.moment_am2) > MIN_INITIAL_MOMENT_RATIO * strongest
+        if is_strong and not is_near:
+            separate.append(candidate)
+    return separate
+
+
+def _find_missed_sources(prepared: PreparedPass, fit: PassFit) -> list[MagnetCandidate]:
+    """Return the sources that the residual of a fit still holds."""
+    window, state = prepared.window, fit.state
+    matched_filter = MatchedFilter(window.sensors_m, window.noise_t, state.height_m)
+    residual = np.nan_to_num(fit.residual / np.sqrt(window.counts)[:, None, None])
+    candidates, _ = matched_filter.find_magnets(
+        state.path_m,
+        residual.reshape(len(window.time_periods), -1),
+        min(MAX_NEW_SOURCES, prepared.max_sources - len(state.position_m)),
+        max(MIN_MAGNET_ENERGY, NEW_SOURCE_RESIDUAL_FACTOR * fit.rms_sigma**2),
+    )
+    # Weak sources cost time and accuracy; they are added only if the residual asks for them.
+    min_moment = 0.0
+    if fit.rms_sigma <= DEBRIS_RESIDUAL_SIGMAS:
+        min_moment = 0.5 * MIN_MOMENT_RATIO * float(np.median(_horizontal_moments(state)))
+    limit = MERGE_DISTANCE_HEIGHTS * state.height_m
     return [
-        atom
-        for atom in new
-        if np.hypot(*atom.moment_am2) > least and _far(atom.place_m, state, SAME_M * state.height_m)
+        candidate
+        for candidate in candidates
+        if np.hypot(*candidate.moment_am2) > min_moment
+        and np.all(np.linalg.norm(state.position_m - candidate.position_m, axis=1) > limit)
     ]
 
 
-def _drifts(window: Window, fitted: Fitted) -> bool:
-    """Whether the residual holds slow courses that a level and a slope do not take out.
+def _has_drift(window: PassWindow, fit: PassFit) -> bool:
+    """Return whether the residual holds slow trends beyond the terms of the background.
 
-    In units of the noise, a white residual has squares of 1 along each course in time.
+    In units of the noise, a white residual has a mean square of 1 along each trend.
     """
-    if window.trends >= TRENDS:
+    if window.trend_terms >= DRIFT_TREND_TERMS:
         return False
-    residual = np.nan_to_num(fitted.residual).reshape(len(window.frames), -1)
-    course = np.linalg.qr(trends(window.frames, TRENDS))[0][:, window.trends :]
-    return bool(((course.T @ residual) ** 2).mean() > UNEVEN)
+    residual = np.nan_to_num(fit.residual).reshape(len(window.time_periods), -1)
+    basis = np.linalg.qr(trend_basis(window.time_periods, DRIFT_TREND_TERMS))[0]
+    projection = basis[:, window.trend_terms :].T @ residual
+    return bool((projection**2).mean() > MAX_DRIFT_SQUARE)
 
 
-def _distinct(atoms: list[Atom], height: float) -> list[Atom]:
-    """Atoms, the strongest first, without those that only mend a stronger one nearby."""
-    kept: list[Atom] = []
-    strongest = np.hypot(*atoms[0].moment_am2)
-    for atom in atoms:
-        near = [np.linalg.norm(atom.place_m - other.place_m) < 1.2 * height for other in kept]
-        if not any(near) and np.hypot(*atom.moment_am2) > 0.25 * strongest:
-            kept.append(atom)
-    return kept
-
-
-def _sizes(state: State) -> Array:
+def _horizontal_moments(state: PassState) -> Array:
+    """Return the magnitudes (M,) of the horizontal moments."""
     return np.hypot(state.moment_am2[:, 0], state.moment_am2[:, 1])
 
 
-def _far(place: Array, state: State, limit: float) -> bool:
-    return bool(np.all(np.linalg.norm(state.place_m - place, axis=1) > limit))
+def _select_sources(state: PassState, chosen: NDArray[np.bool_] | list[int]) -> PassState:
+    """Return the state with some of the sources only."""
+    return replace(state, position_m=state.position_m[chosen], moment_am2=state.moment_am2[chosen])
 
 
-def _with(state: State, atoms: list[Atom]) -> State:
-    if not atoms:
-        return state
-    places = np.vstack([state.place_m, [atom.place_m for atom in atoms]])
-    moments = np.vstack([state.moment_am2, [[*atom.moment_am2, 0.0] for atom in atoms]])
-    return replace(state, place_m=places, moment_am2=moments)
+def _with_sources(state: PassState, candidates: list[MagnetCandidate]) -> PassState:
+    """Return the state with further sources."""
+    positions = [candidate.position_m for candidate in candidates]
+    moments = [[*candidate.moment_am2, 0.0] for candidate in candidates]
+    return replace(
+        state,
+        position_m=np.vstack([state.position_m, positions]),
+        moment_am2=np.vstack([state.moment_am2, moments]),
+    )
 
 
-def _without_ghosts(state: State, task: Task) -> State:
-    """Without sources that are none: beside what the bar has passed over, no hundredth of
-    a magnet, or sharing a magnet with another.
+def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassState:
+    """Remove sources outside of the area passed, very weak ones, and duplicates of stronger ones.
 
-    Two magnets of a tag are never nearer than ``task.apart_m``; a weak source may be, but
-    not at a magnet's own place.
+    Two magnets of a tag are at least ``prepared.min_separation_m`` apart; a weak source may be
+    closer to a magnet, but not at its position.
+
+    Raises
+    ------
+    DegenerateError
+        No source remains.
     """
-    sensors = task.window.sensors_m
-    reach = (BESIDE + 0.5) * state.height_m
-    inside = state.place_m[:, 0] > state.path_m.min() + sensors[:, 0].min() - reach
-    inside &= state.place_m[:, 0] < state.path_m.max() + sensors[:, 0].max() + reach
-    inside &= state.place_m[:, 1] > sensors[:, 1].min() - reach
-    inside &= state.place_m[:, 1] < sensors[:, 1].max() + reach
-    size = np.where(inside, _sizes(state), 0.0)
+    sensors, position = prepared.window.sensors_m, state.position_m
+    margin = (SIDE_MARGIN_HEIGHTS + 0.5) * state.height_m
+    is_inside = position[:, 0] > state.path_m.min() + sensors[:, 0].min() - margin
+    is_inside &= position[:, 0] < state.path_m.max() + sensors[:, 0].max() + margin
+    is_inside &= position[:, 1] > sensors[:, 1].min() - margin
+    is_inside &= position[:, 1] < sensors[:, 1].max() + margin
+    moment = np.where(is_inside, _horizontal_moments(state), 0.0)
+    by_strength = np.argsort(-moment)
+    strongest = moment[by_strength[0]]
     kept: list[int] = []
-    order = np.argsort(-size)
-    for k in order:
-        apart = np.linalg.norm(state.place_m[kept] - state.place_m[k], axis=1)
-        weak = size[k] < WEAK * size[order[0]]
-        least = SAME_M * state.height_m if weak else task.apart_m
-        if size[k] > 0.03 * size[order[0]] and np.all(apart > least):
+    for k in by_strength:
+        is_weak = moment[k] < MIN_MOMENT_RATIO * strongest
+        limit = MERGE_DISTANCE_HEIGHTS * state.height_m if is_weak else prepared.min_separation_m
+        distance = np.linalg.norm(position[kept] - position[k], axis=1)
+        if moment[k] > MIN_SOURCE_MOMENT_RATIO * strongest and np.all(distance > limit):
             kept.append(int(k))
     if not kept:
         raise DegenerateError("no magnet is left under the bar")
-    return replace(state, place_m=state.place_m[kept], moment_am2=state.moment_am2[kept])
+    return _select_sources(state, kept)
 
 
-def magnets(fitted: Fitted, task: Task) -> NDArray[np.intp]:
-    """Which of the sources are magnets of a tag: under the bar, and not weaker by far."""
-    state, sensors = fitted.state, task.window.sensors_m
-    reach = BESIDE * state.height_m
-    under = state.place_m[:, 1] > sensors[:, 1].min() - reach
-    under &= state.place_m[:, 1] < sensors[:, 1].max() + reach
-    size = np.where(under, _sizes(state), 0.0)
-    expected = task.priors[0].moment_am2
-    usual = size[(size > WEAK / 2 * expected) & (size < 3 * expected)]
+# ---- from a fit to magnets
+
+
+def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
+    """Return the sources that are magnets of a tag: under the bar, and not far weaker than others.
+
+    Raises
+    ------
+    DegenerateError
+        None is.
+    """
+    state, sensors = fit.state, prepared.window.sensors_m
+    margin = SIDE_MARGIN_HEIGHTS * state.height_m
+    is_under_bar = state.position_m[:, 1] > sensors[:, 1].min() - margin
+    is_under_bar &= state.position_m[:, 1] < sensors[:, 1].max() + margin
+    moment = np.where(is_under_bar, _horizontal_moments(state), 0.0)
+    expected = prepared.priors[0].moment_am2
+    is_usual = moment > MIN_MOMENT_RATIO / 2 * expected
+    usual = moment[is_usual & (moment < MAX_MOMENT_RATIO * expected)]
     if len(usual) == 0:
-        usual = size[size > WEAK * size.max()]
+        usual = moment[moment > MIN_MOMENT_RATIO * moment.max()]
     if len(usual) == 0:
         raise DegenerateError("no magnet is left under the bar")
-    return np.flatnonzero(size > WEAK * np.median(usual))
+    return np.flatnonzero(moment > MIN_MOMENT_RATIO * np.median(usual))
 
 
-def sighting(samples: Samples, task: Task, fitted: Fitted) -> DetectedMagnets:
-    """What a fit says, in the array's frame at a sample near the magnets' middle."""
-    state = fitted.state
-    chosen = magnets(fitted, task)
-    place = state.place_m[chosen]
-    middle = place.mean(axis=0)
-    number = np.arange(task.samples)
-    path = np.interp(number, task.times, state.path_m)
-    if task.path_m is not None and task.window.path_m is not None:
-        path = task.path_m + (state.path_m[0] - task.window.path_m[0])
-    spread = np.interp(number, task.times, fitted.path_sigma_m) * max(1.0, fitted.usual_sigma)
-    # Of samples at the magnets' middle one that is sure: where nothing is felt, or a sample
-    # was misread, the path may be anywhere.
-    at = int(np.argmin(np.abs(median_filter(path, 5) - middle[0]) + 3 * spread))
-    index = 3 * chosen[:, None] + np.arange(3)
-    covariance = fitted.covariance[np.ix_(index.ravel(), index.ravel())]
-    # What the model does not know shows in the residual.
-    covariance = covariance * max(1.0, fitted.usual_sigma) ** 2
-    here = path[at] * np.array([1.0, np.tan(state.crab_rad)])
+def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> DetectedMagnets:
+    """Return the magnets of a fit, in the array's frame at a sample near their middle."""
+    state = fit.state
+    # Errors of the model show in the residual.
+    noise_factor = max(1.0, fit.robust_sigma)
+    chosen = _magnet_indices(prepared, fit)
+    position = state.position_m[chosen]
+    index = np.arange(prepared.sample_count)
+    path = np.interp(index, prepared.group_index, state.path_m)
+    if prepared.path_m is not None and prepared.window.path_m is not None:
+        path = prepared.path_m + (state.path_m[0] - prepared.window.path_m[0])
+    path_sigma = np.interp(index, prepared.group_index, fit.path_sigma_m) * noise_factor
+    # Near the magnets' middle, but at a sample whose position is well determined: it is not if
+    # the field is weak there or the sample was damaged.
+    distance = np.abs(median_filter(path, 5) - position.mean(axis=0)[0])
+    reference = int(np.argmin(distance + 3 * path_sigma))
+    rows = (3 * chosen[:, None] + np.arange(3)).ravel()
+    origin = path[reference] * np.array([1.0, np.tan(state.crab_rad)])
     moment = state.moment_am2[chosen]
     return DetectedMagnets(
-        time_ns=int(samples.time_ns[task.first + at]),
-        first=task.first,
-        stop=task.first + task.samples,
-        path_m=path - path[at],
-        place_m=place - here,
+        time_ns=int(samples.time_ns[prepared.first + reference]),
+        first=prepared.first,
+        stop=prepared.first + prepared.sample_count,
+        path_m=path - path[reference],
+        position_m=position - origin,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),
-        covariance=covariance,
-        path_sigma_m=spread,
+        covariance=fit.covariance[np.ix_(rows, rows)] * noise_factor**2,
+        path_sigma_m=path_sigma,
         crab_rad=state.crab_rad,
-        free_path=task.window.path_m is None,
+        is_path_estimated=prepared.window.path_m is None,
         height_m=state.height_m,
-        height_sigma_m=fitted.height_sigma_m * max(1.0, fitted.usual_sigma),
-        residual_sigma=fitted.sigma,
-        usual_sigma=fitted.usual_sigma,
-        origin_m=here,
-        others=len(state.place_m) - len(chosen),
+        height_sigma_m=fit.height_sigma_m * noise_factor,
+        residual_sigma=fit.rms_sigma,
+        robust_residual_sigma=fit.robust_sigma,
+        origin_m=origin,
+        other_sources=len(state.position_m) - len(chosen),
     )

@@ -1,9 +1,10 @@
-"""Which magnets of a sighting are a tag, on which cells, and where that tag lies.
+"""Matching of detected magnets with the grid of a tag, and the pose of the tag.
 
-The grid is laid through each pair of magnets in every way that their distance allows;
-what puts the most magnets on cells of their own is kept, and fitted by least squares. The
-scale along the track is part of that fit where the way of the array was found from the
-field alone: the tag's known spacing then is the ruler for it.
+Each pair of magnets is matched with every pair of cells at a similar distance; the transform of
+the pair assigns the other magnets to their nearest cells. The assignments with the most magnets
+are kept, and their transforms are estimated by least squares over all their magnets. If the path
+of the array was estimated from the field alone, its scale is an unknown as well: the known spacing
+of the tag determines it.
 """
 
 from __future__ import annotations
@@ -13,49 +14,65 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.geometry import umeyama, wrap_angle
+from locatk.core.least_squares import DenseEquations, Indices, minimize
 from locatk.core.polaris.magnets import DetectedMagnets
-from locatk.core.polaris.tag import Cell, Tags, places, vertices
+from locatk.core.polaris.tag import Cell, Tags, cell_positions, vertices
 
 Array = NDArray[np.float64]
 
-NEAR = 0.3
-"""How far from its cell a magnet may be before the grid is fitted, in spacings."""
+MAX_CELL_DISTANCE_SPACINGS = 0.3
+"""Distance of a magnet from its cell up to which it is assigned, in spacings; the grid is not
+fitted yet."""
 
-GOOD, FAIR = 0.05, 0.1
-"""Rms distance of the magnets from their cells, in spacings: what is looked for first, and
-what will do."""
+GOOD_MISFIT_SPACINGS, MAX_MISFIT_SPACINGS = 0.05, 0.1
+"""Rms distance of the magnets from their cells, in spacings: the limit that is tried first, and
+the final one."""
 
-FREE_LENGTH, KNOWN_LENGTH = 0.15, 0.05
-"""By how much a distance along the track may be wrong, where the way was found from the field
-alone and where it was known."""
+MISFIT_RESOLUTION_M = 1e-9
+"""Difference of misfits below which placements are equivalent [m]: rotations of a symmetric pattern
+differ by rounding only."""
 
-BUILD_M = 4e-4
-"""Standard deviation of a magnet's place that is set by hand."""
+ESTIMATED_PATH_LENGTH_TOLERANCE, KNOWN_PATH_LENGTH_TOLERANCE = 0.15, 0.05
+"""Relative tolerance of distances if the path was estimated from the field alone, and if it was
+known."""
 
-MEASURED_M = 1e-4
-"""The same of a tag whose magnets were measured as built."""
+HAND_BUILT_SIGMA_M = 4e-4
+"""Standard deviation of the position of a magnet that was set by hand [m]."""
 
-SCALE = 0.03
-"""Standard deviation of a way's scale that was found from the field alone: on the published
-recordings it is 2.5 % short, in each of them (docs/polaris.md)."""
+AS_BUILT_SIGMA_M = 1e-4
+"""The same if the magnets of the tag were measured as built [m]."""
+
+SCALE_SIGMA = 0.03
+"""Standard deviation of the scale of a path that was estimated from the field alone: on each of
+the published recordings it is 2.5 % short (docs/polaris.md)."""
+
+FIXED_SCALE_SIGMA = 1e-6
+"""The same if the path was known: the scale is fixed at 1."""
+
+UNKNOWN_POSITION_SIGMA_M = 1e-3
+"""Standard deviation of all positions if the method of detection has no covariance [m]."""
+
+MAX_ITERATIONS, MIN_STEP = 20, 1e-12
+"""Iterations of the fit of a grid, and the norm of a step (m, rad) that ends it."""
 
 
 @dataclass(frozen=True)
-class Match:
-    """A tag's grid, laid over magnets of a sighting.
+class TagMatch:
+    """Assignment of detected magnets to the cells of a tag, with the pose of the tag.
 
     Attributes
     ----------
     magnets : tuple of int
-        Numbers of the magnets in the sighting, in the order of ``cells``.
+        Indices of the detected magnets, in the order of ``cells``.
     cells : tuple of (column, row)
         Row by row from v1.
     x_m, y_m, heading_rad : float
         Pose of the tag in the array's frame.
     covariance : (3, 3) ndarray
-        Of these.
+        Of the pose.
     scale, scale_sigma : float
-        True over found length along the track, and its standard deviation.
+        True over estimated length along the track, and its standard deviation.
     misfit_m : float
         Rms distance of the magnets from their cells.
     """
@@ -71,164 +88,277 @@ class Match:
     misfit_m: float
 
 
-def matches(
-    sighting: DetectedMagnets, tags: Tags, used: frozenset[int] = frozenset()
-) -> list[Match]:
-    """Ways to lay the grid over magnets that are not in ``used``, the best first.
+def match_tags(
+    detected: DetectedMagnets, tags: Tags, used: frozenset[int] = frozenset()
+) -> list[TagMatch]:
+    """Match the magnets with the grid of a tag; the matches of least misfit come first.
 
-    All of them have as many magnets as a tag has, else as many on cells as can be; with the
-    three position magnets among them where one has those.
+    All matches have as many magnets as a tag, or else as many as possible. Those that include the
+    three vertices are preferred, if there are any.
+
+    Parameters
+    ----------
+    detected : DetectedMagnets
+    tags : Tags
+    used : frozenset of int
+        Indices of magnets that belong to other tags.
     """
-    free = np.array([k for k in range(len(sighting)) if k not in used], int)
-    if len(free) < 2:
+    unused = np.array([k for k in range(len(detected)) if k not in used], int)
+    if len(unused) < 2:
         return []
-    points = sighting.place_m[free]
-    found = _layings(points, tags, FREE_LENGTH if sighting.free_path else KNOWN_LENGTH)
-    if not found:
-        return []
-    corners = set(vertices(tags.order)[:3])
-    counts = sorted({len(cells) for cells in found.values()}, reverse=True)
-    # A whole tag is what is looked for first; more magnets on cells may be two tags' at once.
-    whole_tag = [(tags.magnets, misfit) for misfit in (GOOD, FAIR) if tags.magnets in counts]
-    others = [(count, misfit) for misfit in (GOOD, FAIR) for count in counts if count > 2]
-    for count, misfit in [*whole_tag, *others, (2, FAIR)]:
-        laid = [
-            _fitted(sighting, tags, tuple(int(free[k]) for k, _ in key), cells)
-            for key, cells in found.items()
-            if len(cells) == count
-        ]
-        laid = [match for match in laid if match.misfit_m < misfit * tags.spacing_m]
-        if laid:
-            whole = [match for match in laid if corners <= set(match.cells)]
-            return sorted(whole or laid, key=lambda match: match.misfit_m)
+    tolerance = KNOWN_PATH_LENGTH_TOLERANCE
+    if detected.is_path_estimated:
+        tolerance = ESTIMATED_PATH_LENGTH_TOLERANCE
+    assignments = [
+        (tuple(int(unused[k]) for k, _ in pairs), tuple(cell for _, cell in pairs))
+        for pairs in _candidate_assignments(detected.position_m[unused], tags, tolerance)
+    ]
+    counts = sorted({len(cells) for _, cells in assignments}, reverse=True)
+    by_count = {
+        count: _fit_grids(detected, tags, [a for a in assignments if len(a[1]) == count])
+        for count in counts
+    }
+    vertex_cells = set(vertices(tags.order)[:3])
+    limits = (GOOD_MISFIT_SPACINGS, MAX_MISFIT_SPACINGS)
+    # A complete tag is preferred: more magnets on cells may be those of two tags.
+    attempts = [(tags.magnets, limit) for limit in limits]
+    attempts += [(count, limit) for limit in limits for count in counts if count > 2]
+    attempts += [(2, MAX_MISFIT_SPACINGS)]
+    for count, limit in attempts:
+        matches = [m for m in by_count.get(count, []) if m.misfit_m < limit * tags.spacing_m]
+        if matches:
+            with_vertices = [match for match in matches if vertex_cells <= set(match.cells)]
+            return sorted(with_vertices or matches, key=_rounded_misfit)
     return []
 
 
-def _layings(
-    points: Array, tags: Tags, length: float
-) -> dict[tuple[tuple[int, Cell], ...], tuple[Cell, ...]]:
-    """Distinct assignments of points to cells, from every pair of points and of cells."""
+def _rounded_misfit(match: TagMatch) -> float:
+    """Return the misfit as a sort key: equivalent placements keep the order of enumeration."""
+    return round(match.misfit_m / MISFIT_RESOLUTION_M)
+
+
+def refit_match(
+    detected: DetectedMagnets, tags: Tags, match: TagMatch, positions_m: Array
+) -> TagMatch:
+    """Fit a match again, to positions (M, 2) of the magnets of the tag as it was built."""
+    (refitted,) = _fit_grids(detected, tags, [(match.magnets, match.cells)], positions_m)
+    return refitted
+
+
+def apply_scale(detected: DetectedMagnets, match: TagMatch) -> DetectedMagnets:
+    """Rescale lengths along the track by the scale of a match, if the path was estimated.
+
+    The covariance then has the uncertainty of that scale.
+    """
+    if not detected.is_path_estimated:
+        return detected
+    m = len(detected)
+    position = detected.position_m * [match.scale, 1.0]
+    stretch = np.ones(3 * m)
+    stretch[0::3] = match.scale
+    covariance = detected.covariance * stretch[:, None] * stretch
+    # Derivative of x, y, angle by the scale; its old variance is replaced by the new one.
+    by_scale = np.zeros(3 * m)
+    by_scale[0::3] = position[:, 0]
+    scale_information = by_scale @ np.linalg.solve(covariance, by_scale)
+    if scale_information > 0:
+        change = match.scale_sigma**2 - 1 / scale_information
+        covariance = covariance + change * np.outer(by_scale, by_scale)
+    return replace(
+        detected,
+        position_m=position,
+        path_m=detected.path_m * match.scale,
+        covariance=covariance,
+        is_path_estimated=False,
+    )
+
+
+Assignment = tuple[tuple[int, Cell], ...]
+"""Pairs of a magnet's index and its cell, row by row from v1."""
+
+
+def _candidate_assignments(
+    magnets_m: Array, tags: Tags, length_tolerance: float
+) -> dict[Assignment, None]:
+    """Enumerate assignments of magnets (n, 2) to cells that agree with one rigid transform.
+
+    Each pair of magnets is matched with every pair of cells of similar distance (relative
+    tolerance ``length_tolerance``); the transform of the pair then assigns the other magnets.
+    """
     order, spacing = tags.order, tags.spacing_m
-    grid = [(c, r) for r in range(order) for c in range(order) if (c, r) != (order - 1, 0)]
-    nominal = places(tags, tuple(grid))
-    apart = nominal[None, :] - nominal[:, None]
-    lengths = np.linalg.norm(apart, axis=2)
-    found: dict[tuple[tuple[int, Cell], ...], tuple[Cell, ...]] = {}
-    n = len(points)
-    for i in range(n):
+    empty_column, empty_row = vertices(order)[3]
+    cells = [(column, row) for row in range(order) for column in range(order)]
+    cells.remove((empty_column, empty_row))
+    cells_m = cell_positions(tags, tuple(cells))
+    cell_offsets = cells_m[None, :] - cells_m[:, None]
+    cell_distances = np.linalg.norm(cell_offsets, axis=2)
+    tolerance = length_tolerance * cell_distances + MAX_CELL_DISTANCE_SPACINGS * spacing / 2
+    assignments: dict[Assignment, None] = {}
+    for i in range(len(magnets_m)):
         for j in range(i):
-            span = points[j] - points[i]
-            size = np.linalg.norm(span)
-            a, b = np.nonzero(
-                (np.abs(lengths - size) < length * lengths + NEAR * spacing / 2) & (lengths > 0)
-            )
-            if len(a) == 0:
+            offset = magnets_m[j] - magnets_m[i]
+            difference = np.abs(cell_distances - np.linalg.norm(offset))
+            first, second = np.nonzero((difference < tolerance) & (cell_distances > 0))
+            if len(first) == 0:
                 continue
-            turn = np.arctan2(span[1], span[0]) - np.arctan2(apart[a, b, 1], apart[a, b, 0])
-            # Into the tag's frame, so that the middle of the pair falls on that of the cells.
-            cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-            middle = points - (points[i] + points[j]) / 2
-            x = cos * middle[:, 0] + sin * middle[:, 1]
-            y = cos * middle[:, 1] - sin * middle[:, 0]
-            origin = (nominal[a] + nominal[b]) / 2
-            x, y = x + origin[:, :1], y + origin[:, 1:]
+            pair_offset = cell_offsets[first, second]
+            rotation = np.arctan2(offset[1], offset[0])
+            rotation = rotation - np.arctan2(pair_offset[:, 1], pair_offset[:, 0])
+            # Transform into the tag's frame; the midpoint of the magnets maps to that of the cells.
+            cos, sin = np.cos(rotation)[:, None], np.sin(rotation)[:, None]
+            centred = magnets_m - (magnets_m[i] + magnets_m[j]) / 2
+            midpoint = (cells_m[first] + cells_m[second]) / 2
+            x = cos * centred[:, 0] + sin * centred[:, 1] + midpoint[:, :1]
+            y = cos * centred[:, 1] - sin * centred[:, 0] + midpoint[:, 1:]
             half = (order - 1) / 2
             row, column = x / spacing + half, half - y / spacing
-            near_row, near_column = np.rint(row), np.rint(column)
-            good = np.hypot(row - near_row, column - near_column) < NEAR
-            good &= (near_row >= 0) & (near_row < order)
-            good &= (near_column >= 0) & (near_column < order)
-            good &= ~((near_column == order - 1) & (near_row == 0))
-            number = np.minimum(good.sum(axis=1), tags.magnets)
-            for k in np.flatnonzero(number >= max(2, number.max() - 1)):
-                chosen = np.flatnonzero(good[k])
-                cells = [(int(near_column[k, m]), int(near_row[k, m])) for m in chosen]
-                if len(set(cells)) < len(cells):
-                    continue
-                pairs = sorted(
-                    zip(chosen.tolist(), cells, strict=True), key=lambda pair: pair[1][::-1]
-                )
-                found[tuple(pairs)] = tuple(cell for _, cell in pairs)
-    return found
+            nearest_row, nearest_column = np.rint(row), np.rint(column)
+            distance = np.hypot(row - nearest_row, column - nearest_column)
+            is_on_cell = distance < MAX_CELL_DISTANCE_SPACINGS
+            is_on_cell &= (nearest_row >= 0) & (nearest_row < order)
+            is_on_cell &= (nearest_column >= 0) & (nearest_column < order)
+            is_on_cell &= (nearest_column != empty_column) | (nearest_row != empty_row)
+            count = np.minimum(is_on_cell.sum(axis=1), tags.magnets)
+            for k in np.flatnonzero(count >= max(2, count.max() - 1)):
+                pairs = [
+                    (int(m), (int(nearest_column[k, m]), int(nearest_row[k, m])))
+                    for m in np.flatnonzero(is_on_cell[k])
+                ]
+                if len({cell for _, cell in pairs}) == len(pairs):
+                    assignments[tuple(sorted(pairs, key=lambda pair: pair[1][::-1]))] = None
+    return assignments
 
 
-def _fitted(
-    sighting: DetectedMagnets,
-    tags: Tags,
-    magnets: tuple[int, ...],
-    cells: tuple[Cell, ...],
-    nominal: Array | None = None,
-) -> Match:
-    """The grid by least squares: heading, place, and the scale along the track."""
-    target = places(tags, cells) if nominal is None else nominal
-    build = BUILD_M if nominal is None else MEASURED_M
-    points = sighting.place_m[list(magnets)]
-    m = len(points)
-    index = (3 * np.array(magnets)[:, None] + np.arange(2)).ravel()
-    covariance = sighting.covariance[np.ix_(index, index)]
-    if not np.all(np.isfinite(covariance)):
-        covariance = np.eye(2 * m) * 1e-6
-    weight = np.linalg.inv(covariance + build**2 * np.eye(2 * m))
-    prior = np.zeros(4)
-    prior[3] = (1 / SCALE**2) if sighting.free_path else 1e12
-    a, b = points - points.mean(axis=0), target - target.mean(axis=0)
-    heading = float(np.arctan2((b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]).sum(), (a * b).sum()))
-    scale, shift = 1.0, np.zeros(2)
-    for _ in range(6):
+# ---- least squares
+
+
+@dataclass(frozen=True)
+class _GridStates:
+    """Parameters (k, 4) of k transforms: x, y, heading and scale."""
+
+    parameters: Array
+
+    def take(self, problems: Indices | NDArray[np.bool_]) -> _GridStates:
+        return _GridStates(self.parameters[problems])
+
+    def put(self, problems: Indices, other: _GridStates) -> None:
+        self.parameters[problems] = other.parameters
+
+
+@dataclass(frozen=True)
+class _GridProblem:
+    """Fits of k assignments of m magnets, for :func:`~locatk.core.least_squares.minimize`.
+
+    The residuals are the magnets, scaled along the track, minus the transformed cells.
+
+    Attributes
+    ----------
+    magnets_m, cells_m : (k, m, 2) ndarray
+    whitening : (k, 2 m, 2 m) ndarray
+        Its product with the residuals has unit covariance.
+    scale_sigma : float
+    """
+
+    magnets_m: Array
+    cells_m: Array
+    whitening: Array
+    scale_sigma: float
+
+    def linearize(self, state: _GridStates, problems: Indices) -> DenseEquations:
+        magnets, cells = self.magnets_m[problems], self.cells_m[problems]
+        x, y, heading, scale = (parameter[:, None] for parameter in state.parameters.T)
         cos, sin = np.cos(heading), np.sin(heading)
-        turned = target @ np.array([[cos, sin], [-sin, cos]])
-        scaled = points * [scale, 1.0]
-        residual = (scaled - turned - shift).ravel()
-        jacobian = np.zeros((2 * m, 4))
-        jacobian[0::2, 0] = jacobian[1::2, 1] = 1.0
-        jacobian[0::2, 2], jacobian[1::2, 2] = -turned[:, 1], turned[:, 0]
-        jacobian[0::2, 3] = -points[:, 0]
-        gram = jacobian.T @ weight @ jacobian + np.diag(prior)
-        side = jacobian.T @ weight @ residual
-        side[3] -= prior[3] * (scale - 1.0)
-        moved = np.linalg.solve(gram, side)
-        shift, heading, scale = shift + moved[:2], heading + moved[2], scale + moved[3]
-    misfit = float(np.sqrt((residual**2).sum() / m))
-    # A way that was no straight line shows in the grid, not in the samples.
-    squares = float(residual @ weight @ residual) + prior[3] * (scale - 1) ** 2
-    covariance = np.linalg.inv(gram) * max(1.0, squares / max(2 * m - 3, 1))
-    return Match(
-        magnets,
-        cells,
-        float(shift[0]),
-        float(shift[1]),
-        float(np.remainder(heading + np.pi, 2 * np.pi) - np.pi),
-        covariance[:3, :3],
-        float(scale),
-        float(np.sqrt(covariance[3, 3])),
-        misfit,
+        rotated_x = cos * cells[..., 0] - sin * cells[..., 1]
+        rotated_y = sin * cells[..., 0] + cos * cells[..., 1]
+        k, m, _ = magnets.shape
+        residual = np.empty((k, m, 2))
+        residual[..., 0] = scale * magnets[..., 0] - rotated_x - x
+        residual[..., 1] = magnets[..., 1] - rotated_y - y
+        jacobian = np.zeros((k, m, 2, 4))
+        jacobian[..., 0, 0] = jacobian[..., 1, 1] = -1.0
+        jacobian[..., 0, 2], jacobian[..., 1, 2] = rotated_y, -rotated_x
+        jacobian[..., 0, 3] = magnets[..., 0]
+        whitening = self.whitening[problems]
+        flat = residual.reshape(k, 2 * m)
+        weighted = (whitening @ flat[..., None])[..., 0]
+        cost = 0.5 * np.sum(weighted**2, axis=1)
+        equations = DenseEquations.from_weighted(
+            flat, weighted, whitening @ jacobian.reshape(k, 2 * m, 4), cost
+        )
+        equations.add_prior(
+            slice(3, 4), state.parameters[:, 3:] - 1.0, np.array([self.scale_sigma])
+        )
+        return equations
+
+    def retract(self, state: _GridStates, step: Array) -> _GridStates:
+        return _GridStates(state.parameters + step)
+
+
+def _fit_grids(
+    detected: DetectedMagnets,
+    tags: Tags,
+    assignments: list[tuple[tuple[int, ...], tuple[Cell, ...]]],
+    positions_m: Array | None = None,
+) -> list[TagMatch]:
+    """Fit the transforms of assignments with equal numbers of magnets.
+
+    Parameters
+    ----------
+    assignments : list of (magnets, cells)
+    positions_m : (m, 2) ndarray, optional
+        Positions of the magnets of a tag as it was built, instead of its cells.
+    """
+    magnets = np.array([indices for indices, _ in assignments])
+    count, m = magnets.shape
+    if positions_m is None:
+        build_sigma = HAND_BUILT_SIGMA_M
+        cells_m = np.array([cell_positions(tags, cells) for _, cells in assignments])
+    else:
+        build_sigma, cells_m = AS_BUILT_SIGMA_M, positions_m[None]
+    magnets_m = detected.position_m[magnets]
+    rows = (3 * magnets[..., None] + np.arange(2)).reshape(count, 2 * m)
+    covariance = detected.covariance[rows[:, :, None], rows[:, None, :]]
+    if not np.all(np.isfinite(covariance)):
+        covariance = np.tile(UNKNOWN_POSITION_SIGMA_M**2 * np.eye(2 * m), (count, 1, 1))
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance + build_sigma**2 * np.eye(2 * m)))
+    start = np.zeros((count, 4))
+    start[:, 3] = 1.0
+    for k in range(count):
+        rigid = umeyama(cells_m[k], magnets_m[k], with_scale=False)
+        start[k, :2] = rigid.translation
+        start[k, 2] = np.arctan2(rigid.rotation[1, 0], rigid.rotation[0, 0])
+    minimum = minimize(
+        _GridProblem(
+            magnets_m,
+            cells_m,
+            whitening,
+            SCALE_SIGMA if detected.is_path_estimated else FIXED_SCALE_SIGMA,
+        ),
+        _GridStates(start),
+        count,
+        damping=1e-9,
+        max_iterations=MAX_ITERATIONS,
+        min_gain=0.0,
+        min_step=MIN_STEP,
     )
-
-
-def refitted(sighting: DetectedMagnets, tags: Tags, match: Match, nominal: Array) -> Match:
-    """The same match on ``nominal`` places (M, 2): those of the tag as it was built."""
-    return _fitted(sighting, tags, match.magnets, match.cells, nominal)
-
-
-def ruled(sighting: DetectedMagnets, match: Match) -> DetectedMagnets:
-    """The sighting with lengths along the track measured by the tag itself."""
-    if not sighting.free_path:
-        return sighting
-    scale = match.scale
-    place = sighting.place_m * [scale, 1.0]
-    along = np.zeros(3 * len(place))
-    along[0::3] = place[:, 0]
-    stretch = np.ones(3 * len(place))
-    stretch[0::3] = scale
-    covariance = sighting.covariance * stretch[:, None] * stretch
-    # What was not known of the scale is known now.
-    known = along @ np.linalg.solve(covariance, along)
-    if known > 0:
-        covariance = covariance + (match.scale_sigma**2 - 1 / known) * np.outer(along, along)
-    return replace(
-        sighting,
-        place_m=place,
-        path_m=sighting.path_m * scale,
-        covariance=covariance,
-        free_path=False,
-    )
+    equations: DenseEquations = minimum.equations
+    # A path that is not straight shows in the grid, not in the samples of a pass.
+    inflation = np.maximum(1.0, 2 * equations.cost / max(2 * m - 3, 1))
+    covariances = np.linalg.inv(equations.hessian) * inflation[:, None, None]
+    misfit = np.sqrt((equations.residual**2).sum(axis=1) / m)
+    return [
+        TagMatch(
+            magnets=indices,
+            cells=cells,
+            x_m=float(x),
+            y_m=float(y),
+            heading_rad=float(wrap_angle(heading)),
+            covariance=covariances[k, :3, :3],
+            scale=float(scale),
+            scale_sigma=float(np.sqrt(covariances[k, 3, 3])),
+            misfit_m=float(misfit[k]),
+        )
+        for k, ((indices, cells), (x, y, heading, scale)) in enumerate(
+            zip(assignments, minimum.state.parameters, strict=True)
+        )
+    ]

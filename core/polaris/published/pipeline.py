@@ -469,7 +469,7 @@ def _as_detected(
         first=first,
         stop=stop,
         path_m=path[first:stop] - path[middle],
-        place_m=np.array([(m.x_m + m.path_m - path[middle], m.y_m) for m in ordered]),
+        position_m=np.array([(m.x_m + m.path_m - path[middle], m.y_m) for m in ordered]),
         angle_rad=np.array([m.angle_rad for m in ordered]),
         moment_am2=np.array([m.moment_am2 for m in ordered]),
         covariance=np.full((3 * len(ordered), 3 * len(ordered)), np.nan),

@@ -1,7 +1,7 @@
-"""The field over a floor with tags: discs as finite cylinders, and debris around them.
+"""Field of simulated tags: discs as finite cylinders, debris, and the Earth.
 
-magpylib integrates the cylinders exactly, so that nothing here shares the solver's
-dipoles. Debris is small against its distance, and a dipole by right.
+magpylib integrates the field of the cylinders; the dipoles of the solver are not used. Debris is
+small compared with its distance to the sensors, so that a dipole describes it.
 """
 
 from __future__ import annotations
@@ -17,113 +17,123 @@ from locatk.core.polaris.tag import MU0, Magnet
 
 Array = NDArray[np.float64]
 
-LEAST_T = 1e-10
-"""Where a source is weaker than this it is left out: a thousandth of a sensor's count."""
+MIN_FIELD_T = 1e-10
+"""Field below which a source is ignored [T], a thousandth of a count of an MLX90393."""
 
-IRON_SATURATION = 1.7e6
-"""Magnetisation of saturated iron, A/m (2.15 T / mu0)."""
+IRON_SATURATION_A_PER_M = 1.7e6
+"""Magnetisation of saturated iron [A/m], 2.15 T / mu0."""
 
-REMANENT_MAGNETISATION = 20e3
-"""Of a chip of hard steel that was magnetised, A/m: coercivities of steel are some kA/m,
-and a compact body keeps about three times that against its own demagnetising field."""
+MAX_REMANENCE_A_PER_M = 20e3
+"""Largest magnetisation of a magnetised chip of hard steel [A/m]. Coercivities of steel are some
+kA/m; a compact body keeps about three times that against its own demagnetising field."""
 
-LEAST_SIZE = 0.3
-"""Of the smallest debris, as a share of the largest."""
+MIN_SIZE_RATIO = 0.3
+"""Diameter of the smallest debris, relative to the largest."""
 
 
 @dataclass(frozen=True)
 class Discs:
-    """Magnets as they truly lie, all of one kind, their middles in the plane z = 0.
+    """Magnets as built, all of one kind, with their middles in the plane z = 0.
 
     Attributes
     ----------
     magnet : Magnet
     tag_id : tuple of int
-        To which tag each belongs.
-    place_m : (m, 2) ndarray
+        Tag of each magnet.
+    position_m : (m, 2) ndarray
     angle_rad : (m,) ndarray
-        From the frame's x to north, counter-clockwise.
+        Direction of the north pole, counter-clockwise from the frame's x.
     strength : (m,) ndarray
-        Remanence, as a share of the magnet's.
+        Remanence relative to the nominal one of ``magnet``.
     """
 
     magnet: Magnet
     tag_id: tuple[int, ...]
-    place_m: Array
+    position_m: Array
     angle_rad: Array
     strength: Array
 
     def __len__(self) -> int:
-        return len(self.place_m)
+        return len(self.position_m)
 
     @property
     def moment_am2(self) -> Array:
-        """Magnetic moments (m,)."""
+        """Magnetic moments (m,) in A m2."""
         return self.strength * self.magnet.moment
 
 
 @dataclass(frozen=True)
 class Debris:
-    """Small iron on the floor.
+    """Iron bits on the floor.
 
     Attributes
     ----------
-    place_m, moment_am2 : (n, 3) ndarray
+    position_m, moment_am2 : (n, 3) ndarray
     """
 
-    place_m: Array
+    position_m: Array
     moment_am2: Array
 
     def __len__(self) -> int:
-        return len(self.place_m)
+        return len(self.position_m)
 
 
 def disc_field(discs: Discs, points_m: Array) -> Array:
-    """Flux density (..., 3) in tesla of all discs at ``points_m`` (..., 3).
+    """Return the flux density (..., 3) in tesla of all discs at ``points_m`` (..., 3).
 
-    A disc counts where it makes at least :data:`LEAST_T`.
+    A disc is ignored at points at which its field is below :data:`MIN_FIELD_T`.
     """
     magnet = discs.magnet
-    # Of the strongest axis: a dipole's field along its moment.
-    reach = np.cbrt(2 * MU0_4PI * magnet.moment * np.max(discs.strength, initial=0) / LEAST_T)
+    # The field of a dipole is strongest along its moment.
+    range_m = np.cbrt(2 * MU0_4PI * magnet.moment * np.max(discs.strength, initial=0) / MIN_FIELD_T)
     cylinder = magpylib.magnet.Cylinder(
         polarization=(magnet.remanence_t, 0, 0), dimension=(magnet.diameter_m, magnet.height_m)
     )
     points = np.reshape(points_m, (-1, 3))
     field = np.zeros_like(points)
-    for place, angle, strength in zip(discs.place_m, discs.angle_rad, discs.strength, strict=True):
-        offset = points - [*place, 0.0]
-        near = np.einsum("ni,ni->n", offset, offset) < reach**2
-        if near.any():
+    magnets = zip(discs.position_m, discs.angle_rad, discs.strength, strict=True)
+    for position, angle, strength in magnets:
+        offset = points - [*position, 0.0]
+        in_range = np.einsum("ni,ni->n", offset, offset) < range_m**2
+        if in_range.any():
             cos, sin = np.cos(angle), np.sin(angle)
             axes = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-            own = cylinder.getB(offset[near] @ axes, squeeze=False).reshape(-1, 3)
-            field[near] += strength * (own @ axes.T)
+            magnet_field = cylinder.getB(offset[in_range] @ axes, squeeze=False).reshape(-1, 3)
+            field[in_range] += strength * (magnet_field @ axes.T)
     return field.reshape(np.shape(points_m))
 
 
 def debris_field(debris: Debris, points_m: Array) -> Array:
-    """Flux density (..., 3) in tesla of all debris at ``points_m`` (..., 3)."""
+    """Return the flux density (..., 3) in tesla of all debris at ``points_m`` (..., 3)."""
     points = np.reshape(points_m, (-1, 3))
     field = np.zeros_like(points)
-    reach = np.cbrt(2 * MU0_4PI * np.linalg.norm(debris.moment_am2, axis=1) / LEAST_T)
-    for place, moment, far in zip(debris.place_m, debris.moment_am2, reach, strict=True):
-        offset = points - place
-        near = np.einsum("ni,ni->n", offset, offset) < far**2
-        field[near] += dipole_field(offset[near], moment)
+    ranges_m = np.cbrt(2 * MU0_4PI * np.linalg.norm(debris.moment_am2, axis=1) / MIN_FIELD_T)
+    for position, moment, range_m in zip(
+        debris.position_m, debris.moment_am2, ranges_m, strict=True
+    ):
+        offset = points - position
+        in_range = np.einsum("ni,ni->n", offset, offset) < range_m**2
+        field[in_range] += dipole_field(offset[in_range], moment)
     return field.reshape(np.shape(points_m))
 
 
 def earth_field(strength_t: float, dip_rad: float, north_rad: float) -> Array:
-    """Flux density (3,) of the Earth where it dips by ``dip_rad`` under the horizon, with
-    magnetic north at ``north_rad`` counter-clockwise from the frame's x."""
-    level = strength_t * np.cos(dip_rad)
+    """Return the flux density (3,) of the Earth in the frame of the floor.
+
+    It dips by ``dip_rad`` below the horizon; magnetic north is ``north_rad`` counter-clockwise
+    from the frame's x.
+    """
+    horizontal_t = strength_t * np.cos(dip_rad)
     return np.array(
-        [level * np.cos(north_rad), level * np.sin(north_rad), -strength_t * np.sin(dip_rad)]
+        [
+            horizontal_t * np.cos(north_rad),
+            horizontal_t * np.sin(north_rad),
+            -strength_t * np.sin(dip_rad),
+        ]
     )
 
 
-def scatter(
+def scatter_debris(
     discs: Discs,
     low_m: Array,
     high_m: Array,
@@ -133,40 +143,40 @@ def scatter(
     earth_t: Array,
     rng: np.random.Generator,
 ) -> Debris:
-    """Iron bits on the floor, magnetised by all that is around them.
+    """Scatter iron bits on the floor, magnetised by the discs and the Earth.
 
     Parameters
     ----------
     discs : Discs
-        They lie under the bits, which never touch them.
+        Below the bits, without contact.
     low_m, high_m : (2,) ndarray
-        Corners of the rectangle over which they are strewn.
+        Corners of the rectangle of the bits.
     count : int
     diameter_m : float
-        Of the largest; sizes are even from :data:`LEAST_SIZE` of it.
+        Largest diameter; diameters are uniform from :data:`MIN_SIZE_RATIO` of it.
     magnetised : float
-        Share of the bits that are hard steel and keep a magnetisation of up to
-        :data:`REMANENT_MAGNETISATION`, any way.
+        Fraction of the bits that are hard steel with a remanence of up to
+        :data:`MAX_REMANENCE_A_PER_M` in a random direction.
     earth_t : (3,) ndarray
     rng : Generator
 
     Notes
     -----
     A sphere of high permeability takes the moment ``3 V B / mu0`` in a field (Jackson,
-    Classical Electrodynamics, 3rd ed., section 5.11), until it is saturated. What bits do
-    to each other is left out.
+    Classical Electrodynamics, 3rd ed., section 5.11), until it is saturated. The fields of the
+    bits at each other are neglected.
     """
-    diameter = diameter_m * rng.uniform(LEAST_SIZE, 1.0, count)
-    place = np.column_stack(
+    diameter = diameter_m * rng.uniform(MIN_SIZE_RATIO, 1.0, count)
+    position = np.column_stack(
         [rng.uniform(low_m, high_m, (count, 2)), (discs.magnet.height_m + diameter) / 2]
     )
     volume = np.pi / 6 * diameter**3
-    field = disc_field(discs, place) + earth_t
+    field = disc_field(discs, position) + earth_t
     induced = 3 * volume[:, None] * field / MU0
-    size = np.linalg.norm(induced, axis=1)
-    induced *= np.minimum(1.0, IRON_SATURATION * volume / np.maximum(size, 1e-30))[:, None]
-    way = rng.normal(size=(count, 3))
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    hard = rng.random(count) < magnetised
-    kept = hard * rng.uniform(0, REMANENT_MAGNETISATION, count) * volume
-    return Debris(place, induced + kept[:, None] * way)
+    induced_norm = np.maximum(np.linalg.norm(induced, axis=1), 1e-30)
+    induced *= np.minimum(1.0, IRON_SATURATION_A_PER_M * volume / induced_norm)[:, None]
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    is_hard = rng.random(count) < magnetised
+    remanent = is_hard * rng.uniform(0, MAX_REMANENCE_A_PER_M, count) * volume
+    return Debris(position, induced + remanent[:, None] * direction)

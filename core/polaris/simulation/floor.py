@@ -1,4 +1,4 @@
-"""The floor as it truly is: where tags lie, how they were built, what lies about."""
+"""Simulated floor: tags as built, debris on them, and the Earth's field."""
 
 from __future__ import annotations
 
@@ -16,35 +16,43 @@ from locatk.core.polaris.simulation.field import (
     debris_field,
     disc_field,
     earth_field,
-    scatter,
+    scatter_debris,
 )
-from locatk.core.polaris.simulation.options import SimulationOptions
-from locatk.core.polaris.tag import AsBuiltTag, Placed, Tags, angles, built_magnets, places
+from locatk.core.polaris.simulation.options import RandomSource, SimulationOptions
+from locatk.core.polaris.tag import (
+    AsBuiltTag,
+    PlanarPose,
+    Tags,
+    as_built_magnets,
+    cell_positions,
+    symbol_angles,
+)
+from locatk.core.simulation import random_stream
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Floor:
+class TagFloor:
     """Tags, debris and the Earth.
 
     Attributes
     ----------
     frame : str
-        ``"site"``, or ``"tag-<id>"`` of the one tag.
-    site : mapping of int to Placed
-        All tags that lie there.
+        ``"site"``, or ``"tag-<id>"`` of the only tag.
+    site : mapping of int to PlanarPose
+        Poses of all tags on the floor.
     route : tuple of int
-        Those that are crossed, in their order.
+        Tags to cross, in order.
     discs : Discs
-    built : mapping of int to AsBuilt
-        The discs by tag, against the design.
+    built : mapping of int to AsBuiltTag
+        Deviations of the magnets of each tag from the design.
     debris : Debris
     earth_t : (3,) ndarray
     """
 
     frame: str
-    site: Mapping[int, Placed]
+    site: Mapping[int, PlanarPose]
     route: tuple[int, ...]
     discs: Discs
     built: Mapping[int, AsBuiltTag]
@@ -52,104 +60,117 @@ class Floor:
     earth_t: Array
 
     def field(self, points_m: Array) -> Array:
-        """Flux density (..., 3) in tesla at ``points_m`` (..., 3)."""
-        magnets, bits = disc_field(self.discs, points_m), debris_field(self.debris, points_m)
-        return np.asarray(magnets + bits + self.earth_t)
+        """Return the flux density (..., 3) in tesla at ``points_m`` (..., 3)."""
+        magnets_t, debris_t = disc_field(self.discs, points_m), debris_field(self.debris, points_m)
+        return np.asarray(magnets_t + debris_t + self.earth_t)
 
 
-def floor(tags: Tags, options: SimulationOptions) -> Floor:
-    """Build the tags, and strew debris over those that are crossed.
+def build_floor(tags: Tags, options: SimulationOptions) -> TagFloor:
+    """Build the tags with their errors, and scatter debris over those that are crossed.
 
     Raises
     ------
     InputError
-        A tag of the route is not of the family, or not on the site; or several are to be
-        crossed and there is no site.
+        A tag of the route is not of the family or not on the site, or the route has several
+        tags although there is no site.
     """
-    site, route, frame = _world(tags, options.route)
-    discs, built = _build(tags, site, options)
-    earth = earth_field(options.earth_t, options.dip_rad, options.north_rad)
-    debris = _strew(tags, [site[tag_id] for tag_id in dict.fromkeys(route)], discs, earth, options)
-    return Floor(frame, site, route, discs, built, debris, earth)
+    site, route, frame = _arrange_tags(tags, options.route)
+    discs, built = _build_tags(tags, site, options)
+    earth_t = earth_field(options.earth_t, options.dip_rad, options.north_rad)
+    crossed = [site[tag_id] for tag_id in dict.fromkeys(route)]
+    debris = _debris_of_tags(tags, crossed, discs, earth_t, options)
+    return TagFloor(frame, site, route, discs, built, debris, earth_t)
 
 
-def on_floor(at: Placed, points: Array) -> Array:
-    """Points (..., 2) of a tag's frame in the site's."""
-    cos, sin = np.cos(at.heading_rad), np.sin(at.heading_rad)
-    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]) + [at.x_m, at.y_m])
+def to_site_frame(tag_pose: PlanarPose, points: Array) -> Array:
+    """Transform points (..., 2) from the frame of a tag to that of the site."""
+    cos, sin = np.cos(tag_pose.heading_rad), np.sin(tag_pose.heading_rad)
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]) + [tag_pose.x_m, tag_pose.y_m])
 
 
-def _world(tags: Tags, route: tuple[int, ...]) -> tuple[Mapping[int, Placed], tuple[int, ...], str]:
-    """Where the tags lie, which are crossed, and the frame's name."""
+def _arrange_tags(
+    tags: Tags, route: tuple[int, ...]
+) -> tuple[Mapping[int, PlanarPose], tuple[int, ...], str]:
+    """Return the poses of the tags, the tags to cross, and the name of the frame."""
     if tags.site:
-        strange = [tag_id for tag_id in route if tag_id not in tags.site]
-        if strange:
+        unknown = [tag_id for tag_id in route if tag_id not in tags.site]
+        if unknown:
             raise InputError(
-                f"tag {strange[0]} is not on the site",
+                f"tag {unknown[0]} is not on the site",
                 hint="The site has " + ", ".join(map(str, tags.site)),
             )
         return tags.site, route or tuple(tags.site), "site"
     first = route[0] if route else (tags.ids or (0,))[0]
     if any(tag_id != first for tag_id in route):
         raise InputError(
-            "several tags, and no site that says where they lie",
+            "several tags and no site with their positions",
             hint="Give the tags a site, or cross one of them",
         )
-    return {first: Placed(0.0, 0.0, 0.0)}, (first,), f"tag-{first}"
+    return {first: PlanarPose(0.0, 0.0, 0.0)}, (first,), f"tag-{first}"
 
 
-def _build(
-    tags: Tags, site: Mapping[int, Placed], options: SimulationOptions
+def _build_tags(
+    tags: Tags, site: Mapping[int, PlanarPose], options: SimulationOptions
 ) -> tuple[Discs, dict[int, AsBuiltTag]]:
-    """The magnets of all tags as they truly lie, and the same against the design."""
+    """Return the magnets of all tags with their errors, and the same relative to the design."""
     ids: list[int] = []
-    place: list[Array] = []
-    angle: list[Array] = []
-    strength: list[Array] = []
+    positions: list[Array] = []
+    directions: list[Array] = []
+    strengths: list[Array] = []
     built = {}
-    for tag_id, at in site.items():
+    for tag_id, tag_pose in site.items():
         if tags.ids is not None and tag_id not in tags.ids:
             raise InputError(
                 f"tag {tag_id} is not of the family", hint=f"It has {len(tags.ids)} members"
             )
         layout = codec.layout_of(tags, tag_id)
-        where, towards = built_magnets(tags, tag_id, layout)
-        # By the tag's own number, so that it is the same on every site.
-        rng = np.random.default_rng([options.build_seed, 20, tag_id])
-        where = where + options.build_place_m * rng.normal(size=where.shape)
-        towards = towards + options.build_angle_rad * rng.normal(size=towards.shape)
-        strength.append(1 + options.build_strength * rng.normal(size=towards.shape))
+        position_m, angle_rad = as_built_magnets(tags, tag_id, layout)
+        # A stream for each id: the tag is the same on every site.
+        rng = random_stream(options.build_seed, RandomSource.TAG, tag_id)
+        position_m = position_m + options.build_place_m * rng.normal(size=position_m.shape)
+        angle_rad = angle_rad + options.build_angle_rad * rng.normal(size=angle_rad.shape)
+        strengths.append(1 + options.build_strength * rng.normal(size=angle_rad.shape))
         built[tag_id] = AsBuiltTag(
-            where - places(tags, layout.cells), towards - angles(tags, layout.symbols)
+            position_m - cell_positions(tags, layout.cells),
+            angle_rad - symbol_angles(tags, layout.symbols),
         )
-        ids += [tag_id] * len(where)
-        place.append(on_floor(at, where))
-        angle.append(np.angle(np.exp(1j * (towards + at.heading_rad))))
+        ids += [tag_id] * len(position_m)
+        positions.append(to_site_frame(tag_pose, position_m))
+        directions.append(np.angle(np.exp(1j * (angle_rad + tag_pose.heading_rad))))
     discs = Discs(
-        tags.magnet, tuple(ids), np.vstack(place), np.concatenate(angle), np.concatenate(strength)
+        tags.magnet,
+        tuple(ids),
+        np.vstack(positions),
+        np.concatenate(directions),
+        np.concatenate(strengths),
     )
     return discs, built
 
 
-def _strew(
-    tags: Tags, at: list[Placed], discs: Discs, earth: Array, options: SimulationOptions
+def _debris_of_tags(
+    tags: Tags,
+    tag_poses: list[PlanarPose],
+    discs: Discs,
+    earth_t: Array,
+    options: SimulationOptions,
 ) -> Debris:
-    """Debris over each tag, and a spacing around it."""
-    reach = ((tags.order - 1) / 2 + 1) * tags.spacing_m
-    rng = np.random.default_rng([options.seed, 21])
-    bits = [
-        scatter(
+    """Scatter debris over each tag, and a grid spacing beyond its outer cells."""
+    half_width_m = ((tags.order - 1) / 2 + 1) * tags.spacing_m
+    rng = random_stream(options.seed, RandomSource.DEBRIS)
+    parts = [
+        scatter_debris(
             discs,
-            np.array([tag.x_m, tag.y_m]) - reach,
-            np.array([tag.x_m, tag.y_m]) + reach,
+            np.array([pose.x_m, pose.y_m]) - half_width_m,
+            np.array([pose.x_m, pose.y_m]) + half_width_m,
             options.debris,
             options.debris_size_m,
             options.debris_magnetised,
-            earth,
+            earth_t,
             rng,
         )
-        for tag in at
+        for pose in tag_poses
     ]
     return Debris(
-        np.vstack([some.place_m for some in bits]), np.vstack([some.moment_am2 for some in bits])
+        np.vstack([part.position_m for part in parts]),
+        np.vstack([part.moment_am2 for part in parts]),
     )

@@ -1,17 +1,39 @@
-"""What is simulated, and within which bounds."""
+"""Options of a simulated pass over tags, and their valid ranges."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import IntEnum
 from itertools import pairwise
 
 import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.mlx90393 import Settings, for_rate, published_bar
+from locatk.core.polaris.mlx90393 import Settings, published_bar, settings_for_rate
 from locatk.core.polaris.tag import Magnet, Tags
-from locatk.core.simulation import check_options
+from locatk.core.simulation import (
+    check_options,
+    require_finite,
+    require_fraction,
+    require_fraction_below_1,
+    require_not_negative,
+    require_positive,
+)
+
+
+class RandomSource(IntEnum):
+    """Sources of random errors, each with a stream of its own."""
+
+    OFFSETS = 10
+    DRIFT = 11
+    NOISE = 12
+    LOSSES = 13
+    MOTORS = 14
+    TAG = 20
+    DEBRIS = 21
+    PATH = 22
+    ODOMETRY = 23
 
 
 def usual_bar(
@@ -22,16 +44,16 @@ def usual_bar(
     gain: int = 7,
     resolution: int = 0,
 ) -> SensorArray:
-    """A bar of MLX90393 that convert for as long as the rate allows (default: the paper's).
+    """Return a bar of MLX90393 with the longest conversion of the rate (default: the paper's).
 
-    ``noise_t`` is of each axis; None for the measured one of the published recordings.
+    ``noise_t`` is the standard deviation of each axis; None for that of the published recordings.
 
     Raises
     ------
     InputError
-        The part has no such gain or resolution, or is not that quick.
+        The MLX90393 has no such gain or resolution, or is not that fast.
     """
-    part = for_rate(rate_hz, Settings(gain=gain, resolution=resolution))
+    part = settings_for_rate(rate_hz, Settings(gain=gain, resolution=resolution))
     if part is None:
         raise InputError(
             f"no setting of the MLX90393 gives {rate_hz:g} Hz", hint="Give a lower rate"
@@ -42,15 +64,15 @@ def usual_bar(
 
 @dataclass(frozen=True)
 class Car:
-    """A set-up of the paper.
+    """Robot and tag of the paper.
 
     Attributes
     ----------
     tags : Tags
-        A tag as it drove over, without ids.
+        Design of the tag, without ids.
     sensors : int
     spacing_m : float
-        Between its sensors.
+        Distance between neighbouring sensors.
     rate_hz, speed_mps : float
     """
 
@@ -73,62 +95,63 @@ CARS = {
         0.005,
     ),
 }
-"""The robot car and the miniature car (Polaris sections 7, 8.2 and 8.4)."""
+"""Robot car and miniature car of the paper (Polaris sections 7, 8.2 and 8.4)."""
 
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What to simulate. The defaults are the paper's set-up (sections 7 and 8.2).
+    """Options of a simulated pass. The defaults are the paper's setup (sections 7 and 8.2).
 
     Attributes
     ----------
     array : SensorArray
-        Its noise, delays, counts and range are simulated, and told in the session.
+        Its noise, delays, quantization and range are simulated, and recorded in the session.
     rate_hz : float
     route : tuple of int
-        Tags in the order in which they are crossed, none twice in a row; where it is
-        empty, all of the site, or the first of the family.
+        Tags in the order in which they are crossed, none twice in a row. If empty: all of the
+        site, or the first of the family.
     heading_rad : float or None
         Direction of travel over each tag, in the tag's frame; None for straight ahead (0)
         over a single tag, and along the route over several.
     lateral_m : float
-        How far to the left of the tags' middles the array's middle passes.
+        Distance at which the array's middle passes left of the middles of the tags.
     run_up_m : float or None
-        From the start to the first tag's rim, and from the last one's to the end; None
-        for ten clearances.
+        Distance from the start to the edge of the first tag, and from the edge of the last one to
+        the end; None for ten clearances.
     speed_mps, rest_s, acceleration_mps2, speed_wobble
-        See :class:`~locatk.core.polaris.simulation.paths.Drive`.
+        See :class:`~locatk.core.polaris.simulation.paths.SpeedProfile`.
     crab_rad, yaw_wobble_rad : float
-        From the way the array goes to the way it points: for ever, and up and down.
+        Angle from the direction of travel to the array's x: constant part, and amplitude of its
+        variation.
     clearance_m : float or None
-        From the magnets' middles to the sensors; None for the tags' own.
+        Height of the sensors above the middles of the magnets; None for that of the tags.
     height_wobble_m : float
-        By how much it goes up and down.
+        Amplitude of the variation of that height.
     build_angle_rad, build_place_m, build_strength : float
-        Standard deviations of how the magnets were built: direction, place along each
-        axis, and remanence as a share.
+        Standard deviations of the errors of the magnets: direction, position along each axis, and
+        relative remanence.
     build_seed : int
         Tags of the same seed are the same in every session.
     earth_t, dip_rad, north_rad : float
-        The Earth's field, how much it dips, and where magnetic north is in the frame.
+        Earth's field, its dip below the horizon, and direction of magnetic north in the frame.
     offset_t, drift_t, dead, stuck, clipped
-        See :class:`~locatk.core.polaris.simulation.sensors.Faults`.
+        See :class:`~locatk.core.polaris.simulation.sensors.SensorFaults`.
     lost : float
-        Share of the frames that never arrive.
+        Fraction of the frames that never arrive.
     debris : int
-        Iron bits on and around each tag of the route.
+        Number of iron bits on and around each tag of the route.
     debris_size_m : float
-        Diameter of the largest.
+        Diameter of the largest bit.
     debris_magnetised : float
-        Share of them that keeps a magnetisation of its own.
+        Fraction of the bits with a remanent magnetisation.
     motor_t : float
-        Field of the motors at the bar's middle, at the speed driven.
+        Field of the motors at the array's middle, at the speed driven.
     motor_gradient : float
-        By which share that grows in a metre along the bar.
+        Relative growth of that field in a metre along the array.
     odometry : bool
-        Whether the robot has one.
+        True if the robot records odometry.
     odometry_scale : float
-        By which share it tells too much.
+        Relative error of its distances.
     odometry_turn_rad : float
         Standard deviation of its heading after a metre, as a random walk.
     device : str
@@ -181,13 +204,46 @@ class SimulationOptions:
 
     def __post_init__(self) -> None:
         sensors = range(len(self.array))
-        above_0, from_0, share = "a number above 0", "0 or more", "0 to below 1"
         check_options(
             self,
             (
                 ("array", len(self.array) >= 1, "one sensor or more"),
-                ("array", bool(np.all(self.array.noise_t >= 0)), "one whose noise is known"),
-                ("rate_hz", 0 < self.rate_hz < np.inf, above_0),
+                ("array", bool(np.all(self.array.noise_t >= 0)), "one with a known noise"),
+                *require_positive(
+                    self,
+                    "rate_hz",
+                    "run_up_m",
+                    "speed_mps",
+                    "acceleration_mps2",
+                    "clearance_m",
+                    "debris_size_m",
+                ),
+                *require_not_negative(
+                    self,
+                    "rest_s",
+                    "height_wobble_m",
+                    "build_angle_rad",
+                    "build_place_m",
+                    "build_seed",
+                    "earth_t",
+                    "offset_t",
+                    "drift_t",
+                    "motor_t",
+                    "odometry_turn_rad",
+                    "seed",
+                ),
+                *require_finite(
+                    self,
+                    "heading_rad",
+                    "lateral_m",
+                    "crab_rad",
+                    "yaw_wobble_rad",
+                    "dip_rad",
+                    "north_rad",
+                    "motor_gradient",
+                ),
+                *require_fraction(self, "debris_magnetised"),
+                *require_fraction_below_1(self, "lost"),
                 (
                     "rate_hz",
                     float(np.ptp(self.array.delay_s)) * self.rate_hz < 1,
@@ -198,49 +254,11 @@ class SimulationOptions:
                     all(one != next for one, next in pairwise(self.route)),
                     "another tag in between, or a session for each pass",
                 ),
-                *(
-                    (name, bool(np.isfinite(getattr(self, name) or 0.0)), "a number")
-                    for name in (
-                        "heading_rad",
-                        "lateral_m",
-                        "crab_rad",
-                        "yaw_wobble_rad",
-                        "dip_rad",
-                        "north_rad",
-                        "motor_gradient",
-                    )
-                ),
-                ("run_up_m", self.run_up_m is None or 0 < self.run_up_m < np.inf, above_0),
-                ("speed_mps", 0 < self.speed_mps < np.inf, above_0),
-                ("rest_s", 0 <= self.rest_s < np.inf, from_0),
-                (
-                    "acceleration_mps2",
-                    self.acceleration_mps2 is None or 0 < self.acceleration_mps2 < np.inf,
-                    above_0,
-                ),
                 ("speed_wobble", 0 <= self.speed_wobble <= 0.9, "0 to 0.9"),
-                (
-                    "clearance_m",
-                    self.clearance_m is None or 0 < self.clearance_m < np.inf,
-                    above_0,
-                ),
-                ("height_wobble_m", 0 <= self.height_wobble_m < np.inf, from_0),
-                ("build_angle_rad", 0 <= self.build_angle_rad < np.inf, from_0),
-                ("build_place_m", 0 <= self.build_place_m < np.inf, from_0),
                 ("build_strength", 0 <= self.build_strength <= 0.2, "0 to 0.2"),
-                ("build_seed", self.build_seed >= 0, from_0),
-                ("earth_t", 0 <= self.earth_t < np.inf, from_0),
-                ("offset_t", 0 <= self.offset_t < np.inf, from_0),
-                ("drift_t", 0 <= self.drift_t < np.inf, from_0),
                 ("dead", set(self.dead) <= set(sensors), f"sensors of {sensors}"),
                 ("stuck", set(self.stuck) <= set(sensors), f"sensors of {sensors}"),
-                ("lost", 0 <= self.lost < 1, share),
                 ("debris", 0 <= self.debris <= 10_000, "0 to 10000"),
-                ("debris_size_m", 0 < self.debris_size_m < np.inf, above_0),
-                ("debris_magnetised", 0 <= self.debris_magnetised <= 1, "0 to 1"),
-                ("motor_t", 0 <= self.motor_t < np.inf, from_0),
                 ("odometry_scale", -0.5 < self.odometry_scale < 1, "-0.5 to 1"),
-                ("odometry_turn_rad", 0 <= self.odometry_turn_rad < np.inf, from_0),
-                ("seed", self.seed >= 0, from_0),
             ),
         )

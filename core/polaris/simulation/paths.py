@@ -1,4 +1,4 @@
-"""Where a simulated array is at any time: straight over each tag, at a speed that varies."""
+"""Path of a simulated array: straight over each tag, at a speed that varies."""
 
 from __future__ import annotations
 
@@ -8,132 +8,141 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.polaris.tag import Placed
+from locatk.core.polaris.tag import PlanarPose
 
 Array = NDArray[np.float64]
 
-NODES = 2000
-"""Of the table of times, for a way of one wobble."""
+NODES_PER_WOBBLE = 2000
+"""Nodes of the table from time to distance, for a distance of one wobble."""
 
-MOST_NODES = 1_000_000
-"""Of that table; a very slow start gets coarser ones."""
+MAX_NODES = 1_000_000
+"""Largest number of nodes of that table; a very slow start gets longer intervals."""
 
-BENT_NODES = 500
-"""Of a bend between two tags."""
+NODES_PER_BEND = 500
+"""Nodes of the curve between two tags."""
+
+MAX_STRAIGHT_FRACTION = 0.3
+"""Largest straight part at each of two tags, as a fraction of their distance."""
 
 
 class Wobble:
-    """A smooth function of any number that stays within -1 and 1, and comes near both.
+    """Smooth random function of one variable with values from -1 to 1.
 
-    A wave 1 to 3 long, with two shorter and weaker ones on it.
+    The sum of a sine with a period of 1 to 3 and of two shorter and weaker ones.
     """
 
-    SHARES = np.array([0.6, 0.3, 0.1])
+    AMPLITUDES = np.array([0.6, 0.3, 0.1])
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._wave = np.array([1.0, 2.3, 5.1]) / rng.uniform(1, 3)
+        self._frequency = np.array([1.0, 2.3, 5.1]) / rng.uniform(1, 3)
         self._phase = rng.uniform(0, 2 * np.pi, 3)
 
     def __call__(self, x: Array) -> Array:
-        """Values (...) at ``x`` (...)."""
-        turns = np.asarray(x, float)[..., None] * self._wave
-        return np.asarray(np.sin(2 * np.pi * turns + self._phase) @ self.SHARES)
+        """Return the values (...) at ``x`` (...)."""
+        periods = np.asarray(x, float)[..., None] * self._frequency
+        return np.asarray(np.sin(2 * np.pi * periods + self._phase) @ self.AMPLITUDES)
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line on the floor, by its length.
+class PlanarPath:
+    """Polyline on the floor, parametrised by its length.
 
     Attributes
     ----------
-    way_m : (k,) ndarray
-        Ascending, from 0.
-    place_m : (k, 2) ndarray
+    distance_m : (k,) ndarray
+        Distance of each node along the path, ascending from 0.
+    position_m : (k, 2) ndarray
     heading_rad : (k,) ndarray
-        Of the line, without jumps of a turn.
+        Direction of the path, unwrapped.
     """
 
-    way_m: Array
-    place_m: Array
+    distance_m: Array
+    position_m: Array
     heading_rad: Array
 
     @property
     def length_m(self) -> float:
-        return float(self.way_m[-1])
+        return float(self.distance_m[-1])
 
-    def at(self, way_m: Array) -> tuple[Array, Array]:
-        """Places (..., 2) and headings (...) after ``way_m`` (...).
+    def at(self, distance_m: Array) -> tuple[Array, Array]:
+        """Return positions (..., 2) and headings (...) after ``distance_m`` (...).
 
-        Before its start and after its end the line goes straight on.
+        The path continues straight before its start and after its end.
         """
-        inside = np.clip(way_m, 0.0, self.length_m)
-        heading = np.interp(inside, self.way_m, self.heading_rad)
-        place = np.stack([np.interp(inside, self.way_m, c) for c in self.place_m.T], axis=-1)
-        beyond = (np.asarray(way_m) - inside)[..., None]
-        return place + beyond * np.stack([np.cos(heading), np.sin(heading)], axis=-1), heading
+        inside = np.clip(distance_m, 0.0, self.length_m)
+        heading = np.interp(inside, self.distance_m, self.heading_rad)
+        position = np.stack(
+            [np.interp(inside, self.distance_m, c) for c in self.position_m.T], axis=-1
+        )
+        beyond = (np.asarray(distance_m) - inside)[..., None]
+        return position + beyond * np.stack([np.cos(heading), np.sin(heading)], axis=-1), heading
 
 
-def line(stops: Sequence[Placed], run_up_m: float, straight_m: float) -> Line:
-    """A line straight through each stop at its heading, bent in between.
+def path_through(stops: Sequence[PlanarPose], run_up_m: float, straight_m: float) -> PlanarPath:
+    """Return the path straight through each stop at its heading, curved in between.
 
     Parameters
     ----------
-    stops : sequence of Placed
-        At least one; no two neighbours in one place.
+    stops : sequence of PlanarPose
+        At least one; no two neighbours at the same position.
     run_up_m : float
-        How far it starts before the first stop and ends after the last.
+        Length of the path before the first stop and after the last.
     straight_m : float
-        How far it is straight before and after each stop, where stops leave room for that.
+        Length of the straight part before and after each stop, or
+        :data:`MAX_STRAIGHT_FRACTION` of the distance between two stops if that is shorter.
     """
     centre = np.array([[stop.x_m, stop.y_m] for stop in stops])
     heading = np.array([stop.heading_rad for stop in stops])
-    way = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    places = [centre[0] - run_up_m * way[0]]
-    tangents = [way[0]]
+    direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    positions = [centre[0] - run_up_m * direction[0]]
+    tangents = [direction[0]]
     for k in range(len(stops) - 1):
-        apart = float(np.linalg.norm(centre[k + 1] - centre[k]))
-        straight = min(straight_m, 0.3 * apart)
-        start, end = centre[k] + straight * way[k], centre[k + 1] - straight * way[k + 1]
-        bend, along = _hermite(start, end, way[k], way[k + 1])
-        places.extend(bend)
-        tangents.extend(along)
-    places.append(centre[-1] + run_up_m * way[-1])
-    tangents.append(way[-1])
-    place, tangent = np.array(places), np.array(tangents)
-    step = np.linalg.norm(np.diff(place, axis=0), axis=1)
-    turned = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-    return Line(np.r_[0.0, np.cumsum(step)], place, turned)
+        separation_m = float(np.linalg.norm(centre[k + 1] - centre[k]))
+        straight = min(straight_m, MAX_STRAIGHT_FRACTION * separation_m)
+        start = centre[k] + straight * direction[k]
+        end = centre[k + 1] - straight * direction[k + 1]
+        bend, bend_tangents = _hermite_curve(start, end, direction[k], direction[k + 1])
+        positions.extend(bend)
+        tangents.extend(bend_tangents)
+    positions.append(centre[-1] + run_up_m * direction[-1])
+    tangents.append(direction[-1])
+    position, tangent = np.array(positions), np.array(tangents)
+    step_m = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    unwrapped = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    return PlanarPath(np.r_[0.0, np.cumsum(step_m)], position, unwrapped)
 
 
-def _hermite(start: Array, end: Array, out: Array, into: Array) -> tuple[Array, Array]:
-    """Cubic from one point and direction to another: points and tangents (k, 2)."""
-    u = np.linspace(0.0, 1.0, BENT_NODES)[:, None]
-    pull = np.linalg.norm(end - start)
-    place = (
+def _hermite_curve(
+    start: Array, end: Array, start_direction: Array, end_direction: Array
+) -> tuple[Array, Array]:
+    """Return points and tangents (k, 2) of the cubic Hermite curve between two points."""
+    u = np.linspace(0.0, 1.0, NODES_PER_BEND)[:, None]
+    tangent_norm = np.linalg.norm(end - start)
+    position = (
         (1 + u * u * (2 * u - 3)) * start
         + u * u * (3 - 2 * u) * end
-        + pull * (u * (1 - u) ** 2 * out - u * u * (1 - u) * into)
+        + tangent_norm * (u * (1 - u) ** 2 * start_direction - u * u * (1 - u) * end_direction)
     )
-    tangent = 6 * u * (1 - u) * (end - start) + pull * (
-        (1 - u) * (1 - 3 * u) * out - u * (2 - 3 * u) * into
+    tangent = 6 * u * (1 - u) * (end - start) + tangent_norm * (
+        (1 - u) * (1 - 3 * u) * start_direction - u * (2 - 3 * u) * end_direction
     )
-    return place, tangent
+    return position, tangent
 
 
 @dataclass(frozen=True)
-class Drive:
-    """How fast the line is driven.
+class SpeedProfile:
+    """Speed along a path as a function of time.
 
     Attributes
     ----------
     speed_mps : float
         Above 0.
     rest_s : float
-        Standing at the start.
+        Rest at the start.
     acceleration_mps2 : float or None
-        From rest to the speed; None where it has the speed from the first moment on.
+        Acceleration from rest to the speed; None if it drives at speed from the start.
     wobble : float
-        By which share of it the speed goes up and down, at most 0.9.
+        Relative amplitude of the variation of the speed, at most 0.9.
     """
 
     speed_mps: float
@@ -141,38 +150,39 @@ class Drive:
     acceleration_mps2: float | None = None
     wobble: float = 0.0
 
-    def speed(self, time_s: Array, wave: Wobble, scale_m: float) -> Array:
-        """Speeds (...) in m/s at ``time_s`` (...)."""
-        wobble = 1 + self.wobble * wave(time_s * self.speed_mps / scale_m)
-        return self.speed_mps * self._started(time_s) * wobble
+    def speed(self, time_s: Array, wobble: Wobble, wobble_length_m: float) -> Array:
+        """Return the speeds (...) in m/s at ``time_s`` (...)."""
+        variation = 1 + self.wobble * wobble(time_s * self.speed_mps / wobble_length_m)
+        return self.speed_mps * self._ramp(time_s) * variation
 
-    def _started(self, time_s: Array) -> Array:
+    def _ramp(self, time_s: Array) -> Array:
+        """Return the fraction of the speed that is reached."""
         driven_s = np.asarray(time_s) - self.rest_s
         if self.acceleration_mps2 is None:
             return np.where(driven_s >= 0, 1.0, 0.0)
         return np.clip(driven_s * self.acceleration_mps2 / self.speed_mps, 0.0, 1.0)
 
-    def longest_s(self, way_m: float) -> float:
-        """A time in which ``way_m`` is driven, however it wobbles."""
-        least_m = way_m / (1 - self.wobble)
-        ramp_s = np.sqrt(2 * least_m / self.acceleration_mps2) if self.acceleration_mps2 else 0.0
-        return float(self.rest_s + ramp_s + least_m / self.speed_mps)
+    def max_duration_s(self, distance_m: float) -> float:
+        """Return an upper bound of the time for a distance, for any wobble."""
+        slowest_m = distance_m / (1 - self.wobble)
+        ramp_s = np.sqrt(2 * slowest_m / self.acceleration_mps2) if self.acceleration_mps2 else 0.0
+        return float(self.rest_s + ramp_s + slowest_m / self.speed_mps)
 
 
-class Course:
-    """A line that is driven: where the array is at any time.
+class ArrayTrajectory:
+    """Pose of the array as a function of time: a path that is driven with a speed profile.
 
     Attributes
     ----------
     duration_s : float
-        From its start to the end of the line.
+        Time from the start to the end of the path.
     """
 
     def __init__(
         self,
-        line: Line,
-        drive: Drive,
-        scale_m: float,
+        path: PlanarPath,
+        speed_profile: SpeedProfile,
+        wobble_length_m: float,
         height_m: float,
         crab_rad: float,
         yaw_wobble_rad: float,
@@ -182,54 +192,60 @@ class Course:
         """
         Parameters
         ----------
-        line : Line
-        drive : Drive
-        scale_m : float
-            The length over which things wobble.
+        path : PlanarPath
+        speed_profile : SpeedProfile
+        wobble_length_m : float
+            Distance over which speed, yaw and height vary.
         height_m : float
         crab_rad : float
-            From the way it goes to the way it points.
+            Angle from the direction of travel to the array's x.
         yaw_wobble_rad, height_wobble_m : float
-            By how much it turns and rises about that, along the way.
+            Amplitudes of the variations of that angle and of the height along the path.
         rng : Generator
         """
-        self._line, self._drive, self._scale_m = line, drive, scale_m
+        self._path, self._speed_profile = path, speed_profile
+        self._wobble_length_m = wobble_length_m
         self._height_m, self._height_wobble_m = height_m, height_wobble_m
         self._crab_rad, self._yaw_wobble_rad = crab_rad, yaw_wobble_rad
-        self._speed_wave, self._yaw_wave, self._height_wave = (Wobble(rng) for _ in range(3))
-        # Beyond the end as well, where the last sample's conversion ends.
-        total_s = drive.longest_s(line.length_m + scale_m)
-        step_s = max(scale_m / drive.speed_mps / NODES, (total_s - drive.rest_s) / MOST_NODES)
+        self._speed_wobble, self._yaw_wobble, self._height_wobble = (Wobble(rng) for _ in range(3))
+        # The table goes beyond the end of the path: the conversion of the last sample ends there.
+        total_s = speed_profile.max_duration_s(path.length_m + wobble_length_m)
+        rest_s = speed_profile.rest_s
+        step_s = max(
+            wobble_length_m / speed_profile.speed_mps / NODES_PER_WOBBLE,
+            (total_s - rest_s) / MAX_NODES,
+        )
         self._time_s = np.r_[
-            np.arange(0.0, drive.rest_s, step_s)[:1],
-            np.arange(drive.rest_s, total_s + step_s, step_s),
+            np.arange(0.0, rest_s, step_s)[:1], np.arange(rest_s, total_s + step_s, step_s)
         ]
         speed = self.speed(self._time_s)
-        step = np.diff(self._time_s) * (speed[1:] + speed[:-1]) / 2
-        if drive.rest_s > 0:
-            step[0] = 0.0
-        self._way_m = np.r_[0.0, np.cumsum(step)]
-        self.duration_s = float(np.interp(line.length_m, self._way_m, self._time_s))
+        step_m = np.diff(self._time_s) * (speed[1:] + speed[:-1]) / 2
+        if rest_s > 0:
+            step_m[0] = 0.0
+        self._distance_m = np.r_[0.0, np.cumsum(step_m)]
+        self.duration_s = float(np.interp(path.length_m, self._distance_m, self._time_s))
 
     def speed(self, time_s: Array) -> Array:
-        """Speeds (...) in m/s at ``time_s`` (...)."""
-        return self._drive.speed(time_s, self._speed_wave, self._scale_m)
+        """Return the speeds (...) in m/s at ``time_s`` (...)."""
+        return self._speed_profile.speed(time_s, self._speed_wobble, self._wobble_length_m)
 
     def pose(self, time_s: Array) -> tuple[Array, Array]:
-        """Places (..., 3) of the array's middle and headings (...) at ``time_s`` (...)."""
-        way = np.interp(time_s, self._time_s, self._way_m)
-        flat, heading = self._line.at(way)
-        u = way / self._scale_m
-        height = self._height_m + self._height_wobble_m * self._height_wave(u)
-        turned = heading + self._crab_rad + self._yaw_wobble_rad * self._yaw_wave(u)
-        return np.concatenate([flat, height[..., None]], axis=-1), turned
+        """Return positions (..., 3) of the middle of the array and headings (...)."""
+        distance_m = np.interp(time_s, self._time_s, self._distance_m)
+        position, heading = self._path.at(distance_m)
+        u = distance_m / self._wobble_length_m
+        height = self._height_m + self._height_wobble_m * self._height_wobble(u)
+        yaw = heading + self._crab_rad + self._yaw_wobble_rad * self._yaw_wobble(u)
+        return np.concatenate([position, height[..., None]], axis=-1), yaw
 
-    def crossings(self, x_m: float, y_m: float) -> Array:
-        """Times (k,) in seconds at which a point of the floor passes under the array's y
-        axis, from its front to its back."""
+    def crossing_times_s(self, x_m: float, y_m: float) -> Array:
+        """Return the times (k,) at which a point of the floor passes the array's y axis.
+
+        Only passes from front to back are returned.
+        """
         time_s = self._time_s[self._time_s <= self.duration_s]
-        place, heading = self.pose(time_s)
-        ahead = (x_m - place[:, 0]) * np.cos(heading) + (y_m - place[:, 1]) * np.sin(heading)
+        position, heading = self.pose(time_s)
+        ahead = (x_m - position[:, 0]) * np.cos(heading) + (y_m - position[:, 1]) * np.sin(heading)
         k = np.flatnonzero((ahead[:-1] > 0) & (ahead[1:] <= 0))
-        share = ahead[k] / (ahead[k] - ahead[k + 1])
-        return time_s[k] + share * (time_s[k + 1] - time_s[k])
+        fraction = ahead[k] / (ahead[k] - ahead[k + 1])
+        return time_s[k] + fraction * (time_s[k + 1] - time_s[k])

@@ -1,4 +1,4 @@
-"""What a bar of MLX90393 makes of a field: offsets, drift, noise, counts, losses."""
+"""Simulated bar of MLX90393: offsets, drift, noise, quantization, saturation, losses."""
 
 from __future__ import annotations
 
@@ -8,26 +8,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.polaris.array import SensorArray
+from locatk.core.polaris.simulation.options import RandomSource
+from locatk.core.simulation import quantize, random_stream
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Faults:
-    """What is wrong with the sensors, beyond their noise.
+class SensorFaults:
+    """Errors and faults of the sensors, except their noise.
 
     Attributes
     ----------
     offset_t : float
-        Standard deviation of a sensor's offset (hard iron) by axis.
+        Standard deviation of the offset of a sensor (hard iron) by axis.
     drift_t : float
-        Standard deviation by which each axis of each sensor wanders off in a second, as a
-        random walk.
+        Standard deviation of the drift of an axis in a second, a random walk.
     dead, stuck : tuple of int
-        Sensors that give nothing, and that give their first sample for ever.
+        Sensors that give nothing, and that repeat their first sample.
     clipped : bool
-        A field beyond the range reads as the range's end instead of nothing.
+        True if a reading beyond the range is the end of the range instead of ``nan``.
     """
 
     offset_t: float = 0.0
@@ -38,53 +39,53 @@ class Faults:
 
 
 def measure(
-    field_t: Array, array: SensorArray, rate_hz: float, faults: Faults, seed: int
+    field_t: Array, array: SensorArray, rate_hz: float, faults: SensorFaults, seed: int
 ) -> tuple[Array, int]:
-    """Readings (n, N, 3) of a field (n, N, 3) in the array's axes, tesla.
+    """Return the readings (n, N, 3) of a field (n, N, 3), and the number of saturated ones.
 
-    ``nan`` where a sensor is dead or saturated. Returned beside them is how many readings
-    were saturated. Each matter has random numbers of its own: more noise leaves the
-    offsets as they are.
+    Both are in the axes of the array, in tesla. Readings of dead and of saturated sensors are
+    ``nan``.
     """
-    offsets, walks, noises = (np.random.default_rng([seed, k]) for k in (10, 11, 12))
-    read = field_t + offsets.normal(0.0, faults.offset_t, field_t.shape[1:])
+    offsets = random_stream(seed, RandomSource.OFFSETS)
+    drifts = random_stream(seed, RandomSource.DRIFT)
+    noises = random_stream(seed, RandomSource.NOISE)
+    readings = field_t + offsets.normal(0.0, faults.offset_t, field_t.shape[1:])
     step_t = faults.drift_t / np.sqrt(rate_hz)
-    read += np.cumsum(walks.normal(0.0, step_t, field_t.shape), axis=0)
-    read += noises.normal(size=field_t.shape) * array.noise_t
-    counted = array.quantum_t > 0
-    quantum = array.quantum_t[counted]
-    read[..., counted] = np.rint(read[..., counted] / quantum) * quantum
-    beyond = np.abs(read) > array.range_t
-    ends = np.clip(read, -array.range_t, array.range_t) if faults.clipped else np.nan
-    read = np.where(beyond, ends, read)
-    read[:, list(faults.stuck)] = read[:1, list(faults.stuck)]
-    read[:, list(faults.dead)] = np.nan
-    return read, int(np.count_nonzero(beyond))
+    readings += np.cumsum(drifts.normal(0.0, step_t, field_t.shape), axis=0)
+    readings += noises.normal(size=field_t.shape) * array.noise_t
+    readings = quantize(readings, array.quantum_t)
+    is_saturated = np.abs(readings) > array.range_t
+    limits = np.clip(readings, -array.range_t, array.range_t) if faults.clipped else np.nan
+    readings = np.where(is_saturated, limits, readings)
+    readings[:, list(faults.stuck)] = readings[:1, list(faults.stuck)]
+    readings[:, list(faults.dead)] = np.nan
+    return readings, int(np.count_nonzero(is_saturated))
 
 
-def received(count: int, share: float, seed: int) -> Mask:
-    """Which (n,) of the frames arrive where ``share`` of them is lost.
+def received_frames(count: int, lost_fraction: float, seed: int) -> Mask:
+    """Return a mask (n,) of the frames that arrive.
 
-    Exactly that share, rounded, anywhere; the first and the last always arrive.
+    Exactly the rounded fraction is lost, at random; the first and the last frame always arrive.
     """
-    kept = np.ones(count, bool)
+    is_received = np.ones(count, bool)
     inner = np.arange(1, count - 1)
-    lost = min(round(share * count), len(inner))
-    kept[np.random.default_rng([seed, 13]).choice(inner, lost, replace=False)] = False
-    return kept
+    lost = min(round(lost_fraction * count), len(inner))
+    rng = random_stream(seed, RandomSource.LOSSES)
+    is_received[rng.choice(inner, lost, replace=False)] = False
+    return is_received
 
 
 def motor_field(
-    throttle: Array, position_m: Array, strength_t: float, share_per_m: float, seed: int
+    throttle: Array, position_m: Array, strength_t: float, gradient_per_m: float, seed: int
 ) -> Array:
-    """Field (..., N, 3) in tesla of motors and their wires, in the array's axes.
+    """Return the field (..., N, 3) in tesla of motors and their wires, in the axes of the array.
 
-    It points any one way. Over the bar it grows by ``share_per_m`` of itself a metre
-    towards one end; over time it goes with the throttle (...).
+    Its direction is random. It grows by the fraction ``gradient_per_m`` per metre towards one end
+    of the array, and is proportional to the throttle (...).
     """
-    rng = np.random.default_rng([seed, 14])
-    way = rng.normal(size=3)
-    way *= strength_t / np.linalg.norm(way)
-    towards = rng.choice([-1.0, 1.0])
-    grown = 1 + towards * share_per_m * position_m[:, 1]
-    return np.asarray(throttle)[..., None, None] * grown[:, None] * way
+    rng = random_stream(seed, RandomSource.MOTORS)
+    direction = rng.normal(size=3)
+    direction *= strength_t / np.linalg.norm(direction)
+    end = rng.choice([-1.0, 1.0])
+    growth = 1 + end * gradient_per_m * position_m[:, 1]
+    return np.asarray(throttle)[..., None, None] * growth[:, None] * direction

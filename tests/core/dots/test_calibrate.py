@@ -23,6 +23,7 @@ from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.session import SimulationOptions
 from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import DegenerateError, InputError
+from locatk.core.simulation import SESSION_START_NS
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -136,7 +137,7 @@ def drawn(
 
 
 def as_frames(images: Sequence[Image]) -> Frames:
-    time_ns = simulate.EPOCH_NS + 20_000_000 * np.arange(len(images))
+    time_ns = SESSION_START_NS + 20_000_000 * np.arange(len(images))
     return Frames("camera", time_ns, tuple(map(str, range(len(images)))), images)
 
 

@@ -19,8 +19,8 @@ from locatk.core.dots.codec.pattern import DOWN, LEFT, RIGHT, UP, codec
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.decoys import KINDS, decoys
-from locatk.core.dots.simulation.optics import Exposer, Optics, Stand, view
-from locatk.core.dots.simulation.paths import Course, course
+from locatk.core.dots.simulation.optics import CameraPose, Exposer, Optics, frame_to_paper
+from locatk.core.dots.simulation.paths import CameraPath, camera_path
 from locatk.core.dots.simulation.session import METRES_PER_PX, SimulationOptions
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
@@ -33,9 +33,9 @@ PITCH_PX = 0.508 / 0.046
 BEYOND = {UP: (0, -1), LEFT: (-1, 0), RIGHT: (1, 0), DOWN: (0, 1)}
 
 
-def at(x: float, y: float, heading: float, n: int = 1) -> Course:
+def at(x: float, y: float, heading: float, n: int = 1) -> CameraPath:
     """Standing at a place in metres."""
-    return Course(np.tile([x, y], (n, 1)), np.full(n, heading), np.zeros((n, 2)), np.zeros(n))
+    return CameraPath(np.tile([x, y], (n, 1)), np.full(n, heading), np.zeros((n, 2)), np.zeros(n))
 
 
 def one_dot() -> tuple[Manifest, Array]:
@@ -64,7 +64,7 @@ def test_the_view_is_a_pinhole_over_the_paper(pitch: float, roll: float) -> None
     """The same camera set up in OpenCV's terms, placed by its truth alone."""
     heading, camera = 2.2, simulate.camera(0.0)
     optics = Optics(camera, METRES_PER_PX, 0, 210, 0.75, 0, 0, 0, 0)
-    homography = view(optics, Stand(heading, pitch, roll))
+    homography = frame_to_paper(optics, CameraPose(heading, pitch, roll))
 
     lean, _ = cv2.Rodrigues(np.array([pitch, 0.0, 0.0]))
     roll_only, _ = cv2.Rodrigues(np.array([0.0, roll, 0.0]))
@@ -108,7 +108,7 @@ def test_a_frame_is_what_opencv_draws_of_the_same_page() -> None:
     manifest = simulate.sheet()
     x, y, heading = 0.1034, 0.1721, -2.3
     sheet = manifest.sheets[0]
-    frame = simulate.over(manifest, options, at(x, y, heading)).frames.images[0]
+    frame = simulate.simulate_path(manifest, options, at(x, y, heading)).frames.images[0]
 
     # A page of 90 px a pitch about the place, stamped from letters and printed measures.
     fine, reach = 90, 15
@@ -127,7 +127,9 @@ def test_a_frame_is_what_opencv_draws_of_the_same_page() -> None:
     to_page = np.array([[fine / 0.508, 0, 0], [0, fine / 0.508, 0], [0, 0, 1]])
     start = np.array(sheet.first_mm) + first * 0.508
     to_page[:2, 2] = (0.5 * fine - 0.5) - start * fine / 0.508
-    seen = view(Optics(camera, METRES_PER_PX, 0, 0, 0, 0, 0, 0, 0), Stand(heading, 0.15, -0.1))
+    seen = frame_to_paper(
+        Optics(camera, METRES_PER_PX, 0, 0, 0, 0, 0, 0, 0), CameraPose(heading, 0.15, -0.1)
+    )
     to_paper = np.array([[1e3, 0, middle[0]], [0, -1e3, middle[1]], [0, 0, 1]]) @ seen
     parts = 8
     v, u = (np.mgrid[: 120 * parts, : 188 * parts] + 0.5) / parts - 0.5
@@ -194,8 +196,8 @@ def test_the_published_frame_looks_like_its_simulation(data: Path) -> None:
     (place,) = manifest.to_metres(0, np.array([[129.168, 3224.506]]))
 
     def likeness(degrees: float) -> float:
-        stands = at(*place, math.radians(degrees))
-        frame = simulate.over(manifest, options, stands).frames.images[0]
+        poses = at(*place, math.radians(degrees))
+        frame = simulate.simulate_path(manifest, options, poses).frames.images[0]
         return float(np.corrcoef(frame.ravel(), real.ravel())[0, 1])
 
     assert likeness(1.603) > 0.8
@@ -221,7 +223,7 @@ def test_a_dot_has_the_size_that_was_asked_for(
 ) -> None:
     manifest, ink = one_dot()
     wanted = replace(PLAIN, paper_level=200.0, contrast=1.0, **options)  # type: ignore[arg-type]
-    frame = simulate.over(manifest, wanted, at(*ink, 0.4)).frames.images[0]
+    frame = simulate.simulate_path(manifest, wanted, at(*ink, 0.4)).frames.images[0]
     centre, spread, total = moments(frame, 200.0)
     radius = wanted.dot * PITCH_PX / 2
     assert centre == pytest.approx((93.5, 59.5), abs=0.02)
@@ -239,8 +241,9 @@ def test_a_dot_has_the_size_that_was_asked_for(
 def test_a_path_blurs_along_its_way_by_speed_and_exposure() -> None:
     manifest, ink = one_dot()
     options = replace(PLAIN, exposure_s=2e-3, paper_level=200.0, contrast=1.0)
-    driven = replace(at(*ink, 0.9), velocity=np.array([[0.1 * math.cos(0.9), 0.1 * math.sin(0.9)]]))
-    frame = simulate.over(manifest, options, driven).frames.images[0]
+    velocity_mps = np.array([[0.1 * math.cos(0.9), 0.1 * math.sin(0.9)]])
+    driven = replace(at(*ink, 0.9), velocity_mps=velocity_mps)
+    frame = simulate.simulate_path(manifest, options, driven).frames.images[0]
     centre, spread, _ = moments(frame, 200.0)
     assert centre == pytest.approx((93.5, 59.5), abs=0.02)
     radius = options.dot * PITCH_PX / 2
@@ -248,8 +251,8 @@ def test_a_path_blurs_along_its_way_by_speed_and_exposure() -> None:
     # The way is along the heading, which is right in the image.
     assert spread[0, 0] == pytest.approx(radius**2 / 4 + 1 / 12 + length**2 / 12, rel=0.05)
     assert spread[1, 1] == pytest.approx(radius**2 / 4 + 1 / 12, abs=0.06)
-    turning = replace(at(*(ink + [2e-3, 0]), 0.0), turn_rate=np.array([100.0]))
-    frame = simulate.over(manifest, options, turning).frames.images[0]
+    turning = replace(at(*(ink + [2e-3, 0]), 0.0), yaw_rate_rps=np.array([100.0]))
+    frame = simulate.simulate_path(manifest, options, turning).frames.images[0]
     _, spread, _ = moments(frame, 200.0)
     arc = 2e-3 / METRES_PER_PX * 100 * 2e-3
     assert spread[1, 1] == pytest.approx(radius**2 / 4 + 1 / 12 + arc**2 / 12, rel=0.05)
@@ -303,11 +306,13 @@ def test_dots_are_missing_and_dust_is_there_by_their_share() -> None:
 def test_a_dot_that_is_missing_is_missing_in_every_frame() -> None:
     options = replace(PLAIN, missing=0.3, dust=0.2, jitter_m=2e-5)
     manifest = simulate.sheet()
-    here = simulate.over(manifest, options, at(0.1, 0.1, 0.0)).frames.images[0]
+    here = simulate.simulate_path(manifest, options, at(0.1, 0.1, 0.0)).frames.images[0]
     eight_px = 8 * METRES_PER_PX
-    there = simulate.over(manifest, options, at(0.1 + eight_px, 0.1, 0.0)).frames.images[0]
+    there = simulate.simulate_path(manifest, options, at(0.1 + eight_px, 0.1, 0.0)).frames.images[0]
     assert np.abs(here[:, 8:].astype(int) - there[:, :-8]).max() <= 1
-    other = simulate.over(manifest, replace(options, seed=1), at(0.1, 0.1, 0.0)).frames.images[0]
+    other = simulate.simulate_path(
+        manifest, replace(options, seed=1), at(0.1, 0.1, 0.0)
+    ).frames.images[0]
     assert np.abs(here.astype(int) - other).max() > 100
 
 
@@ -317,7 +322,9 @@ def test_dots_stray_by_the_jitter_that_was_asked_for() -> None:
     options = replace(PLAIN, jitter_m=1e-4)
     strays = []
     for seed in range(60):
-        frame = simulate.over(manifest, replace(options, seed=seed), at(*ink, 0.0)).frames.images[0]
+        frame = simulate.simulate_path(
+            manifest, replace(options, seed=seed), at(*ink, 0.0)
+        ).frames.images[0]
         strays.append(moments(frame)[0] - (93.5, 59.5))
     assert np.std(strays, axis=0) * METRES_PER_PX == pytest.approx([1e-4, 1e-4], rel=0.15)
     assert np.abs(np.corrcoef(np.transpose(strays))[0, 1]) < 0.25
@@ -338,7 +345,7 @@ def test_a_printer_out_of_scale_is_told_by_the_truth_alone() -> None:
     one = Manifest((far,))
     seen = replace(options, printer_scale=(1.004, 0.997), frames=1)
     x, y = place[0] * 1.004e-3, (297 - place[1]) * 0.997e-3
-    centre, _, _ = moments(simulate.over(one, seen, at(x, y, 0.0)).frames.images[0])
+    centre, _, _ = moments(simulate.simulate_path(one, seen, at(x, y, 0.0)).frames.images[0])
     dot = one_dot()[1] * 1e3 - 50
     assert (centre - (93.5, 59.5)) * 0.046 == pytest.approx(
         (dot[0] * 1.004, -dot[1] * 0.997), abs=1e-3
@@ -358,7 +365,7 @@ def test_tiles_lie_on_the_floor_and_the_later_one_on_top() -> None:
     )
     alone = [replace(tiles, sheets=(tile,)) for tile in tiles.sheets]
     left, right, both = (
-        simulate.over(m, PLAIN, at(0.0447, 0.025, 0.3)).frames.images[0].astype(int)
+        simulate.simulate_path(m, PLAIN, at(0.0447, 0.025, 0.3)).frames.images[0].astype(int)
         for m in (*alone, tiles)
     )
     assert (left < 100).any()
@@ -374,13 +381,17 @@ def test_tiles_lie_on_the_floor_and_the_later_one_on_top() -> None:
     spot = np.array([0.02, 0.03])
     c, s = math.cos(turned), math.sin(turned)
     moved = np.array([[c, -s], [s, c]]) @ spot + [0.04, 0.0]
-    there = simulate.over(alone[1], PLAIN, at(*moved, 0.3 + turned)).frames.images[0].astype(int)
-    here = simulate.over(flat, PLAIN, at(*spot, 0.3)).frames.images[0]
+    there = (
+        simulate.simulate_path(alone[1], PLAIN, at(*moved, 0.3 + turned))
+        .frames.images[0]
+        .astype(int)
+    )
+    here = simulate.simulate_path(flat, PLAIN, at(*spot, 0.3)).frames.images[0]
     assert np.abs(there - here).max() <= 1
 
 
 def test_beyond_a_sheet_there_is_paper_only() -> None:
-    frame = simulate.over(simulate.sheet(), PLAIN, at(0.5, 0.5, 0.0)).frames.images[0]
+    frame = simulate.simulate_path(simulate.sheet(), PLAIN, at(0.5, 0.5, 0.0)).frames.images[0]
     assert (frame == 210).all()
 
 
@@ -410,11 +421,11 @@ def test_a_curve_keeps_its_speed_and_looks_ahead() -> None:
 
 def test_a_curve_knows_how_it_moves() -> None:
     time_s = np.arange(0, 20, 1e-3)
-    driven = course("curve", time_s, np.zeros(2), np.array([0.3, 0.2]), 0.2, seed=5)
-    velocity = np.gradient(driven.position, time_s, axis=0)[1:-1]
-    assert np.abs(velocity - driven.velocity[1:-1]).max() < 0.002
-    rate = np.gradient(np.unwrap(driven.heading), time_s)[1:-1]
-    assert np.abs(rate - driven.turn_rate[1:-1]).max() < 0.05 * np.abs(rate).max()
+    driven = camera_path("curve", time_s, np.zeros(2), np.array([0.3, 0.2]), 0.2, seed=5)
+    velocity = np.gradient(driven.position_m, time_s, axis=0)[1:-1]
+    assert np.abs(velocity - driven.velocity_mps[1:-1]).max() < 0.002
+    rate = np.gradient(np.unwrap(driven.heading_rad), time_s)[1:-1]
+    assert np.abs(rate - driven.yaw_rate_rps[1:-1]).max() < 0.05 * np.abs(rate).max()
 
 
 def test_random_frames_are_anywhere_and_still_ones_are_not() -> None:
@@ -448,12 +459,12 @@ def test_the_same_options_give_the_same_session_in_any_order() -> None:
 
 def test_frames_tilt_each_by_themselves_up_to_what_was_said() -> None:
     simulated = simulate.simulate(None, replace(PLAIN, frames=300, tilt_rad=0.17))
-    stands = simulated.frames.images._stands  # type: ignore[attr-defined]
-    tilt = np.array([math.hypot(s.pitch_rad, s.roll_rad) for s in stands])
+    poses = simulated.frames.images._poses  # type: ignore[attr-defined]
+    tilt = np.array([math.hypot(s.pitch_rad, s.roll_rad) for s in poses])
     assert tilt.max() <= 0.17
     assert tilt.max() > 0.16
     assert tilt.min() < 0.01
-    assert abs(np.mean([s.pitch_rad for s in stands])) < 0.02
+    assert abs(np.mean([s.pitch_rad for s in poses])) < 0.02
 
 
 @pytest.mark.parametrize(
@@ -521,5 +532,5 @@ def test_unknown_decoys_are_refused() -> None:
 
 def test_an_exposer_needs_no_marks() -> None:
     exposer = Exposer(Optics(simulate.camera(), METRES_PER_PX, 0.6, 210, 0.75, 0, 0, 0, 0))
-    frame = exposer.expose(Stand(0.0), np.zeros((0, 2)), np.zeros(0), np.random.default_rng(0))
+    frame = exposer.expose(CameraPose(0.0), np.zeros((0, 2)), np.zeros(0), np.random.default_rng(0))
     assert (frame == 210).all()

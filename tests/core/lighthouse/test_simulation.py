@@ -28,11 +28,11 @@ from locatk.core.lighthouse.simulation.optics import SimulatedStation
 from locatk.core.lighthouse.simulation.session import (
     FLOOR_MARKERS_M,
     RAISED_MARKERS_M,
-    START_NS,
     SimulatedSession,
     SimulationOptions,
     simulate,
 )
+from locatk.core.simulation import SESSION_START_NS
 
 Array = NDArray[np.float64]
 NOISELESS = SimulationOptions(noise_rad=0.0, seed=4)
@@ -55,7 +55,7 @@ def find_rotations(session: SimulatedSession, device: int, channel: int) -> Rota
     """Recover rotations from times and counts alone."""
     s = session.sweeps
     rows = np.flatnonzero((s.device == device) & (s.channel == channel))
-    time_s, count = (s.time_ns[rows] - START_NS) * 1e-9, s.count[rows]
+    time_s, count = (s.time_ns[rows] - SESSION_START_NS) * 1e-9, s.count[rows]
     nominal = float(period_ticks(channel)) / 48e6
     period_s = nominal
     for _ in range(3):  # counts are in steps of the station's own clock, estimated here
@@ -71,7 +71,7 @@ def find_rotations(session: SimulatedSession, device: int, channel: int) -> Rota
 def fit_path(session: SimulatedSession, device: int) -> tuple[Array, CubicSpline]:
     """Return the times of the ground truth of a robot, and a spline through its positions."""
     truth = session.truth[device]
-    time_s = (truth.time_ns - START_NS) * 1e-9
+    time_s = (truth.time_ns - SESSION_START_NS) * 1e-9
     return time_s, CubicSpline(time_s, truth.position)
 
 
@@ -170,8 +170,8 @@ def test_standing_robots_obey_the_forward_model(calibration: str) -> None:
         [visit] = marker.visits
         for station in session.true_scene.stations:
             rotations = find_rotations(session, 0, station.channel)
-            still = (rotations.time_s[:, 0] * 1e9 + START_NS > visit.start_ns) & (
-                rotations.time_s[:, 1] * 1e9 + START_NS < visit.end_ns
+            still = (rotations.time_s[:, 0] * 1e9 + SESSION_START_NS > visit.start_ns) & (
+                rotations.time_s[:, 1] * 1e9 + SESSION_START_NS < visit.end_ns
             )
             assert np.count_nonzero(still) >= 18
             local = (marker.position - station.position) @ station.rotation
@@ -203,7 +203,7 @@ def test_rotors_rotate_on_their_own_clocks() -> None:
 
 def test_sweeps_of_a_report_are_spread_in_time() -> None:
     s = simulate(replace(NOISELESS, stations=4)).sweeps
-    time_s = (s.time_ns - START_NS) * 1e-9
+    time_s = (s.time_ns - SESSION_START_NS) * 1e-9
     report = np.r_[True, np.diff(time_s) > 0.05].cumsum()
     spread = [np.ptp(time_s[report == k]) for k in np.unique(report)]
     assert 0.01 < np.median(spread) < 0.03
@@ -219,7 +219,7 @@ def test_noise_is_that_of_the_angle_and_of_whole_counts() -> None:
         rotations = find_rotations(session, 0, channel)
         for marker in session.scene.markers:
             [visit] = marker.visits
-            span = (np.array([visit.start_ns, visit.end_ns]) - START_NS) * 1e-9
+            span = (np.array([visit.start_ns, visit.end_ns]) - SESSION_START_NS) * 1e-9
             still = (rotations.time_s[:, 0] > span[0]) & (rotations.time_s[:, 1] < span[1])
             counts = rotations.count[still]
             deviations.append(counts - counts.mean(axis=0))
@@ -241,7 +241,7 @@ def test_same_options_same_arrays() -> None:
     options = SimulationOptions(robots=2, occlusion=0.1, outliers=0.05, duration_s=5.0, seed=9)
     first, second = simulate(options), simulate(options)
     assert are_equal(first.sweeps, second.sweeps)
-    assert first.sweeps.time_ns.min() >= START_NS == 1_767_225_600_000_000_000
+    assert first.sweeps.time_ns.min() >= SESSION_START_NS == 1_767_225_600_000_000_000
     assert all(
         np.array_equal(a.position, b.position)
         for a, b in zip(first.truth, second.truth, strict=True)
@@ -374,7 +374,7 @@ def test_the_prior_is_the_mean_of_the_units() -> None:
 def test_robots_drive_smoothly_along_their_heading(planar: bool) -> None:
     session = simulate(replace(NOISELESS, robots=4, planar=planar, duration_s=60.0))
     for truth in session.truth[1:]:
-        time_s = (truth.time_ns - START_NS) * 1e-9
+        time_s = (truth.time_ns - SESSION_START_NS) * 1e-9
         np.testing.assert_allclose(np.diff(time_s), 0.01, atol=1e-6)
         velocity = np.diff(truth.position, axis=0) / 0.01
         speed = np.linalg.norm(velocity, axis=1)
@@ -495,7 +495,10 @@ def _is_reflection(session: SimulatedSession, k: int) -> bool:
     s = session.sweeps
     station = session.true_scene.stations[s.channel[k] - 1]
     truth = session.truth[s.device[k]]
-    at = [np.interp(s.time_ns[k] - START_NS, truth.time_ns - START_NS, x) for x in truth.position.T]
+    at = [
+        np.interp(s.time_ns[k] - SESSION_START_NS, truth.time_ns - SESSION_START_NS, x)
+        for x in truth.position.T
+    ]
     for axis, wall in ((0, 2.5), (0, -2.5), (1, 2.5), (1, -2.5)):
         image = np.array(at)
         image[axis] = 2 * wall - image[axis]

@@ -74,30 +74,30 @@ def test_members_keep_the_distance(tags: Tags, data) -> None:
     count = data.draw(st.integers(1, 25 if tags.magnets > 3 else 2))
     if tags.order == 2:
         distance = min(distance, 3)
-    ids = families.generate(tags, count, distance)
+    ids = families.generate_family(tags, count, distance)
     assert len(set(ids)) == len(ids) == count
     pairs = [(a, b) for k, a in enumerate(ids) for b in ids[:k]]
     smallest = min((slow_distance(tags, a, b) for a, b in pairs), default=None)
     if smallest is not None:
         assert smallest >= distance
         assert families.smallest_distance(tags, ids) == smallest
-    families.check(replace(tags, ids=ids, min_distance=distance))
+    families.check_family(replace(tags, ids=ids, min_distance=distance))
 
 
 def test_a_longer_family_begins_with_the_shorter() -> None:
     tags = Tags()
-    long = families.generate(tags, 2000, 4)
-    assert families.generate(tags, 700, 4) == long[:700]
+    long = families.generate_family(tags, 2000, 4)
+    assert families.generate_family(tags, 700, 4) == long[:700]
     assert families.smallest_distance(tags, long) == 4
 
 
 def test_the_batch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     tags = Tags(magnets=4)
-    usual = families.generate(tags, 300, 4)
-    closest = families.closest(tags, usual)
-    monkeypatch.setattr(families, "BATCH", 7)
-    assert families.generate(tags, 300, 4) == usual
-    assert families.closest(tags, usual) == closest
+    usual = families.generate_family(tags, 300, 4)
+    closest = families.closest_pair(tags, usual)
+    monkeypatch.setattr(families, "BATCH_IDS", 7)
+    assert families.generate_family(tags, 300, 4) == usual
+    assert families.closest_pair(tags, usual) == closest
 
 
 @pytest.mark.parametrize(
@@ -136,46 +136,46 @@ def test_the_batch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_version_1_never_changes(tags, count, distance, first, digest) -> None:
     """Tags of these families lie on floors: another rule is another version, beside it."""
-    assert families.VERSION == 1
-    ids = families.generate(tags, count, distance)
+    assert families.FAMILY_RULE_VERSION == 1
+    ids = families.generate_family(tags, count, distance)
     assert ids[:4] == first
     assert hashlib.sha256(" ".join(map(str, ids)).encode()).hexdigest()[:16] == digest
 
 
 def test_all_ids_are_a_family_of_distance_one() -> None:
     tags = Tags(order=2, magnets=3, orientations=8)
-    assert sorted(families.generate(tags, 512, 1)) == list(range(512))
+    assert sorted(families.generate_family(tags, 512, 1)) == list(range(512))
 
 
 def test_what_the_codec_does_not_hold_is_refused() -> None:
     tags = Tags(order=2, magnets=3, orientations=4)
     with pytest.raises(InputError, match="the codec has 64 ids"):
-        families.generate(tags, 65, 1)
+        families.generate_family(tags, 65, 1)
     with pytest.raises(InputError, match=r"\d+ found among all 64 ids") as caught:
-        families.generate(tags, 64, 3)
+        families.generate_family(tags, 64, 3)
     found = int(str(caught.value).split(": ")[1].split()[0])
     # As many as it says are there indeed.
-    assert len(families.generate(tags, found, 3)) == found
+    assert len(families.generate_family(tags, found, 3)) == found
     with pytest.raises(InputError):
-        families.generate(tags, found + 1, 3)
+        families.generate_family(tags, found + 1, 3)
 
 
 def test_the_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(families, "MOST_VISITS", 3000)
+    monkeypatch.setattr(families, "MAX_CANDIDATES", 3000)
     with pytest.raises(InputError, match="found among the first 3000 of 327680 ids"):
-        families.generate(Tags(), 1000, 8)
+        families.generate_family(Tags(), 1000, 8)
 
 
 @pytest.mark.parametrize(("count", "distance"), [(0, 1), (-3, 1), (5, 0)])
 def test_families_that_are_none_are_not_made(count: int, distance: int) -> None:
     with pytest.raises(InputError):
-        families.generate(Tags(), count, distance)
+        families.generate_family(Tags(), count, distance)
 
 
 def test_the_two_closest_are_named() -> None:
     tags = Tags()
     ids = (0, 202517, 77354, 1, 279871)
-    assert families.closest(tags, ids) == (1, (0, 1))
+    assert families.closest_pair(tags, ids) == (1, (0, 1))
     assert families.smallest_distance(tags, (5,)) == 20
 
 
@@ -183,7 +183,7 @@ def test_the_two_closest_are_named() -> None:
     ("ids", "distance", "said"),
     [
         ((), 1, "without ids"),
-        ((7, 9, 7), 1, "id 7 stands twice"),
+        ((7, 9, 7), 1, "id 7 occurs twice"),
         ((0, 202517, 1), 3, "ids 0 and 1 have distance 1, not 3"),
         ((0, 327680), 1, "is not in 0"),
         (None, 3, "without ids"),
@@ -192,4 +192,4 @@ def test_the_two_closest_are_named() -> None:
 )
 def test_a_list_that_is_no_family_is_refused(ids, distance: int, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        families.check(Tags(ids=ids, min_distance=distance))
+        families.check_family(Tags(ids=ids, min_distance=distance))

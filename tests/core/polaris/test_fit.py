@@ -10,10 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.polaris.detection.field_model import thickness
-from locatk.core.polaris.detection.fit import fit
-from locatk.core.polaris.detection.fit_problem import Problem
-from locatk.core.polaris.detection.window import Priors, State, Window
+from locatk.core.polaris.detection.field_model import disc_correction
+from locatk.core.polaris.detection.fit import PassProblem, PassState, fit_pass
+from locatk.core.polaris.detection.window import PassPriors, PassWindow
 from locatk.core.polaris.tag import Magnet
 
 Array = NDArray[np.float64]
@@ -26,7 +25,7 @@ STEP = 1e-3
 
 def posed(
     world: Any, *, known: bool, seed: int = 0, order: bool = False, noise: float = NOISE
-) -> tuple[Window, State, Any]:
+) -> tuple[PassWindow, PassState, Any]:
     """A pass over four magnets of magpylib, the true state, and the tag.
 
     The bar goes through 0 in the middle of the pass; with ``order`` x, y and z are
@@ -38,27 +37,27 @@ def posed(
     samples = world.record([tag], world.line(length=0.16), array=array, noise=noise, seed=seed)
     n = len(samples)
     path = STEP * np.arange(n) - 0.08
-    window = Window(
+    window = PassWindow(
         field_t=samples.field_t,
         sensors_m=array.position_m,
         noise_t=np.full((7, 3), NOISE),
-        frames=np.arange(n, dtype=float),
+        time_periods=np.arange(n, dtype=float),
         counts=np.ones(n, np.intp),
-        order=np.array([-1.0, 0.0, 1.0]) if order else np.zeros(3),
+        axis_order=np.array([-1.0, 0.0, 1.0]) if order else np.zeros(3),
         path_m=path if known else None,
-        thickness_m2=thickness(Magnet()),
+        disc_correction_m2=disc_correction(Magnet()),
     )
     moment = Magnet().moment * np.column_stack(
         [np.cos(tag.angles), np.sin(tag.angles), 0 * tag.angles]
     )
-    return window, State(tag.places, moment, path, STEP, 0.01), tag
+    return window, PassState(tag.places, moment, path, STEP, 0.01), tag
 
 
-def astray(state: State, seed: int = 3) -> State:
+def astray(state: PassState, seed: int = 3) -> PassState:
     rng = np.random.default_rng(seed)
     return replace(
         state,
-        place_m=state.place_m + 2e-3 * rng.standard_normal(state.place_m.shape),
+        position_m=state.position_m + 2e-3 * rng.standard_normal(state.position_m.shape),
         moment_am2=0 * state.moment_am2,
         height_m=0.0115,
     )
@@ -67,30 +66,30 @@ def astray(state: State, seed: int = 3) -> State:
 def test_side_of_the_normal_equations_is_the_slope_of_the_cost(world: Any) -> None:
     """Places, height, skew and crab: half the slope, downhill, for point dipoles."""
     window, truth, _ = posed(world, known=True, order=True)
-    window = replace(window, thickness_m2=0.0)
-    start = replace(astray(truth), skew=0.2, crab_rad=0.01)
-    problem = Problem(
-        window, Priors(), 1 / np.broadcast_to(window.noise_t**2, window.field_t.shape), start
-    )
-    problem.free = frozenset({"crab", "tilt"})
+    window = replace(window, disc_correction_m2=0.0)
+    start = replace(astray(truth), skew_periods=0.2, crab_rad=0.01)
+    weight = 1 / np.broadcast_to(window.noise_t**2, window.field_t.shape)
+    problem = PassProblem(window, PassPriors(), weight, start)
+    problem = problem.with_free(frozenset({"crab", "tilt"}))
     trial = problem.project(start)
-    side = problem.normal(trial).side
+    side = problem.reduce(trial).descent
 
     def cost(**moved: Any) -> float:
         return problem.project(replace(trial.state, **moved)).cost
 
-    m = len(truth.place_m)
+    m = len(truth.position_m)
     step = 1e-8
     for axis in range(2):
         for k in range(m):
             shift = np.zeros((m, 2))
             shift[k, axis] = step
-            place = trial.state.place_m
-            slope = (cost(place_m=place + shift) - cost(place_m=place - shift)) / (2 * step)
+            place = trial.state.position_m
+            slope = (cost(position_m=place + shift) - cost(position_m=place - shift)) / (2 * step)
             assert side[axis * m + k] == pytest.approx(
                 -slope / 2, rel=2e-4, abs=1e-4 * np.abs(side).max()
             )
-    for place, (name, step) in enumerate((("height_m", 1e-8), ("skew", 1e-5), ("crab_rad", 1e-6))):
+    steps = (("height_m", 1e-8), ("skew_periods", 1e-5), ("crab_rad", 1e-6))
+    for place, (name, step) in enumerate(steps):
         value = getattr(trial.state, name)
         slope = (cost(**{name: value + step}) - cost(**{name: value - step})) / (2 * step)
         assert side[2 * m + place] == pytest.approx(-slope / 2, rel=2e-3)
@@ -99,11 +98,11 @@ def test_side_of_the_normal_equations_is_the_slope_of_the_cost(world: Any) -> No
 @pytest.mark.parametrize("known", [True, False])
 def test_magnets_of_magpylib_are_found_from_a_start_nearby(known: bool, world: Any) -> None:
     window, truth, tag = posed(world, known=known)
-    fitted = fit(window, astray(truth), Priors())
+    fitted = fit_pass(window, astray(truth), PassPriors())
     assert fitted.converged
-    assert fitted.sigma == pytest.approx(1.0, abs=0.06)
-    place = fitted.state.place_m - (
-        0 if known else (fitted.state.place_m - tag.places).mean(axis=0) * [1, 0]
+    assert fitted.rms_sigma == pytest.approx(1.0, abs=0.06)
+    place = fitted.state.position_m - (
+        0 if known else (fitted.state.position_m - tag.places).mean(axis=0) * [1, 0]
     )
     np.testing.assert_allclose(place[:, 1], tag.places[:, 1], atol=5e-5)
     np.testing.assert_allclose(place[:, 0], tag.places[:, 0], atol=5e-5 if known else 4e-4)
@@ -114,8 +113,8 @@ def test_magnets_of_magpylib_are_found_from_a_start_nearby(known: bool, world: A
 
 def test_many_starts_one_optimum(world: Any) -> None:
     window, truth, _ = posed(world, known=True)
-    found = [fit(window, astray(truth, seed), Priors()).state.place_m for seed in range(6)]
-    assert np.ptp(found, axis=0).max() < 2e-6
+    fits = [fit_pass(window, astray(truth, seed), PassPriors()) for seed in range(6)]
+    assert np.ptp([fitted.state.position_m for fitted in fits], axis=0).max() < 2e-6
 
 
 def test_free_steps_follow_an_uneven_way(world: Any) -> None:
@@ -129,15 +128,15 @@ def test_free_steps_follow_an_uneven_way(world: Any) -> None:
     uneven = replace(
         window,
         field_t=window.field_t[rows],
-        frames=np.arange(n, dtype=float),
+        time_periods=np.arange(n, dtype=float),
         counts=np.ones(n, np.intp),
     )
     steady = np.linspace(truth.path_m[rows[0]], truth.path_m[rows[-1]], n)
-    start = replace(astray(truth), path_m=steady, speed_m=float(np.diff(steady).mean()))
-    fitted = fit(uneven, start, Priors())
+    start = replace(astray(truth), path_m=steady, mean_step_m=float(np.diff(steady).mean()))
+    fitted = fit_pass(uneven, start, PassPriors())
     inner = slice(15, -15)
     miss = (fitted.state.path_m - truth.path_m[rows])[inner]
-    assert fitted.sigma < 1.15
+    assert fitted.rms_sigma < 1.15
     assert np.ptp((steady - truth.path_m[rows])[inner]) > 6e-3
     assert np.ptp(miss) < 1e-3
     # Against its own middle, and in its own standard deviations (of the whole of it).
@@ -147,10 +146,11 @@ def test_free_steps_follow_an_uneven_way(world: Any) -> None:
 def test_skew_of_the_conversion_is_found(world: Any) -> None:
     """4 ms of 10 between two axes: 0.4 of a sample period."""
     window, truth, _ = posed(world, known=True, order=True)
-    fitted = fit(window, replace(astray(truth), skew=0.1), Priors(skew=(0.1, 0.5)))
-    assert fitted.state.skew == pytest.approx(0.4, abs=0.02)
-    unaware = fit(replace(window, order=np.zeros(3)), astray(truth), Priors())
-    assert unaware.sigma > 1.3 * fitted.sigma
+    start, priors = replace(astray(truth), skew_periods=0.1), PassPriors(skew_periods=(0.1, 0.5))
+    fitted = fit_pass(window, start, priors)
+    assert fitted.state.skew_periods == pytest.approx(0.4, abs=0.02)
+    unaware = fit_pass(replace(window, axis_order=np.zeros(3)), astray(truth), PassPriors())
+    assert unaware.rms_sigma > 1.3 * fitted.rms_sigma
 
 
 def test_covariance_is_that_of_many_noises(world: Any) -> None:
@@ -163,9 +163,9 @@ def test_covariance_is_that_of_many_noises(world: Any) -> None:
         noisy = replace(
             clean, field_t=clean.field_t + NOISE * rng.standard_normal(clean.field_t.shape)
         )
-        fitted = fit(noisy, truth, Priors(crab_rad=1e-5, tilt=1e-4))
+        fitted = fit_pass(noisy, truth, PassPriors(crab_sigma_rad=1e-5, tilt_sigma=1e-4))
         angle = np.arctan2(fitted.state.moment_am2[:, 1], fitted.state.moment_am2[:, 0])
-        errors.append(np.column_stack([fitted.state.place_m, angle]))
+        errors.append(np.column_stack([fitted.state.position_m, angle]))
         spreads.append(np.sqrt(np.diag(fitted.covariance)).reshape(-1, 3))
     scatter = np.std(errors, axis=0)
     ratio = np.sqrt(np.mean((scatter / np.mean(spreads, axis=0)) ** 2, axis=0))
@@ -179,8 +179,8 @@ def test_outliers_are_weighted_down(world: Any) -> None:
     rng = np.random.default_rng(2)
     field = window.field_t.copy()
     field[rng.random(field.shape) < 0.01] += 4e-5
-    fitted = fit(replace(window, field_t=field), astray(truth), Priors())
-    assert np.linalg.norm(fitted.state.place_m - tag.places, axis=1).max() < 1e-4
+    fitted = fit_pass(replace(window, field_t=field), astray(truth), PassPriors())
+    assert np.linalg.norm(fitted.state.position_m - tag.places, axis=1).max() < 1e-4
 
 
 def test_missing_samples_are_no_samples(world: Any) -> None:
@@ -188,14 +188,27 @@ def test_missing_samples_are_no_samples(world: Any) -> None:
     field = window.field_t.copy()
     field[:, 3] = np.nan
     field[60:70] = np.nan
-    fitted = fit(replace(window, field_t=field), astray(truth), Priors())
+    fitted = fit_pass(replace(window, field_t=field), astray(truth), PassPriors())
     assert np.isnan(fitted.residual[:, 3]).all()
     assert np.isnan(fitted.residual[65]).all()
-    assert np.linalg.norm(fitted.state.place_m - tag.places, axis=1).max() < 1e-4
+    assert np.linalg.norm(fitted.state.position_m - tag.places, axis=1).max() < 1e-4
 
 
 def test_what_the_samples_do_not_determine_is_an_error(world: Any) -> None:
     window, truth, _ = posed(world, known=True)
     nothing = replace(window, field_t=np.full_like(window.field_t, np.inf))
     with pytest.raises(DegenerateError):
-        fit(nothing, truth, Priors())
+        fit_pass(nothing, truth, PassPriors())
+
+
+def test_steps_are_limited_to_a_fraction_of_the_height(world: Any) -> None:
+    """Far from the minimum the derivatives would move a magnet by several heights."""
+    window, truth, _ = posed(world, known=True)
+    start = replace(truth, position_m=truth.position_m + 0.012, moment_am2=0 * truth.moment_am2)
+    weight = 1 / np.broadcast_to(window.noise_t**2, window.field_t.shape)
+    problem = PassProblem(window, PassPriors(), weight, start)
+    equations = problem.linearize(start, np.arange(1))
+    moved = problem.retract(start, equations.solve(np.array([1e-9]), np.arange(1)))
+    change = np.abs(moved.position_m - start.position_m).max()
+    assert change == pytest.approx(0.7 * start.height_m)
+    assert 0.7 * start.height_m <= moved.height_m <= 1.4 * start.height_m

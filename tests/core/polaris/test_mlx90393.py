@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.polaris.mlx90393 import (
+    INVALID_OSR_AND_FILTER,
     MEASURED_NOISE_UT,
-    STANDS_STILL,
     Settings,
-    for_rate,
     published_bar,
-    settings,
+    settings_for_rate,
 )
 
 CONVERSION_MS = (
@@ -32,7 +31,7 @@ CONVERSION_MS = (
 )
 """The data sheet's table, by filter and oversampling (as in Adafruit's driver)."""
 
-ALLOWED = [(o, f) for o in range(4) for f in range(8) if (o, f) not in STANDS_STILL]
+ALLOWED = [(o, f) for o in range(4) for f in range(8) if (o, f) not in INVALID_OSR_AND_FILTER]
 
 
 @pytest.fixture(scope="module")
@@ -52,21 +51,21 @@ def recorded(data: Path) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize(("osr", "filt"), ALLOWED)
 def test_conversion_takes_what_the_data_sheet_says(osr: int, filt: int) -> None:
-    part = settings(osr=osr, filt=filt)
+    part = Settings(osr=osr, filt=filt)
     assert round(part.conversion_s * 1e3, 2) == CONVERSION_MS[filt][osr]
     assert part.max_rate_hz < 1 / part.conversion_s
     assert 3 * part.axis_s < part.conversion_s
 
 
 def test_a_count_and_the_range() -> None:
-    part = settings()
+    part = Settings()
     assert part.quantum_t == pytest.approx(np.array([0.150, 0.150, 0.242]) * 1e-6)
     assert part.range_t == pytest.approx([4.9e-3, 4.9e-3, 7.9e-3], rel=0.005)
-    assert settings(gain=0).quantum_t == pytest.approx(5 * part.quantum_t, rel=0.005)
-    assert settings(resolution=2).range_t == pytest.approx(4 * part.range_t)
+    assert Settings(gain=0).quantum_t == pytest.approx(5 * part.quantum_t, rel=0.005)
+    assert Settings(resolution=2).range_t == pytest.approx(4 * part.range_t)
     # At resolution 3 zero is at 0x4000: the range stays, the count doubles.
-    assert settings(resolution=3).range_t == pytest.approx(settings(resolution=2).range_t)
-    assert settings(hallconf=0).quantum_t == pytest.approx(
+    assert Settings(resolution=3).range_t == pytest.approx(Settings(resolution=2).range_t)
+    assert Settings(hallconf=0).quantum_t == pytest.approx(
         np.array([0.196, 0.196, 0.316]) * 1e-6, rel=0.001
     )
 
@@ -86,13 +85,13 @@ def test_a_count_and_the_range() -> None:
 )
 def test_settings_that_the_part_has_not(wrong: dict[str, int]) -> None:
     with pytest.raises(InputError, match="MLX90393"):
-        settings(**wrong)
+        Settings(**wrong)
 
 
 def test_noise_is_that_of_the_recordings(recorded: NDArray[np.float64]) -> None:
     noise = np.median(recorded.std(1), axis=(0, 1))
     assert noise == pytest.approx(MEASURED_NOISE_UT, rel=0.08)
-    assert settings().noise_t == pytest.approx(np.array(MEASURED_NOISE_UT) * 1e-6)
+    assert Settings().noise_t == pytest.approx(np.array(MEASURED_NOISE_UT) * 1e-6)
 
 
 def test_recordings_are_whole_counts(recorded: NDArray[np.float64]) -> None:
@@ -101,22 +100,22 @@ def test_recordings_are_whole_counts(recorded: NDArray[np.float64]) -> None:
 
 
 def test_noise_is_not_made_up() -> None:
-    for other in (settings(osr=2), settings(filt=5), settings(gain=6), settings(resolution=1)):
+    for other in (Settings(osr=2), Settings(filt=5), Settings(gain=6), Settings(resolution=1)):
         assert np.isnan(other.noise_t).all()
-    usual = settings().assumed_noise_t
-    assert settings(filt=5).assumed_noise_t == pytest.approx(usual)
-    assert (settings(osr=2).assumed_noise_t > 1.3 * usual).all()
-    coarse = settings(gain=0, resolution=3)
+    usual = Settings().assumed_noise_t
+    assert Settings(filt=5).assumed_noise_t == pytest.approx(usual)
+    assert (Settings(osr=2).assumed_noise_t > 1.3 * usual).all()
+    coarse = Settings(gain=0, resolution=3)
     assert coarse.assumed_noise_t == pytest.approx(coarse.quantum_t / np.sqrt(12))
 
 
 def test_the_slowest_settings_that_are_fast_enough() -> None:
-    chosen = for_rate(100, settings())
+    chosen = settings_for_rate(100, Settings())
     assert chosen is not None
     assert (chosen.osr, chosen.filt) == (2, 3)
-    assert for_rate(61, settings()) == settings()
-    assert for_rate(1000, settings()) is None
-    kept = for_rate(100, settings(gain=5, resolution=1))
+    assert settings_for_rate(61, Settings()) == Settings()
+    assert settings_for_rate(1000, Settings()) is None
+    kept = settings_for_rate(100, Settings(gain=5, resolution=1))
     assert kept is not None
     assert (kept.gain, kept.resolution) == (5, 1)
 
@@ -131,7 +130,7 @@ def test_the_bar_is_mounted_as_published() -> None:
     # A field along an axis of the array is seen by this axis of the part:
     seen_by = {"x": 1, "y": 0, "z": 2}
     assert array.noise_t.tolist() == [noise[i] for i in seen_by.values()]
-    assert array.range_t.tolist() == [settings().range_t[i] for i in seen_by.values()]
+    assert array.range_t.tolist() == [Settings().range_t[i] for i in seen_by.values()]
     order = np.argsort(array.delay_s)
     assert order.tolist() == [1, 0, 2]
     assert array.delay_s.sum() == pytest.approx(0)

@@ -17,7 +17,7 @@ from locatk.core.polaris.tag import CODECS, TagLayout, Tags
 
 RELEASED = Tags(codec="polaris-released")
 
-# facts/polaris.md section 1: occupied positions and their three bits
+# Offline decoder of github.com/wjk5117/Polaris: occupied positions and their three bits
 TABLE = {
     (1, 4, 5, 6, 8): "111",
     (1, 2, 3, 6, 8): "000",

@@ -30,7 +30,7 @@ from locatk.core.polaris.published.peaks import (
 )
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.simulation.session import SimulationOptions, simulate
-from locatk.core.polaris.tag import TagLayout, Tags, angles, places
+from locatk.core.polaris.tag import TagLayout, Tags, cell_positions, symbol_angles
 from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
@@ -43,8 +43,8 @@ LAYOUT = TagLayout(((0, 0), (1, 1), (2, 1), (0, 2), (2, 2)), (0, 7, 2, 5, 4))
 def lying(x: float, y: float, heading: float, layout: TagLayout = LAYOUT) -> tuple[Array, Array]:
     """Places (M, 2) and angles (M,) of a tag's magnets on the floor."""
     cos, sin = math.cos(heading), math.sin(heading)
-    turned = places(TAGS, layout.cells) @ np.array([[cos, sin], [-sin, cos]])
-    return turned + [x, y], angles(TAGS, layout.symbols) + heading
+    turned = cell_positions(TAGS, layout.cells) @ np.array([[cos, sin], [-sin, cos]])
+    return turned + [x, y], symbol_angles(TAGS, layout.symbols) + heading
 
 
 def drive(
@@ -79,7 +79,7 @@ def drive(
 def on_the_floor(sighting: DetectedMagnets, samples: Samples) -> Array:
     """Places with the way of the array added: from where it started."""
     way = (sighting.time_ns - samples.time_ns[0]) * 1e-9 * SPEED
-    return sighting.place_m + [way, 0.0]
+    return sighting.position_m + [way, 0.0]
 
 
 def compared(sighting: DetectedMagnets, samples: Samples, truth: tuple[Array, Array]) -> Array:
@@ -218,7 +218,7 @@ def test_no_two_magnets_of_a_pass_are_closer_than_half_a_spacing() -> None:
     tags = Tags(magnets=8, clearance_m=0.005, spacing_m=0.02)
     drive_over = SimulationOptions(route=(9770,), heading_rad=10.0, lateral_m=0.003, seed=10)
     (magnets,) = paper.detect_magnets(simulate(tags, drive_over).samples, tags, SPEED)
-    distance = np.linalg.norm(magnets.place_m[:, None] - magnets.place_m, axis=2)
+    distance = np.linalg.norm(magnets.position_m[:, None] - magnets.position_m, axis=2)
     assert distance[np.triu_indices(len(magnets), 1)].min() > 0.01
 
 
@@ -241,10 +241,10 @@ def test_the_frame_is_the_array_s_at_the_middle_of_the_pass() -> None:
     truth = lying(0.25, 0.0, 0.0)
     samples = drive([truth], 0.5)
     (sighting,) = paper.detect_magnets(samples, TAGS, SPEED)
-    assert sighting.place_m.mean(axis=0) == pytest.approx(
+    assert sighting.position_m.mean(axis=0) == pytest.approx(
         truth[0].mean(axis=0) - [0.25, 0], abs=3e-3
     )
-    assert paper.pattern_heading(sighting.place_m) == pytest.approx(0.0, abs=0.03)
+    assert paper.pattern_heading(sighting.position_m) == pytest.approx(0.0, abs=0.03)
     inside = samples.time_ns[sighting.first : sighting.stop]
     assert len(sighting.path_m) == len(inside)
     np.testing.assert_allclose(
@@ -297,7 +297,7 @@ def test_sensors_may_come_in_any_order() -> None:
     mixed = Samples("bar", array, samples.time_ns, samples.field_t[:, order])
     (mine,) = paper.detect_magnets(samples, TAGS, SPEED)
     (other,) = paper.detect_magnets(mixed, TAGS, SPEED)
-    np.testing.assert_allclose(other.place_m, mine.place_m)
+    np.testing.assert_allclose(other.position_m, mine.position_m)
 
 
 def test_interpolated_samples_do_not_lower_the_estimate_of_noise() -> None:
@@ -365,7 +365,7 @@ def test_a_wide_tag_flips_no_moment_across_the_track(heading_deg: int) -> None:
     heading = math.radians(heading_deg)
     cos, sin = math.cos(heading), math.sin(heading)
     for lateral in (0.004, 0.007, 0.0085):
-        turned = places(tags, LAYOUT.cells) @ np.array([[cos, sin], [-sin, cos]])
+        turned = cell_positions(tags, LAYOUT.cells) @ np.array([[cos, sin], [-sin, cos]])
         truth = turned + [0.2, lateral], np.radians([90.0, -90.0, 90.0, -90.0, 90.0]) + heading
         samples = drive([truth], 0.4, clearance_m=0.012)
         (magnets,) = paper.detect_magnets(samples, tags, SPEED)
@@ -440,13 +440,13 @@ def scored(data: Path, request: pytest.FixtureRequest) -> Scores:
             samples = published(data / "polaris" / kind / f"RawData_{run}.csv")
             (magnets,) = paper.detect_magnets(samples, tags, 0.105)
             assert len(magnets) == 5
-            position = 1e3 * np.column_stack([-magnets.place_m[:, 1], magnets.place_m[:, 0]])
+            position = 1e3 * np.column_stack([-magnets.position_m[:, 1], magnets.position_m[:, 0]])
             distance = np.linalg.norm(position[:, None] - position[0] - TRUE_MM, axis=2)
             order = distance.argmin(axis=0)
             assert sorted(order.tolist()) == [0, 1, 2, 3, 4]
             position = position[order]
             aligned = umeyama(position, TRUE_MM, with_scale=False).apply(position)
-            heading = paper.pattern_heading(magnets.place_m)
+            heading = paper.pattern_heading(magnets.position_m)
             assert heading is not None
             scores[kind].append(
                 Score(

@@ -23,17 +23,17 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.magnetics import dipole_field
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray, bar
-from locatk.core.polaris.simulation.field import Discs, disc_field, scatter
-from locatk.core.polaris.simulation.sensors import Faults, measure
+from locatk.core.polaris.simulation.field import Discs, disc_field, scatter_debris
+from locatk.core.polaris.simulation.sensors import SensorFaults, measure, received_frames
 from locatk.core.polaris.simulation.session import (
     CARS,
-    EPOCH_NS,
     SimulatedSession,
     SimulationOptions,
     simulate,
     usual_bar,
 )
-from locatk.core.polaris.tag import AsBuiltTag, Magnet, Placed, TagLayout, Tags
+from locatk.core.polaris.tag import AsBuiltTag, Magnet, PlanarPose, TagLayout, Tags
+from locatk.core.simulation import SESSION_START_NS
 
 Array = NDArray[np.float64]
 UT = 1e-6
@@ -52,7 +52,7 @@ DARK = Tags(magnet=Magnet(remanence_t=1e-12))
 
 def stamped(simulated: SimulatedSession) -> Array:
     """Seconds since the start of the drive."""
-    return (simulated.samples.time_ns - EPOCH_NS) * 1e-9
+    return (simulated.samples.time_ns - SESSION_START_NS) * 1e-9
 
 
 def over_v1(symbol: int) -> SimulatedSession:
@@ -73,7 +73,7 @@ def sample_at(simulated: SimulatedSession, x_m: float, axis: int = 0) -> Array:
 
 def test_samples_are_what_magpylib_says_one_by_one() -> None:
     """Its own sensors and magnets, placed by truth and by the paper's words alone."""
-    tags = Tags(site={300: Placed(0.1, -0.2, 0.4), 77: Placed(0.45, -0.05, -2.0)})
+    tags = Tags(site={300: PlanarPose(0.1, -0.2, 0.4), 77: PlanarPose(0.45, -0.05, -2.0)})
     options = replace(
         PLAIN,
         earth_t=50 * UT,
@@ -126,7 +126,7 @@ def test_far_away_magnets_are_dipoles_and_near_they_are_not() -> None:
         for sensor, place in enumerate(EXACT.position_m):
             points = truth.position + turn.apply(place)
             for spot, angle in zip(
-                simulated.magnets.place_m, simulated.magnets.angle_rad, strict=True
+                simulated.magnets.position_m, simulated.magnets.angle_rad, strict=True
             ):
                 # 1.8125 mA m2: N52, 2 x 0.5 mm (facts/polaris.md section 3).
                 moment = 1.8125e-3 * np.array([math.cos(angle), math.sin(angle), 0])
@@ -274,7 +274,7 @@ def test_noise_is_white_and_of_its_size_and_offsets_stay() -> None:
 def test_offsets_have_their_size_and_drift_wanders() -> None:
     many = replace(EXACT, position_m=bar(400, 0.001))
     still = np.zeros((201, 400, 3))
-    read, _ = measure(still, many, 100.0, Faults(offset_t=15 * UT, drift_t=0.2 * UT), 1)
+    read, _ = measure(still, many, 100.0, SensorFaults(offset_t=15 * UT, drift_t=0.2 * UT), 1)
     assert read[0].std() == pytest.approx(15 * UT, rel=0.06)
     # A random walk: by sqrt(2) more after two seconds than after one.
     assert (read[100] - read[0]).std() == pytest.approx(0.2 * UT, rel=0.06)
@@ -352,7 +352,7 @@ def test_a_pass_goes_straight_over_the_tag_at_its_heading() -> None:
     assert np.diff(truth.time_ns) == pytest.approx(1e7, abs=1)
     (crossing,) = simulated.crossings
     assert crossing.tag_id == 0
-    assert (crossing.time_ns - EPOCH_NS) * 1e-9 == pytest.approx(-way[0] / 0.2, abs=1e-6)
+    assert (crossing.time_ns - SESSION_START_NS) * 1e-9 == pytest.approx(-way[0] / 0.2, abs=1e-6)
     assert crossing.y_m == pytest.approx(-0.015)
     assert crossing.heading_rad == pytest.approx(-2.0)
 
@@ -405,10 +405,10 @@ def test_what_wobbles_stays_within_its_share_and_comes_near_it() -> None:
 def test_a_tour_crosses_the_tags_of_a_site_in_their_order() -> None:
     tags = Tags(
         site={
-            5: Placed(0.0, 0.0, 0.0),
-            9: Placed(0.6, 0.0, 1.0),
-            77: Placed(0.6, 0.6, -2.0),
-            8: Placed(5.0, 5.0, 0.0),
+            5: PlanarPose(0.0, 0.0, 0.0),
+            9: PlanarPose(0.6, 0.0, 1.0),
+            77: PlanarPose(0.6, 0.6, -2.0),
+            8: PlanarPose(5.0, 5.0, 0.0),
         }
     )
     simulated = simulate(tags, replace(PLAIN, route=(5, 9, 77, 5)))
@@ -436,7 +436,7 @@ def test_a_tour_crosses_the_tags_of_a_site_in_their_order() -> None:
 
 
 def test_tags_in_a_row_are_crossed_on_one_straight_line() -> None:
-    tags = Tags(site={k: Placed(0.3 * k, 0.1 * k, 0.2 * k) for k in range(1, 4)})
+    tags = Tags(site={k: PlanarPose(0.3 * k, 0.1 * k, 0.2 * k) for k in range(1, 4)})
     simulated = simulate(tags, PLAIN)
     assert [crossing.tag_id for crossing in simulated.crossings] == [1, 2, 3]
     x, y, _ = simulated.truth.position.T
@@ -461,7 +461,7 @@ def test_a_tag_is_crossed_whole_in_part_or_not(lateral: float, whole: bool | Non
 @pytest.mark.slow
 def test_hand_built_tags_are_the_same_in_every_session_and_told() -> None:
     wrong = {"build_angle_rad": 0.1, "build_place_m": 5e-4, "build_strength": 0.05}
-    tags = Tags(site={k: Placed(0.3 * k, 0.0, 0.3) for k in range(40)})
+    tags = Tags(site={k: PlanarPose(0.3 * k, 0.0, 0.3) for k in range(40)})
     plain = replace(PLAIN, rate_hz=20.0)
     one = simulate(tags, replace(plain, route=(0,), **wrong))  # type: ignore[arg-type]
     two = simulate(tags, replace(plain, route=(3,), seed=9, **wrong))  # type: ignore[arg-type]
@@ -477,7 +477,7 @@ def test_hand_built_tags_are_the_same_in_every_session_and_told() -> None:
     # A tag that is built as told, and well, is the same tag.
     known = replace(tags, built=one.built)
     again = simulate(known, replace(plain, route=(0,)))
-    assert again.magnets.place_m == pytest.approx(one.magnets.place_m)
+    assert again.magnets.position_m == pytest.approx(one.magnets.position_m)
     apart = np.exp(1j * (again.magnets.angle_rad - one.magnets.angle_rad))
     assert apart == pytest.approx(1.0)
     assert one.tags is tags
@@ -500,33 +500,33 @@ def test_soft_iron_takes_three_times_the_field_it_is_in() -> None:
     low, high = np.array([-0.1, 0.2]), np.array([0.3, 0.4])
     earth = np.array([20e-6, -10e-6, -40e-6])
     rng = np.random.default_rng(3)
-    soft = scatter(nothing, low, high, 2000, 2e-3, 0.0, earth, rng)
-    assert (soft.place_m[:, :2] >= low).all()
-    assert (soft.place_m[:, :2] <= high).all()
+    soft = scatter_debris(nothing, low, high, 2000, 2e-3, 0.0, earth, rng)
+    assert (soft.position_m[:, :2] >= low).all()
+    assert (soft.position_m[:, :2] <= high).all()
     # A bit lies on the magnets' upper faces: its height tells its radius.
-    radius = soft.place_m[:, 2] - 0.25e-3
+    radius = soft.position_m[:, 2] - 0.25e-3
     assert radius.max() == pytest.approx(1e-3, rel=0.01)
     assert radius.min() == pytest.approx(0.3e-3, rel=0.01)
     mu0 = 4e-7 * math.pi
     volume = 4 / 3 * math.pi * radius**3
     assert soft.moment_am2 == pytest.approx(3 * volume[:, None] * earth / mu0, rel=1e-6)
-    hard = scatter(nothing, low, high, 2000, 2e-3, 0.5, earth, np.random.default_rng(3))
-    assert np.array_equal(hard.place_m, soft.place_m)
+    hard = scatter_debris(nothing, low, high, 2000, 2e-3, 0.5, earth, np.random.default_rng(3))
+    assert np.array_equal(hard.position_m, soft.position_m)
     kept = np.linalg.norm(hard.moment_am2 - soft.moment_am2, axis=1)
     assert (kept > 0).mean() == pytest.approx(0.5, abs=0.05)
     assert (kept / volume).max() == pytest.approx(20e3, rel=0.01)
     # In a field of a tesla and more, iron has all the magnetisation there is.
-    full = scatter(nothing, low, high, 50, 2e-3, 0.0, np.array([0, 0, 3.0]), rng)
-    volume = 4 / 3 * math.pi * (full.place_m[:, 2] - 0.25e-3) ** 3
+    full = scatter_debris(nothing, low, high, 50, 2e-3, 0.0, np.array([0, 0, 3.0]), rng)
+    volume = 4 / 3 * math.pi * (full.position_m[:, 2] - 0.25e-3) ** 3
     assert full.moment_am2[:, 2] / volume == pytest.approx(1.7e6)
 
 
 def test_iron_beside_a_magnet_is_magnetised_by_it() -> None:
     disc = Discs(Magnet(), (1,), np.zeros((1, 2)), np.zeros(1), np.ones(1))
     low, high = np.array([-0.01, -0.01]), np.array([0.01, 0.01])
-    bits = scatter(disc, low, high, 200, 1e-3, 0.0, np.zeros(3), np.random.default_rng(0))
-    volume = 4 / 3 * math.pi * (bits.place_m[:, 2] - 0.25e-3) ** 3
-    induced = 3 * volume[:, None] * disc_field(disc, bits.place_m) / (4e-7 * math.pi)
+    bits = scatter_debris(disc, low, high, 200, 1e-3, 0.0, np.zeros(3), np.random.default_rng(0))
+    volume = 4 / 3 * math.pi * (bits.position_m[:, 2] - 0.25e-3) ** 3
+    induced = 3 * volume[:, None] * disc_field(disc, bits.position_m) / (4e-7 * math.pi)
     unsaturated = np.linalg.norm(induced, axis=1) < 1.7e6 * volume
     assert unsaturated.mean() > 0.9
     assert bits.moment_am2[unsaturated] == pytest.approx(induced[unsaturated], rel=1e-6)
@@ -538,7 +538,7 @@ def test_debris_lies_on_the_tag_and_is_felt_as_dipoles() -> None:
     dirty = simulate(None, replace(options, debris=25, seed=3))
     bits = dirty.debris
     assert len(bits) == 25
-    assert np.abs(bits.place_m[:, :2]).max() < 0.08
+    assert np.abs(bits.position_m[:, :2]).max() < 0.08
     n = int(np.argmax(np.abs(dirty.samples.field_t - clean.samples.field_t).max(axis=(1, 2))))
     turn = Rotation.from_quat(dirty.truth.quaternion[n])
     total = sum(
@@ -549,7 +549,7 @@ def test_debris_lies_on_the_tag_and_is_felt_as_dipoles() -> None:
                 pixel=EXACT.position_m.tolist(),
             )
         )
-        for moment, place in zip(bits.moment_am2, bits.place_m, strict=True)
+        for moment, place in zip(bits.moment_am2, bits.position_m, strict=True)
     )
     felt = dirty.samples.field_t[n] - clean.samples.field_t[n]
     assert np.abs(felt).max() > 0.5 * UT
@@ -582,7 +582,7 @@ def test_motors_are_felt_while_they_drive_and_more_at_one_end() -> None:
 
 @pytest.mark.slow
 def test_odometry_tells_the_way_too_long_and_turns_away() -> None:
-    tags = Tags(site={1: Placed(0.0, 0.0, 0.0), 2: Placed(1.0, 0.5, 0.0)})
+    tags = Tags(site={1: PlanarPose(0.0, 0.0, 0.0), 2: PlanarPose(1.0, 0.5, 0.0)})
     options = replace(PLAIN, odometry=True, rate_hz=20.0)
     assert simulate(tags, replace(options, odometry=False)).odometry is None
     right = simulate(tags, replace(options, odometry_scale=0.0, odometry_turn_rad=0.0))
@@ -709,7 +709,7 @@ def test_what_cannot_be_is_refused(wrong: dict[str, object]) -> None:
     ("tags", "options", "said"),
     [
         (Tags(), {"route": (1, 2)}, "no site"),
-        (Tags(site={4: Placed(0, 0, 0)}), {"route": (5,)}, "not on the site"),
+        (Tags(site={4: PlanarPose(0, 0, 0)}), {"route": (5,)}, "not on the site"),
         (Tags(ids=(3, 8)), {"route": (4,)}, "not of the family"),
         (Tags(), {"route": (327_680,)}, "327680"),
         (Tags(), {"clearance_m": 2e-4}, "magnet"),
@@ -729,3 +729,10 @@ def test_what_the_tags_do_not_allow_is_refused(
 
 def test_without_a_route_the_first_of_the_family_is_crossed() -> None:
     assert simulate(Tags(ids=(300, 8)), PLAIN).crossings[0].tag_id == 300
+
+
+def test_the_first_and_the_last_frame_always_arrive() -> None:
+    for seed in range(5):
+        is_received = received_frames(10, 0.9, seed)
+        assert is_received.tolist() == [True, *[False] * 8, True]
+    assert np.count_nonzero(~received_frames(100, 0.25, 0)) == 25

@@ -13,12 +13,12 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.polaris import codec
+from locatk.core.polaris import codec, solver
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
-from locatk.core.polaris.tag import Placed, TagLayout, Tags
+from locatk.core.polaris.tag import PlanarPose, TagLayout, Tags
 from locatk.core.solution import Solution
 
 Array = NDArray[np.float64]
@@ -273,7 +273,7 @@ def test_order_is_that_of_time_and_the_site_places_the_array(world: Any) -> None
         world.Tag(CELLS, OTHER, x=0.6, y=-0.01, heading=2.0),
     ]
     ids = [id_of(SYMBOLS), id_of(OTHER)]
-    site = {i: Placed(t.x, t.y, t.heading) for i, t in zip(ids, tags, strict=True)}
+    site = {i: PlanarPose(t.x, t.y, t.heading) for i, t in zip(ids, tags, strict=True)}
     course = world.line(length=0.9, past=(0.3, 0.0))
     solution = solve([world.record(tags, course, seed=9)], replace(TAGS, site=site))
     assert [d.tag_id for d in solution.detections] == ids
@@ -305,9 +305,9 @@ def test_bad_input_is_named(world: Any) -> None:
         solved(slice(0, 0))
     with pytest.raises(InputError, match="no sensor of bar"):
         solved(field_t=np.full_like(recording.field_t, np.nan))
-    with pytest.raises(InputError, match="method"):
+    with pytest.raises(InputError, match="unknown method"):
         SolveOptions(method="best")
-    with pytest.raises(InputError, match="speed"):
+    with pytest.raises(InputError, match="impossible speed"):
         SolveOptions(speed_mps=-1.0)
     with pytest.raises(InputError, match="joint uses no templates") as error:
         SolveOptions(templates=TemplateGrid())
@@ -357,3 +357,20 @@ def test_a_height_is_as_sure_as_the_scale_of_its_way(world: Any) -> None:
     assert np.all(np.abs(off) > 5e-5)
     assert np.all(np.abs(off) < 2 * sigma)
     assert np.all(sigma < 5e-4)
+
+
+def test_passes_are_merged_only_if_that_identifies_a_tag(
+    world: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two passes that may be the ends of one tag stay two if the whole cannot be identified."""
+    _, _, recording = passed(world)
+    (part,) = solver.find_passes(recording, np.full((9, 3), 5e-7))
+    refused = solve([recording], replace(TAGS, spacing_m=0.03)).detections
+    assert [each.tag_id for each in refused] == [None]
+    half = (part.first + part.stop) // 2
+    ends = [replace(part, stop=half), replace(part, first=half)]
+    monkeypatch.setattr(solver, "find_passes", lambda *_: ends)
+    monkeypatch.setattr(solver, "may_be_one_tag", lambda *_: True)
+    assert len(solve([recording], replace(TAGS, spacing_m=0.03)).detections) == 2
+    (merged,) = solve([recording], TAGS).detections
+    assert merged.tag_id == id_of(SYMBOLS)

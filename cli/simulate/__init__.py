@@ -1,0 +1,44 @@
+"""``locatk simulate``: sessions with known truth, without hardware.
+
+The group loads a command's module when the command is called (:mod:`locatk.cli.lazy`).
+"""
+
+from __future__ import annotations
+
+import click
+
+from locatk.cli.lazy import LazyGroup
+
+COMMANDS = {
+    "dots": ("locatk.cli.simulate.dots", "Frames of a camera over a printed sheet."),
+    "landmarks": (
+        "locatk.cli.simulate.landmarks",
+        "A robot with four hall sensors on a floor of landmarks.",
+    ),
+    "lighthouse": (
+        "locatk.cli.simulate.lighthouse",
+        "Robots driving under Lighthouse stations.",
+    ),
+    "polaris": ("locatk.cli.simulate.polaris", "Passes of a magnetometer bar over tags."),
+}
+"""Name of a command to its module and short help. The module holds it as ``command``."""
+
+
+@click.group(
+    cls=LazyGroup, table=COMMANDS, short_help="Make a session with known truth, without hardware."
+)
+def command() -> None:
+    """Make a session with known truth, without hardware.
+
+    All settings of a simulation are in a TOML file with comments (--print-config, --config); the
+    most common ones are options as well.
+
+    \b
+    Examples:
+      locatk simulate lighthouse -o run.mcap
+      locatk simulate dots -o run.mcap
+      locatk simulate polaris -o run.mcap --id 262143
+      locatk simulate landmarks map.toml -o run.mcap
+      locatk simulate landmarks --print-config > sim.toml
+      locatk simulate landmarks map.toml --config sim.toml -o run.mcap
+    """

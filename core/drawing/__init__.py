@@ -1,0 +1,66 @@
+"""Drawings at true size: marks, pages of a pack, cards and tiles, independent of the file format.
+
+``marks`` holds what is drawn (lines, circles, polygons, text, rulers, cut marks), ``pages`` the
+frame of a page with flowing text and tables, ``cards`` the arrangement of equal cards on pages, and
+``tiles`` the division of a large drawing over several papers.
+"""
+
+from locatk.core.drawing.marks import (
+    CAPITAL_HEIGHT_EM,
+    CUT_MARK_MM,
+    LINE_SPACING_EM,
+    LINE_WIDTH_MM,
+    MM_PER_POINT,
+    RULER_DEPTH_MM,
+    TRUE_SIZE_INSTRUCTION,
+    Box,
+    Circle,
+    Group,
+    Line,
+    Mark,
+    Page,
+    Point,
+    Polygon,
+    Text,
+    arrow,
+    capital_height,
+    cross,
+    cut_marks,
+    line_height,
+    page_rulers,
+    paragraph,
+    rectangle,
+    ruler,
+    text_width,
+    wrap,
+)
+
+__all__ = [
+    "CAPITAL_HEIGHT_EM",
+    "CUT_MARK_MM",
+    "LINE_SPACING_EM",
+    "LINE_WIDTH_MM",
+    "MM_PER_POINT",
+    "RULER_DEPTH_MM",
+    "TRUE_SIZE_INSTRUCTION",
+    "Box",
+    "Circle",
+    "Group",
+    "Line",
+    "Mark",
+    "Page",
+    "Point",
+    "Polygon",
+    "Text",
+    "arrow",
+    "capital_height",
+    "cross",
+    "cut_marks",
+    "line_height",
+    "page_rulers",
+    "paragraph",
+    "rectangle",
+    "ruler",
+    "text_width",
+    "wrap",
+]

@@ -1,0 +1,275 @@
+"""Configuration file of a simulation: TOML with a comment for every key.
+
+Each simulator declares its settings once, as :class:`Setting`: key, type and range, meaning,
+default, and possibly a flag. The TOML file (:meth:`SimulationConfig.dumps`,
+:meth:`SimulationConfig.read`) and the options of the command line
+(:mod:`locatk.cli.simulate.options`) are made of that declaration.
+
+Settings are kept as a mapping from key to value, in the units of the file, which holds only what
+was set. Values of the command line override those of the file (:meth:`SimulationConfig.merge`);
+:meth:`SimulationConfig.in_si` converts them to the units of the simulators.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from locatk.core.errors import InputError
+from locatk.formats import toml
+from locatk.formats.simulation.settings import NO_DEFAULT, FilePath, Number, Requirement, Setting
+from locatk.formats.toml import Inline, Table
+from locatk.formats.toml_files import head
+
+FORMAT_VERSION = 1
+"""Version of the configuration files of all simulators."""
+
+COMMENT_WIDTH_CHARACTERS = 98
+"""Longest line of a comment in a configuration file."""
+
+
+class SettingsError(InputError):
+    """Settings that contradict each other: a usage error."""
+
+    exit_status = 2
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """Settings of one simulator.
+
+    Attributes
+    ----------
+    system : str
+    settings : tuple of Setting
+        In the order of the file, table by table.
+    defaults : object
+        Options of the simulator with their defaults.
+    conflicts : tuple of (keys, keys)
+        None of the first keys can be set together with one of the second.
+    requirements : tuple of Requirement
+    """
+
+    system: str
+    settings: tuple[Setting, ...]
+    defaults: object
+    conflicts: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()
+    requirements: tuple[Requirement, ...] = ()
+
+    # ---- declaration
+
+    @property
+    def tables(self) -> dict[str, list[Setting]]:
+        """Settings by table, in the order of the file."""
+        tables: dict[str, list[Setting]] = {}
+        for setting in self.settings:
+            tables.setdefault(setting.table, []).append(setting)
+        return tables
+
+    def setting(self, key: str) -> Setting:
+        """Return the setting of a key."""
+        return next(setting for setting in self.settings if setting.key == key)
+
+    def default(self, setting: Setting) -> Any:
+        """Return the default in units of the file, None if it is not a value."""
+        if setting.default is not NO_DEFAULT:
+            return setting.default
+        value = self._default_si(setting)
+        if value in (None, (), "") or (isinstance(value, float) and math.isinf(value)):
+            return None
+        return _shortest(value, setting.factor) if isinstance(setting.kind, Number) else value
+
+    def default_text(self, setting: Setting) -> str:
+        """Describe the default."""
+        if setting.default_text:
+            return setting.default_text
+        value = self.default(setting)
+        if isinstance(value, bool):
+            return "true" if value else "false"
+        return f"{value:g}" if isinstance(value, float) else str(value)
+
+    def replacements(self, former_flag: str) -> list[Setting]:
+        """Return the settings that replace an option of earlier versions."""
+        return [setting for setting in self.settings if former_flag in setting.former_flag.split()]
+
+    def _default_si(self, setting: Setting) -> Any:
+        value: Any = self.defaults
+        for name in setting.field.split(".") if setting.field else ():
+            value = getattr(value, name)
+        return value if setting.field else None
+
+    # ---- file
+
+    def dumps(self, settings: Mapping[str, Any] | None = None) -> str:
+        """Return the TOML file: every key with a comment, commented out if it is not set."""
+        settings = settings or {}
+        lines = [
+            f"# Settings of `locatk simulate {self.system} --config FILE`.",
+            "# A key behind # has its default, or an example of a value. Remove the # to set it.",
+            "# Options of the command line override this file.",
+            *toml.dumps(head(self._format, FORMAT_VERSION)).splitlines(),
+        ]
+        for table, members in self.tables.items():
+            lines += ["", f"[{table}]"]
+            for setting in members:
+                lines += ["", *self._entry(setting, settings)]
+        return "\n".join(lines) + "\n"
+
+    def _entry(self, setting: Setting, settings: Mapping[str, Any]) -> Iterator[str]:
+        """Yield the comment and the key of a setting."""
+        unit = f" [{setting.unit}]" if setting.unit else ""
+        default = self.default(setting)
+        comment = f"{setting.help}{unit}. Default: {self.default_text(setting)}."
+        yield from textwrap.wrap(
+            comment, COMMENT_WIDTH_CHARACTERS, initial_indent="# ", subsequent_indent="# "
+        )
+        is_set = setting.key in settings
+        value = settings[setting.key] if is_set else setting.example if default is None else default
+        text = toml.dumps({setting.name: _inline(setting.kind.to_toml(value))})
+        yield from (line if is_set else f"#{line}" for line in text.splitlines())
+
+    def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
+        """Read the settings of a file; files that it names are relative to its folder.
+
+        Raises
+        ------
+        MissingDataError
+            There is no such file.
+        ArtifactError
+            It is not TOML or of another simulator, or a key is unknown or has a wrong value.
+        """
+        return self._parse(toml.read(path), Path(path).parent)
+
+    def loads(self, text: str) -> dict[str, Any]:
+        """Read the settings of TOML text; see :meth:`read`."""
+        return self._parse(toml.loads(text, f"<{self._format}>"), Path())
+
+    @property
+    def _format(self) -> str:
+        return f"locatk-simulation-{self.system}"
+
+    def _parse(self, table: Table, folder: Path) -> dict[str, Any]:
+        toml.check_format(table, self._format, FORMAT_VERSION)
+        settings = {}
+        for name, members in self.tables.items():
+            section = table.table(name, None)
+            if section is None:
+                continue
+            for setting in members:
+                value = section.raw(setting.name, None)
+                if value is None:
+                    continue
+                try:
+                    value = setting.kind.parse(value)
+                except ValueError as error:
+                    raise section.error(setting.name, str(error)) from None
+                if isinstance(setting.kind, FilePath):
+                    value = setting.kind.resolve(value, folder)
+                settings[setting.key] = value
+            section.end()
+        table.end()
+        return settings
+
+    # ---- settings
+
+    def merge(self, file: Mapping[str, Any], flags: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of a file, overridden by those of the command line.
+
+        Settings of the file that cannot be combined with one of the command line are dropped.
+
+        Raises
+        ------
+        SettingsError
+            Settings contradict each other.
+        """
+        replaced = set(flags)
+        for first, second in self.conflicts:
+            for keys, others in ((first, second), (second, first)):
+                if any(_is_set(flags, key) for key in keys):
+                    replaced.update(others)
+        for need in self.requirements:
+            if need.other in flags and need.values and flags[need.other] not in need.values:
+                replaced.add(need.key)
+        merged = {key: value for key, value in file.items() if key not in replaced} | dict(flags)
+        self._check_combinations(merged)
+        return merged
+
+    def _check_combinations(self, settings: Mapping[str, Any]) -> None:
+        """Raise an error for settings that cannot be combined; those that are off do not count."""
+        for first, second in self.conflicts:
+            one = next((key for key in first if _is_set(settings, key)), None)
+            other = next((key for key in second if _is_set(settings, key)), None)
+            if one and other:
+                titles = f"{self.setting(one).title} or {self.setting(other).title}"
+                raise SettingsError(f"Give {titles}, not both")
+        for need in self.requirements:
+            if not _is_set(settings, need.key):
+                continue
+            needed = self.setting(need.other)
+            value = settings.get(need.other, self.default(needed))
+            if value not in need.values if need.values else value is None:
+                choices = " or ".join(map(str, need.values))
+                raise SettingsError(
+                    f"{self.setting(need.key).title} needs {needed.title} {choices}".rstrip()
+                )
+
+    def in_si(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return settings by ``field``, or by key if they have none, in units of the simulators.
+
+        A number that equals the default of the file gives exactly the default of the simulator.
+        """
+        converted = {}
+        for key, value in settings.items():
+            setting = self.setting(key)
+            if setting.field and value == self.default(setting):
+                value = self._default_si(setting)
+            elif isinstance(setting.kind, Number):
+                value = value * setting.factor
+            converted[setting.field or key] = value
+        return converted
+
+    def files(self, settings: Mapping[str, Any]) -> list[Path]:
+        """Return the files that settings name."""
+        return [
+            Path(value)
+            for key, value in settings.items()
+            if isinstance(kind := self.setting(key).kind, FilePath) and value not in kind.names
+        ]
+
+
+def _is_set(settings: Mapping[str, Any], key: str) -> bool:
+    return settings.get(key, False) is not False
+
+
+def with_values(options: Any, values: Mapping[str, Any]) -> Any:
+    """Replace attributes of a dataclass; dots in their names stand for nested dataclasses."""
+    direct = {name: value for name, value in values.items() if "." not in name}
+    for part in dict.fromkeys(name.partition(".")[0] for name in values if "." in name):
+        nested = {
+            name.removeprefix(f"{part}."): value
+            for name, value in values.items()
+            if name.startswith(f"{part}.")
+        }
+        direct[part] = with_values(getattr(options, part), nested)
+    return replace(options, **direct)
+
+
+def _inline(value: Any) -> Any:
+    """Mark the tables inside a value to be written on one line."""
+    if isinstance(value, dict):
+        return Inline(value)
+    return [_inline(item) for item in value] if isinstance(value, list) else value
+
+
+def _shortest(value: float, factor: float) -> float:
+    """Return the number with the fewest digits that ``factor`` converts to ``value``."""
+    for digits in range(1, 17):
+        number = float(f"{value / factor:.{digits}g}")
+        if math.isclose(number * factor, value, rel_tol=1e-14):
+            return number
+    return value / factor

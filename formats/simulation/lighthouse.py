@@ -1,0 +1,146 @@
+"""Settings of ``locatk simulate lighthouse``."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from locatk.core.lighthouse.receiver import DECK, Receiver
+from locatk.core.lighthouse.simulation import SimulationOptions, simulate
+from locatk.formats import observations
+from locatk.formats.receivers import read_receiver
+from locatk.formats.simulation.config import SimulationConfig
+from locatk.formats.simulation.settings import (
+    FRACTION_BELOW_1,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Boolean,
+    FilePath,
+    Integer,
+    Setting,
+)
+
+DECK_NAME = "deck"
+"""Name of Bitcraze's Lighthouse deck as a receiver."""
+
+DOTBOT_REPORT_HZ = 10.0
+"""Rate at which a DotBot reports [Hz]."""
+
+EVERY_SWEEP_HZ = 120.0
+"""Rate of reports at which each sweep is reported once [Hz]: rotors rotate at 48 to 54 Hz."""
+
+NOISE_UDEG = 300.0
+"""Jitter of the rotor (paper IV.A) [microdegrees]."""
+
+CONFIG = SimulationConfig(
+    "lighthouse",
+    (
+        Setting("robots.count", Integer(1), "Number of robots", "robots", "--robots"),
+        Setting(
+            "robots.planar",
+            Boolean(),
+            "Robots drive on the floor; otherwise they are moved through space",
+            "planar",
+            "--planar/--3d",
+        ),
+        Setting("robots.duration_s", POSITIVE, "Duration", "duration_s", "--duration"),
+        Setting(
+            "robots.receiver",
+            FilePath((DECK_NAME,)),
+            "Photodiodes of each robot, which reports every sweep: a receiver.toml, or deck for "
+            "Bitcraze's Lighthouse deck",
+            flag="--receiver",
+            default=None,
+            default_text="one photodiode, which reports ten times a second",
+            example=DECK_NAME,
+            metavar="deck|FILE",
+        ),
+        Setting("stations.count", Integer(1, 16), "Number of stations", "stations", "--stations"),
+        Setting(
+            "errors.noise_udeg",
+            NOT_NEGATIVE,
+            "Standard deviation of a rotor angle. The default is the paper's jitter of the rotor; "
+            "receivers at rest scatter by about 6600",
+            flag="--noise-udeg",
+            default=NOISE_UDEG,
+        ),
+        Setting(
+            "errors.occlusion_fraction",
+            FRACTION_BELOW_1,
+            "Fraction of the time in which a station is hidden from a robot",
+            "occlusion",
+            "--occlusion",
+        ),
+        Setting(
+            "errors.outlier_fraction",
+            FRACTION_BELOW_1,
+            "Fraction of the sweeps that are wrong: demodulation errors, reflections, exchanged "
+            "stations",
+            "outliers",
+            "--outliers",
+        ),
+        Setting("random.seed", Integer(0), "Seed of all random numbers", "seed", "--seed"),
+    ),
+    SimulationOptions(),
+)
+"""Settings of the command."""
+
+
+def simulation_options(settings: Mapping[str, Any]) -> SimulationOptions:
+    """Return the options of a simulation.
+
+    Raises
+    ------
+    MissingDataError, ArtifactError
+        The file of the receiver is missing or invalid.
+    InputError
+        A value is out of its range.
+    """
+    values = CONFIG.in_si(settings)
+    noise_udeg = values.pop("errors.noise_udeg", NOISE_UDEG)
+    receiver = _read_receiver(values.pop("robots.receiver", None))
+    return SimulationOptions(
+        **values,
+        noise_rad=math.radians(noise_udeg * 1e-6),
+        receiver=receiver,
+        report_hz=DOTBOT_REPORT_HZ if receiver is None else EVERY_SWEEP_HZ,
+    )
+
+
+def _read_receiver(name: str | None) -> Receiver | None:
+    """Return the deck, or the receiver of a file."""
+    if name is None:
+        return None
+    return DECK if name == DECK_NAME else read_receiver(Path(name))
+
+
+def write_simulation(
+    output: str | os.PathLike[str], settings: Mapping[str, Any], *, overwrite: bool = False
+) -> dict[str, Any]:
+    """Simulate robots under stations, and write the session; return the summary for ``--json``.
+
+    Raises
+    ------
+    LocatkError
+        A file is missing or invalid, or the settings cannot be simulated.
+    """
+    options = simulation_options(settings)
+    simulated = simulate(options)
+    sweeps, receiver = simulated.sweeps, options.receiver
+    observations.write_session(
+        output,
+        system="lighthouse",
+        sweeps=sweeps,
+        scene=simulated.scene,
+        truth=simulated.truth,
+        receivers={} if receiver is None else dict.fromkeys(sweeps.devices, receiver),
+        overwrite=overwrite,
+    )
+    return {
+        "sweeps": len(sweeps),
+        "devices": list(sweeps.devices),
+        "truth_poses": sum(len(trajectory) for trajectory in simulated.truth),
+    }
