@@ -14,7 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from locatk.core.polaris import codec
-from locatk.core.polaris.codec import families
+from locatk.core.polaris.codec import families, redundant
 from locatk.core.polaris.identification.decoding import MAX_TIE_STEPS, DecodedTag, decode_tag
 from locatk.core.polaris.tag import AsBuiltTag, Cell, Tags
 
