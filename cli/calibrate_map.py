@@ -12,8 +12,8 @@ from locatk.cli import console, options, recordings
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
-    from locatk.core.landmarks.calibration.floor import CalibrationReport, Drive
-    from locatk.core.landmarks.calibration.marks import Landmark
+    from locatk.core.landmarks.calibration.floor import CalibrationDrive, FloorCalibrationReport
+    from locatk.core.landmarks.calibration.landmarks import CalibratedLandmark
     from locatk.core.landmarks.map.floor import FloorMap
 
 MOST_LANDMARKS = 40
@@ -84,7 +84,7 @@ def _attached(path: Path) -> FloorMap:
 
 def _drives(
     sessions: tuple[Path, ...], floor: FloorMap, same: bool
-) -> tuple[list[Drive], dict[str, str]]:
+) -> tuple[list[CalibrationDrive], dict[str, str]]:
     """The robots of all sessions, and what cannot be used: name to why.
 
     With ``same``, each session must hold the design of ``floor``.
@@ -93,7 +93,7 @@ def _drives(
     from locatk.formats import observations
     from locatk.formats.session import Session
 
-    drives: list[Drive] = []
+    drives: list[CalibrationDrive] = []
     left_out: dict[str, str] = {}
     with recordings.walk(sessions, "Reading") as bar:
         for path in bar:
@@ -105,7 +105,7 @@ def _drives(
                 samples = observations.read_halls(session)
                 for each in samples:
                     name = str(path) if len(samples) == 1 else f"{path}: {each.device}"
-                    drive = calibrate.read(name, each, odometry.get(each.device), floor)
+                    drive = calibrate.read_drive(name, each, odometry.get(each.device), floor)
                     if isinstance(drive, str):
                         left_out[name] = drive
                     else:
@@ -125,19 +125,19 @@ def _check_same(floor: FloorMap, other: FloorMap, path: Path) -> None:
         )
 
 
-def _letters(landmark: Landmark) -> str:
+def _letters(landmark: CalibratedLandmark) -> str:
     """Its bars as they lie, `-` where there is none."""
-    from locatk.core.landmarks.detection.explanations import GONE
+    from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
 
     return "".join(
-        "-" if abs(value) < GONE else "N" if value > 0 else "S"
+        "-" if abs(value) < MISSING_BAR_STRENGTH else "N" if value > 0 else "S"
         for value in landmark.built.strength.tolist()
     )
 
 
-def _text(output: Path, report: CalibrationReport) -> str:
+def _text(output: Path, report: FloorCalibrationReport) -> str:
     """The landmarks for people: a table, and what it is to be told of the others."""
-    told = [one for one in report.found if not one.why]
+    told = [one for one in report.landmarks if not one.refused]
     flagged = [one for one in told if one.built.flags]
     listed = told if len(told) <= MOST_LANDMARKS else flagged
     rows = [
@@ -164,9 +164,9 @@ def _text(output: Path, report: CalibrationReport) -> str:
     if len(listed) < len(told):
         lines.append(f"{len(told) - len(listed)} more without a flag; --json lists them all")
     lines += [
-        f"seen, but not told: {one.cell[0]},{one.cell[1]}, {one.why}"
-        for one in report.found
-        if one.why
+        f"seen, but not told: {one.cell[0]},{one.cell[1]}, {one.refused}"
+        for one in report.landmarks
+        if one.refused
     ]
     if report.unvisited:
         cells = [f"{row},{column}" for row, column in report.unvisited]
@@ -175,7 +175,9 @@ def _text(output: Path, report: CalibrationReport) -> str:
     return "\n".join([*lines, f"Wrote {output}"])
 
 
-def _entry(sessions: tuple[Path, ...], output: Path, report: CalibrationReport) -> dict[str, Any]:
+def _entry(
+    sessions: tuple[Path, ...], output: Path, report: FloorCalibrationReport
+) -> dict[str, Any]:
     """The one object of ``--json``; docs/formats.md."""
     landmarks = [
         {
@@ -191,9 +193,9 @@ def _entry(sessions: tuple[Path, ...], output: Path, report: CalibrationReport) 
             "sigma_strength": one.built.sigma[3:],
             "laid": _letters(one),
             "flags": one.built.flags,
-            "refused": one.why,
+            "refused": one.refused,
         }
-        for one in report.found
+        for one in report.landmarks
     ]
     return {
         "version": 1,
@@ -203,7 +205,7 @@ def _entry(sessions: tuple[Path, ...], output: Path, report: CalibrationReport) 
         "unvisited": report.unvisited,
         "typical_strength": report.strength,
         "sigma_typical_strength": report.strength_sigma,
-        "misfit_sigma": report.misfit,
+        "misfit_sigma": report.residual_sigma,
         "left_out": report.left_out,
         "notes": report.notes,
     }

@@ -21,7 +21,7 @@ import math
 import os
 
 from locatk.core.errors import FormatError, error_context
-from locatk.core.landmarks.landmark import CODES
+from locatk.core.landmarks.landmark import CODE_COUNT
 from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
 from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
 from locatk.core.units import metres, mm_text
@@ -89,7 +89,7 @@ def loads_csv(
                 where = _header(cells, file, rows.line_num)
                 continue
             line = _Line(cells, where, file, rows.line_num)
-            codes.append(line.whole("Code", 0, CODES - 1))
+            codes.append(line.whole("Code", 0, CODE_COUNT - 1))
             start = line.number("Attr4", 0) == 1  # its heading is that of vehicles
             turn = 0.0 if start else line.number("Attr1", 18_000)
             x, y = (line.number(name, FARTHEST_MM) for name in ("X mm", "Y mm"))

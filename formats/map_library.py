@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.design.generation import DesignOptions, empty_floor, with_codes
 from locatk.core.landmarks.design.generation import design_map as search
 from locatk.core.landmarks.design.proof import prove_map
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, code_of, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, code_of, rotated
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES
 
@@ -129,7 +129,7 @@ def relabelling(alphabet: str, random: np.random.RandomState) -> Codes:
     Letters may change places if the map as read changes them alike under each heading:
     patterns with as many orientations for each other, and each by a turn of its own.
     """
-    table = np.arange(CODES)
+    table = np.arange(CODE_COUNT)
     if alphabet != "16":
         codes = np.array(ALPHABET_CODES[alphabet])
         table[codes] = random.permutation(codes)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from locatk.core.drawing import Line, Point, Polygon
 from locatk.core.landmarks.drawing.landmark import bar_outlines, pole_arrow, pole_letters
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, name
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, Geometry, name
 from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
 
 NAMESPACE = "http://www.w3.org/2000/svg"
@@ -99,7 +99,7 @@ class _Drawn:
         poses = as_built_poses(floor)
         self.places = 1e3 * poses[:, :2] - corner
         self.headings = poses[:, 2].tolist()
-        self.shapes = [_Shape(floor.geometry, code) for code in range(CODES)]
+        self.shapes = [_Shape(floor.geometry, code) for code in range(CODE_COUNT)]
 
     def draw(self, ink: Xml.Element) -> None:
         self._walls(_layer(ink, "walls"))

@@ -1,4 +1,4 @@
-"""Floors of four-bar magnets: from hall sensors and odometry to a place on the map."""
+"""Landmarks of four bar magnets: from hall sensors and odometry to poses on the map of a floor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["SolveOptions", "solve"]
 
 
 def __getattr__(name: str) -> Any:
-    # scipy belongs to the call, not to `import locatk.core.landmarks`.
+    # The solver takes long to import, and many modules need only the data of this package.
     if name in __all__:
         from locatk.core.landmarks import solver
 

@@ -1,4 +1,4 @@
-"""The robot's hall sensors, and what they have measured."""
+"""Hall sensors under a robot, and their samples."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ NAMES = ("front", "left", "rear", "right")
 
 
 def circle(radius_m: float = 0.025) -> Array:
-    """Positions (4, 2) of front, left, rear and right on a circle, in the robot's frame."""
+    """Return positions (4, 2) of front, left, rear and right sensor on a circle, in metres."""
     return radius_m * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
 @dataclass(frozen=True)
 class HallSensors:
-    """Hall sensors under a robot that measure the upright field: the artifact ``halls.toml``.
+    """Hall sensors under a robot that measure the vertical field: the artifact ``halls.toml``.
 
-    The robot's frame: x forward, y left, z up; the origin is the middle of its wheels,
-    about which it turns. What is positive is a field that points up.
+    The robot's frame: x forward, y left, z up; the origin is the midpoint of its wheels, about
+    which it rotates. Fields that point up are positive.
 
     Attributes
     ----------
@@ -31,11 +31,11 @@ class HallSensors:
     position_m : (N, 2) ndarray
         In the robot's frame.
     noise_t : float
-        Standard deviation of a sample in tesla; ``nan`` where unknown.
+        Standard deviation of a sample in tesla; ``nan`` if unknown.
     range_t : float
-        Largest field that can be told; ``inf`` where unknown.
+        Largest field that a sensor can report, in tesla; ``inf`` if unknown.
     sensor : str
-        Its name and settings, for people.
+        Part number and settings, for people.
     """
 
     names: tuple[str, ...] = NAMES
@@ -50,7 +50,7 @@ class HallSensors:
 
 @dataclass(frozen=True)
 class HallSamples:
-    """What the hall sensors of one robot measured, sample by sample.
+    """Samples of the hall sensors of one robot.
 
     Attributes
     ----------
@@ -59,8 +59,8 @@ class HallSamples:
     time_ns : (n,) int64 ndarray
         Strictly ascending.
     field_t : (n, N) ndarray
-        Tesla; ``nan`` where a sensor gave nothing. At and beyond the sensors' range a
-        value is saturated and says only that the field is as large.
+        Tesla; ``nan`` if a sensor reported nothing. A value at the end of the sensors' range is
+        saturated: the field is at least as large.
     """
 
     device: str
@@ -69,9 +69,9 @@ class HallSamples:
     field_t: Array
 
     def __post_init__(self) -> None:
-        wanted = (len(self.time_ns), len(self.sensors))
-        if self.field_t.shape != wanted:
-            raise ValueError(f"field_t has shape {self.field_t.shape}, not {wanted}")
+        expected = (len(self.time_ns), len(self.sensors))
+        if self.field_t.shape != expected:
+            raise ValueError(f"field_t has shape {self.field_t.shape}, not {expected}")
 
     def __len__(self) -> int:
         return len(self.time_ns)

@@ -1,13 +1,14 @@
-"""The landmark: four bar magnets on the sides of a square, and the sixteen ways to lay them.
+"""Landmark of four bar magnets on the sides of a square: geometry, and its sixteen codes.
 
-Frame of a landmark: the origin is the middle of the square, x right, y up, z up from the
-bars' top faces. Bar ``k`` lies at the angle ``90 k`` degrees, counter-clockwise from x
-(the paper counts from "the right-hand side magnet in counter clockwise direction", Fig. 1),
-flat, along the side of the square: tangential to the circle of the sensors. It is ``N``
-where it is magnetised counter-clockwise along that circle, ``S`` where clockwise.
+Frame of a landmark: the origin is the centre of the square, x points right, y up, and z upward
+from the top faces of the bars. Bar ``k`` is at the angle ``90 k`` degrees, counter-clockwise from
+x ("Notation starts from the polarity of the right-hand side magnet in counter clockwise
+direction", Fig. 1 of the paper). It rests flat along the side of the square, tangential to the
+circle of the sensors. It is ``N`` if it is magnetised counter-clockwise along that circle, ``S``
+if clockwise.
 
-A *code* is how the four bars lie: bit ``k`` is set where bar ``k`` is ``N``. The paper's
-six patterns are the codes up to a turn of the whole landmark.
+A *code* states the directions of the four bars: bit ``k`` is set if bar ``k`` is ``N``. The
+paper's six patterns are the codes up to a rotation of the whole landmark.
 """
 
 from __future__ import annotations
@@ -19,33 +20,37 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-CODES = 16
+CODE_COUNT = 16
+"""Number of directions of four bars."""
+
+HALF_PI_RAD = np.pi / 2
+"""Rotation of a landmark by one quarter turn, which maps bars onto bars."""
 
 PATTERNS = ("NSNS", "SSSN", "NNNS", "NNSS", "NNNN", "SSSS")
-"""By the paper's number less one; which of SSSN and NNNS is landmark 2, and which of NNNN
-and SSSS is 5, the paper does not say in words."""
+"""By the paper's number minus one. The text of the paper does not state which of SSSN and NNNS is
+landmark 2, and which of NNNN and SSSS is landmark 5."""
 
 
 @dataclass(frozen=True)
 class Geometry:
     """Bars of a landmark, and the plane in which the sensors pass over them.
 
-    The defaults reproduce the paper's two radii (45 and 54 mm).
+    The defaults reproduce the two radii of the field in the paper (45 and 54 mm, section 3.1).
 
     Attributes
     ----------
     bar_length_m, bar_width_m, bar_height_m : float
-        Of one bar; it is magnetised along its length, and its height is upright.
+        Size of one bar; it is magnetised along its length, and its height is vertical.
     remanence_t : float
-        Br of the bars' material in tesla.
+        Br of the material in tesla.
     radius_m : float
-        From the landmark's centre to the middle of each bar.
+        From the landmark's centre to the centre of each bar.
     sensor_height_m : float
-        From the bars' top faces to the sensors.
+        From the top faces of the bars to the sensors.
     circle_m : float
-        Radius of the circle on which the robot's hall sensors sit.
+        Radius of the circle on which the robot's hall sensors are mounted.
     threshold_t : float
-        Field at which a sensor is inside the landmark's territory (an MEP is there).
+        Field at which a sensor enters the landmark's territory (the paper's MEP).
     """
 
     bar_length_m: float = 0.030
@@ -59,40 +64,46 @@ class Geometry:
 
 
 def name(code: int) -> str:
-    """Letters of the bars, counter-clockwise from the right-hand one, as in ``"NNSN"``."""
+    """Return the letters of the bars, counter-clockwise from the right one, as in ``"NNSN"``."""
     return "".join("N" if code >> k & 1 else "S" for k in range(4))
 
 
 def code_of(letters: str) -> int:
-    """Inverse of :func:`name`; ``ValueError`` for anything but four letters N and S."""
+    """Return the code of four letters; inverse of :func:`name`.
+
+    Raises
+    ------
+    ValueError
+        ``letters`` are not four letters N and S.
+    """
     if len(letters) != 4 or set(letters) - {"N", "S"}:
         raise ValueError(f"{letters!r} is not four letters N and S")
     return sum(1 << k for k, letter in enumerate(letters) if letter == "N")
 
 
 def rotated(codes: ArrayLike, quarters: ArrayLike) -> NDArray[np.int64]:
-    """Codes of landmarks that were turned counter-clockwise by quarter turns.
+    """Return the codes of landmarks after a counter-clockwise rotation by quarter turns.
 
-    Both are integers and broadcast. A robot with the heading of ``q`` quarter turns reads a
-    landmark laid as ``code`` as ``rotated(code, -q)``.
+    Both arguments are integers and broadcast. A robot whose heading is ``q`` quarter turns reads
+    a landmark of the code ``code`` as ``rotated(code, -q)``.
     """
     codes, shift = np.asarray(codes, np.int64), np.asarray(quarters, np.int64) % 4
     return (codes << shift | codes >> (4 - shift)) & 15
 
 
 def signs(codes: ArrayLike) -> Array:
-    """Directions (..., 4) of the bars: 1 where N, -1 where S."""
+    """Return the directions (..., 4) of the bars: 1 for N, -1 for S."""
     bits = np.asarray(codes, np.int64)[..., None] >> np.arange(4) & 1
     return np.where(bits == 1, 1.0, -1.0)
 
 
-PATTERN_OF = np.zeros(CODES, np.int64)
-"""(16,) the paper's number, 1 to 6, of each code."""
+PATTERN_OF = np.zeros(CODE_COUNT, np.int64)
+"""(16,) number of the pattern in the paper, 1 to 6, of each code."""
 
 for _number, _letters in enumerate(PATTERNS, 1):
     PATTERN_OF[rotated(code_of(_letters), np.arange(4))] = _number
 
 
 def pattern(code: int) -> str:
-    """The one of :data:`PATTERNS` of which ``code`` is an orientation."""
+    """Return the one of :data:`PATTERNS` of which ``code`` is an orientation."""
     return PATTERNS[PATTERN_OF[code] - 1]

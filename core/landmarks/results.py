@@ -5,17 +5,15 @@ The names of JSON keys are stable (docs/formats.md).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
-from locatk.core.landmarks.landmark import pattern, rotated
-from locatk.core.landmarks.localization.cell_filter import HALF_PI, Located
+from locatk.core.landmarks.landmark import HALF_PI_RAD, pattern, rotated
+from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY, CellEstimate
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, as_built_code
-
-MIN_CELL_PROBABILITY = 0.8
-"""Posterior probability of a cell of the map from which on it is reported [1]."""
 
 
 @dataclass(frozen=True)
@@ -110,22 +108,22 @@ class LandmarkFacts:
 
 
 def describe_visit(
-    sighting: VisitHypotheses, located: Located | None, floor: FloorMap | None
+    visit: VisitHypotheses, estimate: CellEstimate | None, floor: FloorMap | None
 ) -> LandmarkDetection:
     """Return the detection that reports one visit.
 
     Parameters
     ----------
-    sighting : Sighting
-        Hypotheses of the visit, or the reason why there is none.
-    located : Located or None
+    visit : VisitHypotheses
+        Hypotheses of the visit, or the reason for which there is none.
+    estimate : CellEstimate or None
         Its cell on the map, if it is known.
     floor : FloorMap or None
-        The map; it tells misread landmarks and cells without one.
+        The map; misread landmarks, and cells without one, are recognized by it.
     """
     unread = LandmarkDetection(
-        time_s=sighting.time_ns * 1e-9,
-        device=sighting.device,
+        time_s=visit.time_ns * 1e-9,
+        device=visit.device,
         cell=None,
         pattern=None,
         code=None,
@@ -137,26 +135,26 @@ def describe_visit(
         sigma_y_m=None,
         sigma_heading_rad=None,
         strength=None,
-        residual_sigma=sighting.residual_sigma,
-        refused=sighting.refused,
+        residual_sigma=visit.residual_sigma,
+        refused=visit.refused,
     )
-    if not sighting.hypotheses:
+    if not visit.hypotheses:
         return unread
-    best, cell, quarters, refused = sighting.best, None, 0, sighting.refused
-    if located is not None and located.probability >= MIN_CELL_PROBABILITY:
-        best = sighting.hypotheses[located.hypothesis]
-        cell, quarters = located.cell, located.quarters
+    best, cell, quarters, refused = visit.best, None, 0, visit.refused
+    if estimate is not None and estimate.probability >= MIN_CELL_PROBABILITY:
+        best = visit.hypotheses[estimate.hypothesis]
+        cell, quarters = estimate.cell, estimate.quarters
         if floor is not None:
-            laid = as_built_code(floor, located.cell)
-            if laid == HOLE:
+            code_on_map = as_built_code(floor, estimate.cell)
+            if code_on_map == HOLE:
                 cell = None
                 refused = "off_map"
-            elif laid != rotated(best.code, quarters):
+            elif code_on_map != rotated(best.code, quarters):
                 refused = "misread"
-    elif floor is not None and not sighting.refused:
+    elif floor is not None and not visit.refused:
         refused = "not_localised"
     code = int(rotated(best.code, quarters))
-    rotation = quarters * HALF_PI
+    rotation = quarters * HALF_PI_RAD
     cos, sin = np.cos(rotation), np.sin(rotation)
     x, y, heading = best.pose
     sigma = np.sqrt(np.diag(best.covariance))
@@ -166,10 +164,10 @@ def describe_visit(
         cell=cell,
         pattern=pattern(code),
         code=code,
-        probability=sum(h.probability for h in sighting.hypotheses if h.code == best.code),
+        probability=sum(h.probability for h in visit.hypotheses if h.code == best.code),
         x_m=float(cos * x - sin * y),
         y_m=float(sin * x + cos * y),
-        heading_rad=float(np.remainder(heading + rotation + np.pi, 2 * np.pi) - np.pi),
+        heading_rad=math.remainder(float(heading + rotation), math.tau),
         sigma_x_m=float(sigma_x),
         sigma_y_m=float(sigma_y),
         sigma_heading_rad=float(sigma[2]),

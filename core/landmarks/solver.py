@@ -1,62 +1,86 @@
-"""From hall sensors and odometry to landmarks that were seen and poses on the map."""
+"""Pipeline of the landmarks solver, from hall sensors and odometry to poses on the map."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
-from locatk.core.landmarks.detection import neighbours
-from locatk.core.landmarks.detection.explanations import FAULTY, GONE
-from locatk.core.landmarks.detection.fit import Priors
-from locatk.core.landmarks.detection.trace import compose
+from locatk.core.errors import InputError
+from locatk.core.landmarks.detection.fit import ModelPriors
+from locatk.core.landmarks.detection.hypotheses import detect_landmarks
 from locatk.core.landmarks.halls import HallSamples
-from locatk.core.landmarks.landmark import rotated, signs
-from locatk.core.landmarks.localization import smoothing as smooth
-from locatk.core.landmarks.localization import trajectory as route
-from locatk.core.landmarks.localization.cell_filter import HALF_PI
+from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.localization.cell_filter import (
+    IdentifiedVisit,
+    identify_visits,
+    select_visits_on_map,
+)
 from locatk.core.landmarks.localization.consistency import (
-    CERTAIN,
-    NO_MAP,
-    contradicted,
-    displaced,
-    doubt,
-    exchanged,
-    why_not,
+    CERTAIN_PROBABILITY,
+    NO_MAP_WARNING,
+    find_displaced_landmarks,
+    is_map_contradicted,
+    warn_of_missing_pose,
+    warn_of_opposite_polarity,
+    warn_of_uncertain_cell,
 )
-from locatk.core.landmarks.localization.recording import METHODS as METHODS
-from locatk.core.landmarks.localization.recording import Recording, Seen, on_map, read
-from locatk.core.landmarks.localization.recording import SolveOptions as SolveOptions
-from locatk.core.landmarks.map.floor import Cell, FloorMap
-from locatk.core.landmarks.results import (
-    LandmarkDetection,
-    LandmarkFacts,
-    RobotFacts,
-    describe_visit,
+from locatk.core.landmarks.localization.smoothing import (
+    DISPLACED_LANDMARK_SIGMA,
+    SMOOTHED_MODEL_ERROR_T,
+    SmoothingResult,
+    landmark_priors,
+    measure_visits,
+    smooth,
 )
+from locatk.core.landmarks.localization.trajectory import estimate_trajectory
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import HallRecording, check_odometry, preprocess
+from locatk.core.landmarks.published.solver import solve as solve_published
+from locatk.core.landmarks.results import LandmarkFacts, RobotFacts, describe_visit
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
-Array = NDArray[np.float64]
+METHODS = ("field", "paper")
 
-ALONE_T = 3e-5
-"""What the model leaves where the neighbours' fields are taken off."""
+DEFAULT_PITCH_M = 0.2
+"""Distance of neighbouring landmarks that is assumed without a map."""
 
-MISFIT = 2.0
-"""Rms of what is left of all fields, in standard deviations, from which on it is told..."""
+MAX_RESIDUAL_SIGMAS = 2.0
+"""Rms residual of all fields after smoothing from which on a warning is given ..."""
 
-IMPOSSIBLE = 12.0
-"""... and from which on the poses are not."""
+MAX_CREDIBLE_RESIDUAL_SIGMAS = 12.0
+"""... and from which on the poses are not reported."""
 
-LAID_M, LAID_RAD = 1.5e-3, 0.012
-"""Standard deviations with which landmarks are taken to be laid."""
 
-ASTRAY_M, ASTRAY_RAD = 0.02, 0.1
-"""The same of one that was found far off its place."""
+@dataclass(frozen=True)
+class SolveOptions:
+    """Options of the solver.
+
+    Attributes
+    ----------
+    method : str
+        ``"field"``, the default, or ``"paper"`` (the published method).
+    misread : float
+        Probability that a landmark differs from the map or is misread.
+    priors : ModelPriors
+        Uncertainties of sensors, bars and odometry; the noise is taken from the recording.
+    """
+
+    method: str = "field"
+    misread: float = 0.02
+    priors: ModelPriors = field(default_factory=ModelPriors)
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(
+                f"unknown method {self.method!r}", hint=f"choose one of {', '.join(METHODS)}"
+            )
+        if not 0 < self.misread < 0.5:
+            raise InputError(
+                f"a rate of misread landmarks of {self.misread!r}", hint="Give 0.001 to 0.2"
+            )
 
 
 def solve(
@@ -66,14 +90,14 @@ def solve(
     *,
     odometry: Sequence[Trajectory] = (),
 ) -> Solution:
-    """Find the landmarks that robots have met, and by them their places on the map.
+    """Detect the landmarks that robots visited, and estimate the robots' poses on the map.
 
     Parameters
     ----------
     samples : sequence of HallSamples
-        One a robot.
+        One per robot.
     floor : FloorMap or None
-        Without it landmarks are found, but no places on a map.
+        Without a map landmarks are detected, but there are no poses.
     options : SolveOptions, optional
     odometry : sequence of Trajectory
         By device.
@@ -81,7 +105,7 @@ def solve(
     Returns
     -------
     Solution
-        Its detections are what was seen at each landmark (docs/formats.md).
+        Its detections are the visits to landmarks (docs/formats.md).
 
     Raises
     ------
@@ -91,138 +115,190 @@ def solve(
     """
     options = options or SolveOptions()
     if options.method == "paper":
-        from locatk.core.landmarks.published import solver as paper_solver
-
-        return paper_solver.solve(samples, floor, odometry=odometry)
-    trajectories: list[Trajectory] = []
-    detections: list[LandmarkDetection] = []
-    warnings: list[SolverWarning] = []
-    rejected: Counter[str] = Counter()
-    robots: dict[str, RobotFacts] = {}
-    for recording in samples:
-        driven_by = next((t for t in odometry if t.device == recording.device), None)
-        found = read(recording, driven_by, floor, options)
-        warnings += found.run.warnings
-        if floor is None:
-            warnings.append(NO_MAP.about(recording.device))
-        solved, remarks, robots[recording.device] = placed(found, floor, options.misread)
-        trajectories += solved
-        warnings += remarks
-        for item in found.seen:
-            detections.append(describe_visit(item.sighting, item.located, floor))
-            why = detections[-1].refused
-            if why and why != "misread":  # that one is used, as it was read
-                rejected[why] += 1
+        return solve_published(samples, floor, odometry=odometry)
+    odometry_of = {trajectory.device: trajectory for trajectory in reversed(odometry)}
+    robots = [
+        localize_robot(
+            identify_recording(each, odometry_of.get(each.device), floor, options), floor, options
+        )
+        for each in samples
+    ]
+    detections = [
+        describe_visit(visit.hypotheses, visit.estimate, floor)
+        for robot in robots
+        for visit in robot.identified.visits
+    ]
+    # A misread landmark is used as it was read.
+    rejected = Counter(one.refused for one in detections if one.refused not in ("", "misread"))
     return Solution(
         system="landmarks",
         method=options.method,
-        trajectories=tuple(trajectories),
+        trajectories=tuple(path for robot in robots for path in robot.trajectories),
         rejected=dict(rejected),
         detections=tuple(detections),
         artifact=floor,
-        warnings=tuple(warnings),
-        facts=LandmarkFacts(robots),
+        warnings=tuple(warning for robot in robots for warning in robot.warnings),
+        facts=LandmarkFacts({robot.identified.device: robot.facts for robot in robots}),
     )
 
 
-def placed(
-    found: Recording, floor: FloorMap | None, misread: float
-) -> tuple[list[Trajectory], list[SolverWarning], RobotFacts]:
-    """Return the poses of one robot on the map, warnings, and facts of its localization."""
-    device = found.run.samples.device
-    usable = on_map(found, floor) if floor is not None else []
-    located = [one.located for one in found.seen if one.located is not None]
-    # The least sure of the places that are told; where none is, the surest of all.
-    sure = min((one.located.probability for one in usable if one.located), default=math.nan)
-    if not usable:
-        sure = max((one.probability for one in located), default=0.0)
-    first = next((n for n, one in enumerate(located, 1) if one.so_far >= CERTAIN), None)
-    facts = RobotFacts(
-        localised=bool(usable),
-        probability=sure,
-        landmarks_seen=len(located),
-        landmarks_to_localise=first,
-    )
-    if floor is not None and contradicted(found, usable, floor):
-        message = (
-            "not localised; too many of its landmarks are not those of the map: is it the map of "
-            "this floor, and the odometry the right way round?"
-        )
-        warnings = [SolverWarning("map_contradicted", message).about(device)]
-        return [], warnings, replace(facts, localised=False)
+@dataclass(frozen=True)
+class IdentifiedRecording:
+    """Recording of one robot whose visits were identified on the map.
+
+    Attributes
+    ----------
+    recording : HallRecording
+    odometry : Trajectory
+    priors : ModelPriors
+        With the noise of the recording.
+    visits : list of IdentifiedVisit
+        In order of time, refused ones included.
+    """
+
+    recording: HallRecording
+    odometry: Trajectory
+    priors: ModelPriors
+    visits: list[IdentifiedVisit]
+
+    @property
+    def device(self) -> str:
+        """Name of the robot."""
+        return self.recording.samples.device
+
+
+def identify_recording(
+    samples: HallSamples,
+    odometry: Trajectory | None,
+    floor: FloorMap | None,
+    options: SolveOptions,
+) -> IdentifiedRecording:
+    """Preprocess the recording of one robot, detect landmarks, and identify their cells.
+
+    Raises
+    ------
+    InputError
+        See :func:`solve`.
+    """
+    geometry = floor.geometry if floor is not None else Geometry()
+    pitch_m = floor.pitch_m if floor is not None else DEFAULT_PITCH_M
+    recording = preprocess(samples, odometry)
+    check_odometry(recording, geometry)
+    priors = replace(options.priors, noise_t=recording.noise_t)
+    recording, detected = detect_landmarks(recording, geometry, priors, pitch_m)
+    visits = identify_visits(detected, floor, misread=options.misread, drift=priors.drift)
+    assert odometry is not None  # preprocess() requires it
+    return IdentifiedRecording(recording, odometry, priors, visits)
+
+
+@dataclass(frozen=True)
+class LocalizedRobot:
+    """Result for one robot.
+
+    Attributes
+    ----------
+    identified : IdentifiedRecording
+    facts : RobotFacts
+    warnings : tuple of SolverWarning
+    trajectories : tuple of Trajectory
+        One on the map, or none if the robot is not localized.
+    """
+
+    identified: IdentifiedRecording
+    facts: RobotFacts
+    warnings: tuple[SolverWarning, ...]
+    trajectories: tuple[Trajectory, ...] = ()
+
+
+def localize_robot(
+    identified: IdentifiedRecording, floor: FloorMap | None, options: SolveOptions
+) -> LocalizedRobot:
+    """Estimate the poses of one robot on the map, or explain why there are none."""
+    recording, visits = identified.recording, identified.visits
+    on_map = select_visits_on_map(visits, floor) if floor is not None else []
+    facts = _cell_facts(visits, on_map)
+    unlocalized = LocalizedRobot(identified, facts, recording.warnings)
     if floor is None:
-        return [], [], facts
-    if not usable:
-        return [], [why_not(found, sure), *exchanged(found, floor, misread)], facts
-    uncertain = doubt(sure, first)
-    warnings = [] if uncertain is None else [uncertain.about(device)]
-    marks = expected(usable, floor, found.priors)
-    alone = replace(found.priors, floor_t=ALONE_T)
-    run = as_run(usable, found, floor)
-    smoothed = smooth.smooth([run], marks, floor.geometry, alone)
-    if off := displaced(marks, smoothed):
-        for cell, shift in off.items():
-            marks[cell] = replace(marks[cell], sigma=np.array([ASTRAY_M, ASTRAY_M, ASTRAY_RAD]))
-            message = (
-                f"the landmark at {cell[0]},{cell[1]} lies {1e3 * shift:.2g} mm or more off its "
-                "place; `locatk calibrate map` would tell how far"
-            )
-            warnings.append(SolverWarning("landmark_displaced", message).about(device))
-        smoothed = smooth.smooth([run], marks, floor.geometry, alone)
-    facts = replace(facts, misfit_sigma=smoothed.misfit)
-    if smoothed.misfit > MISFIT:
+        return _with_warnings(unlocalized, NO_MAP_WARNING.about(identified.device))
+    probability = facts.probability if facts.probability is not None else math.nan
+    if is_map_contradicted(visits, on_map, floor):
         message = (
-            f"fields miss the model by {smoothed.misfit:.2g} standard deviations; check clocks and "
-            "scale of the odometry, the sensors and the landmarks' geometry"
+            "not localised; too many of its landmarks differ from the map: is it the map of this "
+            "floor, and does the odometry have the right sign?"
         )
-        warnings.append(SolverWarning("field_misfit", message).about(device))
-    if smoothed.misfit > IMPOSSIBLE:
-        return [], warnings, replace(facts, localised=False)
-    path = route.poses(
-        device, [one.visit for one in usable], smoothed.stays[0], found.odometry, found.priors
+        warning = SolverWarning("map_contradicted", message).about(identified.device)
+        not_localised = replace(facts, localised=False)
+        return _with_warnings(replace(unlocalized, facts=not_localised), warning)
+    if not on_map:
+        polarity = warn_of_opposite_polarity(
+            identified.device,
+            visits,
+            floor,
+            misread=options.misread,
+            drift=identified.priors.drift,
+        )
+        reason = warn_of_missing_pose(recording, visits, probability)
+        return _with_warnings(unlocalized, reason, *polarity)
+    uncertain = warn_of_uncertain_cell(probability, facts.landmarks_to_localise)
+    if uncertain is not None:
+        unlocalized = _with_warnings(unlocalized, uncertain.about(identified.device))
+    smoothed, warnings = smooth_robot(identified, on_map, floor)
+    facts = replace(facts, misfit_sigma=smoothed.residual_sigma)
+    robot = _with_warnings(replace(unlocalized, facts=facts), *warnings)
+    if smoothed.residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
+        return replace(robot, facts=replace(facts, localised=False))
+    trajectory = estimate_trajectory(
+        identified.device,
+        [visit.segment for visit in on_map],
+        smoothed.visits[0],
+        identified.odometry,
+        identified.priors,
     )
-    return [path], warnings, facts
+    return replace(robot, trajectories=(trajectory,))
 
 
-def expected(usable: Sequence[Seen], floor: FloorMap, priors: Priors) -> dict[Cell, smooth.Mark]:
-    """The landmarks of visits, as the map has them and as they were read."""
-    marks: dict[Cell, smooth.Mark] = {}
-    for one in usable:
-        assert one.located is not None
-        cell, quarters = one.located.cell, one.located.quarters
-        best = one.explanations[one.located.hypothesis]
-        strength = signs(rotated(best.code, quarters))
-        sigma = np.full(4, priors.strength)
-        pose = np.array([*floor.place(cell), 0.0])
-        spread = np.array([LAID_M, LAID_M, LAID_RAD])
-        built = floor.built.get(cell)
-        if built is not None:
-            pose = pose + [built.x_m, built.y_m, built.heading_rad]
-            spread = np.fmax(np.where(np.isnan(built.sigma[:3]), spread, built.sigma[:3]), 1e-5)
-            gone = np.abs(built.strength) < GONE
-            same = (np.sign(built.strength) == strength) | gone
-            known = np.where(np.isnan(built.sigma[3:]), sigma, np.fmax(built.sigma[3:], 1e-3))
-            strength = np.where(same, built.strength, strength)
-            sigma = np.where(same, known, sigma)
-        bar = (best.free + quarters) % 4
-        if best.free >= 0 and not (built is not None and gone[bar]):
-            strength[bar], sigma[bar] = 0.0, FAULTY
-        if cell not in marks or best.free < 0:
-            marks[cell] = smooth.Mark(pose, spread, strength, sigma)
-    return marks
+def smooth_robot(
+    identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit], floor: FloorMap
+) -> tuple[SmoothingResult, list[SolverWarning]]:
+    """Smooth the visits of one robot; displaced landmarks are detected and given less weight."""
+    priors = replace(identified.priors, model_error_t=SMOOTHED_MODEL_ERROR_T)
+    measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
+    landmarks = landmark_priors(on_map, floor, identified.priors)
+    smoothed = smooth([measurements], landmarks, floor.geometry, priors)
+    warnings = []
+    displaced = find_displaced_landmarks(landmarks, smoothed)
+    for cell, distance_m in displaced.items():
+        landmarks[cell] = replace(landmarks[cell], sigma=DISPLACED_LANDMARK_SIGMA)
+        message = (
+            f"the landmark at {cell[0]},{cell[1]} is displaced by {1e3 * distance_m:.2g} mm or "
+            "more; `locatk calibrate map` estimates by how much"
+        )
+        warnings.append(SolverWarning("landmark_displaced", message))
+    if displaced:
+        smoothed = smooth([measurements], landmarks, floor.geometry, priors)
+    if smoothed.residual_sigma > MAX_RESIDUAL_SIGMAS:
+        message = (
+            f"fields deviate from the model by {smoothed.residual_sigma:.2g} standard deviations; "
+            "check clocks and scale of the odometry, the sensors and the landmarks' geometry"
+        )
+        warnings.append(SolverWarning("field_misfit", message))
+    return smoothed, [warning.about(identified.device) for warning in warnings]
 
 
-def as_run(usable: Sequence[Seen], found: Recording, floor: FloorMap) -> smooth.Run:
-    """One robot's visits as a run for :func:`.smooth.smooth`."""
-    stays = []
-    for one in usable:
-        assert one.located is not None
-        best = one.sighting.hypotheses[one.located.hypothesis]
-        turn = one.located.quarters * HALF_PI
-        mark = np.array([*floor.place(one.located.cell), turn])
-        pose, trace = compose(mark, best.pose), one.visit.trace
-        wrong = one.explanations[one.located.hypothesis].parameters[-trace.correction.shape[2] :]
-        trace = neighbours.without(trace, pose, wrong, one.located.cell, floor)
-        stays.append(smooth.Stay(trace, one.located.cell, pose))
-    visits = [one.visit for one in usable]
-    return smooth.Run(stays, route.links(visits, found.odometry, found.priors))
+def _cell_facts(visits: Sequence[IdentifiedVisit], on_map: Sequence[IdentifiedVisit]) -> RobotFacts:
+    """Return the facts of a robot that follow from its cells."""
+    estimates = [visit.estimate for visit in visits if visit.estimate is not None]
+    reported = [visit.estimate.probability for visit in on_map if visit.estimate is not None]
+    is_certain = [one.filtered_probability >= CERTAIN_PROBABILITY for one in estimates]
+    return RobotFacts(
+        localised=bool(on_map),
+        probability=min(reported)
+        if reported
+        else max((one.probability for one in estimates), default=0.0),
+        landmarks_seen=len(estimates),
+        landmarks_to_localise=is_certain.index(True) + 1 if any(is_certain) else None,
+    )
+
+
+def _with_warnings(robot: LocalizedRobot, *warnings: SolverWarning) -> LocalizedRobot:
+    return replace(robot, warnings=(*robot.warnings, *warnings))

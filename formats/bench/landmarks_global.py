@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
-from locatk.core.landmarks.detection.trace import Drift
-from locatk.core.landmarks.landmark import CODES, PATTERNS, code_of, rotated
+from locatk.core.landmarks.detection.trace import OdometryDrift
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, code_of, rotated
 from locatk.core.landmarks.localization import cell_filter as globalize
-from locatk.core.landmarks.localization.consistency import CERTAIN
-from locatk.core.landmarks.localization.recording import SolveOptions
+from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY
+from locatk.core.landmarks.localization.consistency import CERTAIN_PROBABILITY
 from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.map.windows import window_path, window_readings
-from locatk.core.landmarks.results import MIN_CELL_PROBABILITY
 from locatk.core.landmarks.simulation.options import Errors
 from locatk.core.landmarks.simulation.sensors import odometry
+from locatk.core.landmarks.solver import SolveOptions
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED
 from locatk.formats.map_library import entries
@@ -199,7 +199,8 @@ def misread(floor: FloorMap, rng: np.random.Generator) -> dict[Cell, int]:
     """Landmarks that are taken for any other code, one in twenty."""
     hit = np.argwhere(rng.random(floor.shape) < MISREAD)
     return {
-        (int(r), int(c)): int((floor.codes[r, c] + rng.integers(1, CODES)) % CODES) for r, c in hit
+        (int(r), int(c)): int((floor.codes[r, c] + rng.integers(1, CODE_COUNT)) % CODE_COUNT)
+        for r, c in hit
     }
 
 
@@ -208,10 +209,10 @@ def told_places(
 ) -> tuple[list[tuple[Cell, int, float]], list[tuple[Cell, int, float]]]:
     """Cell, heading and probability of the last sighting after each of them, and of all
     sightings in the end."""
-    drift, rate = Drift(), SolveOptions().misread
+    drift, rate = OdometryDrift(), SolveOptions().misread
     so_far, places = [], []
     for count in range(1, len(seen) + 1):
-        places = globalize.locate(seen[:count], floor, misread=rate, drift=drift)
+        places = globalize.identify_cells(seen[:count], floor, misread=rate, drift=drift)
         last = places[-1]
         so_far.append((last.cell, last.quarters, last.probability))
     return so_far, [(one.cell, one.quarters, one.probability) for one in places]
@@ -263,11 +264,11 @@ def misread_figures(floor: FloorMap, which: str) -> list[Figure]:
         true = list(zip(walk.cells, walk.quarters, strict=True))
         every = [*zip(so_far, true, strict=True), *zip(places, true, strict=True)]
         wrong = max((p for (c, q, p), t in every if (c, q) != t), default=0.0)
-        if wrong >= CERTAIN:
+        if wrong >= CERTAIN_PROBABILITY:
             certain += 1
             failed.append(number)
-        likely += MIN_CELL_PROBABILITY <= wrong < CERTAIN
-        first = (n for n, (_, _, p) in enumerate(so_far, 1) if p >= CERTAIN)
+        likely += MIN_CELL_PROBABILITY <= wrong < CERTAIN_PROBABILITY
+        first = (n for n, (_, _, p) in enumerate(so_far, 1) if p >= CERTAIN_PROBABILITY)
         needed.append(next(first, math.inf))
     done = [n for n in needed if math.isfinite(n)]
     how = (
@@ -278,13 +279,13 @@ def misread_figures(floor: FloorMap, which: str) -> list[Figure]:
     seeds = f"; walks {', '.join(map(str, failed[:10]))}" if failed else ""
     return [
         Figure("5 % misread: wrong silently", float(certain), "walks",
-               f"{how}: a wrong cell or heading at a probability of {CERTAIN} or more, after any "
-               f"of the landmarks or in the end{seeds}", 0.0),
+               f"{how}: a wrong cell or heading at a probability of {CERTAIN_PROBABILITY} or "
+               f"more, after any of the landmarks or in the end{seeds}", 0.0),
         Figure("5 % misread: wrong with a remark", 100 * likely / len(walks), "%",
-               f"the same, at {MIN_CELL_PROBABILITY} to {CERTAIN}: poses are given, with the "
-               "probability said"),
+               f"the same, at {MIN_CELL_PROBABILITY} to {CERTAIN_PROBABILITY}: poses are given, "
+               "with the probability said"),
         Figure("5 % misread: landmarks needed", float(np.mean(done)) if done else math.nan,
-               "landmarks", f"mean until {CERTAIN} is reached; 99 % within "
+               "landmarks", f"mean until {CERTAIN_PROBABILITY} is reached; 99 % within "
                f"{np.quantile(done, 0.99) if done else math.nan:.0f}", peer="paper, no fault",
                peer_value=3.0),
         Figure(f"5 % misread: certain within {LONGEST} landmarks",

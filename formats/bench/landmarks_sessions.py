@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.localization.consistency import CERTAIN
+from locatk.core.landmarks.localization.consistency import CERTAIN_PROBABILITY
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation.options import Faults, SimulationOptions
 from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
@@ -93,7 +93,9 @@ def judged(made: SimulatedSession, solution: Solution) -> Session:
         wrong += bool(np.hypot(*(mark - made.floor.place(found.cell))) > made.floor.pitch_m / 2)
     none = np.empty(0)
     (facts,) = solution.facts.robots.values()
-    silent = facts.probability is None or facts.probability >= CERTAIN  # the paper has none
+    silent = (
+        facts.probability is None or facts.probability >= CERTAIN_PROBABILITY
+    )  # the paper has none
     if not solution.trajectories:
         return Session(False, silent, wrong, none, none, none)
     track = solution.trajectories[0]
@@ -146,7 +148,7 @@ def session_figures(folder: Path) -> list[Figure]:
                peer="consistent", peer_value=3.0),
         Figure("sessions with 5 % misread landmarks: wrong silently", float(len(lost)), "sessions",
                f"of {SESSIONS} with {SESSION_LANDMARKS} landmarks each: a wrong cell, or poses "
-               f"elsewhere, at a probability of {CERTAIN} or more{hard_failed}", 0.0),
+               f"elsewhere, at a probability of {CERTAIN_PROBABILITY} or more{hard_failed}", 0.0),
         Figure("sessions with 5 % misread landmarks: right, and poses given", _right(hard), "%",
                "the same", better="higher"),
     ]  # fmt: skip

@@ -17,13 +17,13 @@ from locatk.core.landmarks import field as bars
 from locatk.core.landmarks.design.generation import DesignOptions, design_map
 from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.detection import fit
-from locatk.core.landmarks.detection.sightings import sighting
+from locatk.core.landmarks.detection.hypotheses import detect_landmark
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import preprocess, segment_visits
 from locatk.core.landmarks.simulation.options import SimulationOptions
 from locatk.core.landmarks.simulation.session import simulate
 from locatk.core.landmarks.solver import solve
-from locatk.core.landmarks.visits import driven, find
 from locatk.formats.bench import Figure
 from locatk.formats.bench.landmarks_global import PUBLISHED, SIDE, read_published
 from locatk.formats.bench.landmarks_study import visited
@@ -164,10 +164,10 @@ def estimate_times(then: str, count: int) -> tuple[float, float]:
     seconds = []
     for one in [made[0], *made]:  # the first time is not counted
         start = process_time()
-        run = driven(one.samples, one.odometry)
-        priors = fit.Priors(noise_t=run.noise_t)
-        for visit in find(run, geometry, priors.drift):
-            sighting(visit, run, geometry, priors)
+        run = preprocess(one.samples, one.odometry)
+        priors = fit.ModelPriors(noise_t=run.noise_t)
+        for visit in segment_visits(run, geometry, priors.drift):
+            detect_landmark(visit, run, geometry, priors)
         seconds.append(process_time() - start)
     return float(np.median(seconds[1:])), float(np.quantile(seconds[1:], 0.95))
 

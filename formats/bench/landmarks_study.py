@@ -21,12 +21,24 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.detection import explanations as estimate
 from locatk.core.landmarks.detection import fit
-from locatk.core.landmarks.detection.sightings import sighting
-from locatk.core.landmarks.detection.trace import Drift, Trace, compose, relative, sensor_places
+from locatk.core.landmarks.detection import hypotheses as estimate
+from locatk.core.landmarks.detection.hypotheses import detect_landmark
+from locatk.core.landmarks.detection.trace import (
+    OdometryDrift,
+    Trace,
+    compose,
+    relative,
+    sensor_positions,
+)
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
+from locatk.core.landmarks.preprocessing import (
+    HallRecording,
+    VisitSegment,
+    preprocess,
+    segment_visits,
+)
 from locatk.core.landmarks.published import search as paper
 from locatk.core.landmarks.published.pose_compensation import compensate_pose
 from locatk.core.landmarks.published.second_step import find_spins
@@ -34,7 +46,6 @@ from locatk.core.landmarks.simulation.floor import BAR_DRAWS, bar_fields, scatte
 from locatk.core.landmarks.simulation.options import Errors
 from locatk.core.landmarks.simulation.passes import Pass, passes
 from locatk.core.landmarks.solver import SolveOptions
-from locatk.core.landmarks.visits import Driven, Visit, driven, find
 
 Array = NDArray[np.float64]
 
@@ -113,10 +124,10 @@ def visited(count: int, then: str, seed: int) -> list[tuple[int, Pass]]:
     return made[:count]
 
 
-def last_visit(one: Pass) -> tuple[Driven, Visit | None, int]:
+def last_visit(one: Pass) -> tuple[HallRecording, VisitSegment | None, int]:
     """The recording, the last visit that is found in it, and how many were."""
-    run = driven(one.samples, one.odometry)
-    found = find(run, GEOMETRY, Drift())
+    run = preprocess(one.samples, one.odometry)
+    found = segment_visits(run, GEOMETRY, OdometryDrift())
     return run, found[-1] if found else None, len(found)
 
 
@@ -127,11 +138,12 @@ def by_field(number: int, one: Pass) -> Found:
     if visit is None:
         return nothing
     priors = replace(SolveOptions().priors, noise_t=run.noise_t)
-    said, explanations = sighting(visit, run, GEOMETRY, priors)
+    said = detect_landmark(visit, run, GEOMETRY, priors)
+    explanations = [one.fit for one in said.hypotheses if one.fit is not None]
     if said.refused:
         return nothing
     best, at = explanations[0], len(visit.trace) - 1
-    seen, covariance = estimate.robot(visit.trace, best, at)
+    seen, covariance = estimate.robot_pose(visit.trace, best, at)
     at_ns = int(visit.time_ns[at])
     off = error(seen, true_pose(one, at_ns))
     # On to the end of the recording by odometry.
@@ -140,7 +152,7 @@ def by_field(number: int, one: Pass) -> Found:
     codes: dict[int, float] = {}
     true = 0.0
     for other in explanations:
-        pose = estimate.robot(visit.trace, other, at)[0]
+        pose = estimate.robot_pose(visit.trace, other, at)[0]
         codes[other.code] = codes.get(other.code, 0.0) + other.probability
         true += other.probability * (other.code == code_in_frame(one, pose, at_ns))
     share = np.array(list(codes.values()))
@@ -333,21 +345,23 @@ def stands(count: int, seed: int, anywhere: bool = False) -> Stand:
     strength, middle, axes = scatter_bars(GEOMETRY, rng.standard_normal((count, BAR_DRAWS)), STATIC)
     lever = circle(GEOMETRY.circle_m)
     points = np.empty((count, 4, 3))
-    points[..., :2], points[..., 2] = sensor_places(true, lever), GEOMETRY.sensor_height_m
+    points[..., :2], points[..., 2] = sensor_positions(true, lever), GEOMETRY.sensor_height_m
     each = bar_fields(GEOMETRY, middle[:, None], axes[:, None], points[:, :, None])
     field = np.einsum("nsk,nk->ns", each, signs(code) * strength)
     field = field * (1 + rng.normal(0, STATIC.gain, field.shape))
     field += rng.normal(0, STATIC.offset_t, field.shape)
     field += rng.normal(0, STATIC.noise_t, field.shape)
     priors = replace(
-        fit.Priors(), gain=STATIC.gain, offset_t=STATIC.offset_t, strength=STATIC.bar_strength,
-        place_m=STATIC.bar_place_m, noise_t=STATIC.noise_t, floor_t=STATIC.noise_t,
+        fit.ModelPriors(), gain=STATIC.gain, offset_t=STATIC.offset_t, strength=STATIC.bar_strength,
+        bar_position_m=STATIC.bar_place_m, noise_t=STATIC.noise_t, model_error_t=STATIC.noise_t,
     )  # fmt: skip
     field_off, linear, inverted = np.full((3, count, 3), np.nan)
     found = Stand(field_off, linear, inverted, np.full(count, np.nan))
     for k in range(count):
         still = Trace(np.zeros((1, 3)), np.zeros((1, 3, 0)), field[k][None], lever, np.ones(1), 0)
-        seen, covariance = estimate.stand(still, GEOMETRY, priors, signs(int(code[k])), np.zeros(3))
+        seen, covariance = estimate.estimate_pose_at_known_landmark(
+            still, GEOMETRY, priors, signs(int(code[k])), np.zeros(3)
+        )
         off = seen - true[k]
         found.field[k] = off
         found.nees[k] = off @ np.linalg.solve(covariance, off)

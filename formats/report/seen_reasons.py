@@ -124,21 +124,21 @@ def _polaris() -> dict[str, Reason]:
 
 
 def _landmarks() -> dict[str, Reason]:
-    from locatk.core.landmarks import results
-    from locatk.core.landmarks.detection import sightings
+    from locatk.core.landmarks.detection import hypotheses
+    from locatk.core.landmarks.localization import cell_filter
 
     return _of(
         "visits",
         {
             "not_localised": "The landmark was read, but the likeliest place on the map has a "
-            f"probability below {results.MIN_CELL_PROBABILITY:g}.",
+            f"probability below {cell_filter.MIN_CELL_PROBABILITY:g}.",
             "misread": "The place is known, and the map has another landmark there: it is laid "
             "wrongly or was misread. It is used all the same, as it was read.",
             "off_map": "By odometry the landmark lies where the map has none.",
-            "not_explained": f"Every landmark leaves {sightings.UNEXPLAINED:g} standard deviations "
-            "and more: iron, a tool, broken bars, or other bars than the map's.",
+            "not_explained": f"Every landmark leaves {hypotheses.MAX_RESIDUAL_SIGMAS:g} standard "
+            "deviations and more: iron, a tool, broken bars, or other bars than the map's.",
             "too_weak": "A field was felt, but it is too weak for a place.",
-            "too_short": f"There are samples in fewer than {sightings.FEWEST_BINS} places of the "
+            "too_short": f"There are samples in fewer than {hypotheses.MIN_BINS} places of the "
             "visit.",
             "no_spin": "The robot only passed the landmark, and the published method needs it to "
             "turn on the spot.",

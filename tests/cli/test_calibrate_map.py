@@ -85,7 +85,7 @@ def test_sessions_in_a_map_as_built_out(locatk, runs: list[Path], tmp_path: Path
     assert (table[5][6], table[5][-1]) == ("NNSS", "flipped:2")  # designed NNNS
     assert lines[8] == "never visited: 0,3 1,3 2,0 2,1 2,2 2,3"
     assert lines[9] == f"Wrote {out}"
-    assert "1 landmark is not laid as designed; the map is unique all the same" in result.stderr
+    assert "1 landmark differs from the design; the map is still unique" in result.stderr
     assert all(len(line) <= 100 for line in lines[:9])
 
 
@@ -143,7 +143,7 @@ def test_recordings_that_cannot_be_used_are_named(
     assert result.exit_code == 3
     left_out = json.loads(result.stdout)["left_out"]
     assert left_out == {
-        str(quiet): "no landmark was seen",
+        str(quiet): "no landmark was detected",
         str(lost): "no odometry of robot",
         str(strange): "another map than in the first session",
     }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.landmark import CODES, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, rotated
 from locatk.core.landmarks.map import windows
 from locatk.core.landmarks.map.floor import FloorMap, neighbour
 from locatk.core.landmarks.simulation.options import NONE, SimulationOptions
@@ -303,7 +303,7 @@ def test_sightings_are_what_the_robot_reads(floor: FloorMap) -> None:
     assert steps == pytest.approx(floor.pitch_m, abs=0.02)
     wrong = landmarks_global.misread(floor, rng)
     assert 5 < len(wrong) < 60
-    assert all(0 <= code < CODES and code != floor.codes[cell] for cell, code in wrong.items())
+    assert all(0 <= code < CODE_COUNT and code != floor.codes[cell] for cell, code in wrong.items())
 
 
 def test_a_filter_that_is_sure_of_another_place_is_caught(

@@ -11,7 +11,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.design.bounds import require_enough_words
 from locatk.core.landmarks.design.generation import DesignOptions
 from locatk.core.landmarks.design.proof import prove_map
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, rotated
 from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES, window_readings
 from locatk.formats import map_library
@@ -137,7 +137,7 @@ def test_relabellings_keep_readings_apart(alphabet: str) -> None:
         assert sorted(table[letters]) == sorted(letters)
         if alphabet == "16":
             for turn in range(4):
-                turned_first = table[rotated(np.arange(CODES), turn)]
+                turned_first = table[rotated(np.arange(CODE_COUNT), turn)]
                 assert (turned_first == rotated(table, turn)).all()
         if alphabet == "6":
             assert len(set(PATTERN_OF[table[letters]])) == 6

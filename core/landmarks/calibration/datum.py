@@ -1,7 +1,8 @@
-"""What robots cannot see of a floor: where it lies as a whole. Laid over its design here.
+"""Datum of a calibrated floor: alignment with its design, and covariances without the gauge.
 
-Hall sensors and odometry say how landmarks lie to one another. Moving or turning the whole
-floor, with all robots on it, changes nothing of what they measure.
+Hall sensors and odometry determine the poses of landmarks relative to one another. A motion of the
+whole floor, together with all robots on it, changes no measurement (gauge freedom). The floor is
+therefore aligned with its design.
 """
 
 from __future__ import annotations
@@ -12,89 +13,101 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.least_squares import cauchy_loss
+
 Array = NDArray[np.float64]
-Name = TypeVar("Name", bound=Hashable)
+Member = TypeVar("Member", bound=Hashable)
 
-ROUNDS = 30
+REWEIGHTING_ITERATIONS = 30
+"""Iterations of the robust alignment; it converges linearly."""
 
-ODD = 3.0
-"""Standard deviations of its place and heading from which on a landmark counts for less."""
+LOSS_SCALE_SIGMAS = 3.0
+"""Deviation of a landmark from its design at which its weight in the alignment is one half."""
 
 
-def joined(groups: Iterable[Sequence[Name]]) -> list[list[Name]]:
-    """Groups that share a member made one; members sorted, the first group first."""
-    found: list[set[Name]] = []
+def connected_components(groups: Iterable[Sequence[Member]]) -> list[list[Member]]:
+    """Merge groups that share a member; members and components are sorted."""
+    components: list[set[Member]] = []
     for group in groups:
-        whole = set(group)
-        apart = []
-        for other in found:
-            if whole & other:
-                whole |= other
+        merged = set(group)
+        separate = []
+        for component in components:
+            if merged & component:
+                merged |= component
             else:
-                apart.append(other)
-        found = [*apart, whole]
-    return sorted(sorted(group) for group in found)  # type: ignore[type-var]
+                separate.append(component)
+        components = [*separate, merged]
+    return sorted(sorted(component) for component in components)  # type: ignore[type-var]
 
 
-def motions(place: Array) -> Array:
-    """(n, 3, 3): what moving the floor by x and y and turning it about its middle does.
+def gauge_motions(position: Array) -> Array:
+    """Return the effect of motions of the whole floor on the poses of its landmarks.
 
-    Rows are x, y and heading of the landmarks at ``place`` (n, 2), columns the motions.
+    Parameters
+    ----------
+    position : (n, 2) ndarray
+
+    Returns
+    -------
+    (n, 3, 3) ndarray
+        Rows are x, y and heading of a landmark; columns are translation in x and y, and rotation
+        about the centroid.
     """
-    off = place - place.mean(axis=0)
-    out = np.tile(np.eye(3), (len(place), 1, 1))
-    out[:, 0, 2], out[:, 1, 2] = -off[:, 1], off[:, 0]
-    return out
+    offset = position - position.mean(axis=0)
+    motions = np.tile(np.eye(3), (len(position), 1, 1))
+    motions[:, 0, 2], motions[:, 1, 2] = -offset[:, 1], offset[:, 0]
+    return motions
 
 
-def unlike_design(pose: Array, design: Array, sigma: Array) -> Array:
-    """What is left (n, 3) of landmarks' poses when most of them lie on their design.
+def deviations_from_design(pose: Array, design: Array, sigma: Array) -> Array:
+    """Align landmarks with their design, and return the remaining deviations (n, 3).
 
     Parameters
     ----------
     pose, design : (n, 3) ndarray
-        x, y, heading in any frame near to the design's, and as designed.
+        x, y, heading: estimated in a frame near to the design's, and as designed.
     sigma : (3,) ndarray
-        With which landmarks are laid.
+        Standard deviations of installation.
 
     Notes
     -----
-    Least squares with the weights of a Cauchy distribution: the few that lie far off do not
-    pull the others along, as they would in a mean.
+    Least squares under a Cauchy loss, so that a few displaced landmarks do not bias the alignment.
     """
-    off = pose - design
-    shape = motions(design[:, :2])
+    difference = pose - design
+    motions = gauge_motions(design[:, :2])
     weight = np.ones(len(pose))
-    left = off
-    for _ in range(ROUNDS):
+    residual = difference
+    for _ in range(REWEIGHTING_ITERATIONS):
         root = np.sqrt(weight)[:, None] / sigma
-        rows = (root[..., None] * shape).reshape(-1, 3)
-        motion = np.linalg.lstsq(rows, (root * off).ravel(), rcond=None)[0]
-        left = off - shape @ motion
-        weight = 1 / (1 + np.sum((left / sigma) ** 2, axis=1) / ODD**2)
-    return left
+        rows = (root[..., None] * motions).reshape(-1, 3)
+        motion = np.linalg.lstsq(rows, (root * difference).ravel(), rcond=None)[0]
+        residual = difference - motions @ motion
+        _, weight = cauchy_loss(np.linalg.norm(residual / sigma, axis=1), LOSS_SCALE_SIGMAS)
+    return residual
 
 
-def own_covariances(covariance: Array, place: Array, sigma: Array, scale: float = 1.0) -> Array:
-    """Covariances (n, 3, 3) of landmarks' poses to one another, of those on the floor.
+def relative_covariances(
+    covariance: Array, position: Array, sigma: Array, scale: float = 1.0
+) -> Array:
+    """Return the covariances (n, 3, 3) of landmarks relative to one another.
 
     Parameters
     ----------
     covariance : (n, 3, 3) ndarray
-        Of x, y, heading, as least squares with priors give them.
-    place : (n, 2) ndarray
+        Of x, y, heading, from least squares with priors.
+    position : (n, 2) ndarray
     sigma : (n, 3) ndarray
-        Standard deviations of those priors.
+        Standard deviations of these priors.
     scale : float
-        By which the covariances were made larger after the inversion.
+        Factor by which the covariances were multiplied after the inversion.
 
     Notes
     -----
-    In units of the priors the information is A + 1, where A is what was measured, and A
-    times a motion of the whole floor is 0. So the motions G are eigenvectors of the
-    covariance, to the eigenvalue 1, and G (G'G)^-1 G' is all that they add to it.
+    In units of the priors the information matrix is A + 1, where A is the information of the
+    measurements. A times a motion of the whole floor is 0. The motions G are therefore eigenvectors
+    of the covariance with the eigenvalue 1, and their part of it is G (G'G)^-1 G'.
     """
-    shape = motions(place) / sigma[..., None]
-    common = np.linalg.inv(np.einsum("nij,nik->jk", shape, shape))
-    part = sigma[:, :, None] * (shape @ common @ shape.swapaxes(1, 2)) * sigma[:, None]
+    motions = gauge_motions(position) / sigma[..., None]
+    common = np.linalg.inv(np.einsum("nij,nik->jk", motions, motions))
+    part = sigma[:, :, None] * (motions @ common @ motions.swapaxes(1, 2)) * sigma[:, None]
     return np.asarray(covariance - scale * part)

@@ -1,17 +1,17 @@
-"""How the landmarks of a floor really lie, from recordings of robots that drove over it.
+"""Calibration of a floor: landmarks as built, from recordings of robots that drove over it.
 
-All visits of all recordings, the odometry between them and the landmarks are one least
-squares (:mod:`.smooth`), solved twice: first with next to nothing known of the landmarks,
-which shows what is displaced or faulty; then with all others held by the tolerances with
-which landmarks are laid.
+All visits of all recordings, the odometry between them and the landmarks enter one least squares
+(:mod:`locatk.core.landmarks.localization.smoothing`), which is solved twice: first with weak priors
+of the landmarks, which reveals displaced and faulty ones; then with the tolerances of installation
+for all others.
 
-Not everything can be seen. *Where the floor lies as a whole*: moving or turning all of it
-changes no measurement, so that most of the landmarks are taken to lie on the map as
-designed (:mod:`.gauge`), and standard deviations are of landmarks to one another. The same
-holds for recordings that have no landmark in common with the others. *How strong the bars
-are as a whole*: stronger magnets, sensors with more gain and sensors nearer to the floor
-are nearly one, so that the typical bar is taken to have the strength 1. *Which bar of a
-landmark is off its place*: the centre is that of the four bars.
+Some quantities are not observable. *Pose of the whole floor*: its motion changes no measurement, so
+that most landmarks are assumed to be at their designed positions (:mod:`.datum`), and standard
+deviations are those of landmarks relative to one another. The same holds for recordings that have
+no landmark in common with the others. *Strength of all bars*: stronger magnets, sensors with more
+gain and sensors nearer to the floor have almost the same effect, so that the typical bar is
+assumed to have the strength 1. *Displacement of a single bar*: the centre of a landmark is that of
+its four bars.
 """
 
 from __future__ import annotations
@@ -24,267 +24,311 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks import solver
-from locatk.core.landmarks.calibration import datum as gauge
-from locatk.core.landmarks.calibration.marks import (
-    SURE,
-    Landmark,
-    cell_of,
-    common_strength,
-    held,
-    landmarks,
-    unknown,
+from locatk.core.landmarks.calibration.datum import connected_components
+from locatk.core.landmarks.calibration.landmarks import (
+    MIN_FLAG_SIGMAS,
+    CalibratedLandmark,
+    describe_landmarks,
+    tolerance_priors,
+    typical_strength,
+    weak_priors,
 )
 from locatk.core.landmarks.design.proof import prove_map
-from locatk.core.landmarks.detection.fit import Priors
+from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.trace import compose
 from locatk.core.landmarks.halls import HallSamples
-from locatk.core.landmarks.localization import recording
-from locatk.core.landmarks.localization import smoothing as smooth
+from locatk.core.landmarks.landmark import HALF_PI_RAD
+from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit, select_visits_on_map
+from locatk.core.landmarks.localization.smoothing import (
+    SMOOTHED_MODEL_ERROR_T,
+    LandmarkPrior,
+    SmoothingResult,
+    VisitPose,
+    measure_visits,
+    smooth,
+)
 from locatk.core.landmarks.map.floor import Cell, FloorMap, as_built_codes
+from locatk.core.landmarks.solver import IdentifiedRecording, SolveOptions, identify_recording
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-APART_M, APART_RAD = 4e-3, math.radians(4)
-STRAYS = 5.0
-"""A visit that is off by this, and so many standard deviations, was not read right."""
+MAX_VISIT_DEVIATION_M = 4e-3
+MAX_VISIT_DEVIATION_RAD = math.radians(4)
+MAX_VISIT_DEVIATION_SIGMAS = 5.0
+"""A visit is an outlier if its own estimate of the pose deviates from the smoothed one by more than
+these limits and standard deviations."""
 
-ROUNDS = 5
-"""Strays are taken out so often."""
+MAX_OUTLIER_ROUNDS = 5
+"""Rounds of smoothing after which outliers are removed, one per recording in each."""
 
-MISFIT = 2.0
-"""Residual of all fields, in standard deviations, that asks for a word."""
+MAX_RESIDUAL_SIGMAS = 2.0
+"""Rms residual of all fields above which a note is given."""
 
 
 @dataclass(frozen=True)
-class Drive:
-    """One robot's recording, read; ``name`` is for people."""
+class CalibrationDrive:
+    """Recording of one robot for a calibration; ``name`` is for people."""
 
     name: str
-    found: recording.Recording
+    identified: IdentifiedRecording
 
 
 @dataclass(frozen=True)
-class CalibrationReport:
-    """A map with what was learned of it.
+class FloorCalibrationReport:
+    """Map with the landmarks as built.
 
     Attributes
     ----------
     floor : FloorMap
-        As given, but for ``built`` of the landmarks that were found.
-    found : tuple of Landmark
-        All that were visited, by cell.
+        The given map, with updated ``built`` of the landmarks that were observed well enough.
+    landmarks : tuple of CalibratedLandmark
+        All visited ones, by cell.
     unvisited : tuple of (row, column)
     strength, strength_sigma : float
-        Of the typical bar, as far as the sensors' gains and their height tell it.
-    misfit : float
-        Rms of what is left of the fields, in standard deviations.
+        Of the typical bar, as far as gains and heights of the sensors determine it.
+    residual_sigma : float
+        Rms residual of the fields, in standard deviations.
     left_out : dict of str to str
-        A recording or a visit to why it was not used.
+        Recordings and visits that were not used, with the reason.
     notes : tuple of str
     """
 
     floor: FloorMap
-    found: tuple[Landmark, ...]
+    landmarks: tuple[CalibratedLandmark, ...]
     unvisited: tuple[Cell, ...]
     strength: float
     strength_sigma: float
-    misfit: float
+    residual_sigma: float
     left_out: dict[str, str]
     notes: tuple[str, ...]
 
 
-def read(
+@dataclass(frozen=True)
+class _UsedDrive:
+    """Drive with the visits that are used."""
+
+    drive: CalibrationDrive
+    visits: list[IdentifiedVisit]
+
+
+def read_drive(
     name: str,
     samples: HallSamples,
     odometry: Trajectory | None,
     floor: FloorMap,
-    options: recording.SolveOptions | None = None,
-) -> Drive | str:
-    """One robot's recording, localised on the map; or why it cannot be used.
+    options: SolveOptions | None = None,
+) -> CalibrationDrive | str:
+    """Localize one recording on the map.
+
+    Returns
+    -------
+    CalibrationDrive or str
+        Or the reason for which the recording cannot be used.
 
     Raises
     ------
     InputError
-        See :func:`.solver.solve`.
+        See :func:`locatk.core.landmarks.solver.solve`.
     """
-    found = recording.read(samples, odometry, floor, options or recording.SolveOptions())
-    if not found.seen:
-        return "no landmark was seen"
-    if not recording.on_map(found, floor):
+    identified = identify_recording(samples, odometry, floor, options or SolveOptions())
+    if not identified.visits:
+        return "no landmark was detected"
+    if not select_visits_on_map(identified.visits, floor):
         return "not localised on the map"
-    return Drive(name, found)
+    return CalibrationDrive(name, identified)
 
 
 def calibrate(
-    floor: FloorMap, drives: Sequence[Drive], left_out: Mapping[str, str] | None = None
-) -> CalibrationReport:
-    """Fit place, heading and bar strengths of each landmark that was visited.
+    floor: FloorMap,
+    drives: Sequence[CalibrationDrive],
+    left_out: Mapping[str, str] | None = None,
+) -> FloorCalibrationReport:
+    """Estimate pose and bar strengths of each visited landmark.
 
     Parameters
     ----------
     floor : FloorMap
-        What it says of landmarks as built is replaced where they were visited, and is no
-        evidence.
-    drives : sequence of Drive
-        Of :func:`read`.
+        Its landmarks as built are replaced if they were visited; they do not enter as evidence.
+    drives : sequence of CalibrationDrive
+        From :func:`read_drive`.
     left_out : mapping of str to str
-        Recordings that are none already: name to why.
-
-    Returns
-    -------
-    CalibrationReport
+        Recordings that could not be used, with the reason.
 
     Raises
     ------
     InputError
         No visit can be used.
     """
-    out = dict(left_out or {})
-    used = [(drive, recording.on_map(drive.found, floor)) for drive in drives]
-    used = [(drive, visits) for drive, visits in used if visits]
+    left_out = dict(left_out or {})
+    used = [
+        _UsedDrive(drive, select_visits_on_map(drive.identified.visits, floor)) for drive in drives
+    ]
+    used = [one for one in used if one.visits]
     if not used:
-        why = f" ({'; '.join(f'{name}: {text}' for name, text in out.items())})" if out else ""
+        reasons = "; ".join(f"{name}: {text}" for name, text in left_out.items())
         raise InputError(
-            f"no landmark of the map was found in the recordings{why}",
+            f"no landmark of the map was detected in the recordings ({reasons})"
+            if reasons
+            else "no landmark of the map was detected in the recordings",
             hint="Drive over three landmarks or more of the window's shape in one recording",
         )
-    noise = math.sqrt(np.mean([drive.found.priors.noise_t**2 for drive, _ in used]))
-    priors = replace(used[0][0].found.priors, noise_t=noise, floor_t=solver.ALONE_T)
     design = replace(floor, built={})
-    first = _solved(used, unknown(_every(used), design), design, priors)
-    for _ in range(ROUNDS):
-        strays = _strays(used, first)
-        if not strays:
+    priors = _common_priors(used)
+    used, first = _smooth_without_outliers(used, design, priors, left_out)
+    visits = _all_visits(used)
+    components = connected_components([[visit.cell for visit in one.visits] for one in used])
+    strength, strength_sigma = typical_strength(first)
+    rough = describe_landmarks(first, weak_priors(visits, design), design, components, visits)
+    landmark_priors = tolerance_priors(first, rough, design, strength)
+    # The fields of neighbours are subtracted as they were estimated in the first solution.
+    known = {cell: one.built for cell, one in rough.items() if not one.refused}
+    final = _smooth(used, landmark_priors, replace(design, built=known), priors)
+    fine = describe_landmarks(final, landmark_priors, design, components, visits)
+    landmarks = tuple(replace(fine[cell], refused=rough[cell].refused) for cell in sorted(fine))
+    built = {one.cell: one.built for one in landmarks if not one.refused}
+    report = FloorCalibrationReport(
+        floor=replace(floor, built={**floor.built, **built}),
+        landmarks=landmarks,
+        unvisited=tuple(cell for cell in floor.cells() if cell not in fine),
+        strength=strength,
+        strength_sigma=strength_sigma,
+        residual_sigma=final.residual_sigma,
+        left_out=left_out,
+        notes=(),
+    )
+    return replace(report, notes=tuple(_notes(report, components, floor)))
+
+
+def _common_priors(used: Sequence[_UsedDrive]) -> ModelPriors:
+    """Return priors with the rms noise of all recordings."""
+    noises = [one.drive.identified.priors.noise_t for one in used]
+    return replace(
+        used[0].drive.identified.priors,
+        noise_t=math.sqrt(np.mean(np.square(noises))),
+        model_error_t=SMOOTHED_MODEL_ERROR_T,
+    )
+
+
+def _all_visits(used: Sequence[_UsedDrive]) -> list[IdentifiedVisit]:
+    return [visit for one in used for visit in one.visits]
+
+
+def _smooth(
+    used: Sequence[_UsedDrive],
+    landmarks: Mapping[Cell, LandmarkPrior],
+    floor: FloorMap,
+    priors: ModelPriors,
+) -> SmoothingResult:
+    """Smooth all recordings together."""
+    robots = []
+    for one in used:
+        identified = one.drive.identified
+        robots.append(measure_visits(one.visits, identified.odometry, identified.priors, floor))
+    return smooth(robots, landmarks, floor.geometry, priors)
+
+
+def _smooth_without_outliers(
+    used: list[_UsedDrive], design: FloorMap, priors: ModelPriors, left_out: dict[str, str]
+) -> tuple[list[_UsedDrive], SmoothingResult]:
+    """Smooth with weak priors and remove outliers, which are added to ``left_out``."""
+    smoothed = _smooth(used, weak_priors(_all_visits(used), design), design, priors)
+    for _ in range(MAX_OUTLIER_ROUNDS):
+        outliers = [
+            _find_outlier(one.visits, poses, smoothed)
+            for one, poses in zip(used, smoothed.visits, strict=True)
+        ]
+        if all(outlier is None for outlier in outliers):
             break
-        used = _without(used, strays, out)
+        kept = []
+        for one, outlier in zip(used, outliers, strict=True):
+            if outlier is not None:
+                row, column = outlier.cell
+                time_s = outlier.hypotheses.time_ns * 1e-9
+                left_out[f"{one.drive.name} at {time_s:.3f} s"] = (
+                    f"the visit to {row},{column} does not agree with the others"
+                )
+            visits = [visit for visit in one.visits if visit is not outlier]
+            if visits:
+                kept.append(_UsedDrive(one.drive, visits))
+        used = kept
         if not used:
             raise InputError(
                 "no visit agrees with the odometry and the other visits",
                 hint="Check the odometry and the sensors with `locatk solve` first",
             )
-        first = _solved(used, unknown(_every(used), design), design, priors)
-    every = _every(used)
-    parts = gauge.joined([[cell_of(one) for one in visits] for _, visits in used])
-    common, common_sigma = common_strength(first)
-    rough = landmarks(first, unknown(every, design), design, parts, every)
-    marks = held(first, rough, design, common)
-    nearly = replace(design, built={cell: one.built for cell, one in rough.items() if not one.why})
-    last = _solved(used, marks, nearly, priors)
-    fine = landmarks(last, marks, design, parts, every)
-    found = tuple(replace(fine[cell], why=rough[cell].why) for cell in sorted(fine))
-    built = {one.cell: one.built for one in found if not one.why}
-    report = CalibrationReport(
-        replace(floor, built={**floor.built, **built}),
-        found,
-        tuple(cell for cell in floor.cells() if cell not in fine),
-        common,
-        common_sigma,
-        last.misfit,
-        out,
-        (),
-    )
-    return replace(report, notes=tuple(_notes(report, parts, floor)))
+        smoothed = _smooth(used, weak_priors(_all_visits(used), design), design, priors)
+    return used, smoothed
 
 
-def _every(used: _Used) -> list[recording.Seen]:
-    return [one for _, visits in used for one in visits]
-
-
-_Used = list[tuple[Drive, list[recording.Seen]]]
-
-
-def _solved(
-    used: _Used, marks: Mapping[Cell, smooth.Mark], floor: FloorMap, priors: Priors
-) -> smooth.Smoothed:
-    runs = [solver.as_run(visits, drive.found, floor) for drive, visits in used]
-    return smooth.smooth(runs, marks, floor.geometry, priors)
-
-
-def _strays(used: _Used, smoothed: smooth.Smoothed) -> set[tuple[int, int]]:
-    """The visit of each recording that agrees least with all others, where it does not."""
-    found = set()
-    for number, (_, visits) in enumerate(used):
-        worst, at = 1.0, -1
-        for k, (one, stay) in enumerate(zip(visits, smoothed.stays[number], strict=True)):
-            assert one.located is not None
-            told = one.sighting.hypotheses[one.located.hypothesis]
-            mark = smoothed.marks[one.located.cell]
-            turn = np.array([0.0, 0.0, one.located.quarters * math.pi / 2])
-            alone = compose(mark.pose, compose(turn, told.pose))
-            miss = stay.pose - alone
-            miss[2] = math.remainder(miss[2], math.tau)
-            spread = np.sqrt(np.diag(told.covariance))
-            place = float(np.hypot(*miss[:2])) / max(APART_M, STRAYS * float(np.hypot(*spread[:2])))
-            heading = abs(miss[2]) / max(APART_RAD, STRAYS * spread[2])
-            if max(place, heading) > worst:
-                worst, at = max(place, heading), k
-        if at >= 0:
-            found.add((number, at))
-    return found
-
-
-def _without(used: _Used, strays: set[tuple[int, int]], out: dict[str, str]) -> _Used:
-    """Visits less those that stray, which are named."""
-    kept = []
-    for number, (drive, visits) in enumerate(used):
-        for k, one in enumerate(visits):
-            if (number, k) in strays:
-                when = one.sighting.time_ns * 1e-9
-                row, column = cell_of(one)
-                out[f"{drive.name} at {when:.3f} s"] = (
-                    f"the visit to {row},{column} does not agree with the others"
-                )
-        rest = [one for k, one in enumerate(visits) if (number, k) not in strays]
-        if rest:
-            kept.append((drive, rest))
-    return kept
+def _find_outlier(
+    visits: Sequence[IdentifiedVisit], poses: Sequence[VisitPose], smoothed: SmoothingResult
+) -> IdentifiedVisit | None:
+    """Return the visit of a recording that agrees least with all others, if it is an outlier."""
+    outlier, largest = None, 1.0
+    for visit, estimate in zip(visits, poses, strict=True):
+        hypothesis = visit.hypothesis
+        frame = np.array([0.0, 0.0, visit.quarters * HALF_PI_RAD])
+        landmark = smoothed.landmarks[visit.cell].pose
+        own_pose = compose(landmark, compose(frame, hypothesis.pose))
+        deviation = estimate.pose - own_pose
+        distance = float(np.hypot(*deviation[:2]))
+        rotation = abs(math.remainder(deviation[2], math.tau))
+        sigma = MAX_VISIT_DEVIATION_SIGMAS * np.sqrt(np.diag(hypothesis.covariance))
+        ratio = max(
+            distance / max(MAX_VISIT_DEVIATION_M, float(np.hypot(*sigma[:2]))),
+            rotation / max(MAX_VISIT_DEVIATION_RAD, float(sigma[2])),
+        )
+        if ratio > largest:
+            outlier, largest = visit, ratio
+    return outlier
 
 
 def _notes(
-    report: CalibrationReport, parts: Sequence[Sequence[Cell]], given: FloorMap
+    report: FloorCalibrationReport, components: Sequence[Sequence[Cell]], given: FloorMap
 ) -> list[str]:
+    """Return notes on quantities that were assumed or not determined."""
     notes = []
-    if len(parts) > 1:
+    if len(components) > 1:
         notes.append(
-            f"the recordings are of {len(parts)} parts of the floor with no landmark in common: "
-            "each was laid over the map by itself"
+            f"the recordings are of {len(components)} parts of the floor with no landmark in "
+            "common: each was aligned with the map by itself"
         )
-    alone = [part[0] for part in parts if len(part) == 1]
-    if alone:
-        cells = " ".join(f"{row},{column}" for row, column in alone)
+    single = [component[0] for component in components if len(component) == 1]
+    if single:
+        cells = " ".join(f"{row},{column}" for row, column in single)
         notes.append(
-            f"the place of {cells} cannot be told, only the bars: no recording goes from there "
+            f"of {cells} only the bars are determined, not the pose: no recording leads from there "
             "to another landmark"
         )
-    off = abs(report.strength - 1)
-    if math.isfinite(report.strength_sigma) and off > SURE * report.strength_sigma:
+    difference = abs(report.strength - 1)
+    is_known = math.isfinite(report.strength_sigma)
+    if is_known and difference > MIN_FLAG_SIGMAS * report.strength_sigma:
         notes.append(
-            f"the typical bar seems to have {report.strength:.2f} of the strength that the map "
-            "says: remanence_t or sensor_height_mm may be wrong; strengths are told against the "
-            "typical bar"
+            f"the typical bar seems to have {report.strength:.2f} of the strength on the map: "
+            "remanence_t or sensor_height_mm may be wrong; strengths are relative to the typical "
+            "bar"
         )
-    if report.misfit > MISFIT:
+    if report.residual_sigma > MAX_RESIDUAL_SIGMAS:
         notes.append(
-            f"the fields leave {report.misfit:.1f} times what noise would: check the bars and "
-            "the sensor height of the map"
+            f"the residuals of the fields are {report.residual_sigma:.1f} times the noise: check "
+            "the bars and the sensor height of the map"
         )
-    kept = set(given.built) - {one.cell for one in report.found if not one.why}
+    kept = set(given.built) - {one.cell for one in report.landmarks if not one.refused}
     if kept:
-        notes.append(f"kept of an earlier calibration: {len(kept)} landmarks")
-    return [*notes, *_uniqueness(report.floor)]
+        notes.append(f"kept from an earlier calibration: {len(kept)} landmarks")
+    return [*notes, *_uniqueness_notes(report.floor)]
 
 
-def _uniqueness(floor: FloorMap) -> list[str]:
-    """What flipped bars do to the proof of the map."""
+def _uniqueness_notes(floor: FloorMap) -> list[str]:
+    """Return a note if bars differ from the design, and whether the map is still unique."""
     codes = as_built_codes(floor)
     changed = int(np.count_nonzero(codes != floor.codes))
     if not changed:
         return []
-    count = prove_map(replace(floor, codes=codes, built={}), steps=False).duplicate_count
-    is_not = "1 landmark is" if changed == 1 else f"{changed} landmarks are"
-    if not count:
-        return [f"{is_not} not laid as designed; the map is unique all the same, as laid"]
-    repeats = "1 reading repeats" if count == 1 else f"{count} readings repeat"
-    return [f"{is_not} not laid as designed, and so {repeats} another: mend the flagged bars"]
+    duplicates = prove_map(replace(floor, codes=codes, built={}), steps=False).duplicate_count
+    differs = "1 landmark differs" if changed == 1 else f"{changed} landmarks differ"
+    if not duplicates:
+        return [f"{differs} from the design; the map is still unique as built"]
+    repeats = "1 reading repeats" if duplicates == 1 else f"{duplicates} readings repeat"
+    return [f"{differs} from the design, so that {repeats} another: correct the flagged bars"]

@@ -16,7 +16,7 @@ from locatk.core.landmarks.design.localization_steps import (
     Start,
     count_localization_steps,
 )
-from locatk.core.landmarks.landmark import CODES
+from locatk.core.landmarks.landmark import CODE_COUNT
 from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
 from locatk.core.landmarks.map.windows import (
     WINDOW_PATHS,
@@ -230,7 +230,7 @@ def _bar_faults(
 ) -> tuple[FaultEffects, FaultEffects]:
     """Evaluate a flipped bar, and a missing one, which leaves the true word and the flipped one."""
     codes = floor.codes[readings.cells[..., 0], readings.cells[..., 1]]
-    value = CODES ** np.arange(codes.shape[1])
+    value = CODE_COUNT ** np.arange(codes.shape[1])
     valid, is_ambiguous = _WordSet(words), is_repeated(words)[:, None]
     flipped, missing = np.zeros(codes.shape, np.int64), np.zeros(codes.shape, np.int64)
     for bar in range(4):

@@ -1,1 +1,1 @@
-"""Detection of landmarks: the field model fitted to one visit, and its explanations."""
+"""Detection of landmarks: hypotheses from the fit of the field model to each visit."""

@@ -1,182 +1,290 @@
-"""The full field fitted to one visit: from many starts, each with all that can be wrong."""
+"""Fit of the field model to the trace of one visit, for many hypotheses in one batch.
+
+The field at a sensor is that of four bars (:mod:`locatk.core.landmarks.field`), each with a
+strength and a position of its own. The unknowns of a hypothesis are the pose of the landmark in
+the frame of the trace and everything that deviates from its nominal value, each with a Gaussian
+prior (:class:`ModelPriors`). :func:`locatk.core.least_squares.minimize` fits all hypotheses of a
+batch together. The evidence of a hypothesis follows from cost and information by Laplace's
+approximation (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapter 27).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks import field as bars
-from locatk.core.landmarks.detection.trace import Drift, Trace
+from locatk.core.landmarks.detection.trace import OdometryDrift, Trace
+from locatk.core.landmarks.field import basis_gradient
 from locatk.core.landmarks.landmark import Geometry
+from locatk.core.least_squares import DenseEquations, Indices, minimize
 
 Array = NDArray[np.float64]
 
-POSE = 3
-"""Leading parameters: the landmark's x, y and heading in the frame of the trace."""
+MAX_ITERATIONS = 30
 
-STEPS = 30
+MIN_RELATIVE_GAIN = 1e-5
+"""A fit has converged if a step lowers its cost by less than this fraction. The cost is some
+hundreds: the log evidence of hypotheses is compared to about 1e-3."""
 
-CONVERGED = 1e-3
-"""Change of the cost at which a descent ends."""
+INITIAL_DAMPING = 1e-3
+
+POSE_SIGMA = np.array([1.0, 1.0, 1.0])
+"""Standard deviations (m, m, rad) that stand in the information of the landmark's pose for a
+uniform prior. They keep the information regular if the trace does not determine the pose."""
+
+STRENGTH_COUNT = 4
+"""Number of bars."""
 
 
 @dataclass(frozen=True)
-class Priors:
-    """Standard deviations of what is not known of sensors, bars and odometry.
+class ModelPriors:
+    """Standard deviations of deviations from the nominal model of sensors, bars and odometry.
 
     Attributes
     ----------
     gain : float
-        Of each sensor.
+        Relative, of each sensor.
     offset_t : float
-        Of each sensor, the Earth's field included.
+        Of each sensor, including the Earth's field.
     strength : float
-        Of each bar, in units of the nominal one.
-    place_m : float
+        Of each bar, relative to the nominal one.
+    bar_position_m : float
         Of each bar in x and in y.
     height_m : float
         Of the sensors over the bars, common to all.
     noise_t : float
         Of a sample.
-    faulty : float
+    fault_probability : float
         Probability that a given bar is weak or missing.
-    floor_t, model : float
-        What the model itself leaves, and the same in units of the field.
-    drift : Drift
+    model_error_t, relative_model_error : float
+        Residual of the model itself, absolute and relative to the field.
+    drift : OdometryDrift
     """
 
     gain: float = 0.03
     offset_t: float = 1e-4
     strength: float = 0.04
-    place_m: float = 0.5e-3
+    bar_position_m: float = 0.5e-3
     height_m: float = 0.5e-3
     noise_t: float = 1.5e-4
-    faulty: float = 0.01
-    floor_t: float = 1.5e-4
-    model: float = 0.005
-    drift: Drift = field(default_factory=Drift)
+    fault_probability: float = 0.01
+    model_error_t: float = 1.5e-4
+    relative_model_error: float = 0.005
+    drift: OdometryDrift = field(default_factory=OdometryDrift)
 
 
 @dataclass(frozen=True)
-class Problem:
-    """A trace, and the landmark under it.
-
-    Parameters of a hypothesis, in this order: x, y, heading of the landmark; then in
-    standard deviations of their priors the gains and offsets (N each), the strengths (4),
-    the places of the bars (8: x of all, y of all), the height, and the trace's corrections.
+class ParameterLayout:
+    """Columns of the parameters of a hypothesis.
 
     Attributes
     ----------
-    strength : (K, 4) ndarray
-        Expected signed strengths of the bars, hypothesis by hypothesis.
-    strength_sigma : (K, 4) ndarray
+    pose : slice
+        x, y, heading of the landmark in the frame of the trace, in metres and radians. All other
+        parameters are in standard deviations of their priors.
+    gain, offset : slice
+        One per sensor.
+    strength : slice
+        One per bar.
+    bar_position : slice
+        x of all bars, then y of all bars.
+    height : slice
+    correction : slice
+        Errors of the odometry, see :class:`.Trace`.
+    size : int
+        Number of parameters.
+    """
+
+    pose: slice
+    gain: slice
+    offset: slice
+    strength: slice
+    bar_position: slice
+    height: slice
+    correction: slice
+    size: int
+
+    @classmethod
+    def of(cls, sensors: int, corrections: int) -> ParameterLayout:
+        """Return the layout for a number of sensors and of errors of the odometry."""
+        counts = (3, sensors, sensors, STRENGTH_COUNT, 2 * STRENGTH_COUNT, 1, corrections)
+        edges = [0, *np.cumsum(counts).tolist()]
+        pose, gain, offset, strength, bar_position, height, correction = (
+            slice(start, stop) for start, stop in pairwise(edges)
+        )
+        return cls(pose, gain, offset, strength, bar_position, height, correction, size=edges[-1])
+
+    @classmethod
+    def of_trace(cls, trace: Trace) -> ParameterLayout:
+        """Return the layout for a trace."""
+        return cls.of(len(trace.sensor_position_m), trace.correction.shape[2])
+
+
+@dataclass(frozen=True)
+class ParameterSets:
+    """Parameters (K, size) of hypotheses, as the state of a minimization."""
+
+    values: Array
+
+    def take(self, hypotheses: Indices | NDArray[np.bool_]) -> ParameterSets:
+        """Return a copy of the chosen sets."""
+        return ParameterSets(self.values[hypotheses])
+
+    def put(self, hypotheses: Indices | NDArray[np.bool_], other: ParameterSets) -> None:
+        """Overwrite the chosen sets."""
+        self.values[hypotheses] = other.values
+
+
+@dataclass(frozen=True)
+class VisitFitProblem:
+    """Hypotheses of the landmark below a trace, as a batch of least-squares problems.
+
+    Attributes
+    ----------
+    trace : Trace
+    geometry : Geometry
+    priors : ModelPriors
+    strength, strength_sigma : (K, 4) ndarray
+        Signed strengths of the bars by hypothesis, expected values and standard deviations.
     """
 
     trace: Trace
     geometry: Geometry
-    priors: Priors
+    priors: ModelPriors
     strength: Array
     strength_sigma: Array
 
     @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return POSE + 2 * len(self.trace.lever_m) + 13 + self.trace.correction.shape[2]
+    def layout(self) -> ParameterLayout:
+        """Columns of the parameters."""
+        return ParameterLayout.of_trace(self.trace)
 
-    def start(self, pose: Array) -> Array:
-        """(K, size) parameters at landmark poses (K, 3), all else as expected."""
-        start = np.zeros((len(pose), self.size))
-        start[:, :POSE] = pose
-        return start
+    def initial_parameters(self, pose: Array) -> Array:
+        """Return parameters (K, size) at landmark poses (K, 3), all others being nominal."""
+        layout = self.layout
+        parameters = np.zeros((len(pose), layout.size))
+        parameters[:, layout.pose] = pose
+        return parameters
 
-    def chosen(self, which: NDArray[np.intp]) -> Problem:
-        """The same of some of the hypotheses."""
+    def take(self, hypotheses: Indices) -> VisitFitProblem:
+        """Return the problem of the chosen hypotheses."""
         return replace(
-            self, strength=self.strength[which], strength_sigma=self.strength_sigma[which]
+            self,
+            strength=self.strength[hypotheses],
+            strength_sigma=self.strength_sigma[hypotheses],
         )
+
+    def linearize(self, state: ParameterSets, hypotheses: Indices) -> DenseEquations:
+        """Return the normal equations of the chosen hypotheses, priors included."""
+        are_all_running = len(hypotheses) == len(self.strength)
+        problem = self if are_all_running else self.take(hypotheses)
+        residual, by_parameters = problem.residuals(state.values, jacobian=True)
+        cost = np.einsum("kr,kr->k", residual, residual) / 2
+        equations = DenseEquations.from_weighted(residual, residual, by_parameters, cost)
+        pose = self.layout.pose
+        nuisance = state.values[:, pose.stop :]
+        equations.add_prior(pose, np.zeros((len(residual), pose.stop)), POSE_SIGMA)
+        equations.add_prior(slice(pose.stop, None), nuisance, np.ones(nuisance.shape[1]))
+        return equations
+
+    def retract(self, state: ParameterSets, step: Array) -> ParameterSets:
+        """Return the parameters after a step."""
+        return ParameterSets(state.values + step)
 
     def residuals(self, parameters: Array, *, jacobian: bool) -> tuple[Array, Array]:
-        """Whitened residuals (K, rows), and their derivatives (K, rows, size).
+        """Evaluate the model.
 
-        Rows are the samples of all sensors; where there is none, residual and derivatives
-        are 0. The priors' own rows, which are the parameters from the fourth on, are not
-        among them.
+        Parameters
+        ----------
+        parameters : (K, size) ndarray
+        jacobian : bool
+            Return the derivatives as well (an empty array otherwise).
+
+        Returns
+        -------
+        residual : (K, rows) ndarray
+            Predicted minus measured field of each sample and sensor, in standard deviations; 0 if
+            there is no measurement. Priors are not included.
+        by_parameters : (K, rows, size) ndarray
         """
-        trace, priors = self.trace, self.priors
-        count, sensors = trace.value_t.shape
-        hypotheses = len(parameters)
-        gain, offset, strength, place, height, wrong = self._parts(parameters)
-        pose = trace.pose + np.einsum("nim,km->kni", trace.correction, wrong)
-        cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-        lever = trace.lever_m
-        arm_x = cos[..., None] * lever[:, 0] - sin[..., None] * lever[:, 1]
-        arm_y = sin[..., None] * lever[:, 0] + cos[..., None] * lever[:, 1]
-        x = pose[..., 0, None] + arm_x - parameters[:, 0, None, None]
-        y = pose[..., 1, None] + arm_y - parameters[:, 1, None, None]
-        turn = parameters[:, 2, None, None]
-        c, s = np.cos(turn), np.sin(turn)
-        own = np.stack([c * x + s * y, c * y - s * x], -1)
-        at = self.geometry.sensor_height_m + priors.height_m * height
-        # A bar that lies off its place is met as if the sensor were off: to first order.
-        unit, slope = bars.basis_gradient(self.geometry, own, at[:, None, None])
-        push = priors.place_m * place
-        moved = (
-            unit - slope[..., 0] * push[:, None, None, 0] - slope[..., 1] * push[:, None, None, 1]
+        trace, priors, layout = self.trace, self.priors, self.layout
+        samples, sensors = trace.field_t.shape
+        rows = samples * sensors
+        landmark = parameters[:, layout.pose, None, None]
+        gain = 1 + priors.gain * parameters[:, None, layout.gain]
+        strength = self.strength + self.strength_sigma * parameters[:, layout.strength]
+        strength = strength[:, None, None]
+        displacement = priors.bar_position_m * parameters[:, None, None, layout.bar_position]
+        height = priors.height_m * parameters[:, layout.height, None]
+
+        # Sensors in the frame of the trace, then in that of the landmark.
+        pose = trace.pose + np.einsum(
+            "nim,km->kni", trace.correction, parameters[:, layout.correction]
         )
-        total = np.einsum("knsb,kb->kns", moved, strength)
-        seen = ~np.isnan(trace.value_t)
-        value = np.where(seen, trace.value_t, 0.0)
-        variance = priors.noise_t**2 / trace.weight[:, None] + priors.floor_t**2
-        variance = variance + (priors.model * value) ** 2
-        root = np.where(seen, np.sqrt(trace.share / variance), 0.0)
-        g = 1 + priors.gain * gain[:, None]
-        model = g * total + priors.offset_t * offset[:, None]
-        residual = (root * (model - value)).reshape(hypotheses, -1)
+        cos, sin = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
+        sensor = trace.sensor_position_m
+        arm_x = cos * sensor[:, 0] - sin * sensor[:, 1]
+        arm_y = sin * sensor[:, 0] + cos * sensor[:, 1]
+        x = pose[..., 0, None] + arm_x - landmark[:, 0]
+        y = pose[..., 1, None] + arm_y - landmark[:, 1]
+        c, s = np.cos(landmark[:, 2]), np.sin(landmark[:, 2])
+        local = np.stack([c * x + s * y, c * y - s * x], -1)
+
+        bar_field, by_position = basis_gradient(
+            self.geometry, local, self.geometry.sensor_height_m + height
+        )
+        # The displacement of a bar is taken to first order: it acts as the opposite displacement
+        # of the sensor. The derivatives below neglect the change of `by_position`.
+        bar_field = (
+            bar_field
+            - by_position[..., 0] * displacement[..., :STRENGTH_COUNT]
+            - by_position[..., 1] * displacement[..., STRENGTH_COUNT:]
+        )
+        total = np.einsum("knsb,kb->kns", bar_field, strength[:, 0, 0])
+        is_measured = ~np.isnan(trace.field_t)
+        measured = np.where(is_measured, trace.field_t, 0.0)
+        variance = priors.noise_t**2 / trace.weight[:, None] + priors.model_error_t**2
+        variance = variance + (priors.relative_model_error * measured) ** 2
+        root = np.where(is_measured, np.sqrt(trace.thinning / variance), 0.0)
+        offset = priors.offset_t * parameters[:, None, layout.offset]
+        residual = (root * (gain * total + offset - measured)).reshape(len(parameters), rows)
         if not jacobian:
             return residual, np.empty(0)
-        out = np.zeros((hypotheses, count, sensors, self.size))
-        # Derivatives by the sensor's place in the landmark's frame, then in the trace's.
-        dx, dy, dz = np.moveaxis(np.einsum("knsbi,kb->iknsb", slope, strength).sum(-1), 0, 0)
-        fx, fy = c * dx - s * dy, s * dx + c * dy
-        out[..., 0] = -g * fx
-        out[..., 1] = -g * fy
-        out[..., 2] = g * (dx * own[..., 1] - dy * own[..., 0])
-        one = np.eye(sensors)
-        k = POSE
-        out[..., k : k + sensors] = priors.gain * total[..., None] * one
-        k += sensors
-        out[..., k : k + sensors] = priors.offset_t * one
-        k += sensors
-        out[..., k : k + 4] = g[..., None] * moved * self.strength_sigma[:, None, None]
-        k += 4
-        pushed = -priors.place_m * strength[:, None, None]
-        out[..., k : k + 4] = g[..., None] * pushed * slope[..., 0]
-        k += 4
-        out[..., k : k + 4] = g[..., None] * pushed * slope[..., 1]
-        k += 4
-        out[..., k] = g * priors.height_m * dz
-        k += 1
-        by_pose = g[..., None] * np.stack([fx, fy, fy * arm_x - fx * arm_y], -1)
-        out[..., k:] = np.einsum("knsi,nim->knsm", by_pose, trace.correction)
-        out *= root[..., None]
-        return residual, out.reshape(hypotheses, -1, self.size)
 
-    def _parts(self, parameters: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """Gains, offsets, strengths (signed), places (K, 2, 4), height, corrections."""
-        sensors = len(self.trace.lever_m)
-        edges = np.cumsum([POSE, sensors, sensors, 4, 8, 1])
-        gain, offset, strength, place, height, wrong = (
-            parameters[:, a:b] for a, b in zip(edges, [*edges[1:], self.size], strict=True)
+        # Derivatives of the field by the sensor's position in the landmark's frame, then by the
+        # position in the frame of the trace.
+        dx, dy, dz = np.moveaxis(
+            np.einsum("knsbi,kb->iknsb", by_position, strength[:, 0, 0]).sum(-1), 0, 0
         )
-        signed = self.strength + self.strength_sigma * strength
-        return gain, offset, signed, place.reshape(-1, 2, 4), height[:, 0], wrong
+        fx, fy = c * dx - s * dy, s * dx + c * dy
+        by_parameters = np.zeros((len(parameters), samples, sensors, layout.size))
+        by_parameters[..., 0] = -gain * fx
+        by_parameters[..., 1] = -gain * fy
+        by_parameters[..., 2] = gain * (dx * local[..., 1] - dy * local[..., 0])
+        own_sensor = np.eye(sensors)
+        by_parameters[..., layout.gain] = priors.gain * total[..., None] * own_sensor
+        by_parameters[..., layout.offset] = priors.offset_t * own_sensor
+        gain = gain[..., None]
+        by_parameters[..., layout.strength] = gain * bar_field * self.strength_sigma[:, None, None]
+        by_displacement = -priors.bar_position_m * strength
+        by_parameters[..., layout.bar_position] = gain * np.concatenate(
+            [by_displacement * by_position[..., 0], by_displacement * by_position[..., 1]], -1
+        )
+        by_parameters[..., layout.height] = gain * priors.height_m * dz[..., None]
+        by_pose = gain * np.stack([fx, fy, fy * arm_x - fx * arm_y], -1)
+        by_parameters[..., layout.correction] = np.einsum(
+            "knsi,nim->knsm", by_pose, trace.correction
+        )
+        by_parameters *= root[..., None]
+        return residual, by_parameters.reshape(len(parameters), rows, layout.size)
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """Ends of the descents, hypothesis by hypothesis.
+class VisitFits:
+    """Minima of :func:`fit_visit`, by hypothesis.
 
     Attributes
     ----------
@@ -184,61 +292,35 @@ class Fitted:
     cost : (K,) ndarray
         Half the sum of squares, priors included.
     information : (K, size, size) ndarray
+        Inverse covariance of the parameters.
     """
 
     parameters: Array
     cost: Array
     information: Array
 
-    def evidence(self) -> Array:
-        """(K,) logarithm of each hypothesis' probability by Laplace's approximation, but
-        for a constant that is common to all."""
+    def log_evidence(self) -> Array:
+        """Return the log evidence (K,) by Laplace's approximation, up to a common constant."""
         return -self.cost - np.linalg.slogdet(self.information)[1] / 2
 
-    def chosen(self, which: NDArray[np.intp]) -> Fitted:
-        """The same of some of the hypotheses."""
-        return Fitted(self.parameters[which], self.cost[which], self.information[which])
-
-
-def descend(problem: Problem, start: Array, steps: int = STEPS) -> Fitted:
-    """Levenberg-Marquardt from each start (K, size), all at once."""
-    prior = np.ones(problem.size)  # of a metre and a radian for the pose: as good as none
-    pull = np.where(np.arange(problem.size) < POSE, 0.0, 1.0)
-    now = start.copy()
-    residual, slope = problem.residuals(now, jacobian=True)
-    cost = _cost(residual, now)
-    matrix = slope.swapaxes(1, 2) @ slope + np.diag(prior)
-    gradient = np.einsum("krp,kr->kp", slope, residual) + pull * now
-    damping = np.full(len(now), 1e-3)
-    running = np.ones(len(now), bool)
-    diagonal = np.arange(problem.size)
-    for _ in range(steps):
-        which = np.flatnonzero(running)
-        if not len(which):
-            break
-        part = problem.chosen(which)
-        damped = matrix[which]
-        damped[:, diagonal, diagonal] *= 1 + damping[which, None]
-        step = np.linalg.solve(damped, gradient[which][..., None])[..., 0]
-        trial = now[which] - step
-        trial_residual, trial_slope = part.residuals(trial, jacobian=True)
-        trial_cost = _cost(trial_residual, trial)
-        better = trial_cost < cost[which]
-        gained = np.where(better, cost[which] - trial_cost, np.inf)
-        damping[which] = np.where(better, damping[which] / 5, damping[which] * 8)
-        taken = which[better]
-        now[taken], cost[taken] = trial[better], trial_cost[better]
-        fresh = trial_slope[better]
-        matrix[taken] = fresh.swapaxes(1, 2) @ fresh + np.diag(prior)
-        gradient[taken] = (
-            np.einsum("krp,kr->kp", fresh, trial_residual[better]) + pull * trial[better]
+    def take(self, hypotheses: Indices) -> VisitFits:
+        """Return the chosen hypotheses."""
+        return VisitFits(
+            self.parameters[hypotheses], self.cost[hypotheses], self.information[hypotheses]
         )
-        running[which] = (gained > CONVERGED) & (damping[which] < 1e6)
-    return Fitted(now, cost, matrix)
 
 
-def _cost(residual: Array, parameters: Array) -> Array:
-    nuisance = parameters[:, POSE:]
-    return (
-        np.einsum("kr,kr->k", residual, residual) + np.einsum("kp,kp->k", nuisance, nuisance)
-    ) / 2
+def fit_visit(
+    problem: VisitFitProblem, start: Array, max_iterations: int = MAX_ITERATIONS
+) -> VisitFits:
+    """Fit all hypotheses of a problem from initial parameters (K, size)."""
+    minimum = minimize(
+        problem,
+        ParameterSets(start),
+        len(start),
+        damping=INITIAL_DAMPING,
+        max_iterations=max_iterations,
+        min_gain=MIN_RELATIVE_GAIN,
+    )
+    equations: DenseEquations = minimum.equations
+    return VisitFits(minimum.state.values, equations.cost, equations.hessian)

@@ -1,42 +1,189 @@
-"""What one visit of a robot to a landmark has shown, before and after the map is asked."""
+"""Hypotheses of each visit: codes and poses of a landmark that explain its trace.
+
+Detection of the landmark of one visit:
+
+1. :mod:`.scan` finds initial guesses on a grid of positions, headings and codes.
+2. :mod:`.fit` refines them on a thinned trace. Those with too little evidence are dropped after a
+   few iterations; the best one is retried with all other codes, because bars on the far side of a
+   pass are weakly observed.
+3. The remaining ones are fitted to the full trace. Their evidences give the probabilities.
+4. If no intact landmark explains the trace, or a bar seems weak, landmarks of which one bar has
+   any strength are added.
+
+:func:`detect_landmarks` also checks the sensors: their order, signs and gains.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.landmark import CODES
+from locatk.core.errors import InputError
+from locatk.core.landmarks.detection.fit import (
+    ModelPriors,
+    ParameterLayout,
+    VisitFitProblem,
+    VisitFits,
+    fit_visit,
+)
+from locatk.core.landmarks.detection.scan import (
+    COARSE_GRID,
+    FINE_GRID,
+    INTACT_STRENGTHS,
+    ONE_MISSING_STRENGTHS,
+    ScanGrid,
+    find_candidates,
+)
+from locatk.core.landmarks.detection.trace import Trace, planar_rotation
+from locatk.core.landmarks.landmark import (
+    CODE_COUNT,
+    HALF_PI_RAD,
+    Geometry,
+    signs,
+)
+from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
+from locatk.core.landmarks.preprocessing import (
+    HallRecording,
+    VisitSegment,
+    merge_segments,
+    segment_visits,
+)
 from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
+MAX_SCAN_SAMPLES = 36
+"""Samples for the scan and the first fits."""
+
+MAX_FIT_SAMPLES = 150
+"""Samples for the final fits."""
+
+MAX_COARSE_CANDIDATES = 10
+MAX_FINE_CANDIDATES = 30
+"""Initial guesses from the coarse and from the fine grid."""
+
+SELECTION_ITERATIONS = (3, 4)
+"""Iterations of the first fits, after each of which hypotheses without chance are dropped."""
+
+MAX_EARLY_LOG_ODDS = 60.0
+"""Log odds behind the best hypothesis at which one is dropped during the first fits ..."""
+
+MAX_LOG_ODDS = 12.0
+"""... and before the final fits."""
+
+MAX_HYPOTHESES = 8
+
+MERGE_DIFFERENCE = 3e-3
+"""Difference of positions (m) and headings (rad) up to which minima of equal strengths are one."""
+
+FAULTY_STRENGTH_SIGMA = 0.5
+"""Standard deviation of the strength of a bar that may be weak or missing."""
+
+MAX_STRENGTH_SIGMAS = 2.5
+"""Deviation of a bar's strength from the nominal one at which faulty bars are considered."""
+
+MAX_INTACT_RESIDUAL_SIGMAS = 1.6
+"""Rms residual up to which intact landmarks explain a trace."""
+
+MIN_PROBABILITY = 1e-9
+"""Probability below which a hypothesis is not reported."""
+
+MIN_BINS = 4
+"""Bins of the path below which a visit is too short."""
+
+MAX_RESIDUAL_SIGMAS = 6.0
+"""Rms residual above which no landmark explains a visit."""
+
+SAME_LANDMARK_PITCH_FRACTION = 0.2
+"""Distance of landmarks, relative to the pitch, below which two successive visits are one."""
+
+MIN_UNEXPLAINED_FRACTION = 0.25
+"""Fraction of unexplained visits above which the sensors are checked."""
+
+MAX_CHECKED_VISITS = 3
+"""Unexplained visits that are used for this check; it fits each of them many times."""
+
+MAX_PERMUTED_SENSORS = 4
+"""Number of sensors up to which every order is tried."""
+
+MAX_REFINED_CHANGES = 3
+"""Most likely changes of the sensors that are tried on all these visits."""
+
+MAX_GAIN_SIGMAS = 4.0
+"""Deviation of a sensor's gain above which a warning is given."""
+
+MIN_RESIDUAL_RATIO = 3.0
+"""Factor by which a change of the sensors must reduce the residual in order to be believed."""
+
 
 @dataclass(frozen=True)
-class Hypothesis:
-    """One explanation of a visit: which landmark, and where the robot was beside it.
-
-    The frame is the landmark's, turned by quarter turns so that the robot's heading at the
-    sighting's time is nearest to 0: the code is the one that this robot reads, and a
-    landmark laid as ``laid`` on the map and seen under the map heading of ``q`` quarter
-    turns (and :attr:`pose`'s rest) has ``code = rotated(laid, -q)``.
+class LandmarkFit:
+    """Result of fitting one landmark to a trace.
 
     Attributes
     ----------
     code : int
-        How the landmark is laid in this frame.
+        In the frame of the fit.
+    log_odds : float
+        Log evidence, up to a constant that is common to the trace.
+    parameters : (size,) ndarray
+        See :class:`.fit.ParameterLayout`.
+    covariance : (size, size) ndarray
+    strength, strength_sigma : (4,) ndarray
+        Signed, relative to the nominal strength.
+    residual_sigma : float
+        Rms residual in standard deviations of a sample.
+    faulty_bar : int
+        Bar that was allowed to have any strength; -1 for none.
+    probability : float
+        Among all fits to the trace.
+    """
+
+    code: int
+    log_odds: float
+    parameters: Array
+    covariance: Array
+    strength: Array
+    strength_sigma: Array
+    residual_sigma: float
+    faulty_bar: int = -1
+    probability: float = math.nan
+
+    def corrections(self, trace: Trace) -> Array:
+        """Return the errors (m,) of the odometry."""
+        return self.parameters[ParameterLayout.of_trace(trace).correction]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One explanation of a visit: a code, and the pose of the robot relative to the landmark.
+
+    The frame is the landmark's, rotated by quarter turns so that the robot's heading at the time
+    of the visit is nearest to 0. The code is the one that this robot reads: a landmark of the
+    code ``designed`` on the map that is visited under a map heading of ``q`` quarter turns (plus
+    the heading of :attr:`pose`) has ``code = rotated(designed, -q)``.
+
+    Attributes
+    ----------
+    code : int
+        Directions of the bars in this frame.
     probability : float
         Among the hypotheses of the visit; they sum to 1.
     pose : (3,) ndarray
-        Robot in this frame at the sighting's time: x, y in metres and heading in radians.
+        Robot in this frame at the time of the visit: x, y in metres and heading in radians.
     covariance : (3, 3) ndarray
-        Of the pose; ``nan`` where the method knows none.
+        Of the pose; ``nan`` if the method does not estimate it.
     strength : (4,) ndarray
-        Signed strengths of the bars in this frame, in units of the nominal one; ``nan``
-        where the method knows none.
+        Signed strengths of the bars in this frame, relative to the nominal one; ``nan`` if the
+        method does not estimate them.
     strength_sigma : (4,) ndarray
+    fit : LandmarkFit or None
+        Fit of the field model; None if the method has no such model.
     """
 
     code: int
@@ -45,28 +192,30 @@ class Hypothesis:
     covariance: Array
     strength: Array
     strength_sigma: Array
+    fit: LandmarkFit | None = None
 
 
 @dataclass(frozen=True)
 class VisitHypotheses:
-    """One visit to one landmark.
+    """Hypotheses of one visit to one landmark.
 
     Attributes
     ----------
     device : str
     time_ns : int
-        At which the poses of the hypotheses stand: of a sample of the visit.
+        Time of a sample of the visit, to which the poses refer.
     first, stop : int
-        The visit: samples ``first`` to ``stop - 1``.
+        Samples ``first`` to ``stop - 1``.
     odometry : (3,) ndarray
-        The robot at ``time_ns`` by its own odometry: x, y, heading.
+        Robot at ``time_ns`` by its own odometry: x, y, heading.
     hypotheses : tuple of Hypothesis
-        The most probable first; empty where nothing explains the samples.
+        The most probable first; empty if nothing explains the samples.
     residual_sigma : float
-        Rms of what the best hypothesis leaves, in standard deviations of the noise;
-        ``nan`` where the method has no model of the samples.
+        Rms residual of the best hypothesis in standard deviations of the noise; ``nan`` if the
+        method has no model of the samples.
     refused : str
-        Why it is not used, ``""`` where it is: ``"too_weak"``, ``"too_short"``, ...
+        Machine-readable reason for not using the visit, ``""`` if it is used: ``"too_weak"``,
+        ``"too_short"``, ...
     warnings : tuple of SolverWarning
         Without the name of the device.
     """
@@ -83,19 +232,508 @@ class VisitHypotheses:
 
     @property
     def best(self) -> Hypothesis:
-        """The most probable hypothesis; ``IndexError`` where there is none."""
+        """Most probable hypothesis; ``IndexError`` if there is none."""
         return self.hypotheses[0]
 
-    def landmark_place(self) -> Array:
-        """(2,) where the best hypothesis has the landmark's centre, by the robot's odometry."""
+    def landmark_position(self) -> Array:
+        """Return the landmark's centre (2,) of the best hypothesis in the frame of the odometry."""
         x, y, heading = self.best.pose
-        turn = float(self.odometry[2] - heading)
-        cos, sin = math.cos(turn), math.sin(turn)
+        rotation = float(self.odometry[2] - heading)
+        cos, sin = math.cos(rotation), math.sin(rotation)
         return np.asarray(self.odometry[:2] - [cos * x - sin * y, sin * x + cos * y])
 
     def code_probabilities(self) -> Array:
-        """(16,) probability of each code in the frame of the hypotheses."""
-        total = np.zeros(CODES)
+        """Return the probability (16,) of each code in the frame of the hypotheses."""
+        total = np.zeros(CODE_COUNT)
         for hypothesis in self.hypotheses:
             total[hypothesis.code] += hypothesis.probability
         return total
+
+
+@dataclass(frozen=True)
+class DetectedVisit:
+    """Segment of a recording at one landmark, with its hypotheses."""
+
+    segment: VisitSegment
+    hypotheses: VisitHypotheses
+
+
+# ---- visits of a recording
+
+
+def detect_landmarks(
+    recording: HallRecording, geometry: Geometry, priors: ModelPriors, pitch_m: float
+) -> tuple[HallRecording, list[DetectedVisit]]:
+    """Detect the landmarks of all visits, and check the sensors with them.
+
+    Parameters
+    ----------
+    recording : HallRecording
+    geometry : Geometry
+    priors : ModelPriors
+    pitch_m : float
+        Distance of neighbouring landmarks.
+
+    Returns
+    -------
+    recording : HallRecording
+        With warnings of the sensors, and without a sensor that agrees with no landmark.
+    visits : list of DetectedVisit
+        In order of time, refused ones included.
+
+    Raises
+    ------
+    InputError
+        The sensors are in the wrong order, or one has the opposite sign.
+    """
+    visits = detect_visits(recording, geometry, priors, pitch_m)
+    best = [
+        visit.hypotheses.best.fit
+        for visit in visits
+        if visit.hypotheses.hypotheses and visit.hypotheses.best.fit is not None
+    ]
+    gain_warnings = check_gains(best, recording, priors)
+    recording = replace(recording, warnings=(*recording.warnings, *gain_warnings))
+    faulty_sensor = find_faulty_sensor(visits, recording, geometry, priors)
+    if faulty_sensor is not None:
+        recording = recording.without_sensor(faulty_sensor)
+        visits = detect_visits(recording, geometry, priors, pitch_m)
+    return recording, visits
+
+
+def detect_visits(
+    recording: HallRecording, geometry: Geometry, priors: ModelPriors, pitch_m: float
+) -> list[DetectedVisit]:
+    """Detect the landmark of each visit.
+
+    Successive visits to one landmark, which was passed on both sides, are merged.
+    """
+    visits: list[DetectedVisit] = []
+    for segment in segment_visits(recording, geometry, priors.drift, pitch_m):
+        visit = DetectedVisit(segment, detect_landmark(segment, recording, geometry, priors))
+        if visits and not (visits[-1].hypotheses.refused or visit.hypotheses.refused):
+            centre = visit.hypotheses.landmark_position()
+            distance = np.hypot(*(centre - visits[-1].hypotheses.landmark_position()))
+            if distance < SAME_LANDMARK_PITCH_FRACTION * pitch_m:
+                merged = merge_segments(
+                    recording, visits[-1].segment, segment, centre, priors.drift
+                )
+                hypotheses = detect_landmark(merged, recording, geometry, priors)
+                if not hypotheses.refused:
+                    visits[-1] = DetectedVisit(merged, hypotheses)
+                    continue
+        visits.append(visit)
+    return visits
+
+
+def detect_landmark(
+    segment: VisitSegment, recording: HallRecording, geometry: Geometry, priors: ModelPriors
+) -> VisitHypotheses:
+    """Return the hypotheses of one visit, or the reason for which there are none."""
+    trace = segment.trace
+    is_too_short = len(trace) < MIN_BINS
+    fits = [] if is_too_short else fit_landmarks(trace, geometry, priors)
+    unread = VisitHypotheses(
+        device=recording.samples.device,
+        time_ns=int(segment.time_ns[trace.reference]),
+        first=segment.first,
+        stop=segment.stop,
+        odometry=segment.origin,
+        hypotheses=(),
+    )
+    if not fits:
+        return replace(unread, refused="too_short" if is_too_short else "too_weak")
+    hypotheses = []
+    for fit in fits:
+        pose, covariance = robot_pose(trace, fit, trace.reference)
+        pose[2] = math.remainder(pose[2], math.tau)
+        hypotheses.append(
+            Hypothesis(
+                fit.code,
+                fit.probability,
+                pose,
+                covariance,
+                fit.strength,
+                fit.strength_sigma,
+                fit,
+            )
+        )
+    residual = fits[0].residual_sigma
+    return replace(
+        unread,
+        hypotheses=tuple(hypotheses),
+        residual_sigma=residual,
+        refused="not_explained" if residual > MAX_RESIDUAL_SIGMAS else "",
+    )
+
+
+# ---- fits to one trace
+
+
+def fit_landmarks(
+    trace: Trace, geometry: Geometry, priors: ModelPriors, *, thorough: bool = True
+) -> list[LandmarkFit]:
+    """Fit all landmarks that may explain a trace.
+
+    Parameters
+    ----------
+    trace : Trace
+    geometry : Geometry
+    priors : ModelPriors
+    thorough : bool
+        If nothing explains the trace, search on a finer grid and consider faulty bars.
+
+    Returns
+    -------
+    list of LandmarkFit
+        The most probable first. Their probabilities sum to 1. Empty if no field is strong.
+    """
+    fits = _fit_intact(trace, geometry, priors, COARSE_GRID)
+    if not fits:
+        return []
+    if not thorough:
+        return _with_probabilities(fits)
+    if _best(fits).residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
+        fits = _fit_intact(trace, geometry, priors, FINE_GRID)
+    best = _best(fits)
+    deviation = np.abs(best.strength - signs(best.code)) / priors.strength
+    if deviation.max() > MAX_STRENGTH_SIGMAS or best.residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
+        fits += _fit_faulty(trace, geometry, priors, float(best.parameters[2]))
+    return _with_probabilities(fits)
+
+
+def robot_pose(trace: Trace, fit: LandmarkFit, index: int) -> tuple[Array, Array]:
+    """Return the robot's pose in the landmark's frame at one sample of the trace.
+
+    Returns
+    -------
+    pose : (3,) ndarray
+        x, y, heading in m and rad.
+    covariance : (3, 3) ndarray
+    """
+    layout = ParameterLayout.of_trace(trace)
+    landmark = fit.parameters[layout.pose]
+    pose = trace.pose[index] + trace.correction[index] @ fit.corrections(trace)
+    to_landmark = planar_rotation(landmark[2]).T
+    local = to_landmark @ (pose - landmark)
+    by_parameters = np.hstack([-to_landmark, to_landmark @ trace.correction[index]])
+    by_parameters[:2, 2] = [local[1], -local[0]]
+    columns = np.r_[layout.pose, layout.correction]
+    covariance = fit.covariance[np.ix_(columns, columns)]
+    return local, by_parameters @ covariance @ by_parameters.T
+
+
+def estimate_pose_at_known_landmark(
+    trace: Trace, geometry: Geometry, priors: ModelPriors, strength: Array, start: Array
+) -> tuple[Array, Array]:
+    """Estimate the robot's pose at a landmark whose code is known.
+
+    Parameters
+    ----------
+    trace : Trace
+        One sample or more: the four fields of a robot at rest suffice.
+    geometry : Geometry
+    priors : ModelPriors
+    strength : (4,) ndarray
+        Expected signed strengths of the bars in the landmark's frame.
+    start : (3,) ndarray
+        Robot in the landmark's frame, accurate to a centimetre and about ten degrees.
+
+    Returns
+    -------
+    pose : (3,) ndarray
+        Robot in the landmark's frame at the reference of the trace.
+    covariance : (3, 3) ndarray
+    """
+    problem = _fit_problem(trace, geometry, priors, np.asarray(strength, float)[None])
+    cos, sin = math.cos(start[2]), math.sin(start[2])
+    landmark = [-cos * start[0] - sin * start[1], sin * start[0] - cos * start[1], -start[2]]
+    fits = fit_visit(problem, problem.initial_parameters(np.array([landmark])))
+    return robot_pose(trace, _landmark_fits(problem, fits)[0], trace.reference)
+
+
+def _best(fits: list[LandmarkFit]) -> LandmarkFit:
+    return max(fits, key=lambda fit: fit.log_odds)
+
+
+def _fit_intact(
+    trace: Trace, geometry: Geometry, priors: ModelPriors, grid: ScanGrid
+) -> list[LandmarkFit]:
+    """Fit landmarks whose bars all have the nominal strength."""
+    return _fit_strengths(trace, geometry, priors, INTACT_STRENGTHS, grid)
+
+
+def _fit_faulty(
+    trace: Trace, geometry: Geometry, priors: ModelPriors, heading_rad: float
+) -> list[LandmarkFit]:
+    """Fit landmarks of which one bar has any strength, in frames near a heading."""
+    fits = []
+    for fit in _fit_strengths(
+        trace, geometry, priors, ONE_MISSING_STRENGTHS, COARSE_GRID, heading_rad
+    ):
+        bar = fit.faulty_bar
+        log_odds = fit.log_odds + math.log(priors.fault_probability)
+        if abs(fit.strength[bar]) > MISSING_BAR_STRENGTH:
+            fits.append(replace(fit, log_odds=log_odds))
+        else:
+            # The direction of a missing bar is unknown: both codes are equally probable.
+            log_odds -= math.log(2)
+            for code in (fit.code, fit.code ^ 1 << bar):
+                fits.append(replace(fit, code=code, log_odds=log_odds))
+    return fits
+
+
+def _fit_strengths(
+    trace: Trace,
+    geometry: Geometry,
+    priors: ModelPriors,
+    strengths: Array,
+    grid: ScanGrid,
+    heading_rad: float | None = None,
+) -> list[LandmarkFit]:
+    """Fit landmarks with the given strengths (L, 4).
+
+    Their frames are those nearest to the given heading, or else to the heading of the best one.
+    """
+    coarse = trace.thinned(MAX_SCAN_SAMPLES)
+    max_candidates = MAX_COARSE_CANDIDATES if grid == COARSE_GRID else MAX_FINE_CANDIDATES
+    pose, which = find_candidates(coarse, geometry, strengths, max_candidates, grid)
+    if not len(pose):
+        return []
+    problem = _fit_problem(coarse, geometry, priors, strengths[which])
+    problem, fits = _fit_and_select(problem, problem.initial_parameters(pose))
+    evidence = fits.log_evidence()
+    # Bars at the far side are weakly observed: try all other strengths at the best pose.
+    best = int(np.argmax(evidence))
+    others = strengths[(strengths != problem.strength[best]).any(axis=1)]
+    other_problem = _fit_problem(coarse, geometry, priors, others)
+    start = other_problem.initial_parameters(
+        np.repeat(fits.parameters[[best], :3], len(others), axis=0)
+    )
+    other_problem, other_fits = _fit_and_select(other_problem, start, evidence.max())
+    evidence = np.concatenate([evidence, other_fits.log_evidence()])
+    strength = np.concatenate([problem.strength, other_problem.strength])
+    parameters = np.concatenate([fits.parameters, other_fits.parameters])
+    if heading_rad is None:
+        heading_rad = math.remainder(float(parameters[np.argmax(evidence), 2]), HALF_PI_RAD)
+    kept = np.flatnonzero(evidence > evidence.max() - MAX_LOG_ODDS)
+    strength, start = _rotate_frames(strength[kept], parameters[kept], heading_rad)
+    strength, start = _select_distinct(strength, start, evidence[kept])
+    problem = _fit_problem(trace.thinned(MAX_FIT_SAMPLES), geometry, priors, strength)
+    return _landmark_fits(problem, fit_visit(problem, start))
+
+
+def _fit_and_select(
+    problem: VisitFitProblem, start: Array, best_evidence: float = -math.inf
+) -> tuple[VisitFitProblem, VisitFits]:
+    """Fit in a few iterations, and drop hypotheses without chance in between.
+
+    ``best_evidence`` is that of hypotheses outside of the problem.
+    """
+    for iterations in SELECTION_ITERATIONS:
+        fits = fit_visit(problem, start, iterations)
+        evidence = fits.log_evidence()
+        kept = np.flatnonzero(evidence > max(evidence.max(), best_evidence) - MAX_EARLY_LOG_ODDS)
+        problem, fits = problem.take(kept), fits.take(kept)
+        start = fits.parameters
+        if not len(kept):
+            break
+    return problem, fits
+
+
+def _fit_problem(
+    trace: Trace, geometry: Geometry, priors: ModelPriors, strength: Array
+) -> VisitFitProblem:
+    """Return the problem for strengths (K, 4), of which 0 stands for a faulty bar."""
+    sigma = np.where(strength == 0, FAULTY_STRENGTH_SIGMA, priors.strength)
+    return VisitFitProblem(trace, geometry, priors, strength, sigma)
+
+
+def _rotate_frames(strength: Array, parameters: Array, heading_rad: float) -> tuple[Array, Array]:
+    """Express landmarks in the frame, among their four, that is nearest to a heading."""
+    quarters = np.round((heading_rad - parameters[:, 2]) / HALF_PI_RAD).astype(np.int64)
+    rotated_parameters = parameters.copy()
+    rotated_parameters[:, 2] += HALF_PI_RAD * quarters
+    bars = (np.arange(4) + quarters[:, None]) % 4
+    return np.take_along_axis(strength, bars, axis=1), rotated_parameters
+
+
+def _select_distinct(strength: Array, parameters: Array, evidence: Array) -> tuple[Array, Array]:
+    """Return the best of each group of equal hypotheses, at most :data:`MAX_HYPOTHESES`."""
+    kept: list[int] = []
+    for i in np.argsort(-evidence):
+        difference = np.abs(parameters[kept, :3] - parameters[i, :3]).max(axis=1)
+        has_same_bars = (strength[kept] == strength[i]).all(axis=1)
+        is_duplicate = np.any(has_same_bars & (difference < MERGE_DIFFERENCE))
+        if not is_duplicate and len(kept) < MAX_HYPOTHESES:
+            kept.append(int(i))
+    return strength[kept], parameters[kept]
+
+
+def _with_probabilities(fits: list[LandmarkFit]) -> list[LandmarkFit]:
+    """Set the probabilities of all fits to a trace; the most probable first."""
+    log_odds = np.array([fit.log_odds for fit in fits])
+    probability = np.exp(log_odds - log_odds.max())
+    probability /= probability.sum()
+    return [
+        replace(fits[i], probability=float(probability[i]))
+        for i in np.argsort(-probability, kind="stable")
+        if probability[i] > MIN_PROBABILITY
+    ]
+
+
+def _landmark_fits(problem: VisitFitProblem, fits: VisitFits) -> list[LandmarkFit]:
+    """Describe the minima of a problem."""
+    evidence = fits.log_evidence()
+    covariance = np.linalg.inv(fits.information)
+    columns = problem.layout.strength
+    strength = problem.strength + problem.strength_sigma * fits.parameters[:, columns]
+    sigma = problem.strength_sigma * np.sqrt(np.einsum("kii->ki", covariance)[:, columns])
+    may_be_faulty = problem.strength == 0
+    faulty_bar = np.where(may_be_faulty.any(axis=1), may_be_faulty.argmax(axis=1), -1)
+    code = (strength > 0) @ (1 << np.arange(4))
+    residual = problem.residuals(fits.parameters, jacobian=False)[0]
+    measurements = max(int((~np.isnan(problem.trace.field_t)).sum()), 1)
+    rms = np.sqrt(
+        np.einsum("kr,kr->k", residual, residual) / (measurements * problem.trace.thinning)
+    )
+    return [
+        LandmarkFit(
+            code=int(code[i]),
+            log_odds=float(evidence[i]),
+            parameters=fits.parameters[i],
+            covariance=covariance[i],
+            strength=strength[i],
+            strength_sigma=sigma[i],
+            residual_sigma=float(rms[i]),
+            faulty_bar=int(faulty_bar[i]),
+        )
+        for i in range(len(code))
+    ]
+
+
+# ---- checks of the sensors
+
+
+def check_gains(
+    fits: Sequence[LandmarkFit], recording: HallRecording, priors: ModelPriors
+) -> list[SolverWarning]:
+    """Return warnings of sensors whose gain differs from the given one.
+
+    Parameters
+    ----------
+    fits : sequence of LandmarkFit
+        Best fit of each visit.
+    recording : HallRecording
+    priors : ModelPriors
+
+    Raises
+    ------
+    InputError
+        A sensor has the opposite sign.
+    """
+    if not fits:
+        return []
+    names, device = recording.samples.sensors.names, recording.samples.device
+    columns = ParameterLayout.of(len(names), 0).gain
+    gains = 1 + priors.gain * np.median([fit.parameters[columns] for fit in fits], axis=0)
+    warnings = []
+    for name, gain in zip(names, gains.tolist(), strict=True):
+        if gain < 0:
+            raise _opposite_sign_error(name, device)
+        if abs(gain - 1) > MAX_GAIN_SIGMAS * priors.gain:
+            message = f"the gain of the {name} sensor is {gain:.2f} of that of the others"
+            warnings.append(SolverWarning("sensor_gain", message).about(device))
+    return warnings
+
+
+@dataclass(frozen=True)
+class SensorChange:
+    """Hypothetical wiring of the sensors.
+
+    Attributes
+    ----------
+    order : tuple of int
+        Column of each sensor.
+    factor : tuple of float
+        Of each sensor: -1 for the opposite sign, ``nan`` for a sensor that is left out.
+    """
+
+    order: tuple[int, ...]
+    factor: tuple[float, ...]
+
+
+def find_faulty_sensor(
+    visits: Sequence[DetectedVisit],
+    recording: HallRecording,
+    geometry: Geometry,
+    priors: ModelPriors,
+) -> int | None:
+    """Check order and signs of the sensors if many visits are unexplained.
+
+    Returns
+    -------
+    int or None
+        A sensor without which the visits are explained.
+
+    Raises
+    ------
+    InputError
+        The sensors are in the wrong order, or one has the opposite sign; the message names them.
+    """
+    unexplained = [
+        visit.segment.trace
+        for visit in visits
+        if visit.hypotheses.residual_sigma > MAX_RESIDUAL_SIGMAS
+    ]
+    names, device = recording.samples.sensors.names, recording.samples.device
+    if (
+        len(unexplained) <= MIN_UNEXPLAINED_FRACTION * len(visits)
+        or len(names) > MAX_PERMUTED_SENSORS
+    ):
+        return None
+    unexplained = sorted(unexplained, key=len, reverse=True)[:MAX_CHECKED_VISITS]
+
+    def median_residual(change: SensorChange, traces: Sequence[Trace]) -> float:
+        residuals = []
+        for trace in traces:
+            field = trace.field_t[:, list(change.order)] * change.factor
+            fits = fit_landmarks(replace(trace, field_t=field), geometry, priors, thorough=False)
+            residuals.append(fits[0].residual_sigma if fits else math.inf)
+        return float(np.median(residuals))
+
+    as_given, *others = _sensor_changes(len(names))
+    likely = sorted(others, key=lambda change: median_residual(change, unexplained[:1]))
+    best = min(
+        likely[:MAX_REFINED_CHANGES], key=lambda change: median_residual(change, unexplained)
+    )
+    limit = min(MAX_RESIDUAL_SIGMAS, median_residual(as_given, unexplained) / MIN_RESIDUAL_RATIO)
+    if median_residual(best, unexplained) > limit:
+        return None
+    if best.order != as_given.order:
+        actual = ", ".join(names[best.order.index(k)] for k in as_given.order)
+        raise InputError(
+            f"the hall sensors of {device} are in the wrong order: {', '.join(names)} are {actual}",
+            hint="Name the columns in that order, or correct halls.toml",
+        )
+    changed = int(np.flatnonzero(np.asarray(best.factor) != 1)[0])
+    if best.factor[changed] == -1:
+        raise _opposite_sign_error(names[changed], device)
+    return changed
+
+
+def _sensor_changes(count: int) -> list[SensorChange]:
+    """Return all hypothetical wirings of the sensors, the given one first."""
+    given, ones = tuple(range(count)), (1.0,) * count
+    changes = [SensorChange(order, ones) for order in itertools.permutations(given)]
+    for factor in (-1.0, math.nan):
+        for k in given:
+            changes.append(SensorChange(given, (*ones[:k], factor, *ones[k + 1 :])))
+    return changes
+
+
+def _opposite_sign_error(name: str, device: str) -> InputError:
+    return InputError(
+        f"the {name} sensor of {device} has the opposite sign of the others",
+        hint="Turn it over, or change the sign of its column",
+    )

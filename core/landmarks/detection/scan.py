@@ -1,4 +1,8 @@
-"""First places: where, under which turn and of which code a landmark may lie, on a grid."""
+"""Initial guesses: grid search for position, heading and code of the landmark below a trace.
+
+The field is linear in the strengths of the four bars. At each node of a grid of positions and
+headings, one normal matrix (4, 4) therefore gives the residuals of all codes.
+"""
 
 from __future__ import annotations
 
@@ -10,233 +14,276 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.kernels import kernels
-from locatk.core.landmarks import field as bars
 from locatk.core.landmarks.detection.trace import Trace
-from locatk.core.landmarks.landmark import CODES, Geometry, signs
+from locatk.core.landmarks.field import basis
+from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, Geometry, signs
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Grid:
-    """How finely places are searched.
+class ScanGrid:
+    """Resolution of the grid.
 
     Attributes
     ----------
     step_m : float
-        Between neighbouring centres.
-    turns : int
-        In a quarter turn.
+        Between neighbouring positions.
+    headings_per_quarter : int
+        Number of headings in a quarter turn. The other quarters are covered by the codes.
     """
 
     step_m: float = 7e-3
-    turns: int = 10
+    headings_per_quarter: int = 10
 
     def headings(self) -> Array:
-        """(turns,) headings from -45 degrees on."""
-        return np.asarray(-math.pi / 4 + math.pi / 2 / self.turns * np.arange(self.turns))
+        """Return the headings in radians, from -45 degrees on."""
+        step = HALF_PI_RAD / self.headings_per_quarter
+        return np.asarray(-HALF_PI_RAD / 2 + step * np.arange(self.headings_per_quarter))
 
 
-COARSE = Grid()
+COARSE_GRID = ScanGrid()
+"""Grid of the first search; its field errors are allowed for by :data:`GRID_ERROR_FRACTION`."""
 
-FINE = Grid(4e-3, 15)
+FINE_GRID = ScanGrid(4e-3, 15)
+"""Grid of a second search, if no result of the first explains the trace."""
 
-REACH_M = 0.11
-"""Of a landmark's field, as far as the scan looks."""
+TABLE_HALF_WIDTH_M = 0.11
+"""Distance from the centre up to which a landmark's field is tabulated."""
 
 TABLE_STEP_M = 1e-3
+"""Step of that table; fields are interpolated linearly."""
 
-FARTHEST_M = 0.062
-"""From a place of strong field to the landmark's centre."""
+MAX_CENTRE_DISTANCE_M = 0.062
+"""Largest distance from a position of strong field to the landmark's centre. The territory of the
+default geometry ends at 54 mm (radius r2 of the paper, section 3.1)."""
 
-LARGEST_M = 0.5
-"""Strong fields farther apart are of no one landmark."""
+MAX_STRONG_FIELD_EXTENT_M = 0.5
+"""Extent of positions of strong field above which they cannot be of one landmark."""
 
-STRONG = 0.45
-"""Field of a place near a landmark, in units of the threshold."""
+MIN_STRONG_FIELD_THRESHOLDS = 0.45
+"""Field of a position near a landmark, in thresholds of the territory."""
 
-SLACK = 0.25
-"""By which share of the strongest field near a sample the grid's coarseness may be off."""
+GRID_ERROR_FRACTION = 0.25
+"""Error of a predicted field by the coarseness of the grid, relative to the strongest field of the
+same sensor in the neighbourhood."""
 
-BESIDE = 0.12
-"""The same of the strongest field of any sensor: one that runs along a valley tells of
-nothing, but a node beside the valley would have it feel much."""
+OTHER_SENSOR_ERROR_FRACTION = 0.12
+"""The same relative to the strongest field of any sensor: a sensor that moves along a valley of the
+field measures nothing, but at a node off the valley it would measure a strong field."""
 
-NEAR_M = 8e-3
+MIN_NEIGHBOURHOOD_M = 8e-3
+"""Minimum half length of the neighbourhood, along the path."""
 
-FLOOR_T = 3e-4
+MIN_FIELD_ERROR_T = 3e-4
+"""Error of a predicted field that is assumed at least: offset and noise."""
 
-GAINS = (0.6, 1.15)
+GAIN_RANGE = (0.6, 1.15)
+"""Range of a common gain. It is estimated, because heights and remanences differ."""
 
-APART_M = 0.012
+MIN_CANDIDATE_DISTANCE_M = 0.012
+MIN_CANDIDATE_ROTATION_RAD = math.radians(16)
+"""Differences of position and heading below which two candidates of one code are neighbours: both
+converge to one minimum."""
 
-APART_RAD = math.radians(16)
+SORTED_NODES_PER_CANDIDATE = 60
+"""Number of best nodes among which each candidate is selected."""
 
-
-WHOLE = signs(np.arange(CODES))
+INTACT_STRENGTHS = signs(np.arange(CODE_COUNT))
 """(16, 4) strengths of the bars of faultless landmarks."""
 
-ONE_MISSING = np.unique(np.concatenate([WHOLE * (np.arange(4) != bar) for bar in range(4)]), axis=0)
-"""(32, 4) strengths where one bar is missing."""
+ONE_MISSING_STRENGTHS = np.unique(
+    np.concatenate([INTACT_STRENGTHS * (np.arange(4) != bar) for bar in range(4)]), axis=0
+)
+"""(32, 4) strengths of landmarks of which one bar is missing."""
 
 
-def candidates(
-    trace: Trace, geometry: Geometry, laid: Array, most: int, grid: Grid = COARSE
+def find_candidates(
+    trace: Trace,
+    geometry: Geometry,
+    strengths: Array,
+    max_candidates: int,
+    grid: ScanGrid = COARSE_GRID,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """The likeliest places of the landmark under a trace.
+    """Find the most likely poses and strengths of the landmark below a trace.
 
     Parameters
     ----------
     trace : Trace
-        Best thinned: each sample costs.
+        Thinned: the time is in proportion to the number of samples.
     geometry : Geometry
-    laid : (L, 4) ndarray
-        Strengths of the bars that may be there: :data:`WHOLE`, :data:`ONE_MISSING`.
-    most : int
-        Number of candidates.
-    grid : Grid, optional
+    strengths : (L, 4) ndarray
+        Admitted strengths of the bars: :data:`INTACT_STRENGTHS`, :data:`ONE_MISSING_STRENGTHS`.
+    max_candidates : int
+    grid : ScanGrid, optional
 
     Returns
     -------
-    (K, 3) ndarray, (K,) ndarray
-        x, y, heading in the trace's frame and the row of ``laid``; the best first, no two
-        alike. Empty where no field is strong.
+    pose : (K, 3) ndarray
+        x, y, heading in the frame of the trace; the best first, without neighbours of one code.
+        Empty if no field is strong, or if strong fields extend too far for one landmark.
+    which : (K,) ndarray
+        Row of ``strengths``.
     """
-    place = trace.places()
-    seen = ~np.isnan(trace.value_t)
-    strong = seen & (np.abs(np.where(seen, trace.value_t, 0)) > STRONG * geometry.threshold_t)
-    if not strong.any():
+    position = trace.sensor_positions()
+    is_measured = ~np.isnan(trace.field_t)
+    magnitude = np.abs(np.where(is_measured, trace.field_t, 0))
+    is_strong = is_measured & (magnitude > MIN_STRONG_FIELD_THRESHOLDS * geometry.threshold_t)
+    if not is_strong.any() or np.ptp(position[is_strong], axis=0).max() > MAX_STRONG_FIELD_EXTENT_M:
         return np.empty((0, 3)), np.empty(0, np.intp)
-    if np.ptp(place[strong], axis=0).max() > LARGEST_M:
-        return np.empty((0, 3)), np.empty(0, np.intp)
-    centres = _centres(place[strong], grid.step_m)
-    slack = _slack(trace)
-    turns = grid.headings()
-    cost = scan(place[seen], trace.value_t[seen], slack[seen], centres, turns, geometry, laid)
-    return _distinct(cost, centres, turns, most)
+    centres = _grid_centres(position[is_strong], grid.step_m)
+    sigma = _field_errors(trace)
+    headings = grid.headings()
+    cost = scan_costs(
+        position[is_measured],
+        trace.field_t[is_measured],
+        sigma[is_measured],
+        centres,
+        headings,
+        geometry,
+        strengths,
+    )
+    return _separate_minima(cost, centres, headings, max_candidates)
 
 
-def scan(
+def scan_costs(
     points: Array,
-    values: Array,
-    slack: Array,
+    field_t: Array,
+    sigma_t: Array,
     centres: Array,
-    turns: Array,
+    headings: Array,
     geometry: Geometry,
-    laid: Array,
+    strengths: Array,
 ) -> Array:
-    """Cost (turns, centres, L) of all that may be laid at each place: weighted squares left.
+    """Evaluate the weighted sum of squared residuals at all nodes of a grid.
 
-    One normal matrix of the four bars serves all ``laid`` (L, 4); a common gain is free
-    within :data:`GAINS`. ``slack`` is how far each value may be off.
+    Parameters
+    ----------
+    points, field_t, sigma_t : (n, 2), (n,), (n,) ndarray
+        Measured fields and standard deviations.
+    centres, headings : (M, 2), (H,) ndarray
+        Nodes.
+    geometry : Geometry
+    strengths : (L, 4) ndarray
+
+    Returns
+    -------
+    (H, M, L) ndarray
+        A common gain within :data:`GAIN_RANGE` is estimated for each.
     """
-    weight = 1 / slack**2
-    table = _table(geometry)
+    weight = 1 / sigma_t**2
+    table = _field_table(geometry)
     if kernels is None:
-        return scan_numpy(points, values, weight, centres, turns, table, laid)
-    cost = np.empty((len(turns), len(centres), len(laid)))
+        return scan_costs_numpy(points, field_t, weight, centres, headings, table, strengths)
+    cost = np.empty((len(headings), len(centres), len(strengths)))
     kernels.scan_landmarks(
         np.ascontiguousarray(points),
-        np.ascontiguousarray(values),
+        np.ascontiguousarray(field_t),
         weight,
-        len(values),
+        len(field_t),
         np.ascontiguousarray(centres),
         len(centres),
-        turns,
-        len(turns),
+        headings,
+        len(headings),
         table,
         len(table),
         TABLE_STEP_M,
-        *GAINS,
-        laid,
-        len(laid),
+        *GAIN_RANGE,
+        strengths,
+        len(strengths),
         cost,
     )
     return cost
 
 
-def scan_numpy(
+def scan_costs_numpy(
     points: Array,
-    values: Array,
+    field_t: Array,
     weight: Array,
     centres: Array,
-    turns: Array,
+    headings: Array,
     table: NDArray[np.float32],
-    laid: Array,
+    strengths: Array,
 ) -> Array:
-    """Twin of the compiled loop."""
+    """Evaluate :func:`scan_costs`; numpy twin of the compiled loop."""
     last = len(table) - 1
-    cost = np.empty((len(turns), len(centres), len(laid)))
-    power = (weight * values**2).sum()
-    for number, turn in enumerate(turns):
+    cost = np.empty((len(headings), len(centres), len(strengths)))
+    power = (weight * field_t**2).sum()
+    for number, heading in enumerate(headings):
         x, y = np.moveaxis(points - centres[:, None], -1, 0)
-        c, s = math.cos(turn), math.sin(turn)
+        c, s = math.cos(heading), math.sin(heading)
         u, v = (c * x + s * y) / TABLE_STEP_M, (c * y - s * x) / TABLE_STEP_M
         i, j = u + last / 2, v + last / 2
-        inside = (i >= 0) & (j >= 0) & (i < last) & (j < last)
-        i, j = np.where(inside, i, 0), np.where(inside, j, 0)
+        is_inside = (i >= 0) & (j >= 0) & (i < last) & (j < last)
+        i, j = np.where(is_inside, i, 0), np.where(is_inside, j, 0)
         a, b = i.astype(int), j.astype(int)
         di, dj = (i - a)[..., None], (j - b)[..., None]
-        unit = inside[..., None] * (
+        bar_field = is_inside[..., None] * (
             (1 - di) * ((1 - dj) * table[a, b] + dj * table[a, b + 1])
             + di * ((1 - dj) * table[a + 1, b] + dj * table[a + 1, b + 1])
         )
-        right = np.einsum("mnk,n->mk", unit, weight * values)
-        normal = np.einsum("mnk,mnl,n->mkl", unit, unit, weight, optimize=True)
-        top = right @ laid.T
-        square = np.einsum("ck,mkl,cl->mc", laid, normal, laid)
-        gain = np.clip(top / np.maximum(square, 1e-300), *GAINS)
-        cost[number] = power - 2 * gain * top + gain * gain * square
+        right = np.einsum("mnk,n->mk", bar_field, weight * field_t)
+        normal = np.einsum("mnk,mnl,n->mkl", bar_field, bar_field, weight, optimize=True)
+        product = right @ strengths.T
+        square = np.einsum("ck,mkl,cl->mc", strengths, normal, strengths)
+        gain = np.clip(product / np.maximum(square, 1e-300), *GAIN_RANGE)
+        cost[number] = power - 2 * gain * product + gain * gain * square
     return cost
 
 
-def _slack(trace: Trace) -> Array:
-    """(n, N) how far a field may be off, where the nearest node is a few millimetres away."""
+def _field_errors(trace: Trace) -> Array:
+    """Return the standard deviations (n, N) of fields at the nearest node of the grid."""
     step = np.hypot(*np.diff(trace.pose[:, :2], axis=0).T)
-    turn = np.abs(np.diff(trace.pose[:, 2])) * np.hypot(*trace.lever_m.T).max()
-    way = np.concatenate([[0], np.cumsum(step + turn)])
-    reach = max(NEAR_M, 1.01 * float(np.median(np.diff(way))))
-    near = np.abs(way[:, None] - way) <= reach
-    strength = np.abs(np.nan_to_num(trace.value_t))
-    most = np.where(near[:, :, None], strength, 0.0).max(axis=1)
-    beside = most.max(axis=1, keepdims=True)
-    return np.sqrt(FLOOR_T**2 + (SLACK * most) ** 2 + (BESIDE * beside) ** 2)
+    radius = np.hypot(*trace.sensor_position_m.T).max()
+    rotation = np.abs(np.diff(trace.pose[:, 2])) * radius
+    distance = np.concatenate([[0], np.cumsum(step + rotation)])
+    half_length = max(MIN_NEIGHBOURHOOD_M, 1.01 * float(np.median(np.diff(distance))))
+    is_neighbour = np.abs(distance[:, None] - distance) <= half_length
+    magnitude = np.abs(np.nan_to_num(trace.field_t))
+    strongest = np.where(is_neighbour[:, :, None], magnitude, 0.0).max(axis=1)
+    of_any_sensor = strongest.max(axis=1, keepdims=True)
+    return np.sqrt(
+        MIN_FIELD_ERROR_T**2
+        + (GRID_ERROR_FRACTION * strongest) ** 2
+        + (OTHER_SENSOR_ERROR_FRACTION * of_any_sensor) ** 2
+    )
 
 
-def _centres(strong: Array, step_m: float) -> Array:
-    """Nodes (m, 2) of the grid within reach of places (p, 2) of strong field."""
-    low = strong.min(axis=0) - FARTHEST_M
-    high = strong.max(axis=0) + FARTHEST_M
+def _grid_centres(strong: Array, step_m: float) -> Array:
+    """Return the nodes (m, 2) near enough to a position (p, 2) of strong field."""
+    low = strong.min(axis=0) - MAX_CENTRE_DISTANCE_M
+    high = strong.max(axis=0) + MAX_CENTRE_DISTANCE_M
     x, y = (np.arange(a, b + step_m, step_m) for a, b in zip(low, high, strict=True))
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    gap = ((nodes[:, None] - strong) ** 2).sum(axis=-1).min(axis=1)
-    return nodes[gap < FARTHEST_M**2]
+    squared_distance = ((nodes[:, None] - strong) ** 2).sum(axis=-1).min(axis=1)
+    return nodes[squared_distance < MAX_CENTRE_DISTANCE_M**2]
 
 
-def _distinct(
-    cost: Array, centres: Array, turns: Array, most: int
+def _separate_minima(
+    cost: Array, centres: Array, headings: Array, max_candidates: int
 ) -> tuple[Array, NDArray[np.intp]]:
-    """The best nodes, none of which is a neighbour of a better one that is laid alike."""
+    """Return the best nodes, without neighbours of a better one of the same strengths."""
     flat = cost.ravel()
-    order = np.argpartition(flat, min(60 * most, len(flat) - 1))[: 60 * most]
+    count = SORTED_NODES_PER_CANDIDATE * max_candidates
+    order = np.argpartition(flat, min(count, len(flat) - 1))[:count]
     order = order[np.argsort(flat[order])]
-    turn, node, code = np.unravel_index(order, cost.shape)
-    pose = np.column_stack([centres[node], turns[turn]])
-    left = np.ones(len(order), bool)
+    heading, node, which = np.unravel_index(order, cost.shape)
+    pose = np.column_stack([centres[node], headings[heading]])
+    is_left = np.ones(len(order), bool)
     chosen: list[int] = []
-    while left.any() and len(chosen) < most:
-        best = int(np.argmax(left))
+    while is_left.any() and len(chosen) < max_candidates:
+        best = int(np.argmax(is_left))
         chosen.append(best)
-        near = np.hypot(*(pose[:, :2] - pose[best, :2]).T) < APART_M
-        near &= np.abs(pose[:, 2] - pose[best, 2]) < APART_RAD
-        left &= ~(near & (code == code[best]))
-    return pose[chosen], code[chosen]
+        is_neighbour = np.hypot(*(pose[:, :2] - pose[best, :2]).T) < MIN_CANDIDATE_DISTANCE_M
+        is_neighbour &= np.abs(pose[:, 2] - pose[best, 2]) < MIN_CANDIDATE_ROTATION_RAD
+        is_left &= ~(is_neighbour & (which == which[best]))
+    return pose[chosen], which[chosen]
 
 
 @functools.lru_cache(maxsize=4)
-def _table(geometry: Geometry) -> NDArray[np.float32]:
-    """Fields of the bars over the landmark's plane, [x, y, bar] from -REACH_M up in even steps."""
-    count = round(REACH_M / TABLE_STEP_M)
+def _field_table(geometry: Geometry) -> NDArray[np.float32]:
+    """Tabulate the fields of the bars, [x, y, bar], over the plane of the sensors."""
+    count = round(TABLE_HALF_WIDTH_M / TABLE_STEP_M)
     line = np.arange(-count, count + 1) * TABLE_STEP_M
     plane = np.stack(np.meshgrid(line, line, indexing="ij"), -1)
-    return np.ascontiguousarray(bars.basis(geometry, plane), np.float32)
+    return np.ascontiguousarray(basis(geometry, plane), np.float32)

@@ -1,112 +1,130 @@
-"""One visit made ready for a fit: where each sensor was by odometry, and how that may be wrong."""
+"""Trace of one visit: fields along the paths of the sensors, and errors of the odometry.
+
+The path of the robot during a visit is known from odometry only. Its errors are linear in few
+unknowns (:func:`odometry_corrections`), which the fit of the landmark estimates as well.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+WALK_DISTANCE_M = 0.15
+"""Distance that counts as one unit of effort of the random walk."""
+
+WALK_ROTATION_RAD = math.pi / 2
+"""Rotation that counts as one unit of effort of the random walk."""
+
+CONSTANT_ERROR_COUNT = 3
+"""Number of leading corrections that are the same during a whole recording: scale, rotation scale
+and curvature."""
+
 
 @dataclass(frozen=True)
-class Drift:
-    """How far odometry is trusted: standard deviations of what is wrong with it.
+class OdometryDrift:
+    """Standard deviations of the errors of odometry.
 
     Attributes
     ----------
     scale : float
-        Of distances, constant.
-    turn_scale : float
-        Of turns, constant.
-    curvature_radpm : float
-        Turn a metre that odometry does not see, constant; the default is one degree on a
-        pass of 230 mm.
+        Relative error of distances, constant.
+    rotation_scale : float
+        Relative error of rotations, constant.
+    curvature_rad_per_m : float
+        Rotation per metre that odometry does not observe, constant; the default is one degree on
+        a pass of 230 mm.
     walk_m, walk_rad : float
-        Random walk of place and heading over one unit of effort, a way of
-        :data:`WAY_M` or a turn of :data:`TURN_RAD`.
+        Random walk of position and heading over one unit of effort: a distance of
+        :data:`WALK_DISTANCE_M` or a rotation of :data:`WALK_ROTATION_RAD`.
     """
 
     scale: float = 0.01
-    turn_scale: float = 0.01
-    curvature_radpm: float = math.radians(1) / 0.23
+    rotation_scale: float = 0.01
+    curvature_rad_per_m: float = math.radians(1) / 0.23
     walk_m: float = 0.2e-3
     walk_rad: float = math.radians(0.1)
 
 
-WAY_M = 0.15
-
-TURN_RAD = math.pi / 2
-
-
 @dataclass(frozen=True)
 class Trace:
-    """Field along the ways of the sensors in one visit, in a frame of the robot's odometry.
+    """Fields along the paths of the sensors during one visit, in a frame of the odometry.
 
-    The frame is the robot's at sample :attr:`reference`. The way is the odometry's plus
-    ``correction @ c``, where ``c`` is to be found and has the prior ``N(0, 1)``.
+    The frame is that of the robot at sample :attr:`reference`. The path is that of the odometry
+    plus ``correction @ c`` with unknown ``c``, whose prior is ``N(0, 1)``.
 
     Attributes
     ----------
     pose : (n, 3) ndarray
         Robot at each sample by odometry: x, y, heading.
     correction : (n, 3, m) ndarray
-        What each of m ways to be wrong changes in x, y, heading; 0 at the reference.
-    value_t : (n, N) ndarray
-        Fields; ``nan`` where there is none that can be used.
-    lever_m : (N, 2) ndarray
-        Sensors in the robot's frame.
+        Change of x, y, heading by one standard deviation of each of m errors; 0 at the reference.
+    field_t : (n, N) ndarray
+        Tesla; ``nan`` if there is no usable value.
+    sensor_position_m : (N, 2) ndarray
+        In the robot's frame.
     weight : (n,) ndarray
-        Samples of which each is the mean.
+        Number of readings of which each sample is the mean.
     reference : int
-    share : float
-        How many there were for each that was kept.
+    thinning : float
+        Number of original samples per sample that was kept.
     """
 
     pose: Array
     correction: Array
-    value_t: Array
-    lever_m: Array
+    field_t: Array
+    sensor_position_m: Array
     weight: Array
     reference: int
-    share: float = 1.0
+    thinning: float = 1.0
 
     def __len__(self) -> int:
         return len(self.pose)
 
-    def places(self) -> Array:
-        """(n, N, 2) sensors by odometry."""
-        return sensor_places(self.pose, self.lever_m)
+    def sensor_positions(self) -> Array:
+        """Return the positions (n, N, 2) of the sensors by odometry."""
+        return sensor_positions(self.pose, self.sensor_position_m)
 
-    def thinned(self, most: int) -> Trace:
-        """At most ``most`` samples of it, evenly chosen; the reference stays."""
-        step = math.ceil(len(self) / most)
+    def thinned(self, max_samples: int) -> Trace:
+        """Return at most ``max_samples`` samples, evenly chosen; the reference is among them."""
+        step = math.ceil(len(self) / max_samples)
         if step == 1:
             return self
         keep = np.arange(self.reference % step, len(self), step)
-        return Trace(
-            self.pose[keep],
-            self.correction[keep],
-            self.value_t[keep],
-            self.lever_m,
-            self.weight[keep],
-            self.reference // step,
-            self.share * step,
+        return replace(
+            self,
+            pose=self.pose[keep],
+            correction=self.correction[keep],
+            field_t=self.field_t[keep],
+            weight=self.weight[keep],
+            reference=self.reference // step,
+            thinning=self.thinning * step,
         )
 
 
-def sensor_places(pose: Array, lever_m: Array) -> Array:
-    """(n, N, 2) places of sensors at ``lever_m`` (N, 2) on a robot with poses (n, 3)."""
+# ---- poses in the plane
+
+
+def sensor_positions(pose: Array, position_m: Array) -> Array:
+    """Return the positions (n, N, 2) of sensors at ``position_m`` (N, 2) of a robot at (n, 3)."""
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
-    x = pose[:, 0, None] + cos * lever_m[:, 0] - sin * lever_m[:, 1]
-    y = pose[:, 1, None] + sin * lever_m[:, 0] + cos * lever_m[:, 1]
+    x = pose[:, 0, None] + cos * position_m[:, 0] - sin * position_m[:, 1]
+    y = pose[:, 1, None] + sin * position_m[:, 0] + cos * position_m[:, 1]
     return np.stack([x, y], -1)
 
 
+def planar_rotation(heading_rad: float) -> Array:
+    """Return the matrix (3, 3) that rotates x and y and keeps the heading."""
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
 def compose(pose: Array, local: Array) -> Array:
-    """Poses (..., 3) in the outer frame of what is at ``local`` (..., 3) as seen from ``pose``."""
+    """Transform poses ``local`` (..., 3) from the frame of ``pose`` (..., 3) to the outer one."""
     cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x, y = local[..., 0], local[..., 1]
     return np.stack(
@@ -120,22 +138,38 @@ def compose(pose: Array, local: Array) -> Array:
 
 
 def relative(pose: Array, origin: Array) -> Array:
-    """Poses (n, 3) as seen from the pose ``origin`` (3,)."""
+    """Transform poses (n, 3) to the frame of the pose ``origin`` (3,); inverse of compose."""
     cos, sin = math.cos(origin[2]), math.sin(origin[2])
     dx, dy = pose[:, 0] - origin[0], pose[:, 1] - origin[1]
     return np.column_stack([cos * dx + sin * dy, cos * dy - sin * dx, pose[:, 2] - origin[2]])
 
 
-def corrections(pose: Array, reference: int, drift: Drift) -> Array:
-    """(n, 3, m) what can be wrong with odometry, one standard deviation each.
+# ---- errors of odometry
 
-    Scales and curvature are constant over the way; a random walk is kept as a straight
-    line over each unit of effort.
+
+def odometry_corrections(pose: Array, reference: int, drift: OdometryDrift) -> Array:
+    """Linearize the errors of odometry.
+
+    Parameters
+    ----------
+    pose : (n, 3) ndarray
+        Path by odometry.
+    reference : int
+        Sample at which all corrections are zero.
+    drift : OdometryDrift
+
+    Returns
+    -------
+    (n, 3, m) ndarray
+        Change of x, y, heading by one standard deviation of each error. First the constant ones
+        (:data:`CONSTANT_ERROR_COUNT`), then the random walk of heading, x and y, each a linear
+        ramp over one unit of effort.
     """
     step = np.diff(pose, axis=0, prepend=pose[:1])
     length = np.hypot(step[:, 0], step[:, 1])
-    effort = np.cumsum(length / WAY_M + np.abs(step[:, 2]) / TURN_RAD)
-    way, turn = np.cumsum(length), np.cumsum(step[:, 2])
+    effort = np.cumsum(length / WALK_DISTANCE_M + np.abs(step[:, 2]) / WALK_ROTATION_RAD)
+    distance, rotation = np.cumsum(length), np.cumsum(step[:, 2])
+    # A path of a whole number of units must not get one more by rounding.
     parts = max(1, math.ceil(effort[-1] - 1e-9))
     unit = max(effort[-1] / parts, 1e-12)
     ramps = np.clip(effort[:, None] / unit - np.arange(parts), 0, 1) * math.sqrt(unit)
@@ -143,18 +177,18 @@ def corrections(pose: Array, reference: int, drift: Drift) -> Array:
     zero = np.zeros_like(ramps)
     heading = np.column_stack(
         [
-            drift.turn_scale * (turn - turn[reference]),
-            drift.curvature_radpm * (way - way[reference]),
+            drift.rotation_scale * (rotation - rotation[reference]),
+            drift.curvature_rad_per_m * (distance - distance[reference]),
             drift.walk_rad * ramps,
         ]
     )
-    swung = np.moveaxis(_swung(heading, step, reference), 2, 1)
+    by_heading = np.moveaxis(_effect_of_heading_errors(heading, step, reference), 2, 1)
     stretch = np.column_stack([pose[:, :2] - pose[reference, :2], np.zeros(len(pose))])
     shift = drift.walk_m * ramps
     return np.concatenate(
         [
             drift.scale * stretch[:, :, None],
-            swung,
+            by_heading,
             np.stack([shift, zero, zero], 1),
             np.stack([zero, shift, zero], 1),
         ],
@@ -162,29 +196,32 @@ def corrections(pose: Array, reference: int, drift: Drift) -> Array:
     )
 
 
-def bent(pose: Array, steady: Array, drift: Drift) -> Array:
-    """Poses (n, 3) of a way with its constant errors taken off, from its first pose on.
+def correct_constant_errors(pose: Array, errors: Array, drift: OdometryDrift) -> Array:
+    """Remove the constant errors from a path (n, 3), from its first pose on.
 
-    ``steady`` (3,) are scale, turn scale and curvature in standard deviations of ``drift``:
-    what the first three columns of :func:`corrections` are to first order, exactly.
+    ``errors`` (3,) are scale, rotation scale and curvature in standard deviations of ``drift``.
+    The first columns of :func:`odometry_corrections` are the linearization of this function.
     """
     step = np.diff(pose, axis=0, prepend=pose[:1])
-    way = np.cumsum(np.hypot(step[:, 0], step[:, 1]))
-    turn = pose[:, 2] - pose[0, 2]
-    wrong = drift.turn_scale * steady[1] * turn + drift.curvature_radpm * steady[2] * way
-    middle = wrong.copy()
-    middle[1:] = (wrong[1:] + wrong[:-1]) / 2
-    cos, sin = np.cos(middle), np.sin(middle)
-    stretch = 1 + drift.scale * steady[0]
+    distance = np.cumsum(np.hypot(step[:, 0], step[:, 1]))
+    rotation = pose[:, 2] - pose[0, 2]
+    change = (
+        drift.rotation_scale * errors[1] * rotation
+        + drift.curvature_rad_per_m * errors[2] * distance
+    )
+    mean_change = change.copy()
+    mean_change[1:] = (change[1:] + change[:-1]) / 2
+    cos, sin = np.cos(mean_change), np.sin(mean_change)
+    stretch = 1 + drift.scale * errors[0]
     x = np.cumsum(stretch * (cos * step[:, 0] - sin * step[:, 1]))
     y = np.cumsum(stretch * (sin * step[:, 0] + cos * step[:, 1]))
-    return np.column_stack([pose[0, 0] + x, pose[0, 1] + y, pose[:, 2] + wrong])
+    return np.column_stack([pose[0, 0] + x, pose[0, 1] + y, pose[:, 2] + change])
 
 
-def _swung(heading: Array, step: Array, reference: int) -> Array:
-    """(n, m, 3) what errors (n, m) of the heading do to the whole pose: the way swings."""
-    middle = heading.copy()
-    middle[1:] = (heading[1:] + heading[:-1]) / 2
-    x = np.cumsum(-middle * step[:, 1, None], axis=0)
-    y = np.cumsum(middle * step[:, 0, None], axis=0)
+def _effect_of_heading_errors(heading: Array, step: Array, reference: int) -> Array:
+    """Return the changes (n, m, 3) of the poses by errors (n, m) of the heading on the path."""
+    mean_heading = heading.copy()
+    mean_heading[1:] = (heading[1:] + heading[:-1]) / 2
+    x = np.cumsum(-mean_heading * step[:, 1, None], axis=0)
+    y = np.cumsum(mean_heading * step[:, 0, None], axis=0)
     return np.stack([x - x[reference], y - y[reference], heading], -1)

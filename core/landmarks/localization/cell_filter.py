@@ -1,8 +1,10 @@
-"""Which cells of the map were visited: a Bayes filter over cell and heading, and back again.
+"""Identification of the visited cells of a map: a Bayes filter over cell and heading.
 
-The paper compares three patterns in an L with the map (section 4.2). Here every visit
-counts, with the probabilities of all that it may have been; a landmark may be misread,
-missing or laid a bit off, and odometry says how many cells lie between two visits.
+The paper compares three patterns in an L with the map (section 4.2). This filter uses every visit
+with the probabilities of all its hypotheses. A landmark may be misread or missing, and odometry
+determines how many cells there are between two visits. The state is a cell and a heading in
+quarter turns, for each hypothesis of the visit, or a position outside of the map. A forward and a
+backward pass give the probabilities given all visits (Rabiner, Proc. IEEE 77 (1989) 257).
 """
 
 from __future__ import annotations
@@ -15,348 +17,482 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
-from locatk.core.landmarks.detection.trace import Drift
-from locatk.core.landmarks.landmark import CODES, rotated
-from locatk.core.landmarks.map.floor import HOLE, FloorMap, as_built_codes
+from locatk.core.landmarks.detection.hypotheses import DetectedVisit, Hypothesis, VisitHypotheses
+from locatk.core.landmarks.detection.trace import OdometryDrift
+from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, rotated
+from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, as_built_code, as_built_codes
+from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
 
-HALF_PI = math.pi / 2
+MIN_CELL_PROBABILITY = 0.8
+"""Posterior probability of a cell of the map from which on it is reported."""
 
-PAD = 3
-"""Cells around the map in which a robot may be too, though no landmark is told there."""
+PAD_CELLS = 3
+"""Cells around the map on which a robot may be as well, though the map has no landmark there."""
 
-UNTOLD = 1e-3
+UNMAPPED_LANDMARK_PROBABILITY = 1e-3
 """Probability of a landmark in a cell of the map that has none."""
 
-BEYOND = 0.01
-"""The same beside the map, of which it says nothing."""
+OUTSIDE_LANDMARK_PROBABILITY = 0.01
+"""Probability of a landmark in a cell outside of the map."""
 
-LOST = 1e-7
-"""Probability that a robot was carried to anywhere between two visits."""
+KIDNAP_PROBABILITY = 1e-7
+"""Probability that a robot was carried to any other cell between two visits."""
 
-ELSEWHERE = 1e-4
-"""Probability that a recording begins where the map has nothing to say: it is of another
-floor, or all fields have the other sign."""
+START_OUTSIDE_PROBABILITY = 1e-4
+"""Probability that a recording begins outside of the map: it is of another floor, or all fields
+have the opposite sign."""
 
-BACK = 1e-2
-"""Probability of coming onto the map, from one visit to the next, from elsewhere."""
+RETURN_PROBABILITY = 1e-2
+"""Probability of entering the map between two visits, from outside of it."""
 
-UNSEEN = 0.02
-"""Probability of no sighting of a landmark that lies on the way."""
+MISSED_LANDMARK_PROBABILITY = 0.02
+"""Probability of passing a landmark without a visit."""
 
-PLACE_M = 3e-3
-"""Standard deviation of a landmark's place, beside that of odometry."""
+LANDMARK_POSITION_SIGMA_M = 3e-3
+"""Standard deviation of the position of a landmark, in addition to that of odometry."""
 
-FAINT = 1e-4
-"""Probability under which a hypothesis of a visit is not followed."""
+HEADING_SIGMA_RAD = math.radians(2)
+"""Standard deviation of the difference of two landmarks' headings, in addition to odometry's."""
 
-MOST = 6
+MIN_HYPOTHESIS_PROBABILITY = 1e-4
+"""Probability below which a hypothesis of a visit is not followed."""
 
-FAR = 9.0
-"""Logarithm of likelihood that a step of whole cells may lack."""
+MAX_FOLLOWED_HYPOTHESES = 6
+
+MAX_STEP_LOG_ODDS = 9.0
+"""Log likelihood behind a perfect fit at which a step of whole cells is dropped."""
 
 
 @dataclass(frozen=True)
-class Located:
-    """Where on the map one sighting was.
+class CellEstimate:
+    """Cell of the map that a visit belongs to.
 
     Attributes
     ----------
     cell : (row, column)
     quarters : int
-        The heading of the hypothesis' frame in the map, in quarter turns.
+        Heading of the hypothesis' frame on the map, in quarter turns.
     hypothesis : int
-        Of the sighting, in its order.
+        Index among the hypotheses of the visit.
     probability : float
-        Of this cell and heading, given all sightings.
-    so_far : float
-        The same, given this sighting and those before it only.
+        Of this cell and heading, given all visits.
+    filtered_probability : float
+        Of this cell and heading, given this visit and the previous ones.
     """
 
-    cell: tuple[int, int]
+    cell: Cell
     quarters: int
     hypothesis: int
     probability: float
-    so_far: float
+    filtered_probability: float
 
 
 @dataclass(frozen=True)
-class _Step:
-    """Whole cells from one visit to the next, in the frame of the first one's hypothesis."""
+class IdentifiedVisit:
+    """Visit of a robot to a landmark, with its cell on the map.
 
-    before: int
-    after: int
-    cells: tuple[int, int]
-    quarters: int
-    odds: float
+    Attributes
+    ----------
+    segment : VisitSegment
+    hypotheses : VisitHypotheses
+    estimate : CellEstimate or None
+        None if the visit is refused, or if there is no map.
+    """
+
+    segment: VisitSegment
+    hypotheses: VisitHypotheses
+    estimate: CellEstimate | None = None
+
+    @property
+    def cell(self) -> Cell:
+        """Cell of the map; ``ValueError`` if there is none."""
+        return self._identified.cell
+
+    @property
+    def quarters(self) -> int:
+        """Heading of the hypothesis' frame on the map; ``ValueError`` if there is no cell."""
+        return self._identified.quarters
+
+    @property
+    def hypothesis(self) -> Hypothesis:
+        """Hypothesis that agrees with the map; ``ValueError`` if there is no cell."""
+        return self.hypotheses.hypotheses[self._identified.hypothesis]
+
+    @property
+    def _identified(self) -> CellEstimate:
+        if self.estimate is None:
+            raise ValueError("the visit has no cell on a map")
+        return self.estimate
 
 
-def locate(
-    sightings: Sequence[VisitHypotheses], floor: FloorMap, *, misread: float, drift: Drift
-) -> list[Located]:
-    """Places of sightings of one robot, in order of time.
+def identify_visits(
+    visits: Sequence[DetectedVisit], floor: FloorMap | None, *, misread: float, drift: OdometryDrift
+) -> list[IdentifiedVisit]:
+    """Identify the cells of all visits of one robot; arguments as of :func:`identify_cells`.
+
+    Refused visits are not used. Without a map no visit has a cell.
+    """
+    identified = [IdentifiedVisit(visit.segment, visit.hypotheses) for visit in visits]
+    if floor is None:
+        return identified
+    used = [n for n, visit in enumerate(visits) if not visit.hypotheses.refused]
+    estimates = identify_cells(
+        [visits[n].hypotheses for n in used], floor, misread=misread, drift=drift
+    )
+    for n, estimate in zip(used, estimates, strict=True):
+        identified[n] = replace(identified[n], estimate=estimate)
+    return identified
+
+
+def select_visits_on_map(
+    visits: Sequence[IdentifiedVisit], floor: FloorMap
+) -> list[IdentifiedVisit]:
+    """Return the visits whose cell is probable enough and has a landmark on the map."""
+    return [
+        visit
+        for visit in visits
+        if visit.estimate is not None
+        and visit.estimate.probability >= MIN_CELL_PROBABILITY
+        and as_built_code(floor, visit.cell) != HOLE
+    ]
+
+
+def identify_cells(
+    visits: Sequence[VisitHypotheses], floor: FloorMap, *, misread: float, drift: OdometryDrift
+) -> list[CellEstimate]:
+    """Identify the cells of the visits of one robot.
 
     Parameters
     ----------
-    sightings : sequence of Sighting
-        Each with a hypothesis at least.
+    visits : sequence of VisitHypotheses
+        In order of time, each with at least one hypothesis.
     floor : FloorMap
     misread : float
-        Probability that a landmark is laid otherwise than the map says, or is misread.
-    drift : Drift
+        Probability that a landmark differs from the map or is misread.
+    drift : OdometryDrift
         Of the odometry between visits.
 
     Returns
     -------
-    list of Located
+    list of CellEstimate
+        The most probable cell and heading of each visit.
     """
-    if not sightings:
+    if not visits:
         return []
-    kept = [_followed(sighting) for sighting in sightings]
+    followed = [_followed_hypotheses(visit) for visit in visits]
     steps = [
-        _steps(one, other, hypotheses, others, floor.pitch_m, drift)
-        for (one, other), (hypotheses, others) in zip(
-            pairwise(sightings), pairwise(kept), strict=True
+        _steps_between(first, second, hypotheses, next_hypotheses, floor.pitch_m, drift)
+        for (first, second), (hypotheses, next_hypotheses) in zip(
+            pairwise(visits), pairwise(followed), strict=True
         )
     ]
-    laid = as_built_codes(floor)
-    read = [_seen(hypotheses, laid, misread) for hypotheses in kept]
-    seen = list(read)
-    every = [sum(one.probability for _, one in hypotheses) / CODES for hypotheses in kept]
-    for number, code in _again(kept, steps).items():
-        # How a landmark is laid is drawn once: a second look tells nothing of where it is.
-        known = _known(kept[number], code, misread)
-        seen[number] = np.broadcast_to(known[:, None, None, None], seen[number].shape)
-        every[number] = float(known.sum())
-    unseen = _unseen(floor)
-    forward = [_normal(seen[0] / (4 * unseen.size) * (1 - ELSEWHERE), ELSEWHERE * every[0])]
-    for step, now, share in zip(steps, seen[1:], every[1:], strict=True):
-        belief, away = _moved(*forward[-1], step, len(now), unseen)
-        forward.append(_normal(belief * now, away * share))
-    backward = [(np.ones_like(seen[-1]), 1.0)]
+    codes = as_built_codes(floor)
+    map_likelihood = [_map_likelihood(hypotheses, codes, misread) for hypotheses in followed]
+    likelihood = list(map_likelihood)
+    outside_likelihood = [sum(one.probability for _, one in h) / CODE_COUNT for h in followed]
+    for number, code in _repeated_visits(followed, steps).items():
+        # A repeated visit adds no evidence of the cell: it is the same landmark, whether it
+        # agrees with the map or not.
+        of_code = _code_likelihood(followed[number], code, misread)
+        shape = likelihood[number].shape
+        likelihood[number] = np.broadcast_to(of_code[:, None, None, None], shape)
+        outside_likelihood[number] = float(of_code.sum())
+    miss = miss_likelihood(floor)
+
+    prior = (1 - START_OUTSIDE_PROBABILITY) / (4 * miss.size)
+    start_outside = START_OUTSIDE_PROBABILITY * outside_likelihood[0]
+    forward = [_normalized(likelihood[0] * prior, start_outside)]
+    for step, now, now_outside in zip(steps, likelihood[1:], outside_likelihood[1:], strict=True):
+        belief, outside = predict(*forward[-1], step, len(now), miss)
+        forward.append(_normalized(belief * now, outside * now_outside))
+    backward = [(np.ones_like(likelihood[-1]), 1.0)]
     for k in range(len(steps) - 1, -1, -1):
-        belief, away = backward[-1]
-        later = _moved_back(
-            belief * seen[k + 1], away * every[k + 1], steps[k], len(kept[k]), unseen
+        belief, outside = backward[-1]
+        earlier = predict_backward(
+            belief * likelihood[k + 1],
+            outside * outside_likelihood[k + 1],
+            steps[k],
+            len(followed[k]),
+            miss,
         )
-        backward.append(_normal(*later))
-    found = []
-    for hypotheses, own, (past, out), (future, still) in zip(
-        kept, read, forward, reversed(backward), strict=True
+        backward.append(_normalized(*earlier))
+
+    estimates = []
+    for hypotheses, own, (past, past_outside), (future, future_outside) in zip(
+        followed, map_likelihood, forward, reversed(backward), strict=True
     ):
-        both, away = _normal(past * future, out * still)
-        state = both.sum(axis=0)
-        quarters, row, column = np.unravel_index(np.argmax(state), state.shape)
-        # Of a landmark seen again the map has a word too in which hypothesis is right.
-        number = int(np.argmax((both * own)[:, quarters, row, column]))
-        found.append(
-            Located(
-                (int(row) - PAD, int(column) - PAD),
-                int(quarters),
-                hypotheses[number][0],
-                float(state[quarters, row, column]),
-                float(past[:, quarters, row, column].sum()),
+        posterior, _ = _normalized(past * future, past_outside * future_outside)
+        by_state = posterior.sum(axis=0)
+        quarters, row, column = np.unravel_index(np.argmax(by_state), by_state.shape)
+        # The map contributes to the choice of the hypothesis of a repeated visit as well.
+        number = int(np.argmax((posterior * own)[:, quarters, row, column]))
+        estimates.append(
+            CellEstimate(
+                cell=(int(row) - PAD_CELLS, int(column) - PAD_CELLS),
+                quarters=int(quarters),
+                hypothesis=hypotheses[number][0],
+                probability=float(by_state[quarters, row, column]),
+                filtered_probability=float(past[:, quarters, row, column].sum()),
             )
         )
-    return found
+    return estimates
 
 
-def _normal(belief: Array, away: float) -> tuple[Array, float]:
-    """Both, so that they sum to 1."""
-    total = float(belief.sum()) + away
-    return belief / total, away / total
+def _normalized(belief: Array, outside: float) -> tuple[Array, float]:
+    """Scale a belief, and the probability of being outside of the map, to the sum 1."""
+    total = float(belief.sum()) + outside
+    return belief / total, outside / total
 
 
-def _again(kept: list[list[tuple[int, Hypothesis]]], steps: list[list[_Step]]) -> dict[int, int]:
-    """Visits to a landmark that another visit has told better, and its code by that one.
-
-    Which visits are of one landmark is taken from the likeliest steps. Codes are in the
-    frame of the visit's likeliest hypothesis.
-    """
-    place: list[tuple[int, tuple[int, int], int]] = [(0, (0, 0), 0)]
-    for number, several in enumerate(steps, 1):
-        chain, (x, y), turn = place[-1]
-        straight = [step for step in several if step.before == 0 and step.after == 0]
-        if straight:
-            step = max(straight, key=lambda one: one.odds)
-            rows, columns = _on_map(step.cells, turn)
-            place.append((chain, (x + columns, y + rows), (turn + step.quarters) % 4))
-        else:
-            place.append((number, (0, 0), 0))
-    groups: dict[tuple[int, tuple[int, int]], list[int]] = {}
-    for number, (chain, cell, _) in enumerate(place):
-        groups.setdefault((chain, cell), []).append(number)
-    again: dict[int, int] = {}
-    for numbers in groups.values():
-        best = max(numbers, key=lambda n: kept[n][0][1].probability)
-        laid = int(rotated(kept[best][0][1].code, place[best][2]))
-        again |= {n: int(rotated(laid, -place[n][2])) for n in numbers if n != best}
-    return again
+def _followed_hypotheses(visit: VisitHypotheses) -> list[tuple[int, Hypothesis]]:
+    """Return the more probable hypotheses with their indices."""
+    numbered = list(enumerate(visit.hypotheses))
+    kept = [(n, h) for n, h in numbered if n == 0 or h.probability > MIN_HYPOTHESIS_PROBABILITY]
+    return kept[:MAX_FOLLOWED_HYPOTHESES]
 
 
-def _known(hypotheses: list[tuple[int, Hypothesis]], code: int, misread: float) -> Array:
-    """Likelihood (H,) of hypotheses of a landmark whose code is known, wherever it is."""
+# ---- likelihoods of one visit
+
+
+def _map_likelihood(
+    hypotheses: list[tuple[int, Hypothesis]], codes: NDArray[np.int64], misread: float
+) -> Array:
+    """Return the likelihood (H, 4, rows, columns) of each hypothesis in each state, with pad."""
+    padded = np.pad(codes, PAD_CELLS, constant_values=HOLE)
+    rotated_codes = np.stack([rotated(np.maximum(padded, 0), -q) for q in range(4)])
+    is_inside = np.pad(np.ones(codes.shape, bool), PAD_CELLS)
+    without_landmark = (
+        np.where(is_inside, UNMAPPED_LANDMARK_PROBABILITY, OUTSIDE_LANDMARK_PROBABILITY)
+        / CODE_COUNT
+    )
+    likelihood = np.empty((len(hypotheses), 4, *padded.shape))
+    for number, (_, one) in enumerate(hypotheses):
+        of_code = np.where(rotated_codes == one.code, 1 - misread, misread / (CODE_COUNT - 1))
+        likelihood[number] = one.probability * np.where(padded == HOLE, without_landmark, of_code)
+    return likelihood
+
+
+def _code_likelihood(hypotheses: list[tuple[int, Hypothesis]], code: int, misread: float) -> Array:
+    """Return the likelihood (H,) of the hypotheses of a landmark of known code, in any cell."""
     return np.array(
         [
-            one.probability * (1 - misread if one.code == code else misread / (CODES - 1))
+            one.probability * (1 - misread if one.code == code else misread / (CODE_COUNT - 1))
             for _, one in hypotheses
         ]
     )
 
 
-def _followed(sighting: VisitHypotheses) -> list[tuple[int, Hypothesis]]:
-    """The likelier hypotheses with their numbers."""
-    every = list(enumerate(sighting.hypotheses))
-    return [(n, h) for n, h in every if n == 0 or h.probability > FAINT][:MOST]
+def miss_likelihood(floor: FloorMap) -> Array:
+    """Return the likelihood (rows, columns) of passing a cell without a visit, with pad."""
+    padded = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE)
+    return np.where(padded == HOLE, 1.0, MISSED_LANDMARK_PROBABILITY)
 
 
-def _seen(
-    hypotheses: list[tuple[int, Hypothesis]], laid: NDArray[np.int64], misread: float
-) -> Array:
-    """Likelihood (H, 4, rows, columns) of each hypothesis in each state, the pad included."""
-    codes = np.pad(laid, PAD, constant_values=HOLE)
-    turned = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
-    inside = np.pad(np.ones(laid.shape, bool), PAD)
-    untold = np.where(inside, UNTOLD, BEYOND) / CODES
-    out = np.empty((len(hypotheses), 4, *codes.shape))
-    for place, (_, one) in enumerate(hypotheses):
-        same = np.where(turned == one.code, 1 - misread, misread / (CODES - 1))
-        out[place] = one.probability * np.where(codes == HOLE, untold, same)
-    return out
+# ---- steps between visits
 
 
-def _unseen(floor: FloorMap) -> Array:
-    """Likelihood (rows, columns) of passing a cell without a sighting, the pad included."""
-    return np.where(np.pad(floor.codes, PAD, constant_values=HOLE) == HOLE, 1.0, UNSEEN)
+@dataclass(frozen=True)
+class CellStep:
+    """Step of whole cells from one visit to the next, in the frame of the first hypothesis.
+
+    Attributes
+    ----------
+    before, after : int
+        Hypotheses of both visits, by their order among the followed ones.
+    cells : (int, int)
+        Along x and y.
+    quarters : int
+        Rotation of the frame of the second hypothesis against that of the first.
+    log_odds : float
+        Log likelihood, relative to the most likely step.
+    """
+
+    before: int
+    after: int
+    cells: tuple[int, int]
+    quarters: int
+    log_odds: float
 
 
-def _steps(
-    one: VisitHypotheses,
-    other: VisitHypotheses,
-    before: list[tuple[int, Hypothesis]],
-    after: list[tuple[int, Hypothesis]],
+def _steps_between(
+    first: VisitHypotheses,
+    second: VisitHypotheses,
+    hypotheses: list[tuple[int, Hypothesis]],
+    next_hypotheses: list[tuple[int, Hypothesis]],
     pitch_m: float,
-    drift: Drift,
-) -> list[_Step]:
-    """Steps of whole cells that odometry allows between two sightings."""
-    way = other.odometry[:2] - one.odometry[:2]
-    turn = float(other.odometry[2] - one.odometry[2])
-    back = -one.odometry[2]
-    ahead = np.array(
-        [
-            math.cos(back) * way[0] - math.sin(back) * way[1],
-            math.sin(back) * way[0] + math.cos(back) * way[1],
-        ]
+    drift: OdometryDrift,
+) -> list[CellStep]:
+    """Enumerate the steps of whole cells that agree with the odometry between two visits."""
+    shift = second.odometry[:2] - first.odometry[:2]
+    rotation = float(second.odometry[2] - first.odometry[2])
+    cos, sin = math.cos(-first.odometry[2]), math.sin(-first.odometry[2])
+    own_shift = np.array([cos * shift[0] - sin * shift[1], sin * shift[0] + cos * shift[1]])
+    length = float(np.hypot(*own_shift))
+    heading_sigma = math.hypot(
+        drift.curvature_rad_per_m * length, drift.rotation_scale * abs(rotation), drift.walk_rad
     )
-    length = float(np.hypot(*ahead))
-    swing = math.hypot(drift.curvature_radpm * length, drift.turn_scale * abs(turn), drift.walk_rad)
+    frame_sigma = np.hypot(heading_sigma, HEADING_SIGMA_RAD)
     steps = []
-    for i, (_, first) in enumerate(before):
-        for j, (_, last) in enumerate(after):
-            facing = first.pose[2] + turn - last.pose[2]
-            quarters = round(facing / HALF_PI)
-            rest = facing - quarters * HALF_PI
-            angle = np.hypot(swing, math.radians(2))
-            cos, sin = math.cos(first.pose[2]), math.sin(first.pose[2])
-            place = first.pose[:2] + [
-                cos * ahead[0] - sin * ahead[1],
-                sin * ahead[0] + cos * ahead[1],
+    for i, (_, start) in enumerate(hypotheses):
+        for j, (_, end) in enumerate(next_hypotheses):
+            frame_rotation = start.pose[2] + rotation - end.pose[2]
+            quarters = round(frame_rotation / HALF_PI_RAD)
+            misalignment = frame_rotation - quarters * HALF_PI_RAD
+            cos, sin = math.cos(start.pose[2]), math.sin(start.pose[2])
+            position = start.pose[:2] + [
+                cos * own_shift[0] - sin * own_shift[1],
+                sin * own_shift[0] + cos * own_shift[1],
             ]
-            c, s = math.cos(quarters * HALF_PI), math.sin(quarters * HALF_PI)
-            x, y = last.pose[:2]
-            cells = (place - [c * x - s * y, s * x + c * y]) / pitch_m
-            spread = math.hypot(
-                PLACE_M,
-                drift.scale * length,
-                swing * length,
-                _sigma(first),
-                _sigma(last),
+            c, s = math.cos(quarters * HALF_PI_RAD), math.sin(quarters * HALF_PI_RAD)
+            x, y = end.pose[:2]
+            cells = (position - [c * x - s * y, s * x + c * y]) / pitch_m
+            sigma_cells = (
+                math.hypot(
+                    LANDMARK_POSITION_SIGMA_M,
+                    drift.scale * length,
+                    heading_sigma * length,
+                    _position_sigma(start),
+                    _position_sigma(end),
+                )
+                / pitch_m
             )
-            sigma = spread / pitch_m
-            for a in range(math.floor(cells[0]), math.floor(cells[0]) + 2):
-                for b in range(math.floor(cells[1]), math.floor(cells[1]) + 2):
-                    miss = ((cells[0] - a) ** 2 + (cells[1] - b) ** 2) / sigma**2
-                    odds = -(miss + (rest / angle) ** 2) / 2
-                    if odds > -FAR:
-                        steps.append(_Step(i, j, (a, b), quarters, odds))
-    # How well odometry fits says nothing of the map: the best step counts in full.
-    best = max((step.odds for step in steps), default=0.0)
-    return [replace(step, odds=step.odds - best) for step in steps]
+            low_x, low_y = math.floor(cells[0]), math.floor(cells[1])
+            for a in (low_x, low_x + 1):
+                for b in (low_y, low_y + 1):
+                    squared = ((cells[0] - a) ** 2 + (cells[1] - b) ** 2) / sigma_cells**2
+                    log_odds = -(squared + (misalignment / frame_sigma) ** 2) / 2
+                    if log_odds > -MAX_STEP_LOG_ODDS:
+                        steps.append(CellStep(i, j, (a, b), quarters, log_odds))
+    # The quality of the odometry is no evidence of the cell: the best step counts in full.
+    best = max((step.log_odds for step in steps), default=0.0)
+    return [replace(step, log_odds=step.log_odds - best) for step in steps]
 
 
-def _sigma(hypothesis: Hypothesis) -> float:
-    """Standard deviation of its place, in metres."""
-    trace = float(np.trace(hypothesis.covariance[:2, :2]))
-    return math.sqrt(trace) if math.isfinite(trace) else 2 * PLACE_M
+def _position_sigma(hypothesis: Hypothesis) -> float:
+    """Return the standard deviation of the position of a hypothesis, in metres."""
+    variance = float(np.trace(hypothesis.covariance[:2, :2]))
+    return math.sqrt(variance) if math.isfinite(variance) else 2 * LANDMARK_POSITION_SIGMA_M
 
 
-def _moved(
-    belief: Array, away: float, steps: list[_Step], count: int, unseen: Array
+def _repeated_visits(
+    followed: list[list[tuple[int, Hypothesis]]], steps: list[list[CellStep]]
+) -> dict[int, int]:
+    """Find visits to landmarks that another visit determines better.
+
+    The visits to one landmark follow from the most likely steps.
+
+    Returns
+    -------
+    dict of int to int
+        Number of a visit to the code by the better visit, in the frame of the visit's most
+        probable hypothesis.
+    """
+    # Chain of visits that are connected by steps, cell in the frame of its first visit, heading.
+    path: list[tuple[int, tuple[int, int], int]] = [(0, (0, 0), 0)]
+    for number, candidates in enumerate(steps, 1):
+        chain, (x, y), heading = path[-1]
+        of_best = [step for step in candidates if step.before == 0 and step.after == 0]
+        if of_best:
+            step = max(of_best, key=lambda one: one.log_odds)
+            rows, columns = _rotate_step(step.cells, heading)
+            path.append((chain, (x + columns, y + rows), (heading + step.quarters) % 4))
+        else:
+            path.append((number, (0, 0), 0))
+    visits_of: dict[tuple[int, tuple[int, int]], list[int]] = {}
+    for number, (chain, cell, _) in enumerate(path):
+        visits_of.setdefault((chain, cell), []).append(number)
+    repeated: dict[int, int] = {}
+    for numbers in visits_of.values():
+        best = max(numbers, key=lambda n: followed[n][0][1].probability)
+        code = int(rotated(followed[best][0][1].code, path[best][2]))
+        repeated |= {n: int(rotated(code, -path[n][2])) for n in numbers if n != best}
+    return repeated
+
+
+def predict(
+    belief: Array, outside: float, steps: list[CellStep], count: int, miss: Array
 ) -> tuple[Array, float]:
-    """Belief (count, 4, rows, columns) after steps from ``belief`` (H, 4, rows, columns), and
-    that of being nowhere on the map."""
+    """Predict the belief at the next visit.
+
+    Parameters
+    ----------
+    belief : (H, 4, rows, columns) ndarray
+    outside : float
+        Probability of being outside of the map.
+    steps : list of CellStep
+    count : int
+        Number of hypotheses of the next visit.
+    miss : (rows, columns) ndarray
+
+    Returns
+    -------
+    belief : (count, 4, rows, columns) ndarray
+    outside : float
+    """
     total = float(belief.sum())
-    anywhere = (LOST * total + BACK * away) / belief[0].size / count
-    out = np.full((count, *belief.shape[1:]), anywhere)
-    left = (1 - BACK) * away + LOST * total
+    anywhere = KIDNAP_PROBABILITY * total + RETURN_PROBABILITY * outside
+    predicted = np.full((count, *belief.shape[1:]), anywhere / belief[0].size / count)
+    outside = (1 - RETURN_PROBABILITY) * outside + KIDNAP_PROBABILITY * total
     for step in steps:
-        weight = math.exp(step.odds)
+        weight = math.exp(step.log_odds)
         for quarters in range(4):
-            rows, columns = _on_map(step.cells, quarters)
-            going = weight * belief[step.before, quarters] * _passed(unseen, rows, columns)
-            moved = _shifted(going, rows, columns)
-            out[step.after, (quarters + step.quarters) % 4] += moved
-            left += float(going.sum() - moved.sum())
-    return out, max(left, 0.0)
+            rows, columns = _rotate_step(step.cells, quarters)
+            leaving = weight * belief[step.before, quarters] * _pass_likelihood(miss, rows, columns)
+            arriving = _shifted(leaving, rows, columns)
+            predicted[step.after, (quarters + step.quarters) % 4] += arriving
+            outside += float(leaving.sum() - arriving.sum())
+    return predicted, max(outside, 0.0)
 
 
-def _moved_back(
-    belief: Array, away: float, steps: list[_Step], count: int, unseen: Array
+def predict_backward(
+    belief: Array, outside: float, steps: list[CellStep], count: int, miss: Array
 ) -> tuple[Array, float]:
-    """The transpose of :func:`_moved`."""
+    """Apply the transpose of :func:`predict`."""
     total = float(belief.sum()) / belief[0].size / len(belief)
-    out = np.full((count, *belief.shape[1:]), LOST * (total + away))
+    predicted = np.full((count, *belief.shape[1:]), KIDNAP_PROBABILITY * (total + outside))
     for step in steps:
-        weight = math.exp(step.odds)
+        weight = math.exp(step.log_odds)
         for quarters in range(4):
-            rows, columns = _on_map(step.cells, quarters)
-            there = belief[step.after, (quarters + step.quarters) % 4]
-            back = _shifted(there, -rows, -columns, fill=away)
-            out[step.before, quarters] += weight * _passed(unseen, rows, columns) * back
-    return out, (1 - BACK) * away + BACK * total
+            rows, columns = _rotate_step(step.cells, quarters)
+            arriving = belief[step.after, (quarters + step.quarters) % 4]
+            leaving = _shifted(arriving, -rows, -columns, fill=outside)
+            predicted[step.before, quarters] += (
+                weight * _pass_likelihood(miss, rows, columns) * leaving
+            )
+    return predicted, (1 - RETURN_PROBABILITY) * outside + RETURN_PROBABILITY * total
 
 
-def _on_map(cells: tuple[int, int], quarters: int) -> tuple[int, int]:
-    """(rows, columns) of a step of (x, y) cells in a frame turned by quarters."""
+def _rotate_step(cells: tuple[int, int], quarters: int) -> tuple[int, int]:
+    """Return (rows, columns) of a step of (x, y) cells in a frame rotated by quarter turns."""
     x, y = cells
     for _ in range(quarters % 4):
         x, y = -y, x
     return y, x
 
 
-def _passed(unseen: Array, rows: int, columns: int) -> Array:
-    """Likelihood, by the cell of departure, that nothing was seen on a straight way."""
-    out = np.ones_like(unseen)
+def _pass_likelihood(miss: Array, rows: int, columns: int) -> Array:
+    """Return the likelihood, by cell of departure, of no visit on a straight path."""
+    likelihood = np.ones_like(miss)
     if rows and columns:
-        return out
+        return likelihood
     length = max(abs(rows), abs(columns))
     for k in range(1, length):
-        out *= _shifted(unseen, -rows * k // length, -columns * k // length, fill=1.0)
-    return out
+        likelihood *= _shifted(miss, -rows * k // length, -columns * k // length, fill=1.0)
+    return likelihood
 
 
 def _shifted(values: Array, rows: int, columns: int, fill: float = 0.0) -> Array:
-    """``values`` (rows, columns) moved up by whole cells."""
-    out = np.full_like(values, fill)
+    """Shift values (rows, columns) by whole cells."""
+    shifted = np.full_like(values, fill)
     height, width = values.shape
     if abs(rows) < height and abs(columns) < width:
-        source = (_span(-rows, height), _span(-columns, width))
-        target = (_span(rows, height), _span(columns, width))
-        out[target] = values[source]
-    return out
+        source = (_overlap(-rows, height), _overlap(-columns, width))
+        target = (_overlap(rows, height), _overlap(columns, width))
+        shifted[target] = values[source]
+    return shifted
 
 
-def _span(shift: int, size: int) -> slice:
+def _overlap(shift: int, size: int) -> slice:
     return slice(max(shift, 0), size + min(shift, 0))

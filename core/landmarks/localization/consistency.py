@@ -1,110 +1,146 @@
-"""What a user must be told of a solution: where the map, the floor or the robot are not as said."""
+"""Consistency of a localized robot with the map: doubts that a user must know."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from locatk.core.landmarks.localization import cell_filter as globalize
-from locatk.core.landmarks.localization import smoothing as smooth
-from locatk.core.landmarks.localization.recording import Recording, Seen
+from locatk.core.landmarks.detection.trace import OdometryDrift
+from locatk.core.landmarks.landmark import CODE_COUNT
+from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit, identify_cells
+from locatk.core.landmarks.localization.smoothing import LandmarkPrior, SmoothingResult
 from locatk.core.landmarks.map.floor import Cell, FloorMap
+from locatk.core.landmarks.preprocessing import HallRecording
 from locatk.core.landmarks.results import describe_visit
 from locatk.core.solution import SolverWarning
 
-CERTAIN = 0.99999
-"""Probability from which on a place on the map needs no remark."""
+CERTAIN_PROBABILITY = 0.99999
+"""Probability of a cell from which on no warning is given."""
 
-SURE = 0.999
-"""Probability from which on the remark asks for nothing more."""
+NEARLY_CERTAIN_PROBABILITY = 0.999
+"""Probability of a cell from which on the warning asks for no further landmark."""
 
-FEWEST_MARKS = 3
-"""Landmarks from which on one of them can be known to be off its place."""
+MIN_LANDMARKS_FOR_DISPLACEMENT = 3
+"""Number of landmarks from which on the displacement of one of them can be recognized."""
 
-FAR_OFF = 2.5
-"""Standard deviations that a landmark is found off its place to be called so."""
+MIN_DISPLACEMENT_SIGMAS = 2.5
+"""Deviation of a landmark from its pose on the map, in standard deviations of installation, from
+which on it counts as displaced."""
 
-FEWEST_WRONG = 2
+MIN_CONTRADICTIONS = 2
+MAX_CONTRADICTED_FRACTION = 1 / 3
+"""A map is rejected if at least so many landmarks, and more than this fraction of all, are misread
+or unexplained."""
 
-MOST_WRONG = 1 / 3
-"""Share of misread and unexplained landmarks from which on a map is not believed."""
-
-NO_MAP = SolverWarning("no_map", "no map, so that its landmarks have no cells")
+NO_MAP_WARNING = SolverWarning("no_map", "no map, so that its landmarks have no cells")
 
 
-def doubt(sure: float, first: int | None) -> SolverWarning | None:
-    """Warn of a place that has the probability ``sure``; None if it is certain.
+def warn_of_uncertain_cell(probability: float, first_certain: int | None) -> SolverWarning | None:
+    """Return a warning if the cells are uncertain, else None.
 
-    ``first`` is the number of the landmark at which it was certain, None where at none.
+    Parameters
+    ----------
+    probability : float
+        Of the least certain cell.
+    first_certain : int or None
+        Number of the landmark at which the cell was certain; None if it never was.
     """
-    if sure >= CERTAIN:
+    if probability >= CERTAIN_PROBABILITY:
         return None
-    if sure >= SURE:
-        message = f"its place on the map is all but certain ({sure:.5f})"
+    if probability >= NEARLY_CERTAIN_PROBABILITY:
+        message = f"its cell on the map is almost certain ({probability:.5f})"
     else:
-        end = "; one more landmark would settle it" if first is None else " at one landmark"
-        message = f"its place on the map has a probability of {sure:.5f}{end}"
+        end = "; visit one more landmark" if first_certain is None else " at one landmark"
+        message = f"its cell on the map has a probability of {probability:.5f}{end}"
     return SolverWarning("localization_uncertain", message)
 
 
-def displaced(marks: dict[Cell, smooth.Mark], smoothed: smooth.Smoothed) -> dict[Cell, float]:
-    """Landmarks that were found far off where the map has them, and how far (m)."""
-    if len(marks) < FEWEST_MARKS:
+def find_displaced_landmarks(
+    landmarks: Mapping[Cell, LandmarkPrior], smoothed: SmoothingResult
+) -> dict[Cell, float]:
+    """Return the landmarks that are far from their pose on the map, with the distance in metres."""
+    if len(landmarks) < MIN_LANDMARKS_FOR_DISPLACEMENT:
         return {}
-    found = {}
-    for cell, mark in marks.items():
-        shift = smoothed.marks[cell].pose - mark.pose
-        if np.abs(shift / mark.sigma).max() > FAR_OFF:
-            found[cell] = float(np.hypot(*shift[:2]))
-    return found
+    displaced = {}
+    for cell, prior in landmarks.items():
+        shift = smoothed.landmarks[cell].pose - prior.pose
+        if np.abs(shift / prior.sigma).max() > MIN_DISPLACEMENT_SIGMAS:
+            displaced[cell] = float(np.hypot(*shift[:2]))
+    return displaced
 
 
-def contradicted(found: Recording, usable: list[Seen], floor: FloorMap) -> bool:
-    """Whether map and recording differ as often as those of one floor cannot."""
+def is_map_contradicted(
+    visits: Sequence[IdentifiedVisit], on_map: Sequence[IdentifiedVisit], floor: FloorMap
+) -> bool:
+    """Return whether too many landmarks differ from the map.
+
+    Parameters
+    ----------
+    visits : sequence of IdentifiedVisit
+        All visits of a robot.
+    on_map : sequence of IdentifiedVisit
+        Those whose cell is known.
+    floor : FloorMap
+    """
     misread = sum(
-        describe_visit(one.sighting, one.located, floor).refused == "misread" for one in usable
+        describe_visit(visit.hypotheses, visit.estimate, floor).refused == "misread"
+        for visit in on_map
     )
-    unexplained = sum(one.sighting.refused == "not_explained" for one in found.seen)
-    wrong = misread + unexplained
-    return wrong >= FEWEST_WRONG and wrong > MOST_WRONG * (len(usable) + unexplained)
+    unexplained = sum(visit.hypotheses.refused == "not_explained" for visit in visits)
+    contradictions = misread + unexplained
+    return contradictions >= MIN_CONTRADICTIONS and contradictions > MAX_CONTRADICTED_FRACTION * (
+        len(on_map) + unexplained
+    )
 
 
-def why_not(found: Recording, sure: float) -> SolverWarning:
-    """Explain why a robot is not localised."""
-    device = found.run.samples.device
-    explained = [one for one in found.seen if not one.sighting.refused]
-    if explained:
-        message = f"not localised; the likeliest place has a probability of {sure:.2g}"
+def warn_of_missing_pose(
+    recording: HallRecording, visits: Sequence[IdentifiedVisit], probability: float
+) -> SolverWarning:
+    """Return the warning that explains why a robot is not localized.
+
+    ``probability`` is that of the most certain cell.
+    """
+    device = recording.samples.device
+    if any(not visit.hypotheses.refused for visit in visits):
+        message = f"not localised; the most likely cell has a probability of {probability:.2g}"
         return SolverWarning("not_localised", message).about(device)
-    if found.seen:
+    if visits:
         message = (
-            f"{len(found.seen)} visits, but no landmark explains one of them; check the "
-            "landmarks' geometry, the sensors and the odometry"
+            f"{len(visits)} visits, but no landmark explains any of them; check the geometry of "
+            "the landmarks, the sensors and the odometry"
         )
         return SolverWarning("visits_unexplained", message).about(device)
-    largest = 1e3 * float(np.nanmax(np.abs(found.run.samples.field_t)))
-    message = f"no landmark was met; the strongest field is {largest:.2g} mT"
+    strongest_mt = 1e3 * float(np.nanmax(np.abs(recording.samples.field_t)))
+    message = f"no landmark was detected; the strongest field is {strongest_mt:.2g} mT"
     return SolverWarning("no_landmark", message).about(device)
 
 
-def exchanged(found: Recording, floor: FloorMap, misread: float) -> list[SolverWarning]:
-    """Warn if the map would fit what was seen with all fields of the other sign."""
-    turned = [
+def warn_of_opposite_polarity(
+    device: str,
+    visits: Sequence[IdentifiedVisit],
+    floor: FloorMap,
+    *,
+    misread: float,
+    drift: OdometryDrift,
+) -> list[SolverWarning]:
+    """Return a warning if the robot would be localized with all fields of the opposite sign."""
+    opposite = [
         replace(
-            one.sighting,
-            hypotheses=tuple(replace(h, code=15 - h.code) for h in one.sighting.hypotheses),
+            visit.hypotheses,
+            hypotheses=tuple(
+                replace(one, code=CODE_COUNT - 1 - one.code) for one in visit.hypotheses.hypotheses
+            ),
         )
-        for one in found.seen
-        if not one.sighting.refused
+        for visit in visits
+        if not visit.hypotheses.refused
     ]
-    if not turned:
-        return []
-    told = globalize.locate(turned, floor, misread=misread, drift=found.priors.drift)
-    if max(one.probability for one in told) < CERTAIN:
+    estimates = identify_cells(opposite, floor, misread=misread, drift=drift)
+    if max((one.probability for one in estimates), default=0.0) < CERTAIN_PROBABILITY:
         return []
     message = (
-        "with N and S exchanged it would be localised; are the sensors or all bars the other way "
-        "up?"
+        "with N and S exchanged it would be localised; are the sensors or all bars mounted upside "
+        "down?"
     )
-    return [SolverWarning("polarity_exchanged", message).about(found.run.samples.device)]
+    return [SolverWarning("polarity_exchanged", message).about(device)]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, code_of, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, code_of, rotated
 from locatk.core.landmarks.map.floor import HOLE, STEPS, FloorMap
 
 Integers = NDArray[np.int64]
@@ -28,7 +28,7 @@ WINDOW_PATHS: dict[str, tuple[tuple[int, int], ...]] = {
 
 ALPHABET_CODES: dict[str, tuple[int, ...]] = {
     "6": tuple(code_of(letters) for letters in PATTERNS),
-    "16": tuple(range(CODES)),
+    "16": tuple(range(CODE_COUNT)),
     "compass": tuple(code_of(letters) for letters in ("NNNS", "SSSN", "NNSS")),
 }
 """Codes of the landmarks of each alphabet.
@@ -155,4 +155,4 @@ def _shift(grid: Bools, row: int, column: int) -> Bools:
 
 def encode_readings(letters: Integers) -> Integers:
     """Return one number (n,) per reading (n, k) of letters 0 to 15."""
-    return np.asarray(letters @ (CODES ** np.arange(letters.shape[1])), np.int64)
+    return np.asarray(letters @ (CODE_COUNT ** np.arange(letters.shape[1])), np.int64)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.landmarks import visits
-from locatk.core.landmarks.detection.trace import compose, sensor_places
+from locatk.core.landmarks.detection.trace import compose, sensor_positions
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.published.first_step import bar_radii
@@ -226,7 +226,7 @@ class PublishedDriver:
                 return None
             yield from self._move((SEARCH_STEP_M, 0.0))
         yield from self._leave_territory()
-        position = sensor_places(self._now.pose[first:], self._now.lever_arm_m)
+        position = sensor_positions(self._now.pose[first:], self._now.lever_arm_m)
         _, centre, _ = run_first_step(
             position, self._now.field_t[first:], self.geometry.threshold_t, self._radii_m
         )

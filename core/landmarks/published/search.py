@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.landmarks import visits
+from locatk.core.landmarks import preprocessing
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
-from locatk.core.landmarks.detection.trace import Drift, relative, sensor_places
+from locatk.core.landmarks.detection.trace import OdometryDrift, relative, sensor_positions
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, name
@@ -173,7 +173,7 @@ def spin_valleys(
         In the frame of the odometry.
     """
     centre = np.median(pose[:, :2], axis=0)
-    profile = circle_profile(sensor_places(pose, lever_arm_m), field_t, centre)
+    profile = circle_profile(sensor_positions(pose, lever_arm_m), field_t, centre)
     if np.isnan(profile).any():
         return None, centre
     return find_valleys(profile, HYSTERESIS_FRACTION * geometry.threshold_t), centre
@@ -245,16 +245,16 @@ def unexplained_fraction(
     cos, sin = math.cos(heading), math.sin(heading)
     pose[:, :2] = pose[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
     pose[:, 2] += heading
-    expected = landmark_field(geometry, code, sensor_places(pose, lever_arm_m))
+    expected = landmark_field(geometry, code, sensor_positions(pose, lever_arm_m))
     return math.sqrt(np.nanmean((field - expected) ** 2) / np.nanmean(field**2))
 
 
 def _find_visits(
     samples: HallSamples, odometry: Trajectory, geometry: Geometry
 ) -> list[_VisitSearch]:
-    recording = visits.driven(samples, odometry)
+    recording = preprocessing.preprocess(samples, odometry)
     radii_m = bar_radii(geometry)
-    found = visits.find(recording, geometry, Drift())
+    found = preprocessing.segment_visits(recording, geometry, OdometryDrift())
     return [_VisitSearch(recording, visit.first, visit.stop, geometry, radii_m) for visit in found]
 
 
@@ -263,7 +263,7 @@ class _VisitSearch:
 
     def __init__(
         self,
-        recording: visits.Driven,
+        recording: preprocessing.HallRecording,
         first: int,
         stop: int,
         geometry: Geometry,
@@ -284,7 +284,7 @@ class _VisitSearch:
     def first_step(self) -> FirstStep:
         """Run the first step on the first pass."""
         stop = self._end_of_pass()
-        position = sensor_places(self.pose[:stop], self.lever_arm)
+        position = sensor_positions(self.pose[:stop], self.lever_arm)
         entries, centre, voted = run_first_step(
             position, self.field[:stop], self.geometry.threshold_t, self.radii_m
         )

@@ -18,9 +18,9 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.detection.trace import compose, relative
 from locatk.core.landmarks.halls import HallSamples
-from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.localization.cell_filter import HALF_PI, Located
-from locatk.core.landmarks.localization.consistency import NO_MAP
+from locatk.core.landmarks.landmark import HALF_PI_RAD, Geometry
+from locatk.core.landmarks.localization.cell_filter import CellEstimate
+from locatk.core.landmarks.localization.consistency import NO_MAP_WARNING
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.published.global_localization import landmark_sequence, match_map
 from locatk.core.landmarks.published.search import detect_landmarks
@@ -82,7 +82,7 @@ def solve(
             )
             warnings.append(SolverWarning("not_localised", message).about(device))
         else:
-            warnings.append(NO_MAP.about(device))
+            warnings.append(NO_MAP_WARNING.about(device))
         for n, visit in enumerate(visits):
             detections.append(describe_visit(visit, located.get(n), floor))
             if visit.refused:
@@ -100,7 +100,7 @@ def solve(
     )
 
 
-def _locate_visits(visits: Sequence[VisitHypotheses], floor: FloorMap) -> dict[int, Located]:
+def _locate_visits(visits: Sequence[VisitHypotheses], floor: FloorMap) -> dict[int, CellEstimate]:
     """Return the cells of the visits by their number.
 
     They start from the first three visits in a row that occur once on the map; empty if there are
@@ -126,11 +126,11 @@ def _propagate_cells(
     cell: tuple[int, int],
     arrival: int,
     floor: FloorMap,
-) -> dict[int, Located]:
+) -> dict[int, CellEstimate]:
     """Return the cells of all visits, from one with known cell and heading on arrival."""
-    step = visits[known].landmark_place() - visits[known - 1].landmark_place()
-    odometry_rotation = arrival * HALF_PI - math.atan2(step[1], step[0])
-    located = {known: Located(cell, _quarters(visits[known], odometry_rotation), 0, 1.0, 1.0)}
+    step = visits[known].landmark_position() - visits[known - 1].landmark_position()
+    odometry_rotation = arrival * HALF_PI_RAD - math.atan2(step[1], step[0])
+    located = {known: CellEstimate(cell, _quarters(visits[known], odometry_rotation), 0, 1.0, 1.0)}
     for numbers in (range(known + 1, len(visits)), range(known - 1, -1, -1)):
         last, rotation = known, odometry_rotation
         for n in numbers:
@@ -139,11 +139,11 @@ def _propagate_cells(
                 continue
             # The last landmark gives the rotation of the odometry's frame on the map.
             rotation = (
-                located[last].quarters * HALF_PI
+                located[last].quarters * HALF_PI_RAD
                 + visits[last].best.pose[2]
                 - visits[last].odometry[2]
             )
-            x, y = visit.landmark_place() - visits[last].landmark_place()
+            x, y = visit.landmark_position() - visits[last].landmark_position()
             cells = (
                 np.array(
                     [
@@ -158,7 +158,7 @@ def _propagate_cells(
                 continue
             row, column = located[last].cell
             next_cell = (row + int(whole[0]), column + int(whole[1]))
-            located[n] = Located(next_cell, _quarters(visit, rotation), 0, 1.0, 1.0)
+            located[n] = CellEstimate(next_cell, _quarters(visit, rotation), 0, 1.0, 1.0)
             last = n
     return located
 
@@ -166,13 +166,13 @@ def _propagate_cells(
 def _quarters(visit: VisitHypotheses, odometry_rotation: float) -> int:
     """Return the rotation of a visit's frame on the map, in quarter turns."""
     heading = float(visit.odometry[2]) + odometry_rotation
-    return round((heading - visit.best.pose[2]) / HALF_PI) % 4
+    return round((heading - visit.best.pose[2]) / HALF_PI_RAD) % 4
 
 
 def _dead_reckoning(
     device: str,
     visits: Sequence[VisitHypotheses],
-    located: dict[int, Located],
+    located: dict[int, CellEstimate],
     odometry: Trajectory,
     floor: FloorMap,
 ) -> Trajectory:
@@ -184,7 +184,7 @@ def _dead_reckoning(
     starts[0] = 0
     for k, n in enumerate(numbers):
         part = slice(starts[k], starts[k + 1] if k + 1 < len(numbers) else len(own))
-        frame = np.array([*floor.place(located[n].cell), located[n].quarters * HALF_PI])
+        frame = np.array([*floor.place(located[n].cell), located[n].quarters * HALF_PI_RAD])
         at_landmark = compose(frame, visits[n].best.pose)
         pose[part] = compose(at_landmark, relative(own[part], visits[n].odometry))
     return Trajectory(

@@ -16,7 +16,14 @@ from scipy.spatial import cKDTree
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_exp
-from locatk.core.landmarks.landmark import CODES, PATTERN_OF, PATTERNS, Geometry, code_of, signs
+from locatk.core.landmarks.landmark import (
+    CODE_COUNT,
+    PATTERN_OF,
+    PATTERNS,
+    Geometry,
+    code_of,
+    signs,
+)
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.landmarks.simulation.options import Errors, Faults, RandomSource
 from locatk.core.magnetics import MU0_4PI, dipole_field
@@ -170,7 +177,7 @@ def _other_codes(alphabet: str, code: int) -> list[int]:
         codes = [code_of(letters) for letters in PATTERNS]
         return [other for other in codes if PATTERN_OF[other] != PATTERN_OF[code]]
     compass = [code_of(letters) for letters in ("NNNS", "SSSN", "NNSS")]
-    return [c for c in (compass if alphabet == "compass" else range(CODES)) if c != code]
+    return [c for c in (compass if alphabet == "compass" else range(CODE_COUNT)) if c != code]
 
 
 def scatter_bars(geometry: Geometry, draws: Array, errors: Errors) -> tuple[Array, Array, Array]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
-from locatk.core.landmarks.landmark import CODES, Geometry, signs
+from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, signs
 from locatk.core.landmarks.simulation.floor import BAR_DRAWS, bar_fields, scatter_bars
 from locatk.core.landmarks.simulation.options import (
     ASIDE_RAD,
@@ -188,9 +188,9 @@ def _codes(
     count: int, code: int | Sequence[int] | None, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     if code is None:
-        return rng.integers(0, CODES, count)
+        return rng.integers(0, CODE_COUNT, count)
     codes = np.atleast_1d(np.asarray(code, np.int64))
-    if not len(codes) or codes.min() < 0 or codes.max() >= CODES:
+    if not len(codes) or codes.min() < 0 or codes.max() >= CODE_COUNT:
         raise InputError(f"landmarks of the codes {codes.tolist()}", hint="Codes are 0 to 15")
     return np.resize(codes, count)
 

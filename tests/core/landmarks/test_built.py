@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.detection import neighbours
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
-from locatk.core.landmarks.detection.trace import Drift, Trace, sensor_places
+from locatk.core.landmarks.detection.trace import OdometryDrift, Trace, sensor_positions
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import code_of, rotated, signs
-from locatk.core.landmarks.localization import cell_filter as globalize
+from locatk.core.landmarks.localization.cell_filter import identify_cells
+from locatk.core.landmarks.localization.smoothing import subtract_neighbours
 from locatk.core.landmarks.map.floor import (
     HOLE,
     AsBuiltLandmark,
@@ -63,15 +63,15 @@ def test_fields_of_neighbours_are_those_of_their_bars_as_built() -> None:
     others = [mark for cell, mark in laid.items() if cell != (0, 0)]
     pose = np.column_stack([np.linspace(-0.02, 0.05, 15), np.full(15, 0.01), np.full(15, 0.3)])
     local = pose.copy()
-    place = sensor_places(pose, circle())
+    place = sensor_positions(pose, circle())
     height = np.full((*place.shape[:2], 1), floor.geometry.sensor_height_m)
     value = floor_field(floor.geometry, others, np.concatenate([place, height], axis=-1))
     trace = Trace(local, np.zeros((15, 3, 1)), value, circle(), np.ones(15), 0)
-    left = neighbours.without(trace, np.zeros(3), np.zeros(1), (0, 0), floor).value_t
+    left = subtract_neighbours(trace, np.zeros(3), np.zeros(1), (0, 0), floor).field_t
     assert np.abs(value).max() > 1e-3
     assert np.abs(left).max() < 2e-6
     wrong = FloorMap(CODES[:2, :2], pitch_m=0.12)
-    left = neighbours.without(trace, np.zeros(3), np.zeros(1), (0, 0), wrong).value_t
+    left = subtract_neighbours(trace, np.zeros(3), np.zeros(1), (0, 0), wrong).field_t
     assert np.abs(left).max() > 1e-4
 
 
@@ -88,7 +88,7 @@ def test_a_flipped_bar_that_is_known_does_not_count_against_a_place() -> None:
     ]  # fmt: skip
     sure = {}
     for floor in (FloorMap(CODES), FloorMap(CODES, built=flip)):
-        told = globalize.locate(sightings, floor, misread=0.01, drift=Drift())
+        told = identify_cells(sightings, floor, misread=0.01, drift=OdometryDrift())
         sure[bool(floor.built)] = told[-1].probability
         if floor.built:
             assert [one.cell for one in told] == [cell for cell, _ in tour]

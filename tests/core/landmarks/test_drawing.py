@@ -21,14 +21,14 @@ from locatk.core.landmarks.drawing.landmark import (
 from locatk.core.landmarks.drawing.plan import round_scale
 from locatk.core.landmarks.drawing.templates import cells_by_code, cells_text
 from locatk.core.landmarks.field import landmark_field
-from locatk.core.landmarks.landmark import CODES, Geometry, name, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, name, rotated
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
 
 OTHER = Geometry(bar_length_m=0.02, bar_width_m=0.004, radius_m=0.0315, sensor_height_m=0.01)
 
 
 @pytest.mark.parametrize("geometry", [Geometry(), OTHER])
-@pytest.mark.parametrize("code", range(CODES))
+@pytest.mark.parametrize("code", range(CODE_COUNT))
 def test_arrows_point_to_the_poles_at_which_the_field_emerges(
     geometry: Geometry, code: int
 ) -> None:
@@ -63,7 +63,7 @@ def test_outlines_are_the_bars(geometry: Geometry) -> None:
 @pytest.mark.parametrize("quarters", range(4))
 def test_a_rotated_landmark_is_the_rotated_drawing(quarters: int) -> None:
     rotation = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
-    for code in range(CODES):
+    for code in range(CODE_COUNT):
         first = bar_outlines(Geometry(), code)
         second = bar_outlines(Geometry(), int(rotated(code, quarters)))
         for number, bar in enumerate(first):
@@ -92,7 +92,7 @@ def test_a_drawing_stays_within_its_half_side(geometry: Geometry) -> None:
     assert bars_half_side(geometry) < np.abs(away).max() <= drawing_half_side(geometry)
 
 
-@pytest.mark.parametrize("code", range(CODES))
+@pytest.mark.parametrize("code", range(CODE_COUNT))
 def test_symbols_point_to_north_and_are_filled_if_counter_clockwise(code: int) -> None:
     marks = draw_symbol(code, (10.0, 20.0), 8.0)
     bars = [mark for mark in marks if isinstance(mark, Polygon)]

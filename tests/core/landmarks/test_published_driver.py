@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from locatk.core.landmarks.detection.trace import compose, sensor_places
+from locatk.core.landmarks.detection.trace import compose, sensor_positions
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.landmark import Geometry, code_of, rotated
@@ -50,7 +50,7 @@ class Bench:
     def measure(self) -> Measurements:
         time_s = np.arange(int(self.robot.time_s * 50) + 1) / 50
         pose = self.robot.poses_at(time_s)
-        points = sensor_places(pose, self.sensors.position_m)
+        points = sensor_positions(pose, self.sensors.position_m)
         field = np.zeros(points.shape[:2])
         for centre, code in self.landmarks.items():
             field += landmark_field(GEOMETRY, code, points - centre)

@@ -1,4 +1,4 @@
-"""Whole recordings: right places, and nothing wrong without a word."""
+"""Solver on whole recordings: correct poses, and no wrong result without a warning."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
+from locatk.core.landmarks import solver
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import pattern
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
@@ -69,78 +70,80 @@ def solved(
     return solve([samples], floor, odometry=[own])
 
 
-def farthest(one: SimulatedSession, found: Solution) -> float:
+def farthest(one: SimulatedSession, solution: Solution) -> float:
     """Largest distance of a pose to the truth, in metres."""
-    told: Trajectory = found.trajectories[0]
+    trajectory: Trajectory = solution.trajectories[0]
     truth, start = one.truth[0], one.truth[0].time_ns[0]
-    true = [np.interp(told.time_ns - start, truth.time_ns - start, c) for c in truth.position.T]
-    return float(np.hypot(*(told.position - np.column_stack(true))[:, :2].T).max())
+    true = [
+        np.interp(trajectory.time_ns - start, truth.time_ns - start, c) for c in truth.position.T
+    ]
+    return float(np.hypot(*(trajectory.position - np.column_stack(true))[:, :2].T).max())
 
 
 @pytest.mark.slow
 def test_a_session_without_faults() -> None:
-    found = solved(session())
-    assert [seen.cell for seen in found.detections] == CELLS
-    for seen in found.detections:
-        assert seen.code == CODES[seen.cell]
-        assert seen.pattern == pattern(seen.code)
-        assert seen.refused == ""
-    assert farthest(session(), found) < 3e-3
-    assert found.warnings == ()
-    assert found.rejected == {}
-    told = found.facts.robots["robot"]
-    assert told.localised
-    assert told.landmarks_to_localise in (3, 4, 5)
-    assert told.probability > 0.9999
+    solution = solved(session())
+    assert [detection.cell for detection in solution.detections] == CELLS
+    for detection in solution.detections:
+        assert detection.code == CODES[detection.cell]
+        assert detection.pattern == pattern(detection.code)
+        assert detection.refused == ""
+    assert farthest(session(), solution) < 3e-3
+    assert solution.warnings == ()
+    assert solution.rejected == {}
+    trajectory = solution.facts.robots["robot"]
+    assert trajectory.localised
+    assert trajectory.landmarks_to_localise in (3, 4, 5)
+    assert trajectory.probability > 0.9999
 
 
 @pytest.mark.slow
-def test_the_least_pitch() -> None:
+def test_smallest_pitch() -> None:
     floor = FloorMap(CODES, pitch_m=0.16)
     one = drive(floor)
-    found = solved(one, floor)
-    assert [seen.cell for seen in found.detections] == CELLS
-    assert farthest(one, found) < 3e-3
+    solution = solved(one, floor)
+    assert [detection.cell for detection in solution.detections] == CELLS
+    assert farthest(one, solution) < 3e-3
 
 
 @pytest.mark.slow
-def test_places_of_detections_are_beside_their_landmarks() -> None:
+def test_detections_give_the_pose_relative_to_the_landmark() -> None:
     one = session()
     truth = one.truth[0]
-    for seen in solved(one).detections:
-        at = np.argmin(np.abs(truth.time_ns * 1e-9 - seen.time_s))
-        away = truth.position[at, :2] - FLOOR.place(seen.cell)
-        assert seen.x_m == pytest.approx(away[0], abs=4e-3)
-        assert seen.y_m == pytest.approx(away[1], abs=4e-3)
+    for detection in solved(one).detections:
+        at = np.argmin(np.abs(truth.time_ns * 1e-9 - detection.time_s))
+        away = truth.position[at, :2] - FLOOR.place(detection.cell)
+        assert detection.x_m == pytest.approx(away[0], abs=4e-3)
+        assert detection.y_m == pytest.approx(away[1], abs=4e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-def test_another_map_is_not_believed(seed: int) -> None:
+def test_map_of_another_floor_is_rejected(seed: int) -> None:
     other = FloorMap(np.random.default_rng(100 + seed).integers(0, 16, (12, 12)))
-    found = solved(session(), other)
-    assert not found.trajectories
-    assert "not_localised" in warning_codes(found)
+    solution = solved(session(), other)
+    assert not solution.trajectories
+    assert "not_localised" in warning_codes(solution)
 
 
-def test_without_a_map_landmarks_are_told() -> None:
-    found = solved(session(), None)
-    assert not found.trajectories
-    assert len(found.detections) == len(CELLS)
-    assert {pattern(CODES[c]) for c in CELLS} == {s.pattern for s in found.detections}
-    assert "no_map" in warning_codes(found)
+def test_landmarks_are_detected_without_a_map() -> None:
+    solution = solved(session(), None)
+    assert not solution.trajectories
+    assert len(solution.detections) == len(CELLS)
+    assert {pattern(CODES[c]) for c in CELLS} == {s.pattern for s in solution.detections}
+    assert "no_map" in warning_codes(solution)
 
 
 def test_part_of_a_floor_as_the_map() -> None:
-    """Poses beyond it are odometry's, and as unsure."""
+    """Poses outside of it are dead reckoning, with its covariance."""
     part = FloorMap(CODES[:, :5])
-    found = solved(session(), part)
-    for seen in found.detections:
-        if seen.cell is not None:
-            assert seen.cell[1] < 5
-    assert any(seen.refused for seen in found.detections)
-    if found.trajectories:
-        assert farthest(session(), found) < 4 * found.trajectories[0].sigma[:, :2].max()
+    solution = solved(session(), part)
+    for detection in solution.detections:
+        if detection.cell is not None:
+            assert detection.cell[1] < 5
+    assert any(detection.refused for detection in solution.detections)
+    if solution.trajectories:
+        assert farthest(session(), solution) < 4 * solution.trajectories[0].sigma[:, :2].max()
 
 
 @pytest.mark.parametrize(
@@ -150,7 +153,7 @@ def test_part_of_a_floor_as_the_map() -> None:
         ({"field": lambda f: np.nan * f}, "no hall sensor"),
     ],
 )
-def test_recordings_that_cannot_be_are_errors(
+def test_implausible_recordings_are_errors(
     change: dict[str, Callable[[Array], Array]], words: str
 ) -> None:
     with pytest.raises(InputError, match=words):
@@ -159,7 +162,7 @@ def test_recordings_that_cannot_be_are_errors(
 
 @functools.cache
 def spinning() -> SimulatedSession:
-    """The paper's strategy, which turns on each landmark."""
+    """Return a session of the paper's strategy, which spins on each landmark."""
     return drive(strategy="paper", cells=(), seed=5)
 
 
@@ -171,22 +174,22 @@ def spinning() -> SimulatedSession:
         ([0, 3, 2, 1], "front, right, rear, left"),
     ],
 )
-def test_the_right_order_of_sensors_is_named(order: list[int], words: str) -> None:
+def test_wrong_order_of_sensors_is_named(order: list[int], words: str) -> None:
     with pytest.raises(InputError, match=f"are {words}"):
         solved(spinning(), field=lambda f: f[:, order])
 
 
 @pytest.mark.slow
-def test_no_order_of_sensors_leads_astray() -> None:
-    """A straight pass cannot tell left from right, nor then a mirrored landmark."""
+def test_mirrored_sensors_give_no_wrong_pose() -> None:
+    """A straight pass does not distinguish left from right, or a mirrored landmark."""
     message = ""
     try:
-        found = solved(session(), field=lambda f: f[:, [0, 3, 2, 1]])
+        solution = solved(session(), field=lambda f: f[:, [0, 3, 2, 1]])
     except InputError as error:
         message = str(error)
     else:
-        assert not found.trajectories
-        assert found.warnings
+        assert not solution.trajectories
+        assert solution.warnings
     assert not message or "order" in message
 
 
@@ -200,24 +203,24 @@ def test_no_order_of_sensors_leads_astray() -> None:
         ({"field": lambda f: np.where(np.arange(4) == 1, 1e-3, f)}, "sensor_constant", "left"),
     ],
 )
-def test_what_is_wrong_is_told(
+def test_faults_are_reported(
     change: dict[str, Callable[[Array], Array]], code: str, subject: str
 ) -> None:
-    found = solved(session(), **change)
-    (warning,) = [each for each in found.warnings if each.code == code]
+    solution = solved(session(), **change)
+    (warning,) = [each for each in solution.warnings if each.code == code]
     assert subject in warning.message
-    if found.trajectories:
-        assert farthest(session(), found) < 4e-3
+    if solution.trajectories:
+        assert farthest(session(), solution) < 4e-3
 
 
 @pytest.mark.slow
-def test_late_odometry_is_told() -> None:
-    """Where the robot turns: straight on, to be late is to be behind."""
+def test_late_odometry_is_reported() -> None:
+    """On a path with rotations: on a straight one a delay equals an offset."""
     one = spinning()
     late = replace(one.odometry[0], time_ns=one.odometry[0].time_ns + 50_000_000)
-    found = solve(one.samples, FLOOR, odometry=[late])
-    assert "field_misfit" in warning_codes(found) or not found.trajectories
-    assert found.warnings
+    solution = solve(one.samples, FLOOR, odometry=[late])
+    assert "field_misfit" in warning_codes(solution) or not solution.trajectories
+    assert solution.warnings
 
 
 def test_no_odometry_is_an_error() -> None:
@@ -225,53 +228,55 @@ def test_no_odometry_is_an_error() -> None:
         solve(session().samples, FLOOR)
 
 
-def test_a_landmark_that_the_map_lacks() -> None:
+def test_landmark_that_is_not_on_the_map() -> None:
     codes = CODES.copy()
     codes[3, 5] = HOLE
-    found = solved(session(), FloorMap(codes))
-    assert found.rejected == {"off_map": 1}
-    assert farthest(session(), found) < 4e-3
+    solution = solved(session(), FloorMap(codes))
+    assert solution.rejected == {"off_map": 1}
+    assert farthest(session(), solution) < 4e-3
 
 
-def test_a_landmark_that_the_floor_lacks() -> None:
+def test_landmark_that_is_not_on_the_floor() -> None:
     codes = CODES.copy()
     codes[2, 4] = HOLE
     one = drive(FloorMap(codes))
-    found = solved(one, FLOOR)
-    assert [seen.cell for seen in found.detections] == [c for c in CELLS if c != (2, 4)]
-    assert farthest(one, found) < 4e-3
+    solution = solved(one, FLOOR)
+    assert [detection.cell for detection in solution.detections] == [
+        c for c in CELLS if c != (2, 4)
+    ]
+    assert farthest(one, solution) < 4e-3
 
 
 @pytest.mark.slow
-def test_a_landmark_laid_wrongly_is_told() -> None:
+def test_wrong_landmark_is_reported() -> None:
     codes = CODES.copy()
     codes[2, 4] = (codes[2, 4] + 5) % 16
     one = drive(FloorMap(codes))
-    found = solved(one, FLOOR)
-    assert found.rejected == {}  # it is used, as it was read
-    assert sum(seen.refused == "misread" for seen in found.detections) == 1
-    assert found.detections[2].refused == "misread"
-    assert found.detections[2].code == codes[2, 4]
-    assert farthest(one, found) < 4e-3
+    solution = solved(one, FLOOR)
+    assert solution.rejected == {}
+    assert sum(detection.refused == "misread" for detection in solution.detections) == 1
+    assert solution.detections[2].refused == "misread"
+    assert solution.detections[2].code == codes[2, 4]
+    assert farthest(one, solution) < 4e-3
 
 
 @pytest.mark.slow
-def test_missing_bars_do_not_mislead() -> None:
+def test_missing_bars() -> None:
     one = drive(faults=Faults(missing=(((2, 4), 1), ((4, 5), 0))))
-    found = solved(one)
-    assert farthest(one, found) < 4e-3
-    assert [seen.cell for seen in found.detections] == CELLS
+    solution = solved(one)
+    assert farthest(one, solution) < 4e-3
+    assert [detection.cell for detection in solution.detections] == CELLS
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 8])
-def test_any_number_of_sensors_anywhere(count: int) -> None:
+def test_number_and_positions_of_sensors(count: int) -> None:
     places = circle(0.03) @ np.array([[0.8, 0.6], [-0.6, 0.8]])
     places = np.vstack([places, [[0, 0.04], [0.02, 0], [-0.04, 0.01], [0, 0]]])[:count]
     names = tuple(f"s{k}" for k in range(count))
     one = drive(sensors=HallSensors(names, places, noise_t=1.5e-4))
-    found = solved(one)
-    assert farthest(one, found) < 4e-3
+    solution = solved(one)
+    assert farthest(one, solution) < 4e-3
 
 
 def test_gaps_and_missing_values() -> None:
@@ -281,42 +286,63 @@ def test_gaps_and_missing_values() -> None:
     keep[300:420] = False
     field = np.where(random.random(samples.field_t.shape) < 0.2, np.nan, samples.field_t)
     holed = HallSamples("robot", samples.sensors, samples.time_ns[keep], field[keep])
-    found = solve([holed], FLOOR, odometry=session().odometry)
-    assert farthest(session(), found) < 5e-3
+    solution = solve([holed], FLOOR, odometry=session().odometry)
+    assert farthest(session(), solution) < 5e-3
 
 
 @pytest.mark.slow
-def test_robots_of_one_session_keep_apart() -> None:
+def test_robots_of_one_session_are_independent() -> None:
     one, other = session(), drive(seed=2, cells=((7, 7), (7, 9), (9, 9), (9, 8)))
     second = replace(other.samples[0], device="b")
     own = replace(other.odometry[0], device="b")
-    found = solve([second, one.samples[0]], FLOOR, odometry=[one.odometry[0], own])
-    assert [t.device for t in found.trajectories] == ["b", "robot"]
+    solution = solve([second, one.samples[0]], FLOOR, odometry=[one.odometry[0], own])
+    assert [t.device for t in solution.trajectories] == ["b", "robot"]
     alone = solved(one).trajectories[0]
-    np.testing.assert_allclose(found.trajectories[1].position, alone.position, atol=1e-9)
-    assert {seen.device for seen in found.detections} == {"b", "robot"}
+    np.testing.assert_allclose(solution.trajectories[1].position, alone.position, atol=1e-9)
+    assert {detection.device for detection in solution.detections} == {"b", "robot"}
 
 
-def test_too_few_landmarks_are_no_place() -> None:
+def test_too_few_landmarks_give_no_pose() -> None:
     one = drive(cells=((2, 2), (2, 3)))
-    found = solved(one)
-    assert not found.trajectories
-    assert "not_localised" in warning_codes(found)
+    solution = solved(one)
+    assert not solution.trajectories
+    assert "not_localised" in warning_codes(solution)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-def test_misread_landmarks_are_never_silent(seed: int) -> None:
-    """One in five is laid otherwise than the map says."""
+def test_misread_landmarks_give_no_wrong_pose_without_a_warning(seed: int) -> None:
+    """One in five differs from the map."""
     one = drive(seed=seed, faults=Faults(misread_rate=0.2), errors=Errors())
-    found = solved(one)
-    if found.trajectories and farthest(one, found) > 0.05:
-        assert found.facts.robots["robot"].probability < 0.9999
-        assert {"localization_uncertain", "not_localised"} & set(warning_codes(found))
+    solution = solved(one)
+    if solution.trajectories and farthest(one, solution) > 0.05:
+        assert solution.facts.robots["robot"].probability < 0.9999
+        assert {"localization_uncertain", "not_localised"} & set(warning_codes(solution))
 
 
 def test_options_out_of_range_are_refused() -> None:
-    with pytest.raises(InputError, match="no method"):
+    with pytest.raises(InputError, match="unknown method"):
         SolveOptions(method="magic")
     with pytest.raises(InputError, match="misread"):
         SolveOptions(misread=0.0)
+
+
+@pytest.mark.parametrize(
+    ("residual_sigma", "warned", "poses"),
+    [(1.9, False, True), (2.1, True, True), (11.9, True, True), (12.1, True, False)],
+)
+def test_residuals_of_the_fields_limit_the_poses(
+    residual_sigma: float, warned: bool, poses: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    smooth = solver.smooth
+    monkeypatch.setattr(
+        solver,
+        "smooth",
+        lambda *given: replace(smooth(*given), residual_sigma=residual_sigma),
+    )
+    solution = solved(session())
+    assert ("field_misfit" in warning_codes(solution)) == warned
+    assert bool(solution.trajectories) == poses
+    facts = solution.facts.robots["robot"]
+    assert facts.localised == poses
+    assert facts.misfit_sigma == residual_sigma

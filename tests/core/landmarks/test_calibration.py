@@ -1,7 +1,7 @@
-"""Floors that were laid with errors and faults, found again from drives over them.
+"""Calibration of simulated floors with installation errors and faults, compared with the truth.
 
-The truth is the simulator's (magpylib's fields, bars at places of their own); none of it is
-in the map that the calibration is given.
+The truth is that of the simulator (fields by magpylib, each bar displaced); the map that the
+calibration receives contains none of it.
 """
 
 from __future__ import annotations
@@ -14,11 +14,20 @@ import pytest
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks import solver
-from locatk.core.landmarks.calibration import datum as gauge
-from locatk.core.landmarks.calibration.floor import CalibrationReport, Drive, calibrate, read
-from locatk.core.landmarks.calibration.marks import _flags, landmarks
+from locatk.core.landmarks.calibration import datum
+from locatk.core.landmarks.calibration.floor import (
+    CalibrationDrive,
+    FloorCalibrationReport,
+    calibrate,
+    read_drive,
+)
+from locatk.core.landmarks.calibration.landmarks import (
+    describe_landmarks,
+    flag_deviations,
+    refusal_reason,
+)
 from locatk.core.landmarks.landmark import signs
-from locatk.core.landmarks.localization import smoothing as smooth
+from locatk.core.landmarks.localization import smoothing
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.landmarks.simulation import session as simulate
 from locatk.core.landmarks.simulation.floor import Laid, lay
@@ -60,17 +69,19 @@ def drive(
         )
 
 
-def taken(session: SimulatedSession, name: str = "run", floor: FloorMap = FLOOR) -> Drive:
-    found = read(name, session.samples[0], session.odometry[0], floor)
-    assert isinstance(found, Drive)
+def taken(
+    session: SimulatedSession, name: str = "run", floor: FloorMap = FLOOR
+) -> CalibrationDrive:
+    found = read_drive(name, session.samples[0], session.odometry[0], floor)
+    assert isinstance(found, CalibrationDrive)
     return found
 
 
 @dataclass
 class Case:
     floor_seed: int
-    drives: list[Drive]
-    report: CalibrationReport
+    drives: list[CalibrationDrive]
+    report: FloorCalibrationReport
     laid: dict[Cell, Laid]
 
 
@@ -88,8 +99,8 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 def middles(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres (n, 2) as found, the true middles of the bars, and nominal places."""
-    cells = [one.cell for one in case.report.found]
-    found = [[one.built.x_m, one.built.y_m] for one in case.report.found]
+    cells = [one.cell for one in case.report.landmarks]
+    found = [[one.built.x_m, one.built.y_m] for one in case.report.landmarks]
     nominal = np.array([FLOOR.place(cell) for cell in cells])
     true = np.array([case.laid[cell].middle_m[:, :2].mean(axis=0) for cell in cells])
     return np.array(found) + nominal, true, nominal
@@ -114,7 +125,7 @@ def off_frame(error: np.ndarray, place: np.ndarray, at: np.ndarray | None = None
 
 @pytest.mark.slow
 def test_flags_are_exactly_the_faults(case: Case) -> None:
-    flags = {one.cell: one.built.flags for one in case.report.found if one.built.flags}
+    flags = {one.cell: one.built.flags for one in case.report.landmarks if one.built.flags}
     assert flags == {
         (0, 2): ("displaced",),
         (0, 3): ("flipped:0",),
@@ -123,15 +134,15 @@ def test_flags_are_exactly_the_faults(case: Case) -> None:
     }
     assert case.report.unvisited == ()
     assert case.report.left_out == {}
-    assert [one.why for one in case.report.found] == [""] * 12
-    assert case.report.misfit < 1.2
+    assert [one.refused for one in case.report.landmarks] == [""] * 12
+    assert case.report.residual_sigma < 1.2
 
 
 def test_centres_headings_and_strengths_are_the_true_ones(case: Case) -> None:
     found, true, nominal = middles(case)
     error = off_frame(found - true, nominal)
     assert np.hypot(*error.T).max() < 0.5e-3
-    for one in case.report.found:
+    for one in case.report.landmarks:
         laid = case.laid[one.cell]
         assert one.built.visits == 2
         assert one.built.heading_rad == pytest.approx(laid.heading_rad, abs=math.radians(0.4))
@@ -143,12 +154,12 @@ def test_centres_headings_and_strengths_are_the_true_ones(case: Case) -> None:
 def test_standard_deviations_are_those_of_the_errors(case: Case) -> None:
     found, true, nominal = middles(case)
     error = off_frame(found - true, nominal)
-    sigma = np.array([one.built.sigma for one in case.report.found])
+    sigma = np.array([one.built.sigma for one in case.report.landmarks])
     # The bars' own places, of which the middle is told here, are in the sigmas too.
     assert 0.05 < np.mean((error / sigma[:, :2]) ** 2) < 1.5
     assert np.all(sigma[:, :2] < 0.5e-3)
     strength = np.array(
-        [one.built.strength - case.laid[one.cell].strength for one in case.report.found]
+        [one.built.strength - case.laid[one.cell].strength for one in case.report.landmarks]
     )
     assert 0.2 < np.mean((strength / sigma[:, 3:]) ** 2) < 4
 
@@ -168,7 +179,9 @@ def test_later_drives_are_solved_better_with_the_floor_as_built(case: Case) -> N
             ]
         )
         # A pose is one in the frame of the map: less how that lies on the true floor.
-        sound = [n for n, one in enumerate(case.report.found) if "displaced" not in one.built.flags]
+        sound = [
+            n for n, one in enumerate(case.report.landmarks) if "displaced" not in one.built.flags
+        ]
         frame = off_frame((told - true)[sound], nominal[sound], at)
         errors[floor is FLOOR] = np.hypot(*(path.position[:, :2] - at + frame).T)
     assert errors[False].mean() < 0.4e-3
@@ -177,7 +190,7 @@ def test_later_drives_are_solved_better_with_the_floor_as_built(case: Case) -> N
 
 
 @pytest.mark.slow
-def test_what_an_earlier_calibration_says_is_no_evidence(case: Case) -> None:
+def test_earlier_calibration_is_no_evidence(case: Case) -> None:
     wrong = {
         cell: replace(built, x_m=built.x_m + 0.004, strength=0.9 * built.strength)
         for cell, built in case.report.floor.built.items()
@@ -189,29 +202,32 @@ def test_what_an_earlier_calibration_says_is_no_evidence(case: Case) -> None:
 
 
 @pytest.mark.slow
-def test_a_visit_that_was_read_wrongly_is_left_out(case: Case) -> None:
-    """Its place is 15 mm off what odometry and the other visits say."""
+def test_outlier_visit_is_left_out(case: Case) -> None:
+    """Its position deviates by 15 mm from odometry and the other visits."""
     first, second = case.drives
-    seen = list(first.found.seen)
+    visits = list(first.identified.visits)
     which = 5
     hypotheses = tuple(
-        replace(one, pose=one.pose + [0.0, 0.015, 0.0]) for one in seen[which].sighting.hypotheses
+        replace(one, pose=one.pose + [0.0, 0.015, 0.0])
+        for one in visits[which].hypotheses.hypotheses
     )
-    seen[which] = replace(
-        seen[which], sighting=replace(seen[which].sighting, hypotheses=hypotheses)
+    visits[which] = replace(
+        visits[which], hypotheses=replace(visits[which].hypotheses, hypotheses=hypotheses)
     )
-    report = calibrate(FLOOR, [replace(first, found=replace(first.found, seen=seen)), second])
+    report = calibrate(
+        FLOOR, [replace(first, identified=replace(first.identified, visits=visits)), second]
+    )
     (name,) = report.left_out
     assert name.startswith("run0 at ")
-    cell = seen[which].located.cell  # type: ignore[union-attr]
+    cell = visits[which].cell
     assert report.left_out[name].startswith(f"the visit to {cell[0]},{cell[1]} ")
-    count = {one.cell: one.built.visits for one in report.found}
+    count = {one.cell: one.built.visits for one in report.landmarks}
     assert count.pop(cell) == 1
     assert set(count.values()) == {2}
 
 
 @pytest.mark.slow
-def test_parts_without_a_landmark_in_common_are_told() -> None:
+def test_unconnected_parts_are_reported() -> None:
     rows = [drive(tuple((r, c) for c in range(4)), 30 + r, faults=Faults()) for r in (0, 2)]
     report = calibrate(FLOOR, [taken(session) for session in rows])
     assert report.unvisited == tuple((1, c) for c in range(4))
@@ -222,36 +238,36 @@ def test_parts_without_a_landmark_in_common_are_told() -> None:
     assert set(report.floor.built) == {(r, c) for r in (0, 2) for c in range(4)}
 
 
-def test_where_the_whole_floor_lies_cannot_be_seen() -> None:
+def test_position_of_the_whole_floor_is_not_observable() -> None:
     moved = Faults(displaced=tuple((cell, (0.008, 0.003)) for cell in FLOOR.cells()))
     cells = ROWS[:6]
     quiet = replace(Errors(), landmark_place_m=0.0, bar_place_m=0.0, landmark_turn_rad=0.0)
     report = calibrate(FLOOR, [taken(drive(cells, 40, faults=moved, errors=quiet))])
-    for one in report.found:
+    for one in report.landmarks:
         assert np.hypot(one.built.x_m, one.built.y_m) < 1e-3
         assert "displaced" not in one.built.flags
 
 
 @pytest.mark.slow
-def test_magnets_that_are_all_weaker_are_no_weak_bars() -> None:
-    """A quarter off: gains and height take a part of it, the typical bar tells the rest."""
+def test_uniformly_weaker_magnets_are_no_weak_bars() -> None:
+    """By a quarter: gains and height absorb a part, the typical bar shows the remainder."""
     strong = replace(FLOOR, geometry=replace(FLOOR.geometry, remanence_t=1.6))
     session = drive(ROWS[:6], 41, faults=Faults())
     report = calibrate(strong, [taken(session, floor=strong)])
     assert report.strength < 0.9
     assert any("typical bar" in note and "remanence_t" in note for note in report.notes)
-    assert all(one.built.flags == () for one in report.found)
+    assert all(one.built.flags == () for one in report.landmarks)
 
 
-def test_nothing_to_calibrate_from() -> None:
+def test_no_usable_recording() -> None:
     with pytest.raises(InputError, match=r"no landmark of the map .* \(a.mcap: not localised\)"):
         calibrate(FLOOR, [], {"a.mcap": "not localised"})
     session = drive(ROWS[:2], 42, faults=Faults())
     samples = session.samples[0]
     quiet = replace(samples, field_t=1e-5 * np.sign(samples.field_t))
-    assert read("a", quiet, session.odometry[0], FLOOR) == "no landmark was seen"
+    assert read_drive("a", quiet, session.odometry[0], FLOOR) == "no landmark was detected"
     other = FloorMap(np.zeros((1, 1), np.int64))
-    assert read("a", samples, session.odometry[0], other) == "not localised on the map"
+    assert read_drive("a", samples, session.odometry[0], other) == "not localised on the map"
 
 
 # ---- flags
@@ -266,6 +282,7 @@ def test_nothing_to_calibrate_from() -> None:
         ({"strength": [1, -1, -0.75, 1], "sigma": 0.1}, ()),
         ({"strength": [1, 0.9, -1, 1]}, ("flipped:1",)),
         ({"strength": [1, 0.5, -1, 1]}, ("flipped:1", "weak:1")),
+        ({"strength": [1, 0.3, -1, 1], "sigma": 0.15}, ("weak:1",)),
         ({"strength": [0.2, -1, -1, -0.1]}, ("missing:0", "missing:3")),
         ({"left": [3e-3, 3e-3, 0]}, ()),
         ({"left": [4e-3, 4e-3, 0]}, ("displaced",)),
@@ -278,33 +295,38 @@ def test_flags(change: dict, wanted: tuple[str, ...]) -> None:
     sigma[3:] = change.get("sigma", 0.01)
     left = np.array(change.get("left", [0.0, 0.0, 0.0]))
     strength = np.array(change.get("strength", [1.0, -1.0, -1.0, 1.0]))
-    assert _flags(np.array([1.0, -1.0, -1.0, 1.0]), left, strength, sigma) == wanted
+    assert flag_deviations(np.array([1.0, -1.0, -1.0, 1.0]), left, strength, sigma) == wanted
 
 
-def test_a_landmark_alone_has_bars_but_no_place() -> None:
+def test_single_landmark_has_bars_but_no_pose() -> None:
     pose = np.array([*FLOOR.place((1, 1)), 0.0]) + [3e-3, -2e-3, 0.01]
     strength = signs(CODES[1, 1])
     sigma = np.full(3, 0.01)
-    smoothed = smooth.Smoothed(
-        [], {(1, 1): smooth.MarkFound(pose, strength, np.diag([1e-4] * 3 + [1e-4] * 4))}, 0.9
+    smoothed = smoothing.SmoothingResult(
+        [],
+        {(1, 1): smoothing.LandmarkEstimate(pose, strength, np.diag([1e-4] * 3 + [1e-4] * 4))},
+        0.9,
     )
-    marks = {(1, 1): smooth.Mark(pose, sigma, strength, np.full(4, 0.5))}
-    found = landmarks(smoothed, marks, FLOOR, [[(1, 1)]], [])[1, 1]
+    marks = {(1, 1): smoothing.LandmarkPrior(pose, sigma, strength, np.full(4, 0.5))}
+    found = describe_landmarks(smoothed, marks, FLOOR, [[(1, 1)]], [])[1, 1]
     assert (found.built.x_m, found.built.y_m, found.built.heading_rad) == (0, 0, 0)
     assert np.isnan(found.built.sigma[:3]).all()
     assert np.array_equal(found.built.strength, strength)
-    assert found.why == ""
+    assert found.refused == ""
 
 
-# ---- where the floor lies as a whole
+# ---- datum
 
 
-def test_groups_that_share_a_member_are_one() -> None:
-    assert gauge.joined([[3, 1], [7], [1, 4], [9, 8], [4, 9]]) == [[1, 3, 4, 8, 9], [7]]
-    assert gauge.joined([]) == []
+def test_connected_components() -> None:
+    assert datum.connected_components([[3, 1], [7], [1, 4], [9, 8], [4, 9]]) == [
+        [1, 3, 4, 8, 9],
+        [7],
+    ]
+    assert datum.connected_components([]) == []
 
 
-def test_the_few_that_lie_off_pull_no_others() -> None:
+def test_displaced_landmarks_do_not_bias_the_alignment() -> None:
     random = np.random.default_rng(1)
     design = np.column_stack([random.uniform(0, 1, (8, 2)), np.zeros(8)])
     off = np.zeros((8, 3))
@@ -314,26 +336,40 @@ def test_the_few_that_lie_off_pull_no_others() -> None:
     pose = design + off
     pose[:, :2] = pose[:, :2] @ [[c, s], [-s, c]] + [0.02, 0.03]
     pose[:, 2] += turn
-    left = gauge.unlike_design(pose, design, np.array([1.5e-3, 1.5e-3, 0.012]))
+    left = datum.deviations_from_design(pose, design, np.array([1.5e-3, 1.5e-3, 0.012]))
     assert left == pytest.approx(off, abs=3e-4)
 
 
-def test_own_covariances_are_those_without_the_motions() -> None:
+def test_relative_covariances_have_no_gauge_part() -> None:
     """Against the whole matrix: A has the motions as its null space, the priors are W."""
     random = np.random.default_rng(2)
     place = random.uniform(0, 1, (5, 2))
-    motion = gauge.motions(place).reshape(15, 3)
+    motion = datum.gauge_motions(place).reshape(15, 3)
     rows = random.normal(size=(40, 15))
     rows -= rows @ motion @ np.linalg.pinv(motion)
     information = 1e6 * rows.T @ rows
     sigma = np.tile([0.01, 0.01, 0.08], (5, 1))
     sigma[2] *= 0.2
     inverse = np.linalg.inv(information + np.diag(sigma.ravel() ** -2.0))
-    # Known to be 0: what the motions W-averaged over all landmarks are.
+    # Constrain the W-weighted mean motion of all landmarks to 0.
     held = motion.T @ np.diag(sigma.ravel() ** -2.0)
     whole = inverse - inverse @ held.T @ np.linalg.inv(held @ inverse @ held.T) @ held @ inverse
     blocks = np.array([inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(5)])
-    own = gauge.own_covariances(4 * blocks, place, sigma, 4)
+    own = datum.relative_covariances(4 * blocks, place, sigma, 4)
     for k in range(5):
         part = slice(3 * k, 3 * k + 3)
         assert own[k] == pytest.approx(4 * whole[part, part], rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("position_m", "strength", "reason"),
+    [
+        (1.4e-3, 0.14, ""),
+        (1.6e-3, 0.14, "its pose is too uncertain"),
+        (1.4e-3, 0.16, "the strength of bar 2 is too uncertain"),
+        (np.nan, 0.14, ""),
+    ],
+)
+def test_uncertain_landmarks_are_refused(position_m: float, strength: float, reason: str) -> None:
+    sigma = np.array([position_m, 1e-4, 1e-3, 0.01, 0.01, strength, 0.01])
+    assert refusal_reason(sigma) == reason

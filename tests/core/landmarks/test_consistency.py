@@ -1,0 +1,141 @@
+"""Faulty sensors, displaced landmarks and wrong maps: simulated, and reported."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
+from locatk.core.landmarks.localization import consistency
+from locatk.core.landmarks.localization.cell_filter import CellEstimate, IdentifiedVisit
+from locatk.core.landmarks.localization.smoothing import (
+    LandmarkEstimate,
+    LandmarkPrior,
+    SmoothingResult,
+)
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import VisitSegment
+from locatk.core.landmarks.simulation.session import (
+    Faults,
+    SimulatedSession,
+    SimulationOptions,
+    simulate,
+)
+from locatk.core.landmarks.solver import solve
+from locatk.core.solution import Solution, SolverWarning
+
+CODES = np.random.default_rng(11).integers(0, 16, (12, 12))
+
+FLOOR = FloorMap(CODES)
+
+CELLS = ((2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3))
+
+
+def drive(**options: object) -> SimulatedSession:
+    given = {"strategy": "path", "cells": ((2, 2), (2, 5), (4, 5), (4, 3)), "rate_hz": 30.0}
+    return simulate(FLOOR, SimulationOptions(**given | {"seed": 1} | options))  # type: ignore[arg-type]
+
+
+def solved(one: SimulatedSession, floor: FloorMap = FLOOR) -> Solution:
+    return solve(one.samples, floor, odometry=one.odometry)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", range(4))
+def test_sensor_of_opposite_sign(sensor: int) -> None:
+    one = drive(strategy="paper", cells=(), seed=3, landmarks=3)
+    samples = one.samples[0]
+    field = samples.field_t * np.where(np.arange(4) == sensor, -1.0, 1.0)
+    name = samples.sensors.names[sensor]
+    with pytest.raises(InputError, match=f"the {name} sensor of robot has the opposite sign"):
+        solved(replace(one, samples=(replace(samples, field_t=field),)))
+
+
+@pytest.mark.slow
+def test_displaced_landmark_is_reported() -> None:
+    one = drive(faults=Faults(displaced=(((3, 5), (0.012, 0.0)),)))
+    found = solved(one)
+    messages = [each.message for each in found.warnings if each.code == "landmark_displaced"]
+    assert len(messages) == 1
+    assert "landmark at 3,5 is displaced" in messages[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("wrong", "accepted"), [(1, True), (3, False)])
+def test_contradicted_map_is_rejected(wrong: int, accepted: bool) -> None:
+    codes = CODES.copy()
+    for cell in CELLS[1::2][:wrong]:
+        codes[cell] = (codes[cell] + 5) % 16
+    found = solved(drive(), FloorMap(codes))
+    assert bool(found.trajectories) == accepted
+    assert ("map_contradicted" in [each.code for each in found.warnings]) != accepted
+
+
+@pytest.mark.parametrize(
+    ("probability", "first", "message"),
+    [
+        (0.999990, 3, None),
+        (1.0, None, None),
+        (0.99998, None, "its cell on the map is almost certain (0.99998)"),
+        (0.99900, 2, "its cell on the map is almost certain (0.99900)"),
+        (0.96, None, "its cell on the map has a probability of 0.96000; visit one more landmark"),
+        (0.96, 2, "its cell on the map has a probability of 0.96000 at one landmark"),
+    ],
+)  # fmt: skip
+def test_uncertain_cells_are_reported(
+    probability: float, first: int | None, message: str | None
+) -> None:
+    warning = consistency.warn_of_uncertain_cell(probability, first)
+    if message is None:
+        assert warning is None
+    else:
+        assert warning == SolverWarning("localization_uncertain", message)
+
+
+# ---- guards
+
+
+def visits_of(misread: int, unexplained: int, correct: int) -> list[IdentifiedVisit]:
+    """Return visits of the cell (2, 2) that agree with the map or not."""
+    code = int(FLOOR.codes[2, 2])
+    visits = []
+    for refused, codes in (
+        ("not_explained", [code] * unexplained),
+        ("", [code] * correct + [(code + 1) % 16] * misread),
+    ):
+        for read in codes:
+            one = Hypothesis(read, 1.0, np.zeros(3), np.eye(3), np.ones(4), np.ones(4))
+            hypotheses = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (one,), refused=refused)
+            estimate = None if refused else CellEstimate((2, 2), 0, 0, 1.0, 1.0)
+            segment = VisitSegment(0, 5, np.arange(5), None, np.zeros(3))  # type: ignore[arg-type]
+            visits.append(IdentifiedVisit(segment, hypotheses, estimate))
+    return visits
+
+
+@pytest.mark.parametrize(
+    ("misread", "unexplained", "correct", "contradicted"),
+    [(1, 0, 0, False), (2, 0, 4, False), (2, 0, 3, True), (1, 1, 3, True), (0, 2, 0, True)],
+)
+def test_contradictions_are_counted(
+    misread: int, unexplained: int, correct: int, contradicted: bool
+) -> None:
+    visits = visits_of(misread, unexplained, correct)
+    on_map = [visit for visit in visits if visit.estimate is not None]
+    assert consistency.is_map_contradicted(visits, on_map, FLOOR) == contradicted
+
+
+@pytest.mark.parametrize(
+    ("count", "sigmas", "displaced"), [(3, 2.6, True), (3, 2.4, False), (2, 9.0, False)]
+)
+def test_displaced_landmarks_are_found(count: int, sigmas: float, displaced: bool) -> None:
+    cells = [(2, k) for k in range(count)]
+    sigma = np.array([1e-3, 1e-3, 0.01])
+    priors = {cell: LandmarkPrior(np.zeros(3), sigma, np.ones(4), np.ones(4)) for cell in cells}
+    estimates = {cell: LandmarkEstimate(np.zeros(3), np.ones(4), np.eye(7)) for cell in cells}
+    shift = np.array([0.0, -sigmas * 1e-3, 0.0])
+    estimates[2, 0] = replace(estimates[2, 0], pose=shift)
+    found = consistency.find_displaced_landmarks(priors, SmoothingResult([], estimates, 1.0))
+    assert found == ({(2, 0): pytest.approx(sigmas * 1e-3)} if displaced else {})
