@@ -20,12 +20,12 @@ def readings_by_hand(floor: FloorMap) -> list[tuple[int, ...]]:
     for cell in floor.cells():
         for heading in range(4):
             one = (cell, heading)
-            if not floor.open(cell, heading):
+            if not floor.is_passable(cell, heading):
                 continue
             step = {0: (0, 1), 1: (1, 0), 2: (0, -1), 3: (-1, 0)}
             ahead = (cell[0] + step[heading][0], cell[1] + step[heading][1])
             left = (heading + 1) % 4
-            if not floor.open(ahead, left):
+            if not floor.is_passable(ahead, left):
                 continue
             last = (ahead[0] + step[left][0], ahead[1] + step[left][1])
             codes = [int(floor.codes[at]) for at in (one[0], ahead, last)]

@@ -57,7 +57,7 @@ def test_every_pixel_lies_where_its_landmark_is() -> None:
     assert picture.shape == (80, 120)
     rng = np.random.default_rng(0)
     for cell in FLOOR.cells():
-        x, y = FLOOR.place(cell)
+        x, y = FLOOR.position(cell)
         # In the middle of pixels, which lie on whole 5 mm.
         offsets = (rng.integers(-16, 16, (40, 2)) + 0.5) * size
         field = landmark_field(FLOOR.geometry, int(FLOOR.codes[cell]), offsets)
@@ -66,10 +66,10 @@ def test_every_pixel_lies_where_its_landmark_is() -> None:
         np.testing.assert_array_equal(np.array(levels) == map_ros.TERRITORY, inside)
         assert inside.any()
         assert not inside.all()
-    x, y = FLOOR.place((1, 1))
+    x, y = FLOOR.position((1, 1))
     hole = {pixel(picture, FLOOR, x + d, y + e, size) for d in (-0.09, 0, 0.09) for e in (-0.09, 0)}
     assert hole == {map_ros.UNKNOWN}
-    assert pixel(picture, FLOOR, *FLOOR.place((0, 0)), size) == map_ros.FREE
+    assert pixel(picture, FLOOR, *FLOOR.position((0, 0)), size) == map_ros.FREE
 
 
 def test_walls_stand_between_their_cells() -> None:
@@ -77,7 +77,7 @@ def test_walls_stand_between_their_cells() -> None:
     black = picture == map_ros.OCCUPIED
     assert black.any()
     for (row, column), (other, _) in FLOOR.walls:
-        x, y = FLOOR.place((row, column))
+        x, y = FLOOR.position((row, column))
         ahead = (0.0, 0.1) if other > row else (0.1, 0.0)
         for part in (-0.09, 0.0, 0.09):
             along = (part, 0.0) if other > row else (0.0, part)

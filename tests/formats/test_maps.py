@@ -190,11 +190,11 @@ def test_a_map_by_hand() -> None:
     floor = loads_map("\ufeff" + MAP + LANDMARK + BUILT)
     np.testing.assert_array_equal(floor.codes, [[0, 15, HOLE], [3, 12, 7]])
     assert [name(code) for code in floor.codes[1]] == ["NNSS", "SSNN", "NNNS"]
-    assert floor.place((1, 0)) == (0.0, 0.2)  # the first string has the least y
+    assert floor.position((1, 0)) == (0.0, 0.2)  # the first string has the least y
     assert floor.geometry == Geometry()
     assert floor.walls == {((0, 0), (0, 1))}
-    assert not floor.open((0, 0), 0)
-    assert floor.open((0, 0), 1)
+    assert not floor.is_passable((0, 0), 0)
+    assert floor.is_passable((0, 0), 1)
     assert (floor.detect, floor.seed, floor.origin_m) == (0, None, (0.0, 0.0))
     built = floor.built[1, 2]
     assert (built.x_m, built.y_m, built.heading_rad) == (1.5e-3, -0.25e-3, math.pi / 100)

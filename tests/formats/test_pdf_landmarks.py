@@ -26,7 +26,7 @@ from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pac
 from locatk.core.landmarks.drawing.true_size import draw_floor
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import HOLE, FloorMap
-from locatk.core.paper import parse_paper
+from locatk.core.paper_sizes import parse_paper
 from locatk.formats.pdf.drawings import render_floor, render_pages
 
 DPI = 300
@@ -343,7 +343,7 @@ def test_the_floor_at_true_size_is_whole(floor: FloorMap, name: str, overlap: fl
             for seam in tile.seams[axis]
         )
         assert len(set(cuts)) == len(edges) - 1
-        place = [1e3 * floor.place(cell)[axis] for cell in floor.cells()]
+        place = [1e3 * floor.position(cell)[axis] for cell in floor.cells()]
         assert edges[0][0] + 30 <= min(place)
         assert max(place) <= edges[-1][1] - 30
 
@@ -359,8 +359,8 @@ def held(floor: FloorMap, tile: Tile) -> set[tuple[int, int]]:
         cell
         for cell in floor.cells()
         if all(
-            tile.corner_mm[axis] + out <= 1e3 * floor.place(cell)[axis]
-            and 1e3 * floor.place(cell)[axis] <= tile.corner_mm[axis] + span(tile, axis) - out
+            tile.corner_mm[axis] + out <= 1e3 * floor.position(cell)[axis]
+            and 1e3 * floor.position(cell)[axis] <= tile.corner_mm[axis] + span(tile, axis) - out
             for axis in (0, 1)
         )
     }
@@ -369,7 +369,8 @@ def held(floor: FloorMap, tile: Tile) -> set[tuple[int, int]]:
 def check_tile(floor: FloorMap, tile: Tile, dark: Places) -> None:
     for cell in sorted(held(floor, tile))[:4]:
         centre = [
-            1e3 * floor.place(cell)[axis] - tile.corner_mm[axis] + tile.box[axis] for axis in (0, 1)
+            1e3 * floor.position(cell)[axis] - tile.corner_mm[axis] + tile.box[axis]
+            for axis in (0, 1)
         ]
         errors = measure(dark, floor.geometry, int(floor.codes[cell]), (centre[0], centre[1]))
         assert np.abs(errors).max() < 0.1

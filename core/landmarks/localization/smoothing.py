@@ -178,7 +178,7 @@ def measure_visits(
     """
     measurements = []
     for visit in visits:
-        landmark = np.array([*floor.place(visit.cell), visit.quarters * HALF_PI_RAD])
+        landmark = np.array([*floor.position(visit.cell), visit.quarters * HALF_PI_RAD])
         pose, trace = compose(landmark, visit.hypothesis.pose), visit.segment.trace
         if visit.hypothesis.fit is None:
             raise ValueError("smoothing needs hypotheses with a fit of the field model")
@@ -261,7 +261,7 @@ def landmark_priors(
     landmarks: dict[Cell, LandmarkPrior] = {}
     for visit in visits:
         cell, quarters, hypothesis = visit.cell, visit.quarters, visit.hypothesis
-        pose, sigma = np.array([*floor.place(cell), 0.0]), LANDMARK_SIGMA
+        pose, sigma = np.array([*floor.position(cell), 0.0]), LANDMARK_SIGMA
         strength = signs(rotated(hypothesis.code, quarters))
         strength_sigma = np.full(4, priors.strength)
         is_missing = np.zeros(4, bool)

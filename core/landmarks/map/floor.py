@@ -123,12 +123,12 @@ class FloorMap:
         """Return the cells that have a landmark, row by row."""
         return [(int(r), int(c)) for r, c in np.argwhere(self.codes != HOLE)]
 
-    def place(self, cell: Cell) -> tuple[float, float]:
+    def position(self, cell: Cell) -> tuple[float, float]:
         """Return the nominal position of a cell in the map frame, in metres."""
         x, y = self.origin_m
         return x + self.pitch_m * cell[1], y + self.pitch_m * cell[0]
 
-    def open(self, cell: Cell, heading: int) -> bool:
+    def is_passable(self, cell: Cell, heading: int) -> bool:
         """Return whether a robot can drive from ``cell`` to the next one at a heading.
 
         The heading is in quarter turns. Holes, walls and the border are not passable; ``cell``
@@ -149,7 +149,7 @@ def as_built_landmark(floor: FloorMap, cell: Cell) -> tuple[Array, Array]:
 
     What was not measured is as designed.
     """
-    pose = np.array([*floor.place(cell), 0.0])
+    pose = np.array([*floor.position(cell), 0.0])
     strength = signs(floor.codes[cell])
     built = floor.built.get(cell)
     if built is not None:

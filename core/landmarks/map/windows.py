@@ -82,7 +82,7 @@ def letters_as_read(codes: Integers, heading: Integers, alphabet: str) -> Intege
 
 
 def passable_steps(floor: FloorMap) -> Bools:
-    """Return :meth:`.FloorMap.open` (rows, columns, 4) of each cell and heading.
+    """Return :meth:`.FloorMap.is_passable` (rows, columns, 4) of each cell and heading.
 
     No step leads out of a hole.
     """

@@ -125,7 +125,7 @@ def match_map(
             matches = _matches_cell(floor, cell, heading, codes[0])
             for code, rotation in zip(codes[1:], rotations, strict=True):
                 heading = (heading + rotation) % 4
-                matches = matches and floor.open(cell, heading)
+                matches = matches and floor.is_passable(cell, heading)
                 if not matches:
                     break
                 cell = neighbour(cell, heading)

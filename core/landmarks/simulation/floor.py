@@ -130,7 +130,7 @@ def _install(
     standard normal numbers for its position (2) and its rotation.
     """
     designed = int(floor.codes[cell])
-    x, y = floor.place(cell)
+    x, y = floor.position(cell)
     offset_x, offset_y = draws[:2] * errors.landmark_place_m
     heading = float(draws[2] * errors.landmark_turn_rad)
     is_wrong = rng.random() < faults.misread_rate

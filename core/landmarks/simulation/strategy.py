@@ -170,7 +170,7 @@ def _find_start(task: _Task) -> tuple[Array, Cell, float]:
         return np.array(options.start), *met
     for _ in range(MAX_START_DRAWS):
         row, column = cells[rng.integers(len(cells))]
-        x, y = floor.place((row, column)) + rng.uniform(-0.5, 0.5, 2) * floor.pitch_m
+        x, y = floor.position((row, column)) + rng.uniform(-0.5, 0.5, 2) * floor.pitch_m
         start = (float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
         if np.hypot(*(centres - start[:2]).T).min() > range_m:
             met = _first_landmark_ahead(floor, cells, centres, start)
@@ -225,7 +225,7 @@ def is_free(floor: FloorMap, points: Array) -> bool:
         for order in (headings, headings[::-1]):
             cell = start
             for heading in order:
-                if not floor.open(cell, heading):
+                if not floor.is_passable(cell, heading):
                     break
                 cell = neighbour(cell, heading)
             else:
@@ -255,7 +255,7 @@ def _plan_tour(
     for heading in headings:
         last = neighbour(last, heading)
     while len(headings) < count - 1:
-        choice = [q for q in range(4) if floor.open(last, q)]
+        choice = [q for q in range(4) if floor.is_passable(last, q)]
         if not choice:
             notes.append(f"no way on from cell {last[0]},{last[1]}: {count} landmarks not reached")
             break
@@ -267,7 +267,7 @@ def _plan_tour(
 
 def _is_open(floor: FloorMap, cell: Cell, headings: Sequence[int]) -> bool:
     for heading in headings:
-        if not floor.open(cell, heading):
+        if not floor.is_passable(cell, heading):
             return False
         cell = neighbour(cell, heading)
     return True

@@ -37,7 +37,7 @@ def walk(floor: FloorMap) -> Walked:
             at, heading, visited = cell, start, [cell]
             for step in WALKS[floor.window]:
                 heading += {"A": 0, "L": 1, "R": -1}[step]
-                if not floor.open(at, heading):
+                if not floor.is_passable(at, heading):
                     break
                 at = (at[0] + STEPS[heading % 4][0], at[1] + STEPS[heading % 4][1])
                 visited.append(at)

@@ -101,7 +101,7 @@ def middles(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres (n, 2) as found, the true middles of the bars, and nominal places."""
     cells = [one.cell for one in case.report.landmarks]
     found = [[one.built.x_m, one.built.y_m] for one in case.report.landmarks]
-    nominal = np.array([FLOOR.place(cell) for cell in cells])
+    nominal = np.array([FLOOR.position(cell) for cell in cells])
     true = np.array([case.laid[cell].middle_m[:, :2].mean(axis=0) for cell in cells])
     return np.array(found) + nominal, true, nominal
 
@@ -299,7 +299,7 @@ def test_flags(change: dict, wanted: tuple[str, ...]) -> None:
 
 
 def test_single_landmark_has_bars_but_no_pose() -> None:
-    pose = np.array([*FLOOR.place((1, 1)), 0.0]) + [3e-3, -2e-3, 0.01]
+    pose = np.array([*FLOOR.position((1, 1)), 0.0]) + [3e-3, -2e-3, 0.01]
     strength = signs(CODES[1, 1])
     sigma = np.full(3, 0.01)
     smoothed = smoothing.SmoothingResult(

@@ -77,7 +77,7 @@ def visits_of(
     for number, ((cell, quarters), code) in enumerate(zip(path, codes, strict=True)):
         off = np.array([*random.normal(0, 5e-3, 2), random.normal(0, 0.2)])
         c, s = math.cos(quarters * HALF_PI), math.sin(quarters * HALF_PI)
-        x, y = floor.place(cell) + off[0] * np.array([c, s]) + off[1] * np.array([-s, c])
+        x, y = floor.position(cell) + off[0] * np.array([c, s]) + off[1] * np.array([-s, c])
         a, b = math.cos(rotation), math.sin(rotation)
         odometry = np.array(
             [1 + a * x - b * y, 2 + b * x + a * y, quarters * HALF_PI + off[2] + rotation]

@@ -42,7 +42,7 @@ class Robot:
     def step(self) -> None:
         turns = TURNS[self.floor.window]
         for tried, turn in enumerate((turns[self.phase], 0, 1, -1, 2)):
-            if self.floor.open(self.cell, self.heading + turn):
+            if self.floor.is_passable(self.cell, self.heading + turn):
                 self.heading = (self.heading + turn) % 4
                 step = STEPS[self.heading]
                 self.cell = (self.cell[0] + step[0], self.cell[1] + step[1])

@@ -118,7 +118,7 @@ def test_reference_is_near_the_landmark() -> None:
     # The first and the last one are left or reached at rest on the landmark.
     for visit, event in list(zip(visits_of(one), one.events, strict=True))[1:-1]:
         at = np.searchsorted(truth.time_ns, visit.time_ns[visit.trace.reference])
-        away = np.hypot(*(truth.position[at, :2] - one.floor.place(event.cell)))
+        away = np.hypot(*(truth.position[at, :2] - one.floor.position(event.cell)))
         assert away < event.nearest_m + 0.025
 
 
@@ -148,7 +148,7 @@ def test_offsets_and_noise_are_estimated() -> None:
     run = preprocess(silent, one.odometry[0])
     assert run.noise_t == pytest.approx(1.5e-4, rel=0.25)
     away = np.hypot(
-        *(one.truth[0].position[:, None, :2] - [one.floor.place(c) for c in one.floor.cells()]).T
+        *(one.truth[0].position[:, None, :2] - [one.floor.position(c) for c in one.floor.cells()]).T
     ).min(axis=0)
     quiet = one.samples[0].field_t[away > 0.13]
     if len(quiet) > 50:

@@ -104,7 +104,7 @@ def test_samples_are_the_closed_form_at_the_truth(tour: SimulatedSession) -> Non
     (samples,), (truth,) = tour.samples, tour.truth
     spots = sensed(flat(truth), circle(0.025))
     wanted = sum(
-        landmark_field(FLOOR.geometry, int(FLOOR.codes[cell]), spots - FLOOR.place(cell))
+        landmark_field(FLOOR.geometry, int(FLOOR.codes[cell]), spots - FLOOR.position(cell))
         for cell in FLOOR.cells()
     )
     # Landmarks out of reach are left out: a dozen of them, a microtesla each at most.
@@ -267,14 +267,14 @@ def test_it_searches_spins_and_goes_an_l(tour: SimulatedSession) -> None:
     poses = flat(truth)
     start = poses[0, :2]
     # It starts outside of every territory: the nearest sensor is 54 mm away or more.
-    assert min(math.dist(start, FLOOR.place(cell)) for cell in FLOOR.cells()) > 0.079
+    assert min(math.dist(start, FLOOR.position(cell)) for cell in FLOOR.cells()) > 0.079
     for cell in cells:
-        near = np.hypot(*(poses[:, :2] - FLOOR.place(cell)).T) < 0.02
+        near = np.hypot(*(poses[:, :2] - FLOOR.position(cell)).T) < 0.02
         assert np.ptp(poses[near, 2]) > 2 * math.pi, "a spin on each"
         still = near[1:] & ~np.diff(poses, axis=0).any(axis=1)
         assert still.sum() >= 45, "half a second of compensation"
         stands = poses[1:][still]
-        off = np.hypot(*(stands[:, :2] - FLOOR.place(cell)).T)
+        off = np.hypot(*(stands[:, :2] - FLOOR.position(cell)).T)
         assert off.max() < 0.008
         turned = np.remainder(stands[:, 2] + math.pi / 4, math.pi / 2) - math.pi / 4
         assert np.abs(turned).max() < math.radians(4)
@@ -347,7 +347,7 @@ def test_it_respects_holes_and_walls(seed: int) -> None:
     cells = cells_of(simulated)
     for one, other in pairwise(cells):
         heading = STEPS.index((other[0] - one[0], other[1] - one[1]))
-        assert floor.open(one, heading)
+        assert floor.is_passable(one, heading)
     assert len(cells) >= 12 or simulated.notes
 
 
@@ -411,7 +411,7 @@ def test_a_pass_goes_by_the_centre_on_the_side_asked_for(lateral: float) -> None
     options = replace(PLAIN, strategy="pass", cell=(2, 3), lateral_m=lateral, approach_rad=1.0)
     simulated = simulate(FLOOR, options)
     poses = flat(simulated.truth[0])
-    centre = np.array(FLOOR.place((2, 3)))
+    centre = np.array(FLOOR.position((2, 3)))
     assert math.dist(poses[0, :2], centre) == pytest.approx(0.115)
     assert poses[0, :2] - centre == pytest.approx([0.115 * math.cos(1), 0.115 * math.sin(1)])
     heading = poses[0, 2]
@@ -585,7 +585,7 @@ def test_a_floor_lies_as_it_was_built() -> None:
     floor = replace(FLOOR, built={(2, 3): built})
     simulated = simulate(floor, replace(PLAIN, rate_hz=10.0, errors=Errors()))
     (mark,) = (mark for mark in simulated.floor_as_laid if mark.cell == (2, 3))
-    x, y = floor.place((2, 3))
+    x, y = floor.position((2, 3))
     assert (mark.x_m, mark.y_m, mark.heading_rad) == pytest.approx((x + 0.004, y - 0.003, 0.05))
     assert mark.strength[:3] == pytest.approx([1.1, -0.9, 0.0])
     assert abs(mark.strength[3]) == pytest.approx(1, abs=0.2)

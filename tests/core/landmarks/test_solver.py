@@ -112,7 +112,7 @@ def test_detections_give_the_pose_relative_to_the_landmark() -> None:
     truth = one.truth[0]
     for detection in solved(one).detections:
         at = np.argmin(np.abs(truth.time_ns * 1e-9 - detection.time_s))
-        away = truth.position[at, :2] - FLOOR.place(detection.cell)
+        away = truth.position[at, :2] - FLOOR.position(detection.cell)
         assert detection.x_m == pytest.approx(away[0], abs=4e-3)
         assert detection.y_m == pytest.approx(away[1], abs=4e-3)
 

@@ -43,7 +43,7 @@ def test_ways_are_where_the_floor_is_open(
     floor = random_floor(seed)
     free = passable_steps(floor)
     for cell in floor.cells():
-        assert [floor.open(cell, heading) for heading in range(4)] == free[cell].tolist()
+        assert [floor.is_passable(cell, heading) for heading in range(4)] == free[cell].tolist()
     assert not free[floor.codes == HOLE].any()
 
 
