@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from locatk.core.landmarks.landmark import PATTERN_OF, Geometry, rotated
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap
 from locatk.formats.maps import read_map, write_map
 
 
@@ -96,7 +96,7 @@ def test_holes_and_walls_are_where_they_were_asked_for(locatk, tmp_path: Path) -
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
     floor = read_map(path)
-    holes = {(int(r), int(c)) for r, c in np.argwhere(floor.codes == HOLE)}
+    holes = {(int(r), int(c)) for r, c in np.argwhere(floor.codes == HOLE_CODE)}
     assert holes == {(2, 3), (4, 0), (4, 1), (4, 2), (0, 6), (1, 6)}
     assert floor.walls == {((r, 3), (r, 4)) for r in range(6)} | {((1, 1), (2, 1))}
     words = readings_by_hand(floor)

@@ -19,7 +19,7 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import PATTERNS, signs
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap
 from locatk.formats import map_ros, map_svg
 from locatk.formats.map_dxf import dumps_dxf
 from locatk.formats.maps import write_map
@@ -27,7 +27,7 @@ from locatk.formats.maps import write_map
 NONE = np.full(7, np.nan)
 
 FLOOR = FloorMap(
-    np.array([[0b0111, 0b1100, 0b1111], [0b0101, HOLE, 0b0000]]),
+    np.array([[0b0111, 0b1100, 0b1111], [0b0101, HOLE_CODE, 0b0000]]),
     pitch_m=0.2,
     origin_m=(1.0, -3.0),
     walls=frozenset({((0, 0), (0, 1)), ((0, 2), (1, 2))}),
@@ -127,7 +127,7 @@ def test_territories_are_as_built() -> None:
 
 
 def test_odd_pitches_and_wrong_resolutions() -> None:
-    odd = FloorMap(np.array([[5, HOLE]]), pitch_m=0.1234)
+    odd = FloorMap(np.array([[5, HOLE_CODE]]), pitch_m=0.1234)
     picture = map_ros.draw(odd, 0.01)
     assert picture.shape == (13, 25)
     assert (picture[0] == map_ros.UNKNOWN).all()  # beyond the map

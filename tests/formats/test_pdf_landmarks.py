@@ -25,7 +25,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pack
 from locatk.core.landmarks.drawing.true_size import draw_floor
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.paper_sizes import parse_paper
 from locatk.formats.pdf.drawings import render_floor, render_pages
 
@@ -50,7 +50,7 @@ HALL = some_floor(
     origin_m=(-0.4, 1.0),
     walls=frozenset({((0, 0), (0, 1)), ((2, 2), (3, 2))}),
 )
-HALL.codes[1, 2] = HOLE
+HALL.codes[1, 2] = HOLE_CODE
 
 
 def ink(data: bytes, number: int = 0, dpi: float = DPI) -> Places:
@@ -128,7 +128,7 @@ def test_templates_have_their_bars_at_true_size(
     if code is not None:
         floor = replace(floor, codes=np.full((2, 2), code))
     made = draw_installation_pack(floor, size, parts=("templates",))
-    laid = {int(value) for value in floor.codes.ravel()} - {HOLE}
+    laid = {int(value) for value in floor.codes.ravel()} - {HOLE_CODE}
     assert [item.code for item in made.templates] == sorted(laid)
     data = render_pages(made.pages, "t")
     for item in made.templates[:: 1 if code is not None else 3]:

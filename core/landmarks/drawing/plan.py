@@ -24,7 +24,7 @@ from locatk.core.drawing.pages import SMALL_TEXT_POINTS, TEXT_POINTS, PageFrame,
 from locatk.core.drawing.tiles import tile_name
 from locatk.core.landmarks.drawing.landmark import draw_hole, draw_symbol, north_mark
 from locatk.core.landmarks.drawing.legend import LEGEND_HEIGHT_MM, draw_legend
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap
 from locatk.core.units import mm_text
 
 MIN_CELL_MM = 6.5
@@ -261,7 +261,7 @@ class _BlockDrawing:
     def _cell(self, cell: Cell) -> list[Mark]:
         centre, half = self._centre(cell), 0.5 * self.cell_mm
         code = int(self.floor.codes[cell])
-        if code == HOLE:
+        if code == HOLE_CODE:
             return draw_hole(centre, half, 0.1)
         if self.cell_mm <= MIN_LABELLED_CELL_MM:
             return draw_symbol(code, centre, 1.2 * self.cell_mm)
@@ -308,7 +308,7 @@ def _draw_overview(floor: FloorMap, layout: _PlanLayout, box: Box) -> list[Mark]
     left = (box[0] + box[2] - cell * columns) / 2
     bottom = box[3] - 5 - cell * rows
     marks: list[Mark] = []
-    holes = [(r, c) for r in range(rows) for c in range(columns) if floor.codes[r, c] == HOLE]
+    holes = [(r, c) for r in range(rows) for c in range(columns) if floor.codes[r, c] == HOLE_CODE]
     for row, column in holes:
         x, y = left + column * cell, bottom + row * cell
         # A single thin diagonal, because the name of a block may be over it.

@@ -17,7 +17,7 @@ from locatk.core.landmarks.drawing.landmark import (
     drawing_half_side,
     north_mark,
 )
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap
 from locatk.core.paper_sizes import Paper
 from locatk.core.units import mm_text
 
@@ -143,7 +143,7 @@ def _cells_in_area(floor: FloorMap, corner: Point, box: Box) -> list[Cell]:
 def _draw_cell(floor: FloorMap, cell: Cell, centre: Point) -> list[Mark]:
     x, y = centre
     code = int(floor.codes[cell])
-    if code == HOLE:
+    if code == HOLE_CODE:
         return [*draw_hole(centre, 10.0, 0.2), Text("no landmark", (x + 2, y + 12), TEXT_POINTS)]
     notes = (f"row {cell[0]}", f"column {cell[1]}", f"code {code_digit(code)}")
     return [

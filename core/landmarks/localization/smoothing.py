@@ -57,7 +57,7 @@ from locatk.core.landmarks.landmark import (
 )
 from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit
 from locatk.core.landmarks.map.floor import (
-    HOLE,
+    HOLE_CODE,
     MISSING_BAR_STRENGTH,
     Cell,
     FloorMap,
@@ -216,7 +216,7 @@ def subtract_neighbours(
     rows, columns = floor.shape
     for row in range(max(0, cell[0] - span), min(rows, cell[0] + span + 1)):
         for column in range(max(0, cell[1] - span), min(columns, cell[1] + span + 1)):
-            if (row, column) == cell or floor.codes[row, column] == HOLE:
+            if (row, column) == cell or floor.codes[row, column] == HOLE_CODE:
                 continue
             landmark, strength = as_built_landmark(floor, (row, column))
             offset = position - landmark[:2]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.landmark import PATTERN_OF, rotated
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, neighbour
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, neighbour
 
 Array = NDArray[np.float64]
 
@@ -137,7 +137,7 @@ def match_map(
 
 def _matches_cell(floor: FloorMap, cell: Cell, heading: int, code: int) -> bool:
     installed = int(floor.codes[cell])
-    if installed == HOLE:
+    if installed == HOLE_CODE:
         return False
     if floor.alphabet == "6":
         return bool(PATTERN_OF[installed] == PATTERN_OF[code])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from locatk.core.landmarks.landmark import PATTERNS, code_of, pattern, rotated
-from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, STEPS, WINDOWS, Cell, FloorMap
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, STEPS, WINDOWS, Cell, FloorMap
 
 LETTERS = {
     "6": [code_of(letters) for letters in PATTERNS],
@@ -57,7 +57,7 @@ def draw(seed: int) -> FloorMap:
     rows, columns = random.integers(1, 7, 2)
     alphabet = str(random.choice(ALPHABETS))
     codes = random.choice(LETTERS[alphabet], (rows, columns))
-    codes[random.random(codes.shape) < random.choice([0, 0.1])] = HOLE
+    codes[random.random(codes.shape) < random.choice([0, 0.1])] = HOLE_CODE
     walls = set()
     for row in range(rows):
         for column in range(columns):

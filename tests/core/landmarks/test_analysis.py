@@ -57,8 +57,8 @@ def test_valleys_are_those_of_the_facts(usual: LandmarkAnalysis) -> None:
     for plus, minus in (("NNNS", "SSSN"), ("NNNN", "SSSS")):
         one, other = (usual.patterns[PATTERNS.index(letters)] for letters in (plus, minus))
         np.testing.assert_allclose(one.valleys_rad, other.valleys_rad, atol=1e-9)
-        np.testing.assert_array_equal(one.rising, ~other.rising)
-        np.testing.assert_allclose(one.mountains_t, -other.mountains_t)
+        np.testing.assert_array_equal(one.is_rising, ~other.is_rising)
+        np.testing.assert_allclose(one.peaks_t, -other.peaks_t)
 
 
 @pytest.mark.parametrize("geometry", [ONE, LONG])
@@ -70,8 +70,8 @@ def test_counts_are_those_of_the_paper(geometry: Geometry) -> None:
     for pattern in found.patterns:
         assert (np.diff(pattern.valleys_rad) > 0).all()
         # Mountains change sign at each valley, and say whether the field rises there.
-        np.testing.assert_array_equal(pattern.rising, pattern.mountains_t > 0)
-        np.testing.assert_array_equal(pattern.rising, ~np.roll(pattern.rising, 1))
+        np.testing.assert_array_equal(pattern.is_rising, pattern.peaks_t > 0)
+        np.testing.assert_array_equal(pattern.is_rising, ~np.roll(pattern.is_rising, 1))
 
 
 def test_valleys_are_zeros_of_magpylibs_field() -> None:
@@ -98,15 +98,15 @@ def test_mountains_are_those_of_the_facts(usual: LandmarkAnalysis) -> None:
     wide, narrow = [], []
     for pattern in usual.patterns:
         width = np.diff(pattern.valleys_rad, append=pattern.valleys_rad[0] + 2 * math.pi)
-        height = 1e3 * np.abs(pattern.mountains_t)
+        height = 1e3 * np.abs(pattern.peaks_t)
         wide += height[width > math.radians(70)].tolist()
         narrow += height[width < math.radians(60)].tolist()
     assert (min(wide), max(wide)) == pytest.approx((23.1, 24.3), abs=0.06)
     assert (min(narrow), max(narrow)) == pytest.approx((7.8, 9.3), abs=0.06)
     long = analyse_landmark(LONG).patterns
-    assert 1e3 * long[0].mountains_t.max() == pytest.approx(53, abs=0.5)
-    assert 1e3 * long[3].mountains_t.min() == pytest.approx(-54, abs=0.5)
-    assert 1e3 * np.abs(long[3].mountains_t).min() == pytest.approx(9.6, abs=0.06)
+    assert 1e3 * long[0].peaks_t.max() == pytest.approx(53, abs=0.5)
+    assert 1e3 * long[3].peaks_t.min() == pytest.approx(-54, abs=0.5)
+    assert 1e3 * np.abs(long[3].peaks_t).min() == pytest.approx(9.6, abs=0.06)
 
 
 def test_crossing_has_the_bias_of_the_facts(usual: LandmarkAnalysis) -> None:

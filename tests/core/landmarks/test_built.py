@@ -12,16 +12,16 @@ from locatk.core.landmarks.landmark import code_of, rotated, signs
 from locatk.core.landmarks.localization.cell_filter import identify_cells
 from locatk.core.landmarks.localization.smoothing import subtract_neighbours
 from locatk.core.landmarks.map.floor import (
-    HOLE,
+    HOLE_CODE,
     AsBuiltLandmark,
     FloorMap,
     as_built_codes,
     as_built_landmark,
 )
-from locatk.core.landmarks.simulation.floor import floor_field, lay
+from locatk.core.landmarks.simulation.floor import floor_field, install_landmarks
 from locatk.core.landmarks.simulation.options import NONE, Faults
 
-CODES = np.array([[13, 5, 4, 12], [3, 7, 2, 15], [1, 11, HOLE, 8]])
+CODES = np.array([[13, 5, 4, 12], [3, 7, 2, 15], [1, 11, HOLE_CODE, 8]])
 
 
 def built(
@@ -59,7 +59,7 @@ def test_fields_of_neighbours_are_those_of_their_bars_as_built() -> None:
         (1, 0): built([-1, -1, 0.7, 1], -5e-3, 0.0, -0.2),
     }
     floor = FloorMap(CODES[:2, :2], pitch_m=0.12, built=known)
-    laid = lay(floor, NONE, Faults(), 0)
+    laid = install_landmarks(floor, NONE, Faults(), 0)
     others = [mark for cell, mark in laid.items() if cell != (0, 0)]
     pose = np.column_stack([np.linspace(-0.02, 0.05, 15), np.full(15, 0.01), np.full(15, 0.3)])
     local = pose.copy()

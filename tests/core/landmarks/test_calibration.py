@@ -30,7 +30,7 @@ from locatk.core.landmarks.landmark import signs
 from locatk.core.landmarks.localization import smoothing
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.landmarks.simulation import session as simulate
-from locatk.core.landmarks.simulation.floor import Laid, lay
+from locatk.core.landmarks.simulation.floor import InstalledLandmark, install_landmarks
 from locatk.core.landmarks.simulation.session import (
     Errors,
     Faults,
@@ -60,7 +60,9 @@ def drive(
 ) -> SimulatedSession:
     """A robot of its own on the floor of ``floor_seed``."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "lay", lambda f, e, x, _: lay(f, e, x, floor_seed))
+        patch.setattr(
+            simulate, "install_landmarks", lambda f, e, x, _: install_landmarks(f, e, x, floor_seed)
+        )
         return simulate.simulate(
             floor,
             SimulationOptions(
@@ -82,7 +84,7 @@ class Case:
     floor_seed: int
     drives: list[CalibrationDrive]
     report: FloorCalibrationReport
-    laid: dict[Cell, Laid]
+    laid: dict[Cell, InstalledLandmark]
 
 
 @pytest.fixture(scope="module", params=[5, 6])
@@ -93,7 +95,7 @@ def case(request: pytest.FixtureRequest) -> Case:
         for k, cells in enumerate((ROWS, COLUMNS))
     ]
     drives = [taken(session, f"run{k}") for k, session in enumerate(sessions)]
-    laid = {one.cell: one for one in sessions[0].floor_as_laid}
+    laid = {one.cell: one for one in sessions[0].installed_landmarks}
     return Case(request.param, drives, calibrate(FLOOR, drives), laid)
 
 

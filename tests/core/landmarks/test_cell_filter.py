@@ -26,7 +26,7 @@ from locatk.core.landmarks.localization.cell_filter import (
     predict_backward,
     select_visits_on_map,
 )
-from locatk.core.landmarks.map.floor import HOLE, STEPS, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, STEPS, Cell, FloorMap
 from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
@@ -148,7 +148,7 @@ def test_probabilities_agree_with_enumeration(seed: int) -> None:
     codes = on_map(floor, path)
     codes[1] = (codes[1] + 3) % CODE_COUNT
     read = [int(rotated(code, -q)) for code, (_, q) in zip(codes, path, strict=True)]
-    codes_of = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE)
+    codes_of = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE_CODE)
     weight = {}
     for row in range(-PAD_CELLS, 12 + PAD_CELLS):
         for column in range(-PAD_CELLS, 12 + PAD_CELLS):
@@ -161,7 +161,7 @@ def test_probabilities_agree_with_enumeration(seed: int) -> None:
                         hit = int(rotated(max(laid, 0), -q)) == code
                         same = 1 - MISREAD if hit else MISREAD / (CODE_COUNT - 1)
                         weight[other[0]] *= (
-                            OUTSIDE_LANDMARK_PROBABILITY / CODE_COUNT if laid == HOLE else same
+                            OUTSIDE_LANDMARK_PROBABILITY / CODE_COUNT if laid == HOLE_CODE else same
                         )
     want = weight[path[0]] / sum(weight.values())
     estimates = found(floor, visits_of(floor, path, codes, seed))
@@ -204,7 +204,7 @@ def test_kidnapped_robot(published: FloorMap) -> None:
 def test_hole_in_the_map(published: FloorMap) -> None:
     codes = published.codes.copy()
     path = walk(((7, 7), 0), (0, 0, 0, 0, 1))
-    codes[path[2][0]] = HOLE
+    codes[path[2][0]] = HOLE_CODE
     estimates = found(FloorMap(codes), visits_of(published, path, on_map(published, path)))
     assert [(one.cell, one.quarters) for one in estimates] == path
 
@@ -257,7 +257,7 @@ def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
 def test_visits_on_the_map_need_a_probable_cell_with_a_landmark(
     probability: float, cell: Cell, is_used: bool
 ) -> None:
-    floor = FloorMap(np.array([[5, HOLE]]))
+    floor = FloorMap(np.array([[5, HOLE_CODE]]))
     estimate = CellEstimate(cell, 0, 0, probability, probability)
     visit = VisitHypotheses("robot", 0, 0, 1, np.zeros(3), ())
     segment = VisitSegment(0, 1, np.arange(1), None, np.zeros(3))  # type: ignore[arg-type]
@@ -276,7 +276,7 @@ def test_missed_landmarks_cost_probability() -> None:
     """Of two pairs of equal codes, the one with a hole in between is more probable."""
     codes = np.full((1, 9), 0)
     codes[0, [0, 2]] = codes[0, [6, 8]] = 7, 11
-    codes[0, 7] = HOLE
+    codes[0, 7] = HOLE_CODE
     floor = FloorMap(codes)
     path = [((0, 0), 0), ((0, 2), 0)]
     estimates = found(floor, visits_of(floor, path, [7, 11]))

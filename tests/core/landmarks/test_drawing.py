@@ -22,7 +22,7 @@ from locatk.core.landmarks.drawing.plan import round_scale
 from locatk.core.landmarks.drawing.templates import cells_by_code, cells_text
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, name, rotated
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 
 OTHER = Geometry(bar_length_m=0.02, bar_width_m=0.004, radius_m=0.0315, sensor_height_m=0.01)
 
@@ -116,18 +116,18 @@ def floor(codes: list[list[int]], **more: object) -> FloorMap:
 
 
 def test_floors_that_cannot_be_built_are_rejected() -> None:
-    good = floor([[1, 2], [3, HOLE]], pitch_m=0.06)
+    good = floor([[1, 2], [3, HOLE_CODE]], pitch_m=0.06)
     check_buildable(good)
     with pytest.raises(InputError, match="overlap at a pitch of 59 mm"):
         check_buildable(replace(good, pitch_m=0.059))
     with pytest.raises(InputError, match="overlap at the landmark's corners"):
         check_buildable(replace(good, pitch_m=0.2, geometry=Geometry(bar_length_m=0.041)))
     with pytest.raises(InputError, match="no landmark"):
-        check_buildable(floor([[HOLE]]))
+        check_buildable(floor([[HOLE_CODE]]))
 
 
 def test_cells_are_listed_in_short() -> None:
-    laid = floor([[3, 5, 3], [5, HOLE, 5]])
+    laid = floor([[3, 5, 3], [5, HOLE_CODE, 5]])
     cells = cells_by_code(laid)
     assert list(cells) == [3, 5]
     assert cells_text(cells[3]) == "row 0: 0, 2"

@@ -14,7 +14,7 @@ from locatk.core.landmarks.design import search
 from locatk.core.landmarks.design.generation import DesignOptions, design_map
 from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES, passable_steps, place_windows
 
 MODES = [
@@ -90,7 +90,7 @@ def test_what_was_asked_for_is_on_the_map() -> None:
         6, 7, alphabet="6", pitch_m=0.25, forbidden=forbidden, walls=walls, geometry=geometry
     )
     floor = design_map(wanted)
-    assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE).tolist()} == forbidden
+    assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE_CODE).tolist()} == forbidden
     assert floor.walls == {((1, 1), (1, 2)), ((4, 3), (5, 3))}
     assert (floor.pitch_m, floor.geometry, floor.window) == (0.25, geometry, "L")
     assert prove_map(floor).is_unique

@@ -7,7 +7,7 @@ import pytest
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.landmark import signs
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap, as_built_poses
+from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap, as_built_poses
 from locatk.core.landmarks.map.grid_fit import fit_grid, floor_from_poses
 
 
@@ -87,7 +87,7 @@ def test_a_turned_survey_has_no_grid() -> None:
 
 def test_poses_are_as_built() -> None:
     floor = FloorMap(
-        np.array([[5, HOLE], [7, 1]]),
+        np.array([[5, HOLE_CODE], [7, 1]]),
         origin_m=(1.0, 2.0),
         built={(1, 0): AsBuiltLandmark(0.003, -0.002, 0.1, signs(7), np.full(7, np.nan))},
     )

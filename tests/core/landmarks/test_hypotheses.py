@@ -39,7 +39,7 @@ from locatk.core.landmarks.preprocessing import (
     segment_visits,
 )
 from locatk.core.landmarks.simulation.options import NONE
-from locatk.core.landmarks.simulation.passes import Pass, passes
+from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Read:
     covariance: Array
 
 
-def read(one: Pass, geometry: Geometry = GEOMETRY) -> Read | None:
+def read(one: SinglePass, geometry: Geometry = GEOMETRY) -> Read | None:
     run = preprocess(one.samples, one.odometry)
     priors = ModelPriors(noise_t=run.noise_t)
     visits = segment_visits(run, geometry, priors.drift)
@@ -83,14 +83,14 @@ def read(one: Pass, geometry: Geometry = GEOMETRY) -> Read | None:
 
 @functools.cache
 def nominal() -> list[Read]:
-    several = [read(one) for one in passes(60, seed=21)]
+    several = [read(one) for one in simulate_passes(60, seed=21)]
     return [one for one in several if one is not None]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", range(16))
 def test_codes_of_traces_without_errors(code: int) -> None:
-    one = read(passes(1, code, errors=NONE, seed=5, start=(0.7 * code, 0.1))[0])
+    one = read(simulate_passes(1, code, errors=NONE, seed=5, start=(0.7 * code, 0.1))[0])
     assert one is not None
     assert one.found[0].code == one.right
     assert one.found[0].probability > 0.99
@@ -132,7 +132,7 @@ def test_covariances_agree_with_the_errors() -> None:
 @pytest.mark.slow
 def test_weak_magnets_are_not_misread_with_certainty() -> None:
     weak = Geometry(remanence_t=0.4, threshold_t=1.1e-3)
-    for one in passes(15, geometry=weak, seed=22):
+    for one in simulate_passes(15, geometry=weak, seed=22):
         got = read(one, weak)
         if got is not None and got.found[0].probability > 0.99:
             assert got.found[0].code == got.right
@@ -140,7 +140,7 @@ def test_weak_magnets_are_not_misread_with_certainty() -> None:
 
 @pytest.mark.slow
 def test_spin_determines_code_and_pose() -> None:
-    for one in passes(8, then="spin", seed=23):
+    for one in simulate_passes(8, then="spin", seed=23):
         got = read(one)
         assert got is not None
         assert got.found[0].code == got.right
@@ -149,7 +149,7 @@ def test_spin_determines_code_and_pose() -> None:
 
 
 def test_missing_bar_leaves_both_codes() -> None:
-    one = passes(1, 0b0111, then="spin", errors=NONE, seed=3)[0]
+    one = simulate_passes(1, 0b0111, then="spin", errors=NONE, seed=3)[0]
     whole = read(one)
     assert whole is not None
     bar = next(k for k in range(4) if whole.found[0].strength[k] < 0)
@@ -201,7 +201,7 @@ def test_pose_at_known_landmark_at_rest() -> None:
     Under some headings, with a sensor over no bar, the heading shows little.
     """
     sizes, squares = [], []
-    for one in passes(12, 0b0111, then="stand", aim_m=0.002, seed=24):
+    for one in simulate_passes(12, 0b0111, then="stand", aim_m=0.002, seed=24):
         run = preprocess(one.samples, one.odometry)
         still = slice(len(run.samples) - 20, None)
         value = (run.samples.field_t - run.offset_t)[still].mean(axis=0)[None]

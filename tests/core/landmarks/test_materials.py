@@ -8,7 +8,7 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.landmarks.design.materials import bill_of_materials, count_patterns
 from locatk.core.landmarks.landmark import PATTERNS, code_of
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 
 
 def floor(codes: list[list[int]]) -> FloorMap:
@@ -16,7 +16,7 @@ def floor(codes: list[list[int]]) -> FloorMap:
 
 
 def test_materials_are_counted() -> None:
-    laid = floor([[0, 5, 10, 7], [HOLE, 14, 7, 0]])
+    laid = floor([[0, 5, 10, 7], [HOLE_CODE, 14, 7, 0]])
     items = {item.part: item for item in bill_of_materials(laid, spares_percent=10)}
     assert items["bar magnet"].count == 4 * 7
     assert items["bar magnet, spare"].count == 3

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from locatk.core.landmarks.design.proof import min_hamming_distance, prove_map
 from locatk.core.landmarks.landmark import PATTERNS, code_of
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.map.windows import window_readings
 
 Walk = Callable[[FloorMap], dict[Any, Any]]
@@ -153,7 +153,7 @@ def test_what_is_promised_is_not_believed() -> None:
 
 
 def test_floors_without_a_window_are_proved_too() -> None:
-    for codes in ([[5]], [[HOLE]], [[3, HOLE], [HOLE, 3]]):
+    for codes in ([[5]], [[HOLE_CODE]], [[3, HOLE_CODE], [HOLE_CODE, 3]]):
         proof = prove_map(FloorMap(np.array(codes)))
         assert proof.readings == 0
         assert proof.is_unique
@@ -164,7 +164,7 @@ def test_floors_without_a_window_are_proved_too() -> None:
 def test_fingerprint_tells_maps_apart() -> None:
     floor = FloorMap(np.arange(9).reshape(3, 3))
     codes = floor.codes.copy()
-    codes[2, 2] = HOLE
+    codes[2, 2] = HOLE_CODE
     others = [
         floor,
         replace(floor, codes=codes),

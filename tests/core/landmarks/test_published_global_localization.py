@@ -11,7 +11,7 @@ import pytest
 
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.landmark import PATTERNS, code_of, rotated
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.published.global_localization import landmark_sequence, match_map
 from locatk.core.landmarks.published.search import detect_landmarks
 from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
@@ -78,7 +78,7 @@ def test_nothing_ambiguous_walls_and_holes() -> None:
     assert match_map(floor, [15, 15, 15]).status == "none"
     wall = replace(floor, walls=frozenset({((0, 0), (0, 1))}))
     assert match_map(wall, codes).status == "none"
-    hole = replace(floor, codes=np.array([[1, HOLE, 5], [4, 8, 3]]))
+    hole = replace(floor, codes=np.array([[1, HOLE_CODE, 5], [4, 8, 3]]))
     assert match_map(hole, codes).status == "none"
     alike = match_map(FloorMap(np.full((2, 2), 15)), [15, 15, 15])
     assert alike.status == "ambiguous"

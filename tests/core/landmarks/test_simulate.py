@@ -22,7 +22,14 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.field import basis, landmark_field
 from locatk.core.landmarks.halls import NAMES, HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, code_of, pattern, signs
-from locatk.core.landmarks.map.floor import HOLE, STEPS, WINDOWS, AsBuiltLandmark, Cell, FloorMap
+from locatk.core.landmarks.map.floor import (
+    HOLE_CODE,
+    STEPS,
+    WINDOWS,
+    AsBuiltLandmark,
+    Cell,
+    FloorMap,
+)
 from locatk.core.landmarks.simulation.floor import (
     BAR_DRAWS,
     DIPOLE_LENGTHS,
@@ -30,10 +37,10 @@ from locatk.core.landmarks.simulation.floor import (
     dipole_fields,
     scatter_bars,
 )
+from locatk.core.landmarks.simulation.passes import simulate_passes
 from locatk.core.landmarks.simulation.robot import Robot
 from locatk.core.landmarks.simulation.sensors import odometry
 from locatk.core.landmarks.simulation.session import (
-    EPOCH_NS,
     NONE,
     Aims,
     Errors,
@@ -41,10 +48,10 @@ from locatk.core.landmarks.simulation.session import (
     RobotLimits,
     SimulatedSession,
     SimulationOptions,
-    passes,
     simulate,
 )
 from locatk.core.landmarks.simulation.strategy import is_free
+from locatk.core.simulation import SESSION_START_NS
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -119,7 +126,7 @@ def test_a_landmark_that_lies_badly_is_felt_where_it_lies() -> None:
     )
     options = replace(PLAIN, strategy="pass", errors=errors, seed=2)
     simulated = simulate(floor, options)
-    (mark,) = simulated.floor_as_laid
+    (mark,) = simulated.installed_landmarks
     assert math.hypot(mark.x_m - 0.3, mark.y_m + 0.1) > 1e-3
     assert abs(mark.heading_rad) > 0.01
     spots = sensed(flat(simulated.truth[0]), circle(0.025)) - [mark.x_m, mark.y_m]
@@ -332,7 +339,7 @@ def test_it_reads_the_window_of_the_map(window: str) -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_it_respects_holes_and_walls(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    codes = np.where(rng.random((6, 6)) < 0.25, HOLE, rng.integers(0, 16, (6, 6)))
+    codes = np.where(rng.random((6, 6)) < 0.25, HOLE_CODE, rng.integers(0, 16, (6, 6)))
     walls = frozenset(
         ((row, column), (row + up, column + right))
         for row in range(5)
@@ -352,7 +359,7 @@ def test_it_respects_holes_and_walls(seed: int) -> None:
 
 
 def test_what_is_free() -> None:
-    floor = FloorMap(np.array([[1, 2], [HOLE, 3]]), walls=frozenset({((0, 0), (0, 1))}))
+    floor = FloorMap(np.array([[1, 2], [HOLE_CODE, 3]]), walls=frozenset({((0, 0), (0, 1))}))
 
     def line(*ends: tuple[float, float]) -> Array:
         return np.linspace(*ends, 41)
@@ -538,7 +545,7 @@ def test_faults_of_the_floor_are_where_they_were_asked_for() -> None:
     options = replace(PLAIN, rate_hz=20.0, faults=faults, errors=replace(NONE, bar_strength=0.04))
     plain = simulate(FLOOR, replace(options, faults=Faults()))
     wrong = simulate(FLOOR, options)
-    for before, after in zip(plain.floor_as_laid, wrong.floor_as_laid, strict=True):
+    for before, after in zip(plain.installed_landmarks, wrong.installed_landmarks, strict=True):
         strength = before.strength.copy()
         if after.cell == (1, 2):
             strength[[0, 3]] *= -1
@@ -569,7 +576,7 @@ def test_a_misread_landmark_is_another_one_of_the_alphabet(alphabet: str) -> Non
     floor = FloorMap(codes, alphabet=alphabet)
     options = replace(PLAIN, rate_hz=10.0, faults=Faults(misread_rate=0.3))
     simulated = simulate(floor, options)
-    wrong = [mark for mark in simulated.floor_as_laid if mark.code != mark.designed]
+    wrong = [mark for mark in simulated.installed_landmarks if mark.code != mark.designed]
     assert all(mark.faults == ("misread",) for mark in wrong)
     assert len(wrong) / 144 == pytest.approx(0.3, abs=0.12)
     if alphabet == "6":
@@ -584,7 +591,7 @@ def test_a_floor_lies_as_it_was_built() -> None:
     )
     floor = replace(FLOOR, built={(2, 3): built})
     simulated = simulate(floor, replace(PLAIN, rate_hz=10.0, errors=Errors()))
-    (mark,) = (mark for mark in simulated.floor_as_laid if mark.cell == (2, 3))
+    (mark,) = (mark for mark in simulated.installed_landmarks if mark.cell == (2, 3))
     x, y = floor.position((2, 3))
     assert (mark.x_m, mark.y_m, mark.heading_rad) == pytest.approx((x + 0.004, y - 0.003, 0.05))
     assert mark.strength[:3] == pytest.approx([1.1, -0.9, 0.0])
@@ -649,7 +656,7 @@ def test_errors_that_cannot_be_are_refused() -> None:
 
 
 def test_passes_start_on_the_circle_and_head_for_the_landmark() -> None:
-    made = passes(150, errors=NONE, seed=5)
+    made = simulate_passes(150, errors=NONE, seed=5)
     starts = np.array([flat(one.truth)[0] for one in made])
     assert np.hypot(starts[:, 0], starts[:, 1]) == pytest.approx(0.115)
     to_centre = np.arctan2(-starts[:, 1], -starts[:, 0])
@@ -672,24 +679,26 @@ def test_passes_start_on_the_circle_and_head_for_the_landmark() -> None:
 def test_passes_feel_the_closed_form() -> None:
     geometry = Geometry(sensor_height_m=0.01)
     for then in ("", "spin", "pass", "stand"):
-        for one in passes(3, [14, 5, 3], geometry=geometry, errors=NONE, then=then, seed=2):
+        for one in simulate_passes(
+            3, [14, 5, 3], geometry=geometry, errors=NONE, then=then, seed=2
+        ):
             spots = sensed(flat(one.truth), circle(0.025))
             wanted = landmark_field(geometry, one.code, spots)
             assert one.samples.field_t == pytest.approx(wanted, abs=1e-12)
             assert one.strength == pytest.approx(signs(one.code))
             assert np.array_equal(one.samples.time_ns, one.truth.time_ns)
-            assert one.samples.time_ns[0] == EPOCH_NS
+            assert one.samples.time_ns[0] == SESSION_START_NS
 
 
 def test_what_follows_a_pass_is_near_the_centre() -> None:
-    aims = [np.hypot(*one.end[:2]) for one in passes(150, 14, errors=NONE, then="stand")]
+    aims = [np.hypot(*one.end[:2]) for one in simulate_passes(150, 14, errors=NONE, then="stand")]
     assert np.mean(aims) == pytest.approx(0.007, rel=0.13)
-    for one in passes(4, 14, errors=NONE, then="spin", aim_m=0.0):
+    for one in simulate_passes(4, 14, errors=NONE, then="spin", aim_m=0.0):
         poses = flat(one.truth)
         over = np.hypot(poses[:, 0], poses[:, 1]) < 1e-9
         assert np.ptp(poses[over, 2]) >= 2 * math.pi - 1e-9
         assert not over[: one.first].all()
-    for one in passes(4, 14, errors=NONE, then="pass", aim_m=0.0):
+    for one in simulate_passes(4, 14, errors=NONE, then="pass", aim_m=0.0):
         poses = flat(one.truth)
         along = poses[-1, 2] - poses[0, 2]
         assert math.cos(along) == pytest.approx(0, abs=1e-9)
@@ -698,7 +707,7 @@ def test_what_follows_a_pass_is_near_the_centre() -> None:
 
 
 def test_passes_err_as_facts_say() -> None:
-    exact, made = (passes(200, 14, errors=errors, seed=1) for errors in (NONE, None))
+    exact, made = (simulate_passes(200, 14, errors=errors, seed=1) for errors in (NONE, None))
     scale, drift, strength = [], [], []
     for one, other in zip(exact, made, strict=True):
         assert np.array_equal(one.truth.position, other.truth.position)
@@ -718,11 +727,11 @@ def test_passes_err_as_facts_say() -> None:
 
 def test_passes_are_asked_for_with_sense() -> None:
     with pytest.raises(InputError, match="dance"):
-        passes(1, then="dance")
+        simulate_passes(1, then="dance")
     with pytest.raises(InputError, match="16"):
-        passes(1, 16)
+        simulate_passes(1, 16)
     sensors = HallSensors(NAMES, circle(0.03), range_t=0.005)
-    (one,) = passes(1, 5, sensors=sensors, start=(0.0, 0.0))
+    (one,) = simulate_passes(1, 5, sensors=sensors, start=(0.0, 0.0))
     assert one.samples.sensors is sensors
     assert np.abs(one.samples.field_t).max() == 0.005
     assert flat(one.truth)[0] == pytest.approx([0.115, 0, math.pi])

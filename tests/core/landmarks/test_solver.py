@@ -14,7 +14,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks import solver
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import pattern
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.simulation.session import (
     Aims,
     Errors,
@@ -230,7 +230,7 @@ def test_no_odometry_is_an_error() -> None:
 
 def test_landmark_that_is_not_on_the_map() -> None:
     codes = CODES.copy()
-    codes[3, 5] = HOLE
+    codes[3, 5] = HOLE_CODE
     solution = solved(session(), FloorMap(codes))
     assert solution.rejected == {"off_map": 1}
     assert farthest(session(), solution) < 4e-3
@@ -238,7 +238,7 @@ def test_landmark_that_is_not_on_the_map() -> None:
 
 def test_landmark_that_is_not_on_the_floor() -> None:
     codes = CODES.copy()
-    codes[2, 4] = HOLE
+    codes[2, 4] = HOLE_CODE
     one = drive(FloorMap(codes))
     solution = solved(one, FLOOR)
     assert [detection.cell for detection in solution.detections] == [

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.landmarks.landmark import code_of
-from locatk.core.landmarks.map.floor import HOLE, WINDOWS, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, WINDOWS, FloorMap
 from locatk.core.landmarks.map.windows import passable_steps, window_readings
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -44,7 +44,7 @@ def test_ways_are_where_the_floor_is_open(
     free = passable_steps(floor)
     for cell in floor.cells():
         assert [floor.is_passable(cell, heading) for heading in range(4)] == free[cell].tolist()
-    assert not free[floor.codes == HOLE].any()
+    assert not free[floor.codes == HOLE_CODE].any()
 
 
 def test_a_left_turn_by_hand() -> None:
