@@ -28,10 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.landmarks import visits
 from locatk.core.landmarks.detection.trace import compose, sensor_positions
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import preprocess
 from locatk.core.landmarks.published.first_step import bar_radii
 from locatk.core.landmarks.published.pose_compensation import (
     compensate_pose,
@@ -379,7 +379,7 @@ class PublishedDriver:
 
     def _record(self) -> _Recording:
         measurements = self._measure()
-        recording = visits.driven(measurements.samples, measurements.odometry)
+        recording = preprocess(measurements.samples, measurements.odometry)
         pose = recording.pose
         field = recording.samples.field_t - recording.offset_t
         step = np.diff(pose[:, :2], axis=0, prepend=pose[:1, :2])
