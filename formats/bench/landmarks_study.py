@@ -2,7 +2,7 @@
 
 The field is that of every bar as a cuboid (magpylib), each with an error of its strength
 and place; sensors have noise, gains, offsets and the Earth's field; odometry errs in scale,
-heading and turns (:class:`.simulate_options.Errors`, facts/landmarks.md 3). Visits whose
+heading and turns (:class:`.simulation.options.Errors`). Visits whose
 sensors never enter the territory are left out, as in the paper's study.
 
 Errors of places are those of the landmark's centre in the robot's frame at the end of the
@@ -69,7 +69,7 @@ STATIC = Errors(
     noise_t=0.15e-3 / 10, offset_t=0.1e-3, gain=0.02, earth_t=0.0, bar_strength=0.04,
     bar_place_m=0.3e-3,
 )  # fmt: skip
-"""Of facts/landmarks.md 2.4, with the mean of a hundred samples."""
+"""Errors of the static fit: nominal parts, and the mean of a hundred samples."""
 
 
 @dataclass(frozen=True)

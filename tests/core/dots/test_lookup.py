@@ -35,7 +35,7 @@ def draw(
 
 
 def repeated(at: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether libdots' six windows that occur twice are at one of these places (facts 2.1)."""
+    """Return whether positions are those of the six windows that libdots' A4 sequence has twice."""
     twice = [82, 238, 170, 236, 177, 237, 195, 217, 198, 218, 199, 219]
     result: NDArray[np.bool_] = np.isin(at % 241, twice)
     return result

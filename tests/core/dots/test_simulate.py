@@ -181,7 +181,7 @@ def test_each_dot_lies_where_its_symbol_and_the_truth_say() -> None:
 
 
 def test_the_published_frame_looks_like_its_simulation(data: Path) -> None:
-    """Codec, conventions and heading against the one real picture (facts 2.6)."""
+    """Codec, conventions and heading against the real picture of cellulo-localization."""
     real = cv2.imread(str(data / "dots" / "frame.bmp"), cv2.IMREAD_GRAYSCALE)
     manifest = Manifest(
         (Sheet("a", (100, 3200), (60, 50), (24, 32), (100, 100), (10, 10)),), codec="libdots"

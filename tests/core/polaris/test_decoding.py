@@ -158,7 +158,7 @@ def test_refusals_name_their_reason() -> None:
     unknown[free] = np.nan
     assert reason(cells, unknown) == "magnets_missing"
     assert reason([], np.empty(0)) == "magnets_missing"
-    # Two placements are not in the released table (facts/polaris.md section 1).
+    # The table of the released code (github.com/wjk5117/Polaris) has 8 of the 10 placements.
     assert reason([(0, 0), (1, 1), (0, 2), (1, 2), (2, 2)], steps, RELEASED) == "no_such_placement"
 
 
@@ -193,7 +193,7 @@ def test_with_tags_as_built_it_is_the_nearest_of_all_ids(data) -> None:
 
 
 def test_a_magnet_laid_13_degrees_off_is_read_at_16_orientations_once_it_was_measured() -> None:
-    """The published default tag has one (facts/polaris.md section 1)."""
+    """The default tag of the published recordings (github.com/wjk5117/Polaris) has one."""
     design = Tags(orientations=16)
     cells, steps = magnets(design, 54321)
     laid = np.array([4.3, -2.2, 13.0, 0.0, -2.8]) / 22.5
