@@ -67,11 +67,11 @@ def test_valleys_equal_the_reference(usual: LandmarkAnalysis) -> None:
 
 @pytest.mark.parametrize("geometry", [ONE, LONG])
 def test_counts_are_those_of_the_paper(geometry: Geometry) -> None:
-    found = analyse_landmark(geometry)
-    assert [pattern.letters for pattern in found.patterns] == list(PATTERNS)
-    assert [len(pattern.valleys_rad) for pattern in found.patterns] == [4, 6, 6, 6, 8, 8]
-    assert not any(pattern.is_collapsed for pattern in found.patterns)
-    for pattern in found.patterns:
+    result = analyse_landmark(geometry)
+    assert [pattern.letters for pattern in result.patterns] == list(PATTERNS)
+    assert [len(pattern.valleys_rad) for pattern in result.patterns] == [4, 6, 6, 6, 8, 8]
+    assert not any(pattern.is_collapsed for pattern in result.patterns)
+    for pattern in result.patterns:
         assert (np.diff(pattern.valleys_rad) > 0).all()
         # Mountains change sign at each valley, and say whether the field rises there.
         np.testing.assert_array_equal(pattern.is_rising, pattern.peaks_t > 0)
@@ -89,8 +89,8 @@ def test_valleys_are_zeros_of_magpylibs_field() -> None:
         collection.add(bar.rotate_from_angax(90 * k, "z", anchor=0))
     angle = analyse_landmark(ONE).patterns[2].valleys_rad
 
-    def field(turned: float) -> np.ndarray:
-        circle = points_on_circle(0.025, angle + turned)
+    def field(rotated: float) -> np.ndarray:
+        circle = points_on_circle(0.025, angle + rotated)
         return collection.getB(np.column_stack([circle, np.full(len(angle), 0.012)]))[:, 2]
 
     # The field changes its sign within 0.0001 degrees, a hundredth of what the table shows.
@@ -148,13 +148,13 @@ def test_radii_equal_the_reference(usual: LandmarkAnalysis) -> None:
 def test_contour_is_where_the_field_meets_the_threshold() -> None:
     phi = np.radians(np.array([10.0, 22.5, 30, 45, 60, 200, 225, 250, 300]))
     strengths = signs(code_of("NNNS"))
-    found = threshold_contour(ONE, strengths[:, None], phi)[:, 0]
+    result = threshold_contour(ONE, strengths[:, None], phi)[:, 0]
     # In the gulf between equal bars the field never comes to the threshold.
-    np.testing.assert_array_equal(np.isnan(found), phi == np.radians(45.0))
-    field = np.abs(basis(ONE, points_on_circle(found, phi)) @ strengths)
+    np.testing.assert_array_equal(np.isnan(result), phi == np.radians(45.0))
+    field = np.abs(basis(ONE, points_on_circle(result, phi)) @ strengths)
     np.testing.assert_allclose(field[[1, 2, 5, 6, 7, 8]], ONE.threshold_t, rtol=3e-3)
-    outside = np.abs(basis(ONE, points_on_circle(found * 1.05, phi)) @ strengths)
-    assert (outside[np.isfinite(found)] < ONE.threshold_t).all()
+    outside = np.abs(basis(ONE, points_on_circle(result * 1.05, phi)) @ strengths)
+    assert (outside[np.isfinite(result)] < ONE.threshold_t).all()
     # Contour of NNNS by the prototype, at a threshold of 2.90 mT/T.
     reference = replace(ONE, threshold_t=2.90e-3)
     shown = threshold_contour(
@@ -166,10 +166,10 @@ def test_contour_is_where_the_field_meets_the_threshold() -> None:
 def test_no_contour_without_a_field() -> None:
     weak = replace(ONE, threshold_t=0.5)
     assert np.isnan(threshold_contour(weak, signs([5, 7]).T, np.radians([20.0, 50.0]))).all()
-    found = analyse_landmark(weak)
-    assert math.isnan(found.r1_m)
-    assert math.isnan(found.min_pitch_m)
-    assert any("threshold" in text for text in landmark_warnings(found))
+    result = analyse_landmark(weak)
+    assert math.isnan(result.r1_m)
+    assert math.isnan(result.min_pitch_m)
+    assert any("threshold" in text for text in landmark_warnings(result))
 
 
 def test_gulfs_are_some_millimetres_wide(usual: LandmarkAnalysis) -> None:
@@ -228,14 +228,14 @@ def test_neighbours_are_as_bad_as_the_worst_of_all_codes() -> None:
 
 
 def test_hall_sensors_tell_the_largest_field() -> None:
-    found = analyse_landmark(Geometry())
+    result = analyse_landmark(Geometry())
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.06, 0.06, (20_000, 2))
     sampled = max(np.abs(landmark_field(Geometry(), code, points)).max() for code in range(16))
-    assert sampled <= found.largest_t * 1.001
-    assert sampled > 0.98 * found.largest_t
-    assert found.range_t == pytest.approx(1.25 * found.largest_t)
-    assert found.hall_class == (50.0, 0.042)
+    assert sampled <= result.largest_t * 1.001
+    assert sampled > 0.98 * result.largest_t
+    assert result.range_t == pytest.approx(1.25 * result.largest_t)
+    assert result.hall_class == (50.0, 0.042)
     assert analyse_landmark(replace(Geometry(), remanence_t=0.4)).hall_class == (100.0, 0.021)
     close = analyse_landmark(replace(Geometry(), sensor_height_m=0.0005))
     assert close.hall_class is None
@@ -273,26 +273,26 @@ def test_a_collapse_is_told_with_what_to_do() -> None:
     high = analyse_landmark(replace(LONG, sensor_height_m=0.02))
     assert [len(pattern.valleys_rad) for pattern in high.patterns] == [4, 2, 2, 6, 8, 8]
     assert np.isnan(high.patterns[2].bias_m).all()
-    (told,) = [text for text in landmark_warnings(high) if "collapse" in text]
-    assert "SSSN and NNNS collapse to 2 instead of 6" in told
-    assert "at most 17.8 mm" in told
+    (reported,) = [text for text in landmark_warnings(high) if "collapse" in text]
+    assert "SSSN and NNNS collapse to 2 instead of 6" in reported
+    assert "at most 17.8 mm" in reported
     assert not list(landmark_warnings(analyse_landmark(Geometry())))
 
 
 def test_skewed_valleys_are_told() -> None:
     """50 mm bars put the inner valleys at 16 to 18 degrees, which is too large."""
     bars = replace(ONE, bar_length_m=0.05, bar_width_m=0.005, radius_m=0.028, sensor_height_m=0.004)
-    found = analyse_landmark(bars)
-    assert math.degrees(found.patterns[2].skew_rad) == pytest.approx(17, abs=1)
-    assert any("17 degrees" in text for text in landmark_warnings(found))
+    result = analyse_landmark(bars)
+    assert math.degrees(result.patterns[2].skew_rad) == pytest.approx(17, abs=1)
+    assert any("17 degrees" in text for text in landmark_warnings(result))
 
 
 def test_close_landmarks_are_told() -> None:
-    found = analyse_landmark(Geometry())
-    assert not list(pitch_warnings(found, 0.2))
-    (field,) = pitch_warnings(found, 0.17)
+    result = analyse_landmark(Geometry())
+    assert not list(pitch_warnings(result, 0.2))
+    (field,) = pitch_warnings(result, 0.17)
     assert "at least 194 mm" in field
-    assert len(list(pitch_warnings(found, 0.12))) == 2
+    assert len(list(pitch_warnings(result, 0.12))) == 2
 
 
 def test_a_low_threshold_is_the_earths_field() -> None:

@@ -74,7 +74,7 @@ def test_a_rotated_landmark_is_the_rotated_drawing(quarters: int) -> None:
             np.testing.assert_allclose(other.north, rotation @ bar.north, atol=1e-9)
 
 
-def places(mark: Mark) -> list[tuple[float, float]]:
+def positions(mark: Mark) -> list[tuple[float, float]]:
     if isinstance(mark, Line):
         return [mark.start, mark.end]
     if isinstance(mark, Polygon):
@@ -88,7 +88,7 @@ def places(mark: Mark) -> list[tuple[float, float]]:
 @pytest.mark.parametrize("geometry", [Geometry(), OTHER])
 def test_a_drawing_stays_within_its_half_side(geometry: Geometry) -> None:
     marks = draw_landmark(geometry, 0b1001, (500.0, 300.0), ("code 9", "NSSN"))
-    away = np.array([place for mark in marks for place in places(mark)]) - [500, 300]
+    away = np.array([position for mark in marks for position in positions(mark)]) - [500, 300]
     assert bars_half_side(geometry) < np.abs(away).max() <= drawing_half_side(geometry)
 
 
@@ -127,12 +127,12 @@ def test_floors_that_cannot_be_built_are_rejected() -> None:
 
 
 def test_cells_are_listed_in_short() -> None:
-    laid = floor([[3, 5, 3], [5, HOLE_CODE, 5]])
-    cells = cells_by_code(laid)
+    floor_map = floor([[3, 5, 3], [5, HOLE_CODE, 5]])
+    cells = cells_by_code(floor_map)
     assert list(cells) == [3, 5]
     assert cells_text(cells[3]) == "row 0: 0, 2"
     assert cells_text(cells[5]) == "row 0: 1; row 1: 0, 2"
-    assert sum(map(len, cells.values())) == len(laid.cells())
+    assert sum(map(len, cells.values())) == len(floor_map.cells())
 
 
 @pytest.mark.parametrize("least", [0.5, 1.0, 4.49, 7.1, 9.2, 26.1, 100.0, 2001.0])

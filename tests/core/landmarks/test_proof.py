@@ -64,19 +64,19 @@ def test_published_maps_are_unique(data: Path, walked: Walk, name: str) -> None:
 @pytest.mark.parametrize("name", ["id6_S_17x17", "or16_L_24x24"])
 def test_a_changed_letter_is_found_with_both_places(data: Path, walked: Walk, name: str) -> None:
     floor = published(data, name)
-    found = 0
+    result = 0
     for cell in floor.cells()[:40:3]:
         codes = floor.codes.copy()
         codes[cell] = codes[0, 5] if codes[cell] != codes[0, 5] else codes[0, 6]
-        spoiled = replace(floor, codes=codes)
-        proof = prove_map(spoiled, steps=False)
-        walks = walked(spoiled)
-        found += not proof.is_unique
+        with_faults = replace(floor, codes=codes)
+        proof = prove_map(with_faults, steps=False)
+        walks = walked(with_faults)
+        result += not proof.is_unique
         assert proof.duplicate_count == len(walks) - len({w for _, w in walks.values()})
         for one, other, letters in proof.duplicates:
             assert one != other
             assert walks[one][1] == walks[other][1] == letters
-    assert found
+    assert result
 
 
 @pytest.mark.slow
@@ -103,9 +103,9 @@ def test_as_slow_passes_say(
         for bar in range(4):
             codes = floor.codes.copy()
             codes[cell] ^= 1 << bar
-            for place, (cells, wrong) in walked(replace(floor, codes=codes)).items():
+            for position, (cells, wrong) in walked(replace(floor, codes=codes)).items():
                 if cell in cells:
-                    true = walked_word(floor, place)
+                    true = walked_word(floor, position)
                     silent[cell] += wrong in words
                     doubtful[cell] += wrong in words or words.count(true) > 1
         for cells, word in walks:
@@ -129,10 +129,12 @@ def test_as_slow_passes_say(
     assert proof.flipped_bar.cases == proof.missing_bar.cases == 4 * cases
 
 
-def walked_word(floor: FloorMap, place: tuple[tuple[int, int], int]) -> tuple[int, ...]:
-    seen = window_readings(floor)
-    (row,) = np.flatnonzero((seen.cells[:, 0] == place[0]).all(1) & (seen.heading == place[1]))
-    return tuple(seen.letters[row].tolist())
+def walked_word(floor: FloorMap, position: tuple[tuple[int, int], int]) -> tuple[int, ...]:
+    observed = window_readings(floor)
+    (row,) = np.flatnonzero(
+        (observed.cells[:, 0] == position[0]).all(1) & (observed.heading == position[1])
+    )
+    return tuple(observed.letters[row].tolist())
 
 
 def test_least_distance_is_told_beyond_one() -> None:

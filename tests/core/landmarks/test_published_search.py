@@ -32,9 +32,9 @@ def off(run: SinglePass, seen: VisitHypotheses) -> np.ndarray | None:
     x, y = run.truth.position[at, :2]
     heading = float(heading_from_quaternion(run.truth.quaternion[at]))
     for q in range(4):
-        turn = q * math.pi / 2
-        cos, sin = math.cos(turn), math.sin(turn)
-        true = np.array([cos * x + sin * y, cos * y - sin * x, heading - turn])
+        rotation = q * math.pi / 2
+        cos, sin = math.cos(rotation), math.sin(rotation)
+        true = np.array([cos * x + sin * y, cos * y - sin * x, heading - rotation])
         error = seen.best.pose - true
         error[2] = math.remainder(error[2], math.tau)
         if abs(error[2]) < math.pi / 4:
@@ -100,9 +100,11 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
 def test_a_pass_alone_gives_a_centre_only() -> None:
     errors = []
     for run in simulate_passes(40, code_of("NNNS"), seed=3):
-        found = detect_landmarks(run.samples, run.odometry, GEOMETRY)
-        assert all(seen.refused == "no_spin" and not seen.hypotheses for seen in found)
-        for step, seen in zip(first_steps(run.samples, run.odometry, GEOMETRY), found, strict=True):
+        result = detect_landmarks(run.samples, run.odometry, GEOMETRY)
+        assert all(seen.refused == "no_spin" and not seen.hypotheses for seen in result)
+        for step, seen in zip(
+            first_steps(run.samples, run.odometry, GEOMETRY), result, strict=True
+        ):
             if not np.isfinite(step.centre_m).all():
                 continue
             assert "first_step" in [each.code for each in seen.warnings]
@@ -112,8 +114,8 @@ def test_a_pass_alone_gives_a_centre_only() -> None:
                 for track in (run.truth, run.odometry)
             )
             cos, sin = math.cos(own - true), math.sin(own - true)
-            way = np.array([[cos, -sin], [sin, cos]]) @ -run.truth.position[at, :2]
-            errors.append(np.hypot(*(run.odometry.position[at, :2] + way - step.centre_m)))
+            path = np.array([[cos, -sin], [sin, cos]]) @ -run.truth.position[at, :2]
+            errors.append(np.hypot(*(run.odometry.position[at, :2] + path - step.centre_m)))
             assert np.isfinite(step.voted_m).all()
     # the study's 10 mm in the real field (test_published_study.py), and noise
     assert len(errors) > 28
@@ -141,11 +143,11 @@ def test_without_odometry_there_is_an_error() -> None:
 
 
 def test_spins_are_turns_on_the_spot() -> None:
-    turn = np.radians(np.arange(0, 360, 3.0))
-    still = np.zeros_like(turn)
-    spin = np.column_stack([still + 0.1, still, turn])
+    rotation = np.radians(np.arange(0, 360, 3.0))
+    still = np.zeros_like(rotation)
+    spin = np.column_stack([still + 0.1, still, rotation])
     drive = np.column_stack([np.arange(0, 0.1, 0.002), np.zeros(50), np.zeros(50)])
-    both = np.concatenate([drive, spin, drive + [0.1, 0, turn[-1]]])
+    both = np.concatenate([drive, spin, drive + [0.1, 0, rotation[-1]]])
     assert len(find_spins(both)) == 1
     first, stop = find_spins(both)[0]
     assert 46 <= first <= 51
@@ -153,6 +155,6 @@ def test_spins_are_turns_on_the_spot() -> None:
     # clockwise as well; half a turn and a circle that is driven are none
     assert len(find_spins(spin * [1, 1, -1])) == 1
     assert find_spins(spin[:60]) == []
-    circle = 0.1 * np.column_stack([np.sin(turn), -np.cos(turn)])
-    assert find_spins(np.column_stack([circle, turn])) == []
+    circle = 0.1 * np.column_stack([np.sin(rotation), -np.cos(rotation)])
+    assert find_spins(np.column_stack([circle, rotation])) == []
     assert len(find_spins(np.concatenate([spin, spin + [0.05, 0, 0]]))) == 2

@@ -66,8 +66,8 @@ def test_the_truth_is_among_the_first(code: int) -> None:
         c, s = np.cos(heading), np.sin(heading)
         true = np.array([-(c * middle[0] + s * middle[1]), s * middle[0] - c * middle[1]])
         near = np.hypot(*(pose[:, :2] - true).T) < 1.5 * scan.COARSE_GRID.step_m
-        turn = np.remainder(pose[:, 2] + heading + np.pi / 4, np.pi / 2) - np.pi / 4
-        near &= np.abs(turn) < np.radians(15)
+        rotation = np.remainder(pose[:, 2] + heading + np.pi / 4, np.pi / 2) - np.pi / 4
+        near &= np.abs(rotation) < np.radians(15)
         assert signs(code).sum() in (INTACT[which] @ np.ones(4))[near]
 
 

@@ -85,8 +85,8 @@ def flat(trajectory: Trajectory) -> Array:
 def sensed(poses: Array, sensors: Array) -> Array:
     """Places (n, N, 2) of sensors."""
     spots = [
-        place + sensors @ np.array([[math.cos(h), math.sin(h)], [-math.sin(h), math.cos(h)]])
-        for *place, h in poses
+        position + sensors @ np.array([[math.cos(h), math.sin(h)], [-math.sin(h), math.cos(h)]])
+        for *position, h in poses
     ]
     return np.array(spots)
 
@@ -110,12 +110,12 @@ def relative(poses: Array) -> Array:
 def test_samples_are_the_closed_form_at_the_truth(tour: SimulatedSession) -> None:
     (samples,), (truth,) = tour.samples, tour.truth
     spots = sensed(flat(truth), circle(0.025))
-    wanted = sum(
+    expected = sum(
         landmark_field(FLOOR.geometry, int(FLOOR.codes[cell]), spots - FLOOR.position(cell))
         for cell in FLOOR.cells()
     )
     # Landmarks out of reach are left out: a dozen of them, a microtesla each at most.
-    assert samples.field_t == pytest.approx(np.asarray(wanted), abs=4e-6)
+    assert samples.field_t == pytest.approx(np.asarray(expected), abs=4e-6)
     assert np.abs(samples.field_t).max() > 0.02
 
 
@@ -132,12 +132,12 @@ def test_a_landmark_that_lies_badly_is_felt_where_it_lies() -> None:
     spots = sensed(flat(simulated.truth[0]), circle(0.025)) - [mark.x_m, mark.y_m]
     c, s = math.cos(mark.heading_rad), math.sin(mark.heading_rad)
     own = spots @ np.array([[c, -s], [s, c]])
-    wanted = basis(floor.geometry, own, 0.014) @ mark.strength
+    expected = basis(floor.geometry, own, 0.014) @ mark.strength
     near = np.hypot(*np.moveaxis(own, -1, 0)) < 0.03 * DIPOLE_LENGTHS
     assert 1 > near.mean() > 0.5
     read = simulated.samples[0].field_t
-    assert read[near] == pytest.approx(wanted[near], abs=1e-12)
-    assert read[~near] == pytest.approx(wanted[~near], abs=5e-7)
+    assert read[near] == pytest.approx(expected[near], abs=1e-12)
+    assert read[~near] == pytest.approx(expected[~near], abs=5e-7)
     assert np.sign(mark.strength) == pytest.approx(signs(14))
 
 
@@ -237,13 +237,13 @@ def test_a_landing_curve_arrives_with_the_heading_it_had(
     pose: tuple[float, float, float], away: float, off: float
 ) -> None:
     robot = Robot(np.array(pose))
-    way = pose[2] + off
-    place = np.array([pose[0] + away * math.cos(way), pose[1] + away * math.sin(way)])
-    robot.land_at(place)
-    assert robot.pose == pytest.approx([*place, pose[2]], abs=1e-9)
+    path = pose[2] + off
+    position = np.array([pose[0] + away * math.cos(path), pose[1] + away * math.sin(path)])
+    robot.land_at(position)
+    assert robot.pose == pytest.approx([*position, pose[2]], abs=1e-9)
     # Two equal arcs: the curve passes the middle of the chord half-way through.
     halfway = robot.poses_at(np.array([robot.time_s / 2]))[0]
-    assert halfway[:2] == pytest.approx((np.array(pose[:2]) + place) / 2, abs=1e-9)
+    assert halfway[:2] == pytest.approx((np.array(pose[:2]) + position) / 2, abs=1e-9)
     assert halfway[2] - pose[2] == pytest.approx(2 * off, abs=1e-9)
 
 
@@ -283,8 +283,8 @@ def test_it_searches_spins_and_goes_an_l(tour: SimulatedSession) -> None:
         stands = poses[1:][still]
         off = np.hypot(*(stands[:, :2] - FLOOR.position(cell)).T)
         assert off.max() < 0.008
-        turned = np.remainder(stands[:, 2] + math.pi / 4, math.pi / 2) - math.pi / 4
-        assert np.abs(turned).max() < math.radians(4)
+        rotated = np.remainder(stands[:, 2] + math.pi / 4, math.pi / 2) - math.pi / 4
+        assert np.abs(rotated).max() < math.radians(4)
 
 
 def test_each_visit_is_felt(nominal: SimulatedSession) -> None:
@@ -394,13 +394,13 @@ def test_more_landmarks_than_there_is_a_way_to_are_noted() -> None:
 
 
 def test_a_path_is_followed() -> None:
-    way = ((0.3, 0.0), (0.6, 0.1), (0.6, 0.5))
-    simulated = simulate(FLOOR, replace(PLAIN, strategy="path", waypoints=way, aims=EXACT))
+    path = ((0.3, 0.0), (0.6, 0.1), (0.6, 0.5))
+    simulated = simulate(FLOOR, replace(PLAIN, strategy="path", waypoints=path, aims=EXACT))
     poses = flat(simulated.truth[0])
-    for place in way:
-        assert np.hypot(*(poses[:, :2] - place).T).min() < 1e-3
-    assert poses[0, :2] == pytest.approx(way[0])
-    assert poses[-1, :2] == pytest.approx(way[-1])
+    for position in path:
+        assert np.hypot(*(poses[:, :2] - position).T).min() < 1e-3
+    assert poses[0, :2] == pytest.approx(path[0])
+    assert poses[-1, :2] == pytest.approx(path[-1])
     assert not simulated.notes
     beyond = replace(PLAIN, strategy="path", waypoints=((0.3, 0.0), (-0.3, 0.0)))
     assert "leaves the map" in simulate(FLOOR, beyond).notes[0]
@@ -409,8 +409,8 @@ def test_a_path_is_followed() -> None:
 def test_a_path_of_cells_visits_them() -> None:
     cells = ((0, 0), (0, 2), (3, 2))
     simulated = simulate(FLOOR, replace(PLAIN, strategy="path", cells=cells))
-    wanted = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2)]
-    assert cells_of(simulated) == wanted
+    expected = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2)]
+    assert cells_of(simulated) == expected
 
 
 @pytest.mark.parametrize("lateral", [-0.03, 0.0, 0.02])
@@ -439,33 +439,35 @@ def test_a_pass_finds_its_pattern() -> None:
 
 
 def test_odometry_without_errors_is_the_truth(tour: SimulatedSession) -> None:
-    (truth,), (told,) = tour.truth, tour.odometry
-    assert told.frame == "odometry"
-    assert flat(told)[0] == pytest.approx([0, 0, 0])
-    both = np.isin(truth.time_ns, told.time_ns)
-    wanted = relative(flat(truth))[both]
-    assert flat(told)[np.isin(told.time_ns, truth.time_ns)] == pytest.approx(wanted, abs=5e-6)
+    (truth,), (reported,) = tour.truth, tour.odometry
+    assert reported.frame == "odometry"
+    assert flat(reported)[0] == pytest.approx([0, 0, 0])
+    both = np.isin(truth.time_ns, reported.time_ns)
+    expected = relative(flat(truth))[both]
+    assert flat(reported)[np.isin(reported.time_ns, truth.time_ns)] == pytest.approx(
+        expected, abs=5e-6
+    )
 
 
 def test_errors_of_odometry_are_as_large_as_asked() -> None:
     errors = Errors()
     straight = np.linspace([0.2, 0.1, 0.0], [0.7, 0.1, 0.0], 101)
     spin = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 4 * math.pi], 101)
-    ways, turns = [], []
+    ways, rotations = [], []
     for seed in range(400):
-        told, slips = odometry(straight, errors, np.random.default_rng(seed))
+        reported, slips = odometry(straight, errors, np.random.default_rng(seed))
         assert not slips
-        ways.append((np.hypot(*np.diff(told[:, :2], axis=0).T).sum(), told[-1, 2]))
-        turns.append(odometry(spin, errors, np.random.default_rng(seed))[0][-1, 2])
+        ways.append((np.hypot(*np.diff(reported[:, :2], axis=0).T).sum(), reported[-1, 2]))
+        rotations.append(odometry(spin, errors, np.random.default_rng(seed))[0][-1, 2])
     length, heading = np.array(ways).T
     # Noise of two wheels of half a metre each; the track is 0.1 m.
     noise = 0.2e-3 * math.sqrt(0.5)
     assert length.mean() == pytest.approx(0.5, abs=2e-3)
     assert length.std() == pytest.approx(math.hypot(0.005, noise / math.sqrt(2)), rel=0.1)
     drift = math.radians(1) / 0.23 * 0.5
-    wanted = math.hypot(drift, math.sqrt(2) * noise / 0.1)
-    assert heading.std() == pytest.approx(wanted, rel=0.1)
-    assert np.std(turns) == pytest.approx(0.01 * 4 * math.pi, rel=0.1)
+    expected = math.hypot(drift, math.sqrt(2) * noise / 0.1)
+    assert heading.std() == pytest.approx(expected, rel=0.1)
+    assert np.std(rotations) == pytest.approx(0.01 * 4 * math.pi, rel=0.1)
 
 
 def test_a_wheel_that_slips_turns_too_far() -> None:
@@ -473,11 +475,11 @@ def test_a_wheel_that_slips_turns_too_far() -> None:
     errors = replace(NONE, slips_per_m=3.0, slip_m=0.005)
     counts = []
     for seed in range(50):
-        told, slips = odometry(straight, errors, np.random.default_rng(seed))
+        reported, slips = odometry(straight, errors, np.random.default_rng(seed))
         counts.append(len(slips))
         if len(slips) == 1 and slips[0] < 900:
-            assert abs(told[-1, 2]) == pytest.approx(0.005 / 0.1, rel=0.05)
-            assert not told[: slips[0] + 1, 2].any()
+            assert abs(reported[-1, 2]) == pytest.approx(0.005 / 0.1, rel=0.05)
+            assert not reported[: slips[0] + 1, 2].any()
     assert np.mean(counts) == pytest.approx(3, abs=0.8)
 
 
@@ -656,22 +658,22 @@ def test_errors_that_cannot_be_are_refused() -> None:
 
 
 def test_passes_start_on_the_circle_and_head_for_the_landmark() -> None:
-    made = simulate_passes(150, errors=NONE, seed=5)
-    starts = np.array([flat(one.truth)[0] for one in made])
+    generated = simulate_passes(150, errors=NONE, seed=5)
+    starts = np.array([flat(one.truth)[0] for one in generated])
     assert np.hypot(starts[:, 0], starts[:, 1]) == pytest.approx(0.115)
     to_centre = np.arctan2(-starts[:, 1], -starts[:, 0])
     aside = np.remainder(starts[:, 2] - to_centre + math.pi, 2 * math.pi) - math.pi
     assert np.abs(aside).max() <= math.pi / 4
     assert np.abs(aside).max() > 0.7
     assert aside.std() == pytest.approx(math.pi / 2 / math.sqrt(12), rel=0.15)
-    for one in made[:20]:
+    for one in generated[:20]:
         poses = flat(one.truth)
         assert np.hypot(*np.diff(poses[:, :2], axis=0).T) == pytest.approx(0.002)
         assert math.dist(poses[0, :2], poses[-1, :2]) == pytest.approx(0.23)
         assert one.end[:2] == pytest.approx(poses[-1, :2])
         assert flat(one.odometry) == pytest.approx(relative(poses), abs=1e-9)
     # With 25 mm to either side and 45 to 54 mm of territory, some miss and most do not.
-    lines = np.bincount([one.lines for one in made], minlength=4)
+    lines = np.bincount([one.lines for one in generated], minlength=4)
     assert len(lines) == 4
     assert lines[0] < 0.2 * 150 < lines[1:].sum()
 
@@ -683,8 +685,8 @@ def test_passes_feel_the_closed_form() -> None:
             3, [14, 5, 3], geometry=geometry, errors=NONE, then=then, seed=2
         ):
             spots = sensed(flat(one.truth), circle(0.025))
-            wanted = landmark_field(geometry, one.code, spots)
-            assert one.samples.field_t == pytest.approx(wanted, abs=1e-12)
+            expected = landmark_field(geometry, one.code, spots)
+            assert one.samples.field_t == pytest.approx(expected, abs=1e-12)
             assert one.strength == pytest.approx(signs(one.code))
             assert np.array_equal(one.samples.time_ns, one.truth.time_ns)
             assert one.samples.time_ns[0] == SESSION_START_NS
@@ -707,19 +709,19 @@ def test_what_follows_a_pass_is_near_the_centre() -> None:
 
 
 def test_passes_err_as_facts_say() -> None:
-    exact, made = (simulate_passes(200, 14, errors=errors, seed=1) for errors in (NONE, None))
+    exact, generated = (simulate_passes(200, 14, errors=errors, seed=1) for errors in (NONE, None))
     scale, drift, strength = [], [], []
-    for one, other in zip(exact, made, strict=True):
+    for one, other in zip(exact, generated, strict=True):
         assert np.array_equal(one.truth.position, other.truth.position)
-        told = flat(other.odometry)
-        scale.append(np.hypot(*np.diff(told[:, :2], axis=0).T).sum() / 0.23)
-        drift.append(told[-1, 2])
+        reported = flat(other.odometry)
+        scale.append(np.hypot(*np.diff(reported[:, :2], axis=0).T).sum() / 0.23)
+        drift.append(reported[-1, 2])
         strength.append(np.abs(other.strength))
     assert np.std(scale) == pytest.approx(0.01, rel=0.15)
     # A degree, and the noise of the wheels.
     assert np.std(drift) == pytest.approx(math.hypot(math.radians(1), 1.36e-3), rel=0.12)
     assert np.std(strength) == pytest.approx(0.04, rel=0.1)
-    far = np.concatenate([other.samples.field_t[:3] for other in made])
+    far = np.concatenate([other.samples.field_t[:3] for other in generated])
     near = np.concatenate([one.samples.field_t[:3] for one in exact])
     assert (far - near).std() == pytest.approx(math.hypot(1.5e-4, 1e-4), rel=0.1)
     assert (far - near).mean() == pytest.approx(-45e-6, abs=2e-5)

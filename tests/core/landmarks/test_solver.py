@@ -33,7 +33,7 @@ CODES = np.random.default_rng(11).integers(0, 16, (12, 12))
 
 FLOOR = FloorMap(CODES)
 
-WAY = ((2, 2), (2, 5), (4, 5), (4, 3))
+ROUTE = ((2, 2), (2, 5), (4, 5), (4, 3))
 
 CELLS = [(2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3)]
 
@@ -41,7 +41,7 @@ CELLS = [(2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3)]
 def drive(floor: FloorMap = FLOOR, **options: object) -> SimulatedSession:
     given = {
         "strategy": "path",
-        "cells": WAY,
+        "cells": ROUTE,
         "rate_hz": 30.0,
         "stop_s": 0.2,
         "seed": 1,
@@ -271,10 +271,10 @@ def test_missing_bars() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 8])
 def test_number_and_positions_of_sensors(count: int) -> None:
-    places = circle(0.03) @ np.array([[0.8, 0.6], [-0.6, 0.8]])
-    places = np.vstack([places, [[0, 0.04], [0.02, 0], [-0.04, 0.01], [0, 0]]])[:count]
+    positions = circle(0.03) @ np.array([[0.8, 0.6], [-0.6, 0.8]])
+    positions = np.vstack([positions, [[0, 0.04], [0.02, 0], [-0.04, 0.01], [0, 0]]])[:count]
     names = tuple(f"s{k}" for k in range(count))
-    one = drive(sensors=HallSensors(names, places, noise_t=1.5e-4))
+    one = drive(sensors=HallSensors(names, positions, noise_t=1.5e-4))
     solution = solved(one)
     assert farthest(one, solution) < 4e-3
 
