@@ -89,7 +89,7 @@ def visits_of(
     return out
 
 
-def result(floor: FloorMap, observed: Sequence[VisitHypotheses]) -> list[CellEstimate]:
+def identify(floor: FloorMap, observed: Sequence[VisitHypotheses]) -> list[CellEstimate]:
     return identify_cells(observed, floor, misread=MISREAD, drift=OdometryDrift())
 
 
@@ -106,7 +106,7 @@ def starts(floor: FloorMap, every: int) -> list[State]:
 def test_every_l_is_identified(published: FloorMap) -> None:
     for number, start in enumerate(starts(published, 11)):
         path = walk(start, L)
-        estimates = result(published, visits_of(published, path, on_map(published, path), number))
+        estimates = identify(published, visits_of(published, path, on_map(published, path), number))
         assert [(one.cell, one.quarters) for one in estimates] == path
         assert min(one.probability for one in estimates) > 0.9
 
@@ -118,7 +118,7 @@ def test_one_misread_of_three_is_never_certain(published: FloorMap) -> None:
         path, bad = walk(start, L), random.integers(3)
         codes = on_map(published, path)
         codes[bad] = int((codes[bad] + random.integers(1, CODE_COUNT)) % CODE_COUNT)
-        estimates = result(published, visits_of(published, path, codes, number))
+        estimates = identify(published, visits_of(published, path, codes, number))
         right = [(one.cell, one.quarters) for one in estimates] == path
         wrong += not right
         assert right or max(one.probability for one in estimates) < CERTAIN_PROBABILITY
@@ -134,7 +134,9 @@ def test_wrong_landmark_counts_once(published: FloorMap) -> None:
         codes = dict(zip([cell for cell, _ in there], on_map(published, there), strict=True))
         bad = there[2][0]
         codes[bad] = int((codes[bad] + random.integers(1, CODE_COUNT)) % CODE_COUNT)
-        estimates = result(published, visits_of(published, lap, [codes[c] for c, _ in lap], number))
+        estimates = identify(
+            published, visits_of(published, lap, [codes[c] for c, _ in lap], number)
+        )
         right = [(one.cell, one.quarters) for one in estimates] == lap
         assert right or max(one.probability for one in estimates) < CERTAIN_PROBABILITY
 
@@ -166,7 +168,7 @@ def test_probabilities_agree_with_enumeration(seed: int) -> None:
                             else same
                         )
     want = weight[path[0]] / sum(weight.values())
-    estimates = result(floor, visits_of(floor, path, codes, seed))
+    estimates = identify(floor, visits_of(floor, path, codes, seed))
     # The filter also allows for leaving the map, the enumeration does not.
     assert 0.9 * want < estimates[0].probability < want
     assert max(weight.values()) < 1.01 * weight[path[0]]
@@ -176,14 +178,14 @@ def test_map_of_another_floor(published: FloorMap) -> None:
     for seed in range(25):
         other = FloorMap(np.random.default_rng(seed).integers(0, CODE_COUNT, published.shape))
         path = walk(((5, 5), 0), (0, 1, 0, -1, 0, 1, 0, 0, 1))
-        estimates = result(published, visits_of(other, path, on_map(other, path), seed))
+        estimates = identify(published, visits_of(other, path, on_map(other, path), seed))
         assert max(one.probability for one in estimates) < 0.9
 
 
 def test_robot_leaves_the_map(published: FloorMap) -> None:
     part = FloorMap(published.codes[:10, :10])
     path = walk(((5, 4), 0), [0] * 15)
-    estimates = result(part, visits_of(published, path, on_map(published, path)))
+    estimates = identify(part, visits_of(published, path, on_map(published, path)))
     for one, (cell, quarters) in zip(estimates, path, strict=True):
         if one.probability > 0.9:
             assert (one.cell, one.quarters) == (cell, quarters)
@@ -198,7 +200,7 @@ def test_kidnapped_robot(published: FloorMap) -> None:
         codes = on_map(published, first) + on_map(published, then)
         # Odometry reports a single further step.
         gone = walk(first[0], (0, 0, 0, 1, -1, 0, 0, 0, 1))
-        estimates = result(published, visits_of(published, gone, codes, seed))
+        estimates = identify(published, visits_of(published, gone, codes, seed))
         for one, want in zip(estimates, [*first, *then], strict=True):
             assert one.probability < 0.99 or one.cell == want[0]
 
@@ -207,26 +209,26 @@ def test_hole_in_the_map(published: FloorMap) -> None:
     codes = published.codes.copy()
     path = walk(((7, 7), 0), (0, 0, 0, 0, 1))
     codes[path[2][0]] = HOLE_CODE
-    estimates = result(FloorMap(codes), visits_of(published, path, on_map(published, path)))
+    estimates = identify(FloorMap(codes), visits_of(published, path, on_map(published, path)))
     assert [(one.cell, one.quarters) for one in estimates] == path
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_too_few_landmarks(published: FloorMap, count: int) -> None:
     path = walk(((7, 7), 0), L)[:count]
-    estimates = result(published, visits_of(published, path, on_map(published, path)))
+    estimates = identify(published, visits_of(published, path, on_map(published, path)))
     assert max(one.probability for one in estimates) < 0.5
 
 
 def test_no_visits(published: FloorMap) -> None:
-    assert result(published, []) == []
+    assert identify(published, []) == []
 
 
 def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
     """The quarter turn of a hypothesis' frame is arbitrary."""
     path = walk(((9, 12), 3), (0, 1, 0))
     observed = visits_of(published, path, on_map(published, path))
-    rotated_one = []
+    rotated_visits = []
     for number, one in enumerate(observed):
         quarter = number % 4
         c, s = math.cos(quarter * HALF_PI), math.sin(quarter * HALF_PI)
@@ -240,9 +242,9 @@ def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
             np.ones(4),
             np.ones(4),
         )
-        rotated_one.append(VisitHypotheses("robot", number, 0, 1, one.odometry, (own,)))
+        rotated_visits.append(VisitHypotheses("robot", number, 0, 1, one.odometry, (own,)))
     for one, other, number in zip(
-        result(published, observed), result(published, rotated_one), range(4), strict=True
+        identify(published, observed), identify(published, rotated_visits), range(4), strict=True
     ):
         assert one.cell == other.cell
         assert other.quarters == (one.quarters - number) % 4
@@ -281,7 +283,7 @@ def test_missed_landmarks_cost_probability() -> None:
     codes[0, 7] = HOLE_CODE
     floor = FloorMap(codes)
     path = [((0, 0), 0), ((0, 2), 0)]
-    estimates = result(floor, visits_of(floor, path, [7, 11]))
+    estimates = identify(floor, visits_of(floor, path, [7, 11]))
     assert [one.cell for one in estimates] == [(0, 6), (0, 8)]
 
 
@@ -289,9 +291,9 @@ def test_recording_may_begin_outside_of_the_map(monkeypatch: pytest.MonkeyPatch)
     """A visit that contradicts the map makes a start outside of it more probable."""
     floor = FloorMap(np.full((12, 12), 3))
     visits = visits_of(floor, [((4, 4), 0)], [5])
-    largest = max(one.probability for one in result(floor, visits))
+    largest = max(one.probability for one in identify(floor, visits))
     monkeypatch.setattr(cell_filter, "START_OUTSIDE_PROBABILITY", 0.0)
-    assert largest < 0.995 * max(one.probability for one in result(floor, visits))
+    assert largest < 0.995 * max(one.probability for one in identify(floor, visits))
 
 
 def test_repeated_visits_are_no_evidence_of_the_cell() -> None:
@@ -303,7 +305,7 @@ def test_repeated_visits_are_no_evidence_of_the_cell() -> None:
     largest = []
     for count in (2, 6):
         visits = visits_of(floor, path[:count], on_map(floor, path[:count]))
-        largest.append(max(one.probability for one in result(floor, visits)))
+        largest.append(max(one.probability for one in identify(floor, visits)))
     assert largest[0] < 0.9
     assert largest[1] == pytest.approx(largest[0], rel=0.05)
 

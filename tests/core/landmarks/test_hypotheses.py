@@ -70,14 +70,14 @@ def read_pass(one: SinglePass, geometry: Geometry = GEOMETRY) -> PassReading | N
     observed, covariance = robot_pose(visit.trace, found[0], visit.trace.reference)
     since = one.truth.time_ns - visit.time_ns[visit.trace.reference]
     heading = np.unwrap(heading_from_quaternion(one.truth.quaternion))
-    x, y, rotated_one = (
+    x, y, true_heading = (
         np.interp(0, since, column) for column in (*one.truth.position[:, :2].T, heading)
     )
     # The frame of the fit is the landmark's up to quarter turns.
-    quarters = round((rotated_one - observed[2]) / (math.pi / 2))
+    quarters = round((true_heading - observed[2]) / (math.pi / 2))
     rotation = quarters * math.pi / 2
     c, s = math.cos(rotation), math.sin(rotation)
-    error = observed - [c * x + s * y, c * y - s * x, rotated_one - rotation]
+    error = observed - [c * x + s * y, c * y - s * x, true_heading - rotation]
     return PassReading(visit.trace, found, int(rotated(one.code, -quarters)), error, covariance)
 
 
@@ -170,14 +170,17 @@ def test_rotated_frames_give_equal_fields(toward: float) -> None:
     rng = np.random.default_rng(1)
     parameters = rng.uniform(-3, 3, (20, 5))
     strength = rng.choice([-1.0, 0.0, 1.0], (20, 4))
-    bars, rotated_one = _rotate_frames(strength, parameters, toward)
-    assert np.abs(rotated_one[:, 2] - toward).max() <= math.pi / 4 + 1e-12
-    assert (rotated_one[:, [0, 1, 3, 4]] == parameters[:, [0, 1, 3, 4]]).all()
+    bars, rotated_parameters = _rotate_frames(strength, parameters, toward)
+    assert np.abs(rotated_parameters[:, 2] - toward).max() <= math.pi / 4 + 1e-12
+    assert (rotated_parameters[:, [0, 1, 3, 4]] == parameters[:, [0, 1, 3, 4]]).all()
     points = rng.uniform(-0.05, 0.05, (7, 2))
     for k in range(20):
         fields = [
             basis(GEOMETRY, in_frame(angle, points)) @ installed
-            for angle, installed in ((parameters[k, 2], strength[k]), (rotated_one[k, 2], bars[k]))
+            for angle, installed in (
+                (parameters[k, 2], strength[k]),
+                (rotated_parameters[k, 2], bars[k]),
+            )
         ]
         assert fields[0] == pytest.approx(fields[1], abs=1e-12)
 

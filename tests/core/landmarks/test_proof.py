@@ -64,19 +64,19 @@ def test_published_maps_are_unique(data: Path, walked: Walk, name: str) -> None:
 @pytest.mark.parametrize("name", ["id6_S_17x17", "or16_L_24x24"])
 def test_a_changed_letter_is_found_with_both_places(data: Path, walked: Walk, name: str) -> None:
     floor = published(data, name)
-    result = 0
+    repeated_count = 0
     for cell in floor.cells()[:40:3]:
         codes = floor.codes.copy()
         codes[cell] = codes[0, 5] if codes[cell] != codes[0, 5] else codes[0, 6]
         with_faults = replace(floor, codes=codes)
         proof = prove_map(with_faults, steps=False)
         walks = walked(with_faults)
-        result += not proof.is_unique
+        repeated_count += not proof.is_unique
         assert proof.duplicate_count == len(walks) - len({w for _, w in walks.values()})
         for one, other, letters in proof.duplicates:
             assert one != other
             assert walks[one][1] == walks[other][1] == letters
-    assert result
+    assert repeated_count
 
 
 @pytest.mark.slow

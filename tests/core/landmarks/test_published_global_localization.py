@@ -119,7 +119,7 @@ def test_a_sequence_turns_codes_to_the_frames_of_arrival() -> None:
 @pytest.mark.slow
 def test_a_robot_finds_itself_on_the_published_map(data: Path) -> None:
     floor = FloorMap(published(data, "or16_L_24x24.txt"))
-    result = 0
+    localized_count = 0
     for seed in (0, 3, 5, 8):
         generated = simulate(floor, SimulationOptions(seed=seed))
         observed = detect_landmarks(generated.samples[0], generated.odometry[0], floor.geometry)
@@ -127,8 +127,8 @@ def test_a_robot_finds_itself_on_the_published_map(data: Path) -> None:
         drawn = landmark_sequence(read, floor.pitch_m) if len(read) == 3 else None
         if drawn is None:
             continue
-        position = match_map(floor, *drawn)
-        assert position.status == "found"
-        assert position.positions[0][0] == generated.events[-1].cell
-        result += 1
-    assert result >= 2
+        match = match_map(floor, *drawn)
+        assert match.status == "found"
+        assert match.positions[0][0] == generated.events[-1].cell
+        localized_count += 1
+    assert localized_count >= 2

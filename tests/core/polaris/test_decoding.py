@@ -36,8 +36,8 @@ def magnets(tags: Tags, tag_id: int) -> tuple[list[Cell], np.ndarray]:
     return list(layout.cells), np.array(layout.symbols, float)
 
 
-def rotated(tags: Tags, *steps: float) -> AsBuiltTag:
-    """As built, with magnets this many steps clockwise from where they should point."""
+def with_rotated_magnets(tags: Tags, *steps: float) -> AsBuiltTag:
+    """Return a tag whose magnets are rotated by steps clockwise from their designed angles."""
     return AsBuiltTag(np.zeros((len(steps), 2)), -np.array(steps) * tags.step_rad, 1)
 
 
@@ -180,7 +180,9 @@ def test_with_tags_as_built_it_is_the_nearest_of_all_ids(data) -> None:
     shifts = st.lists(st.floats(-0.8, 0.8), min_size=3, max_size=3)
     ids = st.integers(0, codec.capacity(SMALL) - 1)
     built = data.draw(st.dictionaries(ids, shifts, max_size=4))
-    tags = replace(SMALL, built={i: rotated(SMALL, *shift) for i, shift in built.items()})
+    tags = replace(
+        SMALL, built={i: with_rotated_magnets(SMALL, *shift) for i, shift in built.items()}
+    )
     some = data.draw(st.sampled_from(sorted(built)) if built and data.draw(st.booleans()) else ids)
     cells, steps = magnets(tags, some)
     steps += [data.draw(st.floats(-1, 1)) for _ in cells]
@@ -198,7 +200,7 @@ def test_a_magnet_laid_13_degrees_off_is_read_at_16_orientations_once_it_was_mea
     cells, steps = magnets(design, 54321)
     installed = np.array([4.3, -2.2, 13.0, 0.0, -2.8]) / 22.5
     assert decode_tag(design, cells, steps + installed).tag_id != 54321
-    known = replace(design, built={54321: rotated(design, *installed)})
+    known = replace(design, built={54321: with_rotated_magnets(design, *installed)})
     reading = decode_tag(known, cells, steps + installed + 0.02)
     assert reading.tag_id == 54321
     assert reading.corrected == 0
@@ -210,7 +212,7 @@ def test_a_magnet_laid_13_degrees_off_is_read_at_16_orientations_once_it_was_mea
 
 
 def test_a_tag_that_is_not_as_it_was_built_is_not_another() -> None:
-    tags = replace(DEFAULT, built={4711: rotated(DEFAULT, 0, 0.45, 0, 0, 0)})
+    tags = replace(DEFAULT, built={4711: with_rotated_magnets(DEFAULT, 0, 0.45, 0, 0, 0)})
     cells, steps = magnets(tags, 4711)
     steps[1] -= 0.4
     assert decode_tag(tags, cells, steps).refused == "tie"
@@ -227,7 +229,7 @@ def test_members_are_read_as_by_brute_force(data) -> None:
     member = data.draw(st.sampled_from(tags.ids))
     if data.draw(st.booleans()):
         shift = [data.draw(st.floats(-0.3, 0.3)) for _ in range(5)]
-        tags = replace(tags, built={member: rotated(tags, *shift)})
+        tags = replace(tags, built={member: with_rotated_magnets(tags, *shift)})
     cells, steps = magnets(tags, member)
     steps += [data.draw(st.floats(-1.6, 1.6)) for _ in cells]
     best, margin = brute(tags, tags.ids, cells, steps)
@@ -458,7 +460,7 @@ def test_a_redundant_tag_as_built() -> None:
     installed = (0.6, -0.6, 0.1, 0.7, -0.55, 0.0)
     cells, steps = magnets(REDUNDANT, 21)
     assert decode_tag(REDUNDANT, cells, steps + installed).tag_id is None
-    tags = replace(REDUNDANT, built={21: rotated(REDUNDANT, *installed)})
+    tags = replace(REDUNDANT, built={21: with_rotated_magnets(REDUNDANT, *installed)})
     reading = decode_tag(tags, cells, steps + installed + 0.05)
     assert (reading.tag_id, reading.corrected) == (21, 0)
     kept = [0, 1, 3, 4, 5]
