@@ -30,7 +30,7 @@ FIRST = 4096
 """Bytes by which the start of a recording is found in what was sent."""
 
 TOPIC = "/serial/robot"
-NAIVE = "one message a frame, facts 2.3"
+NAIVE = "prototype, one message a frame"
 
 
 def received(path: Path, *, damaged_ok: bool = False) -> bytes:

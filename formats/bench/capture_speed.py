@@ -26,7 +26,7 @@ from locatk.formats.wire.recording import Recording
 PIECE = 65_536
 """Bytes a feed: 20 ms of 3 MB/s."""
 
-COBS = "cobs (C), zlib: facts 2.2"
+COBS = "prototype, cobs (C), zlib"
 
 LEAST = 2_000_000
 """Bytes of which the decoding is timed, at least."""
