@@ -68,7 +68,7 @@ def entry(found: LandmarkAnalysis, pitch_m: float) -> dict[str, Any]:
         "geometry": asdict(found.geometry),
         "patterns": [
             {
-                **asdict(pattern),
+                **_pattern_fields(pattern),
                 "valleys": len(pattern.valleys_rad),
                 "collapsed": pattern.is_collapsed,
                 "skew_rad": pattern.skew_rad,
@@ -87,6 +87,12 @@ def entry(found: LandmarkAnalysis, pitch_m: float) -> dict[str, Any]:
         "hall_class": hall and {"mv_per_mt": hall[0], "range_t": hall[1]},
         "tolerances": [_tolerance(row) for row in found.tolerances],
     }
+
+
+def _pattern_fields(pattern: PatternAnalysis) -> dict[str, Any]:
+    """Return the fields of a pattern by their documented keys (docs/formats.md)."""
+    keys = {"is_rising": "rising", "peaks_t": "mountains_t"}
+    return {keys.get(name, name): value for name, value in asdict(pattern).items()}
 
 
 def _tolerance(effect: ToleranceEffect) -> dict[str, Any]:
@@ -130,13 +136,13 @@ def _valleys(pattern: PatternAnalysis) -> tuple[object, ...]:
     )
     at = (
         f"{_clean(math.degrees(angle), 2):>6}{'+' if up else '-'}"
-        for angle, up in zip(pattern.valleys_rad.tolist(), pattern.rising.tolist(), strict=True)
+        for angle, up in zip(pattern.valleys_rad.tolist(), pattern.is_rising.tolist(), strict=True)
     )
     return pattern.number, pattern.letters, count, " ".join(at).ljust(63)
 
 
 def _territory(pattern: PatternAnalysis) -> tuple[str, ...]:
-    sizes = abs(pattern.mountains_t)
+    sizes = abs(pattern.peaks_t)
     heights = sorted({f"{1e3 * size:.1f}" for size in sizes.tolist()}, key=float)
     gulfs = sorted(
         {f"{math.degrees(g):.0f}" for g in pattern.gulfs_rad.tolist() if g == g}, key=int

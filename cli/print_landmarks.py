@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.drawing.true_size import FloorPage
     from locatk.core.landmarks.map.floor import FloorMap
     from locatk.core.materials import BillItem
-    from locatk.core.paper import Paper
+    from locatk.core.paper_sizes import Paper
 
 
 @click.command(short_help="Installation pack of a landmark floor.")
@@ -106,7 +106,7 @@ def landmarks(
       locatk print landmarks map.toml -o pack.pdf --spares 10 --bom parts.csv
     """
     from locatk.core.landmarks.design.materials import bill_of_materials
-    from locatk.core.paper import parse_paper
+    from locatk.core.paper_sizes import parse_paper
     from locatk.formats.maps import read_map
     from locatk.formats.materials import write_bill
     from locatk.formats.output import atomic_write

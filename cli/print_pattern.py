@@ -198,7 +198,7 @@ def pattern(
     from locatk.core.dots.design.ledger import plan
     from locatk.core.dots.drawing import layout
     from locatk.core.dots.drawing.tiles import tiling
-    from locatk.core.paper import paper_size
+    from locatk.core.paper_sizes import paper_size
     from locatk.formats import printing
     from locatk.formats.ledger import LEDGER_FILE, open_ledger
 

@@ -92,7 +92,7 @@ def tag(
       locatk print tag tag.toml --id 262143 -o tag.svg
       locatk print tag tag.toml --id 7 -o below.pdf --mirror
     """
-    from locatk.core.paper import paper_size
+    from locatk.core.paper_sizes import paper_size
     from locatk.core.polaris.drawing.cards import draw_tag_cards
     from locatk.formats.tags import read_tags
 

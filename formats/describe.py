@@ -13,7 +13,7 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.landmark import PATTERN_OF, PATTERNS
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples, SensorArray
 from locatk.core.polaris.tag import Tags
@@ -262,7 +262,7 @@ def _recorded(found: Samples | HallSamples) -> dict[str, Any]:
 
 def floor(found: FloorMap) -> dict[str, Any]:
     """A map of landmarks: its design, what lies where, and how it was really laid."""
-    geometry, laid = found.geometry, found.codes[found.codes != HOLE]
+    geometry, laid = found.geometry, found.codes[found.codes != HOLE_CODE]
     numbers = PATTERN_OF[laid]
     return {
         "name": found.name or None,

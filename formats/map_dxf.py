@@ -71,7 +71,7 @@ def _draw(document: Drawing, floor: FloorMap) -> None:
             (at[0], at[1] - min(below, pitch / 2 - height)), align=TextEntityAlignment.TOP_CENTER
         )
     for (row, column), (other_row, _) in sorted(floor.walls):
-        x, y = floor.place((row, column))
+        x, y = floor.position((row, column))
         right, top = 1e3 * x + pitch / 2, 1e3 * y + pitch / 2
         start = (right - pitch, top) if other_row > row else (right, top - pitch)
         space.add_line(start, (right, top), dxfattribs={"layer": "WALLS"})
@@ -102,7 +102,7 @@ def _set_extents(document: Drawing, floor: FloorMap) -> None:
     rows, columns = floor.shape
     half = floor.pitch_m / 2
     x, y = floor.origin_m
-    high_x, high_y = floor.place((rows - 1, columns - 1))
+    high_x, high_y = floor.position((rows - 1, columns - 1))
     low, high = (1e3 * (x - half), 1e3 * (y - half)), (1e3 * (high_x + half), 1e3 * (high_y + half))
     document.header["$EXTMIN"], document.header["$EXTMAX"] = (*low, 0.0), (*high, 0.0)
     middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)

@@ -18,7 +18,7 @@ from locatk.core.landmarks.design.generation import DesignOptions, empty_floor, 
 from locatk.core.landmarks.design.generation import design_map as search
 from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, code_of, rotated
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES
 
 Codes = NDArray[np.int64]
@@ -88,8 +88,8 @@ def crop(options: DesignOptions) -> FloorMap | None:
         codes = codes[row : row + options.rows, column : column + options.columns]
         codes = relabelling(options.alphabet, random)[codes]
         note = f"cut of the map {entry.file.removesuffix('.txt')} of the library"
-        there = blank.codes != HOLE
-        floor = with_codes(blank, np.where(there, codes, HOLE), options.seed, (note,))
+        there = blank.codes != HOLE_CODE
+        floor = with_codes(blank, np.where(there, codes, HOLE_CODE), options.seed, (note,))
         if prove_map(floor, steps=False).holds:
             return floor
     return None

@@ -233,7 +233,7 @@ def _ways(floor: FloorMap) -> Iterator[tuple[Cell, Cell]]:
     """Cells between which a robot can go, in both directions."""
     for cell in floor.cells():
         for heading in range(4):
-            if floor.open(cell, heading):
+            if floor.is_passable(cell, heading):
                 yield cell, neighbour(cell, heading)
 
 

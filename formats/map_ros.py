@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.field import basis
-from locatk.core.landmarks.map.floor import HOLE, FloorMap, as_built_landmark
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap, as_built_landmark
 
 RESOLUTION_M = 0.010
 
@@ -57,7 +57,7 @@ def draw(floor: FloorMap, resolution_m: float = RESOLUTION_M) -> Pixels:
     centre = [(np.arange(n) + 0.5) * resolution_m for n in size]  # from the corner: y, x
     cell = [np.floor(c / floor.pitch_m).astype(int) for c in centre]
     known = np.full((max(cell[0][-1] + 1, rows), max(cell[1][-1] + 1, columns)), False)
-    known[:rows, :columns] = floor.codes != HOLE
+    known[:rows, :columns] = floor.codes != HOLE_CODE
     upward = np.where(known[np.ix_(*cell)], FREE, UNKNOWN).astype(np.uint8)
     for at in floor.cells():
         (x, y, heading), strength = as_built_landmark(floor, at)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.landmark import Geometry, code_of, name
 from locatk.core.landmarks.map.floor import (
     ALPHABETS,
-    HOLE,
+    HOLE_CODE,
     WINDOWS,
     AsBuiltLandmark,
     Cell,
@@ -202,7 +202,7 @@ def _codes(sheet: Table, alphabet: str) -> NDArray[np.int64]:
     if max(len(rows), len(rows[0])) > LARGEST_SIDE:
         raise sheet.error("rows", f"expected at most {LARGEST_SIDE} rows and columns")
     known = {letter: code for code, letter in enumerate(LETTERS)}
-    known |= {letter.upper(): code for letter, code in known.items()} | {NO_LANDMARK: HOLE}
+    known |= {letter.upper(): code for letter, code in known.items()} | {NO_LANDMARK: HOLE_CODE}
     for number, row in enumerate(rows):
         if len(row) != len(rows[0]):
             raise sheet.error(
@@ -218,10 +218,10 @@ def _codes(sheet: Table, alphabet: str) -> NDArray[np.int64]:
                     f"{NO_LANDMARK!r} for no landmark",
                 )
     codes = np.array([[known[letter] for letter in row] for row in rows], np.int64)
-    if (codes == HOLE).all():
+    if (codes == HOLE_CODE).all():
         raise sheet.error("rows", "an empty map: no cell has a landmark")
     if alphabet == "compass":
-        strangers = np.argwhere(~np.isin(codes, [HOLE, *COMPASS]))
+        strangers = np.argwhere(~np.isin(codes, [HOLE_CODE, *COMPASS]))
         if len(strangers):
             row, column = strangers[0].tolist()
             letters = ", ".join(f"{LETTERS[code]} ({name(code)})" for code in sorted(COMPASS))
@@ -293,7 +293,7 @@ def _all_built(
         cell = _cell(table, "cell", table.raw("cell"), codes.shape)
         if cell in found:
             raise table.error("cell", f"{list(cell)} is there twice")
-        if codes[cell] == HOLE:
+        if codes[cell] == HOLE_CODE:
             raise table.error("cell", f"{list(cell)} has no landmark in rows")
         found[cell] = _built(table, pitch_m)
     return found

@@ -94,7 +94,7 @@ def floor_of(solution: Solution) -> Floor | None:
         south,
         weak,
         _walls(floor),
-        _flat([floor.place(cell) for cell in cells]),
+        _flat([floor.position(cell) for cell in cells]),
         tuple(f"{row},{column}" for row, column in cells),
         np.array([cell in met for cell in cells], bool),
         seen,
@@ -130,7 +130,7 @@ def _walls(floor: FloorMap) -> Array:
     """Ends of a line between the two cells of each wall, across the way from one to the other."""
     ends = []
     for one, other in sorted(floor.walls):
-        a, b = np.array(floor.place(one)), np.array(floor.place(other))
+        a, b = np.array(floor.position(one)), np.array(floor.position(other))
         across = (b - a)[::-1] * [-1, 1] / 2
         ends.append([(a + b) / 2 - across, (a + b) / 2 + across])
     return _flat(np.array(ends).reshape(-1, 2, 2))
@@ -144,7 +144,7 @@ def _sightings(solution: Solution, floor: FloorMap) -> tuple[Array, Array]:
     for found in solution.detections:
         place = _on_path(paths.get(found.device), found.time_s)
         if place is None and found.cell is not None and found.x_m is not None:
-            x, y = floor.place(found.cell)
+            x, y = floor.position(found.cell)
             place = np.array([x + found.x_m, y + found.y_m])
         if place is not None:
             (refused if found.refused else used).append(place)

@@ -351,7 +351,7 @@ def _landmark(floor: FloorMap, cell: Cell, time_ns: int) -> SceneEntity:
         metadata=_pairs(facts),
         cubes=cubes,
         arrows=arrows,
-        texts=[_text(f"{row},{column}", (*floor.place(cell), 0.0), 0.0)],
+        texts=[_text(f"{row},{column}", (*floor.position(cell), 0.0), 0.0)],
     )
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from locatk.core.drawing.marks import Box, Line, Mark, Point, Text
 from locatk.core.drawing.pages import TEXT_POINTS
 from locatk.core.errors import InputError
-from locatk.core.paper import Paper
+from locatk.core.paper_sizes import Paper
 
 MAX_PAGE_MM = 5000.0
 """Largest side of a page cut from a roll; a PDF page may be 200 inches (ISO 32000-1, annex C)."""

@@ -13,7 +13,7 @@ import numpy as np
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.landmark import HALF_PI_RAD, pattern, rotated
 from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY, CellEstimate
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, as_built_code
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_code
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def describe_visit(
         cell, quarters = estimate.cell, estimate.quarters
         if floor is not None:
             code_on_map = as_built_code(floor, estimate.cell)
-            if code_on_map == HOLE:
+            if code_on_map == HOLE_CODE:
                 cell = None
                 refused = "off_map"
             elif code_on_map != rotated(best.code, quarters):

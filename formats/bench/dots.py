@@ -1,9 +1,9 @@
 """The figures of the dots: frames that were rendered, read one by one, and the real one.
 
-Frames are as those of facts/dots.md 3.2: 188 x 120 px of 0.046 mm over a grid of 0.508 mm,
-anywhere on a sheet and turned anyhow, blurred by 0.6 px, with noise of 2 grey values, dots
-of 0.30 pitches and an ideal lens where a row does not say otherwise. Each is read cold, for
-itself. A place is right within half a pitch and five degrees.
+Frames are like those on which cellulo-localization was measured: 188 x 120 px of 0.046 mm over a
+grid of 0.508 mm, anywhere on a sheet and at any rotation, blurred by 0.6 px, with noise of 2 grey
+values, dots of 0.30 pitches and an ideal lens where a row does not say otherwise. Each is read
+cold, for itself. A place is right within half a pitch and five degrees.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ FLAT = simulate.camera(0.0)
 
 REAL_CENTRE = (129.168, 3224.506)
 REAL_HEADING_DEG = 1.603
-"""Where frame.bmp was taken (facts/dots.md 2.6)."""
+"""Centre [pitches] and heading of frame.bmp, the image a.bmp of cellulo-localization, decoded by a
+prototype and confirmed by the decoder of that repository."""
 
 
 @dataclass(frozen=True)

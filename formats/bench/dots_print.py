@@ -24,7 +24,7 @@ from locatk.core.dots.identification.decoding import (
     identify_windows,
 )
 from locatk.core.dots.sheet import Manifest
-from locatk.core.paper import paper_size
+from locatk.core.paper_sizes import paper_size
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED, cpu_seconds, measured
 

@@ -13,7 +13,7 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.paths import CameraPath
 from locatk.core.dots.solver import METHODS, SolveOptions, solve
-from locatk.core.paper import paper_size
+from locatk.core.paper_sizes import paper_size
 from locatk.formats.bench import Figure
 from locatk.formats.bench.timing import SEED
 

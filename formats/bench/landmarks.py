@@ -47,7 +47,7 @@ STANDS = 400
 
 START_STEP = 1
 """Degrees between the starts of the paper's study; those in the real field are six times
-as far apart, as in facts/landmarks.md 3."""
+as far apart, as in the prototype's study."""
 
 PAPER = {"mean": 7.28, "SD": 3.53, "largest": 17.9}
 """Errors of the paper's first step in mm (section 3.5.2)."""
@@ -96,11 +96,11 @@ def paper_figures() -> Iterator[Figure]:
     yield Figure(f"{name}, literal rules: mean", literal["mean_mm"], "mm",
                  f"the text's convex hull: {100 * literal['over_20_share']:.0f} % over 20 mm",
                  peer="paper", peer_value=PAPER["mean"])  # fmt: skip
-    for label, method, facts in (("", "corrected", 10.0), (", voting", "voting", 9.4)):
+    for label, method, prototype in (("", "corrected", 10.0), (", voting", "voting", 9.4)):
         real = study(6 * START_STEP, "field", method).figures()  # type: ignore[arg-type]
         yield Figure(f"paper's first step, real field{label}: mean", real["mean_mm"], "mm",
                      f"no noise; {100 * real['over_20_share']:.1f} % over 20 mm",
-                     peer="facts 3", peer_value=facts)  # fmt: skip
+                     peer="prototype", peer_value=prototype)  # fmt: skip
 
 
 # ---- visits
@@ -121,17 +121,17 @@ def pass_figures() -> Iterator[Figure]:
     far, theirs = (float((mm > FAR_MM).sum()) for mm in (errors_mm(found), voted))
     yield Figure(f"{name}: over {FAR_MM:.0f} mm", far, "passes", "the same", 0.0, peer="voting",
                  peer_value=theirs)  # fmt: skip
-    yield _right(name, found, seed, 92.0, "prototype (facts 3)", 91.0)
+    yield _right(name, found, seed, 92.0, "prototype", 91.0)
     yield from _probabilities(name, found, seed)
     ruled = errors_mm([one for one, _ in baselines])
     yield Figure(f"{name}, paper's first step: mean", float(ruled.mean()), "mm",
                  f"the same passes; {len(made) - len(ruled)} without a centre; SD "
                  f"{ruled.std():.2f}, largest {ruled.max():.1f}",
-                 peer="facts 3, real field, no noise", peer_value=10.0)  # fmt: skip
+                 peer="prototype, real field, no noise", peer_value=10.0)  # fmt: skip
     yield Figure(f"{name}, voting: mean", mean_voted, "mm",
                  f"the same passes; {len(made) - len(voted)} without a centre; SD "
                  f"{voted.std():.2f}, largest {voted.max():.1f}",
-                 peer="facts 3, real field, no noise", peer_value=9.4)  # fmt: skip
+                 peer="prototype, real field, no noise", peer_value=9.4)  # fmt: skip
 
 
 def spin_figures() -> Iterator[Figure]:
@@ -252,7 +252,7 @@ def _numbers(which: Sequence[int]) -> str:
 
 def stand_figures() -> Iterator[Figure]:
     """A static fit of four values."""
-    errors = "bars 4 % and 0.3 mm, gains 2 %, offsets 0.1 mT (facts 2.4)"
+    errors = "bars 4 % and 0.3 mm, gains 2 %, offsets 0.1 mT"
     for name, anywhere, where in (
         ("static at the landmark", False, "3 mm along each axis and 3 degrees off (1 sigma), all "
          "within 10 mm"),

@@ -138,9 +138,9 @@ def random_walk(floor: FloorMap, start: Cell, heading: int, rng: np.random.Gener
     """On from a start, straight or after a turn, to cells not visited yet if there are any."""
     cells, quarters = [start], [heading]
     while len(cells) < LONGEST:
-        open_ = [h for h in ((heading + t) % 4 for t in (0, 1, 3)) if floor.open(cells[-1], h)] or [
-            (heading + 2) % 4
-        ]
+        open_ = [
+            h for h in ((heading + t) % 4 for t in (0, 1, 3)) if floor.is_passable(cells[-1], h)
+        ] or [(heading + 2) % 4]
         fresh = [h for h in open_ if neighbour(cells[-1], h) not in cells] or open_
         heading = int(rng.choice(fresh))
         cells.append(neighbour(cells[-1], heading))
@@ -161,7 +161,7 @@ def sightings(
         code = laid.get(cell, int(floor.codes[cell]))
         turn = quarters * math.pi / 2
         cos, sin = math.cos(turn), math.sin(turn)
-        x, y = stops[n, :2] - floor.place(cell)
+        x, y = stops[n, :2] - floor.position(cell)
         pose = [cos * x + sin * y, cos * y - sin * x, math.remainder(stops[n, 2] - turn, math.tau)]
         hypothesis = Hypothesis(
             int(rotated(code, -quarters)), 1.0, pose + sigma * rng.standard_normal(3),
@@ -175,7 +175,7 @@ def _stops(floor: FloorMap, walk: Walk, rng: np.random.Generator) -> Array:
     """Poses (n, 3) near the landmarks' centres, the heading without jumps."""
     turns = np.array([math.remainder(t, 4) for t in np.diff(walk.quarters)])
     heading = (walk.quarters[0] + np.concatenate([[0.0], np.cumsum(turns)])) * math.pi / 2
-    place = np.array([floor.place(cell) for cell in walk.cells])
+    place = np.array([floor.position(cell) for cell in walk.cells])
     count = len(walk.cells)
     place = place + rng.normal(0, STOP_M, (count, 2))
     return np.column_stack([place, heading + rng.normal(0, STOP_RAD, count)])

@@ -90,7 +90,7 @@ def judged(made: SimulatedSession, solution: Solution) -> Session:
         known_ns.append(round(found.time_s * 1e9))
         here = true_at(np.array(known_ns[-1:]))[0]
         mark = here[:2] - [found.x_m, found.y_m]
-        wrong += bool(np.hypot(*(mark - made.floor.place(found.cell))) > made.floor.pitch_m / 2)
+        wrong += bool(np.hypot(*(mark - made.floor.position(found.cell))) > made.floor.pitch_m / 2)
     none = np.empty(0)
     (facts,) = solution.facts.robots.values()
     silent = (

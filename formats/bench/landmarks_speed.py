@@ -43,7 +43,7 @@ ESTIMATES = 60
 
 MAP_SEEDS = 5
 
-FACTS = "facts 4, annealing in C++"
+PROTOTYPE = "prototype, annealing in C++"
 
 MAPS = (
     (7, "L", "6", "0.13 to 0.4 s", 0.13),
@@ -52,7 +52,7 @@ MAPS = (
     (100, "2x2", "16", "0.6 s", 0.6),
 )
 """Sides of the square maps that are searched for, their windows and alphabets, and the
-seconds of facts/landmarks.md 4."""
+seconds that a prototype in C++ needed."""
 
 
 def speed_figures() -> list[Figure]:
@@ -79,7 +79,7 @@ def field_figures() -> list[Figure]:
             continue
         rows.append(
             Figure(name, theirs / ours, "ratio", f"{how}: {1e3 * ours:.2f} and {1e3 * theirs:.0f} "
-                   f"ms; {KERNEL}", target, "higher", "facts 2.5, numpy", 33.0)
+                   f"ms; {KERNEL}", target, "higher", "prototype, numpy", 33.0)
         )  # fmt: skip
     rows.append(
         Figure("field of a bar, difference to magpylib", field_difference(), "relative",
@@ -152,7 +152,7 @@ def estimate_figures() -> list[Figure]:
         for label, value in zip(("p50", "p95"), values, strict=True):
             rows.append(
                 Figure(f"time an estimate, {name}, {label}", value, "s", said or how, promised,
-                       peer="prototype (facts 3)", peer_value=0.7)
+                       peer="prototype", peer_value=0.7)
             )  # fmt: skip
     return rows
 
@@ -203,12 +203,12 @@ def map_figures(folder: Path) -> list[Figure]:
         how = f"design() and its proof, longest of {MAP_SEEDS} seeds ({{0:.0f}} found), one thread"
         rows.append(
             measured(name, "s", call, 1.0, f"{how}; {KERNEL}; theirs {theirs}", 10.0,
-                     peer=FACTS, peer_value=peer_value)
+                     peer=PROTOTYPE, peer_value=peer_value)
         )  # fmt: skip
     rows += [
         measured("map 100x100, 16/2x2: proof", "s", "landmarks_speed.proof_time()", 1.0,
                  "prove(), all of it, one thread, best of 3; {0:.0f} duplicates", 1.0,
-                 peer="facts 4, a dictionary in Python", peer_value=0.23),
+                 peer="prototype, a dictionary in Python", peer_value=0.23),
         measured("map 100x100: map.toml read", "s", "landmarks_speed.reading_time()", 1.0,
                  "loads_map() of {0:.0f} kB, one thread, best of 3", None),
         largest_square(),
@@ -251,14 +251,14 @@ def reading_time() -> tuple[float, float]:
 
 
 def largest_square() -> Figure:
-    """What can be cut of the maps that ship, beside what facts 4 have."""
+    """Compare the largest square of the maps that ship with that of the prototype."""
     sides = {(e.alphabet, e.window): min(e.rows, e.columns) for e in entries() if not e.detect}
     said = ", ".join(
         f"{alphabet}/{window} {side}" for (alphabet, window), side in sorted(sides.items())
     )
     return Figure("16/L: largest square that ships", float(sides["16", "L"]), "landmarks",
                   f"without noticing misread ones; all: {said}", float(SIDE), "higher",
-                  FACTS, float(SIDE))  # fmt: skip
+                  PROTOTYPE, float(SIDE))  # fmt: skip
 
 
 def published_maps(folder: Path) -> Figure:

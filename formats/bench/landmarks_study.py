@@ -2,7 +2,7 @@
 
 The field is that of every bar as a cuboid (magpylib), each with an error of its strength
 and place; sensors have noise, gains, offsets and the Earth's field; odometry errs in scale,
-heading and turns (:class:`.simulate_options.Errors`, facts/landmarks.md 3). Visits whose
+heading and turns (:class:`.simulation.options.Errors`). Visits whose
 sensors never enter the territory are left out, as in the paper's study.
 
 Errors of places are those of the landmark's centre in the robot's frame at the end of the
@@ -44,7 +44,7 @@ from locatk.core.landmarks.published.pose_compensation import compensate_pose
 from locatk.core.landmarks.published.second_step import find_spins
 from locatk.core.landmarks.simulation.floor import BAR_DRAWS, bar_fields, scatter_bars
 from locatk.core.landmarks.simulation.options import Errors
-from locatk.core.landmarks.simulation.passes import Pass, passes
+from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 from locatk.core.landmarks.solver import SolveOptions
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ STATIC = Errors(
     noise_t=0.15e-3 / 10, offset_t=0.1e-3, gain=0.02, earth_t=0.0, bar_strength=0.04,
     bar_place_m=0.3e-3,
 )  # fmt: skip
-"""Of facts/landmarks.md 2.4, with the mean of a hundred samples."""
+"""Errors of the static fit: nominal parts, and the mean of a hundred samples."""
 
 
 @dataclass(frozen=True)
@@ -112,26 +112,26 @@ class Found:
     nees: float = math.nan
 
 
-def visited(count: int, then: str, seed: int) -> list[tuple[int, Pass]]:
+def visited(count: int, then: str, seed: int) -> list[tuple[int, SinglePass]]:
     """At least ``count`` simulated visits that were not missed, with their numbers."""
-    made: list[tuple[int, Pass]] = []
+    made: list[tuple[int, SinglePass]] = []
     while len(made) < count:
         # A tenth of the passes misses the territory.
-        batch = passes(math.ceil(1.15 * (count - len(made))) + 2, then=then, seed=seed)
+        batch = simulate_passes(math.ceil(1.15 * (count - len(made))) + 2, then=then, seed=seed)
         first = made[-1][0] + 1 if made else 0
         made += [(first + k, one) for k, one in enumerate(batch) if one.lines > 0]
         seed += 1
     return made[:count]
 
 
-def last_visit(one: Pass) -> tuple[HallRecording, VisitSegment | None, int]:
+def last_visit(one: SinglePass) -> tuple[HallRecording, VisitSegment | None, int]:
     """The recording, the last visit that is found in it, and how many were."""
     run = preprocess(one.samples, one.odometry)
     found = segment_visits(run, GEOMETRY, OdometryDrift())
     return run, found[-1] if found else None, len(found)
 
 
-def by_field(number: int, one: Pass) -> Found:
+def by_field(number: int, one: SinglePass) -> Found:
     """What the default method says of one visit, on the solver's own road."""
     run, visit, visits = last_visit(one)
     nothing = Found(number, one.lines, visits)
@@ -170,7 +170,7 @@ def by_field(number: int, one: Pass) -> Found:
     )
 
 
-def by_voting(number: int, one: Pass) -> tuple[Found, Found]:
+def by_voting(number: int, one: SinglePass) -> tuple[Found, Found]:
     """First estimates of the same visit by the paper's rules and by voting."""
     steps = paper.first_steps(one.samples, one.odometry, GEOMETRY)
     if not steps:
@@ -183,7 +183,7 @@ def by_voting(number: int, one: Pass) -> tuple[Found, Found]:
     )
 
 
-def by_valleys(number: int, one: Pass) -> Found:
+def by_valleys(number: int, one: SinglePass) -> Found:
     """The paper's second step alone: the valleys of the spin, with no voltages after it."""
     run, visit, visits = last_visit(one)
     spins = find_spins(run.pose)
@@ -212,7 +212,7 @@ def by_valleys(number: int, one: Pass) -> Found:
 # ---- what is true
 
 
-def true_pose(one: Pass, time_ns: int) -> Array:
+def true_pose(one: SinglePass, time_ns: int) -> Array:
     """(3,) robot in the landmark's frame, the heading unwrapped over the visit."""
     truth = one.truth
     start = truth.time_ns[0]
@@ -232,7 +232,7 @@ def error(seen: Array, true: Array) -> Array:
     return np.asarray(off)
 
 
-def code_in_frame(one: Pass, seen: Array, time_ns: int) -> int:
+def code_in_frame(one: SinglePass, seen: Array, time_ns: int) -> int:
     """The true code in the frame of a hypothesis that has the robot at ``seen``."""
     quarters = round((true_pose(one, time_ns)[2] - seen[2]) / HALF_PI)
     return int(rotated(one.code, -quarters))
@@ -249,13 +249,13 @@ def centre_error(seen: Array, true: Array) -> float:
     return float(np.hypot(*(centre(seen) - centre(true))))
 
 
-def last_odometry(one: Pass) -> Array:
+def last_odometry(one: SinglePass) -> Array:
     """(3,) the robot at the end of the visit, by its odometry."""
     heading = heading_from_quaternion(one.odometry.quaternion[-1:])
     return np.array([*one.odometry.position[-1, :2], heading[0]])
 
 
-def _off_centre(place: Array, end: Array, one: Pass) -> float:
+def _off_centre(place: Array, end: Array, one: SinglePass) -> float:
     """Of a centre in the odometry's frame, seen by a robot at ``end`` in the same frame."""
     own = relative(np.array([[*place, 0.0]]), end)[0, :2]
     return float(np.hypot(*(own - centre(one.end))))

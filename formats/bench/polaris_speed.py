@@ -35,7 +35,8 @@ MADE = {
     180: ("magpylib's cylinders, one call", 13.7),
     1800: ("magpylib's cylinders, one call", 124.0),
 }
-"""Others' milliseconds (facts/polaris.md 4 and 5)."""
+"""Milliseconds of others: the paper's figures, and magpylib and the authors' code
+(github.com/wjk5117/Polaris) as measured before the project."""
 
 KERNEL = "numpy, no compiled kernel" if kernels is None else "compiled kernel"
 

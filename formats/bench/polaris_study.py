@@ -49,8 +49,9 @@ LATERAL_M = 0.010
 BEYOND_M = 0.005
 """How far a tag of random design may reach beyond the bar's ends, in sum: half a clearance."""
 
-FACTS = {"x": 0.0068, "y": 0.0072, "angle": 0.056}
-"""mm and degrees: bound of the default (facts/polaris.md 4, case B), at heading 0."""
+DEFAULT_BOUND = {"x": 0.0068, "y": 0.0072, "angle": 0.056}
+"""Cramer-Rao bound of the default tag [mm, degrees]: heading 0, known speed, unknown height and
+moments, dipole model."""
 
 PROMISED = {"x": 0.007, "y": 0.007, "angle": 0.056}
 WITHIN = 1.15
@@ -206,11 +207,11 @@ def default_figures() -> Iterator[Figure]:
         pose_bound = np.sqrt(np.mean([p for _, _, p in passes], axis=0)) * _UNITS
         which = "unknown height and strengths" if known else "steps free by 1 mm, no ruler"
         peer = f"Cramer-Rao bound, {which}"
-        for k, axis in enumerate(FACTS):
+        for k, axis in enumerate(DEFAULT_BOUND):
             unit = "deg" if axis == "angle" else "mm"
             how = f"rms of a magnet, {len(magnets)} of them"
             if known:
-                how += f"; the facts have a bound of {FACTS[axis]}"
+                how += f"; the default tag has a bound of {DEFAULT_BOUND[axis]}"
                 yield Figure(f"{label}: {axis}", found[k], unit, how, WITHIN * PROMISED[axis],
                              peer=peer, peer_value=bound[k])  # fmt: skip
                 yield Figure(f"{label}: {axis} over the bound", found[k] / bound[k], "ratio",

@@ -23,7 +23,8 @@ from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
 
 BLACK = CMYKColor(0, 0, 0, 1)
-"""The one ink of all that is drawn: K alone, never grey (facts/dots.md 5.3)."""
+"""The one ink of all that is drawn: K alone, never grey, which printers
+halftone."""
 
 LARGEST_MM = 5080.0
 """200 inches; no PDF viewer need show a longer page (ISO 32000-1 annex C)."""

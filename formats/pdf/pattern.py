@@ -1,8 +1,8 @@
 """The dots as PDF: one Type 3 font of four glyphs, one string a row.
 
-That is the smallest and the sharpest way (facts/dots.md 5.2 and 5.3): 2.2 bits a dot, and
-every dot exactly on the printer's pixels. A page is an XObject in pixels of the printer, so
-that all its numbers are whole.
+Of the methods compared this gives the smallest files, 2.2 bits a dot, and every dot exactly on
+the printer's pixels, whereas renderers resample images. A page is an XObject in pixels of the
+printer, so that all its numbers are whole.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Cameras for dots look in the infrared, where black ink (carbon) is dark and the other three
 inks are clear: black text under the dots hides them, text of cyan, magenta and yellow does
-not (facts/dots.md 4, "Overlay kills the code"; HP's US 7903281 is about just this). So
+not (HP's patent US 7903281 is about just this). So
 black becomes a mix of the other three, everywhere where the document names a colour.
 """
 

@@ -605,7 +605,7 @@ def _summary(simulated: SimulatedSession) -> dict[str, Any]:
         **({"approaches": _approaches(simulated)} if simulated.approaches else {}),
         "faults": [
             {"cell": list(mark.cell), "faults": list(mark.faults)}
-            for mark in simulated.floor_as_laid
+            for mark in simulated.installed_landmarks
             if mark.faults
         ],
         "saturated": simulated.saturated,
@@ -671,7 +671,7 @@ def _facts(simulated: SimulatedSession, options: SimulationOptions) -> dict[str,
                 "strength": mark.strength.tolist(),
                 "faults": list(mark.faults),
             }
-            for mark in simulated.floor_as_laid
+            for mark in simulated.installed_landmarks
             if mark.faults or mark.cell in visited
         ]
     )

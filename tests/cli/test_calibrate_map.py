@@ -11,7 +11,7 @@ import pytest
 
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation import session as simulate
-from locatk.core.landmarks.simulation.floor import lay
+from locatk.core.landmarks.simulation.floor import install_landmarks
 from locatk.core.landmarks.simulation.session import Faults, SimulatedSession, SimulationOptions
 from locatk.formats import halls, maps
 from locatk.formats.session import Session
@@ -30,7 +30,9 @@ def drive(
 ) -> SimulatedSession:
     """A robot of its own, always on the same floor."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "lay", lambda f, e, x, _: lay(f, e, x, 5))
+        patch.setattr(
+            simulate, "install_landmarks", lambda f, e, x, _: install_landmarks(f, e, x, 5)
+        )
         return simulate.simulate(
             floor, SimulationOptions(strategy="path", cells=cells, seed=seed, faults=FAULTS)
         )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from locatk.core.landmarks.landmark import PATTERN_OF, Geometry, rotated
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap
 from locatk.formats.maps import read_map, write_map
 
 
@@ -20,12 +20,12 @@ def readings_by_hand(floor: FloorMap) -> list[tuple[int, ...]]:
     for cell in floor.cells():
         for heading in range(4):
             one = (cell, heading)
-            if not floor.open(cell, heading):
+            if not floor.is_passable(cell, heading):
                 continue
             step = {0: (0, 1), 1: (1, 0), 2: (0, -1), 3: (-1, 0)}
             ahead = (cell[0] + step[heading][0], cell[1] + step[heading][1])
             left = (heading + 1) % 4
-            if not floor.open(ahead, left):
+            if not floor.is_passable(ahead, left):
                 continue
             last = (ahead[0] + step[left][0], ahead[1] + step[left][1])
             codes = [int(floor.codes[at]) for at in (one[0], ahead, last)]
@@ -96,7 +96,7 @@ def test_holes_and_walls_are_where_they_were_asked_for(locatk, tmp_path: Path) -
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
     floor = read_map(path)
-    holes = {(int(r), int(c)) for r, c in np.argwhere(floor.codes == HOLE)}
+    holes = {(int(r), int(c)) for r, c in np.argwhere(floor.codes == HOLE_CODE)}
     assert holes == {(2, 3), (4, 0), (4, 1), (4, 2), (0, 6), (1, 6)}
     assert floor.walls == {((r, 3), (r, 4)) for r in range(6)} | {((1, 1), (2, 1))}
     words = readings_by_hand(floor)

@@ -14,11 +14,11 @@ import pytest
 
 from locatk.cli.app import app
 from locatk.core.landmarks.landmark import Geometry, signs
-from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, WINDOWS, AsBuiltLandmark, FloorMap
 from locatk.formats.maps import dumps_map, read_map, write_map
 
 FLOOR = FloorMap(
-    np.array([[7, 1, HOLE], [0, 15, 9]]),
+    np.array([[7, 1, HOLE_CODE], [0, 15, 9]]),
     window="I2",
     detect=1,
     geometry=Geometry(bar_length_m=0.025),

@@ -11,10 +11,10 @@ import pypdfium2
 import pytest
 
 from locatk.core.landmarks.landmark import name
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.formats.maps import write_map
 
-CODES = np.array([[0, 3, 7], [7, HOLE, 15], [9, 9, 7]])
+CODES = np.array([[0, 3, 7], [7, HOLE_CODE, 15], [9, 9, 7]])
 
 
 @pytest.fixture

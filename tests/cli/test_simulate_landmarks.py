@@ -13,7 +13,7 @@ import pytest
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import name
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.published.driver import published_driver
 from locatk.core.landmarks.simulation.session import (
     Aims,
@@ -29,7 +29,7 @@ from locatk.formats.halls import read_samples
 from locatk.formats.session import Session
 from locatk.formats.tracks import read_odometry, read_truth
 
-CODES = np.array([[1, 5, 9, 14], [7, 3, 12, 8], [15, HOLE, 2, 6]])
+CODES = np.array([[1, 5, 9, 14], [7, 3, 12, 8], [15, HOLE_CODE, 2, 6]])
 
 
 @pytest.fixture
@@ -144,7 +144,7 @@ def test_a_session_holds_samples_map_odometry_and_truth(locatk, floor: Path) -> 
     assert json.loads(facts["simulated_visits"]) == visits
     lying = {tuple(mark["cell"]): mark for mark in json.loads(facts["simulated_floor"])}
     assert set(lying) == {one.cell for one in wanted.events}
-    for mark in wanted.floor_as_laid:
+    for mark in wanted.installed_landmarks:
         if mark.cell in lying:
             assert lying[mark.cell]["strength"] == pytest.approx(mark.strength.tolist())
             assert lying[mark.cell]["code"] == name(int(CODES[mark.cell]))

@@ -16,7 +16,7 @@ from locatk.core.landmarks.landmark import CODE_COUNT, rotated
 from locatk.core.landmarks.map import windows
 from locatk.core.landmarks.map.floor import FloorMap, neighbour
 from locatk.core.landmarks.simulation.options import NONE, SimulationOptions
-from locatk.core.landmarks.simulation.passes import Pass, passes
+from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
 from locatk.core.landmarks.solver import solve
 from locatk.core.solution import Solution
@@ -173,11 +173,11 @@ def test_published_maps_are_unique(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def spun() -> list[Pass]:
-    return passes(4, code=[8, 3, 5, 15], then="spin", errors=NONE, aim_m=0.003, seed=3)
+def spun() -> list[SinglePass]:
+    return simulate_passes(4, code=[8, 3, 5, 15], then="spin", errors=NONE, aim_m=0.003, seed=3)
 
 
-def test_a_visit_without_errors_has_none(spun: list[Pass]) -> None:
+def test_a_visit_without_errors_has_none(spun: list[SinglePass]) -> None:
     for number, one in enumerate(spun):
         found = landmarks_study.by_field(number, one)
         assert found.error_m < 0.1e-3
@@ -191,7 +191,7 @@ def test_a_visit_without_errors_has_none(spun: list[Pass]) -> None:
         assert abs(by_valleys.heading_rad) < math.radians(8)
 
 
-def test_a_wrong_landmark_is_not_right(spun: list[Pass]) -> None:
+def test_a_wrong_landmark_is_not_right(spun: list[SinglePass]) -> None:
     one = replace(spun[0], code=spun[0].code ^ 1)
     assert not landmarks_study.by_field(0, one).right
     assert landmarks_study.by_field(0, one).true_probability < 1e-6
@@ -199,7 +199,7 @@ def test_a_wrong_landmark_is_not_right(spun: list[Pass]) -> None:
 
 
 def test_a_visit_to_nothing_is_not_right() -> None:
-    (one,) = passes(1, errors=NONE, start=(0.0, 0.0))
+    (one,) = simulate_passes(1, errors=NONE, start=(0.0, 0.0))
     quiet = replace(one, samples=replace(one.samples, field_t=0 * one.samples.field_t + 1e-6))
     found = landmarks_study.by_field(7, quiet)
     assert (found.number, found.right) == (7, False)

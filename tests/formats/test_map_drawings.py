@@ -19,7 +19,7 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import PATTERNS, signs
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap
 from locatk.formats import map_ros, map_svg
 from locatk.formats.map_dxf import dumps_dxf
 from locatk.formats.maps import write_map
@@ -27,7 +27,7 @@ from locatk.formats.maps import write_map
 NONE = np.full(7, np.nan)
 
 FLOOR = FloorMap(
-    np.array([[0b0111, 0b1100, 0b1111], [0b0101, HOLE, 0b0000]]),
+    np.array([[0b0111, 0b1100, 0b1111], [0b0101, HOLE_CODE, 0b0000]]),
     pitch_m=0.2,
     origin_m=(1.0, -3.0),
     walls=frozenset({((0, 0), (0, 1)), ((0, 2), (1, 2))}),
@@ -57,7 +57,7 @@ def test_every_pixel_lies_where_its_landmark_is() -> None:
     assert picture.shape == (80, 120)
     rng = np.random.default_rng(0)
     for cell in FLOOR.cells():
-        x, y = FLOOR.place(cell)
+        x, y = FLOOR.position(cell)
         # In the middle of pixels, which lie on whole 5 mm.
         offsets = (rng.integers(-16, 16, (40, 2)) + 0.5) * size
         field = landmark_field(FLOOR.geometry, int(FLOOR.codes[cell]), offsets)
@@ -66,10 +66,10 @@ def test_every_pixel_lies_where_its_landmark_is() -> None:
         np.testing.assert_array_equal(np.array(levels) == map_ros.TERRITORY, inside)
         assert inside.any()
         assert not inside.all()
-    x, y = FLOOR.place((1, 1))
+    x, y = FLOOR.position((1, 1))
     hole = {pixel(picture, FLOOR, x + d, y + e, size) for d in (-0.09, 0, 0.09) for e in (-0.09, 0)}
     assert hole == {map_ros.UNKNOWN}
-    assert pixel(picture, FLOOR, *FLOOR.place((0, 0)), size) == map_ros.FREE
+    assert pixel(picture, FLOOR, *FLOOR.position((0, 0)), size) == map_ros.FREE
 
 
 def test_walls_stand_between_their_cells() -> None:
@@ -77,7 +77,7 @@ def test_walls_stand_between_their_cells() -> None:
     black = picture == map_ros.OCCUPIED
     assert black.any()
     for (row, column), (other, _) in FLOOR.walls:
-        x, y = FLOOR.place((row, column))
+        x, y = FLOOR.position((row, column))
         ahead = (0.0, 0.1) if other > row else (0.1, 0.0)
         for part in (-0.09, 0.0, 0.09):
             along = (part, 0.0) if other > row else (0.0, part)
@@ -127,7 +127,7 @@ def test_territories_are_as_built() -> None:
 
 
 def test_odd_pitches_and_wrong_resolutions() -> None:
-    odd = FloorMap(np.array([[5, HOLE]]), pitch_m=0.1234)
+    odd = FloorMap(np.array([[5, HOLE_CODE]]), pitch_m=0.1234)
     picture = map_ros.draw(odd, 0.01)
     assert picture.shape == (13, 25)
     assert (picture[0] == map_ros.UNKNOWN).all()  # beyond the map

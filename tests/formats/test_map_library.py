@@ -12,7 +12,7 @@ from locatk.core.landmarks.design.bounds import require_enough_words
 from locatk.core.landmarks.design.generation import DesignOptions
 from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, rotated
-from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, FloorMap
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, WINDOWS, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES, window_readings
 from locatk.formats import map_library
 from locatk.formats.map_library import Entry, crop, entries, relabelling, turned
@@ -149,7 +149,7 @@ def test_holes_and_walls_stay() -> None:
     walls = frozenset({((1, 1), (1, 2))})
     floor = crop(DesignOptions(8, 8, forbidden=forbidden, walls=walls, pitch_m=0.3, seed=4))
     assert floor is not None
-    assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE).tolist()} == forbidden
+    assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE_CODE).tolist()} == forbidden
     assert (floor.walls, floor.pitch_m, floor.seed) == (walls, 0.3, 4)
     assert prove_map(floor).is_unique
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.landmarks.landmark import signs
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap, as_built_poses
+from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap, as_built_poses
 from locatk.formats.map_csv import HEADER, dumps_csv, loads_csv
 from locatk.formats.map_lif import dumps_lif, loads_lif
 
@@ -29,13 +29,13 @@ def placed_floors(draw: st.DrawFn) -> FloorMap:
     """Maps that are told by places: in whole 1/100 mm, the first row and column not empty,
     with two neighbours from which the pitch is seen."""
     rows, columns = draw(st.integers(1, 5)), draw(st.integers(2, 5))
-    letters = st.integers(HOLE, 15)
+    letters = st.integers(HOLE_CODE, 15)
     values = draw(st.lists(letters, min_size=rows * columns, max_size=rows * columns))
     values[:2] = draw(st.integers(0, 15)), draw(st.integers(0, 15))
     codes = np.array(values, np.int64).reshape(rows, columns)
-    codes = codes[: np.flatnonzero((codes != HOLE).any(1))[-1] + 1]
-    codes = codes[:, : np.flatnonzero((codes != HOLE).any(0))[-1] + 1]
-    cells = [(int(r), int(c)) for r, c in np.argwhere(codes != HOLE)]
+    codes = codes[: np.flatnonzero((codes != HOLE_CODE).any(1))[-1] + 1]
+    codes = codes[:, : np.flatnonzero((codes != HOLE_CODE).any(0))[-1] + 1]
+    cells = [(int(r), int(c)) for r, c in np.argwhere(codes != HOLE_CODE)]
     pairs = [((r, c), (r + dr, c + dc)) for r, c in cells for dr, dc in ((0, 1), (1, 0))]
     pairs = [pair for pair in pairs if pair[1] in cells]
     hundredth = st.integers(-(10**6), 10**6).map(lambda value: value / 1e5)
@@ -100,7 +100,7 @@ def test_landmarks_as_built_come_back_where_they_lie(floor: FloorMap, data: st.D
 
 def test_the_table_is_that_of_controllers() -> None:
     floor = FloorMap(
-        np.array([[7, HOLE], [0, 15]]),
+        np.array([[7, HOLE_CODE], [0, 15]]),
         origin_m=(-2.48, 0.0125),
         built={(1, 1): AsBuiltLandmark(0.0012, 0, math.radians(-0.5), signs(15), NONE)},
     )
@@ -171,7 +171,7 @@ def test_any_table_is_a_map_or_an_error(text: str) -> None:
 # ---- LIF
 
 FLOOR = FloorMap(
-    np.array([[7, 1, HOLE], [0, 15, 9]]), walls=frozenset({((0, 0), (1, 0))}), name="hall"
+    np.array([[7, 1, HOLE_CODE], [0, 15, 9]]), walls=frozenset({((0, 0), (1, 0))}), name="hall"
 )
 
 

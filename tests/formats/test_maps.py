@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, name
-from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, WINDOWS, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, WINDOWS, AsBuiltLandmark, FloorMap
 from locatk.formats import hall_sensors
 from locatk.formats import maps as files
 from locatk.formats.maps import COMPASS, dumps_halls, dumps_map, loads_halls, loads_map
@@ -44,7 +44,7 @@ def geometries(draw: st.DrawFn) -> Geometry:
 def grids(draw: st.DrawFn, letters: list[int]) -> np.ndarray:
     """Codes with holes; at least one landmark."""
     rows, columns = draw(st.integers(1, 5)), draw(st.integers(1, 5))
-    cells = st.sampled_from([HOLE, *letters])
+    cells = st.sampled_from([HOLE_CODE, *letters])
     values = draw(st.lists(cells, min_size=rows * columns, max_size=rows * columns))
     values[draw(st.integers(0, len(values) - 1))] = draw(st.sampled_from(letters))
     return np.array(values, np.int64).reshape(rows, columns)
@@ -76,7 +76,7 @@ def floors(draw: st.DrawFn) -> FloorMap:
     everywhere = [(r, c) for r in range(codes.shape[0]) for c in range(codes.shape[1])]
     pairs = [((r, c), (r + dr, c + dc)) for r, c in everywhere for dr, dc in ((0, 1), (1, 0))]
     pairs = [pair for pair in pairs if pair[1] in everywhere]
-    laid = [cell for cell in everywhere if codes[cell] != HOLE]
+    laid = [cell for cell in everywhere if codes[cell] != HOLE_CODE]
     far = st.floats(-1e4, 1e4)
     return FloorMap(
         codes,
@@ -188,13 +188,13 @@ strength = [1, 0.9, -1.1, 0]
 
 def test_a_map_by_hand() -> None:
     floor = loads_map("\ufeff" + MAP + LANDMARK + BUILT)
-    np.testing.assert_array_equal(floor.codes, [[0, 15, HOLE], [3, 12, 7]])
+    np.testing.assert_array_equal(floor.codes, [[0, 15, HOLE_CODE], [3, 12, 7]])
     assert [name(code) for code in floor.codes[1]] == ["NNSS", "SSNN", "NNNS"]
-    assert floor.place((1, 0)) == (0.0, 0.2)  # the first string has the least y
+    assert floor.position((1, 0)) == (0.0, 0.2)  # the first string has the least y
     assert floor.geometry == Geometry()
     assert floor.walls == {((0, 0), (0, 1))}
-    assert not floor.open((0, 0), 0)
-    assert floor.open((0, 0), 1)
+    assert not floor.is_passable((0, 0), 0)
+    assert floor.is_passable((0, 0), 1)
     assert (floor.detect, floor.seed, floor.origin_m) == (0, None, (0.0, 0.0))
     built = floor.built[1, 2]
     assert (built.x_m, built.y_m, built.heading_rad) == (1.5e-3, -0.25e-3, math.pi / 100)

@@ -25,8 +25,8 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pack
 from locatk.core.landmarks.drawing.true_size import draw_floor
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
-from locatk.core.paper import parse_paper
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
+from locatk.core.paper_sizes import parse_paper
 from locatk.formats.pdf.drawings import render_floor, render_pages
 
 DPI = 300
@@ -50,7 +50,7 @@ HALL = some_floor(
     origin_m=(-0.4, 1.0),
     walls=frozenset({((0, 0), (0, 1)), ((2, 2), (3, 2))}),
 )
-HALL.codes[1, 2] = HOLE
+HALL.codes[1, 2] = HOLE_CODE
 
 
 def ink(data: bytes, number: int = 0, dpi: float = DPI) -> Places:
@@ -128,7 +128,7 @@ def test_templates_have_their_bars_at_true_size(
     if code is not None:
         floor = replace(floor, codes=np.full((2, 2), code))
     made = draw_installation_pack(floor, size, parts=("templates",))
-    laid = {int(value) for value in floor.codes.ravel()} - {HOLE}
+    laid = {int(value) for value in floor.codes.ravel()} - {HOLE_CODE}
     assert [item.code for item in made.templates] == sorted(laid)
     data = render_pages(made.pages, "t")
     for item in made.templates[:: 1 if code is not None else 3]:
@@ -343,7 +343,7 @@ def test_the_floor_at_true_size_is_whole(floor: FloorMap, name: str, overlap: fl
             for seam in tile.seams[axis]
         )
         assert len(set(cuts)) == len(edges) - 1
-        place = [1e3 * floor.place(cell)[axis] for cell in floor.cells()]
+        place = [1e3 * floor.position(cell)[axis] for cell in floor.cells()]
         assert edges[0][0] + 30 <= min(place)
         assert max(place) <= edges[-1][1] - 30
 
@@ -359,8 +359,8 @@ def held(floor: FloorMap, tile: Tile) -> set[tuple[int, int]]:
         cell
         for cell in floor.cells()
         if all(
-            tile.corner_mm[axis] + out <= 1e3 * floor.place(cell)[axis]
-            and 1e3 * floor.place(cell)[axis] <= tile.corner_mm[axis] + span(tile, axis) - out
+            tile.corner_mm[axis] + out <= 1e3 * floor.position(cell)[axis]
+            and 1e3 * floor.position(cell)[axis] <= tile.corner_mm[axis] + span(tile, axis) - out
             for axis in (0, 1)
         )
     }
@@ -369,7 +369,8 @@ def held(floor: FloorMap, tile: Tile) -> set[tuple[int, int]]:
 def check_tile(floor: FloorMap, tile: Tile, dark: Places) -> None:
     for cell in sorted(held(floor, tile))[:4]:
         centre = [
-            1e3 * floor.place(cell)[axis] - tile.corner_mm[axis] + tile.box[axis] for axis in (0, 1)
+            1e3 * floor.position(cell)[axis] - tile.corner_mm[axis] + tile.box[axis]
+            for axis in (0, 1)
         ]
         errors = measure(dark, floor.geometry, int(floor.codes[cell]), (centre[0], centre[1]))
         assert np.abs(errors).max() < 0.1

@@ -26,7 +26,7 @@ from locatk.core.dots.drawing.layout import SheetLayout, lay_out, manifest, snap
 from locatk.core.dots.drawing.tiles import seams, tiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
-from locatk.core.paper import paper_size
+from locatk.core.paper_sizes import paper_size
 from locatk.formats import rasters
 from locatk.formats.pdf import page, pattern
 

@@ -14,7 +14,7 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import ArtifactError, MissingDataError, OutputExistsError
 from locatk.core.landmarks.halls import HallSensors, circle
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
@@ -36,7 +36,7 @@ ALL: dict[str, tuple[Artifact[Any], Any]] = {
     "camera.toml": (sheets.CAMERA, Camera((188, 120), 900.0, (93.5, 59.5))),
     "tag.toml": (tags.TAGS, Tags(notes=(NOTE,))),
     "array.toml": (tags.ARRAY, SensorArray(bar(3, 0.008))),
-    "map.toml": (maps.MAP, FloorMap(np.array([[1, HOLE], [3, 15]]), notes=(NOTE,))),
+    "map.toml": (maps.MAP, FloorMap(np.array([[1, HOLE_CODE], [3, 15]]), notes=(NOTE,))),
     "halls.toml": (HALLS, HallSensors()),
 }
 

@@ -19,7 +19,7 @@ from locatk.core.dots.drawing.layout import SheetLayout, manifest
 from locatk.core.dots.drawing.tiles import SheetTiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
-from locatk.core.paper import paper_name
+from locatk.core.paper_sizes import paper_name
 
 GAP_POSITIONS = 64
 """Positions left free around an allocated area, so that a window at the border of a sheet is far

@@ -60,7 +60,7 @@ for parameters without a prior."""
 KNOWN_LENS_WEIGHT = 1e12
 """Prior weight of the lens parameter if the lens is known; it keeps the parameter at zero."""
 
-RIDGE = 1e-9
+NORMAL_MATRIX_RIDGE = 1e-9
 """Added to the diagonal of the normal matrix, so that frames without dots are not singular."""
 
 MIN_LATTICE_DOTS = 20
@@ -369,5 +369,5 @@ def add_prior(
 ) -> None:
     """Add the priors of perspective and lens to normal equations in units of ``sigma``."""
     weights = prior_weights(lens) * np.square(np.asarray(sigma, float))[..., None]
-    np.einsum("nii->ni", normal)[:] += weights + RIDGE
+    np.einsum("nii->ni", normal)[:] += weights + NORMAL_MATRIX_RIDGE
     right -= weights * parameters

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from locatk.core.dots.codec import check_window
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, MM_PER_INCH, Manifest, Sheet
 from locatk.core.errors import InputError
-from locatk.core.paper import MAX_PAPER_MM
+from locatk.core.paper_sizes import MAX_PAPER_MM
 
 DPIS = (300, 600, 1200)
 """Supported resolutions of printers."""

@@ -18,7 +18,7 @@ from locatk.core.dots.codec import SECTION_LENGTH, codec, sequences
 from locatk.core.dots.drawing.layout import BASE_DPI, DPIS, Raster, SheetLayout, snap
 from locatk.core.dots.sheet import MM_PER_INCH
 from locatk.core.errors import InputError
-from locatk.core.paper import PAPER_SIZES_MM
+from locatk.core.paper_sizes import PAPER_SIZES_MM
 
 SIZES = ("A4", "Letter")
 """Papers that have a test sheet."""

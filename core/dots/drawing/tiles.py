@@ -9,7 +9,7 @@ from locatk.core.dots.codec import check_window
 from locatk.core.dots.drawing.layout import SheetLayout
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import InputError
-from locatk.core.paper import MAX_PAPER_MM
+from locatk.core.paper_sizes import MAX_PAPER_MM
 
 MAX_TILES = 1000
 """Maximum number of tiles of a floor."""

@@ -25,7 +25,7 @@ from locatk.core.dots.simulation.optics import CameraPose, Exposer, Optics
 from locatk.core.dots.simulation.paths import PATHS, CameraPath, RandomSource, camera_path
 from locatk.core.dots.simulation.printed_paper import PrintedPaper
 from locatk.core.errors import InputError
-from locatk.core.paper import paper_size
+from locatk.core.paper_sizes import paper_size
 from locatk.core.simulation import (
     check_options,
     exact_trajectory,

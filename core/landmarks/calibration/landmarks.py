@@ -85,7 +85,7 @@ def weak_priors(visits: Sequence[IdentifiedVisit], design: FloorMap) -> dict[Cel
     for cell, weighted in total.items():
         mean = weighted / weight[cell]
         direction = np.where(np.abs(mean) < MISSING_BAR_STRENGTH, 0.0, np.sign(mean))
-        pose = np.array([*design.place(cell), 0.0])
+        pose = np.array([*design.position(cell), 0.0])
         sigma = np.full(4, FAULTY_STRENGTH_SIGMA)
         priors[cell] = LandmarkPrior(pose, UNKNOWN_POSE_SIGMA, direction, sigma)
     return priors
@@ -118,7 +118,7 @@ def tolerance_priors(
         relative = landmark.strength / strength
         is_sound = np.abs(np.abs(relative) - 1) < MAX_SOUND_DEVIATION
         priors[cell] = LandmarkPrior(
-            np.array([*design.place(cell), 0.0]),
+            np.array([*design.position(cell), 0.0]),
             UNKNOWN_POSE_SIGMA if is_displaced else LANDMARK_SIGMA,
             np.where(is_sound, np.sign(relative), relative),
             np.where(is_sound, usual_sigma, FAULTY_STRENGTH_SIGMA),
@@ -152,7 +152,7 @@ def describe_landmarks(
         estimates = [smoothed.landmarks[cell] for cell in component]
         pose = np.array([one.pose for one in estimates])
         covariance = np.array([one.covariance for one in estimates])
-        designed = np.array([[*design.place(cell), 0.0] for cell in component])
+        designed = np.array([[*design.position(cell), 0.0] for cell in component])
         deviation = deviations_from_design(pose, designed, LANDMARK_SIGMA)
         prior_sigma = np.array([priors[cell].sigma for cell in component])
         own = relative_covariances(covariance[:, :3, :3], pose[:, :2], prior_sigma, scale)

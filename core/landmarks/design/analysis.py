@@ -73,9 +73,9 @@ class PatternAnalysis:
         Number of valleys by which the pattern is recognised.
     valleys_rad : (n,) ndarray
         Neutral valleys on the circle of the sensors, ascending from x counter-clockwise.
-    rising : (n,) bool ndarray
+    is_rising : (n,) bool ndarray
         True if the field increases there, counter-clockwise.
-    mountains_t : (n,) ndarray
+    peaks_t : (n,) ndarray
         Largest field, signed, between each valley and the next.
     gulfs_rad : (n,) ndarray
         Angular width of the gulf of the threshold contour at each valley
@@ -99,8 +99,8 @@ class PatternAnalysis:
     letters: str
     expected: int
     valleys_rad: Array
-    rising: NDArray[np.bool_]
-    mountains_t: Array
+    is_rising: NDArray[np.bool_]
+    peaks_t: Array
     gulfs_rad: Array
     r1_m: float
     r2_m: float
@@ -266,7 +266,7 @@ def _analyse_patterns(geometry: Geometry) -> tuple[PatternAnalysis, ...]:
     patterns = []
     for k, letters in enumerate(PATTERNS):
         strengths = PATTERN_STRENGTHS[:, k]
-        valleys, rising, peaks = find_valleys(geometry, strengths)
+        valleys, is_rising, peaks = find_valleys(geometry, strengths)
         r1, r2 = territory_radii(phi, contours[:, k], strengths)
         nominal = np.where(is_equal_corner(np.degrees(phi), strengths), r1, r2)
         is_complete = len(valleys) == VALLEY_COUNTS[k]
@@ -276,8 +276,8 @@ def _analyse_patterns(geometry: Geometry) -> tuple[PatternAnalysis, ...]:
                 letters=letters,
                 expected=VALLEY_COUNTS[k],
                 valleys_rad=valleys,
-                rising=rising,
-                mountains_t=peaks,
+                is_rising=is_rising,
+                peaks_t=peaks,
                 gulfs_rad=gulf_widths(contours[:, k], nominal, valleys),
                 r1_m=r1,
                 r2_m=r2,

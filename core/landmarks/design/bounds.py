@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, Wall
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, Wall
 from locatk.core.landmarks.map.windows import (
     ALPHABET_CODES,
     WINDOW_PATHS,
@@ -77,9 +77,9 @@ def require_enough_words(
     """
     codes = np.zeros((rows, columns), np.int64)
     for cell in forbidden:
-        codes[cell] = HOLE
+        codes[cell] = HOLE_CODE
     floor = FloorMap(codes, alphabet=alphabet, window=window, walls=frozenset(walls))
-    cells, heading = place_windows(codes != HOLE, passable_steps(floor), window)
+    cells, heading = place_windows(codes != HOLE_CODE, passable_steps(floor), window)
     require_enough_words_for_windows(
         cells, heading, alphabet=alphabet, window=window, detect=detect
     )

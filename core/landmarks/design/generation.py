@@ -17,7 +17,15 @@ from locatk.core.landmarks.design.search import (
     search,
 )
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, STEPS, WINDOWS, Cell, FloorMap, Wall
+from locatk.core.landmarks.map.floor import (
+    ALPHABETS,
+    HOLE_CODE,
+    STEPS,
+    WINDOWS,
+    Cell,
+    FloorMap,
+    Wall,
+)
 from locatk.core.landmarks.map.windows import (
     ALPHABET_CODES,
     WINDOW_PATHS,
@@ -105,7 +113,7 @@ def design_map(
     16 takes 0.1 to 0.4 s; simulated annealing that proposes one letter for any cell took 4 to 17 s.
     """
     blank = empty_floor(options)
-    has_landmark = blank.codes != HOLE
+    has_landmark = blank.codes != HOLE_CODE
     cells, heading = place_windows(has_landmark, passable_steps(blank), options.window)
     alphabet = options.alphabet
     require_enough_words_for_windows(
@@ -131,7 +139,7 @@ def design_map(
         repeats = search(problem, values, weights, _stage_seed(options.seed, index, 2), steps)
         if repeats == 0:
             codes = np.array(ALPHABET_CODES[alphabet])[values].reshape(has_landmark.shape)
-            return with_codes(blank, np.where(has_landmark, codes, HOLE), options.seed)
+            return with_codes(blank, np.where(has_landmark, codes, HOLE_CODE), options.seed)
         fewest_repeats = min(fewest_repeats, repeats)
         used += length
         if progress is not None:
@@ -176,7 +184,7 @@ def empty_floor(options: DesignOptions) -> FloorMap:
     for cell in options.forbidden:
         if not is_on_floor(cell):
             raise InputError(f"forbidden cell {cell[0]},{cell[1]} is not on the floor")
-        codes[cell] = HOLE
+        codes[cell] = HOLE_CODE
     for first, second in options.walls:
         step = (second[0] - first[0], second[1] - first[1])
         if not (is_on_floor(first) and is_on_floor(second) and step in STEPS):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.map.floor import HOLE, STEPS, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, STEPS, Cell, FloorMap
 from locatk.core.landmarks.map.windows import (
     WINDOW_PATHS,
     Integers,
@@ -74,7 +74,7 @@ def count_localization_steps(floor: FloorMap) -> LocalizationSteps:
     """Return the number of landmarks to visit from each start on a floor without faults."""
     drive = LocalizationDrive.on(floor)
     landmarks = np.zeros(4 * floor.codes.size, np.int64)
-    start = np.flatnonzero(np.repeat(floor.codes.reshape(-1) != HOLE, 4))
+    start = np.flatnonzero(np.repeat(floor.codes.reshape(-1) != HOLE_CODE, 4))
     landmarks[start] = NEVER_LOCALIZED
     # Starts that agree in everything read so far form a group of hypotheses.
     state, group = start * drive.phases, drive.letter[start]
@@ -143,7 +143,7 @@ class LocalizationDrive:
         count, phases = len(passable), len(wanted)
         codes = floor.codes.reshape(-1, 1)
         heading = np.arange(4)
-        letter = letters_as_read(np.where(codes == HOLE, 0, codes), heading, floor.alphabet)
+        letter = letters_as_read(np.where(codes == HOLE_CODE, 0, codes), heading, floor.alphabet)
         letter = letter.reshape(-1)
         cell = np.arange(count)[:, None, None]
         turn = np.full((count, 4, phases), NO_TURN)

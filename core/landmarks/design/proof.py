@@ -17,7 +17,7 @@ from locatk.core.landmarks.design.localization_steps import (
     count_localization_steps,
 )
 from locatk.core.landmarks.landmark import CODE_COUNT
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap
 from locatk.core.landmarks.map.windows import (
     WINDOW_PATHS,
     Integers,
@@ -180,7 +180,9 @@ def canonical_text(floor: FloorMap) -> str:
     """Return the proven map as text: codes as hexadecimal digits, a dot for a hole, and walls."""
     rows, columns = floor.shape
     lines = [f"locatk floor {rows}x{columns} {floor.window} {floor.alphabet} {floor.detect}"]
-    lines += ["".join("." if c == HOLE else f"{c:x}" for c in row) for row in floor.codes.tolist()]
+    lines += [
+        "".join("." if c == HOLE_CODE else f"{c:x}" for c in row) for row in floor.codes.tolist()
+    ]
     lines += [f"wall {a[0]},{a[1]} {b[0]},{b[1]}" for a, b in sorted(floor.walls)]
     return "\n".join(lines) + "\n"
 

@@ -14,7 +14,7 @@ from locatk.core.landmarks.drawing.plan import draw_plan
 from locatk.core.landmarks.drawing.templates import PlacedTemplate, draw_templates
 from locatk.core.landmarks.drawing.texts import bill_pages, checklist_pages, marking_list_pages
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.paper import PAPER_SIZES_MM
+from locatk.core.paper_sizes import PAPER_SIZES_MM
 
 PACK_PARTS = ("plan", "templates", "materials", "checklist", "list")
 """Parts of a pack, in the order of their pages."""

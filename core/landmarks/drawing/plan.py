@@ -24,7 +24,7 @@ from locatk.core.drawing.pages import SMALL_TEXT_POINTS, TEXT_POINTS, PageFrame,
 from locatk.core.drawing.tiles import tile_name
 from locatk.core.landmarks.drawing.landmark import draw_hole, draw_symbol, north_mark
 from locatk.core.landmarks.drawing.legend import LEGEND_HEIGHT_MM, draw_legend
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap
 from locatk.core.units import mm_text
 
 MIN_CELL_MM = 6.5
@@ -158,7 +158,7 @@ def _count(number: int, noun: str) -> str:
 def _label_space(floor: FloorMap) -> Point:
     """Return the space in mm for numbers and axes at the left of and below the cells."""
     rows, columns = floor.shape
-    (x0, y0), (x1, y1) = floor.place((0, 0)), floor.place((rows - 1, columns - 1))
+    (x0, y0), (x1, y1) = floor.position((0, 0)), floor.position((rows - 1, columns - 1))
     longest = max(text_width(mm_text(value), SMALL_TEXT_POINTS) for value in (x0, y0, x1, y1))
     return AXIS_SPACE_MM + longest + 6.0, AXIS_SPACE_MM + longest + 5.0
 
@@ -225,7 +225,7 @@ class _BlockDrawing:
         marks: list[Mark] = []
         for row in self.block.rows:
             y = self._centre((row, 0))[1] - capital / 2
-            position = mm_text(self.floor.place((row, 0))[1])
+            position = mm_text(self.floor.position((row, 0))[1])
             marks.append(Text(str(row), (left - 1.2, y), number_points, "end", bold=True))
             marks.append(Text(position, (left - 5.5, y), SMALL_TEXT_POINTS, "end"))
         longest = _label_space(self.floor)[1] - AXIS_SPACE_MM - 4.0
@@ -233,7 +233,7 @@ class _BlockDrawing:
         for column in self.block.columns:
             x, _ = self._centre((0, column))
             y = bottom - 1.2 - 1.2 * capital
-            position = mm_text(self.floor.place((0, column))[0])
+            position = mm_text(self.floor.position((0, column))[0])
             marks.append(Text(str(column), (x, y), number_points, "middle", bold=True))
             if is_upright:
                 corner = (x + capital / 2, y - 1.2)
@@ -261,14 +261,14 @@ class _BlockDrawing:
     def _cell(self, cell: Cell) -> list[Mark]:
         centre, half = self._centre(cell), 0.5 * self.cell_mm
         code = int(self.floor.codes[cell])
-        if code == HOLE:
+        if code == HOLE_CODE:
             return draw_hole(centre, half, 0.1)
         if self.cell_mm <= MIN_LABELLED_CELL_MM:
             return draw_symbol(code, centre, 1.2 * self.cell_mm)
         points = SMALL_TEXT_POINTS * min(1.4, self.cell_mm / 25)
         left = centre[0] - half + 1.2
         first_baseline = centre[1] + half - line_height(points) - 0.2
-        position = ", ".join(mm_text(value) for value in self.floor.place(cell))
+        position = ", ".join(mm_text(value) for value in self.floor.position(cell))
         return [
             *draw_symbol(code, centre, self.cell_mm),
             Text(f"row {cell[0]}, column {cell[1]}", (left, first_baseline), points),
@@ -308,7 +308,7 @@ def _draw_overview(floor: FloorMap, layout: _PlanLayout, box: Box) -> list[Mark]
     left = (box[0] + box[2] - cell * columns) / 2
     bottom = box[3] - 5 - cell * rows
     marks: list[Mark] = []
-    holes = [(r, c) for r in range(rows) for c in range(columns) if floor.codes[r, c] == HOLE]
+    holes = [(r, c) for r in range(rows) for c in range(columns) if floor.codes[r, c] == HOLE_CODE]
     for row, column in holes:
         x, y = left + column * cell, bottom + row * cell
         # A single thin diagonal, because the name of a block may be over it.

@@ -58,7 +58,7 @@ def bill_pages(
 def installation_steps(floor: FloorMap) -> tuple[str, ...]:
     """Return the instructions for the installation of a floor, in order."""
     rows, columns = floor.shape
-    low, high = floor.place((0, 0)), floor.place((rows - 1, columns - 1))
+    low, high = floor.position((0, 0)), floor.position((rows - 1, columns - 1))
     steps = [
         TRUE_SIZE_INSTRUCTION + " A ruler of 100 mm that measures 99 mm is no template.",
         "Prove the map before you drill: locatk map check MAP must report no duplicates.",
@@ -117,7 +117,7 @@ def marking_list_pages(
     rows = []
     for cell in floor.cells():
         code = int(floor.codes[cell])
-        x, y = (mm_text(value) for value in floor.place(cell))
+        x, y = (mm_text(value) for value in floor.position(cell))
         bars = (code_digit(code), name(code), str(PATTERN_OF[code]))
         rows.append((str(cell[0]), str(cell[1]), x, y, *bars, "[  ]"))
     longest = max(len(value) for row in rows for value in row[2:4])

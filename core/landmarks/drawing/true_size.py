@@ -17,8 +17,8 @@ from locatk.core.landmarks.drawing.landmark import (
     drawing_half_side,
     north_mark,
 )
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap
-from locatk.core.paper import Paper
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap
+from locatk.core.paper_sizes import Paper
 from locatk.core.units import mm_text
 
 MAX_TILES = 500
@@ -90,7 +90,7 @@ def draw_floor(
 def floor_extent(floor: FloorMap) -> Box:
     """Return left, bottom, right and top of the drawing at true size, in mm in the map frame."""
     rows, columns = floor.shape
-    (x0, y0), (x1, y1) = floor.place((0, 0)), floor.place((rows - 1, columns - 1))
+    (x0, y0), (x1, y1) = floor.position((0, 0)), floor.position((rows - 1, columns - 1))
     border = min(drawing_half_side(floor.geometry), 0.5e3 * floor.pitch_m)
     border = max(border, 0.25e3 * floor.pitch_m)
     return 1e3 * x0 - border, 1e3 * y0 - border, 1e3 * x1 + border, 1e3 * y1 + border
@@ -115,15 +115,15 @@ def _draw_area(floor: FloorMap, corner: Point, box: Box) -> list[Mark]:
     rows, columns = floor.shape
     marks: list[Mark] = []
     for row in range(rows):
-        y = 1e3 * floor.place((row, 0))[1] + dy
+        y = 1e3 * floor.position((row, 0))[1] + dy
         if box[1] <= y <= box[3]:
             marks.append(Line((left + dx, y), (right + dx, y), 0.08))
     for column in range(columns):
-        x = 1e3 * floor.place((0, column))[0] + dx
+        x = 1e3 * floor.position((0, column))[0] + dx
         if box[0] <= x <= box[2]:
             marks.append(Line((x, bottom + dy), (x, top + dy), 0.08))
     for cell in _cells_in_area(floor, corner, box):
-        x, y = floor.place(cell)
+        x, y = floor.position(cell)
         marks += _draw_cell(floor, cell, (1e3 * x + dx, 1e3 * y + dy))
     return [*marks, *_draw_walls(floor, (dx, dy), box)]
 
@@ -143,7 +143,7 @@ def _cells_in_area(floor: FloorMap, corner: Point, box: Box) -> list[Cell]:
 def _draw_cell(floor: FloorMap, cell: Cell, centre: Point) -> list[Mark]:
     x, y = centre
     code = int(floor.codes[cell])
-    if code == HOLE:
+    if code == HOLE_CODE:
         return [*draw_hole(centre, 10.0, 0.2), Text("no landmark", (x + 2, y + 12), TEXT_POINTS)]
     notes = (f"row {cell[0]}", f"column {cell[1]}", f"code {code_digit(code)}")
     return [
@@ -157,7 +157,7 @@ def _draw_walls(floor: FloorMap, shift: Point, box: Box) -> list[Mark]:
     marks: list[Mark] = []
     half = 0.5e3 * floor.pitch_m
     for first, second in sorted(floor.walls):
-        (x1, y1), (x2, y2) = floor.place(first), floor.place(second)
+        (x1, y1), (x2, y2) = floor.position(first), floor.position(second)
         x, y = 500 * (x1 + x2) + shift[0], 500 * (y1 + y2) + shift[1]
         if not (box[0] - half <= x <= box[2] + half and box[1] - half <= y <= box[3] + half):
             continue

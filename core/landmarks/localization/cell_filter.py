@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.detection.hypotheses import DetectedVisit, Hypothesis, VisitHypotheses
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, rotated
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, as_built_code, as_built_codes
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_code, as_built_codes
 from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
@@ -155,7 +155,7 @@ def select_visits_on_map(
         for visit in visits
         if visit.estimate is not None
         and visit.estimate.probability >= MIN_CELL_PROBABILITY
-        and as_built_code(floor, visit.cell) != HOLE
+        and as_built_code(floor, visit.cell) != HOLE_CODE
     ]
 
 
@@ -260,7 +260,7 @@ def _map_likelihood(
     hypotheses: list[tuple[int, Hypothesis]], codes: NDArray[np.int64], misread: float
 ) -> Array:
     """Return the likelihood (H, 4, rows, columns) of each hypothesis in each state, with pad."""
-    padded = np.pad(codes, PAD_CELLS, constant_values=HOLE)
+    padded = np.pad(codes, PAD_CELLS, constant_values=HOLE_CODE)
     rotated_codes = np.stack([rotated(np.maximum(padded, 0), -q) for q in range(4)])
     is_inside = np.pad(np.ones(codes.shape, bool), PAD_CELLS)
     without_landmark = (
@@ -270,7 +270,9 @@ def _map_likelihood(
     likelihood = np.empty((len(hypotheses), 4, *padded.shape))
     for number, (_, one) in enumerate(hypotheses):
         of_code = np.where(rotated_codes == one.code, 1 - misread, misread / (CODE_COUNT - 1))
-        likelihood[number] = one.probability * np.where(padded == HOLE, without_landmark, of_code)
+        likelihood[number] = one.probability * np.where(
+            padded == HOLE_CODE, without_landmark, of_code
+        )
     return likelihood
 
 
@@ -286,8 +288,8 @@ def _code_likelihood(hypotheses: list[tuple[int, Hypothesis]], code: int, misrea
 
 def miss_likelihood(floor: FloorMap) -> Array:
     """Return the likelihood (rows, columns) of passing a cell without a visit, with pad."""
-    padded = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE)
-    return np.where(padded == HOLE, 1.0, MISSED_LANDMARK_PROBABILITY)
+    padded = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE_CODE)
+    return np.where(padded == HOLE_CODE, 1.0, MISSED_LANDMARK_PROBABILITY)
 
 
 # ---- steps between visits

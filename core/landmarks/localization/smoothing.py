@@ -57,7 +57,7 @@ from locatk.core.landmarks.landmark import (
 )
 from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit
 from locatk.core.landmarks.map.floor import (
-    HOLE,
+    HOLE_CODE,
     MISSING_BAR_STRENGTH,
     Cell,
     FloorMap,
@@ -178,7 +178,7 @@ def measure_visits(
     """
     measurements = []
     for visit in visits:
-        landmark = np.array([*floor.place(visit.cell), visit.quarters * HALF_PI_RAD])
+        landmark = np.array([*floor.position(visit.cell), visit.quarters * HALF_PI_RAD])
         pose, trace = compose(landmark, visit.hypothesis.pose), visit.segment.trace
         if visit.hypothesis.fit is None:
             raise ValueError("smoothing needs hypotheses with a fit of the field model")
@@ -216,7 +216,7 @@ def subtract_neighbours(
     rows, columns = floor.shape
     for row in range(max(0, cell[0] - span), min(rows, cell[0] + span + 1)):
         for column in range(max(0, cell[1] - span), min(columns, cell[1] + span + 1)):
-            if (row, column) == cell or floor.codes[row, column] == HOLE:
+            if (row, column) == cell or floor.codes[row, column] == HOLE_CODE:
                 continue
             landmark, strength = as_built_landmark(floor, (row, column))
             offset = position - landmark[:2]
@@ -261,7 +261,7 @@ def landmark_priors(
     landmarks: dict[Cell, LandmarkPrior] = {}
     for visit in visits:
         cell, quarters, hypothesis = visit.cell, visit.quarters, visit.hypothesis
-        pose, sigma = np.array([*floor.place(cell), 0.0]), LANDMARK_SIGMA
+        pose, sigma = np.array([*floor.position(cell), 0.0]), LANDMARK_SIGMA
         strength = signs(rotated(hypothesis.code, quarters))
         strength_sigma = np.full(4, priors.strength)
         is_missing = np.zeros(4, bool)

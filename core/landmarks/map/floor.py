@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Cell = tuple[int, int]
 Wall = tuple[Cell, Cell]
 
-HOLE = -1
+HOLE_CODE = -1
 """Code of a cell without a landmark."""
 
 ALPHABETS = ("6", "16", "compass")
@@ -80,7 +80,8 @@ class FloorMap:
     Attributes
     ----------
     codes : (rows, columns) int64 ndarray
-        Code of each cell's landmark (:mod:`.landmark`) or :data:`HOLE`. Row 0 has the smallest y.
+        Code of each cell's landmark (:mod:`.landmark`) or :data:`HOLE_CODE`. Row 0 has the
+        smallest y.
     pitch_m : float
         Distance of neighbouring cells.
     alphabet : str
@@ -121,14 +122,14 @@ class FloorMap:
 
     def cells(self) -> list[Cell]:
         """Return the cells that have a landmark, row by row."""
-        return [(int(r), int(c)) for r, c in np.argwhere(self.codes != HOLE)]
+        return [(int(r), int(c)) for r, c in np.argwhere(self.codes != HOLE_CODE)]
 
-    def place(self, cell: Cell) -> tuple[float, float]:
+    def position(self, cell: Cell) -> tuple[float, float]:
         """Return the nominal position of a cell in the map frame, in metres."""
         x, y = self.origin_m
         return x + self.pitch_m * cell[1], y + self.pitch_m * cell[0]
 
-    def open(self, cell: Cell, heading: int) -> bool:
+    def is_passable(self, cell: Cell, heading: int) -> bool:
         """Return whether a robot can drive from ``cell`` to the next one at a heading.
 
         The heading is in quarter turns. Holes, walls and the border are not passable; ``cell``
@@ -138,7 +139,7 @@ class FloorMap:
         rows, columns = self.shape
         if not (0 <= row < rows and 0 <= column < columns):
             return False
-        if self.codes[row, column] == HOLE:
+        if self.codes[row, column] == HOLE_CODE:
             return False
         first, second = sorted([cell, (row, column)])
         return (first, second) not in self.walls
@@ -149,7 +150,7 @@ def as_built_landmark(floor: FloorMap, cell: Cell) -> tuple[Array, Array]:
 
     What was not measured is as designed.
     """
-    pose = np.array([*floor.place(cell), 0.0])
+    pose = np.array([*floor.position(cell), 0.0])
     strength = signs(floor.codes[cell])
     built = floor.built.get(cell)
     if built is not None:
@@ -179,10 +180,10 @@ def as_built_codes(floor: FloorMap) -> NDArray[np.int64]:
 
 
 def as_built_code(floor: FloorMap, cell: Cell) -> int:
-    """Return the code that robots read in one cell; :data:`HOLE` outside the map."""
+    """Return the code that robots read in one cell; :data:`HOLE_CODE` outside the map."""
     rows, columns = floor.shape
-    if not (0 <= cell[0] < rows and 0 <= cell[1] < columns) or floor.codes[cell] == HOLE:
-        return HOLE
+    if not (0 <= cell[0] < rows and 0 <= cell[1] < columns) or floor.codes[cell] == HOLE_CODE:
+        return HOLE_CODE
     built = floor.built.get(cell)
     if built is None:
         return int(floor.codes[cell])

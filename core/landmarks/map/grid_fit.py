@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.landmark import signs
-from locatk.core.landmarks.map.floor import HOLE, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def floor_from_poses(
     """
     pose = np.asarray(poses, float).reshape(-1, 3)
     grid = fit_grid(pose[:, :2], names, pitch_m=pitch_m, tolerance_m=tolerance_m)
-    floor_codes = np.full(grid.cells.max(0) + 1, HOLE, np.int64)
+    floor_codes = np.full(grid.cells.max(0) + 1, HOLE_CODE, np.int64)
     built = {}
     name_of_cell: dict[tuple[int, int], str] = {}
     for code, (row, column), offset, heading, name in zip(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, code_of, rotated
-from locatk.core.landmarks.map.floor import HOLE, STEPS, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, STEPS, FloorMap
 
 Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -66,7 +66,7 @@ def window_readings(floor: FloorMap) -> WindowReadings:
 
     Windows that would leave the floor, cross a wall or visit a hole are left out.
     """
-    cells, heading = place_windows(floor.codes != HOLE, passable_steps(floor), floor.window)
+    cells, heading = place_windows(floor.codes != HOLE_CODE, passable_steps(floor), floor.window)
     codes = floor.codes[cells[..., 0], cells[..., 1]]
     return WindowReadings(letters_as_read(codes, heading[:, None], floor.alphabet), cells, heading)
 
@@ -82,11 +82,11 @@ def letters_as_read(codes: Integers, heading: Integers, alphabet: str) -> Intege
 
 
 def passable_steps(floor: FloorMap) -> Bools:
-    """Return :meth:`.FloorMap.open` (rows, columns, 4) of each cell and heading.
+    """Return :meth:`.FloorMap.is_passable` (rows, columns, 4) of each cell and heading.
 
     No step leads out of a hole.
     """
-    has_landmark = floor.codes != HOLE
+    has_landmark = floor.codes != HOLE_CODE
     rows, columns = floor.shape
     padded = np.zeros((rows + 2, columns + 2), bool)
     padded[1:-1, 1:-1] = has_landmark

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.landmark import PATTERN_OF, rotated
-from locatk.core.landmarks.map.floor import HOLE, Cell, FloorMap, neighbour
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, neighbour
 
 Array = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ def match_map(
             matches = _matches_cell(floor, cell, heading, codes[0])
             for code, rotation in zip(codes[1:], rotations, strict=True):
                 heading = (heading + rotation) % 4
-                matches = matches and floor.open(cell, heading)
+                matches = matches and floor.is_passable(cell, heading)
                 if not matches:
                     break
                 cell = neighbour(cell, heading)
@@ -137,7 +137,7 @@ def match_map(
 
 def _matches_cell(floor: FloorMap, cell: Cell, heading: int, code: int) -> bool:
     installed = int(floor.codes[cell])
-    if installed == HOLE:
+    if installed == HOLE_CODE:
         return False
     if floor.alphabet == "6":
         return bool(PATTERN_OF[installed] == PATTERN_OF[code])

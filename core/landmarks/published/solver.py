@@ -184,7 +184,7 @@ def _dead_reckoning(
     starts[0] = 0
     for k, n in enumerate(numbers):
         part = slice(starts[k], starts[k + 1] if k + 1 < len(numbers) else len(own))
-        frame = np.array([*floor.place(located[n].cell), located[n].quarters * HALF_PI_RAD])
+        frame = np.array([*floor.position(located[n].cell), located[n].quarters * HALF_PI_RAD])
         at_landmark = compose(frame, visits[n].best.pose)
         pose[part] = compose(at_landmark, relative(own[part], visits[n].odometry))
     return Trajectory(

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.landmark import rotated
 from locatk.core.landmarks.map.floor import Cell, FloorMap
-from locatk.core.landmarks.simulation.floor import Laid
+from locatk.core.landmarks.simulation.floor import InstalledLandmark
 from locatk.core.landmarks.simulation.instruments import Instruments, Measurements
 from locatk.core.landmarks.simulation.options import SimulationOptions
-from locatk.core.landmarks.simulation.passes import EPOCH_NS
 from locatk.core.landmarks.simulation.robot import Robot
 from locatk.core.landmarks.simulation.sensors import odometry_biases
 from locatk.core.landmarks.simulation.strategy import CHECK_STEP_M, is_free, start_of_search
+from locatk.core.simulation import SESSION_START_NS
 
 Array = NDArray[np.float64]
 
@@ -130,7 +130,7 @@ class Approach:
 
 def drive_closed_loop(
     floor: FloorMap,
-    landmarks: Mapping[Cell, Laid],
+    landmarks: Mapping[Cell, InstalledLandmark],
     options: SimulationOptions,
     instruments: Instruments,
     driver: Driver,
@@ -194,10 +194,10 @@ def execute_motion(robot: Robot, motion: Motion, biases: Array) -> None:
 
 
 def judge_approach(
-    report: ApproachReport, robot: Robot, landmarks: Mapping[Cell, Laid]
+    report: ApproachReport, robot: Robot, landmarks: Mapping[Cell, InstalledLandmark]
 ) -> Approach:
     """Compare the report of an approach with the landmark nearest to the robot's true pose."""
-    time_s = np.array([(report.time_ns - EPOCH_NS) * 1e-9])
+    time_s = np.array([(report.time_ns - SESSION_START_NS) * 1e-9])
     x, y, heading = robot.poses_at(time_s)[0]
     nearest = min(landmarks.values(), key=lambda mark: math.hypot(mark.x_m - x, mark.y_m - y))
     distance = math.hypot(nearest.x_m - x, nearest.y_m - y)
@@ -213,7 +213,7 @@ def judge_approach(
     return Approach(report.time_ns, nearest.cell, outcome, report.searched, report.spins, distance)
 
 
-def _code_in_frame(mark: Laid, frame_rad: float) -> int:
+def _code_in_frame(mark: InstalledLandmark, frame_rad: float) -> int:
     """Return the code of a landmark in a frame rotated by about quarter turns from its own.
 
     Flipped bars count as they are; a missing bar counts as designed.

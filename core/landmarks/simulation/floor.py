@@ -31,7 +31,7 @@ from locatk.core.simulation import random_stream
 
 Array = NDArray[np.float64]
 
-REACH_M = 0.3
+FIELD_RANGE_M = 0.3
 """Distance beyond which the field of a landmark is ignored [m]. That of a strong one is 1 uT
 there, a hundredth of the noise."""
 
@@ -44,7 +44,7 @@ tilt (2)."""
 
 
 @dataclass(frozen=True)
-class Laid:
+class InstalledLandmark:
     """One landmark as installed.
 
     Attributes
@@ -77,7 +77,9 @@ class Laid:
     axes: Array
 
 
-def lay(floor: FloorMap, errors: Errors, faults: Faults, seed: int) -> dict[Cell, Laid]:
+def install_landmarks(
+    floor: FloorMap, errors: Errors, faults: Faults, seed: int
+) -> dict[Cell, InstalledLandmark]:
     """Install the landmarks of a map with errors and faults.
 
     Each landmark has a random stream of its own: a fault of one leaves the others unchanged.
@@ -123,14 +125,14 @@ def _install(
     strength: Array,
     middle: Array,
     axes: Array,
-) -> Laid:
+) -> InstalledLandmark:
     """Return the landmark of a cell.
 
     ``strength``, ``middle`` and ``axes`` are those of its bars in its own frame; ``draws`` are
     standard normal numbers for its position (2) and its rotation.
     """
     designed = int(floor.codes[cell])
-    x, y = floor.place(cell)
+    x, y = floor.position(cell)
     offset_x, offset_y = draws[:2] * errors.landmark_place_m
     heading = float(draws[2] * errors.landmark_turn_rad)
     is_wrong = rng.random() < faults.misread_rate
@@ -157,7 +159,7 @@ def _install(
     cos, sin = math.cos(heading), math.sin(heading)
     rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     position = np.array([x + offset_x, y + offset_y, 0.0])
-    return Laid(
+    return InstalledLandmark(
         cell,
         designed,
         code,
@@ -239,10 +241,10 @@ def dipole_fields(
     return dipole_field(np.asarray(points, float) - middle, moment)[..., 2]
 
 
-def floor_field(geometry: Geometry, landmarks: Iterable[Laid], points: Array) -> Array:
+def floor_field(geometry: Geometry, landmarks: Iterable[InstalledLandmark], points: Array) -> Array:
     """Return the vertical field (...) in tesla of landmarks at points (..., 3) of the map's frame.
 
-    A landmark is ignored at distances above :data:`REACH_M`.
+    A landmark is ignored at distances above :data:`FIELD_RANGE_M`.
     """
     flat = points.reshape(-1, 3)
     field = np.zeros(len(flat))
@@ -252,7 +254,9 @@ def floor_field(geometry: Geometry, landmarks: Iterable[Laid], points: Array) ->
     tree = cKDTree(flat[:, :2])
     positions = [(mark.x_m, mark.y_m) for mark in installed]
     dipole_distance_m = DIPOLE_LENGTHS * geometry.bar_length_m
-    for mark, in_range in zip(installed, tree.query_ball_point(positions, REACH_M), strict=True):
+    for mark, in_range in zip(
+        installed, tree.query_ball_point(positions, FIELD_RANGE_M), strict=True
+    ):
         index = np.asarray(in_range, np.int64)
         distance_m = np.hypot(*(flat[index, :2] - [mark.x_m, mark.y_m]).T)
         is_dipole = distance_m > dipole_distance_m

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.map.floor import Cell, FloorMap
-from locatk.core.landmarks.simulation.floor import REACH_M, Laid, floor_field
+from locatk.core.landmarks.simulation.floor import FIELD_RANGE_M, InstalledLandmark, floor_field
 from locatk.core.landmarks.simulation.options import SimulationOptions
-from locatk.core.landmarks.simulation.passes import EPOCH_NS, sensor_points, trajectory
+from locatk.core.landmarks.simulation.passes import sensor_points, trajectory
 from locatk.core.landmarks.simulation.robot import Robot
 from locatk.core.landmarks.simulation.sensors import measure, odometry
+from locatk.core.simulation import SESSION_START_NS
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -73,7 +74,7 @@ class Instruments:
     def __init__(
         self,
         floor: FloorMap,
-        landmarks: Mapping[Cell, Laid],
+        landmarks: Mapping[Cell, InstalledLandmark],
         sensors: HallSensors,
         height_m: float,
         options: SimulationOptions,
@@ -123,12 +124,12 @@ class Instruments:
         motions = np.cumsum(moved) - (0 if known else 1)
         self._field = np.concatenate([self._field, by_motion[motions]])
 
-    def _landmarks_near(self, points: Array) -> list[Laid]:
+    def _landmarks_near(self, points: Array) -> list[InstalledLandmark]:
         """Return the landmarks that can contribute to the field at points (..., 3)."""
         if not points.size:
             return []
-        x_min, y_min, _ = points.reshape(-1, 3).min(axis=0) - REACH_M
-        x_max, y_max, _ = points.reshape(-1, 3).max(axis=0) + REACH_M
+        x_min, y_min, _ = points.reshape(-1, 3).min(axis=0) - FIELD_RANGE_M
+        x_max, y_max, _ = points.reshape(-1, 3).max(axis=0) + FIELD_RANGE_M
         return [
             mark
             for mark in self._landmarks.values()
@@ -148,4 +149,4 @@ class _SampledPath:
         time_s = np.arange(int(robot.time_s * self._rate_hz) + 1) / self._rate_hz
         new = robot.poses_at(time_s[len(self._poses) :])
         self._poses = np.concatenate([self._poses, new])
-        return EPOCH_NS + np.rint(time_s * 1e9).astype(np.int64), self._poses
+        return SESSION_START_NS + np.rint(time_s * 1e9).astype(np.int64), self._poses

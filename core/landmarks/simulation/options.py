@@ -28,13 +28,13 @@ class RandomSource(IntEnum):
     LANDMARK = 40
 
 
-PASS_M = 0.23
-"""Length of one of the paper's passes, twice :data:`START_M`."""
+PASS_LENGTH_M = 0.23
+"""Length of one of the paper's passes, twice :data:`START_RADIUS_M`."""
 
-START_M = 0.115
+START_RADIUS_M = 0.115
 """Radius of the circle of starts of the paper's passes (section 3.5.1)."""
 
-ASIDE_RAD = math.pi / 4
+MAX_HEADING_OFFSET_RAD = math.pi / 4
 """Largest angle between the heading of a pass and the direction of the landmark's centre."""
 
 STRATEGIES = ("paper", "published", "path", "pass")
@@ -90,7 +90,7 @@ class Errors:
     landmark_turn_rad: float = math.radians(0.5)
     odometry_scale: float = 0.01
     odometry_turn: float = 0.01
-    odometry_drift_rad_per_m: float = math.radians(1) / PASS_M
+    odometry_drift_rad_per_m: float = math.radians(1) / PASS_LENGTH_M
     wheel_noise_m: float = 0.2e-3
     slips_per_m: float = 0.0
     slip_m: float = 0.005
@@ -278,8 +278,8 @@ class SimulationOptions:
                 ),
                 (
                     "lateral_m",
-                    self.lateral_m is None or abs(self.lateral_m) <= START_M,
-                    f"at most {START_M * 1e3:g} mm either way",
+                    self.lateral_m is None or abs(self.lateral_m) <= START_RADIUS_M,
+                    f"at most {START_RADIUS_M * 1e3:g} mm either way",
                 ),
                 (
                     "approach_rad",

@@ -18,9 +18,9 @@ from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, signs
 from locatk.core.landmarks.simulation.floor import BAR_DRAWS, bar_fields, scatter_bars
 from locatk.core.landmarks.simulation.options import (
-    ASIDE_RAD,
-    PASS_M,
-    START_M,
+    MAX_HEADING_OFFSET_RAD,
+    PASS_LENGTH_M,
+    START_RADIUS_M,
     Errors,
     RandomSource,
 )
@@ -30,8 +30,6 @@ from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-EPOCH_NS = SESSION_START_NS
-
 STEP_M = 0.002
 """Distance between the samples of a straight pass."""
 
@@ -39,18 +37,20 @@ SPIN_STEP_RAD = math.radians(2)
 """Largest rotation between the samples of a spin."""
 
 SPIN_RAD = 2 * math.pi
+"""Rotation of a spin."""
 
 SAMPLE_RATE_HZ = 50.0
+"""Rate of the samples in time; their distances are those of the constants above."""
 
 SEQUELS = ("", "spin", "pass", "stand")
-"""Choices of ``then`` of :func:`passes`."""
+"""Choices of ``then`` of :func:`simulate_passes`."""
 
 POSES_PER_BATCH = 100_000 // 16
 """Poses whose fields are computed at once: 16 bars and sensors each, 1 kB for each of these."""
 
 
 @dataclass(frozen=True)
-class Pass:
+class SinglePass:
     """One simulated visit to one landmark.
 
     Attributes
@@ -86,7 +86,7 @@ class Pass:
         return np.array([*self.truth.position[-1, :2], heading])
 
 
-def passes(
+def simulate_passes(
     count: int,
     code: int | Sequence[int] | None = None,
     *,
@@ -94,11 +94,11 @@ def passes(
     sensors: HallSensors | None = None,
     errors: Errors | None = None,
     then: str = "",
-    way_m: float = PASS_M,
+    length_m: float = PASS_LENGTH_M,
     aim_m: float = 0.007,
     start: tuple[float, float] | None = None,
     seed: int = 0,
-) -> list[Pass]:
+) -> list[SinglePass]:
     """Simulate straight passes, each over a landmark and with a robot of its own.
 
     Parameters
@@ -116,7 +116,7 @@ def passes(
         ``"pass"`` at right angles to the first, or a ``"stand"`` of half a second near the
         centre. Before it, the robot turns and drives back to its estimate of the centre, and
         measures meanwhile.
-    way_m : float
+    length_m : float
         Length of the straight pass.
     aim_m : float
         Mean error of that estimate of the centre.
@@ -127,7 +127,7 @@ def passes(
 
     Returns
     -------
-    list of Pass
+    list of SinglePass
         Passes that miss the territory (``lines`` is 0) are included, as in the paper.
 
     Raises
@@ -144,11 +144,11 @@ def passes(
     codes = _codes(count, code, random_stream(seed, RandomSource.STUDY_CODES))
     path_rng = random_stream(seed, RandomSource.STUDY_PATHS)
     angle = path_rng.uniform(0, 2 * math.pi, count)
-    offset = path_rng.uniform(-ASIDE_RAD, ASIDE_RAD, count)
+    offset = path_rng.uniform(-MAX_HEADING_OFFSET_RAD, MAX_HEADING_OFFSET_RAD, count)
     target = path_rng.normal(0.0, aim_m / math.sqrt(math.pi / 2), (count, 2))
     if start is not None:
         angle[:], offset[:] = start
-    poses = [_poses(*draw, way_m, then) for draw in zip(angle, offset, target, strict=True)]
+    poses = [_poses(*draw, length_m, then) for draw in zip(angle, offset, target, strict=True)]
     draws = random_stream(seed, RandomSource.STUDY_BARS).standard_normal((count, BAR_DRAWS))
     relative_strength, middle, axes = scatter_bars(geometry, draws, errors)
     strength = signs(codes) * relative_strength
@@ -157,7 +157,7 @@ def passes(
     wheel_rng = random_stream(seed, RandomSource.STUDY_WHEELS)
     simulated = []
     for k, (pose, field) in enumerate(zip(poses, fields, strict=True)):
-        first = round(way_m / STEP_M) + 1
+        first = round(length_m / STEP_M) + 1
         entered = np.abs(field[:first]).max(axis=0) >= geometry.threshold_t
         gain, offset_t = gains(len(sensors), errors, reading_rng)
         readings = gain * (field + errors.earth_t) + offset_t
@@ -166,7 +166,7 @@ def passes(
         time_ns = SESSION_START_NS + sample_ns
         reported, _ = odometry(pose, errors, wheel_rng)
         simulated.append(
-            Pass(
+            SinglePass(
                 HallSamples(
                     "robot",
                     sensors,
@@ -198,33 +198,33 @@ def _codes(
 # ---- poses of the robot
 
 
-def _poses(angle: float, offset: float, target: Array, way_m: float, then: str) -> Array:
+def _poses(angle: float, offset: float, target: Array, length_m: float, then: str) -> Array:
     """Return the poses (n, 3) of a pass and its sequel."""
     heading = angle + math.pi + offset
-    pose = np.array([START_M * math.cos(angle), START_M * math.sin(angle), heading])
-    parts = [_straight(pose, way_m)]
+    pose = np.array([START_RADIUS_M * math.cos(angle), START_RADIUS_M * math.sin(angle), heading])
+    parts = [_straight(pose, length_m)]
     if then:
         pose = parts[-1][-1]
         back = target - pose[:2]
         if then == "pass":
             # The second pass starts at the same distance from the target as the first.
             across = heading + math.pi / 2
-            back = back - START_M * np.array([math.cos(across), math.sin(across)])
+            back = back - START_RADIUS_M * np.array([math.cos(across), math.sin(across)])
         parts.append(_rotation(pose, _wrap(math.atan2(back[1], back[0]) - pose[2])))
         parts.append(_straight(parts[-1][-1], float(np.hypot(*back))))
         if then == "spin":
             parts.append(_rotation(parts[-1][-1], SPIN_RAD))
         elif then == "pass":
             parts.append(_rotation(parts[-1][-1], _wrap(across - parts[-1][-1][2])))
-            parts.append(_straight(parts[-1][-1], way_m))
+            parts.append(_straight(parts[-1][-1], length_m))
         else:
             parts.append(np.repeat(parts[-1][-1:], round(SAMPLE_RATE_HZ / 2), axis=0))
     # The first pose of each part is the last one of the part before.
     return np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
 
 
-def _straight(pose: Array, way_m: float) -> Array:
-    distance_m = np.linspace(0.0, way_m, max(round(way_m / STEP_M), 1) + 1)
+def _straight(pose: Array, length_m: float) -> Array:
+    distance_m = np.linspace(0.0, length_m, max(round(length_m / STEP_M), 1) + 1)
     return pose + distance_m[:, None] * [math.cos(pose[2]), math.sin(pose[2]), 0.0]
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
@@ -19,7 +20,7 @@ from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.landmarks.simulation.closed_loop import Approach as Approach
 from locatk.core.landmarks.simulation.closed_loop import Driver as Driver
 from locatk.core.landmarks.simulation.closed_loop import drive_closed_loop
-from locatk.core.landmarks.simulation.floor import Laid, lay
+from locatk.core.landmarks.simulation.floor import InstalledLandmark, install_landmarks
 from locatk.core.landmarks.simulation.instruments import Instruments
 from locatk.core.landmarks.simulation.options import NONE as NONE
 from locatk.core.landmarks.simulation.options import STRATEGIES as STRATEGIES
@@ -27,9 +28,6 @@ from locatk.core.landmarks.simulation.options import Aims as Aims
 from locatk.core.landmarks.simulation.options import Errors as Errors
 from locatk.core.landmarks.simulation.options import Faults as Faults
 from locatk.core.landmarks.simulation.options import SimulationOptions as SimulationOptions
-from locatk.core.landmarks.simulation.passes import EPOCH_NS as EPOCH_NS
-from locatk.core.landmarks.simulation.passes import Pass as Pass
-from locatk.core.landmarks.simulation.passes import passes as passes
 from locatk.core.landmarks.simulation.passes import trajectory
 from locatk.core.landmarks.simulation.robot import RobotLimits as RobotLimits
 from locatk.core.landmarks.simulation.strategy import VISIT_RADIUS_M, steer
@@ -37,22 +35,27 @@ from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-LARGEST_SESSION = 1_000_000
-"""Samples of a session, at most."""
+MAX_SESSION_SAMPLES = 1_000_000
+"""Largest number of samples of a session."""
+
+MAX_VISIT_GAP_NS = 1_000_000_000
+"""Longest time without a sensor near the landmark within one visit [ns]: sensors on both sides of
+the centre may be outside the radius while the robot is over the landmark."""
 
 
-class Visit(NamedTuple):
+class SimulatedVisit(NamedTuple):
     """A time in which the robot's sensors are over one landmark.
 
     Attributes
     ----------
     cell : (row, column)
     first_ns, last_ns : int
-        From when until when a sensor is within :data:`VISIT_RADIUS_M` of the landmark's centre.
+        First and last time at which a sensor is within :data:`VISIT_RADIUS_M` of the landmark's
+        centre.
     nearest_ns : int
-        When the robot itself is nearest to it.
+        Time of the smallest distance of the robot's origin from that centre.
     nearest_m : float
-        How near.
+        That distance.
     """
 
     cell: Cell
@@ -75,27 +78,27 @@ class SimulatedSession:
     odometry : tuple of Trajectory
         In the frame ``"odometry"``, which is the robot's at the start.
     floor : FloorMap
-        Knowledge of a user: the map as designed.
-    floor_as_laid : tuple of Laid
+        Map as designed, which is all that a user knows.
+    installed_landmarks : tuple of InstalledLandmark
         The landmarks as installed, row by row.
-    events : tuple of Visit
-        In the order of time.
+    events : tuple of SimulatedVisit
+        Visits in the order of time.
     saturated : int
         Readings at the end of the sensors' range.
     slips : tuple of int
-        When a wheel slipped, in nanoseconds.
+        Times of wheel slips.
     notes : tuple of str
-        What a user may not expect.
+        Properties of the simulation that a user may not expect.
     approaches : tuple of Approach
-        Of the strategy ``published``, in the order of time.
+        Approaches of the strategy ``published``, in the order of time.
     """
 
     samples: tuple[HallSamples, ...]
     truth: tuple[Trajectory, ...]
     odometry: tuple[Trajectory, ...]
     floor: FloorMap
-    floor_as_laid: tuple[Laid, ...]
-    events: tuple[Visit, ...]
+    installed_landmarks: tuple[InstalledLandmark, ...]
+    events: tuple[SimulatedVisit, ...]
     saturated: int
     slips: tuple[int, ...]
     notes: tuple[str, ...]
@@ -114,7 +117,7 @@ def simulate(
     Raises
     ------
     InputError
-        The map has no landmark, the way or a fault does not fit it, the sensors are within
+        The map has no landmark, the path or a fault does not fit it, the sensors are within
         the bars, the session would be endless, or the driver is missing.
     """
     options = options or SimulationOptions()
@@ -125,21 +128,21 @@ def simulate(
             f"sensors {height * 1e3:.3g} mm over the bars' top faces", hint="Give a height above 0"
         )
     seed = options.seed if options.floor_seed is None else options.floor_seed
-    laid = lay(floor, errors, options.faults, seed)
+    installed = install_landmarks(floor, errors, options.faults, seed)
     sensors = options.sensors or HallSensors(
         position_m=circle(geometry.circle_m),
         noise_t=errors.noise_t if errors.noise_t > 0 else float("nan"),
         range_t=options.range_t,
     )
-    instruments = Instruments(floor, laid, sensors, height, options)
+    instruments = Instruments(floor, installed, sensors, height, options)
     approaches: tuple[Approach, ...] = ()
     if options.strategy == "published":
         if driver is None:
             raise InputError("the strategy published needs a driver")
-        robot, notes, approaches = drive_closed_loop(floor, laid, options, instruments, driver)
+        robot, notes, approaches = drive_closed_loop(floor, installed, options, instruments, driver)
     else:
-        robot, notes = steer(floor, laid, options)
-    if robot.time_s * options.rate_hz >= LARGEST_SESSION:
+        robot, notes = steer(floor, installed, options)
+    if robot.time_s * options.rate_hz >= MAX_SESSION_SAMPLES:
         raise InputError(
             f"a simulation of {robot.time_s * options.rate_hz:.0f} samples",
             hint="Change the rate, the speed or the way",
@@ -151,8 +154,8 @@ def simulate(
         truth=(trajectory(options.device, "map", time_ns, readout.poses),),
         odometry=(readout.measurements.odometry,),
         floor=floor,
-        floor_as_laid=tuple(laid.values()),
-        events=_visits(laid, time_ns, readout.poses, readout.points_m),
+        installed_landmarks=tuple(installed.values()),
+        events=_visits(installed, time_ns, readout.poses, readout.points_m),
         saturated=readout.saturated,
         slips=readout.slips_ns,
         notes=tuple(notes),
@@ -161,31 +164,42 @@ def simulate(
 
 
 def _visits(
-    laid: dict[Cell, Laid], time_ns: NDArray[np.int64], poses: Array, points: Array
-) -> tuple[Visit, ...]:
-    from scipy.spatial import cKDTree
+    installed: dict[Cell, InstalledLandmark],
+    time_ns: NDArray[np.int64],
+    poses: Array,
+    sensor_positions: Array,
+) -> tuple[SimulatedVisit, ...]:
+    """Return the visits of a drive, in the order of time.
 
-    found = []
-    count = points.shape[1]
-    tree = cKDTree(points[..., :2].reshape(-1, 2))
-    places = [(mark.x_m, mark.y_m) for mark in laid.values()]
-    near = tree.query_ball_point(places, VISIT_RADIUS_M, return_sorted=True)
-    for mark, place, sensed in zip(laid.values(), places, near, strict=True):
-        over = np.unique(np.asarray(sensed, np.int64) // count)
-        if not len(over):
+    Parameters
+    ----------
+    installed : dict of cell to InstalledLandmark
+    time_ns : (n,) int64 ndarray
+    poses : (n, 3) ndarray
+        Poses of the robot in the map frame: x, y and heading.
+    sensor_positions : (n, N, 3) ndarray
+        Positions of the sensors in the map frame.
+    """
+    visits = []
+    sensor_count = sensor_positions.shape[1]
+    tree = cKDTree(sensor_positions[..., :2].reshape(-1, 2))
+    centres = [(mark.x_m, mark.y_m) for mark in installed.values()]
+    in_range = tree.query_ball_point(centres, VISIT_RADIUS_M, return_sorted=True)
+    for mark, centre, readings in zip(installed.values(), centres, in_range, strict=True):
+        samples = np.unique(np.asarray(readings, np.int64) // sensor_count)
+        if not len(samples):
             continue
-        away = np.hypot(*(poses[:, :2] - place).T)
-        # Sensors to both sides of the centre may be out while the robot is over it.
-        gap_ns = 1_000_000_000
-        for part in np.split(over, np.flatnonzero(np.diff(time_ns[over]) > gap_ns) + 1):
-            best = part[np.argmin(away[part])]
-            found.append(
-                Visit(
+        distance_m = np.hypot(*(poses[:, :2] - centre).T)
+        gaps = np.flatnonzero(np.diff(time_ns[samples]) > MAX_VISIT_GAP_NS) + 1
+        for visit_samples in np.split(samples, gaps):
+            nearest = visit_samples[np.argmin(distance_m[visit_samples])]
+            visits.append(
+                SimulatedVisit(
                     mark.cell,
-                    int(time_ns[part[0]]),
-                    int(time_ns[part[-1]]),
-                    int(time_ns[best]),
-                    float(away[best]),
+                    int(time_ns[visit_samples[0]]),
+                    int(time_ns[visit_samples[-1]]),
+                    int(time_ns[nearest]),
+                    float(distance_m[nearest]),
                 )
             )
-    return tuple(sorted(found, key=lambda visit: visit.first_ns))
+    return tuple(sorted(visits, key=lambda visit: visit.first_ns))

@@ -17,9 +17,14 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.landmark import pattern
-from locatk.core.landmarks.map.floor import HOLE, STEPS, Cell, FloorMap, neighbour
-from locatk.core.landmarks.simulation.floor import Laid
-from locatk.core.landmarks.simulation.options import ASIDE_RAD, PASS_M, START_M, SimulationOptions
+from locatk.core.landmarks.map.floor import HOLE_CODE, STEPS, Cell, FloorMap, neighbour
+from locatk.core.landmarks.simulation.floor import InstalledLandmark
+from locatk.core.landmarks.simulation.options import (
+    MAX_HEADING_OFFSET_RAD,
+    PASS_LENGTH_M,
+    START_RADIUS_M,
+    SimulationOptions,
+)
 from locatk.core.landmarks.simulation.robot import Robot
 
 Array = NDArray[np.float64]
@@ -60,14 +65,14 @@ class _Task:
     """Inputs of a strategy; ``notes`` are appended."""
 
     floor: FloorMap
-    landmarks: Mapping[Cell, Laid]
+    landmarks: Mapping[Cell, InstalledLandmark]
     options: SimulationOptions
     rng: np.random.Generator
     notes: list[str]
 
 
 def steer(
-    floor: FloorMap, landmarks: Mapping[Cell, Laid], options: SimulationOptions
+    floor: FloorMap, landmarks: Mapping[Cell, InstalledLandmark], options: SimulationOptions
 ) -> tuple[Robot, list[str]]:
     """Return a robot at the end of its path, and notes on what a user may not expect.
 
@@ -87,7 +92,7 @@ def steer(
 
 
 def start_of_search(
-    floor: FloorMap, landmarks: Mapping[Cell, Laid], options: SimulationOptions
+    floor: FloorMap, landmarks: Mapping[Cell, InstalledLandmark], options: SimulationOptions
 ) -> Robot:
     """Return a robot at rest at the start of a search, facing the first landmark on its path.
 
@@ -170,7 +175,7 @@ def _find_start(task: _Task) -> tuple[Array, Cell, float]:
         return np.array(options.start), *met
     for _ in range(MAX_START_DRAWS):
         row, column = cells[rng.integers(len(cells))]
-        x, y = floor.place((row, column)) + rng.uniform(-0.5, 0.5, 2) * floor.pitch_m
+        x, y = floor.position((row, column)) + rng.uniform(-0.5, 0.5, 2) * floor.pitch_m
         start = (float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
         if np.hypot(*(centres - start[:2]).T).min() > range_m:
             met = _first_landmark_ahead(floor, cells, centres, start)
@@ -215,7 +220,7 @@ def is_free(floor: FloorMap, points: Array) -> bool:
     cells = np.rint((points[:, ::-1] - [y, x]) / floor.pitch_m).astype(int)
     if (cells < 0).any() or (cells >= floor.shape).any():
         return False
-    if (floor.codes[cells[:, 0], cells[:, 1]] == HOLE).any():
+    if (floor.codes[cells[:, 0], cells[:, 1]] == HOLE_CODE).any():
         return False
     for k in np.flatnonzero(np.any(np.diff(cells, axis=0), axis=1)):
         start = (int(cells[k, 0]), int(cells[k, 1]))
@@ -225,7 +230,7 @@ def is_free(floor: FloorMap, points: Array) -> bool:
         for order in (headings, headings[::-1]):
             cell = start
             for heading in order:
-                if not floor.open(cell, heading):
+                if not floor.is_passable(cell, heading):
                     break
                 cell = neighbour(cell, heading)
             else:
@@ -255,7 +260,7 @@ def _plan_tour(
     for heading in headings:
         last = neighbour(last, heading)
     while len(headings) < count - 1:
-        choice = [q for q in range(4) if floor.open(last, q)]
+        choice = [q for q in range(4) if floor.is_passable(last, q)]
         if not choice:
             notes.append(f"no way on from cell {last[0]},{last[1]}: {count} landmarks not reached")
             break
@@ -267,7 +272,7 @@ def _plan_tour(
 
 def _is_open(floor: FloorMap, cell: Cell, headings: Sequence[int]) -> bool:
     for heading in headings:
-        if not floor.open(cell, heading):
+        if not floor.is_passable(cell, heading):
             return False
         cell = neighbour(cell, heading)
     return True
@@ -320,19 +325,19 @@ def _single_pass(task: _Task) -> Robot:
     cell = cells[rng.integers(len(cells))]
     mark = landmarks[cell]
     angle = rng.uniform(-math.pi, math.pi)
-    offset_rad = rng.uniform(-ASIDE_RAD, ASIDE_RAD)
+    offset_rad = rng.uniform(-MAX_HEADING_OFFSET_RAD, MAX_HEADING_OFFSET_RAD)
     if options.approach_rad is not None:
         angle = options.approach_rad
     if options.lateral_m is not None:
         # The robot is to the left of the centre if the centre is to the right of its path.
-        offset_rad = math.asin(options.lateral_m / START_M)
+        offset_rad = math.asin(options.lateral_m / START_RADIUS_M)
     robot = _at_rest(
         [
-            mark.x_m + START_M * math.cos(angle),
-            mark.y_m + START_M * math.sin(angle),
+            mark.x_m + START_RADIUS_M * math.cos(angle),
+            mark.y_m + START_RADIUS_M * math.sin(angle),
             angle + math.pi + offset_rad,
         ],
         options,
     )
-    robot.straight(PASS_M)
+    robot.straight(PASS_LENGTH_M)
     return robot

@@ -19,7 +19,7 @@ FINE = 16
 """Fine pixels a pixel; discs are drawn in fine pixels to 1/16 of one, then averaged."""
 
 
-def places(rng: np.random.Generator, step: float = 11.0, size: tuple[int, int] = SIZE) -> Array:
+def positions(rng: np.random.Generator, step: float = 11.0, size: tuple[int, int] = SIZE) -> Array:
     """Centres on a loose grid, 8 px from the rim, anywhere between the pixels."""
     width, height = size
     x, y = np.meshgrid(np.arange(8, width - 8, step), np.arange(8, height - 8, step))
@@ -46,10 +46,10 @@ def draw(
     for x, y in (at + 0.5) * FINE - 0.5:
         radius = round(diameter / 2 * FINE * 16)
         cv2.circle(canvas, (round(x * 16), round(y * 16)), radius, 255, -1, cv2.LINE_8, 4)
-    share = cv2.resize(canvas, size, interpolation=cv2.INTER_AREA) / 255.0
+    fraction = cv2.resize(canvas, size, interpolation=cv2.INTER_AREA) / 255.0
     if blur:
-        share = cv2.GaussianBlur(share, (0, 0), blur)
-    grey = light * (paper - (paper - ink) * share) + rng.normal(0, noise, share.shape)
+        fraction = cv2.GaussianBlur(fraction, (0, 0), blur)
+    grey = light * (paper - (paper - ink) * fraction) + rng.normal(0, noise, fraction.shape)
     frame: Image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
     return frame
 
@@ -60,11 +60,11 @@ def of(dots: DetectedDots, frame: int = 0) -> Array:
 
 def errors(at: Array, image: Image) -> tuple[Array, int, int]:
     """Errors (n, 2) of the dots that were found, how many were not, and what else was found."""
-    found = of(detect_dots(image[None]))
-    away = np.linalg.norm(at[:, None] - found[None], axis=2)
+    result = of(detect_dots(image[None]))
+    away = np.linalg.norm(at[:, None] - result[None], axis=2)
     nearest, there = away.argmin(axis=1), away.min(axis=1) < 1.5
-    error = (found[nearest] - at)[there]
-    return error, int((~there).sum()), len(found) - len(set(nearest[there].tolist()))
+    error = (result[nearest] - at)[there]
+    return error, int((~there).sum()), len(result) - len(set(nearest[there].tolist()))
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_dots_of_every_size(diameter: float, step: float, scatter: float) -> Non
     rng = np.random.default_rng(1)
     all_errors = []
     for _ in range(3):
-        at = places(rng, step)
+        at = positions(rng, step)
         error, lost, extra = errors(at, draw(at, diameter, rng))
         assert (lost, extra) == (0, 0)
         all_errors.append(error)
@@ -91,9 +91,9 @@ def across(low: float, high: float) -> Array:
     return ramp
 
 
-def vignette(share: float) -> Array:
+def vignette(fraction: float) -> Array:
     x, y = np.meshgrid(np.linspace(-1, 1, SIZE[0]), np.linspace(-1, 1, SIZE[1]))
-    fall: Array = 1 - share * (x * x + y * y) / 2
+    fall: Array = 1 - fraction * (x * x + y * y) / 2
     return fall
 
 
@@ -113,7 +113,7 @@ def vignette(share: float) -> Array:
 )
 def test_dots_in_any_light(how: dict[str, Any], scatter: float, off: int) -> None:
     rng = np.random.default_rng(2)
-    at = places(rng)
+    at = positions(rng)
     error, lost, extra = errors(at, draw(at, 3.3, rng, **how))
     assert lost <= off  # the edge of a shadow hides those on it, and looks like some
     assert extra <= off
@@ -124,7 +124,7 @@ def test_light_from_a_side_moves_no_dots() -> None:
     rng = np.random.default_rng(3)
     means = []
     for low, high in ((0.6, 1.0), (1.0, 0.6)):
-        at = places(np.random.default_rng(4))
+        at = positions(np.random.default_rng(4))
         error, *_ = errors(at, draw(at, 3.3, rng, light=across(low, high), noise=1.0))
         means.append(error.mean(axis=0))
     assert np.abs(np.array(means)).max() < 0.006
@@ -133,9 +133,9 @@ def test_light_from_a_side_moves_no_dots() -> None:
 def test_neighbours_that_lean_to_each_other_are_two() -> None:
     # Two thirds of a pitch apart at most: 7.4 px for dots of 3.9 px.
     rng = np.random.default_rng(5)
-    middle = places(rng, 26.0)[1:] + 3.0
-    turn = rng.uniform(0, 2 * np.pi, len(middle))
-    arm = 7.4 / 2 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    middle = positions(rng, 26.0)[1:] + 3.0
+    rotation = rng.uniform(0, 2 * np.pi, len(middle))
+    arm = 7.4 / 2 * np.stack([np.cos(rotation), np.sin(rotation)], axis=1)
     at = np.concatenate([middle + arm, middle - arm])
     error, lost, extra = errors(at, draw(at, 3.9, rng))
     assert (lost, extra) == (0, 0)
@@ -156,7 +156,7 @@ def test_each_dot_is_found_once_where_there_is_no_noise(width: int) -> None:
 
 def test_specks_that_are_fainter_than_dots_are_no_dots() -> None:
     rng = np.random.default_rng(6)
-    at = places(rng, 13.0)
+    at = positions(rng, 13.0)
     image = draw(at, 3.3, rng).astype(int)
     specks = draw(at + 6.0, 2.0, rng, ink=170.0, noise=0.0)
     image -= 210 - specks.astype(int)
@@ -166,7 +166,7 @@ def test_specks_that_are_fainter_than_dots_are_no_dots() -> None:
 
 def test_a_few_things_much_darker_than_dots_hide_none() -> None:
     rng = np.random.default_rng(7)
-    at = places(rng)
+    at = positions(rng)
     image = draw(at, 3.0, rng, ink=150.0)
     for x, y in rng.uniform(20, 100, (8, 2)):
         cv2.circle(image, (int(x), int(y)), 2, 0, -1)
@@ -187,7 +187,7 @@ def test_no_dots_where_there_are_none() -> None:
 
 def test_white_on_black_has_no_dots_at_its_spots() -> None:
     rng = np.random.default_rng(9)
-    at = places(rng)
+    at = positions(rng)
     dots = of(detect_dots(255 - draw(at, 3.3, rng)[None]))
     if len(dots):
         assert np.linalg.norm(at[:, None] - dots[None], axis=2).min() > 1.5
@@ -225,7 +225,7 @@ def test_no_more_dots_than_asked_for() -> None:
 
 def test_of_too_many_dots_those_about_the_middle_are_kept() -> None:
     rng = np.random.default_rng(12)
-    at = places(rng)
+    at = positions(rng)
     kept = of(detect_dots(draw(at, 3.3, rng)[None], 40))
     reach = np.sort(np.linalg.norm(at - [93.5, 59.5], axis=1))
     assert len(kept) == 40
@@ -234,7 +234,7 @@ def test_of_too_many_dots_those_about_the_middle_are_kept() -> None:
 
 def test_frames_do_not_depend_on_their_company() -> None:
     rng = np.random.default_rng(13)
-    frames = [draw(places(rng, s), 3.3, rng, noise=n) for s, n in ((11, 2), (15, 9), (25, 1))]
+    frames = [draw(positions(rng, s), 3.3, rng, noise=n) for s, n in ((11, 2), (15, 9), (25, 1))]
     frames.append(rng.integers(0, 256, (120, 188), np.uint8))
     together = detect_dots(np.stack(frames))
     for k, frame in enumerate(frames):

@@ -121,15 +121,15 @@ def drawn(
         tilt, towards = math.radians(tilt_deg) * rng.uniform(0.2, 1), rng.uniform(-4, 4)
         lean, _ = cv2.Rodrigues(tilt * np.array([math.cos(towards), math.sin(towards), 0.0]))
         spin, _ = cv2.Rodrigues(np.array([0.0, 0.0, rng.uniform(-4, 4)]))
-        turn, _ = cv2.Rodrigues(lean @ spin)
+        rotation, _ = cv2.Rodrigues(lean @ spin)
         flat, _ = cv2.projectPoints(
-            solid, turn, np.array([0, 0, focal * mm_per_px]), intrinsic, None
+            solid, rotation, np.array([0, 0, focal * mm_per_px]), intrinsic, None
         )
-        seen = lens(flat[:, 0] - centre) + centre
-        seen[:, 0] += rng.choice([-1, 1]) * skew * seen[:, 1]
+        observed = lens(flat[:, 0] - centre) + centre
+        observed[:, 0] += rng.choice([-1, 1]) * skew * observed[:, 1]
         canvas = np.full((size[1] * fine, size[0] * fine), 215, np.uint8)
         # Pixel centres are whole numbers in both pictures; 4 bits are fractions.
-        corners = np.rint(((seen + 0.5) * fine - 0.5) * 16).astype(np.int32).reshape(rims.shape)
+        corners = np.rint(((observed + 0.5) * fine - 0.5) * 16).astype(np.int32).reshape(rims.shape)
         for polygon in corners:
             if (polygon > -800).all() and (polygon < 16 * fine * (max(size) + 6)).all():
                 cv2.fillPoly(canvas, [polygon], 60, shift=4)
@@ -254,9 +254,9 @@ def test_a_focal_length_that_is_given_is_kept(
         assert report.camera.radial == pytest.approx(TRUTH.radial_px * 400**2, rel=0.02)
         assert report.focal_from == "given"
         assert len(report.notes) == (session is tilted)
-    told = re.search(r"tell a focal length of ([\d.]+) px", report.notes[0])
-    assert told is not None
-    assert float(told[1]) == pytest.approx(TRUTH.focal_px, rel=0.01)
+    reported = re.search(r"tell a focal length of ([\d.]+) px", report.notes[0])
+    assert reported is not None
+    assert float(reported[1]) == pytest.approx(TRUTH.focal_px, rel=0.01)
     agreed = calibrate(tilted.frames, MANIFEST, CalibrateOptions(focal_px=TRUTH.focal_px))
     assert agreed.notes == ()
 
@@ -432,18 +432,18 @@ def test_the_few_frames_that_are_tilted_or_turned_are_among_those_taken(
     monkeypatch.setattr(camera_views, "MAX_FITTED_FRAMES", 20)
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.arange(-8, 9), np.arange(-6, 7)), axis=-1).reshape(-1, 2) * 1.0
-    found = []
+    result = []
     for k in range(120):
         c, s = (f(2.0 if k == 37 else rng.normal(0, 0.02)) for f in (math.cos, math.sin))
         towards = [2e-3, 0] if k == 71 else rng.normal(0, 1e-5, 2)
-        turned = 11.0 * grid @ np.array([[c, s], [-s, c]])
-        pixels = turned / (1 + turned @ towards)[:, None] + [93.5, 59.5]
-        found.append(CalibrationFrame(k, SIZE, pixels, grid))
-    chosen = [seen.index for seen in select_diverse_frames(SIZE, found, 120)]
+        rotated = 11.0 * grid @ np.array([[c, s], [-s, c]])
+        pixels = rotated / (1 + rotated @ towards)[:, None] + [93.5, 59.5]
+        result.append(CalibrationFrame(k, SIZE, pixels, grid))
+    chosen = [observed.index for observed in select_diverse_frames(SIZE, result, 120)]
     assert len(set(chosen)) == 20
     assert {37, 71} < set(chosen)
     assert np.diff([0, *chosen, 120]).max() < 30
-    assert select_diverse_frames(SIZE, found[:15], 120) == found[:15]
+    assert select_diverse_frames(SIZE, result[:15], 120) == result[:15]
 
 
 def test_the_same_frames_give_the_same_camera(upright: simulate.SimulatedSession) -> None:

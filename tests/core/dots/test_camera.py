@@ -47,9 +47,9 @@ def test_equation_2_in_numbers() -> None:
     camera = Camera((188, 120), 200.0, (93.5, 59.5), -0.4)
     assert camera.radial_px == pytest.approx(-1e-5)
     # 100 px to the right of the centre: 100 / (1 - 1e-5 * 100^2) = 100 / 0.9.
-    found = camera.undistort(np.array([[193.5, 59.5], [93.5, 59.5], [93.5, -0.5]]))
+    result = camera.undistort(np.array([[193.5, 59.5], [93.5, 59.5], [93.5, -0.5]]))
     expected = [[93.5 + 100 / 0.9, 59.5], [93.5, 59.5], [93.5, 59.5 - 60 / (1 - 0.036)]]
-    np.testing.assert_allclose(found, expected)
+    np.testing.assert_allclose(result, expected)
 
 
 def test_barrel_draws_the_corners_in() -> None:
@@ -57,8 +57,10 @@ def test_barrel_draws_the_corners_in() -> None:
     centre = np.array([93.5, 59.5])
     for radial, nearer in ((-0.3, True), (0.3, False)):
         camera = Camera((188, 120), 219.0, (93.5, 59.5), radial)
-        seen = camera.distort(corner)
-        assert (np.linalg.norm(seen - centre) < np.linalg.norm(corner - centre)) is np.bool_(nearer)
+        observed = camera.distort(corner)
+        assert (np.linalg.norm(observed - centre) < np.linalg.norm(corner - centre)) is np.bool_(
+            nearer
+        )
 
 
 def test_no_lens_changes_nothing_whatever_the_shape() -> None:
@@ -73,6 +75,6 @@ def test_no_lens_changes_nothing_whatever_the_shape() -> None:
 def test_where_no_distorted_point_belongs_there_is_nan() -> None:
     camera = Camera((188, 120), 100.0, (0.0, 0.0), 0.25)
     # r / (1 + k r^2) has its largest value, 1 / (2 sqrt(k)) = 1 focal length, at r = 2.
-    found = camera.distort(np.array([[99.0, 0.0], [101.0, 0.0]]))
-    assert np.isfinite(found[0]).all()
-    assert np.isnan(found[1]).any()
+    result = camera.distort(np.array([[99.0, 0.0], [101.0, 0.0]]))
+    assert np.isfinite(result[0]).all()
+    assert np.isnan(result[1]).any()

@@ -57,14 +57,14 @@ def views(
     intrinsic = np.array([[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]])
     steps = np.arange(-16, 17) * PITCH
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    found = []
+    actual = []
     for tilt in np.radians(tilts_deg or rng.uniform(0, tilt_deg, frames)):
-        towards, turn = rng.uniform(-4, 4, 2)
+        towards, rotation = rng.uniform(-4, 4, 2)
         lean, _ = cv2.Rodrigues(tilt * np.array([math.cos(towards), math.sin(towards), 0.0]))
-        spin, _ = cv2.Rodrigues(np.array([0.0, 0.0, turn]))
+        spin, _ = cv2.Rodrigues(np.array([0.0, 0.0, rotation]))
         vector, _ = cv2.Rodrigues(lean @ spin)
-        place = grid + rng.uniform(-0.3, 0.3, 2)
-        real = np.c_[place * [1 + aspect / 2, 1 - aspect / 2], np.zeros(len(place))]
+        position = grid + rng.uniform(-0.3, 0.3, 2)
+        real = np.c_[position * [1 + aspect / 2, 1 - aspect / 2], np.zeros(len(position))]
         real[:, 2] = bow_mm * rng.normal() * (real[:, 0] / 4) ** 2
         shift = np.array([*rng.uniform(-0.2, 0.2, 2), FOCAL * 0.046])
         flat, _ = cv2.projectPoints(real, vector, shift, intrinsic, None)
@@ -73,24 +73,24 @@ def views(
         seen = seen[inside] + rng.normal(0, noise, (int(inside.sum()), 2))
         astray = rng.random(len(seen)) < wrong
         seen[astray] += rng.uniform(-1.3, 1.3, (int(astray.sum()), 2))
-        found.append((seen, place[inside]))
-    most = max(len(seen) for seen, _ in found)
+        actual.append((seen, position[inside]))
+    most = max(len(seen) for seen, _ in actual)
     result = CalibrationViews(
         SIZE,
         np.full((frames, most, 2), np.nan),
         np.full((frames, most, 2), np.nan),
         np.zeros((frames, most), bool),
     )
-    for n, (seen, place) in enumerate(found):
-        result.pixels[n, : len(seen)], result.plane[n, : len(seen)] = seen, place
+    for n, (seen, position) in enumerate(actual):
+        result.pixels[n, : len(seen)], result.plane[n, : len(seen)] = seen, position
         result.valid[n, : len(seen)] = True
     return result
 
 
 def errors(fit: CameraFit) -> Array:
     """Of centre, k, focal length and aspect in standard deviations."""
-    found = np.array([*fit.centre, fit.radial, fit.focal, fit.aspect])
-    return (found - [*CENTRE, K, FOCAL, 0.0]) / fit.sigma
+    actual = np.array([*fit.centre, fit.radial, fit.focal, fit.aspect])
+    return (actual - [*CENTRE, K, FOCAL, 0.0]) / fit.sigma
 
 
 @pytest.mark.parametrize("name", ["homographies", "poses"])
@@ -102,8 +102,11 @@ def test_derivatives_are_those_of_the_model(name: str) -> None:
     if name == "homographies":
         model, own = models.HomographyModel(), rng.normal(0, 0.1, (3, 8)) + [1, 0, 0, 0, 1, 0, 0, 0]
     else:
-        turns = rotation_exp(rng.normal(0, 0.3, (3, 3))).reshape(3, 9)
-        model, own = models.PoseModel(), np.c_[turns, rng.normal(0, 0.1, (3, 2)), [1.1, 0.9, 1.0]]
+        rotations = rotation_exp(rng.normal(0, 0.3, (3, 3))).reshape(3, 9)
+        model, own = (
+            models.PoseModel(),
+            np.c_[rotations, rng.normal(0, 0.1, (3, 2)), [1.1, 0.9, 1.0]],
+        )
     _, by_own, by_shared = models.project(model, shared, own, plane)
     small = 1e-6
     for k in range(by_own.shape[3]):
@@ -137,14 +140,14 @@ def test_without_noise_the_camera_comes_back_exactly(k: float) -> None:
 
 @pytest.mark.slow
 def test_sigmas_are_what_repetitions_scatter_by() -> None:
-    found = []
+    actual = []
     for seed in range(16):
         seen = views(12, seed=seed)
         bend = fit_homographies(seen)
         assert np.isnan(bend.sigma[3:]).all()
-        found.append([*errors(bend)[:3], *errors(fit_poses(seen, bend, 300.0))])
+        actual.append([*errors(bend)[:3], *errors(fit_poses(seen, bend, 300.0))])
     # 16 draws of a variance scatter by a third; 2.2 of them allowed for eight numbers.
-    assert np.sqrt(np.mean(np.square(found), axis=0)) == pytest.approx(1.0, abs=0.65)
+    assert np.sqrt(np.mean(np.square(actual), axis=0)) == pytest.approx(1.0, abs=0.65)
 
 
 def test_frames_that_contradict_each_other_are_believed_less() -> None:
@@ -156,12 +159,12 @@ def test_frames_that_contradict_each_other_are_believed_less() -> None:
 
 
 def test_wrong_dots_are_given_up() -> None:
-    clean, spoilt = views(seed=5), views(wrong=0.1, seed=5)
-    bend = fit_homographies(spoilt)
-    poses = fit_poses(spoilt, bend, 300.0)
+    clean, with_faults = views(seed=5), views(wrong=0.1, seed=5)
+    bend = fit_homographies(with_faults)
+    poses = fit_poses(with_faults, bend, 300.0)
     assert abs(errors(poses)).max() < 4
     assert poses.sigma[0] < 1.5 * fit_poses(clean, fit_homographies(clean), 300.0).sigma[0]
-    given_up = np.mean(~poses.used[spoilt.valid])
+    given_up = np.mean(~poses.used[with_faults.valid])
     assert 0.05 < given_up < 0.12
 
 

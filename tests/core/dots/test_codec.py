@@ -33,7 +33,7 @@ FOURTH = {
 }
 
 names = st.sampled_from(NAMES)
-places = st.integers(0, SECTION_LENGTH - 100)
+positions = st.integers(0, SECTION_LENGTH - 100)
 sections = st.tuples(st.integers(0, 62), st.integers(0, 62))
 
 
@@ -60,19 +60,21 @@ def one_flip(bits: str) -> list[str]:
 # --- the definition of the pattern in plain Python, one position after the other
 
 
-def shift(name: str, place: int) -> int:
+def shift(name: str, position: int) -> int:
     texts = (sequences.FIRST_DIGITS, sequences.SECOND_DIGITS, sequences.THIRD_DIGITS, FOURTH[name])
-    a1, a2, a3, a4 = (int(text[place % len(text)]) for text in texts)
+    a1, a2, a3, a4 = (int(text[position % len(text)]) for text in texts)
     return 5 + a1 + 3 * a2 + 9 * a3 + 18 * a4
 
 
-def shifts_before(name: str, place: int) -> int:
+def shifts_before(name: str, position: int) -> int:
     """Sum of all shifts before a place: whole rounds of each sequence, then what is left."""
-    total = 5 * place
+    total = 5 * position
     texts = (sequences.FIRST_DIGITS, sequences.SECOND_DIGITS, sequences.THIRD_DIGITS, FOURTH[name])
     for weight, text in zip((1, 3, 9, 18), texts, strict=True):
         digits = [int(c) for c in text]
-        total += weight * (place // len(text) * sum(digits) + sum(digits[: place % len(text)]))
+        total += weight * (
+            position // len(text) * sum(digits) + sum(digits[: position % len(text)])
+        )
     return total
 
 
@@ -132,8 +134,8 @@ def test_secondary_sequences_are_quasi_de_bruijn(sequence: str, length: int, abs
 def test_libdots_repeats_six_strings() -> None:
     def repeated(order: int) -> dict[str, list[int]]:
         at: dict[str, list[int]] = {}
-        for place, string in enumerate(cyclic(sequences.FOURTH_LIBDOTS, order)):
-            at.setdefault(string, []).append(place)
+        for position, string in enumerate(cyclic(sequences.FOURTH_LIBDOTS, order)):
+            at.setdefault(string, []).append(position)
         return {string: where for string, where in at.items() if len(where) > 1}
 
     assert repeated(5) == {
@@ -251,7 +253,7 @@ def test_first_bits_are_those_of_py_microdots() -> None:
         assert "".join(map(str, window[0] >> 1)) == bits
 
 
-@given(names, places, places, st.integers(1, 20), st.integers(1, 20), sections)
+@given(names, positions, positions, st.integers(1, 20), st.integers(1, 20), sections)
 @example("anoto", 0, 0, 9, 9, (0, 0))
 @example("libdots", SECTION_LENGTH - 100, SECTION_LENGTH - 100, 100, 100, (62, 62))
 @settings(max_examples=60, deadline=None)
@@ -268,9 +270,9 @@ def test_closed_form_is_the_slow_road(
 def test_phases_are_sums_one_by_one(name: str) -> None:
     count = 60_000
     total, expected = 7, []
-    for place in range(count):
+    for position in range(count):
         expected.append(total % 63)
-        total += shift(name, place)
+        total += shift(name, position)
     np.testing.assert_array_equal(codec(name).phases(np.arange(count), 7), expected)
 
 
@@ -292,7 +294,7 @@ def test_place_of_residues(name: str, chosen: list[int]) -> None:
     assert one.position(residues).tolist() == chosen
 
 
-@given(names, places, places, sections, st.integers(0, 30), st.integers(0, 30))
+@given(names, positions, positions, sections, st.integers(0, 30), st.integers(0, 30))
 @settings(max_examples=40, deadline=None)
 def test_a_window_is_part_of_every_larger_one(
     name: str, x: int, y: int, section: tuple[int, int], right: int, down: int

@@ -76,12 +76,12 @@ class Windows:
         self.turn = (self.turn + quarters) % 4
         return self
 
-    def right(self, found: DecodedWindows) -> NDArray[np.bool_]:
+    def right(self, actual: DecodedWindows) -> NDArray[np.bool_]:
         result: NDArray[np.bool_] = (
-            (found.x == self.x)
-            & (found.y == self.y)
-            & (found.section == self.section).all(axis=1)
-            & (found.rotation == self.turn)
+            (actual.x == self.x)
+            & (actual.y == self.y)
+            & (actual.section == self.section).all(axis=1)
+            & (actual.rotation == self.turn)
         )
         return result
 
@@ -106,16 +106,16 @@ def hidden(bits: tuple[Bits, Bits], gone: NDArray[np.bool_]) -> tuple[Bits, Bits
     return np.where(gone, np.float32(0), bits[0]), np.where(gone, np.float32(0), bits[1])
 
 
-def accepted(found: DecodedWindows) -> NDArray[np.bool_]:
+def accepted(actual: DecodedWindows) -> NDArray[np.bool_]:
     """What a user takes for a place: sure enough, and in one section."""
-    result: NDArray[np.bool_] = (found.confidence >= MIN_CONFIDENCE) & ~found.border
+    result: NDArray[np.bool_] = (actual.confidence >= MIN_CONFIDENCE) & ~actual.border
     return result
 
 
 def fate(windows: Windows, bits: tuple[Bits, Bits], one: Codec) -> tuple[int, int, int]:
     """How many windows are read right, read wrong, and refused."""
-    found = identify_windows(*bits, one)
-    took, right = accepted(found), windows.right(found)
+    actual = identify_windows(*bits, one)
+    took, right = accepted(actual), windows.right(actual)
     return int((took & right).sum()), int((took & ~right).sum()), int((~took).sum())
 
 
@@ -141,12 +141,12 @@ def test_windows_of_this_test_are_the_codecs(name: str) -> None:
 @pytest.mark.parametrize("quarters", range(4))
 def test_every_place_section_and_turn(name: str, side: int, quarters: int) -> None:
     windows = Windows(name, np.random.default_rng(side), 1000, side, side).turned(quarters)
-    found = identify_windows(*soft(windows.symbols), codec(name))
-    took = accepted(found)
+    actual = identify_windows(*soft(windows.symbols), codec(name))
+    took = accepted(actual)
     assert took.all()
-    np.testing.assert_array_equal(windows.right(found), took)
-    np.testing.assert_array_equal(found.corrected, 0)
-    np.testing.assert_array_equal(found.dots, side * side)
+    np.testing.assert_array_equal(windows.right(actual), took)
+    np.testing.assert_array_equal(actual.corrected, 0)
+    np.testing.assert_array_equal(actual.dots, side * side)
 
 
 @pytest.mark.parametrize("size", [(17, 11), (11, 17), (8, 20), (40, 9)])
@@ -172,10 +172,10 @@ def test_any_window(name: str, x: int, y: int, u: int, v: int, side: int, quarte
     symbols = np.rot90(codec(name).symbols((x, y), (side, side), (u, v)), quarters)
     for _ in range(quarters):
         symbols = QUARTER[symbols]
-    found = identify_windows(*soft(symbols[None].astype(np.int64)), codec(name))
-    assert (found.x[0], found.y[0], *found.section[0]) == (x, y, u, v)
-    assert found.rotation[0] == quarters
-    assert found.confidence[0] >= MIN_CONFIDENCE
+    actual = identify_windows(*soft(symbols[None].astype(np.int64)), codec(name))
+    assert (actual.x[0], actual.y[0], *actual.section[0]) == (x, y, u, v)
+    assert actual.rotation[0] == quarters
+    assert actual.confidence[0] >= MIN_CONFIDENCE
 
 
 def test_windows_at_the_rim_of_the_range() -> None:
@@ -183,9 +183,9 @@ def test_windows_at_the_rim_of_the_range() -> None:
     for x in edge:
         for y in edge:
             windows = Windows("anoto", np.random.default_rng(3), 4, 12, 12, x, y)
-            found = identify_windows(*soft(windows.symbols), codec("anoto"))
-            assert windows.right(found).all(), (x, y)
-            assert accepted(found).all(), (x, y)
+            actual = identify_windows(*soft(windows.symbols), codec("anoto"))
+            assert windows.right(actual).all(), (x, y)
+            assert accepted(actual).all(), (x, y)
 
 
 @pytest.mark.parametrize("quarters", range(4))
@@ -219,10 +219,10 @@ def test_answers_do_not_depend_on_their_company() -> None:
 def test_nothing_to_decode() -> None:
     for n in (0, 3):
         nothing = np.zeros((n, 12, 12), np.float32)
-        found = identify_windows(nothing, nothing, codec("anoto"))
-        assert len(found.x) == n
-        assert not accepted(found).any()
-        assert (found.dots == 0).all()
+        actual = identify_windows(nothing, nothing, codec("anoto"))
+        assert len(actual.x) == n
+        assert not accepted(actual).any()
+        assert (actual.dots == 0).all()
 
 
 # --- missing dots and wrong bits
@@ -234,11 +234,11 @@ def test_missing_dots(side: int, share: float) -> None:
     rng = np.random.default_rng(6)
     windows = Windows("anoto", rng, 400, side, side).turned(1)
     gone = rng.random(windows.symbols.shape) < share
-    found = identify_windows(*hidden(soft(windows.symbols), gone), codec("anoto"))
-    took, right = accepted(found), windows.right(found)
+    actual = identify_windows(*hidden(soft(windows.symbols), gone), codec("anoto"))
+    took, right = accepted(actual), windows.right(actual)
     assert (took & right).sum() >= 394
     assert (took & ~right).sum() == 0
-    np.testing.assert_array_equal(found.dots, (~gone).sum(axis=(1, 2)))
+    np.testing.assert_array_equal(actual.dots, (~gone).sum(axis=(1, 2)))
 
 
 @pytest.mark.slow
@@ -252,11 +252,11 @@ def test_a_few_wrong_bits_of_8_by_8(wrong: int, least: int, most: int) -> None:
     at = rng.permuted(np.tile(np.arange(128), (400, 1)), axis=1)[:, :wrong]
     np.put_along_axis(bits, at, -np.take_along_axis(bits, at, 1), 1)
     bits = bits.reshape(400, 2, 8, 8)
-    found = identify_windows(bits[:, 0].copy(), bits[:, 1].copy(), codec("anoto"))
-    took, right = accepted(found), windows.right(found)
+    actual = identify_windows(bits[:, 0].copy(), bits[:, 1].copy(), codec("anoto"))
+    took, right = accepted(actual), windows.right(actual)
     assert (took & right).sum() >= least
     assert (took & ~right).sum() <= most
-    assert (found.corrected[took & right] == wrong).all()
+    assert (actual.corrected[took & right] == wrong).all()
 
 
 @pytest.mark.slow
@@ -339,21 +339,21 @@ def repeated() -> Iterator[tuple[int, int]]:
     digits = sequences.FOURTH_DIGITS["libdots"]
     for order in (5, 6):
         strings = [(digits + digits)[k : k + order] for k in range(len(digits))]
-        for place, string in enumerate(strings):
+        for position, string in enumerate(strings):
             if strings.count(string) > 1:
-                yield place, order
+                yield position, order
 
 
 def test_what_libdots_repeats_is_not_told() -> None:
     one = codec("libdots")
-    places = list(repeated())
-    assert len(places) == 2 * (6 + 1)
+    positions = list(repeated())
+    assert len(positions) == 2 * (6 + 1)
     rng = np.random.default_rng(12)
-    for place, order in places:
-        x = rng.integers(0, SECTION_LENGTH // 241 - 1, 10) * 241 + place
+    for position, order in positions:
+        x = rng.integers(0, SECTION_LENGTH // 241 - 1, 10) * 241 + position
         windows = Windows("libdots", rng, 10, order + 1, 14, x)
-        assert fate(windows, soft(windows.symbols), one) == (0, 0, 10), (place, order)
-    longer = Windows("libdots", rng, 10, 9, 14, 241 * 1000 + places[0][0])
+        assert fate(windows, soft(windows.symbols), one) == (0, 0, 10), (position, order)
+    longer = Windows("libdots", rng, 10, 9, 14, 241 * 1000 + positions[0][0])
     assert fate(longer, soft(longer.symbols), one) == (10, 0, 0)
 
 
@@ -378,12 +378,12 @@ def test_noise_is_refused(size: tuple[int, int], n: int) -> None:
 @pytest.mark.parametrize("side", [8, 20])
 def test_half_of_it_noise(side: int) -> None:
     rng = np.random.default_rng(14)
-    for spoilt in (1, side // 4, side // 2, 3 * side // 4):
+    for with_faults in (1, side // 4, side // 2, 3 * side // 4):
         windows = Windows("anoto", rng, 60, side, side)
-        windows.symbols[:, :, :spoilt] = rng.integers(0, 4, (60, side, spoilt))
+        windows.symbols[:, :, :with_faults] = rng.integers(0, 4, (60, side, with_faults))
         right, wrong, _ = fate(windows, soft(windows.symbols), codec("anoto"))
         assert wrong == 0
-        if (side, spoilt) == (20, 1):
+        if (side, with_faults) == (20, 1):
             assert right == 60
 
 
@@ -403,8 +403,8 @@ def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
         "one symbol": np.tile(np.arange(4)[:, None, None], (1, side, side)),
         "stripes": np.tile(np.arange(side) % 2 * 3, (1, side, 1)),
     }.items():
-        found = identify_windows(*soft(np.ascontiguousarray(symbols)), one)
-        assert not accepted(found).any(), what
+        actual = identify_windows(*soft(np.ascontiguousarray(symbols)), one)
+        assert not accepted(actual).any(), what
 
 
 @pytest.mark.slow
@@ -423,10 +423,10 @@ def test_a_window_across_the_border_of_a_section(side: int, beyond: int, axis: i
     symbols = np.concatenate(parts, axis=2)
     if axis == 1:  # upright again, after the quarter turn that makes rows of columns
         symbols = QUARTER[QUARTER[QUARTER[np.rot90(symbols, 3, (1, 2))]]]
-    found = identify_windows(*soft(symbols), codec("anoto"))
-    assert not (found.confidence >= MIN_CONFIDENCE).any()
+    actual = identify_windows(*soft(symbols), codec("anoto"))
+    assert not (actual.confidence >= MIN_CONFIDENCE).any()
     if side == 20 and beyond == 2:  # most of it is of one section, so that its place is known
-        assert found.border.all()
+        assert actual.border.all()
 
 
 # --- guards
@@ -463,9 +463,9 @@ def test_evidence_against_random_bits_and_against_other_codecs(
 def test_windows_across_a_border_have_no_confidence() -> None:
     across = estimates(position=np.array([[SECTION_LENGTH - 3, 0]]))
     for window, border in ((across, True), (estimates(), False)):
-        found = decoding.as_decoded(window, np.array([0.9999]), np.array([64]), (0, 0))
-        assert found.border.tolist() == [border]
-        assert found.confidence.tolist() == [0.0 if border else 0.9999]
+        actual = decoding.as_decoded(window, np.array([0.9999]), np.array([64]), (0, 0))
+        assert actual.border.tolist() == [border]
+        assert actual.confidence.tolist() == [0.0 if border else 0.9999]
 
 
 def test_windows_of_too_many_lines_are_refused() -> None:

@@ -38,11 +38,11 @@ def drawn(seed: int, n: int = 6) -> NDArray[np.uint8]:
         angle, pitch = rng.uniform(0, np.pi / 2), rng.uniform(9, 13)
         light = 190 + 30 * np.sin(x / 90 + rng.uniform(0, 6)) - 0.2 * y
         image = light.copy()
-        places = np.stack(np.meshgrid(np.arange(-14, 15), np.arange(-14, 15)), -1).reshape(-1, 2)
+        positions = np.stack(np.meshgrid(np.arange(-14, 15), np.arange(-14, 15)), -1).reshape(-1, 2)
         symbols = ANOTO.symbols((int(rng.integers(SECTION_LENGTH - 29)), 7), (29, 29)).reshape(-1)
         offsets = np.array([[0, -1], [-1, 0], [1, 0], [0, 1]])[symbols] / 6
-        turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        dots = (places + offsets + rng.uniform(-0.5, 0.5, 2)) @ turned.T * pitch
+        rotated = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        dots = (positions + offsets + rng.uniform(-0.5, 0.5, 2)) @ rotated.T * pitch
         dots = dots / (1 + dots @ rng.uniform(-3e-4, 3e-4, 2))[:, None] + [93.5, 59.5]
         dust = rng.uniform([0, 0], [width, height], (4, 2))
         for at in np.concatenate([dots[rng.random(len(dots)) > 0.05], dust]):
@@ -71,8 +71,8 @@ def test_dots_are_the_same(seed: int) -> None:
 @needs_kernels
 def test_dots_in_the_middle_are_kept() -> None:
     images = drawn(3)
-    for found in (blobs.detect_dots(images, 50), blobs.detect_dots_numpy(images, 50)):
-        assert found.counts.tolist() == [50] * len(images)
+    for result in (blobs.detect_dots(images, 50), blobs.detect_dots_numpy(images, 50)):
+        assert result.counts.tolist() == [50] * len(images)
     few = blobs.detect_dots(images, 50).xy, blobs.detect_dots_numpy(images, 50).xy
     order = [np.lexsort(np.round(xy, 1).transpose(2, 0, 1), axis=1) for xy in few]
     rows = np.arange(len(images))[:, None]

@@ -64,22 +64,22 @@ def cloud(
     beside = -math.sin(towards) * right + math.cos(towards) * down
     depth = 1 + along * math.sin(tilt) / 348.7
     along, beside = along * math.cos(tilt) / depth, beside / depth
-    seen = np.stack(
+    observed = np.stack(
         [
             math.cos(towards) * along - math.sin(towards) * beside,
             math.sin(towards) * along + math.cos(towards) * beside,
         ],
         axis=1,
     )
-    seen /= 1 + lens * (seen**2).sum(axis=1, keepdims=True) / CORNER_SQUARE
-    inside = (np.abs(seen) < np.array(size) / 2 - 2).all(axis=1) & (depth > 0.3)
-    kept = inside & (rng.random(len(seen)) >= missing)
-    seen, place = seen[kept], place[kept]
-    specks = rng.binomial(len(seen), dust) if dust else 0
-    seen = np.concatenate([seen, rng.uniform(-0.5, 0.5, (specks, 2)) * size])
+    observed /= 1 + lens * (observed**2).sum(axis=1, keepdims=True) / CORNER_SQUARE
+    inside = (np.abs(observed) < np.array(size) / 2 - 2).all(axis=1) & (depth > 0.3)
+    kept = inside & (rng.random(len(observed)) >= missing)
+    observed, place = observed[kept], place[kept]
+    specks = rng.binomial(len(observed), dust) if dust else 0
+    observed = np.concatenate([observed, rng.uniform(-0.5, 0.5, (specks, 2)) * size])
     place = np.concatenate([place, np.full((specks, 2), np.nan)])
-    order = rng.permutation(len(seen))
-    return Cloud(seen[order], place[order])
+    order = rng.permutation(len(observed))
+    return Cloud(observed[order], place[order])
 
 
 def fit(clouds: list[Cloud], *, lens: bool = True, half: float = HALF_DIAGONAL) -> DotLattices:
@@ -101,8 +101,8 @@ def agreement(lattices: DotLattices, clouds: list[Cloud]) -> Array:
         best = 0.0
         for quarter in range(4):
             a, b = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter]
-            turned = c.place[known] @ np.array([[a, b], [-b, a]], float)
-            _, counts = np.unique(place - turned, axis=0, return_counts=True)
+            rotated = c.place[known] @ np.array([[a, b], [-b, a]], float)
+            _, counts = np.unique(place - rotated, axis=0, return_counts=True)
             best = max(best, counts.max() / len(known))
         shares.append(best)
     return np.array(shares)
@@ -118,8 +118,8 @@ def assert_found(clouds: list[Cloud], share: float = 0.99, **how: Any) -> DotLat
 @pytest.mark.parametrize("pitch", [8, 9, 10, 11.04, 12, 14, 16])
 def test_every_heading_and_pitch(pitch: float) -> None:
     rng = np.random.default_rng(1)
-    turns = np.radians(np.arange(0, 360, 7.5))
-    clouds = [cloud(rng, pitch=pitch, heading=turn) for turn in turns]
+    rotations = np.radians(np.arange(0, 360, 7.5))
+    clouds = [cloud(rng, pitch=pitch, heading=rotation) for rotation in rotations]
     lattices = assert_found(clouds)
     assert np.median(lattices.sigma) < 0.015
     # A step along u is a pitch, to the right of the image or within 45 degrees of it.

@@ -43,10 +43,10 @@ def test_pitch_and_dot_are_snapped_and_it_is_said() -> None:
         "dot 0.06 mm becomes 0.04233 mm, 1 px at 600 dpi",
     ]
     assert snapped(snap(0.508, None, 600), 0.508, None) == []
-    made = manifest(raster, lay_out((100, 100), 10, raster).sheets("a", (0, 0)), "anoto")
+    generated = manifest(raster, lay_out((100, 100), 10, raster).sheets("a", (0, 0)), "anoto")
     # What is written down is what is printed, not what was asked.
-    assert made.pitch_mm == pytest.approx(7 * 25.4 / 600, abs=1e-12)
-    assert made.offset_mm == made.dot_mm == pytest.approx(25.4 / 600, abs=1e-12)
+    assert generated.pitch_mm == pytest.approx(7 * 25.4 / 600, abs=1e-12)
+    assert generated.offset_mm == generated.dot_mm == pytest.approx(25.4 / 600, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -102,29 +102,29 @@ def test_dots_fill_the_page_inside_its_margin(
 @given(page=PAGES, dpi=st.sampled_from(DPIS), pitch=st.floats(0.35, 1.2))
 def test_a_manifest_tells_the_pixels(page: tuple[float, float], dpi: int, pitch: float) -> None:
     layout = lay_out(page, 10, snap(pitch, None, dpi))
-    made = manifest(layout.raster, layout.sheets("a", (5, 6), (7, 8)), "anoto")
-    assert pixels(made, 0) == layout
-    assert made.sheets[0].section == (7, 8)
+    generated = manifest(layout.raster, layout.sheets("a", (5, 6), (7, 8)), "anoto")
+    assert pixels(generated, 0) == layout
+    assert generated.sheets[0].section == (7, 8)
 
 
 def test_place_is_the_middle_of_the_dot_that_would_cover_it() -> None:
     layout = lay_out((210, 297), 10, snap(0.508, None, 600))
-    made = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
+    generated = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
     # Two pixels from an even edge: the middle is at the edge between them.
-    assert made.sheets[0].first_mm[0] == pytest.approx((layout.first[0] + 1) * 25.4 / 600)
-    x, y = made.to_metres(0, (0, 0))
+    assert generated.sheets[0].first_mm[0] == pytest.approx((layout.first[0] + 1) * 25.4 / 600)
+    x, y = generated.to_metres(0, (0, 0))
     assert x == pytest.approx((layout.first[0] + 1) * 0.0254 / 600)
     assert y == pytest.approx((layout.page[1] - layout.first[1] - 1) * 0.0254 / 600)
 
 
 def test_foreign_manifests_are_not_drawn() -> None:
     layout = lay_out((210, 297), 10, snap(0.508, None, 300))
-    made = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
+    generated = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
     for wrong in (
-        replace(made, pitch_mm=0.5),
-        replace(made, dpi=720),
-        replace(made, sheets=(replace(made.sheets[0], page_mm=(210.0, 297.0)),)),
-        replace(made, sheets=(replace(made.sheets[0], first_mm=(10.0, 10.0)),)),
+        replace(generated, pitch_mm=0.5),
+        replace(generated, dpi=720),
+        replace(generated, sheets=(replace(generated.sheets[0], page_mm=(210.0, 297.0)),)),
+        replace(generated, sheets=(replace(generated.sheets[0], first_mm=(10.0, 10.0)),)),
     ):
         with pytest.raises(InputError):
             pixels(wrong, 0)
@@ -165,26 +165,26 @@ def floor(count: tuple[int, int] = (3, 2), overlap: float = 15) -> SheetLayout:
 def test_tiles_continue_one_area() -> None:
     layout = floor()
     tiles = tiling(layout, (3, 2), 15)
-    made = manifest(layout.raster, tiles.sheets("f", (1000, 2000), (1, 2)), "anoto")
-    assert [sheet.id for sheet in made.sheets] == [
+    generated = manifest(layout.raster, tiles.sheets("f", (1000, 2000), (1, 2)), "anoto")
+    assert [sheet.id for sheet in generated.sheets] == [
         "f-c1r1", "f-c2r1", "f-c3r1", "f-c1r2", "f-c2r2", "f-c3r2",
     ]  # fmt: skip
     # 15 mm are 29.5 pitches: 30 columns and rows are on both neighbours.
     columns, rows = layout.size
-    assert made.sheets[1].origin == (1000 + columns - 30, 2000)
-    assert made.sheets[3].origin == (1000, 2000 + rows - 30)
+    assert generated.sheets[1].origin == (1000 + columns - 30, 2000)
+    assert generated.sheets[3].origin == (1000, 2000 + rows - 30)
     assert tiles.size == (3 * columns - 60, 2 * rows - 30)
     # The lower left paper is the floor's origin.
-    assert made.sheets[3].position_mm == (0.0, 0.0)
-    assert all(made.frame(number) == "floor" for number in range(6))
+    assert generated.sheets[3].position_mm == (0.0, 0.0)
+    assert all(generated.frame(number) == "floor" for number in range(6))
     # A place is at one point of the floor, whichever tile holds it.
     whole = codec("anoto").symbols((1000, 2000), tiles.size, (1, 2))
     held = np.zeros(whole.shape, int)
     at = np.full((*whole.shape, 2), np.nan)
-    for number, sheet in enumerate(made.sheets):
+    for number, sheet in enumerate(generated.sheets):
         x, y = (sheet.origin[0] - 1000, sheet.origin[1] - 2000)
         grid = np.stack(np.meshgrid(*map(np.arange, sheet.size)), axis=-1) + sheet.origin
-        metres = made.to_metres(number, grid)
+        metres = generated.to_metres(number, grid)
         part = np.s_[y : y + rows, x : x + columns]
         known = ~np.isnan(at[part][..., 0])
         np.testing.assert_allclose(metres[known], at[part][known], atol=1e-9)
@@ -200,10 +200,12 @@ def test_tiles_continue_one_area() -> None:
 @pytest.mark.parametrize("overlap", [0.0, 15.0])
 def test_neighbours_are_cut_at_the_same_place_of_the_floor(overlap: float) -> None:
     layout = floor()
-    made = manifest(layout.raster, tiling(layout, (3, 2), overlap).sheets("f", (0, 0)), "anoto")
+    generated = manifest(
+        layout.raster, tiling(layout, (3, 2), overlap).sheets("f", (0, 0)), "anoto"
+    )
     cuts: tuple[set[float], set[float]] = (set(), set())
-    for number, sheet in enumerate(made.sheets):
-        x, y = seams(made, number)
+    for number, sheet in enumerate(generated.sheets):
+        x, y = seams(generated, number)
         column, row = number % 3, number // 3
         assert len(x) == (1 if column in (0, 2) else 2)
         assert len(y) == 1
@@ -215,13 +217,13 @@ def test_neighbours_are_cut_at_the_same_place_of_the_floor(overlap: float) -> No
         held = round(overlap / 0.508 + 0.49) - 1
         inside = reach - y[0] if row == 0 else y[0] - sheet.first_mm[1]
         assert inside == pytest.approx(held * 0.508 / 2, abs=1e-6)
-    assert [len(found) for found in cuts] == [2, 1]
+    assert [len(result) for result in cuts] == [2, 1]
 
 
 def test_single_sheets_have_no_seams() -> None:
     layout = floor()
-    made = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
-    assert seams(made, 0) == ([], [])
+    generated = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
+    assert seams(generated, 0) == ([], [])
 
 
 @pytest.mark.parametrize(

@@ -171,14 +171,14 @@ def test_plan_gives_each_sheet_the_area_in_the_ledger() -> None:
     one = lay_out((210, 297), 10, raster)
     wide = lay_out((297, 210), 10, raster)
     floor = tiling(one, (2, 2), 10)
-    areas, made = plan([one, wide, floor], [], codec="libdots", section=(3, 4))
-    assert made.codec == "libdots"
+    areas, generated = plan([one, wide, floor], [], codec="libdots", section=(3, 4))
+    assert generated.codec == "libdots"
     assert [item.id for item in areas] == ["A4-0001", "A4-0002", "A4-0003"]
-    assert [sheet.id for sheet in made.sheets] == [
+    assert [sheet.id for sheet in generated.sheets] == [
         "A4-0001", "A4-0002", "A4-0003-c1r1", "A4-0003-c2r1", "A4-0003-c1r2", "A4-0003-c2r2",
     ]  # fmt: skip
     assert areas[2].size == floor.size
-    for sheet in made.sheets:
+    for sheet in generated.sheets:
         assert sheet.section == (3, 4)
         inside = area("s", *sheet.origin, *sheet.size, u=3, v=4)
         owner = next(item for item in areas if sheet.id.startswith(item.id))

@@ -51,23 +51,23 @@ class Outcome:
         return float(np.sqrt(np.mean(self.error[:, :2] ** 2)))
 
 
-def judge(found: LocalizedFrames, shots: list[Any]) -> Outcome:
+def judge(actual: LocalizedFrames, shots: list[Any]) -> Outcome:
     fate: Counter[str] = Counter()
     errors, nees = [], []
     for k, one in enumerate(shots):
-        if found.rejected[k]:
-            fate[found.rejected[k]] += 1
+        if actual.rejected[k]:
+            fate[actual.rejected[k]] += 1
             continue
         error = np.array(
-            [*(found.grid[k] - one.at), math.remainder(found.heading[k] - one.heading, math.tau)]
+            [*(actual.grid[k] - one.at), math.remainder(actual.heading[k] - one.heading, math.tau)]
         )
         right = np.hypot(*error[:2]) < 0.5 and abs(error[2]) < 0.1
-        if not right or tuple(found.section[k]) != one.section:
+        if not right or tuple(actual.section[k]) != one.section:
             fate["wrong"] += 1
             continue
         fate["right"] += 1
         errors.append(error)
-        nees.append(error @ np.linalg.solve(found.covariance[k], error) / 3)
+        nees.append(error @ np.linalg.solve(actual.covariance[k], error) / 3)
     return Outcome(fate, np.array(errors).reshape(-1, 3), np.array(nees))
 
 
@@ -177,12 +177,12 @@ def test_other_cameras(shot: Shots, size: tuple[int, int], pitch: float, count: 
 def test_errors_are_as_large_as_the_covariance_says(shot: Shots) -> None:
     for how in ({}, {"noise": 12.0}, {"dot": 1 / 6, "tilt": TILT_10}, {"jitter": 0.02}):
         shots = shots_of(shot, 50, 5, **how)
-        found = localize_frames(np.stack([one.take() for one in shots]), codec("anoto"))
-        outcome = judge(found, shots)
+        actual = localize_frames(np.stack([one.take() for one in shots]), codec("anoto"))
+        outcome = judge(actual, shots)
         assert outcome.fate == {"right": 50}
         assert 0.5 < outcome.nees.mean() < 2
         # Each of x, y and heading by itself too.
-        sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
+        sigma = np.sqrt(np.einsum("nii->ni", actual.covariance))
         each = np.mean((outcome.error / sigma) ** 2, axis=0)
         assert (each > 0.4).all()
         assert (each < 2.5).all()
@@ -221,9 +221,9 @@ def test_a_frames_answer_does_not_depend_on_its_company(shot: Shots) -> None:
                         )
 
 
-def locate_row(found: LocalizedFrames, k: int) -> LocalizedFrames:
+def locate_row(actual: LocalizedFrames, k: int) -> LocalizedFrames:
     return LocalizedFrames(
-        **{f.name: getattr(found, f.name)[k : k + 1] for f in fields(LocalizedFrames)}
+        **{f.name: getattr(actual, f.name)[k : k + 1] for f in fields(LocalizedFrames)}
     )
 
 
@@ -233,11 +233,11 @@ def test_quarter_turns_of_a_frame(shot: Shots) -> None:
     upright = localize_frames(image[None], codec("anoto"))
     for quarters in (1, 2, 3):
         # The page seems turned counter-clockwise: the camera was turned clockwise.
-        turned = np.ascontiguousarray(np.rot90(image, quarters))
-        found = localize_frames(turned[None], codec("anoto"))
-        assert found.accepted[0]
-        np.testing.assert_allclose(found.grid, upright.grid, atol=2e-3)
-        change = found.heading[0] - upright.heading[0] + quarters * math.pi / 2
+        rotated = np.ascontiguousarray(np.rot90(image, quarters))
+        actual = localize_frames(rotated[None], codec("anoto"))
+        assert actual.accepted[0]
+        np.testing.assert_allclose(actual.grid, upright.grid, atol=2e-3)
+        change = actual.heading[0] - upright.heading[0] + quarters * math.pi / 2
         assert math.remainder(change, math.tau) == pytest.approx(0, abs=2e-3)
 
 
@@ -295,14 +295,14 @@ def test_what_is_not_sure_is_rejected_and_says_so(shot: Shots) -> None:
     shots = shots_of(shot, 40, 21)
     rng = np.random.default_rng(21)
     images = np.stack([bare(one.take(), rng, 0.62) for one in shots])
-    found = localize_frames(images, codec("anoto"))
-    np.testing.assert_array_equal(found.accepted, found.confidence >= 0.999)
-    doubtful = (found.confidence >= 0.5) & ~found.accepted
+    actual = localize_frames(images, codec("anoto"))
+    np.testing.assert_array_equal(actual.accepted, actual.confidence >= 0.999)
+    doubtful = (actual.confidence >= 0.5) & ~actual.accepted
     assert doubtful.any()
-    assert set(found.rejected[doubtful]) == {"low_confidence"}
-    assert "low_confidence" not in found.rejected[~doubtful]
+    assert set(actual.rejected[doubtful]) == {"low_confidence"}
+    assert "low_confidence" not in actual.rejected[~doubtful]
     lenient = localize_frames(images, codec("anoto"), min_confidence=0.9)
-    assert lenient.accepted.sum() > found.accepted.sum()
+    assert lenient.accepted.sum() > actual.accepted.sum()
     np.testing.assert_array_equal(lenient.accepted, lenient.confidence >= 0.9)
 
 
@@ -361,11 +361,11 @@ def test_a_border_of_sections_is_rejected_and_said(shot: Shots, beyond: int) -> 
             axis=1,
         )
         images.append(shot(**{**vars_of(one), "symbols": symbols}).take())
-    found = localize_frames(np.stack(images), codec("anoto"))
-    assert not found.accepted.any()
+    actual = localize_frames(np.stack(images), codec("anoto"))
+    assert not actual.accepted.any()
     if abs(beyond) == 4:  # enough of one section to know where it ends
-        assert set(found.rejected) <= {"section_border", "no_code", "low_confidence"}
-        assert "section_border" in found.rejected
+        assert set(actual.rejected) <= {"section_border", "no_code", "low_confidence"}
+        assert "section_border" in actual.rejected
 
 
 # --- clean rasters: what `print pattern --format png` makes
@@ -380,14 +380,14 @@ def test_the_printers_raster_itself(pixels: int, dot: int) -> None:
         x, y = (column * 6 + 2 + right) * pixels // 6, (row * 6 + 2 + down) * pixels // 6
         page[y : y + dot, x : x + dot] = 0
     frame = page[3 * pixels : 30 * pixels, 4 * pixels : 40 * pixels]
-    found = localize_frames(frame[None].copy(), codec("anoto"))
-    assert found.rejected[0] == ""
+    actual = localize_frames(frame[None].copy(), codec("anoto"))
+    assert actual.rejected[0] == ""
     # A place is the middle of the dot that would stand on it.
     middle = np.array([4 * pixels + (36 * pixels - 1) / 2, 3 * pixels + (27 * pixels - 1) / 2])
     expected = np.array([5000, 7000]) + (middle - pixels / 3 - (dot - 1) / 2) / pixels
-    np.testing.assert_allclose(found.grid[0], expected, atol=0.01)
-    assert found.heading[0] == pytest.approx(0, abs=1e-3)
-    assert found.section[0].tolist() == [3, 4]
+    np.testing.assert_allclose(actual.grid[0], expected, atol=0.01)
+    assert actual.heading[0] == pytest.approx(0, abs=1e-3)
+    assert actual.section[0].tolist() == [3, 4]
 
 
 # --- frames without the pattern
@@ -411,9 +411,9 @@ def lattice(shot: Shots, k: int, rng: np.random.Generator, kind: str) -> Image:
 def test_grids_without_the_code(shot: Shots, kind: str) -> None:
     rng = np.random.default_rng(14)
     images = np.stack([lattice(shot, k, rng, kind) for k in range(20)])
-    found = localize_frames(images, codec("anoto"))
-    assert not found.accepted.any()
-    assert found.confidence.max() < 0.01
+    actual = localize_frames(images, codec("anoto"))
+    assert not actual.accepted.any()
+    assert actual.confidence.max() < 0.01
 
 
 def test_the_pattern_in_a_mirror_and_as_a_negative(shot: Shots) -> None:
@@ -429,7 +429,7 @@ def test_a_sheet_of_another_codec_has_its_places_elsewhere(shot: Shots) -> None:
     assert not localize_frames(images, codec("anoto")).accepted.any()
 
 
-def other_things(rng: np.random.Generator, kind: str, size: tuple[int, int]) -> Image:
+def distractor_image(rng: np.random.Generator, kind: str, size: tuple[int, int]) -> Image:
     width, height = size
     y, x = np.mgrid[:height, :width].astype(float)
     a, pitch = rng.uniform(0, math.tau), rng.uniform(5, 20)
@@ -472,13 +472,13 @@ def other_things(rng: np.random.Generator, kind: str, size: tuple[int, int]) -> 
 def test_frames_of_something_else(kind: str) -> None:
     rng = np.random.default_rng(17)
     for size, count in (((188, 120), 30), ((320, 240), 3)):
-        images = np.stack([other_things(rng, kind, size) for _ in range(count)])
-        found = localize_frames(images, codec("anoto"))
-        assert not found.accepted.any()
-        assert found.confidence.max() < 0.5
-        assert set(found.rejected) <= {"too_few_dots", "no_grid", "no_code"}
+        images = np.stack([distractor_image(rng, kind, size) for _ in range(count)])
+        actual = localize_frames(images, codec("anoto"))
+        assert not actual.accepted.any()
+        assert actual.confidence.max() < 0.5
+        assert set(actual.rejected) <= {"too_few_dots", "no_grid", "no_code"}
         if kind in ("black", "white"):
-            assert set(found.rejected) == {"too_few_dots"}
+            assert set(actual.rejected) == {"too_few_dots"}
 
 
 @pytest.mark.parametrize("size", [(0, 0), (1, 1), (47, 300), (48, 48), (3000, 50)])
@@ -536,16 +536,16 @@ def test_sightings_are_dots_and_where_they_stand(shot: Shots, known: bool) -> No
     (one,) = shots_of(shot, 1, 19, radial=camera.radial_px, noise=1.0)
     blank = np.full((120, 188), 200, np.uint8)
     images = np.stack([blank, one.take(), blank])
-    (seen,) = dot_correspondences(images, codec("anoto"), camera if known else None)
-    assert len(seen.pixels) > 120
+    (observed,) = dot_correspondences(images, codec("anoto"), camera if known else None)
+    assert len(observed.pixels) > 120
     # From the place of each dot back to its pixel, through the renderer's own lens.
-    away = seen.grid + seen.origin - one.at
+    away = observed.grid + observed.origin - one.at
     c, s = math.cos(one.heading), math.sin(one.heading)
     ideal = camera.centre_px + away @ np.array([[c, s], [-s, c]]) * one.pitch
-    whole = (np.abs(seen.pixels - camera.centre_px) < [90, 56]).all(axis=1)
-    np.testing.assert_allclose(seen.pixels[whole], camera.distort(ideal)[whole], atol=0.12)
+    whole = (np.abs(observed.pixels - camera.centre_px) < [90, 56]).all(axis=1)
+    np.testing.assert_allclose(observed.pixels[whole], camera.distort(ideal)[whole], atol=0.12)
     # A dot stands a sixth of a pitch beside its place, in one of four directions.
-    aside = np.sort(np.abs(seen.grid - np.rint(seen.grid)), axis=1)
+    aside = np.sort(np.abs(observed.grid - np.rint(observed.grid)), axis=1)
     np.testing.assert_allclose(aside, [[0, 1 / 6]] * len(aside), atol=1e-9)
 
 

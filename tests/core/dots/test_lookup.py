@@ -35,39 +35,39 @@ def draw(
 
 
 def repeated(at: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether libdots' six windows that occur twice are at one of these places (facts 2.1)."""
+    """Return whether positions are those of the six windows that libdots' A4 sequence has twice."""
     twice = [82, 238, 170, 236, 177, 237, 195, 217, 198, 218, 199, 219]
     result: NDArray[np.bool_] = np.isin(at % 241, twice)
     return result
 
 
 def agrees(
-    found: ExactWindows,
+    actual: ExactWindows,
     rows: Any,
     at: NDArray[np.int64],
     sections: NDArray[np.int64],
     rotation: int,
 ) -> None:
-    assert found.ok[rows].all()
-    np.testing.assert_array_equal(found.x[rows], at[rows, 0])
-    np.testing.assert_array_equal(found.y[rows], at[rows, 1])
-    np.testing.assert_array_equal(found.section[rows], sections[rows])
-    np.testing.assert_array_equal(found.rotation[rows], rotation)
+    assert actual.ok[rows].all()
+    np.testing.assert_array_equal(actual.x[rows], at[rows, 0])
+    np.testing.assert_array_equal(actual.y[rows], at[rows, 1])
+    np.testing.assert_array_equal(actual.section[rows], sections[rows])
+    np.testing.assert_array_equal(actual.rotation[rows], rotation)
 
 
-def nothing(found: ExactWindows) -> None:
+def nothing(actual: ExactWindows) -> None:
     """Rows that are not ok say nothing else either."""
-    bad = ~found.ok
-    for values in (found.x, found.y, found.section, found.rotation):
+    bad = ~actual.ok
+    for values in (actual.x, actual.y, actual.section, actual.rotation):
         assert (values[bad] == -1).all()
 
 
 def test_a_quarter_turn_is_counter_clockwise() -> None:
     page = np.array([[UP, UP, RIGHT], [DOWN, LEFT, LEFT]], np.uint8)
-    turned = np.array([[UP, DOWN], [LEFT, DOWN], [LEFT, RIGHT]], np.uint8)
-    np.testing.assert_array_equal(rotate_symbols(page, 1), turned)
-    np.testing.assert_array_equal(rotate_symbols(turned, -1), page)
-    np.testing.assert_array_equal(rotate_symbols(page, 2), rotate_symbols(turned, 1))
+    rotated = np.array([[UP, DOWN], [LEFT, DOWN], [LEFT, RIGHT]], np.uint8)
+    np.testing.assert_array_equal(rotate_symbols(page, 1), rotated)
+    np.testing.assert_array_equal(rotate_symbols(rotated, -1), page)
+    np.testing.assert_array_equal(rotate_symbols(page, 2), rotate_symbols(rotated, 1))
     np.testing.assert_array_equal(rotate_symbols(page, 7), rotate_symbols(page, -1))
 
 
@@ -75,8 +75,8 @@ def test_a_quarter_turn_is_counter_clockwise() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_8x8_anywhere_in_any_section_and_turn(name: str, rotation: int) -> None:
     windows, at, sections = draw(name, 400, (8, 8), 10 + rotation)
-    found = decode_exact(rotate_symbols(windows, rotation), codec(name))
-    agrees(found, slice(None), at, sections, rotation)
+    actual = decode_exact(rotate_symbols(windows, rotation), codec(name))
+    agrees(actual, slice(None), at, sections, rotation)
 
 
 @given(
@@ -113,22 +113,22 @@ def test_6x6_is_read_as_it_stands(name: str) -> None:
 
 def test_libdots_6x6_with_two_positions_is_not_read() -> None:
     windows, at, sections = draw("libdots", 3000, (6, 6), 4)
-    found = decode_exact(windows, codec("libdots"))
+    actual = decode_exact(windows, codec("libdots"))
     twice = repeated(at).any(axis=1)
     assert 0.05 < twice.mean() < 0.15
-    assert not found.ok[twice].any()
-    agrees(found, ~twice, at, sections, 0)
-    nothing(found)
+    assert not actual.ok[twice].any()
+    agrees(actual, ~twice, at, sections, 0)
+    nothing(actual)
 
 
 def test_libdots_7x7_knows_all_but_one_string() -> None:
     windows, at, sections = draw("libdots", 3000, (7, 7), 5)
-    found = decode_exact(windows, codec("libdots"))
+    actual = decode_exact(windows, codec("libdots"))
     # 121222 at 198 and 218 is the one string of six digits that occurs twice.
     twice = np.isin(at % 241, [198, 218]).any(axis=1)
     assert twice.any()
-    np.testing.assert_array_equal(found.ok, ~twice)
-    agrees(found, ~twice, at, sections, 0)
+    np.testing.assert_array_equal(actual.ok, ~twice)
+    agrees(actual, ~twice, at, sections, 0)
 
 
 @pytest.mark.slow
@@ -138,10 +138,10 @@ def test_small_windows_of_unknown_turn_are_right_or_not_read(
     size: tuple[int, int], rotation: int
 ) -> None:
     windows, at, sections = draw("anoto", 1500, size, 6)
-    found = decode_exact(rotate_symbols(windows, rotation), codec("anoto"), (0, 1, 2, 3))
-    assert found.ok.mean() > 0.3
-    agrees(found, found.ok, at, sections, rotation)
-    nothing(found)
+    actual = decode_exact(rotate_symbols(windows, rotation), codec("anoto"), (0, 1, 2, 3))
+    assert actual.ok.mean() > 0.3
+    agrees(actual, actual.ok, at, sections, rotation)
+    nothing(actual)
 
 
 def test_only_the_turns_that_are_asked_for() -> None:
@@ -159,39 +159,39 @@ def test_one_wrong_bit_of_8x8_is_always_found(name: str) -> None:
         wrong = np.repeat(window[None], 128, axis=0)
         wrong[np.arange(128), rows, columns] ^= (1 + bits).astype(np.uint8)
         for rotation in range(4):
-            found = decode_exact(rotate_symbols(wrong, rotation), codec(name))
-            assert not found.ok.any()
-            nothing(found)
+            actual = decode_exact(rotate_symbols(wrong, rotation), codec(name))
+            assert not actual.ok.any()
+            nothing(actual)
 
 
 def test_one_wrong_bit_of_6x6_may_go_unseen() -> None:
     windows, at, _ = draw("anoto", 2000, (6, 6), 9)
     windows[:, 3, 3] ^= 1
-    found = decode_exact(windows, codec("anoto"))
-    wrong = found.ok & (found.x != at[:, 0])
+    actual = decode_exact(windows, codec("anoto"))
+    wrong = actual.ok & (actual.x != at[:, 0])
     assert 0.1 < wrong.mean() < 0.9  # it is so, and the docstring says it
-    nothing(found)
+    nothing(actual)
 
 
 @given(st.integers(0, 2**32), st.integers(8, 12))
 @settings(max_examples=20, deadline=None)
 def test_noise_is_not_read(seed: int, side: int) -> None:
     noise = np.random.default_rng(seed).integers(0, 4, (2000, side, side))
-    found = decode_exact(noise, codec("anoto"))
-    assert not found.ok.any()
-    nothing(found)
+    actual = decode_exact(noise, codec("anoto"))
+    assert not actual.ok.any()
+    nothing(actual)
 
 
 def test_what_is_read_is_what_is_there() -> None:
     # Of any window that is read, however it came about, all dots are the codec's.
     noise = np.random.default_rng(11).integers(0, 4, (20_000, 6, 6)).astype(np.uint8)
     one = codec("anoto")
-    found = decode_exact(noise, one, (0, 1, 2, 3))
-    assert 0.05 < found.ok.mean() < 0.5
-    for k in np.flatnonzero(found.ok)[:300]:
-        u, v = found.section[k].tolist()
-        printed = one.symbols((int(found.x[k]), int(found.y[k])), (6, 6), (u, v))
-        np.testing.assert_array_equal(rotate_symbols(printed, int(found.rotation[k])), noise[k])
+    actual = decode_exact(noise, one, (0, 1, 2, 3))
+    assert 0.05 < actual.ok.mean() < 0.5
+    for k in np.flatnonzero(actual.ok)[:300]:
+        u, v = actual.section[k].tolist()
+        printed = one.symbols((int(actual.x[k]), int(actual.y[k])), (6, 6), (u, v))
+        np.testing.assert_array_equal(rotate_symbols(printed, int(actual.rotation[k])), noise[k])
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -208,8 +208,8 @@ def test_window_across_the_border_is_not_read(axis: int) -> None:
     after = one.symbols((at[0], at[1]), (size[0], size[1]), (on[0], on[1]))
     both = np.concatenate([before, after], axis=1 - axis)
     windows = [both[:, k : k + 8] if axis == 0 else both[k : k + 8] for k in range(17)]
-    found = decode_exact(np.stack(windows), one)
-    assert found.ok.tolist() == [True] * 5 + [False] * 7 + [True] * 5
+    actual = decode_exact(np.stack(windows), one)
+    assert actual.ok.tolist() == [True] * 5 + [False] * 7 + [True] * 5
 
 
 def test_anoto_sheet_read_as_another_codec() -> None:
@@ -223,9 +223,9 @@ def test_anoto_sheet_read_as_another_codec() -> None:
 
 
 def test_no_windows_at_all() -> None:
-    found = decode_exact(np.zeros((0, 8, 8), np.uint8), codec("anoto"))
-    assert found.ok.shape == found.x.shape == found.rotation.shape == (0,)
-    assert found.section.shape == (0, 2)
+    actual = decode_exact(np.zeros((0, 8, 8), np.uint8), codec("anoto"))
+    assert actual.ok.shape == actual.x.shape == actual.rotation.shape == (0,)
+    assert actual.section.shape == (0, 2)
 
 
 def test_digits_of_shifts() -> None:

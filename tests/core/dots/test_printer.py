@@ -50,8 +50,8 @@ def picture(
 
     ``to_picture`` maps pixels of the printer to those of the picture.
     """
-    seen = cv2.warpPerspective(ink, to_picture, size, flags=cv2.INTER_LINEAR)
-    grey = GREY[cv2.GaussianBlur(seen, (0, 0), blur_px)]
+    observed = cv2.warpPerspective(ink, to_picture, size, flags=cv2.INTER_LINEAR)
+    grey = GREY[cv2.GaussianBlur(observed, (0, 0), blur_px)]
     patch = np.random.default_rng(1).integers(0, 13, (701, 703), np.uint8)
     times = (size[1] // 701 + 1, size[0] // 703 + 1)
     noise = np.tile(patch, times)[: size[1], : size[0]]
@@ -67,8 +67,8 @@ def scan(
 ) -> NDArray[np.uint8]:
     """A flat scan of a print that came out ``scale`` times as large."""
     angle = np.radians(turn_deg)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    linear = turn @ np.diag(scale) * scan_dpi / dpi
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    linear = rotation @ np.diag(scale) * scan_dpi / dpi
     corners = np.array([[0, 0], ink.shape[::-1], [ink.shape[1], 0], [0, ink.shape[0]]]) @ linear.T
     low, high = corners.min(axis=0) - 40.3, corners.max(axis=0) + 40
     to_picture = np.eye(3)
@@ -117,11 +117,11 @@ def test_a_sheet_may_lie_across(coarse: Ink) -> None:
 
 @pytest.mark.slow
 def test_lost_dots_cost_their_field_also_in_a_photo(coarse: Ink) -> None:
-    spoilt = losing(losing(coarse, area=1, share=0.3), area=4, share=0.05)
+    with_faults = losing(losing(coarse, area=1, share=0.3), area=4, share=0.05)
     height, width = coarse.shape
     here = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     there = np.array([[310, 190], [4020, 330], [3890, 5200], [120, 5390]], np.float32)
-    image = picture(spoilt, cv2.getPerspectiveTransform(here, there), (4200, 5600))
+    image = picture(with_faults, cv2.getPerspectiveTransform(here, there), (4200, 5600))
     shade = np.linspace(0.7, 1, image.shape[1])
     report = calibrate((image * shade).astype(np.uint8))
     assert report.scale is None
@@ -154,9 +154,11 @@ def test_dots_that_grow_are_measured_and_smaller_ones_recommended(coarse: Ink) -
 def test_a_field_is_known_by_what_it_says(coarse: Ink) -> None:
     image = scan(coarse, 300)
     sheet = printer_sheet("A4", 300)
-    spoilt = next(field for field in sheet.fields if field.name == "B4")
+    with_faults = next(field for field in sheet.fields if field.name == "B4")
     # The picture of the page starts 40 px before it: see scan().
-    left, top, right, bottom = (round(edge * SCAN_DPI / 300 + 40.3) for edge in spoilt.layout.box)
+    left, top, right, bottom = (
+        round(edge * SCAN_DPI / 300 + 40.3) for edge in with_faults.layout.box
+    )
     part = image[top:bottom, left:right]
     image[top:bottom, left:right] = part[::-1, ::-1]
     report = calibrate(image, (SCAN_DPI, SCAN_DPI))
@@ -238,9 +240,9 @@ def test_no_two_fields_share_a_place() -> None:
         for field in sheet.fields:
             (columns, rows), (x, y) = field.layout.size, field.origin
             assert min(columns, rows) >= 16
-            places = {(x + i, y + j) for i in range(columns) for j in range(rows)}
-            assert not taken & places
-            taken |= places
+            positions = {(x + i, y + j) for i in range(columns) for j in range(rows)}
+            assert not taken & positions
+            taken |= positions
             left, top, right, bottom = field.layout.box
             assert 0 < left < right < sheet.page[0]
             assert 0 < top < bottom < sheet.page[1]

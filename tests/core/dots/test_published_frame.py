@@ -35,52 +35,52 @@ def frame(data: Path) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
-def turned_by(found: float, true_deg: float) -> float:
-    return abs(math.remainder(math.degrees(found) - true_deg, 360))
+def turned_by(result: float, true_deg: float) -> float:
+    return abs(math.remainder(math.degrees(result) - true_deg, 360))
 
 
 @pytest.mark.parametrize("quarters", range(4))
 def test_place_and_heading(frame: NDArray[np.uint8], quarters: int) -> None:
     # numpy turns the picture counter-clockwise, as if the camera had been turned clockwise.
     image = np.ascontiguousarray(np.rot90(frame, quarters))
-    found = localize_frames(image[None], codec("libdots"))
-    assert found.rejected[0] == ""
-    np.testing.assert_allclose(found.grid[0], PLACE, atol=0.05)
+    result = localize_frames(image[None], codec("libdots"))
+    assert result.rejected[0] == ""
+    np.testing.assert_allclose(result.grid[0], PLACE, atol=0.05)
     # A heading is that of the image's right. The picture is sheared: its down is 0.15 degrees
     # off the square, by whatever centroids, so that its quarter turns cannot be within 0.2 too.
-    assert turned_by(found.heading[0], HEADING_DEG - 90 * quarters) < (
+    assert turned_by(result.heading[0], HEADING_DEG - 90 * quarters) < (
         0.35 if quarters % 2 else 0.2
     )
-    assert tuple(found.section[0]) == SECTION
-    assert found.dots[0] >= 175
-    assert found.corrected[0] <= 6  # 2 of 384 in its full window, more at the blurred rim
-    sigma = np.sqrt(np.diag(found.covariance[0]))
+    assert tuple(result.section[0]) == SECTION
+    assert result.dots[0] >= 175
+    assert result.corrected[0] <= 6  # 2 of 384 in its full window, more at the blurred rim
+    sigma = np.sqrt(np.diag(result.covariance[0]))
     assert (sigma[:2] < 0.01).all()
 
 
 def test_the_turns_agree_with_each_other(frame: NDArray[np.uint8]) -> None:
-    found = [
+    result = [
         localize_frames(np.ascontiguousarray(np.rot90(frame, k))[None], codec("libdots"))
         for k in range(4)
     ]
-    assert np.ptp([one.grid[0] for one in found], axis=0).max() < 0.01
+    assert np.ptp([one.grid[0] for one in result], axis=0).max() < 0.01
 
 
 def test_at_half_and_twice_its_size(frame: NDArray[np.uint8]) -> None:
     half = cv2.resize(frame[:240], (160, 120), interpolation=cv2.INTER_AREA)
     twice = cv2.resize(frame, (640, 482), interpolation=cv2.INTER_CUBIC)
     for image, middle in ((half, 119.5), (twice, 120.0)):
-        found = localize_frames(np.asarray(image, np.uint8)[None], codec("libdots"))
-        assert found.rejected[0] == ""
+        result = localize_frames(np.asarray(image, np.uint8)[None], codec("libdots"))
+        assert result.rejected[0] == ""
         # The middle of the first 240 rows is half a pixel, a 40th of a pitch, above.
         np.testing.assert_allclose(
-            found.grid[0], np.array(PLACE) + [0, (middle - 120) / 20.2], atol=0.05
+            result.grid[0], np.array(PLACE) + [0, (middle - 120) / 20.2], atol=0.05
         )
 
 
 def test_a_microdots_reader_finds_nothing(frame: NDArray[np.uint8]) -> None:
-    found = localize_frames(frame[None], codec("microdots"))
-    assert not found.accepted[0]
+    result = localize_frames(frame[None], codec("microdots"))
+    assert not result.accepted[0]
 
 
 @pytest.mark.parametrize("method", ["lattice", "paper"])

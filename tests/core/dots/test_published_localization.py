@@ -82,9 +82,9 @@ def photograph(
     return np.clip(np.rint(frame), 0, 255).astype(np.uint8)
 
 
-def turned_by(found: float, true: float) -> float:
+def turned_by(actual: float, true: float) -> float:
     """Difference of two headings, in degrees."""
-    return abs(math.degrees(math.remainder(found - true, math.tau)))
+    return abs(math.degrees(math.remainder(actual - true, math.tau)))
 
 
 def study(count: int, seed: int, **how: Any) -> tuple[Counter[str], list[float], list[float]]:
@@ -243,9 +243,9 @@ def test_clusters_are_found_in_any_direction(degrees: int) -> None:
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     true = 11 * np.array([[c, s], [-s, c]])
     edges = true[rng.integers(0, 2, 300)] * rng.choice([-1, 1], (300, 1))
-    found = paper_grid.cluster_edges(edges + rng.normal(0, 1, edges.shape))
-    assert found is not None
-    u, v = found
+    actual = paper_grid.cluster_edges(edges + rng.normal(0, 1, edges.shape))
+    assert actual is not None
+    u, v = actual
     assert u[0] * v[1] - u[1] * v[0] > 0  # v is a quarter turn from u, as y is from x
     for axis in (u, v):
         alike = np.abs(true @ axis) / 121
@@ -266,22 +266,22 @@ def test_intact_neighbourhood_is_the_nearest_whole_one() -> None:
         result: Array = np.mean([where[(row + b) * 7 + column + a] for a, b in around], axis=0)
         return result
 
-    found = origin(where)
-    assert found is not None
-    np.testing.assert_allclose(found, middle(3, 2))
+    actual = origin(where)
+    assert actual is not None
+    np.testing.assert_allclose(actual, middle(3, 2))
     gone = np.delete(where, 1 * 7 + 4, axis=0)  # a corner dot of the 3 x 3 around (3, 2)
-    found = origin(gone)
-    assert found is not None
-    assert np.abs(found - near).max() > 0.5
+    actual = origin(gone)
+    assert actual is not None
+    assert np.abs(actual - near).max() > 0.5
     assert origin(where[:14]) is None
 
 
 def test_refinement_moves_the_origin_and_the_lengths() -> None:
     rng = np.random.default_rng(8)
-    places = np.stack(np.meshgrid(np.arange(-8, 9), np.arange(-5, 6)), axis=-1).reshape(-1, 2)
-    offsets = np.array([[0, -1], [-1, 0], [1, 0], [0, 1]])[rng.integers(0, 4, len(places))] / 6
-    noise = rng.normal(0, 0.01, places.shape)
-    points = np.array([90.0, 60.0]) + (places + offsets + noise) * 11.0
+    positions = np.stack(np.meshgrid(np.arange(-8, 9), np.arange(-5, 6)), axis=-1).reshape(-1, 2)
+    offsets = np.array([[0, -1], [-1, 0], [1, 0], [0, 1]])[rng.integers(0, 4, len(positions))] / 6
+    noise = rng.normal(0, 0.01, positions.shape)
+    points = np.array([90.0, 60.0]) + (positions + offsets + noise) * 11.0
     rough = paper_grid.AffineGrid(np.array([91.0, 58.8]), np.array([11.1, 0]), np.array([0, 10.85]))
     refined = paper_grid.refine_grid(rough, points)
     assert refined is not None
@@ -289,7 +289,7 @@ def test_refinement_moves_the_origin_and_the_lengths() -> None:
     np.testing.assert_allclose(grid.origin, [90, 60], atol=0.4)  # from 1.0 and 1.2 px off
     assert grid.u[0] == pytest.approx(11, abs=0.05)
     assert grid.v[1] == pytest.approx(11, abs=0.05)
-    np.testing.assert_array_equal(g, places)
+    np.testing.assert_array_equal(g, positions)
     np.testing.assert_allclose(delta, offsets, atol=0.1)
 
 
@@ -302,10 +302,10 @@ def test_refinement_corrects_the_direction() -> None:
     rotated = paper_grid.AffineGrid(np.array([90.0, 60.0]), np.array([c, s]), np.array([-s, c]))
     refined = paper_grid.refine_grid(rotated, points)
     assert refined is not None
-    grid, found, delta = refined
+    grid, actual, delta = refined
     assert math.degrees(math.atan2(grid.u[1], grid.u[0])) == pytest.approx(0, abs=0.2)
     assert math.degrees(math.atan2(grid.v[0], grid.v[1])) == pytest.approx(0, abs=0.2)
-    np.testing.assert_array_equal(found, nodes)
+    np.testing.assert_array_equal(actual, nodes)
     np.testing.assert_allclose(delta, offsets, atol=0.1)
 
 

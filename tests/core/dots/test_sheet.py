@@ -16,9 +16,9 @@ MANIFEST = Manifest((PAGE,), pitch_mm=0.5)
 
 
 def test_origin_is_the_papers_lower_left_corner_and_y_points_up() -> None:
-    found = MANIFEST.to_metres(0, [[1000, 2000], [1100, 2000], [1000, 2010.5], [989.84, 2586]])
+    result = MANIFEST.to_metres(0, [[1000, 2000], [1100, 2000], [1000, 2010.5], [989.84, 2586]])
     expected = [[0.00508, 0.293], [0.05508, 0.293], [0.00508, 0.28775], [0.0, 0.0]]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(result, expected, atol=1e-12)
     assert MANIFEST.to_metres(0, (1000, 2000)).shape == (2,)
     assert MANIFEST.to_metres(0, np.zeros((4, 3, 2))).shape == (4, 3, 2)
 
@@ -35,14 +35,14 @@ def test_tiles_lie_on_the_floor() -> None:
     plain = Manifest((tile,), pitch_mm=0.5)
     np.testing.assert_allclose(plain.to_metres(0, [1000, 2000]), [1.00508, 0.093], atol=1e-12)
     # Turned a quarter counter-clockwise: the paper's x points to the floor's y.
-    turned = Manifest((replace(tile, heading_deg=90.0),), pitch_mm=0.5)
+    rotated = Manifest((replace(tile, heading_deg=90.0),), pitch_mm=0.5)
     np.testing.assert_allclose(
-        turned.to_metres(0, [[1000, 2000], [1100, 2000]]),
+        rotated.to_metres(0, [[1000, 2000], [1100, 2000]]),
         [[0.707, -0.19492], [0.707, -0.14492]],
         atol=1e-12,
     )
     # The scale is the paper's, and goes before the turn; the tile's place is not scaled.
-    both = replace(turned, scale=(1.01, 1.0))
+    both = replace(rotated, scale=(1.01, 1.0))
     np.testing.assert_allclose(
         both.to_metres(0, [1000, 2000]), [0.707, -0.2 + 0.00508 * 1.01], atol=1e-12
     )

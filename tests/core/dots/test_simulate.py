@@ -94,10 +94,10 @@ def test_the_view_is_a_pinhole_over_the_paper(pitch: float, roll: float) -> None
         low, high = (middle, high) if sinks(low) * sinks(middle) > 0 else (low, middle)
     assert project(ahead, low)[0, 0] > 93.5
 
-    places = np.random.default_rng(0).uniform(-3e-3, 3e-3, (50, 2))
-    ours = np.c_[places, np.ones(50)] @ np.linalg.inv(homography).T
+    positions = np.random.default_rng(0).uniform(-3e-3, 3e-3, (50, 2))
+    ours = np.c_[positions, np.ones(50)] @ np.linalg.inv(homography).T
     assert ours[:, :2] / ours[:, 2:] + camera.centre_px == pytest.approx(
-        project(places, low), abs=1e-5
+        project(positions, low), abs=1e-5
     )
 
 
@@ -127,10 +127,10 @@ def test_a_frame_is_what_opencv_draws_of_the_same_page() -> None:
     to_page = np.array([[fine / 0.508, 0, 0], [0, fine / 0.508, 0], [0, 0, 1]])
     start = np.array(sheet.first_mm) + first * 0.508
     to_page[:2, 2] = (0.5 * fine - 0.5) - start * fine / 0.508
-    seen = frame_to_paper(
+    observed = frame_to_paper(
         Optics(camera, METRES_PER_PX, 0, 0, 0, 0, 0, 0, 0), CameraPose(heading, 0.15, -0.1)
     )
-    to_paper = np.array([[1e3, 0, middle[0]], [0, -1e3, middle[1]], [0, 0, 1]]) @ seen
+    to_paper = np.array([[1e3, 0, middle[0]], [0, -1e3, middle[1]], [0, 0, 1]]) @ observed
     parts = 8
     v, u = (np.mgrid[: 120 * parts, : 188 * parts] + 0.5) / parts - 0.5
     rays = camera.undistort(np.stack([u, v], axis=-1)) - camera.centre_px
@@ -152,13 +152,15 @@ def test_each_dot_lies_where_its_symbol_and_the_truth_say() -> None:
     manifest = simulate.sheet()
     simulated = simulate.simulate(manifest, replace(PLAIN, frames=3, blur_px=0.6))
     sheet = manifest.sheets[0]
-    for frame, place, turn in zip(
+    for frame, position, turn in zip(
         simulated.frames.images,
         simulated.truth.position,
         heading_from_quaternion(simulated.truth.quaternion),
         strict=True,
     ):
-        middle = np.array([1e3 * place[0], sheet.page_mm[1] - 1e3 * place[1]]) - sheet.first_mm
+        middle = (
+            np.array([1e3 * position[0], sheet.page_mm[1] - 1e3 * position[1]]) - sheet.first_mm
+        )
         near = np.rint(middle / 0.508).astype(int)
         away: list[Array] = []
         symbols = codec("anoto").symbols(
@@ -181,7 +183,7 @@ def test_each_dot_lies_where_its_symbol_and_the_truth_say() -> None:
 
 
 def test_the_published_frame_looks_like_its_simulation(data: Path) -> None:
-    """Codec, conventions and heading against the one real picture (facts 2.6)."""
+    """Codec, conventions and heading against the real picture of cellulo-localization."""
     real = cv2.imread(str(data / "dots" / "frame.bmp"), cv2.IMREAD_GRAYSCALE)
     manifest = Manifest(
         (Sheet("a", (100, 3200), (60, 50), (24, 32), (100, 100), (10, 10)),), codec="libdots"
@@ -193,10 +195,10 @@ def test_the_published_frame_looks_like_its_simulation(data: Path) -> None:
         dot=0.33,
         blur_px=1.0,
     )
-    (place,) = manifest.to_metres(0, np.array([[129.168, 3224.506]]))
+    (position,) = manifest.to_metres(0, np.array([[129.168, 3224.506]]))
 
     def likeness(degrees: float) -> float:
-        poses = at(*place, math.radians(degrees))
+        poses = at(*position, math.radians(degrees))
         frame = simulate.simulate_path(manifest, options, poses).frames.images[0]
         return float(np.corrcoef(frame.ravel(), real.ravel())[0, 1])
 
@@ -222,10 +224,10 @@ def test_a_dot_has_the_size_that_was_asked_for(
     options: dict[str, float], extra: float | None
 ) -> None:
     manifest, ink = one_dot()
-    wanted = replace(PLAIN, paper_level=200.0, contrast=1.0, **options)  # type: ignore[arg-type]
-    frame = simulate.simulate_path(manifest, wanted, at(*ink, 0.4)).frames.images[0]
+    expected = replace(PLAIN, paper_level=200.0, contrast=1.0, **options)  # type: ignore[arg-type]
+    frame = simulate.simulate_path(manifest, expected, at(*ink, 0.4)).frames.images[0]
     centre, spread, total = moments(frame, 200.0)
-    radius = wanted.dot * PITCH_PX / 2
+    radius = expected.dot * PITCH_PX / 2
     assert centre == pytest.approx((93.5, 59.5), abs=0.02)
     assert total / 200 == pytest.approx(math.pi * radius**2, rel=0.02)
     # A disc spreads by r^2 / 4 an axis, and a pixel by 1 / 12.
@@ -340,12 +342,12 @@ def test_a_printer_out_of_scale_is_told_by_the_truth_alone() -> None:
     assert np.array_equal(unknown.truth.position, known.truth.position)
     assert np.array_equal(list(unknown.frames.images), list(known.frames.images))
     # A dot 150 mm from the left is printed 0.6 mm further out.
-    place = (150.0, 200.0)
-    far = Sheet("dot", (5_000, 70_000), (1, 1), (0, 0), (210.0, 297.0), (place[0], place[1]))
+    position = (150.0, 200.0)
+    far = Sheet("dot", (5_000, 70_000), (1, 1), (0, 0), (210.0, 297.0), (position[0], position[1]))
     one = Manifest((far,))
-    seen = replace(options, printer_scale=(1.004, 0.997), frames=1)
-    x, y = place[0] * 1.004e-3, (297 - place[1]) * 0.997e-3
-    centre, _, _ = moments(simulate.simulate_path(one, seen, at(x, y, 0.0)).frames.images[0])
+    observed = replace(options, printer_scale=(1.004, 0.997), frames=1)
+    x, y = position[0] * 1.004e-3, (297 - position[1]) * 0.997e-3
+    centre, _, _ = moments(simulate.simulate_path(one, observed, at(x, y, 0.0)).frames.images[0])
     dot = one_dot()[1] * 1e3 - 50
     assert (centre - (93.5, 59.5)) * 0.046 == pytest.approx(
         (dot[0] * 1.004, -dot[1] * 0.997), abs=1e-3
@@ -377,16 +379,16 @@ def test_tiles_lie_on_the_floor_and_the_later_one_on_top() -> None:
     assert simulate.simulate(tiles, PLAIN).truth.frame == "floor"
     # Turned by five degrees: what one sees under it is what one saw on the paper.
     flat = Manifest((replace(tiles.sheets[1], position_mm=None, heading_deg=0.0),))
-    turned = np.radians(5)
-    spot = np.array([0.02, 0.03])
-    c, s = math.cos(turned), math.sin(turned)
-    moved = np.array([[c, -s], [s, c]]) @ spot + [0.04, 0.0]
+    rotated = np.radians(5)
+    point = np.array([0.02, 0.03])
+    c, s = math.cos(rotated), math.sin(rotated)
+    moved = np.array([[c, -s], [s, c]]) @ point + [0.04, 0.0]
     there = (
-        simulate.simulate_path(alone[1], PLAIN, at(*moved, 0.3 + turned))
+        simulate.simulate_path(alone[1], PLAIN, at(*moved, 0.3 + rotated))
         .frames.images[0]
         .astype(int)
     )
-    here = simulate.simulate_path(flat, PLAIN, at(*spot, 0.3)).frames.images[0]
+    here = simulate.simulate_path(flat, PLAIN, at(*point, 0.3)).frames.images[0]
     assert np.abs(there - here).max() <= 1
 
 

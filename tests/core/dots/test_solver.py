@@ -209,10 +209,10 @@ def test_covariance_in_metres(shoot: Shoot) -> None:
     manifest = Manifest((tile,), scale=(1.003, 0.995))
     rng = np.random.default_rng(5)
     at = rng.uniform([1050, 2050], [1350, 2350], (60, 2))
-    turn = rng.uniform(-np.pi, np.pi, 60)
+    rotation = rng.uniform(-np.pi, np.pi, 60)
     images = [
-        shoot(at=tuple(place), heading=angle, noise=12.0, jitter=0.01, seed=k)
-        for k, (place, angle) in enumerate(zip(at.tolist(), turn.tolist(), strict=True))
+        shoot(at=tuple(position), heading=angle, noise=12.0, jitter=0.01, seed=k)
+        for k, (position, angle) in enumerate(zip(at.tolist(), rotation.tolist(), strict=True))
     ]
     track = only(solve([frames_of(images)], manifest))
     assert (track.frame, len(track)) == ("floor", 60)
@@ -221,7 +221,7 @@ def test_covariance_in_metres(shoot: Shoot) -> None:
     paper *= [1.003, 0.995]
     c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
     floor = (paper @ np.array([[c, s], [-s, c]]) + [300, -40]) * 1e-3
-    right = np.stack([1.003 * np.cos(turn), 0.995 * np.sin(turn)], axis=1)
+    right = np.stack([1.003 * np.cos(rotation), 0.995 * np.sin(rotation)], axis=1)
     angle = np.arctan2(right[:, 1], right[:, 0]) + math.radians(30)
     error = np.column_stack(
         [track.position[:, :2] - floor, heading_from_quaternion(track.quaternion) - angle]

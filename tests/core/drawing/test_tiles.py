@@ -10,7 +10,7 @@ import pytest
 from locatk.core.drawing import Line, Text
 from locatk.core.drawing.tiles import MAX_PAGE_MM, divide_area, tile_name
 from locatk.core.errors import InputError
-from locatk.core.paper import Paper, parse_paper
+from locatk.core.paper_sizes import Paper, parse_paper
 
 EXTENT = (-100.0, 50.0, 900.0, 650.0)
 

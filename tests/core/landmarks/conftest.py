@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from locatk.core.landmarks.landmark import PATTERNS, code_of, pattern, rotated
-from locatk.core.landmarks.map.floor import ALPHABETS, HOLE, STEPS, WINDOWS, Cell, FloorMap
+from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, STEPS, WINDOWS, Cell, FloorMap
 
 LETTERS = {
     "6": [code_of(letters) for letters in PATTERNS],
@@ -37,7 +37,7 @@ def walk(floor: FloorMap) -> Walked:
             at, heading, visited = cell, start, [cell]
             for step in WALKS[floor.window]:
                 heading += {"A": 0, "L": 1, "R": -1}[step]
-                if not floor.open(at, heading):
+                if not floor.is_passable(at, heading):
                     break
                 at = (at[0] + STEPS[heading % 4][0], at[1] + STEPS[heading % 4][1])
                 visited.append(at)
@@ -57,7 +57,7 @@ def draw(seed: int) -> FloorMap:
     rows, columns = random.integers(1, 7, 2)
     alphabet = str(random.choice(ALPHABETS))
     codes = random.choice(LETTERS[alphabet], (rows, columns))
-    codes[random.random(codes.shape) < random.choice([0, 0.1])] = HOLE
+    codes[random.random(codes.shape) < random.choice([0, 0.1])] = HOLE_CODE
     walls = set()
     for row in range(rows):
         for column in range(columns):

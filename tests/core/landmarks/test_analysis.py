@@ -1,4 +1,8 @@
-"""What a geometry is worth, against the figures of facts/landmarks.md 2, magpylib and itself."""
+"""Analysis of a geometry against magpylib, reference figures and itself.
+
+Reference figures were computed with an independent prototype of the bars' field (numpy, equal to
+magpylib 6.1.0); "the paper" is DOI 10.5772/57517.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,7 @@ from locatk.core.landmarks.field import basis, landmark_field
 from locatk.core.landmarks.landmark import PATTERNS, Geometry, code_of, signs
 
 ONE = replace(Geometry(), remanence_t=1.0, threshold_t=2.73e-3)
-"""The default in the units of facts 2.2 and 2.3."""
+"""Default geometry with a remanence of 1 T and a threshold of 2.73 mT per tesla."""
 LONG = replace(ONE, bar_length_m=0.04, sensor_height_m=0.005, threshold_t=2.84e-3)
 
 
@@ -46,8 +50,8 @@ def degrees(analysis: LandmarkAnalysis, letters: str) -> np.ndarray:
     return np.degrees(analysis.patterns[PATTERNS.index(letters)].valleys_rad)
 
 
-def test_valleys_are_those_of_the_facts(usual: LandmarkAnalysis) -> None:
-    """facts 2.3, to the digits given there."""
+def test_valleys_equal_the_reference(usual: LandmarkAnalysis) -> None:
+    """Angles equal those of the prototype to the digits given."""
     np.testing.assert_allclose(degrees(usual, "NSNS"), [0, 90, 180, 270], atol=1e-6)
     np.testing.assert_allclose(degrees(usual, "NNNN"), 45.0 * np.arange(8), atol=1e-6)
     np.testing.assert_allclose(degrees(usual, "NNNS"), [6.0, 44.2, 90, 135.8, 174, 270], atol=0.05)
@@ -57,21 +61,21 @@ def test_valleys_are_those_of_the_facts(usual: LandmarkAnalysis) -> None:
     for plus, minus in (("NNNS", "SSSN"), ("NNNN", "SSSS")):
         one, other = (usual.patterns[PATTERNS.index(letters)] for letters in (plus, minus))
         np.testing.assert_allclose(one.valleys_rad, other.valleys_rad, atol=1e-9)
-        np.testing.assert_array_equal(one.rising, ~other.rising)
-        np.testing.assert_allclose(one.mountains_t, -other.mountains_t)
+        np.testing.assert_array_equal(one.is_rising, ~other.is_rising)
+        np.testing.assert_allclose(one.peaks_t, -other.peaks_t)
 
 
 @pytest.mark.parametrize("geometry", [ONE, LONG])
 def test_counts_are_those_of_the_paper(geometry: Geometry) -> None:
-    found = analyse_landmark(geometry)
-    assert [pattern.letters for pattern in found.patterns] == list(PATTERNS)
-    assert [len(pattern.valleys_rad) for pattern in found.patterns] == [4, 6, 6, 6, 8, 8]
-    assert not any(pattern.is_collapsed for pattern in found.patterns)
-    for pattern in found.patterns:
+    result = analyse_landmark(geometry)
+    assert [pattern.letters for pattern in result.patterns] == list(PATTERNS)
+    assert [len(pattern.valleys_rad) for pattern in result.patterns] == [4, 6, 6, 6, 8, 8]
+    assert not any(pattern.is_collapsed for pattern in result.patterns)
+    for pattern in result.patterns:
         assert (np.diff(pattern.valleys_rad) > 0).all()
         # Mountains change sign at each valley, and say whether the field rises there.
-        np.testing.assert_array_equal(pattern.rising, pattern.mountains_t > 0)
-        np.testing.assert_array_equal(pattern.rising, ~np.roll(pattern.rising, 1))
+        np.testing.assert_array_equal(pattern.is_rising, pattern.peaks_t > 0)
+        np.testing.assert_array_equal(pattern.is_rising, ~np.roll(pattern.is_rising, 1))
 
 
 def test_valleys_are_zeros_of_magpylibs_field() -> None:
@@ -85,32 +89,32 @@ def test_valleys_are_zeros_of_magpylibs_field() -> None:
         collection.add(bar.rotate_from_angax(90 * k, "z", anchor=0))
     angle = analyse_landmark(ONE).patterns[2].valleys_rad
 
-    def field(turned: float) -> np.ndarray:
-        circle = points_on_circle(0.025, angle + turned)
+    def field(rotated: float) -> np.ndarray:
+        circle = points_on_circle(0.025, angle + rotated)
         return collection.getB(np.column_stack([circle, np.full(len(angle), 0.012)]))[:, 2]
 
     # The field changes its sign within 0.0001 degrees, a hundredth of what the table shows.
     assert (field(-1.7e-6) * field(1.7e-6) < 0).all()
 
 
-def test_mountains_are_those_of_the_facts(usual: LandmarkAnalysis) -> None:
-    """facts 2.3: 90-degree mountains 23.1-24.3 mT/T, 45-degree ones 7.8-9.3; 53 and 9.6."""
+def test_peaks_equal_the_reference(usual: LandmarkAnalysis) -> None:
+    """90-degree peaks are 23.1 to 24.3 mT/T, 45-degree ones 7.8 to 9.3; 53 and 9.6 if long."""
     wide, narrow = [], []
     for pattern in usual.patterns:
         width = np.diff(pattern.valleys_rad, append=pattern.valleys_rad[0] + 2 * math.pi)
-        height = 1e3 * np.abs(pattern.mountains_t)
+        height = 1e3 * np.abs(pattern.peaks_t)
         wide += height[width > math.radians(70)].tolist()
         narrow += height[width < math.radians(60)].tolist()
     assert (min(wide), max(wide)) == pytest.approx((23.1, 24.3), abs=0.06)
     assert (min(narrow), max(narrow)) == pytest.approx((7.8, 9.3), abs=0.06)
     long = analyse_landmark(LONG).patterns
-    assert 1e3 * long[0].mountains_t.max() == pytest.approx(53, abs=0.5)
-    assert 1e3 * long[3].mountains_t.min() == pytest.approx(-54, abs=0.5)
-    assert 1e3 * np.abs(long[3].mountains_t).min() == pytest.approx(9.6, abs=0.06)
+    assert 1e3 * long[0].peaks_t.max() == pytest.approx(53, abs=0.5)
+    assert 1e3 * long[3].peaks_t.min() == pytest.approx(-54, abs=0.5)
+    assert 1e3 * np.abs(long[3].peaks_t).min() == pytest.approx(9.6, abs=0.06)
 
 
-def test_crossing_has_the_bias_of_the_facts(usual: LandmarkAnalysis) -> None:
-    """facts 2.2: 2.6 mm for landmarks 2 and 3, 4.2 with 40 mm bars, towards the middle bar."""
+def test_intersection_has_the_reference_bias(usual: LandmarkAnalysis) -> None:
+    """2.6 mm for landmarks 2 and 3, 4.2 mm with 40 mm bars, towards the middle bar."""
     assert usual.patterns[2].bias_m == pytest.approx([0, 2.6e-3], abs=0.05e-3)
     assert usual.patterns[1].bias_m == pytest.approx([0, 2.6e-3], abs=0.05e-3)
     assert analyse_landmark(LONG).patterns[2].bias_m == pytest.approx([0, 4.2e-3], abs=0.05e-3)
@@ -128,8 +132,8 @@ def test_crossing_is_of_the_labels_of_the_paper() -> None:
     np.testing.assert_allclose(centre_from_valleys(ONE, angle), one + t * (four - one), atol=1e-12)
 
 
-def test_radii_are_those_of_the_facts(usual: LandmarkAnalysis) -> None:
-    """facts 2.2. r2 and NSNS to their digits; r1 depends on how gulfs are cut: to 0.6 mm."""
+def test_radii_equal_the_reference(usual: LandmarkAnalysis) -> None:
+    """r2 and NSNS agree to the digits given; r1 depends on the limits of gulfs: to 0.6 mm."""
     assert 1e3 * usual.r2_m == pytest.approx(54.7, abs=0.1)
     assert 1e3 * usual.patterns[0].r2_m == pytest.approx(54, abs=0.1)
     assert 1e3 * usual.patterns[4].r1_m == pytest.approx(44.7, abs=0.6)
@@ -144,17 +148,17 @@ def test_radii_are_those_of_the_facts(usual: LandmarkAnalysis) -> None:
 def test_contour_is_where_the_field_meets_the_threshold() -> None:
     phi = np.radians(np.array([10.0, 22.5, 30, 45, 60, 200, 225, 250, 300]))
     strengths = signs(code_of("NNNS"))
-    found = threshold_contour(ONE, strengths[:, None], phi)[:, 0]
+    result = threshold_contour(ONE, strengths[:, None], phi)[:, 0]
     # In the gulf between equal bars the field never comes to the threshold.
-    np.testing.assert_array_equal(np.isnan(found), phi == np.radians(45.0))
-    field = np.abs(basis(ONE, points_on_circle(found, phi)) @ strengths)
+    np.testing.assert_array_equal(np.isnan(result), phi == np.radians(45.0))
+    field = np.abs(basis(ONE, points_on_circle(result, phi)) @ strengths)
     np.testing.assert_allclose(field[[1, 2, 5, 6, 7, 8]], ONE.threshold_t, rtol=3e-3)
-    outside = np.abs(basis(ONE, points_on_circle(found * 1.05, phi)) @ strengths)
-    assert (outside[np.isfinite(found)] < ONE.threshold_t).all()
-    # facts 2.3, at their threshold of 2.90 mT/T: the NNNS contour every 15 degrees
-    facts = replace(ONE, threshold_t=2.90e-3)
+    outside = np.abs(basis(ONE, points_on_circle(result * 1.05, phi)) @ strengths)
+    assert (outside[np.isfinite(result)] < ONE.threshold_t).all()
+    # Contour of NNNS by the prototype, at a threshold of 2.90 mT/T.
+    reference = replace(ONE, threshold_t=2.90e-3)
     shown = threshold_contour(
-        facts, strengths[:, None], np.radians([15, 22.5, 60, 67.5, 210, 217.5])
+        reference, strengths[:, None], np.radians([15, 22.5, 60, 67.5, 210, 217.5])
     )[:, 0]
     np.testing.assert_allclose(1e3 * shown, [41, 44, 46, 46, 56, 56], atol=1)
 
@@ -162,14 +166,14 @@ def test_contour_is_where_the_field_meets_the_threshold() -> None:
 def test_no_contour_without_a_field() -> None:
     weak = replace(ONE, threshold_t=0.5)
     assert np.isnan(threshold_contour(weak, signs([5, 7]).T, np.radians([20.0, 50.0]))).all()
-    found = analyse_landmark(weak)
-    assert math.isnan(found.r1_m)
-    assert math.isnan(found.min_pitch_m)
-    assert any("threshold" in text for text in landmark_warnings(found))
+    result = analyse_landmark(weak)
+    assert math.isnan(result.r1_m)
+    assert math.isnan(result.min_pitch_m)
+    assert any("threshold" in text for text in landmark_warnings(result))
 
 
 def test_gulfs_are_some_millimetres_wide(usual: LandmarkAnalysis) -> None:
-    """facts 2.3: +-5 to 8 degrees at the corners between equal bars."""
+    """Gulfs are +-5 to 8 degrees wide at the corners between equal bars."""
     nnnn = usual.patterns[4]
     corners = np.degrees(nnnn.gulfs_rad[1::2])
     assert ((corners > 8) & (corners < 18)).all()
@@ -178,7 +182,7 @@ def test_gulfs_are_some_millimetres_wide(usual: LandmarkAnalysis) -> None:
 
 @pytest.mark.parametrize(("geometry", "low", "high"), [(ONE, 0.020, 0.030), (LONG, 0.015, 0.020)])
 def test_heights_end_where_the_table_collapses(geometry: Geometry, low: float, high: float) -> None:
-    """facts 2.1: 40 mm bars give 2 valleys from 20 mm on, 30 mm bars still 6 there."""
+    """40 mm bars give 2 valleys from a height of 20 mm on, 30 mm bars still 6 there."""
     bottom, top = valid_sensor_heights(geometry)
     assert bottom == 0
     assert low < top < high
@@ -192,7 +196,7 @@ def test_a_circle_beyond_the_bars_has_no_valid_height() -> None:
 
 
 def test_far_neighbours_are_let_pass(usual: LandmarkAnalysis) -> None:
-    """facts 2.3: 2 x (54 + 25) mm, and under about 15 uT at 200 mm."""
+    """Contours need 2 x (54 + 25) mm; the field of a neighbour is below 15 uT at 200 mm."""
     assert usual.contour_pitch_m == pytest.approx(0.160, abs=0.002)
     nominal = analyse_landmark(Geometry())
     assert 0.19 < nominal.field_pitch_m < 0.2
@@ -224,22 +228,22 @@ def test_neighbours_are_as_bad_as_the_worst_of_all_codes() -> None:
 
 
 def test_hall_sensors_tell_the_largest_field() -> None:
-    found = analyse_landmark(Geometry())
+    result = analyse_landmark(Geometry())
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.06, 0.06, (20_000, 2))
     sampled = max(np.abs(landmark_field(Geometry(), code, points)).max() for code in range(16))
-    assert sampled <= found.largest_t * 1.001
-    assert sampled > 0.98 * found.largest_t
-    assert found.range_t == pytest.approx(1.25 * found.largest_t)
-    assert found.hall_class == (50.0, 0.042)
+    assert sampled <= result.largest_t * 1.001
+    assert sampled > 0.98 * result.largest_t
+    assert result.range_t == pytest.approx(1.25 * result.largest_t)
+    assert result.hall_class == (50.0, 0.042)
     assert analyse_landmark(replace(Geometry(), remanence_t=0.4)).hall_class == (100.0, 0.021)
     close = analyse_landmark(replace(Geometry(), sensor_height_m=0.0005))
     assert close.hall_class is None
     assert any("hall" in text for text in landmark_warnings(close))
 
 
-def test_lines_over_the_bars_are_those_of_the_facts() -> None:
-    """facts 2.3, J = 1.2 T: slopes in mT/mm, and a zero 2.6 mm off beside the odd bar."""
+def test_lines_over_the_bars_equal_the_reference() -> None:
+    """Slopes are in mT/mm at 1.2 T; zeros next to the odd bar are 2.6 mm off."""
     shapes = analyse_landmark(Geometry()).patterns
     np.testing.assert_allclose(np.abs(shapes[0].slope_t_per_m), 1.94, rtol=0.01)
     np.testing.assert_allclose(shapes[4].slope_t_per_m, 1.13, rtol=0.03)
@@ -259,7 +263,7 @@ def test_fields_grow_with_remanence_and_shrink_with_height() -> None:
     assert designed.bias_m == pytest.approx(2.6e-3, abs=0.05e-3)
     assert by_what["sensors 1 mm higher"].largest_t < designed.largest_t
     assert by_what["sensors 1 mm lower"].largest_t > designed.largest_t
-    # facts 2.3: a tenth of the threshold, as of the field, moves both radii by about 1 mm.
+    # A tenth of the threshold, or of the field, moves both radii by about 1 mm.
     stronger = by_what["bars 10 % stronger"]
     assert 1e3 * (stronger.r1_m - designed.r1_m) == pytest.approx(1, abs=0.5)
     assert 1e3 * (stronger.r2_m - designed.r2_m) == pytest.approx(1, abs=0.5)
@@ -269,26 +273,26 @@ def test_a_collapse_is_told_with_what_to_do() -> None:
     high = analyse_landmark(replace(LONG, sensor_height_m=0.02))
     assert [len(pattern.valleys_rad) for pattern in high.patterns] == [4, 2, 2, 6, 8, 8]
     assert np.isnan(high.patterns[2].bias_m).all()
-    (told,) = [text for text in landmark_warnings(high) if "collapse" in text]
-    assert "SSSN and NNNS collapse to 2 instead of 6" in told
-    assert "at most 17.8 mm" in told
+    (reported,) = [text for text in landmark_warnings(high) if "collapse" in text]
+    assert "SSSN and NNNS collapse to 2 instead of 6" in reported
+    assert "at most 17.8 mm" in reported
     assert not list(landmark_warnings(analyse_landmark(Geometry())))
 
 
 def test_skewed_valleys_are_told() -> None:
-    """facts 2.2: 50 mm bars put inner valleys at 16 to 18 degrees, too big."""
+    """50 mm bars put the inner valleys at 16 to 18 degrees, which is too large."""
     bars = replace(ONE, bar_length_m=0.05, bar_width_m=0.005, radius_m=0.028, sensor_height_m=0.004)
-    found = analyse_landmark(bars)
-    assert math.degrees(found.patterns[2].skew_rad) == pytest.approx(17, abs=1)
-    assert any("17 degrees" in text for text in landmark_warnings(found))
+    result = analyse_landmark(bars)
+    assert math.degrees(result.patterns[2].skew_rad) == pytest.approx(17, abs=1)
+    assert any("17 degrees" in text for text in landmark_warnings(result))
 
 
 def test_close_landmarks_are_told() -> None:
-    found = analyse_landmark(Geometry())
-    assert not list(pitch_warnings(found, 0.2))
-    (field,) = pitch_warnings(found, 0.17)
+    result = analyse_landmark(Geometry())
+    assert not list(pitch_warnings(result, 0.2))
+    (field,) = pitch_warnings(result, 0.17)
     assert "at least 194 mm" in field
-    assert len(list(pitch_warnings(found, 0.12))) == 2
+    assert len(list(pitch_warnings(result, 0.12))) == 2
 
 
 def test_a_low_threshold_is_the_earths_field() -> None:

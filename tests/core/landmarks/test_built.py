@@ -12,22 +12,22 @@ from locatk.core.landmarks.landmark import code_of, rotated, signs
 from locatk.core.landmarks.localization.cell_filter import identify_cells
 from locatk.core.landmarks.localization.smoothing import subtract_neighbours
 from locatk.core.landmarks.map.floor import (
-    HOLE,
+    HOLE_CODE,
     AsBuiltLandmark,
     FloorMap,
     as_built_codes,
     as_built_landmark,
 )
-from locatk.core.landmarks.simulation.floor import floor_field, lay
+from locatk.core.landmarks.simulation.floor import floor_field, install_landmarks
 from locatk.core.landmarks.simulation.options import NONE, Faults
 
-CODES = np.array([[13, 5, 4, 12], [3, 7, 2, 15], [1, 11, HOLE, 8]])
+CODES = np.array([[13, 5, 4, 12], [3, 7, 2, 15], [1, 11, HOLE_CODE, 8]])
 
 
 def built(
-    strength: object, x_m: float = 0.0, y_m: float = 0.0, turn: float = 0.0
+    strength: object, x_m: float = 0.0, y_m: float = 0.0, rotation: float = 0.0
 ) -> AsBuiltLandmark:
-    return AsBuiltLandmark(x_m, y_m, turn, np.array(strength, float), np.full(7, np.nan))
+    return AsBuiltLandmark(x_m, y_m, rotation, np.array(strength, float), np.full(7, np.nan))
 
 
 def test_codes_are_the_designs_where_nothing_else_is_known() -> None:
@@ -59,13 +59,13 @@ def test_fields_of_neighbours_are_those_of_their_bars_as_built() -> None:
         (1, 0): built([-1, -1, 0.7, 1], -5e-3, 0.0, -0.2),
     }
     floor = FloorMap(CODES[:2, :2], pitch_m=0.12, built=known)
-    laid = lay(floor, NONE, Faults(), 0)
-    others = [mark for cell, mark in laid.items() if cell != (0, 0)]
+    installed = install_landmarks(floor, NONE, Faults(), 0)
+    others = [mark for cell, mark in installed.items() if cell != (0, 0)]
     pose = np.column_stack([np.linspace(-0.02, 0.05, 15), np.full(15, 0.01), np.full(15, 0.3)])
     local = pose.copy()
-    place = sensor_positions(pose, circle())
-    height = np.full((*place.shape[:2], 1), floor.geometry.sensor_height_m)
-    value = floor_field(floor.geometry, others, np.concatenate([place, height], axis=-1))
+    position = sensor_positions(pose, circle())
+    height = np.full((*position.shape[:2], 1), floor.geometry.sensor_height_m)
+    value = floor_field(floor.geometry, others, np.concatenate([position, height], axis=-1))
     trace = Trace(local, np.zeros((15, 3, 1)), value, circle(), np.ones(15), 0)
     left = subtract_neighbours(trace, np.zeros(3), np.zeros(1), (0, 0), floor).field_t
     assert np.abs(value).max() > 1e-3
@@ -88,10 +88,10 @@ def test_a_flipped_bar_that_is_known_does_not_count_against_a_place() -> None:
     ]  # fmt: skip
     sure = {}
     for floor in (FloorMap(CODES), FloorMap(CODES, built=flip)):
-        told = identify_cells(sightings, floor, misread=0.01, drift=OdometryDrift())
-        sure[bool(floor.built)] = told[-1].probability
+        reported = identify_cells(sightings, floor, misread=0.01, drift=OdometryDrift())
+        sure[bool(floor.built)] = reported[-1].probability
         if floor.built:
-            assert [one.cell for one in told] == [cell for cell, _ in tour]
-            assert all(one.quarters == 0 for one in told)
+            assert [one.cell for one in reported] == [cell for cell, _ in tour]
+            assert all(one.quarters == 0 for one in reported)
     assert sure[True] > 0.99
     assert sure[True] > sure[False] + 1e-4

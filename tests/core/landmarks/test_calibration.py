@@ -30,7 +30,7 @@ from locatk.core.landmarks.landmark import signs
 from locatk.core.landmarks.localization import smoothing
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.landmarks.simulation import session as simulate
-from locatk.core.landmarks.simulation.floor import Laid, lay
+from locatk.core.landmarks.simulation.floor import InstalledLandmark, install_landmarks
 from locatk.core.landmarks.simulation.session import (
     Errors,
     Faults,
@@ -60,7 +60,9 @@ def drive(
 ) -> SimulatedSession:
     """A robot of its own on the floor of ``floor_seed``."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "lay", lambda f, e, x, _: lay(f, e, x, floor_seed))
+        patch.setattr(
+            simulate, "install_landmarks", lambda f, e, x, _: install_landmarks(f, e, x, floor_seed)
+        )
         return simulate.simulate(
             floor,
             SimulationOptions(
@@ -69,12 +71,12 @@ def drive(
         )
 
 
-def taken(
+def calibration_drive(
     session: SimulatedSession, name: str = "run", floor: FloorMap = FLOOR
 ) -> CalibrationDrive:
-    found = read_drive(name, session.samples[0], session.odometry[0], floor)
-    assert isinstance(found, CalibrationDrive)
-    return found
+    result = read_drive(name, session.samples[0], session.odometry[0], floor)
+    assert isinstance(result, CalibrationDrive)
+    return result
 
 
 @dataclass
@@ -82,7 +84,7 @@ class Case:
     floor_seed: int
     drives: list[CalibrationDrive]
     report: FloorCalibrationReport
-    laid: dict[Cell, Laid]
+    laid: dict[Cell, InstalledLandmark]
 
 
 @pytest.fixture(scope="module", params=[5, 6])
@@ -92,23 +94,23 @@ def case(request: pytest.FixtureRequest) -> Case:
         drive(cells, 100 * request.param + k, floor_seed=request.param)
         for k, cells in enumerate((ROWS, COLUMNS))
     ]
-    drives = [taken(session, f"run{k}") for k, session in enumerate(sessions)]
-    laid = {one.cell: one for one in sessions[0].floor_as_laid}
+    drives = [calibration_drive(session, f"run{k}") for k, session in enumerate(sessions)]
+    laid = {one.cell: one for one in sessions[0].installed_landmarks}
     return Case(request.param, drives, calibrate(FLOOR, drives), laid)
 
 
 def middles(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres (n, 2) as found, the true middles of the bars, and nominal places."""
     cells = [one.cell for one in case.report.landmarks]
-    found = [[one.built.x_m, one.built.y_m] for one in case.report.landmarks]
-    nominal = np.array([FLOOR.place(cell) for cell in cells])
+    result = [[one.built.x_m, one.built.y_m] for one in case.report.landmarks]
+    nominal = np.array([FLOOR.position(cell) for cell in cells])
     true = np.array([case.laid[cell].middle_m[:, :2].mean(axis=0) for cell in cells])
-    return np.array(found) + nominal, true, nominal
+    return np.array(result) + nominal, true, nominal
 
 
-def off_frame(error: np.ndarray, place: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
+def off_frame(error: np.ndarray, position: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
     """Errors ``at`` places less the motion that fits the errors at ``place`` best."""
-    middle = place.mean(axis=0)
+    middle = position.mean(axis=0)
 
     def shape(points: np.ndarray) -> np.ndarray:
         off = points - middle
@@ -117,9 +119,9 @@ def off_frame(error: np.ndarray, place: np.ndarray, at: np.ndarray | None = None
             [np.stack([one, zero, -off[:, 1]], 1), np.stack([zero, one, off[:, 0]], 1)], 1
         )
 
-    motion = np.linalg.lstsq(shape(place).reshape(-1, 3), error.ravel(), rcond=None)[0]
+    motion = np.linalg.lstsq(shape(position).reshape(-1, 3), error.ravel(), rcond=None)[0]
     if at is None:
-        return error - shape(place) @ motion
+        return error - shape(position) @ motion
     return -(shape(at) @ motion)
 
 
@@ -139,8 +141,8 @@ def test_flags_are_exactly_the_faults(case: Case) -> None:
 
 
 def test_centres_headings_and_strengths_are_the_true_ones(case: Case) -> None:
-    found, true, nominal = middles(case)
-    error = off_frame(found - true, nominal)
+    result, true, nominal = middles(case)
+    error = off_frame(result - true, nominal)
     assert np.hypot(*error.T).max() < 0.5e-3
     for one in case.report.landmarks:
         laid = case.laid[one.cell]
@@ -152,8 +154,8 @@ def test_centres_headings_and_strengths_are_the_true_ones(case: Case) -> None:
 
 
 def test_standard_deviations_are_those_of_the_errors(case: Case) -> None:
-    found, true, nominal = middles(case)
-    error = off_frame(found - true, nominal)
+    result, true, nominal = middles(case)
+    error = off_frame(result - true, nominal)
     sigma = np.array([one.built.sigma for one in case.report.landmarks])
     # The bars' own places, of which the middle is told here, are in the sigmas too.
     assert 0.05 < np.mean((error / sigma[:, :2]) ** 2) < 1.5
@@ -168,8 +170,8 @@ def test_standard_deviations_are_those_of_the_errors(case: Case) -> None:
 def test_later_drives_are_solved_better_with_the_floor_as_built(case: Case) -> None:
     later = drive(ROWS[::-1][:8], 77, floor_seed=case.floor_seed)
     errors = {}
-    found, true, nominal = middles(case)
-    for floor, told in ((FLOOR, nominal), (case.report.floor, found)):
+    result, true, nominal = middles(case)
+    for floor, reported in ((FLOOR, nominal), (case.report.floor, result)):
         solution = solver.solve(later.samples, floor, None, odometry=later.odometry)
         (path,), truth = solution.trajectories, later.truth[0]
         at = np.column_stack(
@@ -182,7 +184,7 @@ def test_later_drives_are_solved_better_with_the_floor_as_built(case: Case) -> N
         sound = [
             n for n, one in enumerate(case.report.landmarks) if "displaced" not in one.built.flags
         ]
-        frame = off_frame((told - true)[sound], nominal[sound], at)
+        frame = off_frame((reported - true)[sound], nominal[sound], at)
         errors[floor is FLOOR] = np.hypot(*(path.position[:, :2] - at + frame).T)
     assert errors[False].mean() < 0.4e-3
     assert errors[False].mean() < 0.6 * errors[True].mean()
@@ -229,7 +231,7 @@ def test_outlier_visit_is_left_out(case: Case) -> None:
 @pytest.mark.slow
 def test_unconnected_parts_are_reported() -> None:
     rows = [drive(tuple((r, c) for c in range(4)), 30 + r, faults=Faults()) for r in (0, 2)]
-    report = calibrate(FLOOR, [taken(session) for session in rows])
+    report = calibrate(FLOOR, [calibration_drive(session) for session in rows])
     assert report.unvisited == tuple((1, c) for c in range(4))
     assert "2 parts of the floor" in report.notes[0]
     for row in (0, 2):
@@ -242,7 +244,7 @@ def test_position_of_the_whole_floor_is_not_observable() -> None:
     moved = Faults(displaced=tuple((cell, (0.008, 0.003)) for cell in FLOOR.cells()))
     cells = ROWS[:6]
     quiet = replace(Errors(), landmark_place_m=0.0, bar_place_m=0.0, landmark_turn_rad=0.0)
-    report = calibrate(FLOOR, [taken(drive(cells, 40, faults=moved, errors=quiet))])
+    report = calibrate(FLOOR, [calibration_drive(drive(cells, 40, faults=moved, errors=quiet))])
     for one in report.landmarks:
         assert np.hypot(one.built.x_m, one.built.y_m) < 1e-3
         assert "displaced" not in one.built.flags
@@ -253,7 +255,7 @@ def test_uniformly_weaker_magnets_are_no_weak_bars() -> None:
     """By a quarter: gains and height absorb a part, the typical bar shows the remainder."""
     strong = replace(FLOOR, geometry=replace(FLOOR.geometry, remanence_t=1.6))
     session = drive(ROWS[:6], 41, faults=Faults())
-    report = calibrate(strong, [taken(session, floor=strong)])
+    report = calibrate(strong, [calibration_drive(session, floor=strong)])
     assert report.strength < 0.9
     assert any("typical bar" in note and "remanence_t" in note for note in report.notes)
     assert all(one.built.flags == () for one in report.landmarks)
@@ -299,7 +301,7 @@ def test_flags(change: dict, wanted: tuple[str, ...]) -> None:
 
 
 def test_single_landmark_has_bars_but_no_pose() -> None:
-    pose = np.array([*FLOOR.place((1, 1)), 0.0]) + [3e-3, -2e-3, 0.01]
+    pose = np.array([*FLOOR.position((1, 1)), 0.0]) + [3e-3, -2e-3, 0.01]
     strength = signs(CODES[1, 1])
     sigma = np.full(3, 0.01)
     smoothed = smoothing.SmoothingResult(
@@ -308,11 +310,11 @@ def test_single_landmark_has_bars_but_no_pose() -> None:
         0.9,
     )
     marks = {(1, 1): smoothing.LandmarkPrior(pose, sigma, strength, np.full(4, 0.5))}
-    found = describe_landmarks(smoothed, marks, FLOOR, [[(1, 1)]], [])[1, 1]
-    assert (found.built.x_m, found.built.y_m, found.built.heading_rad) == (0, 0, 0)
-    assert np.isnan(found.built.sigma[:3]).all()
-    assert np.array_equal(found.built.strength, strength)
-    assert found.refused == ""
+    result = describe_landmarks(smoothed, marks, FLOOR, [[(1, 1)]], [])[1, 1]
+    assert (result.built.x_m, result.built.y_m, result.built.heading_rad) == (0, 0, 0)
+    assert np.isnan(result.built.sigma[:3]).all()
+    assert np.array_equal(result.built.strength, strength)
+    assert result.refused == ""
 
 
 # ---- datum
@@ -331,11 +333,11 @@ def test_displaced_landmarks_do_not_bias_the_alignment() -> None:
     design = np.column_stack([random.uniform(0, 1, (8, 2)), np.zeros(8)])
     off = np.zeros((8, 3))
     off[3] = [0.012, -0.009, 0.1]
-    turn = 0.004
-    c, s = math.cos(turn), math.sin(turn)
+    rotation = 0.004
+    c, s = math.cos(rotation), math.sin(rotation)
     pose = design + off
     pose[:, :2] = pose[:, :2] @ [[c, s], [-s, c]] + [0.02, 0.03]
-    pose[:, 2] += turn
+    pose[:, 2] += rotation
     left = datum.deviations_from_design(pose, design, np.array([1.5e-3, 1.5e-3, 0.012]))
     assert left == pytest.approx(off, abs=3e-4)
 
@@ -343,8 +345,8 @@ def test_displaced_landmarks_do_not_bias_the_alignment() -> None:
 def test_relative_covariances_have_no_gauge_part() -> None:
     """Against the whole matrix: A has the motions as its null space, the priors are W."""
     random = np.random.default_rng(2)
-    place = random.uniform(0, 1, (5, 2))
-    motion = datum.gauge_motions(place).reshape(15, 3)
+    position = random.uniform(0, 1, (5, 2))
+    motion = datum.gauge_motions(position).reshape(15, 3)
     rows = random.normal(size=(40, 15))
     rows -= rows @ motion @ np.linalg.pinv(motion)
     information = 1e6 * rows.T @ rows
@@ -355,7 +357,7 @@ def test_relative_covariances_have_no_gauge_part() -> None:
     held = motion.T @ np.diag(sigma.ravel() ** -2.0)
     whole = inverse - inverse @ held.T @ np.linalg.inv(held @ inverse @ held.T) @ held @ inverse
     blocks = np.array([inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(5)])
-    own = datum.relative_covariances(4 * blocks, place, sigma, 4)
+    own = datum.relative_covariances(4 * blocks, position, sigma, 4)
     for k in range(5):
         part = slice(3 * k, 3 * k + 3)
         assert own[k] == pytest.approx(4 * whole[part, part], rel=1e-6, abs=1e-12)

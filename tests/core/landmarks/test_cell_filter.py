@@ -26,7 +26,7 @@ from locatk.core.landmarks.localization.cell_filter import (
     predict_backward,
     select_visits_on_map,
 )
-from locatk.core.landmarks.map.floor import HOLE, STEPS, Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, STEPS, Cell, FloorMap
 from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
@@ -48,11 +48,11 @@ def published(data: Path) -> FloorMap:
     return FloorMap(np.array([[int(letter, 16) for letter in line] for line in lines if line]))
 
 
-def walk(start: State, turns: Sequence[int]) -> list[State]:
+def walk(start: State, rotations: Sequence[int]) -> list[State]:
     """Cells and headings, each heading the one of arrival."""
     path = [start]
     cell, heading = start
-    for turn in turns:
+    for turn in rotations:
         heading = (heading + turn) % 4
         cell = (cell[0] + STEPS[heading][0], cell[1] + STEPS[heading][1])
         path.append((cell, heading))
@@ -77,7 +77,7 @@ def visits_of(
     for number, ((cell, quarters), code) in enumerate(zip(path, codes, strict=True)):
         off = np.array([*random.normal(0, 5e-3, 2), random.normal(0, 0.2)])
         c, s = math.cos(quarters * HALF_PI), math.sin(quarters * HALF_PI)
-        x, y = floor.place(cell) + off[0] * np.array([c, s]) + off[1] * np.array([-s, c])
+        x, y = floor.position(cell) + off[0] * np.array([c, s]) + off[1] * np.array([-s, c])
         a, b = math.cos(rotation), math.sin(rotation)
         odometry = np.array(
             [1 + a * x - b * y, 2 + b * x + a * y, quarters * HALF_PI + off[2] + rotation]
@@ -89,8 +89,8 @@ def visits_of(
     return out
 
 
-def found(floor: FloorMap, seen: Sequence[VisitHypotheses]) -> list[CellEstimate]:
-    return identify_cells(seen, floor, misread=MISREAD, drift=OdometryDrift())
+def result(floor: FloorMap, observed: Sequence[VisitHypotheses]) -> list[CellEstimate]:
+    return identify_cells(observed, floor, misread=MISREAD, drift=OdometryDrift())
 
 
 def on_map(floor: FloorMap, path: Sequence[State]) -> list[int]:
@@ -106,7 +106,7 @@ def starts(floor: FloorMap, every: int) -> list[State]:
 def test_every_l_is_identified(published: FloorMap) -> None:
     for number, start in enumerate(starts(published, 11)):
         path = walk(start, L)
-        estimates = found(published, visits_of(published, path, on_map(published, path), number))
+        estimates = result(published, visits_of(published, path, on_map(published, path), number))
         assert [(one.cell, one.quarters) for one in estimates] == path
         assert min(one.probability for one in estimates) > 0.9
 
@@ -118,7 +118,7 @@ def test_one_misread_of_three_is_never_certain(published: FloorMap) -> None:
         path, bad = walk(start, L), random.integers(3)
         codes = on_map(published, path)
         codes[bad] = int((codes[bad] + random.integers(1, CODE_COUNT)) % CODE_COUNT)
-        estimates = found(published, visits_of(published, path, codes, number))
+        estimates = result(published, visits_of(published, path, codes, number))
         right = [(one.cell, one.quarters) for one in estimates] == path
         wrong += not right
         assert right or max(one.probability for one in estimates) < CERTAIN_PROBABILITY
@@ -134,7 +134,7 @@ def test_wrong_landmark_counts_once(published: FloorMap) -> None:
         codes = dict(zip([cell for cell, _ in there], on_map(published, there), strict=True))
         bad = there[2][0]
         codes[bad] = int((codes[bad] + random.integers(1, CODE_COUNT)) % CODE_COUNT)
-        estimates = found(published, visits_of(published, lap, [codes[c] for c, _ in lap], number))
+        estimates = result(published, visits_of(published, lap, [codes[c] for c, _ in lap], number))
         right = [(one.cell, one.quarters) for one in estimates] == lap
         assert right or max(one.probability for one in estimates) < CERTAIN_PROBABILITY
 
@@ -148,7 +148,7 @@ def test_probabilities_agree_with_enumeration(seed: int) -> None:
     codes = on_map(floor, path)
     codes[1] = (codes[1] + 3) % CODE_COUNT
     read = [int(rotated(code, -q)) for code, (_, q) in zip(codes, path, strict=True)]
-    codes_of = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE)
+    codes_of = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE_CODE)
     weight = {}
     for row in range(-PAD_CELLS, 12 + PAD_CELLS):
         for column in range(-PAD_CELLS, 12 + PAD_CELLS):
@@ -157,14 +157,16 @@ def test_probabilities_agree_with_enumeration(seed: int) -> None:
                 if all(min(cell) >= -PAD_CELLS and max(cell) < 12 + PAD_CELLS for cell, _ in other):
                     weight[other[0]] = 1.0
                     for (cell, q), code in zip(other, read, strict=True):
-                        laid = codes_of[cell[0] + PAD_CELLS, cell[1] + PAD_CELLS]
-                        hit = int(rotated(max(laid, 0), -q)) == code
+                        installed = codes_of[cell[0] + PAD_CELLS, cell[1] + PAD_CELLS]
+                        hit = int(rotated(max(installed, 0), -q)) == code
                         same = 1 - MISREAD if hit else MISREAD / (CODE_COUNT - 1)
                         weight[other[0]] *= (
-                            OUTSIDE_LANDMARK_PROBABILITY / CODE_COUNT if laid == HOLE else same
+                            OUTSIDE_LANDMARK_PROBABILITY / CODE_COUNT
+                            if installed == HOLE_CODE
+                            else same
                         )
     want = weight[path[0]] / sum(weight.values())
-    estimates = found(floor, visits_of(floor, path, codes, seed))
+    estimates = result(floor, visits_of(floor, path, codes, seed))
     # The filter also allows for leaving the map, the enumeration does not.
     assert 0.9 * want < estimates[0].probability < want
     assert max(weight.values()) < 1.01 * weight[path[0]]
@@ -174,14 +176,14 @@ def test_map_of_another_floor(published: FloorMap) -> None:
     for seed in range(25):
         other = FloorMap(np.random.default_rng(seed).integers(0, CODE_COUNT, published.shape))
         path = walk(((5, 5), 0), (0, 1, 0, -1, 0, 1, 0, 0, 1))
-        estimates = found(published, visits_of(other, path, on_map(other, path), seed))
+        estimates = result(published, visits_of(other, path, on_map(other, path), seed))
         assert max(one.probability for one in estimates) < 0.9
 
 
 def test_robot_leaves_the_map(published: FloorMap) -> None:
     part = FloorMap(published.codes[:10, :10])
     path = walk(((5, 4), 0), [0] * 15)
-    estimates = found(part, visits_of(published, path, on_map(published, path)))
+    estimates = result(part, visits_of(published, path, on_map(published, path)))
     for one, (cell, quarters) in zip(estimates, path, strict=True):
         if one.probability > 0.9:
             assert (one.cell, one.quarters) == (cell, quarters)
@@ -196,7 +198,7 @@ def test_kidnapped_robot(published: FloorMap) -> None:
         codes = on_map(published, first) + on_map(published, then)
         # Odometry reports a single further step.
         gone = walk(first[0], (0, 0, 0, 1, -1, 0, 0, 0, 1))
-        estimates = found(published, visits_of(published, gone, codes, seed))
+        estimates = result(published, visits_of(published, gone, codes, seed))
         for one, want in zip(estimates, [*first, *then], strict=True):
             assert one.probability < 0.99 or one.cell == want[0]
 
@@ -204,28 +206,28 @@ def test_kidnapped_robot(published: FloorMap) -> None:
 def test_hole_in_the_map(published: FloorMap) -> None:
     codes = published.codes.copy()
     path = walk(((7, 7), 0), (0, 0, 0, 0, 1))
-    codes[path[2][0]] = HOLE
-    estimates = found(FloorMap(codes), visits_of(published, path, on_map(published, path)))
+    codes[path[2][0]] = HOLE_CODE
+    estimates = result(FloorMap(codes), visits_of(published, path, on_map(published, path)))
     assert [(one.cell, one.quarters) for one in estimates] == path
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_too_few_landmarks(published: FloorMap, count: int) -> None:
     path = walk(((7, 7), 0), L)[:count]
-    estimates = found(published, visits_of(published, path, on_map(published, path)))
+    estimates = result(published, visits_of(published, path, on_map(published, path)))
     assert max(one.probability for one in estimates) < 0.5
 
 
 def test_no_visits(published: FloorMap) -> None:
-    assert found(published, []) == []
+    assert result(published, []) == []
 
 
 def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
     """The quarter turn of a hypothesis' frame is arbitrary."""
     path = walk(((9, 12), 3), (0, 1, 0))
-    seen = visits_of(published, path, on_map(published, path))
-    turned = []
-    for number, one in enumerate(seen):
+    observed = visits_of(published, path, on_map(published, path))
+    rotated_one = []
+    for number, one in enumerate(observed):
         quarter = number % 4
         c, s = math.cos(quarter * HALF_PI), math.sin(quarter * HALF_PI)
         x, y, heading = one.best.pose
@@ -238,9 +240,9 @@ def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
             np.ones(4),
             np.ones(4),
         )
-        turned.append(VisitHypotheses("robot", number, 0, 1, one.odometry, (own,)))
+        rotated_one.append(VisitHypotheses("robot", number, 0, 1, one.odometry, (own,)))
     for one, other, number in zip(
-        found(published, seen), found(published, turned), range(4), strict=True
+        result(published, observed), result(published, rotated_one), range(4), strict=True
     ):
         assert one.cell == other.cell
         assert other.quarters == (one.quarters - number) % 4
@@ -257,7 +259,7 @@ def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
 def test_visits_on_the_map_need_a_probable_cell_with_a_landmark(
     probability: float, cell: Cell, is_used: bool
 ) -> None:
-    floor = FloorMap(np.array([[5, HOLE]]))
+    floor = FloorMap(np.array([[5, HOLE_CODE]]))
     estimate = CellEstimate(cell, 0, 0, probability, probability)
     visit = VisitHypotheses("robot", 0, 0, 1, np.zeros(3), ())
     segment = VisitSegment(0, 1, np.arange(1), None, np.zeros(3))  # type: ignore[arg-type]
@@ -276,10 +278,10 @@ def test_missed_landmarks_cost_probability() -> None:
     """Of two pairs of equal codes, the one with a hole in between is more probable."""
     codes = np.full((1, 9), 0)
     codes[0, [0, 2]] = codes[0, [6, 8]] = 7, 11
-    codes[0, 7] = HOLE
+    codes[0, 7] = HOLE_CODE
     floor = FloorMap(codes)
     path = [((0, 0), 0), ((0, 2), 0)]
-    estimates = found(floor, visits_of(floor, path, [7, 11]))
+    estimates = result(floor, visits_of(floor, path, [7, 11]))
     assert [one.cell for one in estimates] == [(0, 6), (0, 8)]
 
 
@@ -287,9 +289,9 @@ def test_recording_may_begin_outside_of_the_map(monkeypatch: pytest.MonkeyPatch)
     """A visit that contradicts the map makes a start outside of it more probable."""
     floor = FloorMap(np.full((12, 12), 3))
     visits = visits_of(floor, [((4, 4), 0)], [5])
-    largest = max(one.probability for one in found(floor, visits))
+    largest = max(one.probability for one in result(floor, visits))
     monkeypatch.setattr(cell_filter, "START_OUTSIDE_PROBABILITY", 0.0)
-    assert largest < 0.995 * max(one.probability for one in found(floor, visits))
+    assert largest < 0.995 * max(one.probability for one in result(floor, visits))
 
 
 def test_repeated_visits_are_no_evidence_of_the_cell() -> None:
@@ -301,7 +303,7 @@ def test_repeated_visits_are_no_evidence_of_the_cell() -> None:
     largest = []
     for count in (2, 6):
         visits = visits_of(floor, path[:count], on_map(floor, path[:count]))
-        largest.append(max(one.probability for one in found(floor, visits)))
+        largest.append(max(one.probability for one in result(floor, visits)))
     assert largest[0] < 0.9
     assert largest[1] == pytest.approx(largest[0], rel=0.05)
 

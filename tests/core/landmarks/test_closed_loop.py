@@ -20,13 +20,13 @@ from locatk.core.landmarks.simulation.closed_loop import (
     execute_motion,
     judge_approach,
 )
-from locatk.core.landmarks.simulation.floor import lay
+from locatk.core.landmarks.simulation.floor import install_landmarks
 from locatk.core.landmarks.simulation.instruments import Instruments, Measurements
 from locatk.core.landmarks.simulation.options import NONE, Errors, Faults, SimulationOptions
-from locatk.core.landmarks.simulation.passes import EPOCH_NS
 from locatk.core.landmarks.simulation.robot import Robot
 from locatk.core.landmarks.simulation.sensors import odometry, odometry_biases
 from locatk.core.landmarks.simulation.session import simulate
+from locatk.core.simulation import SESSION_START_NS
 
 FLOOR = FloorMap(np.array([[7, 4, 9], [2, 11, 13]]))
 OPTIONS = SimulationOptions("published", rate_hz=100.0, seed=4)
@@ -91,7 +91,7 @@ def test_readouts_on_the_way_are_the_start_of_the_session() -> None:
 
 
 def test_readouts_in_parts_are_the_readout_of_the_whole() -> None:
-    landmarks = lay(FLOOR, OPTIONS.errors, Faults(), 4)
+    landmarks = install_landmarks(FLOOR, OPTIONS.errors, Faults(), 4)
     whole, parts = (Instruments(FLOOR, landmarks, HallSensors(), 0.012, OPTIONS) for _ in range(2))
     robot = Robot(np.array([-0.1, 0.0, 0.2]))
     for motion in SCRIPT:
@@ -138,11 +138,11 @@ def test_the_strategy_needs_a_driver_and_no_slips() -> None:
 
 @pytest.mark.parametrize("quarters", range(4))
 def test_an_approach_is_judged_in_the_frame_of_the_report(quarters: int) -> None:
-    landmarks = lay(FLOOR, NONE, Faults(), 0)
+    landmarks = install_landmarks(FLOOR, NONE, Faults(), 0)
     true_pose = np.array([0.202, 0.001, quarters * math.pi / 2 + 0.1])
     robot = Robot(true_pose)
     code = int(rotated(FLOOR.codes[0, 1], -quarters))
-    time_ns = EPOCH_NS + 10**9
+    time_ns = SESSION_START_NS + 10**9
     report = ApproachReport(time_ns, True, 2, code, np.array([0.002, 0.001, 0.1]))
     approach = judge_approach(report, robot, landmarks)
     assert (approach.outcome, approach.cell, approach.spins) == ("centre", (0, 1), 2)
@@ -160,9 +160,9 @@ def test_an_approach_is_judged_in_the_frame_of_the_report(quarters: int) -> None
 
 def test_flipped_bars_count_as_they_are_and_missing_ones_as_designed() -> None:
     faults = Faults(flipped=(((0, 1), 2),), missing=(((0, 1), 0),))
-    landmarks = lay(FLOOR, NONE, faults, 0)
+    landmarks = install_landmarks(FLOOR, NONE, faults, 0)
     report = ApproachReport(
-        EPOCH_NS, True, 1, int(FLOOR.codes[0, 1]) ^ 0b100, np.array([0.0, 0.0, 0.0])
+        SESSION_START_NS, True, 1, int(FLOOR.codes[0, 1]) ^ 0b100, np.array([0.0, 0.0, 0.0])
     )
     approach = judge_approach(report, Robot(np.array([0.2, 0.0, 0.0])), landmarks)
     assert approach.outcome == "centre"

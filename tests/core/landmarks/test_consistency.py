@@ -57,8 +57,8 @@ def test_sensor_of_opposite_sign(sensor: int) -> None:
 @pytest.mark.slow
 def test_displaced_landmark_is_reported() -> None:
     one = drive(faults=Faults(displaced=(((3, 5), (0.012, 0.0)),)))
-    found = solved(one)
-    messages = [each.message for each in found.warnings if each.code == "landmark_displaced"]
+    result = solved(one)
+    messages = [each.message for each in result.warnings if each.code == "landmark_displaced"]
     assert len(messages) == 1
     assert "landmark at 3,5 is displaced" in messages[0]
 
@@ -69,9 +69,9 @@ def test_contradicted_map_is_rejected(wrong: int, accepted: bool) -> None:
     codes = CODES.copy()
     for cell in CELLS[1::2][:wrong]:
         codes[cell] = (codes[cell] + 5) % 16
-    found = solved(drive(), FloorMap(codes))
-    assert bool(found.trajectories) == accepted
-    assert ("map_contradicted" in [each.code for each in found.warnings]) != accepted
+    result = solved(drive(), FloorMap(codes))
+    assert bool(result.trajectories) == accepted
+    assert ("map_contradicted" in [each.code for each in result.warnings]) != accepted
 
 
 @pytest.mark.parametrize(
@@ -137,5 +137,5 @@ def test_displaced_landmarks_are_found(count: int, sigmas: float, displaced: boo
     estimates = {cell: LandmarkEstimate(np.zeros(3), np.ones(4), np.eye(7)) for cell in cells}
     shift = np.array([0.0, -sigmas * 1e-3, 0.0])
     estimates[2, 0] = replace(estimates[2, 0], pose=shift)
-    found = consistency.find_displaced_landmarks(priors, SmoothingResult([], estimates, 1.0))
-    assert found == ({(2, 0): pytest.approx(sigmas * 1e-3)} if displaced else {})
+    result = consistency.find_displaced_landmarks(priors, SmoothingResult([], estimates, 1.0))
+    assert result == ({(2, 0): pytest.approx(sigmas * 1e-3)} if displaced else {})

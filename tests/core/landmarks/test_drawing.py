@@ -22,7 +22,7 @@ from locatk.core.landmarks.drawing.plan import round_scale
 from locatk.core.landmarks.drawing.templates import cells_by_code, cells_text
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, name, rotated
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 
 OTHER = Geometry(bar_length_m=0.02, bar_width_m=0.004, radius_m=0.0315, sensor_height_m=0.01)
 
@@ -74,7 +74,7 @@ def test_a_rotated_landmark_is_the_rotated_drawing(quarters: int) -> None:
             np.testing.assert_allclose(other.north, rotation @ bar.north, atol=1e-9)
 
 
-def places(mark: Mark) -> list[tuple[float, float]]:
+def positions(mark: Mark) -> list[tuple[float, float]]:
     if isinstance(mark, Line):
         return [mark.start, mark.end]
     if isinstance(mark, Polygon):
@@ -88,7 +88,7 @@ def places(mark: Mark) -> list[tuple[float, float]]:
 @pytest.mark.parametrize("geometry", [Geometry(), OTHER])
 def test_a_drawing_stays_within_its_half_side(geometry: Geometry) -> None:
     marks = draw_landmark(geometry, 0b1001, (500.0, 300.0), ("code 9", "NSSN"))
-    away = np.array([place for mark in marks for place in places(mark)]) - [500, 300]
+    away = np.array([position for mark in marks for position in positions(mark)]) - [500, 300]
     assert bars_half_side(geometry) < np.abs(away).max() <= drawing_half_side(geometry)
 
 
@@ -116,23 +116,23 @@ def floor(codes: list[list[int]], **more: object) -> FloorMap:
 
 
 def test_floors_that_cannot_be_built_are_rejected() -> None:
-    good = floor([[1, 2], [3, HOLE]], pitch_m=0.06)
+    good = floor([[1, 2], [3, HOLE_CODE]], pitch_m=0.06)
     check_buildable(good)
     with pytest.raises(InputError, match="overlap at a pitch of 59 mm"):
         check_buildable(replace(good, pitch_m=0.059))
     with pytest.raises(InputError, match="overlap at the landmark's corners"):
         check_buildable(replace(good, pitch_m=0.2, geometry=Geometry(bar_length_m=0.041)))
     with pytest.raises(InputError, match="no landmark"):
-        check_buildable(floor([[HOLE]]))
+        check_buildable(floor([[HOLE_CODE]]))
 
 
 def test_cells_are_listed_in_short() -> None:
-    laid = floor([[3, 5, 3], [5, HOLE, 5]])
-    cells = cells_by_code(laid)
+    floor_map = floor([[3, 5, 3], [5, HOLE_CODE, 5]])
+    cells = cells_by_code(floor_map)
     assert list(cells) == [3, 5]
     assert cells_text(cells[3]) == "row 0: 0, 2"
     assert cells_text(cells[5]) == "row 0: 1; row 1: 0, 2"
-    assert sum(map(len, cells.values())) == len(laid.cells())
+    assert sum(map(len, cells.values())) == len(floor_map.cells())
 
 
 @pytest.mark.parametrize("least", [0.5, 1.0, 4.49, 7.1, 9.2, 26.1, 100.0, 2001.0])

@@ -30,14 +30,14 @@ def peer(geometry: Geometry, strengths: np.ndarray, points: np.ndarray) -> np.nd
     """Whole field (n, 3) of four cuboids by magpylib, each placed and turned by itself."""
     total = np.zeros((len(points), 3))
     for k, strength in enumerate(strengths):
-        turn = math.pi / 2 * k
+        rotation = math.pi / 2 * k
         bar = magpylib.magnet.Cuboid(
             # magnetised counter-clockwise: along +y where the bar lies on the right
             polarization=(0, geometry.remanence_t * strength, 0),
             dimension=(geometry.bar_width_m, geometry.bar_length_m, geometry.bar_height_m),
             position=(geometry.radius_m, 0, -geometry.bar_height_m / 2),
         )
-        bar.rotate_from_angax(turn, "z", anchor=0, degrees=False)
+        bar.rotate_from_angax(rotation, "z", anchor=0, degrees=False)
         total += bar.getB(points)
     return total
 
@@ -54,10 +54,10 @@ def scattered(geometry: Geometry, seed: int, count: int = 3000) -> np.ndarray:
 @pytest.mark.parametrize("geometry", GEOMETRIES)
 def test_each_bar_is_magpylibs(geometry: Geometry) -> None:
     points = scattered(geometry, 2)
-    found = basis(geometry, points[:, :2], points[:, 2])
+    result = basis(geometry, points[:, :2], points[:, 2])
     for k in range(4):
         expected = peer(geometry, np.eye(4)[k], points)
-        error = np.abs(found[:, k] - expected[:, 2])
+        error = np.abs(result[:, k] - expected[:, 2])
         size = np.linalg.norm(expected, axis=1)
         strong = size > 5e-4
         assert strong.sum() > 1000
@@ -74,9 +74,9 @@ def test_landmarks_are_magpylibs(geometry: Geometry) -> None:
     single = np.abs(basis(geometry, points[:, :2], points[:, 2])).max(axis=1)
     for code in range(16):
         expected = peer(geometry, signs(code), points)
-        found = landmark_field(geometry, code, points[:, :2], points[:, 2])
+        result = landmark_field(geometry, code, points[:, :2], points[:, 2])
         size = np.maximum(np.linalg.norm(expected, axis=1), single)
-        error = np.abs(found - expected[:, 2])
+        error = np.abs(result - expected[:, 2])
         strong = size > 1e-3
         assert (error[strong] <= 1e-12 * size[strong]).all()
         assert (error <= 1e-12 * size + 6e-15 * geometry.remanence_t).all()
@@ -87,16 +87,16 @@ def test_beside_and_below_too() -> None:
     geometry = GEOMETRIES[0]
     points = np.array([[0.045, 0.004, -0.002], [0.002, 0.001, -0.003], [0.03, 0.012, -0.02]])
     expected = peer(geometry, signs(0b0111), points)
-    found = landmark_field(geometry, 0b0111, points[:, :2], points[:, 2])
-    np.testing.assert_allclose(found, expected[:, 2], rtol=1e-11)
+    result = landmark_field(geometry, 0b0111, points[:, :2], points[:, 2])
+    np.testing.assert_allclose(result, expected[:, 2], rtol=1e-11)
 
 
 def test_a_turned_landmark_has_a_turned_field() -> None:
     geometry = GEOMETRIES[0]
     points = scattered(geometry, 3)[:200]
     field = basis(geometry, points[:, :2], points[:, 2])
-    turned = points[:, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # by 90 degrees
-    after = basis(geometry, turned, points[:, 2])
+    rotated = points[:, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # by 90 degrees
+    after = basis(geometry, rotated, points[:, 2])
     np.testing.assert_allclose(after, np.roll(field, 1, axis=1), rtol=0, atol=1e-15)
 
 
@@ -134,7 +134,7 @@ def test_gradient_is_magpylibs() -> None:
     slopes = basis_gradient(geometry, points[:, :2], points[:, 2])[1]
     total = np.einsum("nki,k->ni", slopes, signs(0b0011))
     up = np.array([0, 0, 1e-5])
-    above, below = (peer(geometry, signs(0b0011), points + way * up) for way in (1, -1))
+    above, below = (peer(geometry, signs(0b0011), points + path * up) for path in (1, -1))
     expected = (above - below) / 2e-5
     np.testing.assert_allclose(total, expected, atol=1e-4 * np.abs(expected).max())
 
@@ -177,19 +177,19 @@ def test_far_away_it_is_a_dipole() -> None:
         assert basis(g, point[:2], point[2])[0] == pytest.approx(dipole, rel=tolerance)
 
 
-def test_far_fields_of_the_facts() -> None:
-    """Microtesla by distance for J = 1.2 T (facts/landmarks.md 2.3)."""
+def test_far_fields_equal_the_reference() -> None:
+    """Largest fields [uT] by distance at 1.2 T, computed with a prototype equal to magpylib."""
     phi = np.radians(np.arange(720) / 2)
-    told = {
+    reference_ut = {
         0b0101: {0.06: 2327, 0.08: 527, 0.115: 82, 0.15: 21, 0.2: 5},
         0b0111: {0.06: 2481, 0.08: 600, 0.115: 107, 0.15: 32, 0.2: 9},
         0b1111: {0.06: 628, 0.08: 85, 0.115: 7, 0.15: 1, 0.2: 0.1},
     }
-    for code, by_distance in told.items():
+    for code, by_distance in reference_ut.items():
         for radius, expected in by_distance.items():
             circle = radius * np.column_stack([np.cos(phi), np.sin(phi)])
-            found = 1e6 * np.abs(landmark_field(Geometry(), code, circle)).max()
-            assert found == pytest.approx(expected, rel=0.01, abs=0.6 if expected > 0.5 else 0.06)
+            result = 1e6 * np.abs(landmark_field(Geometry(), code, circle)).max()
+            assert result == pytest.approx(expected, rel=0.01, abs=0.6 if expected > 0.5 else 0.06)
 
 
 @settings(max_examples=40, deadline=None)
@@ -198,11 +198,11 @@ def test_far_fields_of_the_facts() -> None:
     st.floats(0.005, 0.05),
     st.floats(0.002, 0.02),
 )
-def test_twins_agree(place: tuple[float, ...], length: float, width: float) -> None:
+def test_twins_agree(position: tuple[float, ...], length: float, width: float) -> None:
     if kernels is None:
         pytest.skip("no compiled twin here")
     g = replace(Geometry(), bar_length_m=length, bar_width_m=width, radius_m=0.035)
-    at = np.array([place])
+    at = np.array([position])
     field, slope = basis_gradient(g, at[:, :2], at[:, 2])
     other, its_slope = bars.evaluate_numpy(g, at, gradient=True)
     np.testing.assert_allclose(field, other, rtol=1e-9, atol=1e-13)
@@ -228,10 +228,10 @@ def test_without_the_compiled_twin_all_is_the_same() -> None:
         env={**os.environ, "LOCATK_NUMPY": "1"},
         check=True,
     )
-    told = np.frombuffer(done.stdout).reshape(-1, 4, 4)
+    reported = np.frombuffer(done.stdout).reshape(-1, 4, 4)
     field, slope = basis_gradient(GEOMETRIES[0], points[:, :2], points[:, 2])
-    np.testing.assert_allclose(field, told[..., 0], rtol=1e-9, atol=1e-14)
-    np.testing.assert_allclose(slope, told[..., 1:], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(field, reported[..., 0], rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(slope, reported[..., 1:], rtol=1e-9, atol=1e-11)
 
 
 def test_shapes_broadcast() -> None:

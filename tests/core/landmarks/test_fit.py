@@ -94,8 +94,10 @@ def trace() -> Trace:
 
 
 def problem_of(trace: Trace, *strengths: Array) -> VisitFitProblem:
-    laid = np.array(strengths)
-    return VisitFitProblem(trace, GEOMETRY, ModelPriors(), laid, np.full(laid.shape, 0.04))
+    installed = np.array(strengths)
+    return VisitFitProblem(
+        trace, GEOMETRY, ModelPriors(), installed, np.full(installed.shape, 0.04)
+    )
 
 
 def differences(problem: VisitFitProblem, at: Array) -> tuple[Array, Array]:
@@ -189,15 +191,15 @@ def test_log_evidence_is_the_integral_of_the_posterior() -> None:
     """Laplace's approximation is exact for a problem that is linear in its unknowns."""
     # y = a u + noise with u from N(0, 1): y comes from N(0, s^2 + a^2).
     y, s = 1.7, 0.5
-    found, want = [], []
+    result, want = [], []
     for a in (0.3, 2.0):
         u = a * y / (s**2 + a**2)
         cost = ((y - a * u) / s) ** 2 / 2 + u**2 / 2
         matrix = np.array([[[1 + (a / s) ** 2]]])
         fitted = VisitFits(np.array([[u]]), np.array([cost]), matrix)
-        found.append(float(fitted.log_evidence()[0]))
+        result.append(float(fitted.log_evidence()[0]))
         want.append(stats.norm.logpdf(y, scale=math.hypot(s, a)))
-    assert found[1] - found[0] == pytest.approx(want[1] - want[0], rel=1e-12)
+    assert result[1] - result[0] == pytest.approx(want[1] - want[0], rel=1e-12)
 
 
 def test_cost_does_not_depend_on_the_frame(trace: Trace) -> None:

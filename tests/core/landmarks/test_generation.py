@@ -14,7 +14,7 @@ from locatk.core.landmarks.design import search
 from locatk.core.landmarks.design.generation import DesignOptions, design_map
 from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import Geometry
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES, passable_steps, place_windows
 
 MODES = [
@@ -51,8 +51,8 @@ def test_maps_hold_what_they_promise(mode: Any, walked: Callable[[FloorMap], Any
     assert floor.shape == mode[:2]
     assert set(np.unique(floor.codes)) <= set(ALPHABET_CODES[mode[2]])
     assert prove_map(floor, steps=False).holds
-    for place in range(len(words[0]) if words and mode[4] else 0):
-        rest = {word[:place] + word[place + 1 :] for word in words}
+    for position in range(len(words[0]) if words and mode[4] else 0):
+        rest = {word[:position] + word[position + 1 :] for word in words}
         assert len(rest) == len(words)
 
 
@@ -75,8 +75,8 @@ def test_sizes_of_the_facts_are_found(mode: Any) -> None:
 
 
 def test_same_seed_same_map() -> None:
-    wanted = options(12, 9, "16", "L", 0)
-    maps = [design_map(replace(wanted, seed=seed)) for seed in (0, 0, 1, -5, 2**40)]
+    expected = options(12, 9, "16", "L", 0)
+    maps = [design_map(replace(expected, seed=seed)) for seed in (0, 0, 1, -5, 2**40)]
     assert (maps[0].codes == maps[1].codes).all()
     assert all((maps[0].codes != other.codes).mean() > 0.5 for other in maps[2:])
     assert [floor.seed for floor in maps] == [0, 0, 1, -5, 2**40]
@@ -86,11 +86,11 @@ def test_what_was_asked_for_is_on_the_map() -> None:
     geometry = Geometry(bar_length_m=0.02)
     forbidden = frozenset({(0, 0), (3, 4), (2, 2)})
     walls = frozenset({((1, 1), (1, 2)), ((5, 3), (4, 3))})
-    wanted = DesignOptions(
+    expected = DesignOptions(
         6, 7, alphabet="6", pitch_m=0.25, forbidden=forbidden, walls=walls, geometry=geometry
     )
-    floor = design_map(wanted)
-    assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE).tolist()} == forbidden
+    floor = design_map(expected)
+    assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE_CODE).tolist()} == forbidden
     assert floor.walls == {((1, 1), (1, 2)), ((4, 3), (5, 3))}
     assert (floor.pitch_m, floor.geometry, floor.window) == (0.25, geometry, "L")
     assert prove_map(floor).is_unique
@@ -103,16 +103,16 @@ def test_more_than_the_bound_is_refused() -> None:
 
 def test_a_spent_budget_says_what_is_left() -> None:
     """34 x 34 less one is within the bound, and none is known."""
-    seen: list[tuple[float, int]] = []
+    observed: list[tuple[float, int]] = []
     options = DesignOptions(32, 32, evaluations=100_000)
     message = r"at best \d+ of 3844 words of its readings repeat"
     with pytest.raises(DegenerateError, match=message) as error:
-        design_map(options, lambda *report: seen.append(report))
+        design_map(options, lambda *report: observed.append(report))
     assert "seed" in str(error.value.hint)
-    shares = [share for share, _ in seen]
+    shares = [share for share, _ in observed]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    assert all(left > 0 for _, left in seen)
+    assert all(left > 0 for _, left in observed)
 
 
 @pytest.mark.parametrize(

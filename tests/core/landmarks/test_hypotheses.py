@@ -39,7 +39,7 @@ from locatk.core.landmarks.preprocessing import (
     segment_visits,
 )
 from locatk.core.landmarks.simulation.options import NONE
-from locatk.core.landmarks.simulation.passes import Pass, passes
+from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ GEOMETRY = Geometry()
 
 
 @dataclass(frozen=True)
-class Read:
+class PassReading:
     """One pass: fits, and true code and error."""
 
     trace: Trace
@@ -57,7 +57,7 @@ class Read:
     covariance: Array
 
 
-def read(one: Pass, geometry: Geometry = GEOMETRY) -> Read | None:
+def read_pass(one: SinglePass, geometry: Geometry = GEOMETRY) -> PassReading | None:
     run = preprocess(one.samples, one.odometry)
     priors = ModelPriors(noise_t=run.noise_t)
     visits = segment_visits(run, geometry, priors.drift)
@@ -67,30 +67,30 @@ def read(one: Pass, geometry: Geometry = GEOMETRY) -> Read | None:
     found = fit_landmarks(visit.trace, geometry, priors)
     if not found:
         return None
-    seen, covariance = robot_pose(visit.trace, found[0], visit.trace.reference)
+    observed, covariance = robot_pose(visit.trace, found[0], visit.trace.reference)
     since = one.truth.time_ns - visit.time_ns[visit.trace.reference]
     heading = np.unwrap(heading_from_quaternion(one.truth.quaternion))
-    x, y, turned = (
+    x, y, rotated_one = (
         np.interp(0, since, column) for column in (*one.truth.position[:, :2].T, heading)
     )
     # The frame of the fit is the landmark's up to quarter turns.
-    quarters = round((turned - seen[2]) / (math.pi / 2))
-    turn = quarters * math.pi / 2
-    c, s = math.cos(turn), math.sin(turn)
-    error = seen - [c * x + s * y, c * y - s * x, turned - turn]
-    return Read(visit.trace, found, int(rotated(one.code, -quarters)), error, covariance)
+    quarters = round((rotated_one - observed[2]) / (math.pi / 2))
+    rotation = quarters * math.pi / 2
+    c, s = math.cos(rotation), math.sin(rotation)
+    error = observed - [c * x + s * y, c * y - s * x, rotated_one - rotation]
+    return PassReading(visit.trace, found, int(rotated(one.code, -quarters)), error, covariance)
 
 
 @functools.cache
-def nominal() -> list[Read]:
-    several = [read(one) for one in passes(60, seed=21)]
+def nominal() -> list[PassReading]:
+    several = [read_pass(one) for one in simulate_passes(60, seed=21)]
     return [one for one in several if one is not None]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", range(16))
 def test_codes_of_traces_without_errors(code: int) -> None:
-    one = read(passes(1, code, errors=NONE, seed=5, start=(0.7 * code, 0.1))[0])
+    one = read_pass(simulate_passes(1, code, errors=NONE, seed=5, start=(0.7 * code, 0.1))[0])
     assert one is not None
     assert one.found[0].code == one.right
     assert one.found[0].probability > 0.99
@@ -132,16 +132,16 @@ def test_covariances_agree_with_the_errors() -> None:
 @pytest.mark.slow
 def test_weak_magnets_are_not_misread_with_certainty() -> None:
     weak = Geometry(remanence_t=0.4, threshold_t=1.1e-3)
-    for one in passes(15, geometry=weak, seed=22):
-        got = read(one, weak)
+    for one in simulate_passes(15, geometry=weak, seed=22):
+        got = read_pass(one, weak)
         if got is not None and got.found[0].probability > 0.99:
             assert got.found[0].code == got.right
 
 
 @pytest.mark.slow
 def test_spin_determines_code_and_pose() -> None:
-    for one in passes(8, then="spin", seed=23):
-        got = read(one)
+    for one in simulate_passes(8, then="spin", seed=23):
+        got = read_pass(one)
         assert got is not None
         assert got.found[0].code == got.right
         assert got.found[0].probability > 0.98
@@ -149,8 +149,8 @@ def test_spin_determines_code_and_pose() -> None:
 
 
 def test_missing_bar_leaves_both_codes() -> None:
-    one = passes(1, 0b0111, then="spin", errors=NONE, seed=3)[0]
-    whole = read(one)
+    one = simulate_passes(1, 0b0111, then="spin", errors=NONE, seed=3)[0]
+    whole = read_pass(one)
     assert whole is not None
     bar = next(k for k in range(4) if whole.found[0].strength[k] < 0)
     without_bar = replace(
@@ -170,14 +170,14 @@ def test_rotated_frames_give_equal_fields(toward: float) -> None:
     rng = np.random.default_rng(1)
     parameters = rng.uniform(-3, 3, (20, 5))
     strength = rng.choice([-1.0, 0.0, 1.0], (20, 4))
-    bars, turned = _rotate_frames(strength, parameters, toward)
-    assert np.abs(turned[:, 2] - toward).max() <= math.pi / 4 + 1e-12
-    assert (turned[:, [0, 1, 3, 4]] == parameters[:, [0, 1, 3, 4]]).all()
+    bars, rotated_one = _rotate_frames(strength, parameters, toward)
+    assert np.abs(rotated_one[:, 2] - toward).max() <= math.pi / 4 + 1e-12
+    assert (rotated_one[:, [0, 1, 3, 4]] == parameters[:, [0, 1, 3, 4]]).all()
     points = rng.uniform(-0.05, 0.05, (7, 2))
     for k in range(20):
         fields = [
-            basis(GEOMETRY, in_frame(angle, points)) @ laid
-            for angle, laid in ((parameters[k, 2], strength[k]), (turned[k, 2], bars[k]))
+            basis(GEOMETRY, in_frame(angle, points)) @ installed
+            for angle, installed in ((parameters[k, 2], strength[k]), (rotated_one[k, 2], bars[k]))
         ]
         assert fields[0] == pytest.approx(fields[1], abs=1e-12)
 
@@ -188,7 +188,7 @@ def in_frame(angle: float, points: Array) -> Array:
     return points @ np.array([[c, -s], [s, c]])
 
 
-def field_of_bar(one: Read, bar: int) -> Array:
+def field_of_bar(one: PassReading, bar: int) -> Array:
     """What one bar adds to a trace, laid as it was read."""
     mark = one.found[0].parameters[:3]
     local = in_frame(mark[2], one.trace.sensor_positions() - mark[:2])
@@ -201,7 +201,7 @@ def test_pose_at_known_landmark_at_rest() -> None:
     Under some headings, with a sensor over no bar, the heading shows little.
     """
     sizes, squares = [], []
-    for one in passes(12, 0b0111, then="stand", aim_m=0.002, seed=24):
+    for one in simulate_passes(12, 0b0111, then="stand", aim_m=0.002, seed=24):
         run = preprocess(one.samples, one.odometry)
         still = slice(len(run.samples) - 20, None)
         value = (run.samples.field_t - run.offset_t)[still].mean(axis=0)[None]
@@ -214,17 +214,17 @@ def test_pose_at_known_landmark_at_rest() -> None:
             0,
         )
         quarters = round(one.end[2] / (math.pi / 2))
-        turn = quarters * math.pi / 2
-        c, s = math.cos(turn), math.sin(turn)
+        rotation = quarters * math.pi / 2
+        c, s = math.cos(rotation), math.sin(rotation)
         x, y, heading = one.end
-        true = np.array([c * x + s * y, c * y - s * x, heading - turn])
+        true = np.array([c * x + s * y, c * y - s * x, heading - rotation])
         near = true + [0.004, -0.003, 0.08]
-        laid = signs(rotated(0b0111, -quarters))
-        seen, spread = estimate_pose_at_known_landmark(
-            trace, GEOMETRY, ModelPriors(noise_t=run.noise_t), laid, near
+        installed = signs(rotated(0b0111, -quarters))
+        observed, spread = estimate_pose_at_known_landmark(
+            trace, GEOMETRY, ModelPriors(noise_t=run.noise_t), installed, near
         )
-        sizes.append(np.hypot(*(seen - true)[:2]))
-        squares.append((seen - true) @ np.linalg.solve(spread, seen - true))
+        sizes.append(np.hypot(*(observed - true)[:2]))
+        squares.append((observed - true) @ np.linalg.solve(spread, observed - true))
     assert np.mean(sizes) < 1e-3
     assert 0.5 < np.mean(squares) < 5
 

@@ -65,11 +65,11 @@ def test_sixteen_orientations_of_six_patterns() -> None:
     orientations = [
         {int(code) for code in rotated(code_of(letters), np.arange(4))} for letters in PATTERNS
     ]
-    assert [len(found) for found in orientations] == [2, 4, 4, 4, 1, 1]
+    assert [len(result) for result in orientations] == [2, 4, 4, 4, 1, 1]
     assert set().union(*orientations) == set(range(CODE_COUNT))
-    for number, found in enumerate(orientations, 1):
-        assert {int(PATTERN_OF[code]) for code in found} == {number}
-        assert {pattern(code) for code in found} == {PATTERNS[number - 1]}
+    for number, result in enumerate(orientations, 1):
+        assert {int(PATTERN_OF[code]) for code in result} == {number}
+        assert {pattern(code) for code in result} == {PATTERNS[number - 1]}
 
 
 def test_a_turned_code_is_a_turned_field() -> None:
@@ -77,8 +77,8 @@ def test_a_turned_code_is_a_turned_field() -> None:
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (50, 2))
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
     for code in range(CODE_COUNT):
-        laid = landmark_field(Geometry(), code, points)
+        installed = landmark_field(Geometry(), code, points)
         for q in range(4):
-            seen = points @ np.linalg.matrix_power(quarter, q)  # rows: turned back by q
-            read = landmark_field(Geometry(), int(rotated(code, -q)), seen)
-            np.testing.assert_allclose(read, laid, atol=1e-15)
+            observed = points @ np.linalg.matrix_power(quarter, q)  # rows: turned back by q
+            read = landmark_field(Geometry(), int(rotated(code, -q)), observed)
+            np.testing.assert_allclose(read, installed, atol=1e-15)

@@ -40,14 +40,14 @@ class Robot:
         return int(rotated(code, -self.heading))
 
     def step(self) -> None:
-        turns = TURNS[self.floor.window]
-        for tried, turn in enumerate((turns[self.phase], 0, 1, -1, 2)):
-            if self.floor.open(self.cell, self.heading + turn):
-                self.heading = (self.heading + turn) % 4
+        rotations = TURNS[self.floor.window]
+        for tried, rotation in enumerate((rotations[self.phase], 0, 1, -1, 2)):
+            if self.floor.is_passable(self.cell, self.heading + rotation):
+                self.heading = (self.heading + rotation) % 4
                 step = STEPS[self.heading]
                 self.cell = (self.cell[0] + step[0], self.cell[1] + step[1])
-                self.phase = 0 if tried else (self.phase + 1) % len(turns)
-                self.log.append((turn % 4, self.letter()))
+                self.phase = 0 if tried else (self.phase + 1) % len(rotations)
+                self.log.append((rotation % 4, self.letter()))
                 return
         self.phase = 0
         self.log.append((9, self.letter()))
@@ -62,26 +62,26 @@ def test_as_robots_with_lists(seed: int, random_floor: Callable[[int], FloorMap]
     starts = dict.fromkeys(robots, 0)
     for steps in range(1, 60):
         logs = [tuple(robot.log) for robot in robots.values()]
-        for place, robot in robots.items():
-            if not starts[place] and logs.count(tuple(robot.log)) == 1:
-                starts[place] = steps
+        for position, robot in robots.items():
+            if not starts[position] and logs.count(tuple(robot.log)) == 1:
+                starts[position] = steps
         if all(starts.values()):
             break
         for robot in robots.values():
             robot.step()
-    for place, wanted in starts.items():
-        got = int(result.landmarks[*place[0], place[1]])
-        if wanted:
-            assert got == wanted
+    for position, expected in starts.items():
+        got = int(result.landmarks[*position[0], position[1]])
+        if expected:
+            assert got == expected
         else:
             assert got == NEVER_LOCALIZED or got >= 60
     assert (result.landmarks[floor.codes == -1] == 0).all()
-    told = [n for n in starts.values() if n]
-    assert result.never + len(told) == len(starts) or not all(starts.values())
-    if told and result.never + len(told) == len(starts):
-        assert result.worst == max(told)
-        assert result.mean == pytest.approx(np.mean(told))
-        assert all(starts[place] == max(told) for place in result.worst_starts)
+    reported = [n for n in starts.values() if n]
+    assert result.never + len(reported) == len(starts) or not all(starts.values())
+    if reported and result.never + len(reported) == len(starts):
+        assert result.worst == max(reported)
+        assert result.mean == pytest.approx(np.mean(reported))
+        assert all(starts[position] == max(reported) for position in result.worst_starts)
 
 
 @pytest.mark.parametrize("window", WINDOWS)

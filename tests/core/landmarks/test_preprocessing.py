@@ -50,8 +50,8 @@ def recorded(field: Array) -> HallSamples:
 def waves() -> Array:
     """Return fields of 25 mT whose peaks are about 14 samples wide, as of fast robots."""
     rng = np.random.default_rng(2)
-    turn = np.linspace(0, 60, 400)[:, None] + np.arange(4)
-    return np.asarray(0.025 * np.sin(turn) + rng.normal(0, 1.5e-4, turn.shape))
+    rotation = np.linspace(0, 60, 400)[:, None] + np.arange(4)
+    return np.asarray(0.025 * np.sin(rotation) + rng.normal(0, 1.5e-4, rotation.shape))
 
 
 def test_spikes_are_removed_and_counted() -> None:
@@ -85,10 +85,10 @@ def test_unknown_range_is_detected() -> None:
 @functools.cache
 def session(pitch_m: float = 0.2, noise_t: float = 1.5e-4) -> SimulatedSession:
     floor = FloorMap(CODES, pitch_m=pitch_m)
-    way = ((1, 1), (1, 4), (3, 4))
+    path = ((1, 1), (1, 4), (3, 4))
     errors = Errors(noise_t=noise_t, offset_t=2e-4)
     return simulate(
-        floor, SimulationOptions(strategy="path", cells=way, errors=errors, rate_hz=60, seed=4)
+        floor, SimulationOptions(strategy="path", cells=path, errors=errors, rate_hz=60, seed=4)
     )
 
 
@@ -103,12 +103,12 @@ def test_one_visit_per_landmark(pitch_m: float, noise_t: float) -> None:
     one = session(pitch_m, noise_t)
     want = [(1, 1), (1, 2), (1, 3), (1, 4), (2, 4), (3, 4)]
     assert [event.cell for event in one.events] == want
-    found = visits_of(one)
-    assert len(found) == len(want)
-    for visit, event in zip(found, one.events, strict=True):
+    result = visits_of(one)
+    assert len(result) == len(want)
+    for visit, event in zip(result, one.events, strict=True):
         assert one.samples[0].time_ns[visit.first] <= event.nearest_ns
         assert one.samples[0].time_ns[visit.stop - 1] >= event.nearest_ns
-    for before, after in pairwise(found):
+    for before, after in pairwise(result):
         assert before.stop <= after.first
 
 
@@ -118,7 +118,7 @@ def test_reference_is_near_the_landmark() -> None:
     # The first and the last one are left or reached at rest on the landmark.
     for visit, event in list(zip(visits_of(one), one.events, strict=True))[1:-1]:
         at = np.searchsorted(truth.time_ns, visit.time_ns[visit.trace.reference])
-        away = np.hypot(*(truth.position[at, :2] - one.floor.place(event.cell)))
+        away = np.hypot(*(truth.position[at, :2] - one.floor.position(event.cell)))
         assert away < event.nearest_m + 0.025
 
 
@@ -128,8 +128,8 @@ def test_bins_are_means_of_their_samples() -> None:
     for visit in visits_of(one):
         assert visit.trace.weight.sum() == visit.stop - visit.first
         own = (run.samples.field_t - run.offset_t)[visit.first : visit.stop].sum(axis=0)
-        told = visit.trace.weight @ visit.trace.field_t
-        np.testing.assert_allclose(told, own, rtol=1e-9, atol=1e-12)
+        reported = visit.trace.weight @ visit.trace.field_t
+        np.testing.assert_allclose(reported, own, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(visit.trace.pose[visit.trace.reference], 0, atol=1e-12)
 
 
@@ -148,7 +148,7 @@ def test_offsets_and_noise_are_estimated() -> None:
     run = preprocess(silent, one.odometry[0])
     assert run.noise_t == pytest.approx(1.5e-4, rel=0.25)
     away = np.hypot(
-        *(one.truth[0].position[:, None, :2] - [one.floor.place(c) for c in one.floor.cells()]).T
+        *(one.truth[0].position[:, None, :2] - [one.floor.position(c) for c in one.floor.cells()]).T
     ).min(axis=0)
     quiet = one.samples[0].field_t[away > 0.13]
     if len(quiet) > 50:

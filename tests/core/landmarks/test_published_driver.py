@@ -232,13 +232,13 @@ def test_a_centre_far_from_the_spin_is_not_trusted(monkeypatch: pytest.MonkeyPat
 @pytest.fixture(scope="module")
 def sessions() -> list[SimulatedSession]:
     """First approaches of some robots."""
-    made = []
+    generated = []
     for seed in range(10):
         options = SimulationOptions("published", landmarks=1, rate_hz=100.0, seed=seed)
         driver = published_driver(FLOOR, options)
         driver.max_approaches = 1
-        made.append(simulate(FLOOR, options, driver))
-    return made
+        generated.append(simulate(FLOOR, options, driver))
+    return generated
 
 
 @pytest.mark.slow

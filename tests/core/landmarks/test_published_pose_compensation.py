@@ -56,8 +56,8 @@ def test_the_linear_way_is_good_near_the_centre_and_newton_exact(code: int) -> N
 def test_three_sensors_are_enough_and_two_are_not() -> None:
     field = voltages(0b0111, 0.002, -0.001, 0.03)
     field[2] = np.nan
-    found = compensate_pose(GEOMETRY, 0b0111, circle(), field, steps=5)
-    assert np.allclose(found, [0.002, -0.001, 0.03], atol=1e-9)
+    result = compensate_pose(GEOMETRY, 0b0111, circle(), field, steps=5)
+    assert np.allclose(result, [0.002, -0.001, 0.03], atol=1e-9)
     field[0] = np.nan
     with pytest.raises(DegenerateError, match="2 sensors"):
         compensate_pose(GEOMETRY, 0b0111, circle(), field)
@@ -72,9 +72,9 @@ def test_sensors_in_one_place_tell_no_pose() -> None:
 @given(st.floats(-20, 20), st.floats(-math.pi, math.pi))
 def test_the_turn_to_the_bars_is_the_least(heading: float, first: float) -> None:
     bars = first + np.radians([0, 90, 180, 270])
-    turn = rotation_to_bars(heading, bars)
-    assert abs(turn) <= math.pi / 4 + 1e-9
-    assert np.isclose(np.cos(4 * (heading + turn - first)), 1.0)
+    rotation = rotation_to_bars(heading, bars)
+    assert abs(rotation) <= math.pi / 4 + 1e-9
+    assert np.isclose(np.cos(4 * (heading + rotation - first)), 1.0)
 
 
 # ---- landing curve
@@ -99,11 +99,11 @@ def test_two_equal_arcs_lead_to_the_goal(
     steps = 2000
     bend = np.repeat([math.copysign(1 / curve.radius_m, arc) for arc in curve.arc_rad], steps)
     size = np.repeat([abs(arc) * curve.radius_m / steps for arc in curve.arc_rad], steps)
-    turned = start[2] + np.concatenate([[0], np.cumsum(bend * size)])
-    middle = (turned[1:] + turned[:-1]) / 2
+    rotated = start[2] + np.concatenate([[0], np.cumsum(bend * size)])
+    middle = (rotated[1:] + rotated[:-1]) / 2
     end = start[:2] + [np.sum(size * np.cos(middle)), np.sum(size * np.sin(middle))]
     assert np.allclose(end, goal[:2], atol=1e-6)
-    assert abs(math.remainder(turned[-1] - goal[2], math.tau)) < 1e-6
+    assert abs(math.remainder(rotated[-1] - goal[2], math.tau)) < 1e-6
     assert curve.arc_rad[0] * curve.arc_rad[1] <= 0
     poses = curve.poses(start, [0.0, curve.length_m / 2, curve.length_m])
     assert np.allclose(poses[0], start)

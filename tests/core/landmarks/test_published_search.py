@@ -15,7 +15,7 @@ from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, code_of, name, rotated
 from locatk.core.landmarks.published.search import detect_landmarks, first_steps
 from locatk.core.landmarks.published.second_step import find_spins
-from locatk.core.landmarks.simulation.session import Pass, passes
+from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 
 GEOMETRY = Geometry()
 
@@ -23,7 +23,7 @@ VALLEYS_ALONE = {"never_over_bars", "voltages_undetermined", "voltages_contradic
 """Codes of the warnings that the voltages did not amend the pose."""
 
 
-def off(run: Pass, seen: VisitHypotheses) -> np.ndarray | None:
+def off(run: SinglePass, seen: VisitHypotheses) -> np.ndarray | None:
     """Error (3,) of the best hypothesis; None where its code is not the landmark's.
 
     Where the robot stands about half way between two of the frames either may be taken.
@@ -32,9 +32,9 @@ def off(run: Pass, seen: VisitHypotheses) -> np.ndarray | None:
     x, y = run.truth.position[at, :2]
     heading = float(heading_from_quaternion(run.truth.quaternion[at]))
     for q in range(4):
-        turn = q * math.pi / 2
-        cos, sin = math.cos(turn), math.sin(turn)
-        true = np.array([cos * x + sin * y, cos * y - sin * x, heading - turn])
+        rotation = q * math.pi / 2
+        cos, sin = math.cos(rotation), math.sin(rotation)
+        true = np.array([cos * x + sin * y, cos * y - sin * x, heading - rotation])
         error = seen.best.pose - true
         error[2] = math.remainder(error[2], math.tau)
         if abs(error[2]) < math.pi / 4:
@@ -46,7 +46,7 @@ def off(run: Pass, seen: VisitHypotheses) -> np.ndarray | None:
 @pytest.mark.parametrize("letters", ["NSNS", "NNNS", "SSSN", "NNSS", "NNNN", "SSSS"])
 def test_spins_near_the_centre_are_read_right(letters: str) -> None:
     errors = []
-    for run in passes(8, code_of(letters), then="spin", aim_m=0.003, seed=2):
+    for run in simulate_passes(8, code_of(letters), then="spin", aim_m=0.003, seed=2):
         for seen in detect_landmarks(run.samples, run.odometry, GEOMETRY):
             if seen.refused:
                 continue
@@ -68,7 +68,7 @@ def test_spins_near_the_centre_are_read_right(letters: str) -> None:
 @pytest.mark.slow
 def test_spins_far_off_are_refused_and_not_misread() -> None:
     refused, read = [], 0
-    for run in passes(30, None, then="spin", aim_m=0.014, seed=7):
+    for run in simulate_passes(30, None, then="spin", aim_m=0.014, seed=7):
         for seen in detect_landmarks(run.samples, run.odometry, GEOMETRY):
             if seen.refused:
                 assert seen.hypotheses == ()
@@ -84,7 +84,7 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
     # section 5.2.3: less than 1 mm and 1.5 degrees; where nothing is in the field but bars
     # a few percent off and sensors with offsets
     errors = []
-    for run in passes(24, None, then="spin", aim_m=0.002, seed=9):
+    for run in simulate_passes(24, None, then="spin", aim_m=0.002, seed=9):
         for seen in detect_landmarks(run.samples, run.odometry, GEOMETRY):
             if not seen.refused and not VALLEYS_ALONE & {each.code for each in seen.warnings}:
                 error = off(run, seen)
@@ -99,10 +99,12 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
 @pytest.mark.slow
 def test_a_pass_alone_gives_a_centre_only() -> None:
     errors = []
-    for run in passes(40, code_of("NNNS"), seed=3):
-        found = detect_landmarks(run.samples, run.odometry, GEOMETRY)
-        assert all(seen.refused == "no_spin" and not seen.hypotheses for seen in found)
-        for step, seen in zip(first_steps(run.samples, run.odometry, GEOMETRY), found, strict=True):
+    for run in simulate_passes(40, code_of("NNNS"), seed=3):
+        result = detect_landmarks(run.samples, run.odometry, GEOMETRY)
+        assert all(seen.refused == "no_spin" and not seen.hypotheses for seen in result)
+        for step, seen in zip(
+            first_steps(run.samples, run.odometry, GEOMETRY), result, strict=True
+        ):
             if not np.isfinite(step.centre_m).all():
                 continue
             assert "first_step" in [each.code for each in seen.warnings]
@@ -112,8 +114,8 @@ def test_a_pass_alone_gives_a_centre_only() -> None:
                 for track in (run.truth, run.odometry)
             )
             cos, sin = math.cos(own - true), math.sin(own - true)
-            way = np.array([[cos, -sin], [sin, cos]]) @ -run.truth.position[at, :2]
-            errors.append(np.hypot(*(run.odometry.position[at, :2] + way - step.centre_m)))
+            path = np.array([[cos, -sin], [sin, cos]]) @ -run.truth.position[at, :2]
+            errors.append(np.hypot(*(run.odometry.position[at, :2] + path - step.centre_m)))
             assert np.isfinite(step.voted_m).all()
     # the study's 10 mm in the real field (test_published_study.py), and noise
     assert len(errors) > 28
@@ -122,7 +124,7 @@ def test_a_pass_alone_gives_a_centre_only() -> None:
 
 def test_a_dead_sensor_is_gone_without() -> None:
     read = 0
-    for run in passes(8, code_of("NNSS"), then="spin", aim_m=0.002, seed=4):
+    for run in simulate_passes(8, code_of("NNSS"), then="spin", aim_m=0.002, seed=4):
         field = run.samples.field_t.copy()
         field[:, 1] = np.nan
         samples = HallSamples(run.samples.device, run.samples.sensors, run.samples.time_ns, field)
@@ -134,18 +136,18 @@ def test_a_dead_sensor_is_gone_without() -> None:
 
 
 def test_without_odometry_there_is_an_error() -> None:
-    run = passes(1, code_of("NNSS"), seed=4)[0]
+    run = simulate_passes(1, code_of("NNSS"), seed=4)[0]
     late = replace(run.odometry, time_ns=run.odometry.time_ns + 10**12)
     with pytest.raises(InputError, match="covers none"):
         detect_landmarks(run.samples, late, GEOMETRY)
 
 
 def test_spins_are_turns_on_the_spot() -> None:
-    turn = np.radians(np.arange(0, 360, 3.0))
-    still = np.zeros_like(turn)
-    spin = np.column_stack([still + 0.1, still, turn])
+    rotation = np.radians(np.arange(0, 360, 3.0))
+    still = np.zeros_like(rotation)
+    spin = np.column_stack([still + 0.1, still, rotation])
     drive = np.column_stack([np.arange(0, 0.1, 0.002), np.zeros(50), np.zeros(50)])
-    both = np.concatenate([drive, spin, drive + [0.1, 0, turn[-1]]])
+    both = np.concatenate([drive, spin, drive + [0.1, 0, rotation[-1]]])
     assert len(find_spins(both)) == 1
     first, stop = find_spins(both)[0]
     assert 46 <= first <= 51
@@ -153,6 +155,6 @@ def test_spins_are_turns_on_the_spot() -> None:
     # clockwise as well; half a turn and a circle that is driven are none
     assert len(find_spins(spin * [1, 1, -1])) == 1
     assert find_spins(spin[:60]) == []
-    circle = 0.1 * np.column_stack([np.sin(turn), -np.cos(turn)])
-    assert find_spins(np.column_stack([circle, turn])) == []
+    circle = 0.1 * np.column_stack([np.sin(rotation), -np.cos(rotation)])
+    assert find_spins(np.column_stack([circle, rotation])) == []
     assert len(find_spins(np.concatenate([spin, spin + [0.05, 0, 0]]))) == 2

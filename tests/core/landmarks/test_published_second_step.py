@@ -39,7 +39,9 @@ def magpylibs(code: int) -> magpylib.Collection:
     return bars
 
 
-def spun(code: int, x: float, y: float, turn: float = 0.0, seed: int = 1) -> SpinReading | None:
+def simulate_spin(
+    code: int, x: float, y: float, rotation: float = 0.0, seed: int = 1
+) -> SpinReading | None:
     """A spin of four sensors at (x, y) of a landmark; the answer is in a frame about the
     robot that is turned by ``turn`` from the landmark's."""
     bearing = HEADINGS[:, None] + np.radians([0, 90, 180, 270])
@@ -49,7 +51,7 @@ def spun(code: int, x: float, y: float, turn: float = 0.0, seed: int = 1) -> Spi
     )
     field = magpylibs(code).getB(points.reshape(-1, 3))[:, 2].reshape(bearing.shape)
     field = field + np.random.default_rng(seed).normal(0, 0.15e-3, field.shape)
-    cos, sin = math.cos(turn), math.sin(turn)
+    cos, sin = math.cos(rotation), math.sin(rotation)
     own = circle @ np.array([[cos, -sin], [sin, cos]])
     around = circle_profile(own, field, np.zeros(2))
     return recognise(find_valleys(around, 0.2 * GEOMETRY.threshold_t), RADIUS)
@@ -60,17 +62,17 @@ def test_each_code_is_read_under_any_heading(code: int) -> None:
     rng = np.random.default_rng(code)
     for _ in range(3):
         # 8 mm is where the paper's way still holds
-        off, where, turn = rng.uniform(0, 0.008), *rng.uniform(-math.pi, math.pi, 2)
+        off, where, rotation = rng.uniform(0, 0.008), *rng.uniform(-math.pi, math.pi, 2)
         x, y = off * math.cos(where), off * math.sin(where)
-        found = spun(code, x, y, turn)
-        assert found is not None
-        cos, sin = math.cos(turn), math.sin(turn)
-        place = np.array([[cos, -sin], [sin, cos]]) @ found.centre_m
-        assert np.hypot(*(place + [x, y])) < (0.0045 if pattern(code)[0:3] != "NSN" else 0.0003)
+        result = simulate_spin(code, x, y, rotation)
+        assert result is not None
+        cos, sin = math.cos(rotation), math.sin(rotation)
+        position = np.array([[cos, -sin], [sin, cos]]) @ result.centre_m
+        assert np.hypot(*(position + [x, y])) < (0.0045 if pattern(code)[0:3] != "NSN" else 0.0003)
         for heading in (0.0, 1.0, -2.5):
-            read, frame = found.in_frame_of(heading)
+            read, frame = result.in_frame_of(heading)
             # The frame's heading here is the landmark's, which is -turn, and quarter turns.
-            quarters = (frame + turn) / (math.pi / 2)
+            quarters = (frame + rotation) / (math.pi / 2)
             assert abs(quarters - round(quarters)) < math.radians(2) / (math.pi / 2)
             assert abs(math.remainder(heading - frame, math.tau)) <= math.pi / 4 + 1e-9
             assert read == rotated(code, -round(quarters)), name(read)
@@ -80,25 +82,25 @@ def test_each_code_is_read_under_any_heading(code: int) -> None:
     ("code", "bias_mm"), [(0b0101, 0.0), (0b0011, 0.0), (0b1111, 0.0), (0b0111, 2.6), (0b1000, 2.6)]
 )
 def test_lines_cross_at_the_centre_but_for_landmarks_2_and_3(code: int, bias_mm: float) -> None:
-    found = spun(code, 0.0, 0.0)
-    assert found is not None
-    assert abs(np.hypot(*found.centre_m) * 1e3 - bias_mm) < 0.2
+    result = simulate_spin(code, 0.0, 0.0)
+    assert result is not None
+    assert abs(np.hypot(*result.centre_m) * 1e3 - bias_mm) < 0.2
 
 
 def test_far_off_no_centre_is_believed() -> None:
     for code in (0b0111, 0b0011, 0b1111):
         for where in np.radians(np.arange(0, 360, 60)):
-            found = spun(code, 0.02 * math.cos(where), 0.02 * math.sin(where))
-            assert found is None or np.hypot(*found.centre_m) <= 0.01
+            result = simulate_spin(code, 0.02 * math.cos(where), 0.02 * math.sin(where))
+            assert result is None or np.hypot(*result.centre_m) <= 0.01
 
 
 @given(st.integers(1, 6), st.floats(0, math.tau), st.floats(0.6, 10))
 def test_valleys_of_a_wave(waves: int, phase: float, size: float) -> None:
     angle = np.radians(np.arange(360))
-    found = find_valleys(size * np.sin(waves * angle - phase), 0.5)
-    assert len(found.angle_rad) == 2 * waves
-    assert (found.rising != np.roll(found.rising, 1)).all()
-    off = waves * found.angle_rad[found.rising] - phase
+    result = find_valleys(size * np.sin(waves * angle - phase), 0.5)
+    assert len(result.angle_rad) == 2 * waves
+    assert (result.rising != np.roll(result.rising, 1)).all()
+    off = waves * result.angle_rad[result.rising] - phase
     assert np.abs(np.angle(np.exp(1j * off))).max() < 0.01
 
 
@@ -112,14 +114,14 @@ def test_small_ripples_are_no_valleys() -> None:
 
 def test_a_circle_that_is_not_seen_all_around() -> None:
     angle = np.radians(np.arange(0, 300.0, 3))[:, None]
-    place = np.stack([np.cos(angle), np.sin(angle)], -1)
-    assert np.isnan(circle_profile(place, np.ones((100, 1)), np.zeros(2))).all()
+    position = np.stack([np.cos(angle), np.sin(angle)], -1)
+    assert np.isnan(circle_profile(position, np.ones((100, 1)), np.zeros(2))).all()
     angle = np.radians(np.arange(0, 360.0, 6))[:, None]
-    place = np.stack([np.cos(angle), np.sin(angle)], -1)
+    position = np.stack([np.cos(angle), np.sin(angle)], -1)
     field = np.sin(angle)
     field[3] = np.nan
     assert np.allclose(
-        circle_profile(place, field, np.zeros(2)), np.sin(np.radians(np.arange(360))), atol=0.02
+        circle_profile(position, field, np.zeros(2)), np.sin(np.radians(np.arange(360))), atol=0.02
     )
 
 
@@ -134,5 +136,5 @@ def test_a_circle_that_is_not_seen_all_around() -> None:
 )
 def test_valleys_that_fit_no_landmark(degrees: list[float]) -> None:
     angle = np.radians(degrees)
-    seen = Valleys(angle, np.arange(len(angle)) % 2 == 0, np.ones(len(angle)))
-    assert recognise(seen, RADIUS) is None
+    observed = Valleys(angle, np.arange(len(angle)) % 2 == 0, np.ones(len(angle)))
+    assert recognise(observed, RADIUS) is None

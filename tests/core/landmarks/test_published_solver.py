@@ -34,40 +34,44 @@ def session(codes: bytes, seed: int) -> SimulatedSession:
     return simulate(floor, SimulationOptions(seed=seed, errors=NONE, rate_hz=100))
 
 
-def solved(floor: FloorMap, seed: int, told: FloorMap | None) -> tuple[SimulatedSession, Solution]:
+def solved(
+    floor: FloorMap, seed: int, reported: FloorMap | None
+) -> tuple[SimulatedSession, Solution]:
     one = session(np.ascontiguousarray(floor.codes).tobytes(), seed)
-    return one, solve(one.samples, told, PAPER, odometry=one.odometry)
+    return one, solve(one.samples, reported, PAPER, odometry=one.odometry)
 
 
 @pytest.mark.slow
 def test_an_l_is_a_place_or_a_note(published: FloorMap) -> None:
     located = 0
     for seed in range(4):
-        one, found = solved(published, seed, published)
-        assert found.method == "paper"
-        if not found.trajectories:
-            assert "not_localised" in [each.code for each in found.warnings]
+        one, result = solved(published, seed, published)
+        assert result.method == "paper"
+        if not result.trajectories:
+            assert "not_localised" in [each.code for each in result.warnings]
             continue
         located += 1
-        told, truth = found.trajectories[0], one.truth[0]
+        reported, truth = result.trajectories[0], one.truth[0]
         start = truth.time_ns[0]
-        at = [np.interp(told.time_ns - start, truth.time_ns - start, c) for c in truth.position.T]
-        away = np.hypot(*(told.position - np.column_stack(at))[:, :2].T)
+        at = [
+            np.interp(reported.time_ns - start, truth.time_ns - start, c) for c in truth.position.T
+        ]
+        away = np.hypot(*(reported.position - np.column_stack(at))[:, :2].T)
         assert away.max() < 0.03
         assert np.median(away) < 0.01
         cells = {event.cell for event in one.events}
-        told_cells = {s.cell for s in found.detections if s.cell}
+        told_cells = {s.cell for s in result.detections if s.cell}
         assert len(told_cells & cells) >= 3
-        np.testing.assert_array_equal(told.time_ns, one.odometry[0].time_ns)
-        assert np.isnan(told.covariance).all()
+        np.testing.assert_array_equal(reported.time_ns, one.odometry[0].time_ns)
+        assert np.isnan(reported.covariance).all()
     assert located >= 2
 
 
 def test_without_a_map_there_is_a_note_and_no_place(published: FloorMap) -> None:
-    _, found = solved(published, 0, None)
-    assert not found.trajectories
-    assert all(seen.cell is None for seen in found.detections)
-    assert "no_map" in [each.code for each in found.warnings]
+    _, result = solved(published, 0, None)
+    assert not result.trajectories
+    assert all(observed.cell is None for observed in result.detections)
+    assert "no_map" in [each.code for each in result.warnings]
 
 
 def test_no_odometry_is_an_error(published: FloorMap) -> None:
@@ -78,7 +82,7 @@ def test_no_odometry_is_an_error(published: FloorMap) -> None:
 
 def test_a_map_that_has_not_these_three_is_told(published: FloorMap) -> None:
     other = FloorMap(np.zeros((24, 24), np.int64))
-    _, found = solved(published, 1, other)
-    assert not found.trajectories
-    assert not found.facts.robots["robot"].localised
-    assert "not_localised" in [each.code for each in found.warnings]
+    _, result = solved(published, 1, other)
+    assert not result.trajectories
+    assert not result.facts.robots["robot"].localised
+    assert "not_localised" in [each.code for each in result.warnings]

@@ -41,26 +41,26 @@ def test_lines_meet_the_half_discs_where_another_intersection_says() -> None:
     origin = rng.uniform(-0.12, 0.12, (4000, 2))
     heading = rng.uniform(0, math.tau, 4000)
     ahead = np.stack([np.cos(heading), np.sin(heading)], -1)
-    found = half_disc_interval(origin, ahead)
+    result = half_disc_interval(origin, ahead)
     expected = [outline_interval(x, y, h) for (x, y), h in zip(origin, heading, strict=True)]
-    assert np.allclose(found, expected, atol=1e-12, equal_nan=True)
-    assert 1000 < np.isnan(found[:, 0]).sum() < 3000
+    assert np.allclose(result, expected, atol=1e-12, equal_nan=True)
+    assert 1000 < np.isnan(result[:, 0]).sum() < 3000
 
 
 def test_level_lines() -> None:
     origin = np.array([[-0.1, 0.044], [-0.1, 0.046], [-0.1, -0.05], [0.1, -0.0001]])
     ahead = np.array([[1.0, 0], [1, 0], [1, 0], [-1, 0]])
-    found = half_disc_interval(origin, ahead)
+    result = half_disc_interval(origin, ahead)
     half = [math.sqrt(0.045**2 - 0.044**2), math.nan, math.sqrt(0.054**2 - 0.05**2), 0.054]
-    assert np.allclose((found[:, 1] - found[:, 0]) / 2, half, atol=1e-6, equal_nan=True)
+    assert np.allclose((result[:, 1] - result[:, 0]) / 2, half, atol=1e-6, equal_nan=True)
 
 
 @pytest.mark.slow
 def test_the_papers_figures_are_reproduced() -> None:
     # Section 3.5.2: mean 7.28, SD 3.53, largest 17.9 mm; issue 5: mean within 0.5 mm, and
     # at most 0.5 % over 20 mm.
-    found = study()
-    all_runs, clear = found.figures(), found.figures(grazed=False)
+    result = study()
+    all_runs, clear = result.figures(), result.figures(grazed=False)
     assert all_runs["runs"] == 32760
     assert abs(all_runs["mean_mm"] - 7.28) <= 0.5
     assert abs(all_runs["sd_mm"] - 3.53) <= 0.5
@@ -69,14 +69,14 @@ def test_the_papers_figures_are_reproduced() -> None:
     # What is over 20 mm cut a corner of the territory on less than 20 mm.
     assert clear["over_20_share"] == 0
     assert abs(clear["max_mm"] - 17.9) < 1
-    assert abs(found.error_m[found.lines == 3].max() * 1e3 - 17.9) < 0.5
+    assert abs(result.error_m[result.lines == 3].max() * 1e3 - 17.9) < 0.5
 
 
 def test_the_literal_rule_fails_where_two_lines_hit() -> None:
     # 27 % over 20 mm; 27.8 mm in the mean with two lines, 8.1 with three
-    found = study(3, method="literal")
-    assert abs(found.figures()["over_20_share"] - 0.27) < 0.02
-    mean = [np.nanmean(found.error_m[found.lines == k]) * 1e3 for k in (2, 3)]
+    result = study(3, method="literal")
+    assert abs(result.figures()["over_20_share"] - 0.27) < 0.02
+    mean = [np.nanmean(result.error_m[result.lines == k]) * 1e3 for k in (2, 3)]
     assert np.allclose(mean, [27.8, 8.1], atol=1)
 
 
@@ -87,7 +87,7 @@ def test_the_literal_rule_fails_where_two_lines_hit() -> None:
 )
 def test_in_the_real_field_all_are_worse(method: str, mean_mm: float, over: float) -> None:
     # figures of a study with starts every 6 degrees
-    found = study(24, "field", method).figures()  # type: ignore[arg-type]
-    assert abs(found["mean_mm"] - mean_mm) < 1.5
-    assert abs(found["over_20_share"] - over) < 0.03
-    assert found["unsolved"] == 0 or method != "voting"
+    result = study(24, "field", method).figures()  # type: ignore[arg-type]
+    assert abs(result["mean_mm"] - mean_mm) < 1.5
+    assert abs(result["over_20_share"] - over) < 0.03
+    assert result["unsolved"] == 0 or method != "voting"

@@ -16,14 +16,14 @@ from locatk.core.landmarks.detection.trace import (
 )
 from locatk.core.landmarks.landmark import Geometry, signs
 from locatk.core.landmarks.simulation.options import NONE
-from locatk.core.landmarks.simulation.passes import Pass, passes
+from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 
 GEOMETRY = Geometry()
 
 INTACT = scan.INTACT_STRENGTHS
 
 
-def trace_of(one: Pass) -> Trace:
+def trace_of(one: SinglePass) -> Trace:
     """Return the true path, every third sample, in the frame of the middle one."""
     pose = np.column_stack(
         [one.truth.position[:, :2], heading_from_quaternion(one.truth.quaternion)]
@@ -57,7 +57,7 @@ def test_the_compiled_loop_is_its_twin() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("code", range(16))
 def test_the_truth_is_among_the_first(code: int) -> None:
-    for one in passes(2, code, errors=NONE, seed=code, start=(0.3 * code, 0.2)):
+    for one in simulate_passes(2, code, errors=NONE, seed=code, start=(0.3 * code, 0.2)):
         trace = trace_of(one)
         pose, which = scan.find_candidates(trace, GEOMETRY, INTACT, 10, scan.COARSE_GRID)
         # The landmark in the frame of the robot, which may be any of its four frames.
@@ -66,13 +66,13 @@ def test_the_truth_is_among_the_first(code: int) -> None:
         c, s = np.cos(heading), np.sin(heading)
         true = np.array([-(c * middle[0] + s * middle[1]), s * middle[0] - c * middle[1]])
         near = np.hypot(*(pose[:, :2] - true).T) < 1.5 * scan.COARSE_GRID.step_m
-        turn = np.remainder(pose[:, 2] + heading + np.pi / 4, np.pi / 2) - np.pi / 4
-        near &= np.abs(turn) < np.radians(15)
+        rotation = np.remainder(pose[:, 2] + heading + np.pi / 4, np.pi / 2) - np.pi / 4
+        near &= np.abs(rotation) < np.radians(15)
         assert signs(code).sum() in (INTACT[which] @ np.ones(4))[near]
 
 
 def test_candidates_of_one_code_are_not_neighbours() -> None:
-    trace = trace_of(passes(1, 7, errors=NONE, seed=1)[0])
+    trace = trace_of(simulate_passes(1, 7, errors=NONE, seed=1)[0])
     pose, which = scan.find_candidates(trace, GEOMETRY, INTACT, 10, scan.COARSE_GRID)
     for k in range(len(pose)):
         same = np.hypot(*(pose[:k, :2] - pose[k, :2]).T) < scan.MIN_CANDIDATE_DISTANCE_M
@@ -81,7 +81,7 @@ def test_candidates_of_one_code_are_not_neighbours() -> None:
 
 
 def test_weak_fields_give_no_candidate() -> None:
-    trace = trace_of(passes(1, 7, errors=NONE, seed=1)[0])
+    trace = trace_of(simulate_passes(1, 7, errors=NONE, seed=1)[0])
     quiet = Trace(
         trace.pose,
         trace.correction,
@@ -95,7 +95,7 @@ def test_weak_fields_give_no_candidate() -> None:
 
 def test_fields_over_a_large_extent_give_no_candidate() -> None:
     """Odometry in millimetres: a grid over it would exceed the memory."""
-    trace = trace_of(passes(1, 7, errors=NONE, seed=1)[0])
+    trace = trace_of(simulate_passes(1, 7, errors=NONE, seed=1)[0])
     large = Trace(
         trace.pose * [1e3, 1e3, 1],
         trace.correction,

@@ -22,7 +22,14 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.field import basis, landmark_field
 from locatk.core.landmarks.halls import NAMES, HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, code_of, pattern, signs
-from locatk.core.landmarks.map.floor import HOLE, STEPS, WINDOWS, AsBuiltLandmark, Cell, FloorMap
+from locatk.core.landmarks.map.floor import (
+    HOLE_CODE,
+    STEPS,
+    WINDOWS,
+    AsBuiltLandmark,
+    Cell,
+    FloorMap,
+)
 from locatk.core.landmarks.simulation.floor import (
     BAR_DRAWS,
     DIPOLE_LENGTHS,
@@ -30,10 +37,10 @@ from locatk.core.landmarks.simulation.floor import (
     dipole_fields,
     scatter_bars,
 )
+from locatk.core.landmarks.simulation.passes import simulate_passes
 from locatk.core.landmarks.simulation.robot import Robot
 from locatk.core.landmarks.simulation.sensors import odometry
 from locatk.core.landmarks.simulation.session import (
-    EPOCH_NS,
     NONE,
     Aims,
     Errors,
@@ -41,10 +48,10 @@ from locatk.core.landmarks.simulation.session import (
     RobotLimits,
     SimulatedSession,
     SimulationOptions,
-    passes,
     simulate,
 )
 from locatk.core.landmarks.simulation.strategy import is_free
+from locatk.core.simulation import SESSION_START_NS
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -78,8 +85,8 @@ def flat(trajectory: Trajectory) -> Array:
 def sensed(poses: Array, sensors: Array) -> Array:
     """Places (n, N, 2) of sensors."""
     spots = [
-        place + sensors @ np.array([[math.cos(h), math.sin(h)], [-math.sin(h), math.cos(h)]])
-        for *place, h in poses
+        position + sensors @ np.array([[math.cos(h), math.sin(h)], [-math.sin(h), math.cos(h)]])
+        for *position, h in poses
     ]
     return np.array(spots)
 
@@ -103,12 +110,12 @@ def relative(poses: Array) -> Array:
 def test_samples_are_the_closed_form_at_the_truth(tour: SimulatedSession) -> None:
     (samples,), (truth,) = tour.samples, tour.truth
     spots = sensed(flat(truth), circle(0.025))
-    wanted = sum(
-        landmark_field(FLOOR.geometry, int(FLOOR.codes[cell]), spots - FLOOR.place(cell))
+    expected = sum(
+        landmark_field(FLOOR.geometry, int(FLOOR.codes[cell]), spots - FLOOR.position(cell))
         for cell in FLOOR.cells()
     )
     # Landmarks out of reach are left out: a dozen of them, a microtesla each at most.
-    assert samples.field_t == pytest.approx(np.asarray(wanted), abs=4e-6)
+    assert samples.field_t == pytest.approx(np.asarray(expected), abs=4e-6)
     assert np.abs(samples.field_t).max() > 0.02
 
 
@@ -119,18 +126,18 @@ def test_a_landmark_that_lies_badly_is_felt_where_it_lies() -> None:
     )
     options = replace(PLAIN, strategy="pass", errors=errors, seed=2)
     simulated = simulate(floor, options)
-    (mark,) = simulated.floor_as_laid
+    (mark,) = simulated.installed_landmarks
     assert math.hypot(mark.x_m - 0.3, mark.y_m + 0.1) > 1e-3
     assert abs(mark.heading_rad) > 0.01
     spots = sensed(flat(simulated.truth[0]), circle(0.025)) - [mark.x_m, mark.y_m]
     c, s = math.cos(mark.heading_rad), math.sin(mark.heading_rad)
     own = spots @ np.array([[c, -s], [s, c]])
-    wanted = basis(floor.geometry, own, 0.014) @ mark.strength
+    expected = basis(floor.geometry, own, 0.014) @ mark.strength
     near = np.hypot(*np.moveaxis(own, -1, 0)) < 0.03 * DIPOLE_LENGTHS
     assert 1 > near.mean() > 0.5
     read = simulated.samples[0].field_t
-    assert read[near] == pytest.approx(wanted[near], abs=1e-12)
-    assert read[~near] == pytest.approx(wanted[~near], abs=5e-7)
+    assert read[near] == pytest.approx(expected[near], abs=1e-12)
+    assert read[~near] == pytest.approx(expected[~near], abs=5e-7)
     assert np.sign(mark.strength) == pytest.approx(signs(14))
 
 
@@ -230,13 +237,13 @@ def test_a_landing_curve_arrives_with_the_heading_it_had(
     pose: tuple[float, float, float], away: float, off: float
 ) -> None:
     robot = Robot(np.array(pose))
-    way = pose[2] + off
-    place = np.array([pose[0] + away * math.cos(way), pose[1] + away * math.sin(way)])
-    robot.land_at(place)
-    assert robot.pose == pytest.approx([*place, pose[2]], abs=1e-9)
+    path = pose[2] + off
+    position = np.array([pose[0] + away * math.cos(path), pose[1] + away * math.sin(path)])
+    robot.land_at(position)
+    assert robot.pose == pytest.approx([*position, pose[2]], abs=1e-9)
     # Two equal arcs: the curve passes the middle of the chord half-way through.
     halfway = robot.poses_at(np.array([robot.time_s / 2]))[0]
-    assert halfway[:2] == pytest.approx((np.array(pose[:2]) + place) / 2, abs=1e-9)
+    assert halfway[:2] == pytest.approx((np.array(pose[:2]) + position) / 2, abs=1e-9)
     assert halfway[2] - pose[2] == pytest.approx(2 * off, abs=1e-9)
 
 
@@ -267,17 +274,17 @@ def test_it_searches_spins_and_goes_an_l(tour: SimulatedSession) -> None:
     poses = flat(truth)
     start = poses[0, :2]
     # It starts outside of every territory: the nearest sensor is 54 mm away or more.
-    assert min(math.dist(start, FLOOR.place(cell)) for cell in FLOOR.cells()) > 0.079
+    assert min(math.dist(start, FLOOR.position(cell)) for cell in FLOOR.cells()) > 0.079
     for cell in cells:
-        near = np.hypot(*(poses[:, :2] - FLOOR.place(cell)).T) < 0.02
+        near = np.hypot(*(poses[:, :2] - FLOOR.position(cell)).T) < 0.02
         assert np.ptp(poses[near, 2]) > 2 * math.pi, "a spin on each"
         still = near[1:] & ~np.diff(poses, axis=0).any(axis=1)
         assert still.sum() >= 45, "half a second of compensation"
         stands = poses[1:][still]
-        off = np.hypot(*(stands[:, :2] - FLOOR.place(cell)).T)
+        off = np.hypot(*(stands[:, :2] - FLOOR.position(cell)).T)
         assert off.max() < 0.008
-        turned = np.remainder(stands[:, 2] + math.pi / 4, math.pi / 2) - math.pi / 4
-        assert np.abs(turned).max() < math.radians(4)
+        rotated = np.remainder(stands[:, 2] + math.pi / 4, math.pi / 2) - math.pi / 4
+        assert np.abs(rotated).max() < math.radians(4)
 
 
 def test_each_visit_is_felt(nominal: SimulatedSession) -> None:
@@ -332,7 +339,7 @@ def test_it_reads_the_window_of_the_map(window: str) -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_it_respects_holes_and_walls(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    codes = np.where(rng.random((6, 6)) < 0.25, HOLE, rng.integers(0, 16, (6, 6)))
+    codes = np.where(rng.random((6, 6)) < 0.25, HOLE_CODE, rng.integers(0, 16, (6, 6)))
     walls = frozenset(
         ((row, column), (row + up, column + right))
         for row in range(5)
@@ -347,12 +354,12 @@ def test_it_respects_holes_and_walls(seed: int) -> None:
     cells = cells_of(simulated)
     for one, other in pairwise(cells):
         heading = STEPS.index((other[0] - one[0], other[1] - one[1]))
-        assert floor.open(one, heading)
+        assert floor.is_passable(one, heading)
     assert len(cells) >= 12 or simulated.notes
 
 
 def test_what_is_free() -> None:
-    floor = FloorMap(np.array([[1, 2], [HOLE, 3]]), walls=frozenset({((0, 0), (0, 1))}))
+    floor = FloorMap(np.array([[1, 2], [HOLE_CODE, 3]]), walls=frozenset({((0, 0), (0, 1))}))
 
     def line(*ends: tuple[float, float]) -> Array:
         return np.linspace(*ends, 41)
@@ -387,13 +394,13 @@ def test_more_landmarks_than_there_is_a_way_to_are_noted() -> None:
 
 
 def test_a_path_is_followed() -> None:
-    way = ((0.3, 0.0), (0.6, 0.1), (0.6, 0.5))
-    simulated = simulate(FLOOR, replace(PLAIN, strategy="path", waypoints=way, aims=EXACT))
+    path = ((0.3, 0.0), (0.6, 0.1), (0.6, 0.5))
+    simulated = simulate(FLOOR, replace(PLAIN, strategy="path", waypoints=path, aims=EXACT))
     poses = flat(simulated.truth[0])
-    for place in way:
-        assert np.hypot(*(poses[:, :2] - place).T).min() < 1e-3
-    assert poses[0, :2] == pytest.approx(way[0])
-    assert poses[-1, :2] == pytest.approx(way[-1])
+    for position in path:
+        assert np.hypot(*(poses[:, :2] - position).T).min() < 1e-3
+    assert poses[0, :2] == pytest.approx(path[0])
+    assert poses[-1, :2] == pytest.approx(path[-1])
     assert not simulated.notes
     beyond = replace(PLAIN, strategy="path", waypoints=((0.3, 0.0), (-0.3, 0.0)))
     assert "leaves the map" in simulate(FLOOR, beyond).notes[0]
@@ -402,8 +409,8 @@ def test_a_path_is_followed() -> None:
 def test_a_path_of_cells_visits_them() -> None:
     cells = ((0, 0), (0, 2), (3, 2))
     simulated = simulate(FLOOR, replace(PLAIN, strategy="path", cells=cells))
-    wanted = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2)]
-    assert cells_of(simulated) == wanted
+    expected = [(0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (3, 2)]
+    assert cells_of(simulated) == expected
 
 
 @pytest.mark.parametrize("lateral", [-0.03, 0.0, 0.02])
@@ -411,7 +418,7 @@ def test_a_pass_goes_by_the_centre_on_the_side_asked_for(lateral: float) -> None
     options = replace(PLAIN, strategy="pass", cell=(2, 3), lateral_m=lateral, approach_rad=1.0)
     simulated = simulate(FLOOR, options)
     poses = flat(simulated.truth[0])
-    centre = np.array(FLOOR.place((2, 3)))
+    centre = np.array(FLOOR.position((2, 3)))
     assert math.dist(poses[0, :2], centre) == pytest.approx(0.115)
     assert poses[0, :2] - centre == pytest.approx([0.115 * math.cos(1), 0.115 * math.sin(1)])
     heading = poses[0, 2]
@@ -432,33 +439,35 @@ def test_a_pass_finds_its_pattern() -> None:
 
 
 def test_odometry_without_errors_is_the_truth(tour: SimulatedSession) -> None:
-    (truth,), (told,) = tour.truth, tour.odometry
-    assert told.frame == "odometry"
-    assert flat(told)[0] == pytest.approx([0, 0, 0])
-    both = np.isin(truth.time_ns, told.time_ns)
-    wanted = relative(flat(truth))[both]
-    assert flat(told)[np.isin(told.time_ns, truth.time_ns)] == pytest.approx(wanted, abs=5e-6)
+    (truth,), (reported,) = tour.truth, tour.odometry
+    assert reported.frame == "odometry"
+    assert flat(reported)[0] == pytest.approx([0, 0, 0])
+    both = np.isin(truth.time_ns, reported.time_ns)
+    expected = relative(flat(truth))[both]
+    assert flat(reported)[np.isin(reported.time_ns, truth.time_ns)] == pytest.approx(
+        expected, abs=5e-6
+    )
 
 
 def test_errors_of_odometry_are_as_large_as_asked() -> None:
     errors = Errors()
     straight = np.linspace([0.2, 0.1, 0.0], [0.7, 0.1, 0.0], 101)
     spin = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 4 * math.pi], 101)
-    ways, turns = [], []
+    ways, rotations = [], []
     for seed in range(400):
-        told, slips = odometry(straight, errors, np.random.default_rng(seed))
+        reported, slips = odometry(straight, errors, np.random.default_rng(seed))
         assert not slips
-        ways.append((np.hypot(*np.diff(told[:, :2], axis=0).T).sum(), told[-1, 2]))
-        turns.append(odometry(spin, errors, np.random.default_rng(seed))[0][-1, 2])
+        ways.append((np.hypot(*np.diff(reported[:, :2], axis=0).T).sum(), reported[-1, 2]))
+        rotations.append(odometry(spin, errors, np.random.default_rng(seed))[0][-1, 2])
     length, heading = np.array(ways).T
     # Noise of two wheels of half a metre each; the track is 0.1 m.
     noise = 0.2e-3 * math.sqrt(0.5)
     assert length.mean() == pytest.approx(0.5, abs=2e-3)
     assert length.std() == pytest.approx(math.hypot(0.005, noise / math.sqrt(2)), rel=0.1)
     drift = math.radians(1) / 0.23 * 0.5
-    wanted = math.hypot(drift, math.sqrt(2) * noise / 0.1)
-    assert heading.std() == pytest.approx(wanted, rel=0.1)
-    assert np.std(turns) == pytest.approx(0.01 * 4 * math.pi, rel=0.1)
+    expected = math.hypot(drift, math.sqrt(2) * noise / 0.1)
+    assert heading.std() == pytest.approx(expected, rel=0.1)
+    assert np.std(rotations) == pytest.approx(0.01 * 4 * math.pi, rel=0.1)
 
 
 def test_a_wheel_that_slips_turns_too_far() -> None:
@@ -466,11 +475,11 @@ def test_a_wheel_that_slips_turns_too_far() -> None:
     errors = replace(NONE, slips_per_m=3.0, slip_m=0.005)
     counts = []
     for seed in range(50):
-        told, slips = odometry(straight, errors, np.random.default_rng(seed))
+        reported, slips = odometry(straight, errors, np.random.default_rng(seed))
         counts.append(len(slips))
         if len(slips) == 1 and slips[0] < 900:
-            assert abs(told[-1, 2]) == pytest.approx(0.005 / 0.1, rel=0.05)
-            assert not told[: slips[0] + 1, 2].any()
+            assert abs(reported[-1, 2]) == pytest.approx(0.005 / 0.1, rel=0.05)
+            assert not reported[: slips[0] + 1, 2].any()
     assert np.mean(counts) == pytest.approx(3, abs=0.8)
 
 
@@ -538,7 +547,7 @@ def test_faults_of_the_floor_are_where_they_were_asked_for() -> None:
     options = replace(PLAIN, rate_hz=20.0, faults=faults, errors=replace(NONE, bar_strength=0.04))
     plain = simulate(FLOOR, replace(options, faults=Faults()))
     wrong = simulate(FLOOR, options)
-    for before, after in zip(plain.floor_as_laid, wrong.floor_as_laid, strict=True):
+    for before, after in zip(plain.installed_landmarks, wrong.installed_landmarks, strict=True):
         strength = before.strength.copy()
         if after.cell == (1, 2):
             strength[[0, 3]] *= -1
@@ -569,7 +578,7 @@ def test_a_misread_landmark_is_another_one_of_the_alphabet(alphabet: str) -> Non
     floor = FloorMap(codes, alphabet=alphabet)
     options = replace(PLAIN, rate_hz=10.0, faults=Faults(misread_rate=0.3))
     simulated = simulate(floor, options)
-    wrong = [mark for mark in simulated.floor_as_laid if mark.code != mark.designed]
+    wrong = [mark for mark in simulated.installed_landmarks if mark.code != mark.designed]
     assert all(mark.faults == ("misread",) for mark in wrong)
     assert len(wrong) / 144 == pytest.approx(0.3, abs=0.12)
     if alphabet == "6":
@@ -584,8 +593,8 @@ def test_a_floor_lies_as_it_was_built() -> None:
     )
     floor = replace(FLOOR, built={(2, 3): built})
     simulated = simulate(floor, replace(PLAIN, rate_hz=10.0, errors=Errors()))
-    (mark,) = (mark for mark in simulated.floor_as_laid if mark.cell == (2, 3))
-    x, y = floor.place((2, 3))
+    (mark,) = (mark for mark in simulated.installed_landmarks if mark.cell == (2, 3))
+    x, y = floor.position((2, 3))
     assert (mark.x_m, mark.y_m, mark.heading_rad) == pytest.approx((x + 0.004, y - 0.003, 0.05))
     assert mark.strength[:3] == pytest.approx([1.1, -0.9, 0.0])
     assert abs(mark.strength[3]) == pytest.approx(1, abs=0.2)
@@ -649,22 +658,22 @@ def test_errors_that_cannot_be_are_refused() -> None:
 
 
 def test_passes_start_on_the_circle_and_head_for_the_landmark() -> None:
-    made = passes(150, errors=NONE, seed=5)
-    starts = np.array([flat(one.truth)[0] for one in made])
+    generated = simulate_passes(150, errors=NONE, seed=5)
+    starts = np.array([flat(one.truth)[0] for one in generated])
     assert np.hypot(starts[:, 0], starts[:, 1]) == pytest.approx(0.115)
     to_centre = np.arctan2(-starts[:, 1], -starts[:, 0])
     aside = np.remainder(starts[:, 2] - to_centre + math.pi, 2 * math.pi) - math.pi
     assert np.abs(aside).max() <= math.pi / 4
     assert np.abs(aside).max() > 0.7
     assert aside.std() == pytest.approx(math.pi / 2 / math.sqrt(12), rel=0.15)
-    for one in made[:20]:
+    for one in generated[:20]:
         poses = flat(one.truth)
         assert np.hypot(*np.diff(poses[:, :2], axis=0).T) == pytest.approx(0.002)
         assert math.dist(poses[0, :2], poses[-1, :2]) == pytest.approx(0.23)
         assert one.end[:2] == pytest.approx(poses[-1, :2])
         assert flat(one.odometry) == pytest.approx(relative(poses), abs=1e-9)
     # With 25 mm to either side and 45 to 54 mm of territory, some miss and most do not.
-    lines = np.bincount([one.lines for one in made], minlength=4)
+    lines = np.bincount([one.lines for one in generated], minlength=4)
     assert len(lines) == 4
     assert lines[0] < 0.2 * 150 < lines[1:].sum()
 
@@ -672,24 +681,26 @@ def test_passes_start_on_the_circle_and_head_for_the_landmark() -> None:
 def test_passes_feel_the_closed_form() -> None:
     geometry = Geometry(sensor_height_m=0.01)
     for then in ("", "spin", "pass", "stand"):
-        for one in passes(3, [14, 5, 3], geometry=geometry, errors=NONE, then=then, seed=2):
+        for one in simulate_passes(
+            3, [14, 5, 3], geometry=geometry, errors=NONE, then=then, seed=2
+        ):
             spots = sensed(flat(one.truth), circle(0.025))
-            wanted = landmark_field(geometry, one.code, spots)
-            assert one.samples.field_t == pytest.approx(wanted, abs=1e-12)
+            expected = landmark_field(geometry, one.code, spots)
+            assert one.samples.field_t == pytest.approx(expected, abs=1e-12)
             assert one.strength == pytest.approx(signs(one.code))
             assert np.array_equal(one.samples.time_ns, one.truth.time_ns)
-            assert one.samples.time_ns[0] == EPOCH_NS
+            assert one.samples.time_ns[0] == SESSION_START_NS
 
 
 def test_what_follows_a_pass_is_near_the_centre() -> None:
-    aims = [np.hypot(*one.end[:2]) for one in passes(150, 14, errors=NONE, then="stand")]
+    aims = [np.hypot(*one.end[:2]) for one in simulate_passes(150, 14, errors=NONE, then="stand")]
     assert np.mean(aims) == pytest.approx(0.007, rel=0.13)
-    for one in passes(4, 14, errors=NONE, then="spin", aim_m=0.0):
+    for one in simulate_passes(4, 14, errors=NONE, then="spin", aim_m=0.0):
         poses = flat(one.truth)
         over = np.hypot(poses[:, 0], poses[:, 1]) < 1e-9
         assert np.ptp(poses[over, 2]) >= 2 * math.pi - 1e-9
         assert not over[: one.first].all()
-    for one in passes(4, 14, errors=NONE, then="pass", aim_m=0.0):
+    for one in simulate_passes(4, 14, errors=NONE, then="pass", aim_m=0.0):
         poses = flat(one.truth)
         along = poses[-1, 2] - poses[0, 2]
         assert math.cos(along) == pytest.approx(0, abs=1e-9)
@@ -698,19 +709,19 @@ def test_what_follows_a_pass_is_near_the_centre() -> None:
 
 
 def test_passes_err_as_facts_say() -> None:
-    exact, made = (passes(200, 14, errors=errors, seed=1) for errors in (NONE, None))
+    exact, generated = (simulate_passes(200, 14, errors=errors, seed=1) for errors in (NONE, None))
     scale, drift, strength = [], [], []
-    for one, other in zip(exact, made, strict=True):
+    for one, other in zip(exact, generated, strict=True):
         assert np.array_equal(one.truth.position, other.truth.position)
-        told = flat(other.odometry)
-        scale.append(np.hypot(*np.diff(told[:, :2], axis=0).T).sum() / 0.23)
-        drift.append(told[-1, 2])
+        reported = flat(other.odometry)
+        scale.append(np.hypot(*np.diff(reported[:, :2], axis=0).T).sum() / 0.23)
+        drift.append(reported[-1, 2])
         strength.append(np.abs(other.strength))
     assert np.std(scale) == pytest.approx(0.01, rel=0.15)
     # A degree, and the noise of the wheels.
     assert np.std(drift) == pytest.approx(math.hypot(math.radians(1), 1.36e-3), rel=0.12)
     assert np.std(strength) == pytest.approx(0.04, rel=0.1)
-    far = np.concatenate([other.samples.field_t[:3] for other in made])
+    far = np.concatenate([other.samples.field_t[:3] for other in generated])
     near = np.concatenate([one.samples.field_t[:3] for one in exact])
     assert (far - near).std() == pytest.approx(math.hypot(1.5e-4, 1e-4), rel=0.1)
     assert (far - near).mean() == pytest.approx(-45e-6, abs=2e-5)
@@ -718,11 +729,11 @@ def test_passes_err_as_facts_say() -> None:
 
 def test_passes_are_asked_for_with_sense() -> None:
     with pytest.raises(InputError, match="dance"):
-        passes(1, then="dance")
+        simulate_passes(1, then="dance")
     with pytest.raises(InputError, match="16"):
-        passes(1, 16)
+        simulate_passes(1, 16)
     sensors = HallSensors(NAMES, circle(0.03), range_t=0.005)
-    (one,) = passes(1, 5, sensors=sensors, start=(0.0, 0.0))
+    (one,) = simulate_passes(1, 5, sensors=sensors, start=(0.0, 0.0))
     assert one.samples.sensors is sensors
     assert np.abs(one.samples.field_t).max() == 0.005
     assert flat(one.truth)[0] == pytest.approx([0.115, 0, math.pi])

@@ -75,13 +75,13 @@ def session(
         if seed is not None:
             sigma = math.hypot(PRIORS.noise_t, PRIORS.model_error_t)
             value = value + np.random.default_rng([seed, number]).normal(0, sigma, value.shape)
-        seen = relative(own, own[15])
+        observed = relative(own, own[15])
         trace = Trace(
-            seen,
-            odometry_corrections(seen, 15, PRIORS.drift),
+            observed,
+            odometry_corrections(observed, 15, PRIORS.drift),
             value,
             SENSORS,
-            np.ones(len(seen)),
+            np.ones(len(observed)),
             15,
         )
         visits.append(VisitMeasurement(trace, cell, true[15] + [0.001, -0.001, 0.01]))
@@ -156,20 +156,20 @@ def test_derivatives_of_all_rows(kind: str) -> None:
 
 def test_faultless_sessions_give_the_truth() -> None:
     robot, landmarks = session()
-    found = smooth([robot], landmarks, GEOMETRY, PRIORS)
-    for stay, true in zip(found.visits[0], true_path(), strict=True):
+    result = smooth([robot], landmarks, GEOMETRY, PRIORS)
+    for stay, true in zip(result.visits[0], true_path(), strict=True):
         np.testing.assert_allclose(stay.pose, true[15], atol=2e-5)
-    for cell, mark in found.landmarks.items():
+    for cell, mark in result.landmarks.items():
         np.testing.assert_allclose(mark.pose, POSES[cell], atol=2e-5)
-    assert found.residual_sigma < 0.05
+    assert result.residual_sigma < 0.05
 
 
 def test_scale_of_odometry_is_estimated() -> None:
     robot, landmarks = session(0.02)
-    found = smooth([robot], landmarks, GEOMETRY, PRIORS)
-    scale = found.visits[0][0].corrections[0] * PRIORS.drift.scale
+    result = smooth([robot], landmarks, GEOMETRY, PRIORS)
+    scale = result.visits[0][0].corrections[0] * PRIORS.drift.scale
     assert scale == pytest.approx(-0.02, abs=0.006)
-    for stay, true in zip(found.visits[0], true_path(), strict=True):
+    for stay, true in zip(result.visits[0], true_path(), strict=True):
         np.testing.assert_allclose(stay.pose[:2], true[15, :2], atol=3e-4)
 
 
@@ -178,8 +178,8 @@ def test_displaced_landmark_is_moved() -> None:
     robot, landmarks = session()
     off = np.array([0.004, -0.003, 0.0])
     landmarks[(0, 1)] = replace(landmarks[(0, 1)], pose=POSES[(0, 1)] + off)
-    found = smooth([robot], landmarks, GEOMETRY, PRIORS)
-    shift = found.landmarks[(0, 1)].pose - landmarks[(0, 1)].pose
+    result = smooth([robot], landmarks, GEOMETRY, PRIORS)
+    shift = result.landmarks[(0, 1)].pose - landmarks[(0, 1)].pose
     assert shift[:2] @ -off[:2] / (off[:2] @ off[:2]) > 0.3
 
 
@@ -188,9 +188,9 @@ def test_covariance_agrees_with_the_scatter() -> None:
     squares = []
     for seed in range(15):
         robot, landmarks = session(seed=seed)
-        found = smooth([robot], landmarks, GEOMETRY, PRIORS)
-        assert 0.8 < found.residual_sigma < 1.2
-        for stay, true in zip(found.visits[0], true_path(), strict=True):
+        result = smooth([robot], landmarks, GEOMETRY, PRIORS)
+        assert 0.8 < result.residual_sigma < 1.2
+        for stay, true in zip(result.visits[0], true_path(), strict=True):
             off = stay.pose - true[15]
             squares.append(off @ np.linalg.solve(stay.covariance[:3, :3], off))
     assert 0.001 < np.mean(squares) < 3.5

@@ -14,7 +14,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks import solver
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import pattern
-from locatk.core.landmarks.map.floor import HOLE, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.simulation.session import (
     Aims,
     Errors,
@@ -33,7 +33,7 @@ CODES = np.random.default_rng(11).integers(0, 16, (12, 12))
 
 FLOOR = FloorMap(CODES)
 
-WAY = ((2, 2), (2, 5), (4, 5), (4, 3))
+ROUTE = ((2, 2), (2, 5), (4, 5), (4, 3))
 
 CELLS = [(2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3)]
 
@@ -41,7 +41,7 @@ CELLS = [(2, 2), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5), (4, 4), (4, 3)]
 def drive(floor: FloorMap = FLOOR, **options: object) -> SimulatedSession:
     given = {
         "strategy": "path",
-        "cells": WAY,
+        "cells": ROUTE,
         "rate_hz": 30.0,
         "stop_s": 0.2,
         "seed": 1,
@@ -112,7 +112,7 @@ def test_detections_give_the_pose_relative_to_the_landmark() -> None:
     truth = one.truth[0]
     for detection in solved(one).detections:
         at = np.argmin(np.abs(truth.time_ns * 1e-9 - detection.time_s))
-        away = truth.position[at, :2] - FLOOR.place(detection.cell)
+        away = truth.position[at, :2] - FLOOR.position(detection.cell)
         assert detection.x_m == pytest.approx(away[0], abs=4e-3)
         assert detection.y_m == pytest.approx(away[1], abs=4e-3)
 
@@ -230,7 +230,7 @@ def test_no_odometry_is_an_error() -> None:
 
 def test_landmark_that_is_not_on_the_map() -> None:
     codes = CODES.copy()
-    codes[3, 5] = HOLE
+    codes[3, 5] = HOLE_CODE
     solution = solved(session(), FloorMap(codes))
     assert solution.rejected == {"off_map": 1}
     assert farthest(session(), solution) < 4e-3
@@ -238,7 +238,7 @@ def test_landmark_that_is_not_on_the_map() -> None:
 
 def test_landmark_that_is_not_on_the_floor() -> None:
     codes = CODES.copy()
-    codes[2, 4] = HOLE
+    codes[2, 4] = HOLE_CODE
     one = drive(FloorMap(codes))
     solution = solved(one, FLOOR)
     assert [detection.cell for detection in solution.detections] == [
@@ -271,10 +271,10 @@ def test_missing_bars() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 8])
 def test_number_and_positions_of_sensors(count: int) -> None:
-    places = circle(0.03) @ np.array([[0.8, 0.6], [-0.6, 0.8]])
-    places = np.vstack([places, [[0, 0.04], [0.02, 0], [-0.04, 0.01], [0, 0]]])[:count]
+    positions = circle(0.03) @ np.array([[0.8, 0.6], [-0.6, 0.8]])
+    positions = np.vstack([positions, [[0, 0.04], [0.02, 0], [-0.04, 0.01], [0, 0]]])[:count]
     names = tuple(f"s{k}" for k in range(count))
-    one = drive(sensors=HallSensors(names, places, noise_t=1.5e-4))
+    one = drive(sensors=HallSensors(names, positions, noise_t=1.5e-4))
     solution = solved(one)
     assert farthest(one, solution) < 4e-3
 

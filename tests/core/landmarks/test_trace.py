@@ -22,7 +22,7 @@ from locatk.core.landmarks.detection.trace import (
 
 Array = NDArray[np.float64]
 
-ALONE = {
+SINGLE_DRIFTS = {
     "scale": OdometryDrift(1, 0, 0, 0, 0),
     "rotation_scale": OdometryDrift(0, 1, 0, 0, 0),
     "curvature": OdometryDrift(0, 0, 1, 0, 0),
@@ -34,13 +34,15 @@ def driven(
 ) -> Array:
     """Return poses (n + 1, 3) after distances and rotations (n, 2) under constant errors."""
     poses = [np.zeros(3)]
-    for path, turn in steps:
+    for path, rotation in steps:
         x, y, heading = poses[-1]
-        turned = turn * (1 + rotation_scale) + curvature * abs(path)
-        middle = heading + turned / 2
+        rotated = rotation * (1 + rotation_scale) + curvature * abs(path)
+        middle = heading + rotated / 2
         moved = path * (1 + scale)
         poses.append(
-            np.array([x + moved * math.cos(middle), y + moved * math.sin(middle), heading + turned])
+            np.array(
+                [x + moved * math.cos(middle), y + moved * math.sin(middle), heading + rotated]
+            )
         )
     return np.array(poses)
 
@@ -62,31 +64,33 @@ def test_corrections_are_the_first_order_of_constant_errors(number: int, referen
     """Half the error leaves a quarter of the residual."""
     measured = driven(winding())
     reference %= len(measured)
-    name = list(ALONE)[number]
+    name = list(SINGLE_DRIFTS)[number]
     residual = []
     for size in (0.02, 0.01):
         true = driven(winding(), **{name: size})
         # Both in the frame of the robot at the reference.
-        true, seen = relative(true, true[reference]), relative(measured, measured[reference])
-        errors = np.zeros(odometry_corrections(seen, reference, OdometryDrift()).shape[2])
+        true, observed = relative(true, true[reference]), relative(measured, measured[reference])
+        errors = np.zeros(odometry_corrections(observed, reference, OdometryDrift()).shape[2])
         errors[number] = size
-        drift = ALONE[name]
+        drift = SINGLE_DRIFTS[name]
         residual.append(
-            np.abs(seen + odometry_corrections(seen, reference, drift) @ errors - true).max()
+            np.abs(
+                observed + odometry_corrections(observed, reference, drift) @ errors - true
+            ).max()
         )
-        assert np.abs(seen - true).max() > 5 * residual[-1]
+        assert np.abs(observed - true).max() > 5 * residual[-1]
     assert residual[1] < 0.3 * residual[0] + 1e-12
 
 
 @pytest.mark.parametrize("number", range(3))
 def test_correct_constant_errors_removes_large_errors(number: int) -> None:
     measured = driven(winding(1))
-    true = driven(winding(1), **{list(ALONE)[number]: 0.3})
+    true = driven(winding(1), **{list(SINGLE_DRIFTS)[number]: 0.3})
     steady = np.zeros(3)
     steady[number] = 0.3
-    found = correct_constant_errors(measured, steady, OdometryDrift(1, 1, 1))
+    result = correct_constant_errors(measured, steady, OdometryDrift(1, 1, 1))
     # Arcs are correct_constant_errors by middle headings: the steps are small, not nothing.
-    np.testing.assert_allclose(found, true, atol=2e-4)
+    np.testing.assert_allclose(result, true, atol=2e-4)
     assert np.abs(measured - true).max() > 0.02
 
 

@@ -47,9 +47,9 @@ def session(seed: int, clean: bool = False) -> tuple[SimulatedSession, Trajector
         seed=seed,
     )
     one = simulate(FLOOR, options)
-    found = solver.solve(one.samples, FLOOR, odometry=one.odometry)
-    assert len(found.trajectories) == 1
-    return one, found.trajectories[0]
+    result = solver.solve(one.samples, FLOOR, odometry=one.odometry)
+    assert len(result.trajectories) == 1
+    return one, result.trajectories[0]
 
 
 def errors_of(one: SimulatedSession, trajectory: Trajectory) -> tuple[Array, Array]:
@@ -175,11 +175,11 @@ def test_frame_of_odometry_does_not_matter() -> None:
     one, trajectory = session(4)
     own = one.odometry[0]
     c, s = np.cos(2.0), np.sin(2.0)
-    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     half = np.array([0, 0, np.sin(1.0), np.cos(1.0)])
     x, y, z, w = own.quaternion.T
-    turned = np.column_stack([x, y, w * half[2] + z * half[3], w * half[3] - z * half[2]])
-    moved = replace(own, position=own.position @ turn + [5, -3, 0], quaternion=turned)
+    rotated = np.column_stack([x, y, w * half[2] + z * half[3], w * half[3] - z * half[2]])
+    moved = replace(own, position=own.position @ rotation + [5, -3, 0], quaternion=rotated)
     again = solver.solve(one.samples, FLOOR, odometry=[moved]).trajectories[0]
     np.testing.assert_allclose(again.position, trajectory.position, atol=2e-5)
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.landmarks.landmark import code_of
-from locatk.core.landmarks.map.floor import HOLE, WINDOWS, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, WINDOWS, FloorMap
 from locatk.core.landmarks.map.windows import passable_steps, window_readings
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -23,16 +23,18 @@ def test_as_a_robot_walks(
     seed: int, random_floor: Callable[[int], FloorMap], walked: Callable[[FloorMap], Any]
 ) -> None:
     floor = random_floor(seed)
-    seen = window_readings(floor)
-    found = {
+    observed = window_readings(floor)
+    result = {
         (tuple(cells[0].tolist()), int(heading)): (
             [tuple(cell) for cell in cells.tolist()],
             tuple(letters.tolist()),
         )
-        for cells, heading, letters in zip(seen.cells, seen.heading, seen.letters, strict=True)
+        for cells, heading, letters in zip(
+            observed.cells, observed.heading, observed.letters, strict=True
+        )
     }
-    assert len(found) == len(seen)
-    assert found == walked(floor)
+    assert len(result) == len(observed)
+    assert result == walked(floor)
 
 
 @given(seed=SEEDS)
@@ -43,18 +45,18 @@ def test_ways_are_where_the_floor_is_open(
     floor = random_floor(seed)
     free = passable_steps(floor)
     for cell in floor.cells():
-        assert [floor.open(cell, heading) for heading in range(4)] == free[cell].tolist()
-    assert not free[floor.codes == HOLE].any()
+        assert [floor.is_passable(cell, heading) for heading in range(4)] == free[cell].tolist()
+    assert not free[floor.codes == HOLE_CODE].any()
 
 
 def test_a_left_turn_by_hand() -> None:
     """Facing up the rows, left is towards lower columns."""
     codes = np.array([[0, code_of("NSSS")], [code_of("SSNS"), code_of("NNSS")]])
-    seen = window_readings(FloorMap(codes, window="L"))
-    (up,) = np.flatnonzero((seen.heading == 1) & (seen.cells[:, 0] == [0, 1]).all(1))
-    assert seen.cells[up].tolist() == [[0, 1], [1, 1], [1, 0]]
+    observed = window_readings(FloorMap(codes, window="L"))
+    (up,) = np.flatnonzero((observed.heading == 1) & (observed.cells[:, 0] == [0, 1]).all(1))
+    assert observed.cells[up].tolist() == [[0, 1], [1, 1], [1, 0]]
     # Bar 0 is on the map's right side, which is this robot's right too: its bar 3.
-    assert seen.letters[up].tolist() == [code_of("SSSN"), code_of("NSSN"), code_of("SNSS")]
+    assert observed.letters[up].tolist() == [code_of("SSSN"), code_of("NSSN"), code_of("SNSS")]
 
 
 @pytest.mark.parametrize("window", WINDOWS)

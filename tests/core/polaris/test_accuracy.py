@@ -75,10 +75,10 @@ def known_speed(world: Any) -> Round:
         tag = world.Tag(CELLS, SYMBOLS, heading=np.radians(degrees))
         course = world.line(length=0.24, lateral=0.004 * np.sin(k))
         recording = world.record([tag], course, seed=k)
-        seen = the_tag(solve([recording], TAGS, SolveOptions(speed_mps=0.1)))
-        error, spread = magnet_errors(world, seen, course, tag)
-        found.append(seen)
-        pose.append(pose_errors(world, seen, course, tag))
+        observed = the_tag(solve([recording], TAGS, SolveOptions(speed_mps=0.1)))
+        error, spread = magnet_errors(world, observed, course, tag)
+        found.append(observed)
+        pose.append(pose_errors(world, observed, course, tag))
         magnets.append(error)
         sigma.append(spread)
     return Round(found, np.array(pose), np.vstack(magnets), np.vstack(sigma))
@@ -94,7 +94,9 @@ def test_every_heading_is_read(known_speed: Round) -> None:
 
 
 def test_at_the_bound(known_speed: Round) -> None:
-    """facts/polaris.md 3, case B, at 0.5 uT: 0.0068 and 0.0072 mm, 0.056 degrees."""
+    """Errors reach the Cramer-Rao bound at 0.5 uT: 0.0068 and 0.0072 mm, 0.056 degrees.
+
+    The bound is that of dipoles at 1 mm a frame, known speed, unknown height and moments."""
     x, y, angle = np.sqrt(np.mean(known_speed.magnets**2, axis=0))
     assert x < 1.15 * 7.0e-6
     assert y < 1.15 * 7.2e-6
@@ -102,8 +104,10 @@ def test_at_the_bound(known_speed: Round) -> None:
 
 
 def test_pose_of_a_tag_that_is_as_designed(known_speed: Round) -> None:
-    """facts: 0.0026, 0.0027 mm and 0.0032 degrees, were the tag known to be so. It is laid
-    by hand, and the pose's covariance says that; so the grid weighs all magnets alike."""
+    """The bound is 0.0026 and 0.0027 mm and 0.0032 degrees if the tag is known to be as designed.
+
+    Tags are installed by hand, and the covariance of the pose includes that; so the grid weights
+    all magnets alike."""
     x, y, heading = np.sqrt(np.mean(known_speed.pose**2, axis=0))
     assert max(x, y) < 2 * 2.7e-6
     assert np.degrees(heading) < 2 * 0.0032
@@ -144,7 +148,7 @@ def test_array_in_the_tags_frame_is_the_inverse(world: Any, known_speed: Round) 
 
 
 @dataclass(frozen=True)
-class Hands:
+class HandInstalledTags:
     """Tags that hands have laid, passed over by a bar that is not mounted square."""
 
     ids: list[int]
@@ -154,7 +158,7 @@ class Hands:
 
 
 @pytest.fixture(scope="module")
-def hands(world: Any) -> Hands:
+def hand_installed(world: Any) -> HandInstalledTags:
     rng = np.random.default_rng(7)
     ids, z_pose, z_magnets, pose = [], [], [], []
     for k in range(16):
@@ -180,31 +184,31 @@ def hands(world: Any) -> Hands:
         z_pose.append(error / sigma)
         error, spread = magnet_errors(world, found, course, tag)
         z_magnets.append(error / spread)
-    return Hands(ids, np.array(z_pose), np.vstack(z_magnets), np.array(pose))
+    return HandInstalledTags(ids, np.array(z_pose), np.vstack(z_magnets), np.array(pose))
 
 
 @pytest.mark.slow
-def test_no_wrong_bit_at_any_speed_profile(hands: Hands) -> None:
-    assert set(hands.ids) == {ID}
+def test_no_wrong_bit_at_any_speed_profile(hand_installed: HandInstalledTags) -> None:
+    assert set(hand_installed.ids) == {ID}
 
 
-def test_position_and_heading_of_tags_laid_by_hand(hands: Hands) -> None:
+def test_position_and_heading_of_tags_laid_by_hand(hand_installed: HandInstalledTags) -> None:
     """Five magnets 0.4 mm off put a tag 0.18 mm off and turn it by 0.3 degrees."""
-    rms = np.sqrt(np.mean(hands.pose**2, axis=0))
+    rms = np.sqrt(np.mean(hand_installed.pose**2, axis=0))
     assert np.all(rms < [4e-4, 4e-4, np.radians(0.6)])
 
 
-def test_covariance_of_the_pose_is_honest(hands: Hands) -> None:
+def test_covariance_of_the_pose_is_honest(hand_installed: HandInstalledTags) -> None:
     """Over 16 tags a mean square of 1 scatters by 0.35."""
-    square = np.mean(hands.z_pose**2, axis=0)
+    square = np.mean(hand_installed.z_pose**2, axis=0)
     assert np.all(square < 1.9)
     assert np.all(square > 0.35)
 
 
-def test_covariance_of_the_magnets_is_honest(hands: Hands) -> None:
+def test_covariance_of_the_magnets_is_honest(hand_installed: HandInstalledTags) -> None:
     """Angles to half of a sigma. Places across the track are worse: a bar that stands askew
     by less than the samples show leaves up to three of its own sigmas there."""
-    across, angle = np.mean(hands.z_magnets[:, 1:] ** 2, axis=0)
+    across, angle = np.mean(hand_installed.z_magnets[:, 1:] ** 2, axis=0)
     assert 0.4 < angle < 1.5**2
     assert 0.25 < across < 3**2
 
@@ -229,11 +233,11 @@ def test_a_dense_tag_is_read_by_its_grid(world: Any) -> None:
     rng = np.random.default_rng([4, 13, 8])
     cells, symbols = design(rng, 4, 13, 8)
     tags = Tags(order=4, magnets=13, orientations=8, spacing_m=0.016)
-    turn = rng.uniform(-np.pi, np.pi)
-    tag = world.Tag(cells, symbols, heading=turn, order=4, orientations=8, spacing=0.016)
+    rotation = rng.uniform(-np.pi, np.pi)
+    tag = world.Tag(cells, symbols, heading=rotation, order=4, orientations=8, spacing=0.016)
     course = world.line(length=1.5 * 0.048 + 0.12)
-    made = world.record([tag], course, array=world.bar(7), seed=0)
-    found = the_tag(solve([made], tags))
+    generated = world.record([tag], course, array=world.bar(7), seed=0)
+    found = the_tag(solve([generated], tags))
     assert found.tag_id == codec.id_of(tags, TagLayout(cells, symbols))
 
 

@@ -46,22 +46,22 @@ def brute_force(
 ):
     """The covariance by a dense information matrix of every unknown, from magpylib's dipoles
     and central differences."""
-    place, angle = cell_positions(tags, layout.cells), symbol_angles(tags, layout.symbols)
-    count = len(place)
-    low, high = place[:, 0].min(), place[:, 0].max()
+    position, angle = cell_positions(tags, layout.cells), symbol_angles(tags, layout.symbols)
+    count = len(position)
+    low, high = position[:, 0].min(), position[:, 0].max()
     reach = PASS_MARGIN_CLEARANCES * tags.clearance_m
-    way = np.arange(math.floor((low - reach) / step), math.ceil((high + reach) / step) + 1) * step
+    path = np.arange(math.floor((low - reach) / step), math.ceil((high + reach) / step) + 1) * step
 
-    start = np.concatenate([place.ravel(), angle, np.ones(count), [tags.clearance_m, 1.0]])
+    start = np.concatenate([position.ravel(), angle, np.ones(count), [tags.clearance_m, 1.0]])
 
     def field(p: Array, ways: Array) -> Array:
-        xy, turned = p[: 2 * count].reshape(-1, 2), p[2 * count : 3 * count]
+        xy, rotated = p[: 2 * count].reshape(-1, 2), p[2 * count : 3 * count]
         strength, height, speed = p[3 * count : 4 * count], p[-2], p[-1]
         points = (sensors.position_m[None] + (speed * ways)[:, None, None] * [1, 0, 0]).reshape(
             -1, 3
         )
         total = np.zeros_like(points)
-        for (x, y), a, s in zip(xy, turned, strength, strict=True):
+        for (x, y), a, s in zip(xy, rotated, strength, strict=True):
             moment = s * tags.magnet.moment * np.array([math.cos(a), math.sin(a), 0])
             source = magpylib.misc.Dipole(moment=moment, position=(x, y, -height))
             total += source.getB(points)
@@ -72,7 +72,7 @@ def brute_force(
         up, down = start.copy(), start.copy()
         up[k] += h
         down[k] -= h
-        return (field(up, way) - field(down, way)) / (2 * h)
+        return (field(up, path) - field(down, path)) / (2 * h)
 
     kept = list(range(3 * count))
     if nuisance != "magnets":
@@ -81,11 +81,11 @@ def brute_force(
         kept += [len(start) - 1]
     columns = [column(k) for k in kept]
     per_sample = 3 * len(sensors)
-    columns += list(np.tile(np.eye(per_sample), (1, len(way))))
+    columns += list(np.tile(np.eye(per_sample), (1, len(path))))
     steps = 0
     if nuisance == "steps":
-        slope = (field(start, way + 1e-6) - field(start, way - 1e-6)) / 2e-6
-        for k in np.flatnonzero(way != 0):
+        slope = (field(start, path + 1e-6) - field(start, path - 1e-6)) / 2e-6
+        for k in np.flatnonzero(path != 0):
             one = np.zeros_like(slope)
             one[k * per_sample : (k + 1) * per_sample] = slope[
                 k * per_sample : (k + 1) * per_sample
@@ -95,7 +95,7 @@ def brute_force(
     jacobian = np.array(columns).T
     information = jacobian.T @ jacobian
     if steps:
-        walk = np.diff(np.eye(len(way)), axis=0)[:, way != 0] / STEP_SIGMA_M
+        walk = np.diff(np.eye(len(path)), axis=0)[:, path != 0] / STEP_SIGMA_M
         information[-steps:, -steps:] += walk.T @ walk
     scale = np.sqrt(np.diag(information))
     covariance = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
@@ -144,13 +144,13 @@ REFERENCE = {
 
 @pytest.mark.parametrize("nuisance", REFERENCE)
 def test_reference_figures(nuisance: NuisanceModel) -> None:
-    found = accuracy_bound(TAGS, LAYOUTS, array(), step_m=1e-3, nuisance=nuisance)
+    result = accuracy_bound(TAGS, LAYOUTS, array(), step_m=1e-3, nuisance=nuisance)
     across, along, angle = REFERENCE[nuisance]
-    assert found.y_m * 1e3 == pytest.approx(across, rel=0.1)
-    assert found.x_m * 1e3 == pytest.approx(along, rel=0.2)
-    assert math.degrees(found.angle_rad) == pytest.approx(angle, rel=0.1)
-    assert found.pose_y_m * 1e3 == pytest.approx(0.0027, rel=0.15)
-    assert math.degrees(found.pose_heading_rad) == pytest.approx(0.0033, rel=0.2)
+    assert result.y_m * 1e3 == pytest.approx(across, rel=0.1)
+    assert result.x_m * 1e3 == pytest.approx(along, rel=0.2)
+    assert math.degrees(result.angle_rad) == pytest.approx(angle, rel=0.1)
+    assert result.pose_y_m * 1e3 == pytest.approx(0.0027, rel=0.15)
+    assert math.degrees(result.pose_heading_rad) == pytest.approx(0.0033, rel=0.2)
 
 
 def test_reference_figures_of_the_recordings() -> None:
@@ -161,9 +161,9 @@ def test_reference_figures_of_the_recordings() -> None:
     sensors = array((0.85, 0.85, 1.25))
     known = accuracy_bound(tags, LAYOUTS, sensors, step_m=2.6e-3, nuisance="strength")
     free = accuracy_bound(tags, LAYOUTS, sensors, step_m=2.6e-3, nuisance="steps")
-    for found in (known, free):
-        assert found.y_m * 1e3 == pytest.approx(0.05, rel=0.1)
-        assert math.degrees(found.angle_rad) == pytest.approx(0.34, rel=0.1)
+    for result in (known, free):
+        assert result.y_m * 1e3 == pytest.approx(0.05, rel=0.1)
+        assert math.degrees(result.angle_rad) == pytest.approx(0.34, rel=0.1)
     assert known.x_m * 1e3 == pytest.approx(0.05, rel=0.1)
     assert free.x_m > 5 * known.x_m
 
@@ -173,18 +173,18 @@ def test_reference_figures_of_the_recordings() -> None:
 )
 def test_reference_figures_by_clearance(clearance: int, across: float, angle: float) -> None:
     tags = replace(TAGS, clearance_m=clearance * 1e-3)
-    found = accuracy_bound(tags, LAYOUTS, array(), step_m=1e-3, nuisance="strength")
-    assert found.y_m * 1e3 == pytest.approx(across, rel=0.12)
-    assert math.degrees(found.angle_rad) == pytest.approx(angle, rel=0.12)
+    result = accuracy_bound(tags, LAYOUTS, array(), step_m=1e-3, nuisance="strength")
+    assert result.y_m * 1e3 == pytest.approx(across, rel=0.12)
+    assert math.degrees(result.angle_rad) == pytest.approx(angle, rel=0.12)
 
 
 def test_less_known_is_never_better() -> None:
-    found = [
+    result = [
         accuracy_bound(TAGS, LAYOUTS[:3], array(), step_m=2e-3, nuisance=u)
         for u in NUISANCE_MODELS[:3]
     ]
     free = accuracy_bound(TAGS, LAYOUTS[:3], array(), step_m=2e-3, nuisance="steps")
-    for better, worse in [*pairwise(found), (found[1], free)]:
+    for better, worse in [*pairwise(result), (result[1], free)]:
         for name in vars(better):
             assert getattr(better, name) <= getattr(worse, name) * (1 + 1e-9), name
 
@@ -217,7 +217,7 @@ def test_the_heading_rotates_the_tag() -> None:
     """A tag at 90 degrees is another tag, whose magnets lie and point elsewhere."""
     square = TagLayout(((0, 0), (0, 2), (2, 2)), (0, 2, 5))
     tags = replace(TAGS, magnets=3)
-    turned = magnet_covariance(
+    rotated = magnet_covariance(
         tags, square, array(), step_m=1e-3, heading_rad=math.pi / 2, nuisance="strength"
     )
     # Counter-clockwise: v1 comes to lie where v4 was, v2 where v1 was, v3 where v2 was.
@@ -225,7 +225,7 @@ def test_the_heading_rotates_the_tag() -> None:
     same = bounds.rotate(cell_positions(tags, square.cells), math.pi / 2)
     assert same == pytest.approx(there, abs=1e-12)
     upright = Tags(order=3, magnets=3)
-    pose = pose_covariance(upright, square, turned, math.pi / 2)
+    pose = pose_covariance(upright, square, rotated, math.pi / 2)
     assert np.linalg.eigvalsh(pose).min() > 0
 
 

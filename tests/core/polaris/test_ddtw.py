@@ -31,7 +31,7 @@ def by_definition(a: Array, b: Array) -> float:
     """Written from Keogh and Pazzani's text, number by number."""
 
     def slopes(series: Array) -> list[list[float]]:
-        found = [
+        result = [
             [
                 ((series[i][axis] - series[i - 1][axis])
                  + (series[i + 1][axis] - series[i - 1][axis]) / 2) / 2
@@ -39,8 +39,8 @@ def by_definition(a: Array, b: Array) -> float:
             ]
             for i in range(1, len(series) - 1)
         ]  # fmt: skip
-        scale = math.sqrt(sum(math.hypot(*slope) ** 2 for slope in found) / len(found))
-        return [[value / scale for value in slope] for slope in found]
+        scale = math.sqrt(sum(math.hypot(*slope) ** 2 for slope in result) / len(result))
+        return [[value / scale for value in slope] for slope in result]
 
     q, c = slopes(a), slopes(b)
     total: dict[tuple[int, int], float] = {}
@@ -53,12 +53,12 @@ def by_definition(a: Array, b: Array) -> float:
 
 @pytest.mark.parametrize(("n", "length", "count"), SIZES)
 def test_distances_are_those_of_the_definition(n: int, length: int, count: int) -> None:
-    window, made = walk(1, n, 3), walk(2, count, length, 3)
-    found = ddtw.distances(window, ddtw.prepare(made))
-    assert found.shape == (count,)
+    window, generated = walk(1, n, 3), walk(2, count, length, 3)
+    result = ddtw.distances(window, ddtw.prepare(generated))
+    assert result.shape == (count,)
     some = range(0, count, max(count // 4, 1))
-    expected = [by_definition(window, made[k]) for k in some]
-    np.testing.assert_allclose(found[list(some)], expected, rtol=2e-5)
+    expected = [by_definition(window, generated[k]) for k in some]
+    np.testing.assert_allclose(result[list(some)], expected, rtol=2e-5)
 
 
 @needs_kernels
@@ -102,26 +102,28 @@ def test_the_axes_keep_their_proportions() -> None:
 
 
 def test_a_template_is_nearest_to_itself_at_other_speeds() -> None:
-    made = template_set(Tags(), 0.01, TemplateGrid(orientations=18))
-    slopes = ddtw.prepare(made.field_t)
+    generated = template_set(Tags(), 0.01, TemplateGrid(orientations=18))
+    slopes = ddtw.prepare(generated.field_t)
     for k in range(0, 90, 7):
-        assert ddtw.distances(made.field_t[k], slopes)[k] == 0
+        assert ddtw.distances(generated.field_t[k], slopes)[k] == 0
         where = np.linspace(0, 79, 80) + 3 * np.sin(np.linspace(0, math.tau, 80))
         warped = np.column_stack(
-            [np.interp(where, np.arange(80), made.field_t[k, :, axis]) for axis in range(3)]
+            [np.interp(where, np.arange(80), generated.field_t[k, :, axis]) for axis in range(3)]
         )
         near = int(ddtw.distances(warped, slopes).argmin())
-        turned = made.angle_rad[near] - made.angle_rad[k]
-        assert abs(math.remainder(turned, math.tau)) < math.radians(21)
+        rotated = generated.angle_rad[near] - generated.angle_rad[k]
+        assert abs(math.remainder(rotated, math.tau)) < math.radians(21)
 
 
 def test_each_orientation_is_told_under_the_middle_of_a_sensor() -> None:
     # Where the axes are brought to one size each, those of a quadrant are the same, and those
     # with an axis of zeros (0, 90, 180 and 270 degrees) are not numbers.
     angles = np.linspace(0, math.tau, 36, endpoint=False)
-    made = templates(Tags().magnet, 0.01, np.linspace(-0.04, 0.04, 80), np.zeros(1), angles).field_t
-    slopes = ddtw.prepare(made)
-    noisy = made + np.random.default_rng(7).normal(0, 2e-7, made.shape)
+    generated = templates(
+        Tags().magnet, 0.01, np.linspace(-0.04, 0.04, 80), np.zeros(1), angles
+    ).field_t
+    slopes = ddtw.prepare(generated)
+    noisy = generated + np.random.default_rng(7).normal(0, 2e-7, generated.shape)
     assert [int(ddtw.distances(window, slopes).argmin()) for window in noisy] == list(range(36))
 
 

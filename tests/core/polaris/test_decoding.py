@@ -36,14 +36,14 @@ def magnets(tags: Tags, tag_id: int) -> tuple[list[Cell], np.ndarray]:
     return list(layout.cells), np.array(layout.symbols, float)
 
 
-def turned(tags: Tags, *steps: float) -> AsBuiltTag:
+def rotated(tags: Tags, *steps: float) -> AsBuiltTag:
     """As built, with magnets this many steps clockwise from where they should point."""
     return AsBuiltTag(np.zeros((len(steps), 2)), -np.array(steps) * tags.step_rad, 1)
 
 
 def apart(tags: Tags, one: float, other: float) -> float:
-    turn = (one - other) % tags.orientations
-    return min(turn, tags.orientations - turn)
+    rotation = (one - other) % tags.orientations
+    return min(rotation, tags.orientations - rotation)
 
 
 def soft_distance(
@@ -158,7 +158,7 @@ def test_refusals_name_their_reason() -> None:
     unknown[free] = np.nan
     assert reason(cells, unknown) == "magnets_missing"
     assert reason([], np.empty(0)) == "magnets_missing"
-    # Two placements are not in the released table (facts/polaris.md section 1).
+    # The table of the released code (github.com/wjk5117/Polaris) has 8 of the 10 placements.
     assert reason([(0, 0), (1, 1), (0, 2), (1, 2), (2, 2)], steps, RELEASED) == "no_such_placement"
 
 
@@ -180,7 +180,7 @@ def test_with_tags_as_built_it_is_the_nearest_of_all_ids(data) -> None:
     shifts = st.lists(st.floats(-0.8, 0.8), min_size=3, max_size=3)
     ids = st.integers(0, codec.capacity(SMALL) - 1)
     built = data.draw(st.dictionaries(ids, shifts, max_size=4))
-    tags = replace(SMALL, built={i: turned(SMALL, *shift) for i, shift in built.items()})
+    tags = replace(SMALL, built={i: rotated(SMALL, *shift) for i, shift in built.items()})
     some = data.draw(st.sampled_from(sorted(built)) if built and data.draw(st.booleans()) else ids)
     cells, steps = magnets(tags, some)
     steps += [data.draw(st.floats(-1, 1)) for _ in cells]
@@ -193,24 +193,24 @@ def test_with_tags_as_built_it_is_the_nearest_of_all_ids(data) -> None:
 
 
 def test_a_magnet_laid_13_degrees_off_is_read_at_16_orientations_once_it_was_measured() -> None:
-    """The published default tag has one (facts/polaris.md section 1)."""
+    """The default tag of the published recordings (github.com/wjk5117/Polaris) has one."""
     design = Tags(orientations=16)
     cells, steps = magnets(design, 54321)
-    laid = np.array([4.3, -2.2, 13.0, 0.0, -2.8]) / 22.5
-    assert decode_tag(design, cells, steps + laid).tag_id != 54321
-    known = replace(design, built={54321: turned(design, *laid)})
-    reading = decode_tag(known, cells, steps + laid + 0.02)
+    installed = np.array([4.3, -2.2, 13.0, 0.0, -2.8]) / 22.5
+    assert decode_tag(design, cells, steps + installed).tag_id != 54321
+    known = replace(design, built={54321: rotated(design, *installed)})
+    reading = decode_tag(known, cells, steps + installed + 0.02)
     assert reading.tag_id == 54321
     assert reading.corrected == 0
     assert reading.margin > 0.3
     # And the tag that this one was mistaken for is read still where it lies.
-    neighbour = decode_tag(design, cells, steps + laid).tag_id
+    neighbour = decode_tag(design, cells, steps + installed).tag_id
     assert neighbour is not None
     assert decode_tag(known, *magnets(known, neighbour)).tag_id == neighbour
 
 
 def test_a_tag_that_is_not_as_it_was_built_is_not_another() -> None:
-    tags = replace(DEFAULT, built={4711: turned(DEFAULT, 0, 0.45, 0, 0, 0)})
+    tags = replace(DEFAULT, built={4711: rotated(DEFAULT, 0, 0.45, 0, 0, 0)})
     cells, steps = magnets(tags, 4711)
     steps[1] -= 0.4
     assert decode_tag(tags, cells, steps).refused == "tie"
@@ -227,7 +227,7 @@ def test_members_are_read_as_by_brute_force(data) -> None:
     member = data.draw(st.sampled_from(tags.ids))
     if data.draw(st.booleans()):
         shift = [data.draw(st.floats(-0.3, 0.3)) for _ in range(5)]
-        tags = replace(tags, built={member: turned(tags, *shift)})
+        tags = replace(tags, built={member: rotated(tags, *shift)})
     cells, steps = magnets(tags, member)
     steps += [data.draw(st.floats(-1.6, 1.6)) for _ in cells]
     best, margin = brute(tags, tags.ids, cells, steps)
@@ -320,9 +320,9 @@ def test_a_missing_magnet_takes_half_a_turn_from_the_distance(data) -> None:
     tags = family(30, 9)
     member = data.draw(st.sampled_from(tags.ids))
     cells, steps = magnets(tags, member)
-    gone, *turn = data.draw(st.permutations(range(5)))
-    steps[turn[0]] += data.draw(st.sampled_from([-1, 0, 1]))
-    steps[turn[1]] += data.draw(st.sampled_from([-1, 0, 1]))
+    gone, *rotation = data.draw(st.permutations(range(5)))
+    steps[rotation[0]] += data.draw(st.sampled_from([-1, 0, 1]))
+    steps[rotation[1]] += data.draw(st.sampled_from([-1, 0, 1]))
     wrong = int(np.abs(steps - magnets(tags, member)[1]).sum())
     rest = [k for k in range(5) if k != gone]
     reading = decode_tag(tags, [cells[k] for k in rest], steps[rest])
@@ -388,8 +388,8 @@ def words() -> dict[int, tuple[int, ...]]:
     return {i: codec.layout_of(REDUNDANT, i).symbols for i in range(count)}
 
 
-def capped(steps: np.ndarray, word, places: list[int]) -> float:
-    return sum(min(1.0, apart(REDUNDANT, steps[k], word[k])) for k in places)
+def capped(steps: np.ndarray, word, positions: list[int]) -> float:
+    return sum(min(1.0, apart(REDUNDANT, steps[k], word[k])) for k in positions)
 
 
 @pytest.mark.slow
@@ -402,11 +402,11 @@ def test_a_missing_magnet_and_a_misread_one_are_borne(data) -> None:
     order = data.draw(st.permutations(range(6)))
     missing = data.draw(st.integers(0, 3))
     kept = order[missing:]
-    turn = data.draw(st.integers(0, 7)) if missing < 2 else 0
-    steps[kept[0]] += turn
+    rotation = data.draw(st.integers(0, 7)) if missing < 2 else 0
+    steps[kept[0]] += rotation
     reading = decode_tag(REDUNDANT, [cells[k] for k in kept], steps[kept])
     assert (reading.tag_id, reading.refused, reading.erased) == (tag_id, "", missing)
-    assert reading.corrected == min(turn, 8 - turn)
+    assert reading.corrected == min(rotation, 8 - rotation)
     assert reading.symbols == tuple(words()[tag_id][k] for k in kept)
     # The margin promises no more than brute force over all words finds.
     own = capped(steps, words()[tag_id], kept)
@@ -455,14 +455,14 @@ def test_a_redundant_family_has_only_its_members() -> None:
 
 def test_a_redundant_tag_as_built() -> None:
     """Four magnets more than half a step off: beyond the code, but measured."""
-    laid = (0.6, -0.6, 0.1, 0.7, -0.55, 0.0)
+    installed = (0.6, -0.6, 0.1, 0.7, -0.55, 0.0)
     cells, steps = magnets(REDUNDANT, 21)
-    assert decode_tag(REDUNDANT, cells, steps + laid).tag_id is None
-    tags = replace(REDUNDANT, built={21: turned(REDUNDANT, *laid)})
-    reading = decode_tag(tags, cells, steps + laid + 0.05)
+    assert decode_tag(REDUNDANT, cells, steps + installed).tag_id is None
+    tags = replace(REDUNDANT, built={21: rotated(REDUNDANT, *installed)})
+    reading = decode_tag(tags, cells, steps + installed + 0.05)
     assert (reading.tag_id, reading.corrected) == (21, 0)
     kept = [0, 1, 3, 4, 5]
-    misread = steps + laid
+    misread = steps + installed
     misread[3] += 3
     reading = decode_tag(tags, [cells[k] for k in kept], misread[kept])
     assert (reading.tag_id, reading.corrected, reading.erased) == (21, 3, 1)

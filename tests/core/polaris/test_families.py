@@ -33,8 +33,8 @@ def slow_distance(tags: Tags, one: int, other: int) -> int:
     total = 0
     for cell, symbol in first.items():
         if cell in second:
-            turn = (symbol - second[cell]) % tags.orientations
-            total += min(turn, tags.orientations - turn)
+            rotation = (symbol - second[cell]) % tags.orientations
+            total += min(rotation, tags.orientations - rotation)
         else:
             total += tags.orientations // 2
     return total
@@ -153,11 +153,11 @@ def test_what_the_codec_does_not_hold_is_refused() -> None:
         families.generate_family(tags, 65, 1)
     with pytest.raises(InputError, match=r"\d+ found among all 64 ids") as caught:
         families.generate_family(tags, 64, 3)
-    found = int(str(caught.value).split(": ")[1].split()[0])
+    result = int(str(caught.value).split(": ")[1].split()[0])
     # As many as it says are there indeed.
-    assert len(families.generate_family(tags, found, 3)) == found
+    assert len(families.generate_family(tags, result, 3)) == result
     with pytest.raises(InputError):
-        families.generate_family(tags, found + 1, 3)
+        families.generate_family(tags, result + 1, 3)
 
 
 def test_the_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

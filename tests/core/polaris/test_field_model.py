@@ -23,17 +23,17 @@ def over(height: float, count: int = 23) -> tuple[MagnetOffsets, Array]:
     y = np.array([-0.021, -0.008, 0.0, 0.005, 0.03])
     along = np.broadcast_to(x[:, None], (len(y), 3, count, 1)).copy()
     offsets = MagnetOffsets.from_components(along, y[:, None, None, None], height)
-    place = np.stack(np.broadcast_arrays(x, y[:, None], height), axis=-1)
-    return offsets, place
+    position = np.stack(np.broadcast_arrays(x, y[:, None], height), axis=-1)
+    return offsets, position
 
 
-def cylinder(place: Array, magnet: Magnet, angle: float) -> Array:
+def cylinder(position: Array, magnet: Magnet, angle: float) -> Array:
     """magpylib's field (..., 3) of a disc that is magnetised towards ``angle``."""
     polarization = magnet.remanence_t * np.array([np.cos(angle), np.sin(angle), 0])
     source = magpylib.magnet.Cylinder(
         polarization=polarization, dimension=(magnet.diameter_m, magnet.height_m)
     )
-    return np.asarray(source.getB(place))
+    return np.asarray(source.getB(position))
 
 
 def modelled(offsets: MagnetOffsets, moment: ArrayLike, flat: float = 0.0) -> Array:
@@ -60,8 +60,8 @@ def flat_moment(magnet: Magnet, angle: float) -> Array:
 def test_disc_is_magpylibs_cylinder(
     magnet: Magnet, height: float, point: float, disc: float, angle: float
 ) -> None:
-    offsets, place = over(height)
-    truth = cylinder(place, magnet, angle)
+    offsets, position = over(height)
+    truth = cylinder(position, magnet, angle)
     peak = np.abs(truth).max()
     moment = flat_moment(magnet, angle)
     as_point = np.abs(modelled(offsets, moment) - truth).max() / peak
@@ -72,9 +72,9 @@ def test_disc_is_magpylibs_cylinder(
 
 
 def test_moment_upward_is_magpylibs_too() -> None:
-    offsets, place = over(0.01)
+    offsets, position = over(0.01)
     moment = (0, 0, 2e-3)
-    truth = magpylib.misc.Dipole(moment=moment).getB(place)
+    truth = magpylib.misc.Dipole(moment=moment).getB(position)
     np.testing.assert_allclose(modelled(offsets, moment), truth, atol=1e-9 * np.abs(truth).max())
 
 
@@ -105,14 +105,14 @@ def test_gradients_are_those_of_the_field(axis: int) -> None:
 
 def test_each_axis_of_the_field_has_its_own_place_along_the_track() -> None:
     """X, Y and Z are converted one after the other, while the array moves on."""
-    _, place = over(0.01)
+    _, position = over(0.01)
     shift = np.array([-5e-4, 0.0, 5e-4])
-    along = place[:, None, :, None, 0] + shift[:, None, None]
-    skewed = MagnetOffsets.from_components(along, place[:, None, :1, None, 1], 0.01)
-    found = modelled(skewed, flat_moment(DISC, 1.0), disc_correction(DISC))
+    along = position[:, None, :, None, 0] + shift[:, None, None]
+    skewed = MagnetOffsets.from_components(along, position[:, None, :1, None, 1], 0.01)
+    result = modelled(skewed, flat_moment(DISC, 1.0), disc_correction(DISC))
     for axis in range(3):
-        truth = cylinder(place + [shift[axis], 0, 0], DISC, 1.0)[..., axis]
-        assert np.abs(found[..., axis] - truth).max() < 1e-3 * np.abs(truth).max()
+        truth = cylinder(position + [shift[axis], 0, 0], DISC, 1.0)[..., axis]
+        assert np.abs(result[..., axis] - truth).max() < 1e-3 * np.abs(truth).max()
 
 
 def test_disc_correction_is_the_second_derivative_along_z() -> None:

@@ -53,7 +53,7 @@ def posed(
     return window, PassState(tag.places, moment, path, STEP, 0.01), tag
 
 
-def astray(state: PassState, seed: int = 3) -> PassState:
+def perturbed(state: PassState, seed: int = 3) -> PassState:
     rng = np.random.default_rng(seed)
     return replace(
         state,
@@ -67,7 +67,7 @@ def test_side_of_the_normal_equations_is_the_slope_of_the_cost(world: Any) -> No
     """Places, height, skew and crab: half the slope, downhill, for point dipoles."""
     window, truth, _ = posed(world, known=True, order=True)
     window = replace(window, disc_correction_m2=0.0)
-    start = replace(astray(truth), skew_periods=0.2, crab_rad=0.01)
+    start = replace(perturbed(truth), skew_periods=0.2, crab_rad=0.01)
     weight = 1 / np.broadcast_to(window.noise_t**2, window.field_t.shape)
     problem = PassProblem(window, PassPriors(), weight, start)
     problem = problem.with_free(frozenset({"crab", "tilt"}))
@@ -83,29 +83,31 @@ def test_side_of_the_normal_equations_is_the_slope_of_the_cost(world: Any) -> No
         for k in range(m):
             shift = np.zeros((m, 2))
             shift[k, axis] = step
-            place = trial.state.position_m
-            slope = (cost(position_m=place + shift) - cost(position_m=place - shift)) / (2 * step)
+            position = trial.state.position_m
+            slope = (cost(position_m=position + shift) - cost(position_m=position - shift)) / (
+                2 * step
+            )
             assert side[axis * m + k] == pytest.approx(
                 -slope / 2, rel=2e-4, abs=1e-4 * np.abs(side).max()
             )
     steps = (("height_m", 1e-8), ("skew_periods", 1e-5), ("crab_rad", 1e-6))
-    for place, (name, step) in enumerate(steps):
+    for position, (name, step) in enumerate(steps):
         value = getattr(trial.state, name)
         slope = (cost(**{name: value + step}) - cost(**{name: value - step})) / (2 * step)
-        assert side[2 * m + place] == pytest.approx(-slope / 2, rel=2e-3)
+        assert side[2 * m + position] == pytest.approx(-slope / 2, rel=2e-3)
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_magnets_of_magpylib_are_found_from_a_start_nearby(known: bool, world: Any) -> None:
     window, truth, tag = posed(world, known=known)
-    fitted = fit_pass(window, astray(truth), PassPriors())
+    fitted = fit_pass(window, perturbed(truth), PassPriors())
     assert fitted.converged
     assert fitted.rms_sigma == pytest.approx(1.0, abs=0.06)
-    place = fitted.state.position_m - (
+    position = fitted.state.position_m - (
         0 if known else (fitted.state.position_m - tag.places).mean(axis=0) * [1, 0]
     )
-    np.testing.assert_allclose(place[:, 1], tag.places[:, 1], atol=5e-5)
-    np.testing.assert_allclose(place[:, 0], tag.places[:, 0], atol=5e-5 if known else 4e-4)
+    np.testing.assert_allclose(position[:, 1], tag.places[:, 1], atol=5e-5)
+    np.testing.assert_allclose(position[:, 0], tag.places[:, 0], atol=5e-5 if known else 4e-4)
     angle = np.arctan2(fitted.state.moment_am2[:, 1], fitted.state.moment_am2[:, 0])
     assert np.abs(world.turn(angle, tag.angles)).max() < np.radians(0.3)
     assert fitted.state.height_m == pytest.approx(0.01, abs=1e-4)
@@ -113,7 +115,7 @@ def test_magnets_of_magpylib_are_found_from_a_start_nearby(known: bool, world: A
 
 def test_many_starts_one_optimum(world: Any) -> None:
     window, truth, _ = posed(world, known=True)
-    fits = [fit_pass(window, astray(truth, seed), PassPriors()) for seed in range(6)]
+    fits = [fit_pass(window, perturbed(truth, seed), PassPriors()) for seed in range(6)]
     assert np.ptp([fitted.state.position_m for fitted in fits], axis=0).max() < 2e-6
 
 
@@ -121,9 +123,9 @@ def test_free_steps_follow_an_uneven_way(world: Any) -> None:
     """The speed swings by a quarter, and once eight samples are lost of which the clock
     knows nothing; the start is a steady drive."""
     window, truth, _ = posed(world, known=False)
-    wanted = np.cumsum(1 + 0.25 * np.sin(np.arange(150) / 15))
-    wanted[75:] += 8
-    rows = np.unique(np.rint(wanted[wanted < 159]).astype(int))
+    expected = np.cumsum(1 + 0.25 * np.sin(np.arange(150) / 15))
+    expected[75:] += 8
+    rows = np.unique(np.rint(expected[expected < 159]).astype(int))
     n = len(rows)
     uneven = replace(
         window,
@@ -132,7 +134,7 @@ def test_free_steps_follow_an_uneven_way(world: Any) -> None:
         counts=np.ones(n, np.intp),
     )
     steady = np.linspace(truth.path_m[rows[0]], truth.path_m[rows[-1]], n)
-    start = replace(astray(truth), path_m=steady, mean_step_m=float(np.diff(steady).mean()))
+    start = replace(perturbed(truth), path_m=steady, mean_step_m=float(np.diff(steady).mean()))
     fitted = fit_pass(uneven, start, PassPriors())
     inner = slice(15, -15)
     miss = (fitted.state.path_m - truth.path_m[rows])[inner]
@@ -146,10 +148,10 @@ def test_free_steps_follow_an_uneven_way(world: Any) -> None:
 def test_skew_of_the_conversion_is_found(world: Any) -> None:
     """4 ms of 10 between two axes: 0.4 of a sample period."""
     window, truth, _ = posed(world, known=True, order=True)
-    start, priors = replace(astray(truth), skew_periods=0.1), PassPriors(skew_periods=(0.1, 0.5))
+    start, priors = replace(perturbed(truth), skew_periods=0.1), PassPriors(skew_periods=(0.1, 0.5))
     fitted = fit_pass(window, start, priors)
     assert fitted.state.skew_periods == pytest.approx(0.4, abs=0.02)
-    unaware = fit_pass(replace(window, axis_order=np.zeros(3)), astray(truth), PassPriors())
+    unaware = fit_pass(replace(window, axis_order=np.zeros(3)), perturbed(truth), PassPriors())
     assert unaware.rms_sigma > 1.3 * fitted.rms_sigma
 
 
@@ -179,7 +181,7 @@ def test_outliers_are_weighted_down(world: Any) -> None:
     rng = np.random.default_rng(2)
     field = window.field_t.copy()
     field[rng.random(field.shape) < 0.01] += 4e-5
-    fitted = fit_pass(replace(window, field_t=field), astray(truth), PassPriors())
+    fitted = fit_pass(replace(window, field_t=field), perturbed(truth), PassPriors())
     assert np.linalg.norm(fitted.state.position_m - tag.places, axis=1).max() < 1e-4
 
 
@@ -188,7 +190,7 @@ def test_missing_samples_are_no_samples(world: Any) -> None:
     field = window.field_t.copy()
     field[:, 3] = np.nan
     field[60:70] = np.nan
-    fitted = fit_pass(replace(window, field_t=field), astray(truth), PassPriors())
+    fitted = fit_pass(replace(window, field_t=field), perturbed(truth), PassPriors())
     assert np.isnan(fitted.residual[:, 3]).all()
     assert np.isnan(fitted.residual[65]).all()
     assert np.linalg.norm(fitted.state.position_m - tag.places, axis=1).max() < 1e-4

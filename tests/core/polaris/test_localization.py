@@ -27,7 +27,7 @@ CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
 SYMBOLS = ((0, 3, 5, 2, 6), (1, 7, 4, 4, 3), (2, 2, 0, 6, 1))
 IDS = tuple(codec.id_of(TAGS, TagLayout(CELLS, symbols)) for symbols in SYMBOLS)
 PLACES = ((0.0, 0.008, 0.4), (0.5, -0.012, 2.0), (1.0, 0.005, -1.3))
-SITE = {i: PlanarPose(*place) for i, place in zip(IDS, PLACES, strict=True)}
+SITE = {i: PlanarPose(*position) for i, position in zip(IDS, PLACES, strict=True)}
 
 
 def quaternions(heading: Array) -> Array:
@@ -62,7 +62,8 @@ def odometry(
 def tour(world: Any) -> tuple[Any, Samples]:
     """A straight drive over three tags, turned by 0.02 rad against the floor's x."""
     tags = [
-        world.Tag(CELLS, symbols, *place) for symbols, place in zip(SYMBOLS, PLACES, strict=True)
+        world.Tag(CELLS, symbols, *position)
+        for symbols, position in zip(SYMBOLS, PLACES, strict=True)
     ]
     course = world.line(length=1.3, past=(0.5, 0.0), direction=0.02)
     return course, world.record(tags, course, seed=11)
@@ -165,9 +166,9 @@ def test_odometry_of_another_device_is_not_used(world: Any, tour: tuple[Any, Sam
 def test_corrections_lead_to_the_next_tag(world: Any, tour: tuple[Any, Samples]) -> None:
     """Paper 8.3.7. Checked by driving them: turn, then go straight as far as is said."""
     course, recording = tour
-    turns = solve([recording], replace(TAGS, site=SITE)).facts.heading_corrections
-    assert [(turn.from_tag, turn.to_tag) for turn in turns] == [IDS[:2], IDS[1:]]
-    for turn in turns:
+    rotations = solve([recording], replace(TAGS, site=SITE)).facts.heading_corrections
+    assert [(turn.from_tag, turn.to_tag) for turn in rotations] == [IDS[:2], IDS[1:]]
+    for turn in rotations:
         x, y, heading = (float(v) for v in course.at(np.array(turn.time_s - world.start_ns * 1e-9)))
         reached = x + 1j * y + turn.distance_m * np.exp(1j * (heading + turn.rotation_rad))
         goal = SITE[turn.to_tag]
@@ -178,10 +179,10 @@ def test_corrections_lead_to_the_next_tag(world: Any, tour: tuple[Any, Samples])
 def test_along_counts_backward_as_negative(world: Any) -> None:
     course = world.driven(world.line(length=1.0, direction=1.1), [0, 5, 10], [0, 1, 0.5])
     driven = odometry(world, course, turn=0.7)
-    way = distance_along(driven, driven.time_ns)
-    assert way[0] == 0
-    assert way.max() == pytest.approx(1.0, abs=0.01)
-    assert way[-1] == pytest.approx(0.5, abs=0.01)
+    path = distance_along(driven, driven.time_ns)
+    assert path[0] == 0
+    assert path.max() == pytest.approx(1.0, abs=0.01)
+    assert path[-1] == pytest.approx(0.5, abs=0.01)
 
 
 def test_along_counts_only_what_the_robot_looks_at(world: Any) -> None:

@@ -83,8 +83,8 @@ def test_magnets_of_a_tag_the_strongest_first(world: Any) -> None:
     cells = ((0, 0), (1, 1), (0, 2), (2, 2))
     tag = world.Tag(cells, (0, 3, 5, 6), strength=(1.0, 1.1, 0.7, 0.85), heading=0.3)
     atoms, left = atoms_of(world, [tag], most=4)
-    places = np.array([atom.position_m for atom in atoms])
-    nearest = np.linalg.norm(places[:, None] - tag.places[None], axis=2)
+    positions = np.array([atom.position_m for atom in atoms])
+    nearest = np.linalg.norm(positions[:, None] - tag.places[None], axis=2)
     assert sorted(nearest.argmin(axis=1)) == [0, 1, 2, 3]
     assert nearest.min(axis=1).max() < 0.4 * HEIGHT
     energies = [atom.energy for atom in atoms]

@@ -161,8 +161,8 @@ def test_a_step_changes_one_bit_of_the_id(data) -> None:
     layout = codec.layout_of(tags, tag_id)
     symbols = list(layout.symbols)
     symbols[data.draw(st.integers(0, 4))] += data.draw(st.sampled_from([1, -1]))
-    turned = tuple(s % tags.orientations for s in symbols)
-    assert bits_apart(codec.id_of(tags, TagLayout(layout.cells, turned)), tag_id) == 1
+    rotated = tuple(s % tags.orientations for s in symbols)
+    assert bits_apart(codec.id_of(tags, TagLayout(layout.cells, rotated)), tag_id) == 1
 
 
 def test_released_ids_are_the_published_ones() -> None:

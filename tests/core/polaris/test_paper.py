@@ -40,11 +40,13 @@ SPEED = 0.1
 LAYOUT = TagLayout(((0, 0), (1, 1), (2, 1), (0, 2), (2, 2)), (0, 7, 2, 5, 4))
 
 
-def lying(x: float, y: float, heading: float, layout: TagLayout = LAYOUT) -> tuple[Array, Array]:
+def installed_magnets(
+    x: float, y: float, heading: float, layout: TagLayout = LAYOUT
+) -> tuple[Array, Array]:
     """Places (M, 2) and angles (M,) of a tag's magnets on the floor."""
     cos, sin = math.cos(heading), math.sin(heading)
-    turned = cell_positions(TAGS, layout.cells) @ np.array([[cos, sin], [-sin, cos]])
-    return turned + [x, y], symbol_angles(TAGS, layout.symbols) + heading
+    rotated = cell_positions(TAGS, layout.cells) @ np.array([[cos, sin], [-sin, cos]])
+    return rotated + [x, y], symbol_angles(TAGS, layout.symbols) + heading
 
 
 def drive(
@@ -57,39 +59,39 @@ def drive(
 ) -> Samples:
     """The paper's array driven over the floor from x = 0 on, with 0.5 uT of noise."""
     rng = np.random.default_rng(seed)
-    way = np.arange(0, length, step)
+    path = np.arange(0, length, step)
     array = SensorArray(bar(9, 0.02))
-    sensor = array.position_m + way[:, None, None] * [1.0, 0.0, 0.0]
+    sensor = array.position_m + path[:, None, None] * [1.0, 0.0, 0.0]
     sensor[..., 2] = clearance_m
     field = rng.normal(0, 0.5e-6, sensor.shape) + rng.normal(0, 3e-5, (1, 9, 3))
     sources = [
         magpylib.magnet.Cylinder(
-            polarization=(1.45 * math.cos(turn), 1.45 * math.sin(turn), 0),
+            polarization=(1.45 * math.cos(rotation), 1.45 * math.sin(rotation), 0),
             dimension=(2e-3, 0.5e-3),
-            position=(*place, 0),
+            position=(*point, 0),
         )
-        for places_m, turns in magnets
-        for place, turn in zip(places_m, turns, strict=True)
+        for places_m, rotations in magnets
+        for point, rotation in zip(places_m, rotations, strict=True)
     ]
     if sources:
         field += magpylib.getB(sources, sensor, sumup=True)
-    return Samples("bar", array, np.rint(way / SPEED * 1e9).astype(np.int64), field)
+    return Samples("bar", array, np.rint(path / SPEED * 1e9).astype(np.int64), field)
 
 
-def on_the_floor(sighting: DetectedMagnets, samples: Samples) -> Array:
+def floor_positions(sighting: DetectedMagnets, samples: Samples) -> Array:
     """Places with the way of the array added: from where it started."""
-    way = (sighting.time_ns - samples.time_ns[0]) * 1e-9 * SPEED
-    return sighting.position_m + [way, 0.0]
+    path = (sighting.time_ns - samples.time_ns[0]) * 1e-9 * SPEED
+    return sighting.position_m + [path, 0.0]
 
 
 def compared(sighting: DetectedMagnets, samples: Samples, truth: tuple[Array, Array]) -> Array:
     """Distance in m and turn in rad (M, 2) of each true magnet's nearest."""
-    place = on_the_floor(sighting, samples)
-    apart = np.linalg.norm(place[:, None] - truth[0], axis=2)
+    point = floor_positions(sighting, samples)
+    apart = np.linalg.norm(point[:, None] - truth[0], axis=2)
     nearest = apart.argmin(axis=0)
     assert sorted(nearest.tolist()) == list(range(len(sighting)))
-    turn = np.remainder(sighting.angle_rad[nearest] - truth[1] + math.pi, math.tau) - math.pi
-    return np.column_stack([apart.min(axis=0), np.abs(turn)])
+    rotation = np.remainder(sighting.angle_rad[nearest] - truth[1] + math.pi, math.tau) - math.pi
+    return np.column_stack([apart.min(axis=0), np.abs(rotation)])
 
 
 # ---- Eq. 3
@@ -112,8 +114,8 @@ def test_a_magnet_between_two_sensors_is_found_by_their_ratio(
         source.getB([(0, -side * offset, clearance), (0, side * (0.02 - offset), clearance)]),
         axis=1,
     )
-    found = paper.lateral_offset(strengths[0] / strengths[1], angle, 0.02, clearance)
-    assert found == pytest.approx(offset, abs=2e-4)
+    result = paper.lateral_offset(strengths[0] / strengths[1], angle, 0.02, clearance)
+    assert result == pytest.approx(offset, abs=2e-4)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.8, math.pi / 2])
@@ -132,13 +134,13 @@ def test_the_magnet_stays_between_the_two(angle: float) -> None:
 def test_the_pattern_gives_the_heading(heading: float, order: list[int], placement: int) -> None:
     free = list(itertools.combinations([(1, 0), (0, 1), (1, 1), (2, 1), (1, 2)], 2))[placement]
     layout = TagLayout(((0, 0), (0, 2), (2, 2), *free), (0, 7, 2, 5, 4))
-    position = lying(0.3, -0.02, heading, layout)[0][order]
+    position = installed_magnets(0.3, -0.02, heading, layout)[0][order]
     pattern = paper.position_pattern(position)
     assert pattern is not None
     assert [order[k] for k in pattern] == [0, 1, 2]
-    found = paper.pattern_heading(position)
-    assert found is not None
-    assert math.remainder(found - heading, math.tau) == pytest.approx(0, abs=1e-9)
+    result = paper.pattern_heading(position)
+    assert result is not None
+    assert math.remainder(result - heading, math.tau) == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("degrees", "is_pattern"), [(76, True), (74, False), (104, True)])
@@ -167,7 +169,7 @@ def test_no_pattern_without_a_right_angle(points: list[tuple[float, float]]) -> 
 @pytest.mark.parametrize("degrees", range(0, 360, 40))
 def test_magnets_of_a_tag_at_any_heading(degrees: int) -> None:
     # The paper has 1.93 to 2.49 mm over its headings (8.3.2).
-    truth = lying(0.17, 0.004, math.radians(degrees))
+    truth = installed_magnets(0.17, 0.004, math.radians(degrees))
     samples = drive([truth], 0.34, seed=degrees)
     (sighting,) = paper.detect_magnets(samples, TAGS, SPEED)
     wrong = compared(sighting, samples, truth)
@@ -180,10 +182,10 @@ def test_magnets_of_a_tag_at_any_heading(degrees: int) -> None:
 @pytest.mark.parametrize(("lateral", "expected"), [(0.0, {4}), (0.004, {4}), (0.01, {4, 5})])
 def test_a_magnet_counts_where_it_is_nearest(lateral: float, expected: set[int]) -> None:
     samples = drive([(np.array([[0.1, lateral]]), np.array([0.5]))], 0.2)
-    found = find_peaks(measure_signals(samples, 1.0), 20.0)
-    assert {peak.sensor for peak in found} == expected
-    assert [peak.sample for peak in found] == pytest.approx([100] * len(found), abs=6)
-    assert found[0].amplitude_t > 5e-5
+    result = find_peaks(measure_signals(samples, 1.0), 20.0)
+    assert {peak.sensor for peak in result} == expected
+    assert [peak.sample for peak in result] == pytest.approx([100] * len(result), abs=6)
+    assert result[0].amplitude_t > 5e-5
 
 
 @given(st.lists(st.floats(0, 1), max_size=8))
@@ -238,7 +240,7 @@ def test_magnets_passed_together_share_no_sensor(magnets: list[tuple[float, floa
 
 
 def test_the_frame_is_the_array_s_at_the_middle_of_the_pass() -> None:
-    truth = lying(0.25, 0.0, 0.0)
+    truth = installed_magnets(0.25, 0.0, 0.0)
     samples = drive([truth], 0.5)
     (sighting,) = paper.detect_magnets(samples, TAGS, SPEED)
     assert sighting.position_m.mean(axis=0) == pytest.approx(
@@ -255,7 +257,7 @@ def test_the_frame_is_the_array_s_at_the_middle_of_the_pass() -> None:
 
 
 def test_two_tags_are_two_passes() -> None:
-    first, second = lying(0.15, 0.01, 0.2), lying(0.5, -0.015, -1.0)
+    first, second = installed_magnets(0.15, 0.01, 0.2), installed_magnets(0.5, -0.015, -1.0)
     samples = drive([second, first], 0.65)
     before, after = paper.detect_magnets(samples, TAGS, SPEED)
     assert before.time_ns < after.time_ns
@@ -264,7 +266,7 @@ def test_two_tags_are_two_passes() -> None:
 
 
 def test_background_that_drifts_is_no_magnet_and_moves_none() -> None:
-    truth = lying(0.3, 0.003, 0.1)
+    truth = installed_magnets(0.3, 0.003, 0.1)
     still, samples = drive([], 0.6), drive([truth], 0.6)
     # 20 uT over the drive, and 8 uT more from motors once it has begun.
     drift = np.linspace(0, 2e-5, 600)[:, None, None] * np.array([1.0, -0.5, 0.3])
@@ -276,7 +278,7 @@ def test_background_that_drifts_is_no_magnet_and_moves_none() -> None:
 
 
 def test_lost_samples_and_a_dead_sensor_that_sees_nothing() -> None:
-    truth = lying(0.17, 0.02, 0.0)
+    truth = installed_magnets(0.17, 0.02, 0.0)
     samples = drive([truth], 0.34)
     field = samples.field_t.copy()
     field[np.random.default_rng(3).random(field.shape[:2]) < 0.02] = np.nan
@@ -291,7 +293,7 @@ def test_lost_samples_and_a_dead_sensor_that_sees_nothing() -> None:
 
 @pytest.mark.slow
 def test_sensors_may_come_in_any_order() -> None:
-    samples = drive([lying(0.17, 0.004, 0.4)], 0.34)
+    samples = drive([installed_magnets(0.17, 0.004, 0.4)], 0.34)
     order = np.random.default_rng(4).permutation(9)
     array = replace(samples.array, position_m=samples.array.position_m[order])
     mixed = Samples("bar", array, samples.time_ns, samples.field_t[:, order])
@@ -321,7 +323,7 @@ def test_nothing_is_found_in_noise() -> None:
 
 
 def test_a_long_slow_recording_is_thinned_out() -> None:
-    truth = lying(0.15, 0.004, 0.0)
+    truth = installed_magnets(0.15, 0.004, 0.0)
     samples = drive([truth], 0.3, step=1e-4)
     (sighting,) = paper.detect_magnets(samples, TAGS, SPEED)
     assert compared(sighting, samples, truth)[:, 0].mean() < 2.4e-3
@@ -351,7 +353,7 @@ def test_windows_of_sparse_samples_have_the_points_of_the_templates() -> None:
     # As in the published recordings, 2.6 mm a sample: windows of 31 samples scatter twice as much.
     wrong = []
     for seed in range(6):
-        truth = lying(0.17, 1e-3 * seed, math.radians(3 * seed))
+        truth = installed_magnets(0.17, 1e-3 * seed, math.radians(3 * seed))
         samples = drive([truth], 0.34, step=2.625e-3, seed=seed)
         (magnets,) = paper.detect_magnets(samples, TAGS, SPEED)
         wrong.append(compared(magnets, samples, truth)[:, 1])
@@ -365,8 +367,8 @@ def test_a_wide_tag_flips_no_moment_across_the_track(heading_deg: int) -> None:
     heading = math.radians(heading_deg)
     cos, sin = math.cos(heading), math.sin(heading)
     for lateral in (0.004, 0.007, 0.0085):
-        turned = cell_positions(tags, LAYOUT.cells) @ np.array([[cos, sin], [-sin, cos]])
-        truth = turned + [0.2, lateral], np.radians([90.0, -90.0, 90.0, -90.0, 90.0]) + heading
+        rotated = cell_positions(tags, LAYOUT.cells) @ np.array([[cos, sin], [-sin, cos]])
+        truth = rotated + [0.2, lateral], np.radians([90.0, -90.0, 90.0, -90.0, 90.0]) + heading
         samples = drive([truth], 0.4, clearance_m=0.012)
         (magnets,) = paper.detect_magnets(samples, tags, SPEED)
         assert compared(magnets, samples, truth)[:, 1].max() < math.radians(45)
@@ -384,7 +386,7 @@ def test_the_gap_of_a_dead_sensor_flips_no_moment(lateral: float) -> None:
 
 
 def test_the_resolution_of_the_templates_is_that_of_the_orientations() -> None:
-    samples = drive([lying(0.17, 0.004, 0.0)], 0.34)
+    samples = drive([installed_magnets(0.17, 0.004, 0.0)], 0.34)
     for orientations in (8, 90):
         (magnets,) = paper.detect_magnets(samples, TAGS, SPEED, TemplateGrid(orientations))
         steps = magnets.angle_rad / (math.tau / orientations)

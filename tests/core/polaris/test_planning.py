@@ -82,24 +82,24 @@ def test_merged_peaks_have_no_error() -> None:
 
 
 def test_the_default_works() -> None:
-    found = evaluate_design(Tags())
-    assert found.warnings == ()
-    assert found.signal_to_noise == pytest.approx(200, rel=0.05)
-    assert found.between_t * 1e6 == pytest.approx(63.9, abs=0.1)
-    assert found.rate_hz == pytest.approx(61, abs=0.5)
-    assert found.max_orientations in (9, 10)
-    assert found.capacity == 327_680
-    assert found.play_m == pytest.approx(0.04)
-    assert found.noise_from == "measured"
+    result = evaluate_design(Tags())
+    assert result.warnings == ()
+    assert result.signal_to_noise == pytest.approx(200, rel=0.05)
+    assert result.between_t * 1e6 == pytest.approx(63.9, abs=0.1)
+    assert result.rate_hz == pytest.approx(61, abs=0.5)
+    assert result.max_orientations in (9, 10)
+    assert result.capacity == 327_680
+    assert result.play_m == pytest.approx(0.04)
+    assert result.noise_from == "measured"
 
 
 def test_the_papers_rate_is_not_the_sensors() -> None:
     """100 Hz with a conversion of 16.05 ms: the warning's settings do it."""
-    found = evaluate_design(Tags(), ReadingConditions(rate_hz=100))
-    (warning,) = found.warnings
+    result = evaluate_design(Tags(), ReadingConditions(rate_hz=100))
+    (warning,) = result.warnings
     assert "16.05 ms" in warning
     assert "61.2 Hz" in warning
-    assert found.rate_hz == found.max_rate_hz
+    assert result.rate_hz == result.max_rate_hz
     osr, filt = map(int, re.findall(r"osr (\d) filt (\d) gives", warning)[0])
     better = evaluate_design(
         Tags(), ReadingConditions(rate_hz=100, settings=Settings(osr=osr, filt=filt))
@@ -112,34 +112,34 @@ def test_the_papers_rate_is_not_the_sensors() -> None:
 
 
 def test_the_mini_tag_works() -> None:
-    found = evaluate_design(MINI, MINI_USE)
-    assert found.warnings == ()
-    assert found.capacity == 512
-    assert found.rate_hz == 17
-    assert found.free_speed.y_m < 0.58e-3
-    assert found.free_speed.angle_rad < math.radians(0.997)
-    assert any("to within 0 mm" in note for note in found.notes)
+    result = evaluate_design(MINI, MINI_USE)
+    assert result.warnings == ()
+    assert result.capacity == 512
+    assert result.rate_hz == 17
+    assert result.free_speed.y_m < 0.58e-3
+    assert result.free_speed.angle_rad < math.radians(0.997)
+    assert any("to within 0 mm" in note for note in result.notes)
 
 
 def test_too_many_orientations() -> None:
     """6 degrees, as measured on the published tags: 8 are fine, 16 and 20 are not."""
     for orientations in (8, 16, 20):
-        found = evaluate_design(replace(Tags(), orientations=orientations))
-        assert len(found.warnings) == (orientations > 8)
+        result = evaluate_design(replace(Tags(), orientations=orientations))
+        assert len(result.warnings) == (orientations > 8)
     assert "16" in evaluate_design(replace(Tags(), orientations=16)).warnings[0]
-    most = found.max_orientations
+    most = result.max_orientations
     assert evaluate_design(replace(Tags(), orientations=most)).warnings == ()
     assert evaluate_design(replace(Tags(), orientations=most + 1)).warnings != ()
-    jig = float(re.findall(r"come to ([\d.]+) degrees", found.warnings[0])[0])
+    jig = float(re.findall(r"come to ([\d.]+) degrees", result.warnings[0])[0])
     better = ReadingConditions(placement_rad=math.radians(jig * 0.97))
     assert evaluate_design(replace(Tags(), orientations=20), better).warnings == ()
 
 
 def test_misread_is_the_chance_of_a_tag() -> None:
     tags, error = replace(Tags(), orientations=16), math.radians(6)
-    found = evaluate_design(tags, ReadingConditions(placement_rad=error))
+    result = evaluate_design(tags, ReadingConditions(placement_rad=error))
     off = np.random.default_rng(0).normal(0, error, (100_000, tags.magnets))
-    assert found.misread == pytest.approx(
+    assert result.misread == pytest.approx(
         (np.abs(off) > math.radians(11.25)).any(1).mean(), rel=0.03
     )
 
@@ -153,8 +153,8 @@ def test_calibrated_tags_tell_how_well_they_are_laid() -> None:
 
 
 def test_too_fast() -> None:
-    found = evaluate_design(Tags(), ReadingConditions(speed_mps=2))
-    (warning,) = found.warnings
+    result = evaluate_design(Tags(), ReadingConditions(speed_mps=2))
+    (warning,) = result.warnings
     most = float(re.findall(r"at most ([\d.]+) m/s", warning)[0])
     assert evaluate_design(Tags(), ReadingConditions(speed_mps=most * 0.98)).warnings == ()
     assert evaluate_design(Tags(), ReadingConditions(speed_mps=most * 1.03)).warnings != ()
@@ -163,11 +163,11 @@ def test_too_fast() -> None:
 
 
 def test_too_weak() -> None:
-    found = evaluate_design(
+    result = evaluate_design(
         replace(Tags(), clearance_m=0.04, spacing_m=0.16), ReadingConditions(sensors=17)
     )
-    assert any("too weak" in warning for warning in found.warnings)
-    assert found.between_to_noise < 6
+    assert any("too weak" in warning for warning in result.warnings)
+    assert result.between_to_noise < 6
     assert evaluate_design(replace(Tags(), clearance_m=0.02, spacing_m=0.08)).warnings == ()
 
 
@@ -199,8 +199,8 @@ def test_spacing() -> None:
 
 
 def test_a_tag_wider_than_the_array() -> None:
-    found = evaluate_design(Tags(), ReadingConditions(sensors=4))
-    (warning,) = found.warnings
+    result = evaluate_design(Tags(), ReadingConditions(sensors=4))
+    (warning,) = result.warnings
     needed = int(re.findall(r"take (\d+) sensors", warning)[0])
     assert needed == 5
     assert evaluate_design(Tags(), ReadingConditions(sensors=needed)).warnings == ()
@@ -209,9 +209,9 @@ def test_a_tag_wider_than_the_array() -> None:
 
 
 def test_noise_that_is_given_counts() -> None:
-    found = evaluate_design(Tags(), ReadingConditions(noise_t=0.5e-6))
-    assert found.noise_from == "given"
-    assert found.signal_to_noise == pytest.approx(358, rel=0.005)
+    result = evaluate_design(Tags(), ReadingConditions(noise_t=0.5e-6))
+    assert result.noise_from == "given"
+    assert result.signal_to_noise == pytest.approx(358, rel=0.005)
 
 
 @pytest.mark.parametrize(

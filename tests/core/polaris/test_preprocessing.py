@@ -48,10 +48,10 @@ def test_a_magnet_is_no_spike() -> None:
 @pytest.mark.parametrize("at", [30, 100])
 def test_a_misframed_row_goes(at: int) -> None:
     """At rest, and at the peak of a magnet."""
-    made = samples()
-    made.field_t[at] += 1e-3
-    result = preprocess(made)
-    gone = changed(made, result.samples)
+    generated = samples()
+    generated.field_t[at] += 1e-3
+    result = preprocess(generated)
+    gone = changed(generated, result.samples)
     assert gone[at].all()
     assert gone.sum() == 15
     assert [each.code for each in result.warnings] == ["spikes", "samples_missing"]
@@ -59,10 +59,10 @@ def test_a_misframed_row_goes(at: int) -> None:
 
 
 def test_a_stuck_sensor_goes_while_it_is_stuck() -> None:
-    made = samples()
-    made.field_t[60:140, 2] = made.field_t[60, 2]
-    result = preprocess(made)
-    gone = changed(made, result.samples)
+    generated = samples()
+    generated.field_t[60:140, 2] = generated.field_t[60, 2]
+    result = preprocess(generated)
+    gone = changed(generated, result.samples)
     assert gone[60:140, 2].all()
     assert not gone[:60].any()
     assert not gone[140:].any()
@@ -72,19 +72,19 @@ def test_a_stuck_sensor_goes_while_it_is_stuck() -> None:
 
 
 def test_a_bar_without_noise_is_not_stuck() -> None:
-    made = samples()
-    made.field_t[:] = 1e-5
-    result = preprocess(made)
+    generated = samples()
+    generated.field_t[:] = 1e-5
+    result = preprocess(generated)
     assert np.isfinite(result.samples.field_t).all()
     assert result.warnings == ()
 
 
 def test_what_is_not_finite_is_missing() -> None:
-    made = samples()
-    made.field_t[50, 1, 2] = np.inf
-    result = preprocess(made)
+    generated = samples()
+    generated.field_t[50, 1, 2] = np.inf
+    result = preprocess(generated)
     assert np.isnan(result.samples.field_t[50, 1, 2])
-    assert changed(made, result.samples).sum() == 0
+    assert changed(generated, result.samples).sum() == 0
 
 
 # ---- noise and passes

@@ -65,18 +65,18 @@ class Run:
 def aligned(place_mm: NDArray[np.complex128]) -> float:
     """Mean distance in mm from the layout after the best rotation and translation."""
     a, b = place_mm - place_mm.mean(), TRUTH_MM - TRUTH_MM.mean()
-    turn = np.vdot(a, b)
-    return float(np.abs(a * turn / abs(turn) - b).mean())
+    rotation = np.vdot(a, b)
+    return float(np.abs(a * rotation / abs(rotation) - b).mean())
 
 
 def solved(samples: Samples, options: SolveOptions) -> Run:
-    (found,) = solve([samples], TAGS, options).detections
-    place = np.array([-m.y_m + 1j * m.x_m for m in found.magnets]) * 1e3
-    angle = np.array([m.angle_rad for m in found.magnets])
-    assert len(place) == 5
-    order = min(permutations(range(5)), key=lambda order: aligned(place[list(order)]))
-    place, angle = place[list(order)], angle[list(order)]
-    return Run(found.tag_id, place, angle, found.heading_rad, found.margin, found)
+    (result,) = solve([samples], TAGS, options).detections
+    position = np.array([-m.y_m + 1j * m.x_m for m in result.magnets]) * 1e3
+    angle = np.array([m.angle_rad for m in result.magnets])
+    assert len(position) == 5
+    order = min(permutations(range(5)), key=lambda order: aligned(position[list(order)]))
+    position, angle = position[list(order)], angle[list(order)]
+    return Run(result.tag_id, position, angle, result.heading_rad, result.margin, result)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +104,8 @@ def anchored(run: Run) -> float:
 
 def scatter_deg(some: list[Run]) -> float:
     """Rms of the orientations about each magnet's own mean over the runs."""
-    turned = np.exp(1j * np.array([run.angle_rad for run in some]))
-    return float(np.degrees(np.sqrt(np.mean(np.angle(turned * turned.mean(axis=0).conj()) ** 2))))
+    rotated = np.exp(1j * np.array([run.angle_rad for run in some]))
+    return float(np.degrees(np.sqrt(np.mean(np.angle(rotated * rotated.mean(axis=0).conj()) ** 2))))
 
 
 @pytest.mark.slow
@@ -156,10 +156,10 @@ def test_uncertainty_is_of_the_size_of_the_errors(name: str, runs: dict[str, lis
     """How the car stood is not known (one of the ten runs is 1.6 degrees askew, the others
     scatter by 0.3), nor where the tag lay: so much only."""
     for run in runs[name]:
-        found = run.detection
-        assert 0.1 < np.degrees(found.sigma_heading_rad) < 1.0
-        assert 1e-4 < found.sigma_y_m < 1e-3
-        assert 0.8 < found.residual_sigma < 1.6
+        result = run.detection
+        assert 0.1 < np.degrees(result.sigma_heading_rad) < 1.0
+        assert 1e-4 < result.sigma_y_m < 1e-3
+        assert 0.8 < result.residual_sigma < 1.6
     askew = [abs(run.heading_rad / run.detection.sigma_heading_rad) for run in runs[name]]
     assert np.median(askew) < 2.5
 
@@ -167,8 +167,8 @@ def test_uncertainty_is_of_the_size_of_the_errors(name: str, runs: dict[str, lis
 def test_height_and_moments_are_those_of_an_independent_fit(runs: dict[str, list[Run]]) -> None:
     """11.4 to 11.9 mm and 1.1 to 1.4 mA m^2 by an independent least-squares fit of all dipoles."""
     every = [run.detection for some in runs.values() for run in some]
-    assert 0.0105 < np.median([found.height_m for found in every]) < 0.0125
-    moments = [magnet.moment_am2 for found in every for magnet in found.magnets]
+    assert 0.0105 < np.median([result.height_m for result in every]) < 0.0125
+    moments = [magnet.moment_am2 for result in every for magnet in result.magnets]
     assert 1.0e-3 < np.median(moments) < 1.5e-3
 
 

@@ -35,8 +35,8 @@ def words(magnets: int, orientations: int) -> tuple[tuple[int, ...], ...]:
     return tuple(codec.layout_of(tags, i).symbols for i in range(codec.capacity(tags)))
 
 
-def errors(word: tuple[int, ...], seen: tuple[int | None, ...]) -> int:
-    return sum(s is not None and s != w for w, s in zip(word, seen, strict=True))
+def errors(word: tuple[int, ...], observed: tuple[int | None, ...]) -> int:
+    return sum(s is not None and s != w for w, s in zip(word, observed, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -80,11 +80,11 @@ def test_decoding_is_right_for_whatever_is_seen(magnets: int, orientations: int)
     known = words(magnets, orientations)
     alphabet = [None, *range(orientations)]
     every = itertools.product(alphabet, repeat=magnets)
-    for seen in itertools.islice(every, 0, None, 1 if magnets == 5 else 7):
-        missing = seen.count(None)
-        near = [word for word in known if 2 * errors(word, seen) + missing <= BUDGET]
+    for observed in itertools.islice(every, 0, None, 1 if magnets == 5 else 7):
+        missing = observed.count(None)
+        near = [word for word in known if 2 * errors(word, observed) + missing <= BUDGET]
         assert len(near) <= 1
-        assert redundant.decode_word(tags, seen) == (near[0] if near else None)
+        assert redundant.decode_word(tags, observed) == (near[0] if near else None)
 
 
 def test_every_missing_magnet_with_every_misread_is_corrected() -> None:
@@ -92,9 +92,9 @@ def test_every_missing_magnet_with_every_misread_is_corrected() -> None:
     for word in words(5, 8):
         for missing, wrong in itertools.permutations(range(5), 2):
             for symbol in range(8):
-                seen: list[int | None] = list(word)
-                seen[missing], seen[wrong] = None, symbol
-                assert redundant.decode_word(tags, seen) == word
+                observed: list[int | None] = list(word)
+                observed[missing], observed[wrong] = None, symbol
+                assert redundant.decode_word(tags, observed) == word
 
 
 @st.composite
@@ -105,14 +105,14 @@ def damaged(draw) -> tuple[Tags, tuple[int, ...], list[int | None], int, int]:
     word = codec.layout_of(tags, draw(st.integers(0, codec.capacity(tags) - 1))).symbols
     missing = draw(st.integers(0, 3))
     misread = draw(st.integers(0, (BUDGET - missing) // 2 + 1))
-    places = draw(st.permutations(range(tags.magnets)))
-    seen: list[int | None] = list(word)
-    for place in places[:missing]:
-        seen[place] = None
-    for place in places[missing : missing + misread]:
+    positions = draw(st.permutations(range(tags.magnets)))
+    observed: list[int | None] = list(word)
+    for position in positions[:missing]:
+        observed[position] = None
+    for position in positions[missing : missing + misread]:
         by = draw(st.integers(1, size - 1))
-        seen[place] = (word[place] + by) % size
-    return tags, word, seen, misread, missing
+        observed[position] = (word[position] + by) % size
+    return tags, word, observed, misread, missing
 
 
 @pytest.mark.slow
@@ -120,19 +120,21 @@ def damaged(draw) -> tuple[Tags, tuple[int, ...], list[int | None], int, int]:
 @given(damaged())
 def test_the_promise_holds_at_any_size(case) -> None:
     """Within the budget the word comes back; one misread more is noticed."""
-    tags, word, seen, misread, missing = case
+    tags, word, observed, misread, missing = case
     expected = word if 2 * misread + missing <= BUDGET else None
-    assert redundant.decode_word(tags, seen) == expected
+    assert redundant.decode_word(tags, observed) == expected
 
 
 @settings(deadline=None)
 @given(st.sampled_from([t for t in DESIGNS if t.magnets > 5]), st.data())
 def test_three_misreads_of_a_whole_tag_are_noticed(tags: Tags, data) -> None:
     size = redundant.field_size(tags.orientations)
-    seen = list(codec.layout_of(tags, data.draw(st.integers(0, codec.capacity(tags) - 1))).symbols)
-    for place in data.draw(st.permutations(range(tags.magnets)))[:3]:
-        seen[place] = (seen[place] + data.draw(st.integers(1, size - 1))) % size
-    assert redundant.decode_word(tags, seen) is None
+    observed = list(
+        codec.layout_of(tags, data.draw(st.integers(0, codec.capacity(tags) - 1))).symbols
+    )
+    for position in data.draw(st.permutations(range(tags.magnets)))[:3]:
+        observed[position] = (observed[position] + data.draw(st.integers(1, size - 1))) % size
+    assert redundant.decode_word(tags, observed) is None
 
 
 @settings(deadline=None)
@@ -148,10 +150,10 @@ def test_an_orientation_that_no_word_has_counts_as_missing() -> None:
     tags = DESIGNS[-3]
     assert tags.orientations == 20
     word = codec.layout_of(tags, 123456789).symbols
-    seen: list[int | None] = list(word)
-    seen[3] = seen[7] = 19
-    seen[11] = None
-    assert redundant.decode_word(tags, seen) == word
+    observed: list[int | None] = list(word)
+    observed[3] = observed[7] = 19
+    observed[11] = None
+    assert redundant.decode_word(tags, observed) == word
 
 
 def test_words_never_change() -> None:
@@ -178,9 +180,9 @@ def test_the_checks_are_the_documented_ones(data) -> None:
 def test_layouts_that_are_no_word_are_refused() -> None:
     tags = design(7, 8)
     layout = codec.layout_of(tags, 100)
-    turned = (layout.symbols[0] ^ 1, *layout.symbols[1:])
+    rotated = (layout.symbols[0] ^ 1, *layout.symbols[1:])
     with pytest.raises(InputError, match="no word"):
-        codec.id_of(tags, TagLayout(layout.cells, turned))
+        codec.id_of(tags, TagLayout(layout.cells, rotated))
     moved = (*layout.cells[:-3], (1, 2), *layout.cells[-2:])
     with pytest.raises(InputError, match="in the cells"):
         codec.id_of(tags, TagLayout(moved, layout.symbols))

@@ -35,20 +35,20 @@ def id_of(symbols: tuple[int, ...], tags: Tags = TAGS) -> int:
 
 def the_tag(solution: Solution) -> TagDetection:
     """The one detection that was read."""
-    (found,) = [d for d in solution.detections if d.tag_id is not None]
-    return found
+    (result,) = [d for d in solution.detections if d.tag_id is not None]
+    return result
 
 
-def errors(world: Any, found: TagDetection, course: Any, tag: Any) -> Array:
+def errors(world: Any, result: TagDetection, course: Any, tag: Any) -> Array:
     """Of the pose (x, y in m, heading in rad) against the truth at that time."""
-    truth = world.seen_from(course, round(found.time_s * 1e9), tag)
-    seen = np.array([found.x_m, found.y_m, found.heading_rad]) - truth
-    seen[2] = world.turn(seen[2])
-    return seen
+    truth = world.seen_from(course, round(result.time_s * 1e9), tag)
+    observed = np.array([result.x_m, result.y_m, result.heading_rad]) - truth
+    observed[2] = world.turn(observed[2])
+    return observed
 
 
-def sigmas(found: TagDetection) -> Array:
-    return np.array([found.sigma_x_m, found.sigma_y_m, found.sigma_heading_rad])
+def sigmas(result: TagDetection) -> Array:
+    return np.array([result.sigma_x_m, result.sigma_y_m, result.sigma_heading_rad])
 
 
 # ---- what goes wrong on floors and in wires
@@ -60,7 +60,7 @@ def passed(world: Any, **more: Any) -> tuple[Any, Any, Samples]:
     return tag, course, world.record([tag], course, **more)
 
 
-def spoiled(kind: str, samples: Samples) -> Samples:
+def with_faults(kind: str, samples: Samples) -> Samples:
     """The same recording with one thing wrong."""
     rng = np.random.default_rng(3)
     b = samples.field_t.copy()
@@ -106,16 +106,16 @@ def spoiled(kind: str, samples: Samples) -> Samples:
 )  # fmt: skip
 def test_read_in_spite_of(kind: str, world: Any) -> None:
     tag, course, recording = passed(world, seed=8)
-    found = the_tag(solve([spoiled(kind, recording)], TAGS))
-    assert found.tag_id == id_of(SYMBOLS)
-    error = errors(world, found, course, tag)
+    result = the_tag(solve([with_faults(kind, recording)], TAGS))
+    assert result.tag_id == id_of(SYMBOLS)
+    error = errors(world, result, course, tag)
     assert np.all(np.abs(error) < [6e-4, 2e-4, np.radians(0.3)])
-    assert np.all(np.abs(error) < 4 * sigmas(found))
+    assert np.all(np.abs(error) < 4 * sigmas(result))
 
 
 def test_missing_samples_are_told(world: Any) -> None:
     _, _, recording = passed(world)
-    solution = solve([spoiled("dead sensor", recording)], TAGS)
+    solution = solve([with_faults("dead sensor", recording)], TAGS)
     (warning,) = [each for each in solution.warnings if each.code == "samples_missing"]
     assert "11 %" in warning.message
 
@@ -125,28 +125,28 @@ def test_iron_debris_is_no_magnet(world: Any) -> None:
     debris = [world.Debris(0.02, 0.025, 3e-3), world.Debris(-0.05, 0.0, 2e-3)]
     debris += [world.Debris(0.01, -0.055, 4e-3)]
     course = world.line(length=0.28)
-    found = the_tag(solve([world.record([tag, *debris], course, seed=4)], TAGS))
-    assert found.tag_id == id_of(SYMBOLS)
-    assert len(found.magnets) == 5
-    assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 2e-4, np.radians(0.3)])
+    result = the_tag(solve([world.record([tag, *debris], course, seed=4)], TAGS))
+    assert result.tag_id == id_of(SYMBOLS)
+    assert len(result.magnets) == 5
+    assert np.all(np.abs(errors(world, result, course, tag)) < [6e-4, 2e-4, np.radians(0.3)])
 
 
 @pytest.mark.parametrize("step_mm", [0.1, 0.4, 3.0, 7.0])
 def test_slow_and_fast(step_mm: float, world: Any) -> None:
     tag, course, recording = passed(world, course=world.line(length=0.26, speed=step_mm / 10))
-    found = the_tag(solve([recording], TAGS))
-    assert found.tag_id == id_of(SYMBOLS)
-    assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
-    assert found.speed_mps == pytest.approx(step_mm / 10, rel=0.06)
+    result = the_tag(solve([recording], TAGS))
+    assert result.tag_id == id_of(SYMBOLS)
+    assert np.all(np.abs(errors(world, result, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
+    assert result.speed_mps == pytest.approx(step_mm / 10, rel=0.06)
 
 
 @pytest.mark.slow
 def test_backward(world: Any) -> None:
     course = world.driven(world.line(length=0.28), [0, 2.8], [1, 0])
     tag, _, recording = passed(world, course=course)
-    found = the_tag(solve([recording], TAGS))
-    assert found.tag_id == id_of(SYMBOLS)
-    assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
+    result = the_tag(solve([recording], TAGS))
+    assert result.tag_id == id_of(SYMBOLS)
+    assert np.all(np.abs(errors(world, result, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
 
 
 @pytest.mark.slow
@@ -154,11 +154,11 @@ def test_standing_still_over_the_tag(world: Any) -> None:
     course = world.driven(world.line(length=0.28), [0, 1.2, 2.7, 4.3], [0, 0.43, 0.43, 1])
     tag, _, recording = passed(world, course=course, heading=np.radians(33), seed=2)
     solution = solve([recording], TAGS)
-    for found in solution.detections:
-        assert found.tag_id in (None, id_of(SYMBOLS))  # read, or refused; never wrong
-        if found.tag_id is not None:
-            error = errors(world, found, course, tag)
-            assert np.all(np.abs(error) < np.maximum(4 * sigmas(found), [6e-4, 1e-4, 3e-3]))
+    for result in solution.detections:
+        assert result.tag_id in (None, id_of(SYMBOLS))  # read, or refused; never wrong
+        if result.tag_id is not None:
+            error = errors(world, result, course, tag)
+            assert np.all(np.abs(error) < np.maximum(4 * sigmas(result), [6e-4, 1e-4, 3e-3]))
 
 
 # ---- what must be refused
@@ -190,10 +190,10 @@ def test_plain_tag_without_a_magnet_is_refused(gone: int, world: Any) -> None:
     strength = tuple(float(k != gone) for k in range(5))
     tag = world.Tag(CELLS, SYMBOLS, heading=1.0, strength=strength)
     solution = solve([world.record([tag], world.line(length=0.28), seed=gone)], TAGS)
-    (found,) = solution.detections
-    assert found.tag_id is None
-    assert found.refused in ("magnets_missing", "partial")  # four fit on more than one grid
-    assert len(found.magnets) == 4
+    (result,) = solution.detections
+    assert result.tag_id is None
+    assert result.refused in ("magnets_missing", "partial")  # four fit on more than one grid
+    assert len(result.magnets) == 4
 
 
 @pytest.mark.slow
@@ -219,28 +219,30 @@ def test_tag_of_another_design_is_refused(wrong: dict[str, Any], world: Any) -> 
 @pytest.mark.parametrize("spacing", [0.036, 0.045])
 def test_slightly_wrong_spacing_is_never_a_surely_wrong_pose(spacing: float, world: Any) -> None:
     tag, course, recording = passed(world, heading=0.0)
-    for found in solve([recording], replace(TAGS, spacing_m=spacing)).detections:
-        if found.tag_id is not None:
-            assert np.all(np.abs(errors(world, found, course, tag)) < 4 * sigmas(found))
+    for result in solve([recording], replace(TAGS, spacing_m=spacing)).detections:
+        if result.tag_id is not None:
+            assert np.all(np.abs(errors(world, result, course, tag)) < 4 * sigmas(result))
 
 
 def test_wrong_clearance_does_not_matter(world: Any) -> None:
     tag, course, recording = passed(world)
     for clearance in (0.006, 0.015):
-        found = the_tag(solve([recording], replace(TAGS, clearance_m=clearance)))
-        assert found.tag_id == id_of(SYMBOLS)
-        assert found.height_m == pytest.approx(0.010, abs=1e-4)
-        assert np.all(np.abs(errors(world, found, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
+        result = the_tag(solve([recording], replace(TAGS, clearance_m=clearance)))
+        assert result.tag_id == id_of(SYMBOLS)
+        assert result.height_m == pytest.approx(0.010, abs=1e-4)
+        assert np.all(np.abs(errors(world, result, course, tag)) < [6e-4, 1e-4, np.radians(0.2)])
 
 
 def test_without_a_tag_there_are_magnets_but_no_ids(world: Any) -> None:
     tag, _, recording = passed(world)
     solution = solve([recording], None)
     assert solution.rejected == {"no_tag_given": 1}
-    (found,) = solution.detections
-    assert found.tag_id is None
-    places = np.array([[m.x_m, m.y_m] for m in found.magnets])
-    apart = np.sort(np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(5, 1)])
+    (result,) = solution.detections
+    assert result.tag_id is None
+    positions = np.array([[m.x_m, m.y_m] for m in result.magnets])
+    apart = np.sort(
+        np.linalg.norm(positions[:, None] - positions[None], axis=2)[np.triu_indices(5, 1)]
+    )
     grid = tag.places
     expected = np.sort(np.linalg.norm(grid[:, None] - grid[None], axis=2)[np.triu_indices(5, 1)])
     np.testing.assert_allclose(apart, expected, atol=1e-3)
@@ -262,9 +264,9 @@ def test_two_tags(ahead: float, aside: float, world: Any) -> None:
     solution = solve([recording], TAGS)
     truth = {id_of(SYMBOLS): first, id_of(OTHER): second}
     assert {d.tag_id for d in solution.detections} == set(truth)
-    for found in solution.detections:
-        error = errors(world, found, course, truth[found.tag_id])
-        assert np.all(np.abs(error) < np.maximum([8e-4, 1e-4, 3e-3], 3 * sigmas(found)))
+    for result in solution.detections:
+        error = errors(world, result, course, truth[result.tag_id])
+        assert np.all(np.abs(error) < np.maximum([8e-4, 1e-4, 3e-3], 3 * sigmas(result)))
 
 
 def test_order_is_that_of_time_and_the_site_places_the_array(world: Any) -> None:
@@ -283,8 +285,8 @@ def test_order_is_that_of_time_and_the_site_places_the_array(world: Any) -> None
     error = poses.position[:, :2] - np.column_stack([x, y])
     assert np.sqrt(np.mean(error**2)) < 3e-4
     assert np.all(np.abs(error) < 4 * poses.sigma[:, :2] + 1e-4)
-    (turn,) = solution.facts.heading_corrections
-    assert (turn.from_tag, turn.to_tag) == tuple(ids)
+    (rotation,) = solution.facts.heading_corrections
+    assert (rotation.from_tag, rotation.to_tag) == tuple(ids)
 
 
 # ---- input that is none

@@ -33,17 +33,19 @@ def driven(magnet: Magnet, clearance: float, lateral: float, angle: float) -> np
 @pytest.mark.parametrize("magnet", [Magnet(), Magnet(3e-3, 1e-3, 1.2, "N35")])
 def test_cylinders_are_magpylibs(magnet: Magnet) -> None:
     laterals, angles = np.array([-0.01, 0.0, 0.004]), np.radians([0, 35, 90, 200])
-    made = templates(magnet, 0.006, ALONG, laterals, angles, cylinder_fields)
-    assert made.field_t.shape == (12, 31, 3)
-    for lateral, angle, field in zip(made.lateral_m, made.angle_rad, made.field_t, strict=True):
+    generated = templates(magnet, 0.006, ALONG, laterals, angles, cylinder_fields)
+    assert generated.field_t.shape == (12, 31, 3)
+    for lateral, angle, field in zip(
+        generated.lateral_m, generated.angle_rad, generated.field_t, strict=True
+    ):
         true = driven(magnet, 0.006, lateral, angle)
         np.testing.assert_allclose(field, true, rtol=1e-9, atol=1e-14)
 
 
 def test_the_grid_holds_every_offset_with_every_orientation_once() -> None:
-    made = templates(Magnet(), 0.01, ALONG, np.array([-0.01, 0.0, 0.01]), np.array([0.0, 1.0]))
-    assert made.lateral_m.tolist() == [-0.01, 0.0, 0.01] * 2
-    assert made.angle_rad.tolist() == [0.0] * 3 + [1.0] * 3
+    generated = templates(Magnet(), 0.01, ALONG, np.array([-0.01, 0.0, 0.01]), np.array([0.0, 1.0]))
+    assert generated.lateral_m.tolist() == [-0.01, 0.0, 0.01] * 2
+    assert generated.angle_rad.tolist() == [0.0] * 3 + [1.0] * 3
 
 
 def test_dipoles_are_within_the_disc_s_size_of_cylinders() -> None:
@@ -61,28 +63,28 @@ def test_dipoles_are_within_the_disc_s_size_of_cylinders() -> None:
 def test_the_released_set_s_peak() -> None:
     # Polaris' template_36_5_80.txt: 2 x 1 mm, 2 T, 15 mm away, 147.5 uT straight above.
     disc = Magnet(2e-3, 1e-3, 2.0, "")
-    made = templates(disc, 0.015, np.zeros(1), np.zeros(1), np.zeros(1), cylinder_fields)
-    assert np.linalg.norm(made.field_t) == pytest.approx(147.5e-6, abs=0.5e-6)
+    generated = templates(disc, 0.015, np.zeros(1), np.zeros(1), np.zeros(1), cylinder_fields)
+    assert np.linalg.norm(generated.field_t) == pytest.approx(147.5e-6, abs=0.5e-6)
 
 
 def test_the_paper_s_set() -> None:
-    made = template_set(Tags(), 0.01)
-    assert made.field_t.shape == (180, 80, 3)
-    assert np.unique(made.lateral_m) == pytest.approx([-0.01, -0.005, 0, 0.005, 0.01])
-    assert np.diff(np.unique(np.degrees(made.angle_rad))) == pytest.approx(10)
+    generated = template_set(Tags(), 0.01)
+    assert generated.field_t.shape == (180, 80, 3)
+    assert np.unique(generated.lateral_m) == pytest.approx([-0.01, -0.005, 0, 0.005, 0.01])
+    assert np.diff(np.unique(np.degrees(generated.angle_rad))) == pytest.approx(10)
     # Straight above a magnet that points ahead, the field points back.
-    ahead = made.field_t[(made.angle_rad == 0) & (made.lateral_m == 0)][0]
+    ahead = generated.field_t[(generated.angle_rad == 0) & (generated.lateral_m == 0)][0]
     assert ahead[:, 0].argmin() in (39, 40)
-    assert ahead[:, 0].min() == pytest.approx(-np.abs(made.field_t).max(), rel=0.01)
+    assert ahead[:, 0].min() == pytest.approx(-np.abs(generated.field_t).max(), rel=0.01)
     assert np.abs(ahead[:, 1]).max() == 0
     assert ahead[0, 2] < 0 < ahead[-1, 2]
 
 
 def test_resolution_of_a_set() -> None:
-    made = template_set(Tags(), 0.01, TemplateGrid(orientations=360, offsets=3, points=15))
-    assert made.field_t.shape == (1080, 15, 3)
-    assert np.unique(made.lateral_m) == pytest.approx([-0.01, 0, 0.01])
-    assert np.diff(np.unique(np.degrees(made.angle_rad))) == pytest.approx(1)
+    generated = template_set(Tags(), 0.01, TemplateGrid(orientations=360, offsets=3, points=15))
+    assert generated.field_t.shape == (1080, 15, 3)
+    assert np.unique(generated.lateral_m) == pytest.approx([-0.01, 0, 0.01])
+    assert np.diff(np.unique(np.degrees(generated.angle_rad))) == pytest.approx(1)
 
 
 def test_a_single_offset_is_the_middle() -> None:
@@ -90,12 +92,12 @@ def test_a_single_offset_is_the_middle() -> None:
 
 
 def test_a_set_of_cylinders() -> None:
-    made = template_set(Tags(), 0.01, TemplateGrid(4, 3, 9), cylinder_fields)
+    generated = template_set(Tags(), 0.01, TemplateGrid(4, 3, 9), cylinder_fields)
     disc = Tags().magnet
     source = magpylib.magnet.Cylinder(
         polarization=(disc.remanence_t, 0, 0), dimension=(disc.diameter_m, disc.height_m)
     )
-    np.testing.assert_allclose(made.field_t[1, 4], source.getB((0, 0, 0.01)), atol=1e-14)
+    np.testing.assert_allclose(generated.field_t[1, 4], source.getB((0, 0, 0.01)), atol=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from locatk.core.errors import InputError
-from locatk.core.paper import PAPER_SIZES_MM, paper_name, paper_size, parse_paper
+from locatk.core.paper_sizes import PAPER_SIZES_MM, paper_name, paper_size, parse_paper
 
 
 def test_papers() -> None:
