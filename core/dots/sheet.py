@@ -95,7 +95,8 @@ class Manifest:
         section : (n, 2) array_like
             Each 0..62; -1 if unknown, which then matches any.
         slack : float
-            Pitches by which a position may be outside: the middle of a frame on the border.
+            Pitches by which a position may be outside the sheet: the middle of a frame at its
+            border is.
 
         Returns
         -------

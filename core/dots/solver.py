@@ -18,6 +18,7 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec, codec
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.localization.frames import (
+    NO_CODE,
     TOO_FEW_DOTS,
     LocalizedFrames,
     localize_frames,
@@ -40,7 +41,8 @@ SHEET_SLACK_PITCHES = 12.0
 """Largest distance of the middle of a frame from the printed area whose dots it shows [pitches]."""
 
 MAX_TOLERATED_NO_CODE = 3
-"""Number of frames without code up to which a session gets no warning."""
+"""Number of frames without code up to which a session gets no warning; beyond it they must also be
+most of the rejected frames."""
 
 UNREADABLE = "unreadable_frame"
 OTHER_SIZE = "not_of_the_cameras_size"
@@ -57,7 +59,7 @@ class SolveOptions:
         ``"lattice"`` or ``"paper"`` (the published method).
     camera : Camera, optional
         Default: its centre is the middle of the frame, and the distortion of its lens is estimated
-        in each frame.
+        in each frame (``paper``: no distortion).
     """
 
     method: str = "lattice"
@@ -257,7 +259,7 @@ def _detections(
 def _trajectories(
     frames: Frames, sheet: NDArray[np.intp], poses: _SheetPoses, manifest: Manifest
 ) -> Iterator[Trajectory]:
-    """Yield a trajectory per frame of reference, which the device is named after if several."""
+    """Yield one trajectory per coordinate frame; if there are several, its name is appended."""
     names = np.array([manifest.frame(k) for k in range(len(manifest.sheets))], object)
     visited = list(dict.fromkeys(names[sheet[sheet >= 0]]))
     for name in visited or [names[0]]:
@@ -307,7 +309,7 @@ def _warnings(
                 f"the first at {x:.1f}, {y:.1f}: is it the manifest of another sheet?",
             )
         )
-    if rejected["no_code"] > max(MAX_TOLERATED_NO_CODE, sum(rejected.values()) // 2):
+    if rejected[NO_CODE] > max(MAX_TOLERATED_NO_CODE, sum(rejected.values()) // 2):
         warnings.append(
             SolverWarning(
                 "frames_without_code",

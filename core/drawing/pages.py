@@ -226,7 +226,7 @@ class TextFlow:
         """
         left, _, right, _ = self.frame.content_box
         step = line_height(FLOW_TEXT_POINTS)
-        lines = wrap(cells[-1], FLOW_TEXT_POINTS, right - left - sum(widths_mm))
+        lines = wrap(cells[-1], FLOW_TEXT_POINTS, right - left - sum(widths_mm)) or [""]
         marks = self._marks_with_space(len(lines) * step)
         x = left
         for text, width in zip(cells[:-1], widths_mm, strict=True):

@@ -156,7 +156,14 @@ def _divide(extent_mm: Box, page_mm: Point, margin_mm: float, overlap_mm: float)
     sides, counts = [], []
     for length, page_side in zip((right - left, top - bottom), page_mm, strict=True):
         tile_side = min(page_side, MAX_PAGE_MM) - 2 * margin_mm
-        if not 0 <= overlap_mm <= tile_side / 2:
+        if not overlap_mm >= 0:  # nan too
+            raise InputError(f"an overlap of {overlap_mm:g} mm is below 0")
+        if tile_side <= 0:
+            raise InputError(
+                f"margins of {margin_mm:g} mm leave nothing of a page of {page_side:g} mm",
+                hint="Use smaller margins",
+            )
+        if overlap_mm > tile_side / 2:
             raise InputError(
                 f"an overlap of {overlap_mm:g} mm is more than half of a tile's {tile_side:.0f} mm",
                 hint="Use a smaller overlap",

@@ -60,7 +60,7 @@ MIN_NOISE_T = 2e-5
 """Lower limit of the estimated or given noise of a sample."""
 
 UNKNOWN_NOISE_T = 10 * MIN_NOISE_T
-"""Noise that is assumed if a recording is too short for an estimate."""
+"""Noise that is assumed if a recording is too short or too sparse for an estimate."""
 
 NOISE_QUANTILE = 0.25
 """Quantile of the second differences from which noise is estimated: most of the time the field is
@@ -70,7 +70,7 @@ NORMAL_QUARTILE_OF_MAGNITUDE = 0.3186
 """25 % quantile of the absolute value of a standard normal variable."""
 
 MAX_SPAN_M = 2.0
-"""Distance by odometry within which one landmark can certainly not be measured."""
+"""Extent of a path that is certainly too long for one landmark."""
 
 MIN_MOTION_M = 1e-3
 """Motion of a sensor below which a field cannot change."""
@@ -226,11 +226,12 @@ def check_odometry(recording: HallRecording, geometry: Geometry) -> None:
         )
     motion_m = max(
         np.ptp(recording.pose[:, :2], axis=0).max(),
-        recording.samples.sensors.position_m.max() * np.ptp(recording.pose[:, 2]),
+        np.hypot(*recording.samples.sensors.position_m.T).max() * np.ptp(recording.pose[:, 2]),
     )
     if motion_m >= MIN_MOTION_M:
         return
-    if np.nanmax(np.ptp(recording.samples.field_t, axis=0)) > geometry.threshold_t:
+    field_t = recording.samples.field_t
+    if np.nanmax(np.fmax.reduce(field_t) - np.fmin.reduce(field_t)) > geometry.threshold_t:
         raise InputError(
             f"the odometry of {device} does not move while its fields change",
             hint="Positions are in metres and headings in radians: check the units",
@@ -338,7 +339,7 @@ def _sample_noise(samples: HallSamples, field: Array) -> float:
     if math.isfinite(given_t) and given_t > 0:
         return max(given_t, MIN_NOISE_T)
     second = np.abs(field[2:] - 2 * field[1:-1] + field[:-2])
-    if not len(second):
+    if np.isnan(second).all():
         return UNKNOWN_NOISE_T
     quantile = np.nanquantile(second, NOISE_QUANTILE)
     # A second difference has the variance 1 + 4 + 1.

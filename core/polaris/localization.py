@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,14 +187,7 @@ def _fill_gaps(poses: Trajectory, odometry: Trajectory) -> Trajectory:
         start_ns, end_ns = poses.time_ns[[gap, gap + 1]]
         if odometry.time_ns[0] <= start_ns and end_ns <= odometry.time_ns[-1]:
             parts.append(_poses_in_gap(poses, heading, int(gap), odometry))
-    order = np.argsort(np.concatenate([part.time_ns for part in parts]), kind="stable")
-    return replace(
-        poses,
-        time_ns=np.concatenate([part.time_ns for part in parts])[order],
-        position=np.concatenate([part.position for part in parts])[order],
-        quaternion=quaternion_from_heading(np.concatenate([part.heading for part in parts])[order]),
-        covariance=np.concatenate([part.covariance for part in parts])[order],
-    )
+    return _concatenate(poses.device, poses.frame, parts)
 
 
 def _poses_in_gap(

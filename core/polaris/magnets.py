@@ -31,7 +31,7 @@ class DetectedMagnets:
     angle_rad : (M,) ndarray
         Direction of the moments, counter-clockwise from x.
     moment_am2 : (M,) ndarray
-        Their magnitude.
+        Magnitude of the horizontal moments.
     covariance : (3 M, 3 M) ndarray
         Of x, y, angle of the first magnet, of the second, ... in m and rad; ``nan`` if the method
         does not estimate it.

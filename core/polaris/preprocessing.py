@@ -47,7 +47,7 @@ PASS_TO_MARGIN_RATIO = 6
 """Duration of a pass relative to its margins, whose samples determine the background."""
 
 MIN_NOISE_T = 2e-8
-"""Noise assumed of an array without noise and without known quantum [T]."""
+"""Lower limit of the noise [T]; a quarter of the quantum if that is larger."""
 
 MIN_NOISE_SAMPLES = 20
 """Number of second differences from which the noise of a sensor is estimated."""
@@ -169,8 +169,8 @@ def _spikes(field: Array, noise_t: Array) -> NDArray[np.bool_]:
 def estimate_noise(samples: Samples) -> Array:
     """Estimate the standard deviation (N, 3) of the noise of each sensor and axis [T].
 
-    From second differences, most of which a smooth field hardly changes. The noise that the array
-    states is returned if there are too few samples.
+    It follows from second differences, most of which a smooth field hardly changes. The noise that
+    the array states is returned if there are too few samples.
     """
     stated = np.broadcast_to(samples.array.noise_t, (len(samples.array), 3))
     least = np.maximum(samples.array.quantum_t / 4, MIN_NOISE_T)
@@ -187,7 +187,7 @@ def estimate_noise(samples: Samples) -> Array:
         noise = np.where(
             count >= MIN_NOISE_SAMPLES, quantile / NORMAL_QUANTILE / np.sqrt(6), stated
         )
-    # A sensor without samples is assumed to be like the others.
+    # A sensor whose noise is neither measured nor stated is assumed to be like the others.
     is_known = np.isfinite(noise)
     for axis in range(3):
         known = noise[is_known[:, axis], axis]

@@ -89,7 +89,8 @@ def solve(
         not identified.
     options : SolveOptions, optional
     odometry : sequence of Trajectory
-        By device. It measures the path, and joins the poses between two tags.
+        At most one per device, selected by its name. It measures the path, and joins the poses
+        between two tags.
 
     Returns
     -------

@@ -543,6 +543,8 @@ def read_waypoints(file: Path) -> tuple[tuple[float, float], ...]:
             continue
         try:
             x, y = (float(row[header.index(column)]) * 1e-3 for column in ("x_mm", "y_mm"))
+            if not math.isfinite(x + y):
+                raise ValueError("not finite")
         except (ValueError, IndexError):
             raise FormatError(
                 "a waypoint is not two numbers", file=file, where=rows.line_num

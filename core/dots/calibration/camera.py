@@ -60,7 +60,7 @@ MIN_NOTED_ASPECT = 5e-4
 """Least aspect that is reported: 0.05 mm on a ruler of 100 mm."""
 
 NOTED_SIGMAS = 3.0
-"""Difference in standard deviations from which it is reported."""
+"""Difference in standard deviations from which an aspect or a focal length is reported."""
 
 MIN_NOTED_FOCAL_RATIO = 0.01
 """Relative difference of focal lengths from which it is reported."""
@@ -75,8 +75,8 @@ class CalibrateOptions:
     focal_px : float, optional
         Focal length, which is used whatever the frames indicate.
     camera : Camera, optional
-        An earlier calibration: the frames are localized with its lens, and its focal length is used
-        if the frames do not determine one.
+        An earlier calibration: frames that cannot be localized with an unknown lens are tried with
+        its lens, and its focal length is used if the frames do not determine one.
     """
 
     focal_px: float | None = None
@@ -102,9 +102,9 @@ class CameraReport:
         Of k in px^-2.
     aspect, sigma_aspect : float
         The sheet's true scale along x over that along y, relative to the manifest's, minus 1; nan
-        if the focal length is not estimated.
+        if the frames do not determine a focal length.
     largest_tilt_rad : float
-        Likewise.
+        Largest tilt of a frame; nan if the frames do not determine a focal length.
     rms_before_px, rms_px : float
         Root mean square distance of the dots from their predicted positions: without a lens, and
         with the camera.

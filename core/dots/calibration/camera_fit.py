@@ -44,7 +44,8 @@ CENTRE_PRIOR_SIGMA = 0.1
 """Prior standard deviation of the centre of a lens [half diagonals]."""
 
 RADIAL_PRIOR_SIGMA = 1.0
-"""Prior standard deviation of k in half diagonals: 1 moves the corners inwards by about a half."""
+"""Prior standard deviation of k in half diagonals: with 1, a dot seen at half a diagonal is at half
+that distance without the distortion."""
 
 LOG_FOCAL_PRIOR_SIGMA = 1.5
 """Prior standard deviation of the logarithm of the focal length: a factor of 4.5."""
@@ -309,7 +310,7 @@ class FrameEquations:
     block_hessian, block_gradient : (n, q, q) and (n, q) ndarray
     coupling : (n, s, q) ndarray
     cost : float
-        Half the weighted sum of squares; infinite if the lens shows no such dot.
+        Half the weighted sum of squares; infinite if the lens cannot show a dot that has weight.
     residual : (n, m, 2) ndarray
         Predicted minus observed; 0 for missing dots, :data:`INVISIBLE_RESIDUAL` for dots that the
         lens does not show.

@@ -190,7 +190,9 @@ def common_size(outcomes: Outcomes, total: int) -> tuple[int, int]:
             hint="Is it the manifest of another sheet?",
         )
     raise DegenerateError(
-        f"{count or 'none'} {examined} show the pattern, where {MIN_CALIBRATION_FRAMES} are needed",
+        f"{count or 'none'} {examined} show the pattern"
+        + (f" at {size[0]} x {size[1]} px" if len(sizes) > 1 else "")
+        + f", where {MIN_CALIBRATION_FRAMES} are needed",
         hint="Take sharp frames at several places of the sheet that the manifest describes",
     )
 

@@ -63,7 +63,8 @@ MAX_CERTAIN_WRONG_FRACTION = 0.08
 """Fraction of wrong bits beyond which another position may be as likely, whatever the odds."""
 
 MIN_CERTAIN_LEAD = 10.0
-"""Votes by which a position leads that no other can share: the margin of one line or less."""
+"""Lead in votes from which no other position can be the right one; a lead below it may rest on a
+single line."""
 
 MAX_SMALL_WINDOW_LINES = 16
 """Columns and rows up to which a window is small: wrong bits may hide its rotation or its position,

@@ -2,7 +2,8 @@
 
 Frames are independent, so that the first one is as reliable as the thousandth. (The peer
 cellulo-localization, commit 894f0d0, needs several frames until its vote on the orientation has
-settled.) Batches only save time: the result of a frame does not depend on them.
+settled.) Batches save time. A frame is decoded in a window as large as the largest of its batch
+needs, which decides whether the searches for small windows are used.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ PREFERRED_SIDE_PX = 120
 """Short side of a frame [px] at which the pattern is searched first: the paper's frames at full
 size, those of twice their size at half size, and so on."""
 
-MAX_LEVELS = 4
-"""Maximum number of sizes that are tried, each half of the previous one."""
+MIN_TRIED_LEVELS = 4
+"""Number of sizes that are tried, each half of the previous one; more if the preferred one is
+smaller still."""
 
 MIN_CODE_CONFIDENCE = 0.5
 """Confidence below which a frame contains no position of the codec; between this and the threshold
@@ -58,7 +60,8 @@ SECTION_BORDER = "section_border"
 class LocalizedFrames:
     """Poses of n frames on the grid, or the reasons of their rejection.
 
-    The other values of a rejected frame have no meaning.
+    Of a rejected frame, only dots, corrected and confidence are meaningful; grid and section too if
+    it is off the sheets.
 
     Attributes
     ----------
@@ -95,7 +98,7 @@ class LocalizedFrames:
         return result
 
     def update(self, indices: NDArray[np.int64], part: LocalizedFrames) -> None:
-        """Store ``part`` for the frames ``indices`` that it localizes or has more confidence in."""
+        """Store ``part`` for the ``indices`` that it localizes or has no less confidence in."""
         better = part.accepted | (part.confidence >= self.confidence[indices])
         for field in fields(LocalizedFrames):
             getattr(self, field.name)[indices[better]] = getattr(part, field.name)[better]
@@ -189,7 +192,7 @@ def _levels(height: int, width: int) -> list[int]:
     """Return the numbers of halvings of the frame to try, the most suitable first."""
     short = min(height, width)
     preferred = max(0, round(math.log2(short / PREFERRED_SIDE_PX)))
-    levels = range(max(MAX_LEVELS, preferred + 1))
+    levels = range(max(MIN_TRIED_LEVELS, preferred + 1))
     possible = [level for level in levels if short >> level >= MIN_SIDE_PX]
     return sorted(possible, key=lambda level: (abs(level - preferred), level))
 

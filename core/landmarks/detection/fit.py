@@ -35,7 +35,7 @@ POSE_SIGMA = np.array([1.0, 1.0, 1.0])
 """Standard deviations (m, m, rad) that stand in the information of the landmark's pose for a
 uniform prior. They keep the information regular if the trace does not determine the pose."""
 
-STRENGTH_COUNT = 4
+BAR_COUNT = 4
 """Number of bars."""
 
 
@@ -110,7 +110,7 @@ class ParameterLayout:
     @classmethod
     def of(cls, sensors: int, corrections: int) -> ParameterLayout:
         """Return the layout for a number of sensors and of errors of the odometry."""
-        counts = (3, sensors, sensors, STRENGTH_COUNT, 2 * STRENGTH_COUNT, 1, corrections)
+        counts = (3, sensors, sensors, BAR_COUNT, 2 * BAR_COUNT, 1, corrections)
         edges = [0, *np.cumsum(counts).tolist()]
         pose, gain, offset, strength, bar_position, height, correction = (
             slice(start, stop) for start, stop in pairwise(edges)
@@ -207,7 +207,8 @@ class VisitFitProblem:
         -------
         residual : (K, rows) ndarray
             Predicted minus measured field of each sample and sensor, in standard deviations; 0 if
-            there is no measurement. Priors are not included.
+            there is no measurement. They are multiplied by the root of the thinning, so that the
+            cost is that of all samples. Priors are not included.
         by_parameters : (K, rows, size) ndarray
         """
         trace, priors, layout = self.trace, self.priors, self.layout
@@ -240,8 +241,8 @@ class VisitFitProblem:
         # of the sensor. The derivatives below neglect the change of `by_position`.
         bar_field = (
             bar_field
-            - by_position[..., 0] * displacement[..., :STRENGTH_COUNT]
-            - by_position[..., 1] * displacement[..., STRENGTH_COUNT:]
+            - by_position[..., 0] * displacement[..., :BAR_COUNT]
+            - by_position[..., 1] * displacement[..., BAR_COUNT:]
         )
         total = np.einsum("knsb,kb->kns", bar_field, strength[:, 0, 0])
         is_measured = ~np.isnan(trace.field_t)
@@ -256,9 +257,7 @@ class VisitFitProblem:
 
         # Derivatives of the field by the sensor's position in the landmark's frame, then by the
         # position in the frame of the trace.
-        dx, dy, dz = np.moveaxis(
-            np.einsum("knsbi,kb->iknsb", by_position, strength[:, 0, 0]).sum(-1), 0, 0
-        )
+        dx, dy, dz = np.einsum("knsbi,kb->iknsb", by_position, strength[:, 0, 0]).sum(-1)
         fx, fy = c * dx - s * dy, s * dx + c * dy
         by_parameters = np.zeros((len(parameters), samples, sensors, layout.size))
         by_parameters[..., 0] = -gain * fx

@@ -187,9 +187,14 @@ def recognise_spin(
 ) -> SpinReading | None:
     """Recognise the landmark of one spin, in the frame of the odometry; None if it fits none.
 
-    The first parameters are the results of :func:`spin_valleys`, the others the sensors (N, 2) in
-    the robot's frame, whose mean distance from the origin is the radius of the circle, and the
-    limit of :func:`~.second_step.recognise`.
+    Parameters
+    ----------
+    valleys, centre_m
+        Results of :func:`spin_valleys`.
+    lever_arm_m : (N, 2) ndarray
+        Sensors in the robot's frame; their mean distance from the origin is the circle's radius.
+    max_offset_fraction : float
+        See :func:`~.second_step.recognise`.
     """
     radius = float(np.mean(np.hypot(*lever_arm_m.T)))
     reading = recognise(valleys, radius, max_offset_fraction)
@@ -312,7 +317,9 @@ class _VisitSearch:
             )
             if unexplained > MAX_UNEXPLAINED_FRACTION:
                 refused = "unexplained"
-                message = f"{name(code)} leaves {100 * unexplained:.0f} % of the spin's field"
+                message = (
+                    f"{name(code)} leaves {100 * unexplained:.0f} % of the spin's field unexplained"
+                )
                 self.warn("spin_unexplained", message)
                 continue
             return self._visit_hypotheses(index, (_hypothesis(code, pose),), "")
@@ -340,7 +347,7 @@ class _VisitSearch:
             self.pose[spin], self.field[spin], self.lever_arm, self.geometry
         )
         if valleys is None:
-            self.warn("spin_incomplete", "a spin with a part of the circle not measured")
+            self.warn("spin_incomplete", "a part of the circle was not measured during a spin")
             return None
         reading = recognise_spin(valleys, centre, self.lever_arm)
         if reading is None:
@@ -356,7 +363,10 @@ class _VisitSearch:
         """
         index = self._nearest_to_bars(reading, start)
         if index is None:
-            self.warn("never_over_bars", "never above the bars: by the valleys alone")
+            self.warn(
+                "never_over_bars",
+                "the sensors were never above the bars; the pose is that of the valleys alone",
+            )
             return stop - 1, *pose_by_valleys(reading, self.pose[stop - 1])
         standstill = self._standstill(index)
         code, _ = reading.in_frame_of(self.pose[index, 2])
@@ -365,10 +375,10 @@ class _VisitSearch:
         try:
             pose = compensate_pose(self.geometry, code, self.lever_arm[valid], field)
         except DegenerateError as error:
-            self.warn("voltages_undetermined", f"{error}: by the valleys alone")
+            self.warn("voltages_undetermined", f"{error}; the pose is that of the valleys alone")
             return index, *pose_by_valleys(reading, self.pose[index])
         if contradicts_valleys(pose):
-            message = "the voltages contradict the valleys: by the valleys alone"
+            message = "the voltages contradict the valleys; the pose is that of the valleys alone"
             self.warn("voltages_contradict_valleys", message)
             return index, *pose_by_valleys(reading, self.pose[index])
         return index, code, pose

@@ -131,7 +131,7 @@ def circle_profile(position_m: Array, field_t: Array, centre_m: Array) -> Array:
     -------
     (360,) ndarray
         Bin ``k`` is centred at ``k`` degrees. Bins without a sample are interpolated; all are
-        ``nan`` if more than :data:`MAX_GAP_BINS` in a row have none.
+        ``nan`` if :data:`MAX_GAP_BINS` or more in a row have none.
     """
     offset = position_m - centre_m
     angle = np.arctan2(offset[..., 1], offset[..., 0])

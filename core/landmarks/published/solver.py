@@ -132,7 +132,7 @@ def _propagate_cells(
     odometry_rotation = arrival * HALF_PI_RAD - math.atan2(step[1], step[0])
     located = {known: CellEstimate(cell, _quarters(visits[known], odometry_rotation), 0, 1.0, 1.0)}
     for numbers in (range(known + 1, len(visits)), range(known - 1, -1, -1)):
-        last, rotation = known, odometry_rotation
+        last = known
         for n in numbers:
             visit = visits[n]
             if visit.refused or not visit.hypotheses:

@@ -116,7 +116,7 @@ def _at_rest(pose: Sequence[float] | Array, options: SimulationOptions) -> Robot
 
 def _draw_aim(position: Sequence[float], mean_m: float, rng: np.random.Generator) -> Array:
     """Draw a position near another: ``mean_m`` off on average, and 3 sigma at most."""
-    sigma = mean_m / math.sqrt(QUARTER_TURN_RAD)
+    sigma = mean_m / math.sqrt(math.pi / 2)  # The mean of a Rayleigh distribution.
     offset = rng.normal(0.0, sigma, 2)
     distance = float(np.hypot(*offset))
     factor = min(1.0, 3 * sigma / distance if distance > 0 else 1.0)
@@ -170,7 +170,7 @@ def _find_start(task: _Task) -> tuple[Array, Cell, float]:
             raise InputError(
                 f"a robot that starts at {x * 1e3:.0f},{y * 1e3:.0f} mm under "
                 f"{math.degrees(heading):.0f} degrees meets no landmark",
-                hint="Start it elsewhere, or leave it out for anywhere",
+                hint="Choose another start, or leave it out to have one drawn",
             )
         return np.array(options.start), *met
     for _ in range(MAX_START_DRAWS):
@@ -182,8 +182,9 @@ def _find_start(task: _Task) -> tuple[Array, Cell, float]:
             if met is not None:
                 return np.array(start), *met
     raise InputError(
-        "no place on the floor from which a robot could come upon a landmark",
-        hint=f"Give --start x,y,deg, or a pitch above {2 * range_m / math.sqrt(2) * 1e3:.0f} mm",
+        "no position on the floor from which a robot could meet a landmark",
+        hint="Set start in the table robot of the --config file, or use a pitch above "
+        f"{2 * range_m / math.sqrt(2) * 1e3:.0f} mm",
     )
 
 
@@ -262,7 +263,10 @@ def _plan_tour(
     while len(headings) < count - 1:
         choice = [q for q in range(4) if floor.is_passable(last, q)]
         if not choice:
-            notes.append(f"no way on from cell {last[0]},{last[1]}: {count} landmarks not reached")
+            missing = count - 1 - len(headings)
+            notes.append(
+                f"no step on from cell {last[0]},{last[1]}: {missing} landmarks not reached"
+            )
             break
         onward = [q for q in choice if not headings or (q - headings[-1]) % 4 != 2]
         headings.append(int(task.rng.choice(onward or choice)))

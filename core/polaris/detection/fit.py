@@ -90,14 +90,14 @@ MIN_NUISANCE_GAIN = 9.0
 """Decrease of the cost beyond one per unknown, in units of the noise, from which a nuisance is
 estimated: three standard deviations."""
 
-COARSE_ITERATIONS, COARSE_GAIN_FRACTION = 12, 1e-3
-"""Iterations of a coarse fit, and the relative decrease of the cost that ends it."""
+COARSE_ITERATIONS, COARSE_GAIN_FRACTION = 20, 1e-3
+"""Steps that a coarse fit tries, and the relative decrease of the cost that ends it."""
 
-FINE_ITERATIONS, FINE_GAIN_FRACTION = 30, 4e-5
+FINE_ITERATIONS, FINE_GAIN_FRACTION = 45, 4e-5
 """The same for the final fit."""
 
-REWEIGHTED_ITERATIONS, NUISANCE_ITERATIONS = 5, 10
-"""Iterations of a fit that continues from a minimum: with new weights, with another nuisance."""
+REWEIGHTED_ITERATIONS, NUISANCE_ITERATIONS = 8, 15
+"""Steps tried by a fit that continues from a minimum: with new weights, with another nuisance."""
 
 RELATIVE_RIDGE = 1e-13
 """Added to the unit diagonal of scaled normal equations."""
@@ -146,7 +146,8 @@ class PassFit:
         Mean square of the part of the residual that all sensors share, in units of the noise; 1
         if that is noise alone.
     covariance : (3 M, 3 M) ndarray
-        Of x, y and angle of each magnet, in m and rad, for the noise as stated; ``nan`` after a
+        Of x, y and angle of each magnet, in m and rad, for the noise as stated. It includes the
+        prior uncertainty of crab and tilt, also while they are fixed at zero. ``nan`` after a
         coarse fit, like the next two.
     path_sigma_m : (n,) ndarray
         Of the path relative to the sample with the strongest field; 0 if the path is known.
@@ -414,7 +415,8 @@ class PassProblem:
     def whiten(self, rows: Array) -> Array:
         """Scale rows (C, n) or (C, n, k) to unit noise, and reduce the part that sensors share.
 
-        A background of each channel remains one of each channel.
+        A background of each channel remains one of each channel, exactly if the weights do not
+        change with time.
         """
         is_wide = rows.ndim == 3
         root = self.root[..., None] if is_wide else self.root

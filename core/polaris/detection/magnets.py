@@ -5,8 +5,8 @@ them together with the path of the array, and the filter searches the residual f
 hypotheses that explain the samples best are refined first. Sources that turn out to be too weak
 (iron debris, a magnet of another kind) stay in the fit but are not reported as magnets.
 
-All lengths of the matched filter are in units of the height over the magnets, so that one set of
-templates serves every speed: the pass is resampled to rows of a quarter of the height.
+The matched filter resamples the pass to rows of a quarter of the height over the magnets, so that
+one set of templates per height serves every speed.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ MIN_MAGNET_ENERGY = 80.0
 alone reaches 45 among the thousands of positions of a pass."""
 
 MIN_ENERGY_FRACTION = 0.02
-"""Least energy of a magnet relative to the one found before it."""
+"""Least energy of a magnet relative to the most energetic one detected before it."""
 
 SPEED_MAGNETS = 3
 """Number of magnets by which speeds and heights are compared."""
@@ -82,7 +82,7 @@ MAX_GROWTH_ROUNDS = 4
 MAX_NEW_SOURCES = 4
 """Maximum number of sources that are added at once."""
 
-MIN_IMPROVEMENT_RATIO = 0.95
+MAX_WORTHWHILE_RESIDUAL_RATIO = 0.95
 """Ratio of the rms residual after to before above which a further attempt is not worthwhile."""
 
 WHITE_RESIDUAL_SIGMAS = 1.6
@@ -95,7 +95,7 @@ DEBRIS_RESIDUAL_SIGMAS = 1.3
 """Rms residual above which weak sources are added as well."""
 
 NEW_SOURCE_RESIDUAL_FACTOR = 12.0
-"""Least energy of a source in a residual, relative to its mean square."""
+"""Least energy of a source in a residual, relative to the residual's mean square."""
 
 DRIFT_TREND_TERMS = 5
 """Terms of a background that drifts more than a straight line."""
@@ -440,7 +440,7 @@ def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
                 continue
             yield fit
             is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
-            if is_residual_moderate and fit.rms_sigma > MIN_IMPROVEMENT_RATIO * least:
+            if is_residual_moderate and fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * least:
                 return  # Another initial guess does not reduce the residual.
             least = min(least, fit.rms_sigma)
         if prepared.window.path_m is not None or least < UNRELATED_RESIDUAL_SIGMAS:
@@ -467,7 +467,7 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
             break
         before = fit
         fit = fit_coarse(coarse, _with_sources(fit.state, missed), priors)
-        if fit.rms_sigma > MIN_IMPROVEMENT_RATIO * before.rms_sigma:
+        if fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * before.rms_sigma:
             break
     if window.path_m is not None and fit.rms_sigma > UNRELATED_RESIDUAL_SIGMAS:
         raise DegenerateError("the samples contradict the given path")

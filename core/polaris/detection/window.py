@@ -25,7 +25,8 @@ DEFAULT_HEIGHTS_M = (0.005, 0.0075, 0.011, 0.016)
 tolerates a height that is wrong by a quarter."""
 
 DEFAULT_MOMENT_AM2 = 1.5e-3
-"""Moment expected of a magnet if no tag states one: a disc of 2 x 0.5 mm [A m^2]."""
+"""Moment expected of a magnet if no tag states one: a disc of 2 x 0.5 mm with a
+remanence of 1.2 T [A m^2]."""
 
 HEIGHT_SIGMA_FRACTION = 0.3
 """Standard deviation of the height over the magnets, relative to the expected one."""

@@ -50,8 +50,8 @@ class DecodedTag:
         None if it is refused.
     margin : float
         Soft distance to the second best id minus that to the best, in steps; for codec
-        ``redundant`` a lower bound of it, see :func:`decode_tag`. 0 if there is no candidate; the
-        largest distance of two tags if there is only one.
+        ``redundant`` a lower bound of it, see :func:`decode_tag`. 0 if there is no candidate; if
+        there is only one, the largest distance of two tags minus the distance to it.
     corrected : int
         Steps between the observed orientations and those of the id, in whole steps, with P // 2
         for a magnet in a wrong cell.
@@ -106,9 +106,9 @@ def decode_tag(
     is that of the least certain magnet.
 
     *In a family*, the nearest member is accepted if at most ``(d - 1) // 2`` steps have to be
-    corrected. The distance d is ``min_distance``, less ``P // 2`` for each missing magnet; if
-    nothing remains of it, missing magnets are accepted only if all observed ones agree and all
-    other members are :data:`MIN_ERASED_MARGIN_STEPS` farther away.
+    corrected. The distance d is ``min_distance``, less ``P // 2`` for each missing magnet. If a
+    magnet is missing, all other members must also be :data:`MIN_ERASED_MARGIN_STEPS` farther away;
+    if nothing remains of d, all observed magnets must agree.
 
     *Codec redundant* accepts the words that :func:`redundant.decode_word` does, if they are in the
     family. Its code corrects misreads of any size, so that soft distances count at most one step
@@ -325,7 +325,7 @@ def _nearest(
         return best, float(tags.magnets * half_turn - distance[best]), False
     margin = float(gaps.min())
     # The error of a magnet that is between the orientations of two candidates changes the gap
-    # twice; other errors do not change it.
+    # by twice the error; other errors do not change it.
     is_doubtful = gaps < MAX_TIE_SIGMAS * 2 * np.sqrt((magnets.sigma**2).sum())
     sign = np.where(is_empty, 0.0, np.sign(deviation))
     gap_by_steps = sign[is_rival][is_doubtful] - sign[best]

@@ -1,7 +1,8 @@
 """Identification of tags: from the magnets of a pass to tags with id and pose, or to refusals.
 
 A pass has several explanations by magnets. The first one is taken that leaves a white residual and
-can be decoded; otherwise the one of least residual.
+can be decoded. Otherwise, of those whose residual is within :data:`MAX_EQUIVALENT_RESIDUAL_RATIO`
+of the least, one that can be decoded is preferred.
 """
 
 from __future__ import annotations
