@@ -210,6 +210,30 @@ def test_commands_import_little_at_import_time(root: Path) -> None:
             assert is_light, f"{path} imports {name} at its top"
 
 
+def test_imported_names_exist(root: Path) -> None:
+    """A name imported from a package is one of its modules, or defined in its ``__init__``.
+
+    mypy does not check that for packages with ``__getattr__``.
+    """
+    for path in [p for layer in LAYERS for p in find_modules(root, layer)]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("locatk"):
+                continue
+            package = root.joinpath(*(node.module or "").split(".")[1:])
+            if not (package / "__init__.py").exists():
+                continue
+            init = ast.parse((package / "__init__.py").read_text(encoding="utf-8"))
+            defined = {name.rpartition(".")[2] for name in imported_names(ast.walk(init))} | {
+                getattr(each, "name", getattr(each, "id", "")) for each in ast.walk(init)
+            }
+            for alias in node.names:
+                is_module = any((package / f"{alias.name}{end}").exists() for end in (".py", ""))
+                is_extension = alias.name == "_kernels"
+                assert is_module or is_extension or alias.name in defined, (
+                    f"{path}: no {alias.name} in {node.module}"
+                )
+
+
 SYSTEMS = ("dots", "landmarks", "lighthouse", "polaris")
 
 SOLVER_STAGES = (

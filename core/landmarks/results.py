@@ -5,15 +5,9 @@ The names of JSON keys are stable (docs/formats.md).
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-import numpy as np
-
-from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
-from locatk.core.landmarks.landmark import HALF_PI_RAD, pattern, rotated
-from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY, CellEstimate
-from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_code
+from locatk.core.landmarks.map.floor import Cell
 
 
 @dataclass(frozen=True)
@@ -105,72 +99,3 @@ class LandmarkFacts:
     """
 
     robots: dict[str, RobotFacts] = field(default_factory=dict)
-
-
-def describe_visit(
-    visit: VisitHypotheses, estimate: CellEstimate | None, floor: FloorMap | None
-) -> LandmarkDetection:
-    """Return the detection that reports one visit.
-
-    Parameters
-    ----------
-    visit : VisitHypotheses
-        Hypotheses of the visit, or the reason for which there is none.
-    estimate : CellEstimate or None
-        Its cell on the map, if it is known.
-    floor : FloorMap or None
-        The map; misread landmarks, and cells without one, are recognized by it.
-    """
-    unread = LandmarkDetection(
-        time_s=visit.time_ns * 1e-9,
-        device=visit.device,
-        cell=None,
-        pattern=None,
-        code=None,
-        probability=0.0,
-        x_m=None,
-        y_m=None,
-        heading_rad=None,
-        sigma_x_m=None,
-        sigma_y_m=None,
-        sigma_heading_rad=None,
-        strength=None,
-        residual_sigma=visit.residual_sigma,
-        refused=visit.refused,
-    )
-    if not visit.hypotheses:
-        return unread
-    best, cell, quarters, refused = visit.best, None, 0, visit.refused
-    if estimate is not None and estimate.probability >= MIN_CELL_PROBABILITY:
-        best = visit.hypotheses[estimate.hypothesis]
-        cell, quarters = estimate.cell, estimate.quarters
-        if floor is not None:
-            code_on_map = as_built_code(floor, estimate.cell)
-            if code_on_map == HOLE_CODE:
-                cell = None
-                refused = "off_map"
-            elif code_on_map != rotated(best.code, quarters):
-                refused = "misread"
-    elif floor is not None and not visit.refused:
-        refused = "not_localised"
-    code = int(rotated(best.code, quarters))
-    rotation = quarters * HALF_PI_RAD
-    cos, sin = np.cos(rotation), np.sin(rotation)
-    x, y, heading = best.pose
-    sigma = np.sqrt(np.diag(best.covariance))
-    sigma_x, sigma_y = np.abs([[cos, -sin], [sin, cos]]) @ sigma[:2]
-    return replace(
-        unread,
-        cell=cell,
-        pattern=pattern(code),
-        code=code,
-        probability=sum(h.probability for h in visit.hypotheses if h.code == best.code),
-        x_m=float(cos * x - sin * y),
-        y_m=float(sin * x + cos * y),
-        heading_rad=math.remainder(float(heading + rotation), math.tau),
-        sigma_x_m=float(sigma_x),
-        sigma_y_m=float(sigma_y),
-        sigma_heading_rad=float(sigma[2]),
-        strength=tuple(float(v) for v in np.roll(best.strength, quarters)),
-        refused=refused,
-    )

@@ -20,6 +20,7 @@ from locatk.core.landmarks.localization.cell_filter import (
 from locatk.core.landmarks.localization.consistency import (
     CERTAIN_PROBABILITY,
     NO_MAP_WARNING,
+    describe_visit,
     find_displaced_landmarks,
     is_map_contradicted,
     warn_of_missing_pose,
@@ -38,7 +39,7 @@ from locatk.core.landmarks.localization.trajectory import estimate_trajectory
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.preprocessing import HallRecording, check_odometry, preprocess
 from locatk.core.landmarks.published.solver import solve as solve_published
-from locatk.core.landmarks.results import LandmarkFacts, RobotFacts, describe_visit
+from locatk.core.landmarks.results import LandmarkFacts, RobotFacts
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 

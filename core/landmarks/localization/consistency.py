@@ -1,19 +1,26 @@
-"""Consistency of a localized robot with the map: doubts that a user must know."""
+"""Consistency of a localized robot with the map: detections as reported, and doubts about them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.detection.trace import OdometryDrift
-from locatk.core.landmarks.landmark import CODE_COUNT
-from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit, identify_cells
+from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, pattern, rotated
+from locatk.core.landmarks.localization.cell_filter import (
+    MIN_CELL_PROBABILITY,
+    CellEstimate,
+    IdentifiedVisit,
+    identify_cells,
+)
 from locatk.core.landmarks.localization.smoothing import LandmarkPrior, SmoothingResult
-from locatk.core.landmarks.map.floor import Cell, FloorMap
+from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_code
 from locatk.core.landmarks.preprocessing import HallRecording
-from locatk.core.landmarks.results import describe_visit
+from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import SolverWarning
 
 CERTAIN_PROBABILITY = 0.99999
@@ -35,6 +42,75 @@ MAX_CONTRADICTED_FRACTION = 1 / 3
 or unexplained."""
 
 NO_MAP_WARNING = SolverWarning("no_map", "no map, so that its landmarks have no cells")
+
+
+def describe_visit(
+    visit: VisitHypotheses, estimate: CellEstimate | None, floor: FloorMap | None
+) -> LandmarkDetection:
+    """Return the detection that reports one visit.
+
+    Parameters
+    ----------
+    visit : VisitHypotheses
+        Hypotheses of the visit, or the reason for which there is none.
+    estimate : CellEstimate or None
+        Its cell on the map, if it is known.
+    floor : FloorMap or None
+        The map; misread landmarks, and cells without one, are recognized by it.
+    """
+    unread = LandmarkDetection(
+        time_s=visit.time_ns * 1e-9,
+        device=visit.device,
+        cell=None,
+        pattern=None,
+        code=None,
+        probability=0.0,
+        x_m=None,
+        y_m=None,
+        heading_rad=None,
+        sigma_x_m=None,
+        sigma_y_m=None,
+        sigma_heading_rad=None,
+        strength=None,
+        residual_sigma=visit.residual_sigma,
+        refused=visit.refused,
+    )
+    if not visit.hypotheses:
+        return unread
+    best, cell, quarters, refused = visit.best, None, 0, visit.refused
+    if estimate is not None and estimate.probability >= MIN_CELL_PROBABILITY:
+        best = visit.hypotheses[estimate.hypothesis]
+        cell, quarters = estimate.cell, estimate.quarters
+        if floor is not None:
+            code_on_map = as_built_code(floor, estimate.cell)
+            if code_on_map == HOLE_CODE:
+                cell = None
+                refused = "off_map"
+            elif code_on_map != rotated(best.code, quarters):
+                refused = "misread"
+    elif floor is not None and not visit.refused:
+        refused = "not_localised"
+    code = int(rotated(best.code, quarters))
+    rotation = quarters * HALF_PI_RAD
+    cos, sin = np.cos(rotation), np.sin(rotation)
+    x, y, heading = best.pose
+    sigma = np.sqrt(np.diag(best.covariance))
+    sigma_x, sigma_y = np.abs([[cos, -sin], [sin, cos]]) @ sigma[:2]
+    return replace(
+        unread,
+        cell=cell,
+        pattern=pattern(code),
+        code=code,
+        probability=sum(h.probability for h in visit.hypotheses if h.code == best.code),
+        x_m=float(cos * x - sin * y),
+        y_m=float(sin * x + cos * y),
+        heading_rad=math.remainder(float(heading + rotation), math.tau),
+        sigma_x_m=float(sigma_x),
+        sigma_y_m=float(sigma_y),
+        sigma_heading_rad=float(sigma[2]),
+        strength=tuple(float(v) for v in np.roll(best.strength, quarters)),
+        refused=refused,
+    )
 
 
 def warn_of_uncertain_cell(probability: float, first_certain: int | None) -> SolverWarning | None:

@@ -20,7 +20,7 @@ from locatk.core.landmarks.detection.trace import compose, relative
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import HALF_PI_RAD, Geometry
 from locatk.core.landmarks.localization.cell_filter import CellEstimate
-from locatk.core.landmarks.localization.consistency import NO_MAP_WARNING
+from locatk.core.landmarks.localization.consistency import NO_MAP_WARNING, describe_visit
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.published.global_localization import landmark_sequence, match_map
 from locatk.core.landmarks.published.search import detect_landmarks
@@ -28,7 +28,6 @@ from locatk.core.landmarks.results import (
     LandmarkDetection,
     LandmarkFacts,
     RobotFacts,
-    describe_visit,
 )
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory

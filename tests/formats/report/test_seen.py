@@ -17,7 +17,7 @@ pytest.importorskip("plotly")
 
 from locatk.core.dots.results import DotFacts, FrameOutcome
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
-from locatk.core.landmarks.results import describe_visit
+from locatk.core.landmarks.localization.consistency import describe_visit
 from locatk.core.lighthouse.results import StationDetection
 from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.solution import GenericRecord, Solution
@@ -34,14 +34,14 @@ ARGUMENTS = {
     "select_stations": 2,
     "_refusal": 2,
     "_answer": 2,
-    "Seen": 3,
+    "TagObservation": 3,
 }
 """Calls in core that give a reason, and which of their arguments it is."""
 
 NAMES = {"refused", "rejected", "reason", "why"}
 """What variables, fields and keys are called that hold one."""
 
-RETURNING = {"_incomplete", "_misplaced"}
+RETURNING = {"_fit_reason", "_missing_reason", "_misplaced"}
 """Functions that answer with one."""
 
 
@@ -50,9 +50,8 @@ def reasons(system: str) -> set[str]:
     found: set[str] = set()
     for path in sorted((ROOT / "core" / system).rglob("*.py")):
         # Demodulation counts bursts, which are no observations of a solution.
-        if path.parent.name != "demodulation" and not path.name.startswith(
-            ("simulate", "paper_study", "camera_views")
-        ):
+        is_of_solver = path.parent.name not in ("demodulation", "simulation")
+        if is_of_solver and path.name not in ("study.py", "camera_views.py"):
             tree = ast.parse(path.read_text())
             constants = {
                 target.id: node.value.value
@@ -82,6 +81,11 @@ def _given(tree: ast.AST) -> Iterator[ast.AST]:
             ]
             if any(_holds(target) for target in targets):
                 yield node.value
+            yield from (
+                target.slice
+                for target in targets
+                if isinstance(target, ast.Subscript) and _holds(target.value)
+            )
         elif isinstance(node, ast.AugAssign) and _holds(node.target):
             assert isinstance(node.target, ast.Subscript)
             yield node.target.slice
