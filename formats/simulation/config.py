@@ -110,7 +110,7 @@ class SimulationConfig:
         settings = settings or {}
         lines = [
             f"# Settings of `locatk simulate {self.system} --config FILE`.",
-            "# A key behind # has its default, or an example of a value. Remove the # to set it.",
+            "# A key after # has its default, or an example of a value. Remove the # to set it.",
             "# Options of the command line override this file.",
             *toml.dumps(head(self._format, FORMAT_VERSION)).splitlines(),
         ]
