@@ -326,3 +326,17 @@ def test_bars_that_cannot_be_are_refused(change: dict[str, float], said: str) ->
 def test_bars_that_touch_are_none_of_those() -> None:
     check_geometry(LONG)
     check_geometry(replace(LONG, bar_length_m=0.0393, radius_m=0.02465))
+
+
+def test_a_contour_beyond_the_searched_radii_is_unknown() -> None:
+    weak = replace(Geometry(), threshold_t=1e-9)
+    contour = threshold_contour(weak, signs([code_of("NSNS")]).T, np.radians([10.0, 100.0]))
+    assert np.isnan(contour).all()
+
+
+def test_a_territory_within_the_circle_of_the_sensors_is_reported() -> None:
+    wide = analyse_landmark(replace(Geometry(), threshold_t=8e-3, circle_m=0.04))
+    assert wide.r1_m < 0.04
+    assert any("smaller than the circle" in text for text in landmark_warnings(wide))
+    narrow = analyse_landmark(replace(Geometry(), threshold_t=8e-3))
+    assert not any("smaller than the circle" in text for text in landmark_warnings(narrow))
