@@ -72,6 +72,9 @@ NORMAL_QUARTILE_OF_MAGNITUDE = 0.3186
 MAX_SPAN_M = 2.0
 """Extent of a path that is certainly too long for one landmark."""
 
+DEFAULT_PITCH_M = 0.2
+"""Distance of neighbouring landmarks that is assumed without a map."""
+
 MIN_MOTION_M = 1e-3
 """Motion of a sensor below which a field cannot change."""
 
@@ -361,7 +364,7 @@ def segment_visits(
     recording: HallRecording,
     geometry: Geometry,
     drift: OdometryDrift,
-    pitch_m: float = 0.2,
+    pitch_m: float = DEFAULT_PITCH_M,
 ) -> list[VisitSegment]:
     """Divide a recording into visits to landmarks, in order of time.
 

@@ -37,16 +37,18 @@ from locatk.core.landmarks.localization.smoothing import (
 )
 from locatk.core.landmarks.localization.trajectory import estimate_trajectory
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.landmarks.preprocessing import HallRecording, check_odometry, preprocess
+from locatk.core.landmarks.preprocessing import (
+    DEFAULT_PITCH_M,
+    HallRecording,
+    check_odometry,
+    preprocess,
+)
 from locatk.core.landmarks.published.solver import solve as solve_published
 from locatk.core.landmarks.results import LandmarkFacts, RobotFacts
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 METHODS = ("field", "paper")
-
-DEFAULT_PITCH_M = 0.2
-"""Distance of neighbouring landmarks that is assumed without a map."""
 
 MAX_RESIDUAL_SIGMAS = 2.0
 """Rms residual of all fields after smoothing from which on a warning is given ..."""

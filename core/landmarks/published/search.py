@@ -1,6 +1,6 @@
 """Sequential landmark search on a recording (sections 3 and 4.1).
 
-The visits are those of the default method. For each visit:
+Visits are segmented as in the default method, but not merged. For each visit:
 
 1. the first pass gives entries, and these the first estimate of the centre (:mod:`.first_step`);
 2. each rotation of at least 330 degrees on the spot gives valleys, and these the pattern, heading
@@ -102,7 +102,10 @@ class FirstStep:
 
 
 def detect_landmarks(
-    samples: HallSamples, odometry: Trajectory, geometry: Geometry
+    samples: HallSamples,
+    odometry: Trajectory,
+    geometry: Geometry,
+    pitch_m: float = preprocessing.DEFAULT_PITCH_M,
 ) -> list[VisitHypotheses]:
     """Detect the landmarks visited in a recording by the published algorithm.
 
@@ -112,6 +115,8 @@ def detect_landmarks(
     odometry : Trajectory
         Of the same robot and clock.
     geometry : Geometry
+    pitch_m : float
+        Distance of neighbouring landmarks, by which visits are separated.
 
     Returns
     -------
@@ -126,15 +131,20 @@ def detect_landmarks(
     DegenerateError
         The field of the bars does not reach the threshold.
     """
-    return [visit.detect() for visit in _find_visits(samples, odometry, geometry)]
+    return [visit.detect() for visit in _find_visits(samples, odometry, geometry, pitch_m)]
 
 
-def first_steps(samples: HallSamples, odometry: Trajectory, geometry: Geometry) -> list[FirstStep]:
+def first_steps(
+    samples: HallSamples,
+    odometry: Trajectory,
+    geometry: Geometry,
+    pitch_m: float = preprocessing.DEFAULT_PITCH_M,
+) -> list[FirstStep]:
     """Run the first step alone for each visit of a recording.
 
     Parameters and exceptions as in :func:`detect_landmarks`.
     """
-    return [visit.first_step() for visit in _find_visits(samples, odometry, geometry)]
+    return [visit.first_step() for visit in _find_visits(samples, odometry, geometry, pitch_m)]
 
 
 def run_first_step(
@@ -255,11 +265,11 @@ def unexplained_fraction(
 
 
 def _find_visits(
-    samples: HallSamples, odometry: Trajectory, geometry: Geometry
+    samples: HallSamples, odometry: Trajectory, geometry: Geometry, pitch_m: float
 ) -> list[_VisitSearch]:
     recording = preprocessing.preprocess(samples, odometry)
     radii_m = bar_radii(geometry)
-    found = preprocessing.segment_visits(recording, geometry, OdometryDrift())
+    found = preprocessing.segment_visits(recording, geometry, OdometryDrift(), pitch_m)
     return [_VisitSearch(recording, visit.first, visit.stop, geometry, radii_m) for visit in found]
 
 

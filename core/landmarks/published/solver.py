@@ -22,6 +22,7 @@ from locatk.core.landmarks.landmark import HALF_PI_RAD, Geometry
 from locatk.core.landmarks.localization.cell_filter import CellEstimate
 from locatk.core.landmarks.localization.consistency import NO_MAP_WARNING, describe_visit
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import DEFAULT_PITCH_M
 from locatk.core.landmarks.published.global_localization import landmark_sequence, match_map
 from locatk.core.landmarks.published.search import detect_landmarks
 from locatk.core.landmarks.results import (
@@ -57,6 +58,7 @@ def solve(
         A recording has no odometry, or none of its sensors can be used.
     """
     geometry = floor.geometry if floor is not None else Geometry()
+    pitch_m = floor.pitch_m if floor is not None else DEFAULT_PITCH_M
     trajectories: list[Trajectory] = []
     detections: list[LandmarkDetection] = []
     warnings: list[SolverWarning] = []
@@ -69,7 +71,7 @@ def solve(
                 f"no odometry of {device}",
                 hint="Record it with the hall sensors: four fields alone do not give a path",
             )
-        visits = detect_landmarks(recording, own_odometry, geometry)
+        visits = detect_landmarks(recording, own_odometry, geometry, pitch_m)
         located = _locate_visits(visits, floor) if floor is not None else {}
         robots[device] = RobotFacts(localised=bool(located), landmarks_seen=len(visits))
         if located and floor is not None:

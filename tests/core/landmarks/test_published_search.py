@@ -13,9 +13,13 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry, code_of, name, rotated
+from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.published.search import detect_landmarks, first_steps
 from locatk.core.landmarks.published.second_step import find_spins
+from locatk.core.landmarks.simulation.options import NONE, SimulationOptions
 from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
+from locatk.core.landmarks.simulation.session import simulate
+from locatk.core.landmarks.solver import SolveOptions, solve
 
 GEOMETRY = Geometry()
 
@@ -158,3 +162,16 @@ def test_spins_are_turns_on_the_spot() -> None:
     circle = 0.1 * np.column_stack([np.sin(rotation), -np.cos(rotation)])
     assert find_spins(np.column_stack([circle, rotation])) == []
     assert len(find_spins(np.concatenate([spin, spin + [0.05, 0, 0]]))) == 2
+
+
+def test_visits_are_separated_by_the_pitch_of_the_map() -> None:
+    floor = FloorMap(np.array([[13, 5, 4, 12]]), pitch_m=0.13)
+    options = SimulationOptions(
+        strategy="path", cells=((0, 0), (0, 3)), errors=NONE, rate_hz=100.0, seed=1
+    )
+    session = simulate(floor, options)
+    samples, odometry = session.samples[0], session.odometry[0]
+    merged = detect_landmarks(samples, odometry, floor.geometry)
+    separate = detect_landmarks(samples, odometry, floor.geometry, floor.pitch_m)
+    assert len(merged) < len(separate) == 4
+    assert len(solve([samples], floor, SolveOptions("paper"), odometry=[odometry]).detections) == 4
