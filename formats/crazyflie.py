@@ -1,7 +1,7 @@
 """System configurations of the Crazyflie: geometry and calibration of base stations (YAML).
 
-The file is what cfclient saves and cflib's ``LighthouseConfigFileManager`` reads and writes
-(facts/lighthouse.md 2.7); ids in it are channels less one. Frames are ours: ``origin`` in
+The file is what cfclient saves and cflib's ``LighthouseConfigFileManager`` reads and writes;
+ids in it are channels less one. Frames are ours: ``origin`` in
 metres, ``rotation`` from the station (x forward, y left, z up) to the room.
 
 Calibrations are the factory's numbers, as the stations send them. Crazyflie firmware leaves

@@ -55,7 +55,7 @@ POLYNOMIALS = (0, 1, 2, 3)
 
 IDS = {1: 0x4CC60647, 2: 0x0FF22226}
 PPM = {1: -15.49, 2: -18.69}
-"""Of the capture that is scored: facts/lighthouse.md 1.4."""
+"""Clock errors of the stations, measured in the capture that is scored."""
 
 ROTOR_S = 1e-6
 

@@ -95,8 +95,7 @@ def _switches(solution: Solution) -> Figure:
         "libsurvive: jump when a station is hidden, 95 %",
         1e3 * max(check.jump_95_m for check in checks),
         "mm",
-        f"largest of {len(checks)} stations left out in turn; users of peers report 50 to 100 mm "
-        "(facts/lighthouse.md 4.3)",
+        f"largest of {len(checks)} stations left out in turn; users of peers report 50 to 100 mm",
         peer="users of Crazyflies",
         peer_value=50.0,
     )

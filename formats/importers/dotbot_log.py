@@ -23,7 +23,7 @@ Log lines are late by tens of milliseconds, more than lies between two sweeps. W
 tell db_time, it dates the sweeps (:mod:`locatk.core.clock_sync`).
 
 Source: PyDotBot ``controller.py``, ``logger.py``; ``parse_logfile.py`` of alvarado23lighthouse,
-alvarado24lh-distortion and alvarado24automatic; facts/lighthouse.md 1.1 and 2.8.
+alvarado24lh-distortion and alvarado24automatic.
 """
 
 from __future__ import annotations

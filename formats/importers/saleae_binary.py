@@ -4,7 +4,7 @@ Two kinds begin with ``<SALEAE>``, a version (i32) and a type (i32), all little 
 
 **Channels inside a capture** (``digital-N.bin`` of a ``.sal`` archive; version 1, type 100).
 Not documented by its maker; found from published captures and verified on each of their
-chunks and index entries (facts/lighthouse.md, 1.4)::
+chunks and index entries::
 
     u8 = 1, f64 rate, u64 start ms since the epoch, f64 fraction of a ms, u16, u64 chunks
     chunk: u64 first sample, past the last, samples, rate, 1, bytes of runs

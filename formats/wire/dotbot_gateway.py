@@ -37,7 +37,7 @@ they come. A polynomial above 31 or an index beyond the sequence is a robot's ma
 error, and gives no sweep.
 
 Source: PyDotBot ``protocol.py``, PyDotBot-utils, DotBot-libs ``frame.h`` and ``protocol.h``,
-dotbot-lh2-calibration ``main.c``; facts/lighthouse.md 2.8.
+dotbot-lh2-calibration ``main.c``.
 """
 
 from __future__ import annotations

@@ -479,7 +479,7 @@ def test_from_a_video_to_poses(locatk, manifest: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("turns", range(4))
 def test_the_published_frame(locatk, data: Path, tmp_path: Path, turns: int) -> None:
-    """The one frame of a real camera (facts/dots.md 2.6), of a `libdots` sheet."""
+    """The public frame of cellulo-localization, of a `libdots` sheet."""
     source = data / "dots" / "frame.bmp"
     if not source.exists():
         pytest.skip(f"{source} is not there")

@@ -32,7 +32,7 @@ LEAST = {
     ("16", "2x2", 1): 22,
     ("6", "2x2", 1): 6,
 }
-"""Side of the square floor that is there at least: that of facts/landmarks.md 4 or above."""
+"""Side of the square floor that is there at least: as large as annealing reached, or larger."""
 
 
 def wanted(entry: Entry, rows: int, columns: int, seed: int = 0) -> DesignOptions:
