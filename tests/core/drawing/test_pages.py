@@ -152,3 +152,11 @@ def test_tables_fill_blocks_and_pages_in_order() -> None:
     assert (first[2].position[0], first[2].anchor) == (left + 19.0, "end")
     assert (first[3].position[0], first[3].anchor) == (left + 20.0, "start")
     assert len(table_pages([], columns, FRAME)) == 1
+
+
+def test_a_row_with_an_empty_last_cell_takes_a_line() -> None:
+    flow = TextFlow(FRAME)
+    flow.add_row(("a", ""), (30.0,))
+    flow.add_row(("b", "c"), (30.0,))
+    first, *_, second, _ = texts(flow.pages()[0].groups[0].marks)
+    assert first.position[1] - second.position[1] >= line_height(FLOW_TEXT_POINTS)

@@ -104,3 +104,10 @@ def test_overlaps_beyond_half_a_tile_are_rejected(overlap: float) -> None:
     divide_area(EXTENT, parse_paper("A4"), 10.0, 95.0)
     with pytest.raises(InputError, match="overlap"):
         divide_area(EXTENT, parse_paper("A4"), 10.0, overlap)
+
+
+def test_margins_wider_than_the_paper_are_rejected() -> None:
+    with pytest.raises(InputError, match="leave nothing"):
+        divide_area(EXTENT, parse_paper("A4"), 110.0, 0.0)
+    with pytest.raises(InputError, match="below 0"):
+        divide_area(EXTENT, parse_paper("A4"), 10.0, -1.0)

@@ -275,3 +275,31 @@ def test_removed_sensor_is_reported() -> None:
     (warning,) = recording.warnings
     assert warning.code == "sensor_left_out"
     assert "rear" in warning.message
+
+
+def test_odometry_at_rest_is_an_error_also_if_each_sensor_lost_a_reading() -> None:
+    recording = line_recording(0.5e-3, 0.01)
+    field = recording.samples.field_t.copy()
+    field[0] = np.nan
+    recording = replace(recording, samples=replace(recording.samples, field_t=field))
+    with pytest.raises(InputError, match="does not move"):
+        check_odometry(recording, GEOMETRY)
+
+
+def test_rotation_moves_sensors_on_any_side_of_the_robot() -> None:
+    recording = line_recording(0.5e-3, 0.01)
+    behind = replace(recording.samples.sensors, position_m=np.array([[-0.05, 0.0]] * 4))
+    pose = recording.pose.copy()
+    pose[:, 2] = np.linspace(0, 6, len(pose))
+    samples = replace(recording.samples, sensors=behind)
+    check_odometry(replace(recording, samples=samples, pose=pose), GEOMETRY)
+
+
+def test_noise_of_sensors_that_report_in_turn_is_assumed() -> None:
+    session = simulate(FloorMap(CODES), SimulationOptions(seed=1, rate_hz=100.0))
+    samples = session.samples[0]
+    field = samples.field_t.copy()
+    field[::2, :2] = field[1::2, 2:] = np.nan
+    sensors = replace(samples.sensors, noise_t=np.nan)
+    turns = replace(samples, field_t=field, sensors=sensors)
+    assert np.isfinite(preprocess(turns, session.odometry[0]).noise_t)
