@@ -51,7 +51,7 @@ class SimulationConfig:
     defaults : object
         Options of the simulator with their defaults.
     conflicts : tuple of (keys, keys)
-        None of the first keys can be set together with one of the second.
+        None of the first keys can be set together with one of the second; false counts as not set.
     requirements : tuple of Requirement
     """
 
@@ -76,7 +76,7 @@ class SimulationConfig:
         return next(setting for setting in self.settings if setting.key == key)
 
     def default(self, setting: Setting) -> Any:
-        """Return the default in units of the file, None if it is not a value."""
+        """Return the default in units of the file; None if it is None, empty or infinite."""
         if setting.default is not NO_DEFAULT:
             return setting.default
         value = self._default_si(setting)
@@ -146,7 +146,7 @@ class SimulationConfig:
         return self._parse(toml.read(path), Path(path).parent)
 
     def loads(self, text: str) -> dict[str, Any]:
-        """Read the settings of TOML text; see :meth:`read`."""
+        """Read the settings of TOML text like :meth:`read`; files are relative to the working folder."""
         return self._parse(toml.loads(text, f"<{self._format}>"), Path())
 
     @property
@@ -221,7 +221,7 @@ class SimulationConfig:
     def in_si(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Return settings by ``field``, or by key if they have none, in units of the simulators.
 
-        A number that equals the default of the file gives exactly the default of the simulator.
+        A value that equals the default of the file gives exactly the default of the simulator.
         """
         converted = {}
         for key, value in settings.items():
@@ -247,7 +247,7 @@ def _is_set(settings: Mapping[str, Any], key: str) -> bool:
 
 
 def with_values(options: Any, values: Mapping[str, Any]) -> Any:
-    """Replace attributes of a dataclass; dots in their names stand for nested dataclasses."""
+    """Return a copy of a dataclass with attributes replaced; dots in names are nested dataclasses."""
     direct = {name: value for name, value in values.items() if "." not in name}
     for part in dict.fromkeys(name.partition(".")[0] for name in values if "." in name):
         nested = {

@@ -71,12 +71,13 @@ SELECTION_ITERATIONS = (3, 4)
 """Iterations of the first fits, after each of which hypotheses without chance are dropped."""
 
 MAX_EARLY_LOG_ODDS = 60.0
-"""Log odds behind the best hypothesis at which one is dropped during the first fits ..."""
+"""Log evidence below that of the best hypothesis at which one is dropped during the first fits."""
 
 MAX_LOG_ODDS = 12.0
-"""... and before the final fits."""
+"""Log evidence below that of the best hypothesis at which one is dropped before the final fits."""
 
 MAX_HYPOTHESES = 8
+"""Final fits of intact landmarks, and again of faulty ones; a missing bar gives two codes each."""
 
 MERGE_DIFFERENCE = 3e-3
 """Difference of positions (m) and headings (rad) up to which minima of equal strengths are one."""
@@ -88,7 +89,7 @@ MAX_STRENGTH_SIGMAS = 2.5
 """Deviation of a bar's strength from the nominal one at which faulty bars are considered."""
 
 MAX_INTACT_RESIDUAL_SIGMAS = 1.6
-"""Rms residual up to which intact landmarks explain a trace."""
+"""Rms residual of the best intact landmark above which the fine grid and faulty bars are tried."""
 
 MIN_PROBABILITY = 1e-9
 """Probability below which a hypothesis is not reported."""
@@ -109,13 +110,15 @@ MAX_CHECKED_VISITS = 3
 """Unexplained visits that are used for this check; it fits each of them many times."""
 
 MAX_PERMUTED_SENSORS = 4
-"""Number of sensors up to which every order is tried."""
+"""Number of sensors up to which order, signs and faulty sensors are checked on
+unexplained visits."""
 
 MAX_REFINED_CHANGES = 3
 """Most likely changes of the sensors that are tried on all these visits."""
 
 MAX_GAIN_SIGMAS = 4.0
-"""Deviation of a sensor's gain above which a warning is given."""
+"""Deviation of a sensor's gain, in standard deviations of its prior, above which a warning is
+given."""
 
 MIN_RESIDUAL_RATIO = 3.0
 """Factor by which a change of the sensors must reduce the residual in order to be believed."""
@@ -130,7 +133,7 @@ class LandmarkFit:
     code : int
         In the frame of the fit.
     log_odds : float
-        Log evidence, up to a constant that is common to the trace.
+        Log evidence plus log prior probability of a fault, up to a constant of the trace.
     parameters : (size,) ndarray
         See :class:`.fit.ParameterLayout`.
     covariance : (size, size) ndarray
@@ -209,7 +212,8 @@ class VisitHypotheses:
     odometry : (3,) ndarray
         Robot at ``time_ns`` by its own odometry: x, y, heading.
     hypotheses : tuple of Hypothesis
-        The most probable first; empty if nothing explains the samples.
+        The most probable first; empty if the visit is too short or too weak, but kept if it is
+        ``"not_explained"``.
     residual_sigma : float
         Rms residual of the best hypothesis in standard deviations of the noise; ``nan`` if the
         method has no model of the samples.
@@ -329,7 +333,7 @@ def detect_visits(
 def detect_landmark(
     segment: VisitSegment, recording: HallRecording, geometry: Geometry, priors: ModelPriors
 ) -> VisitHypotheses:
-    """Return the hypotheses of one visit, or the reason for which there are none."""
+    """Return the hypotheses of one visit; ``refused`` tells why it must not be used."""
     trace = segment.trace
     is_too_short = len(trace) < MIN_BINS
     fits = [] if is_too_short else fit_landmarks(trace, geometry, priors)
@@ -381,7 +385,7 @@ def fit_landmarks(
     geometry : Geometry
     priors : ModelPriors
     thorough : bool
-        If nothing explains the trace, search on a finer grid and consider faulty bars.
+        Search on a finer grid, and for faulty bars, if intact landmarks fit badly.
 
     Returns
     -------
@@ -435,7 +439,8 @@ def estimate_pose_at_known_landmark(
     geometry : Geometry
     priors : ModelPriors
     strength : (4,) ndarray
-        Expected signed strengths of the bars in the landmark's frame.
+        Expected signed strengths of the bars in the landmark's frame, relative to the nominal one;
+        0 for a bar whose strength is unknown and fitted.
     start : (3,) ndarray
         Robot in the landmark's frame, accurate to a centimetre and about ten degrees.
 
@@ -669,7 +674,7 @@ def find_faulty_sensor(
     geometry: Geometry,
     priors: ModelPriors,
 ) -> int | None:
-    """Check order and signs of the sensors if many visits are unexplained.
+    """Find a wrong order, an opposite sign or a faulty sensor if many visits are unexplained.
 
     Returns
     -------

@@ -94,7 +94,8 @@ class Driver(Protocol):
     def motions(self, measure: Callable[[], Measurements]) -> Iterator[Motion]:
         """Yield one motion after the other.
 
-        ``measure`` returns all measurements from the start to the end of the last motion.
+        ``measure`` returns all measurements from the start of the session to the end of
+        the last motion.
         """
 
 
@@ -196,7 +197,7 @@ def execute_motion(robot: Robot, motion: Motion, biases: Array) -> None:
 def judge_approach(
     report: ApproachReport, robot: Robot, landmarks: Mapping[Cell, InstalledLandmark]
 ) -> Approach:
-    """Compare the report of an approach with the landmark nearest to the robot's true pose."""
+    """Judge an approach by the reported code and heading, and its true distance from the centre."""
     time_s = np.array([(report.time_ns - SESSION_START_NS) * 1e-9])
     x, y, heading = robot.poses_at(time_s)[0]
     nearest = min(landmarks.values(), key=lambda mark: math.hypot(mark.x_m - x, mark.y_m - y))
