@@ -146,7 +146,7 @@ class SimulationConfig:
         return self._parse(toml.read(path), Path(path).parent)
 
     def loads(self, text: str) -> dict[str, Any]:
-        """Read the settings of TOML text like :meth:`read`; files are relative to the working folder."""
+        """Read the settings of TOML text like :meth:`read`, relative to the working folder."""
         return self._parse(toml.loads(text, f"<{self._format}>"), Path())
 
     @property
@@ -247,7 +247,7 @@ def _is_set(settings: Mapping[str, Any], key: str) -> bool:
 
 
 def with_values(options: Any, values: Mapping[str, Any]) -> Any:
-    """Return a copy of a dataclass with attributes replaced; dots in names are nested dataclasses."""
+    """Return a copy of a dataclass with attributes replaced; dots in names separate levels."""
     direct = {name: value for name, value in values.items() if "." not in name}
     for part in dict.fromkeys(name.partition(".")[0] for name in values if "." in name):
         nested = {
