@@ -10,13 +10,13 @@ import click
 from locatk.cli import console, options
 
 BENCHES = {
-    "lighthouse": "locatk.formats.bench.lighthouse:figures",
-    "dots": "locatk.formats.bench.dots:figures",
-    "polaris": "locatk.formats.bench.polaris:figures",
-    "landmarks": "locatk.formats.bench.landmarks:figures",
-    "capture": "locatk.formats.bench.capture:figures",
-    "look": "locatk.formats.bench.look:figures",
-    "infrared": "locatk.formats.bench.infrared:figures",
+    "lighthouse": "locatk.formats.benchmarks.lighthouse:figures",
+    "dots": "locatk.formats.benchmarks.dots.suite:figures",
+    "polaris": "locatk.formats.benchmarks.polaris.suite:figures",
+    "landmarks": "locatk.formats.benchmarks.landmarks.suite:figures",
+    "capture": "locatk.formats.benchmarks.capture.suite:figures",
+    "look": "locatk.formats.benchmarks.look.suite:figures",
+    "infrared": "locatk.formats.benchmarks.infrared.suite:figures",
 }
 """Name of a system, or of a part, to the function that measures its figures."""
 
@@ -48,7 +48,7 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
       locatk bench infrared
       locatk bench lighthouse --data ~/data --json
     """
-    from locatk.formats.data import data_folder
+    from locatk.formats.published_data import data_folder
 
     with console.working("Measuring"):
         figures = options.load(BENCHES[system])(data_folder(data) or ELSEWHERE)

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.capture_options import names_option
+from locatk.cli.capture.options import names_option
 
 
 @click.command(short_help="Decode the raw bytes of a recording again.")
@@ -53,9 +53,9 @@ def command(
       locatk decode run.mcap --device lines --columns t_ms,x_m,y_m,heading_deg -o again.mcap
       locatk decode run.mcap --artifact array.toml --artifact tag.toml -o again.mcap
     """
-    from locatk.formats.capture import artifacts
-    from locatk.formats.capture.decode import decode, losses
-    from locatk.formats.wire.decoder import Options
+    from locatk.formats.capture import attachments as artifacts
+    from locatk.formats.capture.redecoding import decode, losses
+    from locatk.formats.devices.decoder import Options
 
     options.guard_output(output, overwrite=overwrite, inputs=[recording, *artifact])
     with console.working("Decoding"):
@@ -94,6 +94,6 @@ def command(
 
 def _counted(totals: Any) -> dict[str, Any]:
     """What the decoder counts; the rest is of the port."""
-    from locatk.formats.capture.decode import LINE
+    from locatk.formats.capture.redecoding import LINE
 
     return {key: value for key, value in vars(totals).items() if key not in LINE}

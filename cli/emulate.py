@@ -14,9 +14,9 @@ from locatk.cli.signals import asked_to_stop
 from locatk.core.errors import InputError, LocatkError, MissingDataError
 
 if TYPE_CHECKING:
-    from locatk.formats.emulate.emulator import Totals
-    from locatk.formats.emulate.source import Source
-    from locatk.formats.session import Session
+    from locatk.formats.emulation.emulator import Totals
+    from locatk.formats.emulation.source import Source
+    from locatk.formats.sessions.reader import Session
 
 SYSTEMS = ("polaris", "landmarks", "lighthouse", "dots")
 
@@ -124,8 +124,8 @@ def command(
       locatk emulate run.mcap --drop 0.001 --flip 1e-5 --unplug-every 10 --seed 7
       locatk emulate run.mcap --rate 3e6 --loop 0 --json
     """
-    from locatk.formats.emulate.emulator import Emulator
-    from locatk.formats.emulate.pseudo_port import PseudoPort
+    from locatk.formats.emulation.emulator import Emulator
+    from locatk.formats.emulation.pseudo_port import PseudoPort
 
     _refuse_contradictions(source, save, given)
     with ExitStack() as stack:
@@ -176,9 +176,9 @@ def _source(
     ``stack``."""
     import tempfile
 
-    from locatk.formats.emulate.simulated import simulate_session
-    from locatk.formats.emulate.source import source_of
-    from locatk.formats.session import Session
+    from locatk.formats.emulation.default_sessions import simulate_session
+    from locatk.formats.emulation.source import source_of
+    from locatk.formats.sessions.reader import Session
 
     path = Path(source)
     if source in SYSTEMS:
@@ -201,9 +201,9 @@ def _parts(found: Source, given: dict[str, Any]) -> tuple[Any, Any, Any]:
     """Pace, faults and plan, of what was said on the command line."""
     from math import inf
 
-    from locatk.formats.emulate.emulator import Plan
-    from locatk.formats.emulate.faults import Faults
-    from locatk.formats.emulate.pace import Constant, Pace, Recorded, repeated
+    from locatk.formats.emulation.emulator import Plan
+    from locatk.formats.emulation.faults import Faults
+    from locatk.formats.emulation.pacing import Constant, Pace, Recorded, repeated
 
     packets = repeated(found.packets, given["loop"])
     pace: Pace
@@ -239,7 +239,7 @@ def _how_long(session: Session, given: dict[str, Any]) -> str:
 
 def _reader(port: str, found: Source, session: Session | None) -> str:
     """What to type in another terminal; with what the session knows beside the bytes."""
-    from locatk.formats.capture import artifacts
+    from locatk.formats.capture import attachments as artifacts
 
     words = ["locatk", "capture", port, "--device", found.device]
     if session is not None:

@@ -70,8 +70,8 @@ def command(
       locatk export scene.toml --format crazyflie-config -o lighthouse.yaml
     """
     from locatk.core.errors import InputError
-    from locatk.formats import exports
-    from locatk.formats.solutions import read_trajectories
+    from locatk.formats.exporters import export as exports
+    from locatk.formats.sessions.solutions import read_trajectories
 
     if covariance and format_name != "ros2":
         raise click.UsageError("--covariance is for --format ros2; csv and parquet always have it.")
@@ -122,7 +122,7 @@ def command(
 def stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> None:
     """Write the stations of a scene, of a session or of a solution."""
     from locatk.core.errors import error_context
-    from locatk.formats import crazyflie
+    from locatk.formats.exporters import crazyflie
 
     options.guard_output(output, overwrite=overwrite, inputs=[source])
     scene = scene_of(source)
@@ -139,8 +139,8 @@ def stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> N
 def scene_of(source: Path) -> Scene:
     """The scene in a file of its own, or attached to a session or a solution."""
     from locatk.core.errors import InputError
-    from locatk.formats import artifacts
-    from locatk.formats.session import Session
+    from locatk.formats.artifacts import scene as artifacts
+    from locatk.formats.sessions.reader import Session
 
     if source.suffix.lower() == ".toml":
         return artifacts.read_scene(source)
@@ -177,7 +177,7 @@ def chosen(found: list[Trajectory], devices: tuple[str, ...], solution: Path) ->
 def text(found: list[Trajectory], format_name: str) -> bytes:
     """The file as it would be written."""
     from locatk.core.errors import InputError
-    from locatk.formats import exports
+    from locatk.formats.exporters import export as exports
 
     if format_name in exports.ENDINGS and len(found) > 1:
         raise InputError(

@@ -88,17 +88,6 @@ artifact = input_option(
 )
 
 
-def together(*decorators: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Several options as one decorator, in the order of the help."""
-
-    def decorate(command: Any) -> Any:
-        for decorator in reversed(decorators):
-            command = decorator(command)
-        return command
-
-    return decorate
-
-
 def number(*names: str, default: Any, help: str, **more: Any) -> Callable[[Any], Any]:
     """An option with a default, of the default's type where none is given."""
     more.setdefault("type", type(default))

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.info_capture import size
-from locatk.cli.info_text import when
+from locatk.cli.info.capture import size
+from locatk.cli.info.text import when
 
 if TYPE_CHECKING:
-    from locatk.formats.mcap_salvage import Loss
-    from locatk.formats.recover import Recovered
+    from locatk.formats.sessions.recovery.recover import Recovered
+    from locatk.formats.sessions.recovery.salvage import Loss
 
 MOST_LOSSES = 20
 """So many losses are listed for people; ``--json`` holds them all."""
@@ -41,7 +41,7 @@ def command(file: Path, output: Path, overwrite: bool, as_json: bool) -> None:
       locatk recover run.mcap -o whole.mcap
       locatk recover run.mcap -o whole.mcap --overwrite --json
     """
-    from locatk.formats.recover import recover
+    from locatk.formats.sessions.recovery.recover import recover
 
     options.guard_output(output, overwrite=overwrite, inputs=[file])
     with console.working(f"Recovering {file}"):

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from locatk.cli import console, options
-from locatk.cli.eval import align_option, offset_option
+from locatk.cli.eval.command import align_option, offset_option
 
 PAGES = (".html", ".htm")
 PICTURES = (".png", ".pdf", ".svg")
@@ -86,7 +86,7 @@ def command(
     ]
     for subject in found:
         if subject.truth and subject.evaluation is None:
-            from locatk.formats.report.judgement import why_unjudged
+            from locatk.formats.report.evaluation import why_unjudged
 
             console.warn(f"{subject.name}: {why_unjudged(subject)}")
     written = []
@@ -98,8 +98,8 @@ def command(
             written.append(page)
         for subject, row in zip(found, pictures, strict=True):
             for path in row:
-                from locatk.formats.plot import plot_solution
-                from locatk.formats.plot_clock import origin_ns
+                from locatk.formats.plots.solution import plot_solution
+                from locatk.formats.plots.time_axis import origin_ns
 
                 plot_solution(
                     path,
@@ -154,7 +154,7 @@ def _sessions_of(solutions: tuple[Path, ...], sessions: tuple[Path, ...]) -> lis
         return [None] * len(solutions)
     if len(solutions) == len(sessions) == 1:
         return [sessions[0]]
-    from locatk.formats.session import Session
+    from locatk.formats.sessions.reader import Session
 
     by_name = {path.name: path for path in sessions}
     if len(by_name) < len(sessions):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from locatk.core.lighthouse.receiver import Receiver
     from locatk.core.lighthouse.recording import Sweeps
     from locatk.core.solution import Solution
-    from locatk.formats.session import Session
+    from locatk.formats.sessions.reader import Session
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,9 @@ def lighthouse(session: Session, request: Request) -> Solved:
     from locatk.core import lighthouse
     from locatk.core.lighthouse.scene import Scene
     from locatk.core.solution import SolverWarning
-    from locatk.formats import artifacts, heard, observations
+    from locatk.formats.artifacts import scene as artifacts
+    from locatk.formats.sessions import observations
+    from locatk.formats.sessions import station_reports as heard
 
     _check(
         request, "lighthouse", methods=("bundle", "paper"), refused=("camera", "speed", "templates")
@@ -86,7 +88,8 @@ def _rigid(sweeps: Sweeps, receivers: Mapping[str, Receiver]) -> dict[str, Recei
 def dots(session: Session, request: Request) -> Solved:
     """Solve a session of camera frames of a dot sheet."""
     from locatk.core import dots as system
-    from locatk.formats import observations, sheets
+    from locatk.formats.artifacts import sheets
+    from locatk.formats.sessions import observations
 
     _check(request, "dots", methods=("lattice", "paper"), refused=("scene", "speed", "templates"))
     if request.artifact is not None:
@@ -116,7 +119,8 @@ def polaris(session: Session, request: Request) -> Solved:
     """Solve a session of a magnetometer array over tags."""
     from locatk.core import polaris as system
     from locatk.core.polaris.published.templates import TemplateGrid
-    from locatk.formats import observations, tags
+    from locatk.formats.artifacts import tags
+    from locatk.formats.sessions import observations
 
     _check(request, "polaris", methods=("joint", "paper"), refused=("scene", "camera"))
     given = request.artifact
@@ -138,7 +142,8 @@ def polaris(session: Session, request: Request) -> Solved:
 def landmarks(session: Session, request: Request) -> Solved:
     """Solve a session of hall sensors over a floor of landmarks."""
     from locatk.core import landmarks as system
-    from locatk.formats import maps, observations
+    from locatk.formats.artifacts import maps
+    from locatk.formats.sessions import observations
 
     _check(
         request,
@@ -183,7 +188,7 @@ def solve_session(path: Path, request: Request) -> Solved:
     LocatkError
         Whatever reading and solving raise.
     """
-    from locatk.formats.session import Session
+    from locatk.formats.sessions.reader import Session
 
     session = Session.open(path)
     kind = session.facts.get("kind")
@@ -227,7 +232,8 @@ def check_given(request: Request) -> None:
     ------
     ArtifactError
     """
-    from locatk.formats import artifacts, maps, sheets, tags, toml
+    from locatk.formats.artifacts import maps, sheets, tags, toml
+    from locatk.formats.artifacts import scene as artifacts
 
     readers: dict[str, Callable[[Path], Any]] = {
         artifacts.SCENE_FORMAT: artifacts.read_scene,

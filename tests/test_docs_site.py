@@ -107,7 +107,7 @@ Values = dict[str, list[ast.expr]]
 
 def _modules(system: str) -> Iterator[ast.Module]:
     """The module of a bench, and those of the package that it imports figures from."""
-    package = "locatk.formats.bench"
+    package = "locatk.formats.benchmarks"
     left, seen = [BENCHES[system].split(":")[0]], {f"{package}.timing"}
     while left:
         name = left.pop()

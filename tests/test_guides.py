@@ -147,8 +147,8 @@ def _toml_of_formats(name: str) -> str:
 def _pictures(sheet: Path, frames: int = 20) -> Iterator[bytes]:
     """PNG files of a camera over a printed sheet."""
     from locatk.core.dots.simulation.session import SimulationOptions, simulate
+    from locatk.formats.artifacts.sheets import read_manifest
     from locatk.formats.images import encode_png
-    from locatk.formats.sheets import read_manifest
 
     made = simulate(read_manifest(sheet), SimulationOptions(frames=frames))
     yield from map(encode_png, made.frames.images)
@@ -185,7 +185,7 @@ def _drive_csv(folder: Path, words: list[str]) -> None:
 
     from locatk.core.geometry import heading_from_quaternion
     from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
-    from locatk.formats.maps import read_map
+    from locatk.formats.artifacts.maps import read_map
 
     made = simulate(read_map(folder / words[words.index("--map") + 1]), SimulationOptions())
     (samples,), (odometry,) = made.samples, made.odometry
@@ -203,7 +203,7 @@ def _published(place: str) -> Callable[[Path, list[str]], None]:
     """A link to published data."""
 
     def provide(folder: Path, words: list[str]) -> None:
-        from locatk.formats.data import data_folder
+        from locatk.formats.published_data import data_folder
 
         data = data_folder()
         if data is None or not (data / place).exists():
@@ -334,7 +334,7 @@ class Reader:
 
     def store(self, bucket: str) -> None:
         """A bucket with the sessions of the folder, where the page names it first."""
-        from locatk.formats.batch.places import facts_of
+        from locatk.formats.pipeline.locations import facts_of
 
         if bucket in self.buckets:
             return

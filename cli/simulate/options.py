@@ -17,6 +17,7 @@ import click
 from click.core import ParameterSource
 
 from locatk.cli import options
+from locatk.cli.command import Command, combine
 from locatk.formats.simulation.settings import (
     ANY_NUMBER,
     Boolean,
@@ -32,7 +33,7 @@ from locatk.formats.simulation.settings import (
 CONFIG_FILE, PRINT_CONFIG = "config_file", "print_config"
 
 
-class SimulationCommand(click.Command):
+class SimulationCommand(Command):
     """Command whose options are the settings of a simulation, grouped as in the TOML file."""
 
     def __init__(self, *args: Any, module: str, **more: Any) -> None:
@@ -93,20 +94,10 @@ class SimulationCommand(click.Command):
         ctx.params = {**others, "settings": settings, "input_files": input_files}
         return super().invoke(ctx)
 
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options in groups: first those of any command, then the settings."""
-        groups: dict[str, list[tuple[str, str]]] = {"Options": []}
-        for parameter in self.get_params(ctx):
-            if isinstance(parameter, click.Argument):
-                continue
-            setting = self._settings.get(parameter.name or "")
-            record = parameter.get_help_record(ctx)
-            if record is not None:
-                title = setting.table.capitalize() if setting else "Options"
-                groups.setdefault(title, []).append(record)
-        for title, records in groups.items():
-            with formatter.section(title):
-                formatter.write_dl(records)
+    def section_of(self, parameter: click.Parameter) -> str:
+        """Return the section of an option: the table of its setting in the TOML file."""
+        setting = self._settings.get(parameter.name or "")
+        return setting.table.capitalize() if setting else "Options"
 
 
 class _UnlessPrinting(click.Parameter):
@@ -127,7 +118,7 @@ class _Option(_UnlessPrinting, click.Option):
 
 def simulation_command(module: str) -> Callable[[Callable[..., None]], click.Command]:
     """Make a function the command whose settings are the ``CONFIG`` of a module."""
-    return options.together(
+    return combine(
         click.command("", cls=SimulationCommand, module=module),
         click.option(
             "-o",

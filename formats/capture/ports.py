@@ -29,15 +29,10 @@ from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-from locatk.formats.capture.holders import busy, forbidden, is_pty
-from locatk.formats.capture.listing import PortInfo, attached
+from locatk.formats.capture.connections import DescriptorLink, PolledLink, RemoteLink, SerialLink
+from locatk.formats.capture.port_holders import busy, forbidden, is_pty
+from locatk.formats.capture.port_listing import PortInfo, attached
 from locatk.formats.capture.replay import ReplayPort
-from locatk.formats.capture.serial_link import (
-    DescriptorLink,
-    PolledLink,
-    RemoteLink,
-    SerialLink,
-)
 from locatk.formats.capture.source import Link, Port, SourceError
 
 URLS = ("socket", "rfc2217", "replay", "loop", "spy", "alt", "hwgrep", "cp2110")

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError
-from locatk.formats.capture.clock import HostClock
-from locatk.formats.capture.intake import Intake
-from locatk.formats.capture.parts import CHUNK, Parts
-from locatk.formats.capture.receiver import Arrived, Back, Ended, Event, Lost, Receiver
-from locatk.formats.capture.totals import Recorded, Status, Totals
+from locatk.formats.capture.host_clock import HostClock
+from locatk.formats.capture.ingestion import Intake
+from locatk.formats.capture.reader_thread import Arrived, Back, Ended, Event, Lost, Receiver
+from locatk.formats.capture.recording_files import CHUNK, Parts
+from locatk.formats.capture.statistics import Recorded, Status, Totals
 
 TURN_S = 0.02
 """Between looks at what was received: one message of each stream covers about so much."""

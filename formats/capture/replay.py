@@ -14,8 +14,8 @@ from collections.abc import Generator
 
 from locatk.core.errors import InputError, LocatkError
 from locatk.formats.capture.source import LinkEnded, LinkLost, Overruns, SourceError
-from locatk.formats.proto.serial_pb2 import SerialChunk
-from locatk.formats.session import Session
+from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.sessions.reader import Session
 
 SCHEMA = SerialChunk.DESCRIPTOR.full_name
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.formats import images
-from locatk.formats.frames import Shot
+from locatk.formats.sessions.frames import Shot
 
 DEVICE = "camera"
 """Name of the camera; image files and videos do not tell one."""

@@ -20,9 +20,9 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.columns import UNITS, Column, by_quantity, find
-from locatk.formats.importers.readings import leave_out, no_reading
-from locatk.formats.importers.table import Table, read_table
+from locatk.formats.importers.field_readings import leave_out, no_reading
+from locatk.formats.tables.columns import UNITS, Column, by_quantity, find
+from locatk.formats.tables.csv_table import Table, read_table
 
 Array = NDArray[np.float64]
 
@@ -130,7 +130,7 @@ def read_landmarks(
     Raises
     ------
     MissingDataError, FormatError
-        See :func:`locatk.formats.importers.table.read_table`; also where a column is
+        See :func:`locatk.formats.tables.csv_table.read_table`; also where a column is
         missing, or two could be meant.
     InputError
         A unit is not known, a cell is no number, times do not ascend, or nothing is left.

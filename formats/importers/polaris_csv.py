@@ -26,8 +26,8 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.polaris import mlx90393
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.tag import Tags
-from locatk.formats.importers.readings import Bad, leave_out, no_reading
-from locatk.formats.importers.table import TIME, Table, read_table
+from locatk.formats.importers.field_readings import Bad, leave_out, no_reading
+from locatk.formats.tables.csv_table import TIME, Table, read_table
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def read_polaris(path: Path, *, rate_hz: float, spacing_m: float) -> ImportedSam
     Raises
     ------
     MissingDataError, FormatError
-        See :func:`locatk.formats.importers.table.read_table`; also where the columns of the
+        See :func:`locatk.formats.tables.csv_table.read_table`; also where the columns of the
         sensors are missing or have gaps.
     InputError
         A cell is no tuple of three numbers, stamps go backwards, no MLX90393 gives this

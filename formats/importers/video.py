@@ -14,8 +14,8 @@ from typing import Any
 
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError
-from locatk.formats.frames import Shot
 from locatk.formats.importers.images import START_NS, check_size
+from locatk.formats.sessions.frames import Shot
 
 _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 """With which a Matroska file and the segment in it begin."""

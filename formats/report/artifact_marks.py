@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from plotly.graph_objects import Scatter
 
-from locatk.formats.plot_floor import (
+from locatk.formats.plots.floor import (
     MOST_NAMED,
     NORTH_COLOR,
     REFUSED_COLOR,
@@ -18,8 +18,8 @@ from locatk.formats.plot_floor import (
     WEAK_COLOR,
     Floor,
 )
-from locatk.formats.plot_ground import FOUND_COLOR, PAPER_COLOR, SCENE_COLOR, Ground, Paper, View
-from locatk.formats.plot_tags import Arrows, Tag
+from locatk.formats.plots.ground import FOUND_COLOR, PAPER_COLOR, SCENE_COLOR, Ground, Paper, View
+from locatk.formats.plots.tags import Arrows, Tag
 from locatk.formats.report.figures import Array, label
 
 

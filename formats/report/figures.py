@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.formats.plot_ground import COLORS
-from locatk.formats.plot_units import thousands
+from locatk.formats.plots.ground import COLORS
+from locatk.formats.plots.units import thousands
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

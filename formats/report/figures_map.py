@@ -11,7 +11,7 @@ from plotly.graph_objects import Figure, Scatter
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plot_ground import (
+from locatk.formats.plots.ground import (
     IN_LEGEND,
     SCENE_COLOR,
     TRUTH_COLOR,
@@ -22,7 +22,7 @@ from locatk.formats.plot_ground import (
     framed,
     short,
 )
-from locatk.formats.plot_units import digits, thousands
+from locatk.formats.plots.units import digits, thousands
 from locatk.formats.report.artifact_marks import artifact_marks, landmark_names
 from locatk.formats.report.figures import (
     FIRST,

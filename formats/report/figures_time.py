@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from plotly.graph_objects import Bar, Figure, Scatter
 from plotly.subplots import make_subplots
 
-from locatk.formats.plot_ground import IN_LEGEND, broken, short
-from locatk.formats.plot_series import MOST_BANDS, Series, usual_top
-from locatk.formats.plot_units import Unit, thousands
+from locatk.formats.plots.ground import IN_LEGEND, broken, short
+from locatk.formats.plots.series import MOST_BANDS, Series, usual_top
+from locatk.formats.plots.units import Unit, thousands
 from locatk.formats.report.figures import (
     FIRST,
     MOST_POINTS,

@@ -9,10 +9,12 @@ from dataclasses import replace
 from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats.output import atomic_write, check_output, tool_version
-from locatk.formats.plot_clock import of_one_time, origin_ns, span, when
-from locatk.formats.plot_ground import ground_of
-from locatk.formats.plot_units import length, thousands
-from locatk.formats.report import judgement, page, run_facts, seen, signals
+from locatk.formats.plots.ground import ground_of
+from locatk.formats.plots.time_axis import of_one_time, origin_ns, span, when
+from locatk.formats.plots.units import length, thousands
+from locatk.formats.report import detections as seen
+from locatk.formats.report import evaluation as judgement
+from locatk.formats.report import page, run_facts, signals
 from locatk.formats.report.figures_map import map_panels
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.subject import Subject

@@ -10,11 +10,11 @@ from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution, to_json
-from locatk.formats import describe
-from locatk.formats.plot_clock import span, when
-from locatk.formats.plot_units import digits
+from locatk.formats.plots.time_axis import span, when
+from locatk.formats.plots.units import digits
 from locatk.formats.report.panel import Panel, Table
 from locatk.formats.report.subject import Subject
+from locatk.formats.sessions import description as describe
 
 MOST_ROWS = 60
 """Of a table of facts; the rest is counted."""

@@ -8,7 +8,7 @@ from importlib import import_module
 from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats.report.panel import Panel
-from locatk.formats.session import Session
+from locatk.formats.sessions.reader import Session
 
 MODULES = {
     system: f"locatk.formats.report.signals_{system}"

@@ -15,16 +15,18 @@ from locatk.core.dots.results import DotDetection, FrameOutcome
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError, LocatkError
 from locatk.core.solution import Solution
-from locatk.formats import captured, seen_text, sheets
-from locatk.formats import frames as camera_frames
-from locatk.formats.plot_clock import origin_ns
-from locatk.formats.plot_ground import COLORS
+from locatk.formats.artifacts import sheets
+from locatk.formats.plots.ground import COLORS
+from locatk.formats.plots.time_axis import origin_ns
+from locatk.formats.report import detection_tables as seen_text
 from locatk.formats.report import signals_drawing as drawing
+from locatk.formats.report.detection_tables import words
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel, Picture
 from locatk.formats.report.signals_drawing import one_a_pixel
-from locatk.formats.seen_text import words
-from locatk.formats.session import Session
+from locatk.formats.sessions import capture_record as captured
+from locatk.formats.sessions import frames as camera_frames
+from locatk.formats.sessions.reader import Session
 
 PICTURES = 8
 """Frames that are shown, of all cameras together."""

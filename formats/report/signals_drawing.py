@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.formats.plot_ground import COLORS
+from locatk.formats.plots.ground import COLORS
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure

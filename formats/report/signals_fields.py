@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, LocatkError
 from locatk.core.solution import Solution
-from locatk.formats.messages import BatchError
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_reading import MOST_DEVICES, excerpt
-from locatk.formats.samples import Kind
-from locatk.formats.session import Session
+from locatk.formats.sessions.field_samples import Kind
+from locatk.formats.sessions.messages import BatchError
+from locatk.formats.sessions.reader import Session
 
 
 @dataclass(frozen=True)

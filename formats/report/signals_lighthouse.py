@@ -12,14 +12,14 @@ from locatk.core.lighthouse.channels import CHANNELS, period_counts
 from locatk.core.lighthouse.epochs import Epochs, group_epochs
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.solution import Solution
-from locatk.formats.messages import SWEEPS, BatchError
-from locatk.formats.plot_clock import origin_ns
-from locatk.formats.plot_ground import COLORS
+from locatk.formats.plots.ground import COLORS
+from locatk.formats.plots.time_axis import origin_ns
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_drawing import one_a_pixel
 from locatk.formats.report.signals_reading import MOST_DEVICES, excerpt
-from locatk.formats.session import Session
+from locatk.formats.sessions.messages import SWEEPS, BatchError
+from locatk.formats.sessions.reader import Session
 
 Array = NDArray[np.float64]
 

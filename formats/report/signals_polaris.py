@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.polaris.results import TagDetection
 from locatk.core.solution import Solution
-from locatk.formats import seen_text
-from locatk.formats.arrays import KIND
-from locatk.formats.plot_clock import origin_ns
+from locatk.formats.plots.time_axis import origin_ns
+from locatk.formats.report import detection_tables as seen_text
 from locatk.formats.report import signals_drawing as drawing
+from locatk.formats.report.detection_tables import words
 from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_drawing import Event, envelope, number, short
 from locatk.formats.report.signals_fields import Fields, each_device
-from locatk.formats.seen_text import words
-from locatk.formats.session import Session
+from locatk.formats.sessions.magnetometers import KIND
+from locatk.formats.sessions.reader import Session
 
 Array = NDArray[np.float64]
 

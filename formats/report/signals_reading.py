@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from locatk.formats import captured, mcap_records
-from locatk.formats.mcap_records import DamageError, Segment
-from locatk.formats.session import Session, reading
+from locatk.formats.sessions import capture_record as captured
+from locatk.formats.sessions import mcap_records
+from locatk.formats.sessions.mcap_records import DamageError, Segment
+from locatk.formats.sessions.reader import Session, reading
 
 MOST_READ = 8 << 20
 """Bytes of a recording that are read to be drawn; of a larger one, parts spread over it."""

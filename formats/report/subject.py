@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from locatk.core.evaluation import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.session import Session
+from locatk.formats.sessions.reader import Session
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import trajectory_files
-from locatk.formats.plot_clock import of_one_time
-from locatk.formats.plot_ground import has_no_scale, known
+from locatk.formats.importers import trajectories as trajectory_files
+from locatk.formats.plots.ground import has_no_scale, known
+from locatk.formats.plots.time_axis import of_one_time
 from locatk.formats.report.subject import Subject
-from locatk.formats.session import Session
-from locatk.formats.solutions import read_solution
-from locatk.formats.tracks import read_truth
+from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.solutions import read_solution
+from locatk.formats.sessions.trajectories import read_truth
 
 
 def load(

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.errors import InputError
-from locatk.formats import toml
+from locatk.formats.artifacts import toml
+from locatk.formats.artifacts.base import head
+from locatk.formats.artifacts.toml import Inline, Table
 from locatk.formats.simulation.settings import NO_DEFAULT, FilePath, Number, Requirement, Setting
-from locatk.formats.toml import Inline, Table
-from locatk.formats.toml_files import head
 
 FORMAT_VERSION = 1
 """Version of the configuration files of all simulators."""

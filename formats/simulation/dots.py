@@ -13,8 +13,8 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation import session as simulation
 from locatk.core.dots.simulation.paths import PATHS
 from locatk.core.dots.simulation.session import SimulationOptions
-from locatk.formats import sheets
-from locatk.formats.frames import Shot, write_shots
+from locatk.formats.artifacts import sheets
+from locatk.formats.sessions.frames import Shot, write_shots
 from locatk.formats.simulation.config import SettingsError, SimulationConfig
 from locatk.formats.simulation.settings import (
     ANY_NUMBER,

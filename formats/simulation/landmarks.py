@@ -20,8 +20,9 @@ from locatk.core.landmarks.simulation.session import (
     SimulationOptions,
     simulate,
 )
-from locatk.formats import halls, maps
+from locatk.formats.artifacts import maps
 from locatk.formats.files import read_text
+from locatk.formats.sessions import halls
 from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
 from locatk.formats.simulation.settings import (
     ANY_NUMBER,

@@ -10,8 +10,8 @@ from typing import Any
 
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
-from locatk.formats import observations
-from locatk.formats.receivers import read_receiver
+from locatk.formats.artifacts.receiver import read_receiver
+from locatk.formats.sessions import observations
 from locatk.formats.simulation.config import SimulationConfig
 from locatk.formats.simulation.settings import (
     FRACTION_BELOW_1,

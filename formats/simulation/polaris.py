@@ -16,8 +16,8 @@ from locatk.core.polaris.simulation.session import (
     simulate,
     usual_bar,
 )
-from locatk.formats import arrays
-from locatk.formats import tags as tag_files
+from locatk.formats.artifacts import tags as tag_files
+from locatk.formats.sessions import magnetometers as arrays
 from locatk.formats.simulation.config import SimulationConfig
 from locatk.formats.simulation.settings import (
     ANY_NUMBER,

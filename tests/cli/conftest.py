@@ -24,8 +24,8 @@ from locatk.core.lighthouse.results import StationDetection
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-from locatk.formats import observations
-from locatk.formats.session import Session
+from locatk.formats.sessions import observations
+from locatk.formats.sessions.reader import Session
 
 START_NS = 1_700_000_000_000_000_000
 POSES = 20
@@ -283,7 +283,7 @@ def _processes() -> Iterator[Callable[..., Process]]:
 def raw_bytes() -> Callable[..., bytes]:
     """``raw_bytes(path, ...)``: the bytes in recordings, whose offsets must follow on; of a
     damaged one what is left."""
-    from locatk.formats.proto.serial_pb2 import SerialChunk
+    from locatk.formats.schemas.serial_pb2 import SerialChunk
 
     def join(*paths: Path, topic: str = "/serial/robot") -> bytes:
         content = bytearray()

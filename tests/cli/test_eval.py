@@ -15,10 +15,10 @@ import pytest
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import trajectories
-from locatk.formats.session_writer import SessionWriter
-from locatk.formats.solutions import write_solution
-from locatk.formats.tracks import truth_messages, write_streams
+from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.sessions.solutions import write_solution
+from locatk.formats.sessions.trajectories import truth_messages, write_streams
+from locatk.formats.sessions.writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000
 N = 600

@@ -13,9 +13,11 @@ import pytest
 
 from locatk.cli import export
 from locatk.core.lighthouse.scene import Scene
-from locatk.formats import artifacts, exports, trajectories
-from locatk.formats.session_writer import SessionWriter
-from locatk.formats.solutions import read_solution, write_solution
+from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.exporters import export as exports
+from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.sessions.solutions import read_solution, write_solution
+from locatk.formats.sessions.writer import SessionWriter
 
 POSES = 20
 
@@ -85,7 +87,7 @@ def test_kitti_keeps_the_times_beside_the_matrices(locatk, solved: Path, tmp_pat
 
 
 def exports_of(path: Path) -> list[trajectories.Trajectory]:
-    from locatk.formats.solutions import read_trajectories
+    from locatk.formats.sessions.solutions import read_trajectories
 
     return read_trajectories(path)
 

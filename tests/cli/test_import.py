@@ -12,9 +12,10 @@ import pytest
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport, Sweeps
-from locatk.formats import artifacts, observations
-from locatk.formats.importers.sweeps import ImportedSession
-from locatk.formats.session import Session
+from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.sessions import observations
+from locatk.formats.sessions.reader import Session
 
 HEADER = "timestamp,source,LHA_count_1,LHA_count_2,LHB_count_1,LHB_count_2"
 ROW = "2023-07-27T15:34:{:02d}.700963Z,R,48333,88779,48979,94628"

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from locatk.cli.eval import ALIGNMENTS
+from locatk.cli.eval.command import ALIGNMENTS
 from locatk.core import evaluation
-from locatk.formats import artifacts
+from locatk.formats.artifacts import scene as artifacts
 
 POSES = 20
 

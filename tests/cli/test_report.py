@@ -11,7 +11,7 @@ import pytest
 from click.testing import Result
 
 from locatk.cli import systems
-from locatk.cli.eval import ALIGNMENTS
+from locatk.cli.eval.command import ALIGNMENTS
 from locatk.cli.report import plan
 from locatk.core.evaluation import ALIGNMENTS as CORE
 

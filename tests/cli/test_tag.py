@@ -12,7 +12,7 @@ import pytest
 from locatk.core.polaris import codec
 from locatk.core.polaris.codec import families
 from locatk.core.polaris.tag import AsBuiltTag, Tags
-from locatk.formats.tags import read_tags, write_tags
+from locatk.formats.artifacts.tags import read_tags, write_tags
 
 
 def design(locatk, path: Path, *options: object):

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from locatk.core.errors import ArtifactError
-from locatk.formats.toml_files import Artifact
+from locatk.formats.artifacts.base import Artifact
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from locatk.core.dots.calibration.printed_fields import FieldScore
 from locatk.core.dots.calibration.printer import PrinterReport, calibrate, find_sheet, recommend
 from locatk.core.dots.drawing.test_sheet import PrinterSheet, marker_dictionary, printer_sheet
 from locatk.core.errors import DegenerateError, InputError
-from locatk.formats.pdf.testsheet import render
+from locatk.formats.printing.test_sheet import render
 
 Ink = NDArray[np.uint8]
 SCAN_DPI = 450.0

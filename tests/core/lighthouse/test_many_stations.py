@@ -248,7 +248,7 @@ def test_serial_numbers_that_were_heard_are_kept(world: Any) -> None:
 
 @pytest.fixture(scope="module")
 def tracker(recordings: Path) -> Any:
-    from locatk.formats.importers.libsurvive import read_libsurvive
+    from locatk.formats.importers.libsurvive.recording import read_libsurvive
 
     path = recordings / "libsurvive" / "tracker-cal-attempt.rec.gz"
     return read_libsurvive([path], stations=True)

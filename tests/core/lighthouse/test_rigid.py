@@ -352,7 +352,7 @@ def test_a_pause_of_years_is_handled() -> None:
 def test_the_poses_of_a_recorded_tracker_agree_with_libsurvive(data: Path) -> None:
     """The reference are libsurvive's poses in its own scene. libsurvive gives all sweeps the same
     weight, three of which are 1.8 mrad off; that is a part of the difference."""
-    importer = pytest.importorskip("locatk.formats.importers.libsurvive")
+    importer = pytest.importorskip("locatk.formats.importers.libsurvive.recording")
     path = data / "lighthouse" / "libsurvive" / "tracker-cal-attempt.rec.gz"
     session = importer.read_libsurvive([path], stations=True)
     truth = session.truth[0]

@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 
-from locatk.formats.capture import ports, recorder, session
+from locatk.formats.capture import ports, recorder
+from locatk.formats.capture import setup as session
 from locatk.formats.capture.recorder import Limits, Recorded, Status
 from locatk.formats.capture.source import LinkEnded, LinkLost, Overruns
-from locatk.formats.proto.serial_pb2 import SerialChunk
-from locatk.formats.session import Session
+from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.sessions.reader import Session
 
 WAIT_S = 20.0
 """Longer than anything here takes; a test that waits for it has failed."""

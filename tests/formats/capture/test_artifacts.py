@@ -15,10 +15,11 @@ from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
-from locatk.formats import artifacts as scenes
-from locatk.formats import hall_sensors, maps, receivers, sheets, tags
-from locatk.formats.capture.artifacts import ATTACHED, KINDS, attachments
-from locatk.formats.session_writer import SessionWriter
+from locatk.formats.artifacts import hall_sensors, maps, sheets, tags
+from locatk.formats.artifacts import receiver as receivers
+from locatk.formats.artifacts import scene as scenes
+from locatk.formats.capture.attachments import ATTACHED, KINDS, attachments
+from locatk.formats.sessions.writer import SessionWriter
 
 SCENE = scenes.dumps_scene(Scene(markers=(Marker("corner", np.zeros(3)),)))
 TAG = tags.dumps_tags(Tags(ids=(3, 5), min_distance=2))

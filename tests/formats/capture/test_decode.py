@@ -13,18 +13,18 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from locatk.core.errors import FormatError, InputError, MissingDataError, OutputExistsError
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.polaris.array import Samples, SensorArray, bar
-from locatk.formats import messages
-from locatk.formats.capture.decode import decode, losses
-from locatk.formats.capture.intake import SerialIntake
-from locatk.formats.capture.parts import LOG_NAME, Content, Parts
-from locatk.formats.capture.receiver import Arrived
-from locatk.formats.capture.totals import RECORD
-from locatk.formats.proto.serial_pb2 import Readings, SerialChunk
-from locatk.formats.session import Session
-from locatk.formats.session_writer import SessionWriter
-from locatk.formats.wire import device
-from locatk.formats.wire.decoder import Options
-from locatk.formats.wire.recording import Recording
+from locatk.formats.capture.ingestion import SerialIntake
+from locatk.formats.capture.reader_thread import Arrived
+from locatk.formats.capture.recording_files import LOG_NAME, Content, Parts
+from locatk.formats.capture.redecoding import decode, losses
+from locatk.formats.capture.statistics import RECORD
+from locatk.formats.devices import device
+from locatk.formats.devices.decoder import Options
+from locatk.formats.devices.recording import Recording
+from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
+from locatk.formats.sessions import messages
+from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

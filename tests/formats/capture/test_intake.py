@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
-from locatk.formats import wire
-from locatk.formats.capture.intake import PAUSE_NS, CameraIntake, SerialIntake
-from locatk.formats.capture.receiver import Arrived
-from locatk.formats.capture.streams import Stamped
-from locatk.formats.capture.totals import Totals
-from locatk.formats.proto.serial_pb2 import SerialChunk
-from locatk.formats.wire.decoder import Batch, Counts, Options, Stream, Ticks
+from locatk.formats import devices as wire
+from locatk.formats.capture.device_messages import Stamped
+from locatk.formats.capture.ingestion import PAUSE_NS, CameraIntake, SerialIntake
+from locatk.formats.capture.reader_thread import Arrived
+from locatk.formats.capture.statistics import Totals
+from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks
+from locatk.formats.schemas.serial_pb2 import SerialChunk
 
 START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -384,7 +384,7 @@ def auto(monkeypatch: pytest.MonkeyPatch) -> type[Identifier]:
     module: Any = types.ModuleType("identify")
     kind = type("Identifier", (Identifier,), {})
     module.Identifier, module.Verdict, module.LISTEN_S = kind, Verdict, 3.0
-    monkeypatch.setitem(sys.modules, "locatk.formats.wire.identify", module)
+    monkeypatch.setitem(sys.modules, "locatk.formats.devices.identification", module)
     monkeypatch.setattr(wire, "identify", module, raising=False)
     return kind
 

@@ -11,13 +11,20 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
-from locatk.formats.capture import live_file, parts
+from locatk.formats.capture import live_file
+from locatk.formats.capture import recording_files as parts
+from locatk.formats.capture.device_messages import Stamped
 from locatk.formats.capture.live_file import DiskFullError
-from locatk.formats.capture.parts import LOG_NAME, Content, Parts, check_outputs, part_path
-from locatk.formats.capture.streams import Stamped
-from locatk.formats.messages import timestamp
-from locatk.formats.proto.serial_pb2 import Readings, SerialChunk
-from locatk.formats.session import Session
+from locatk.formats.capture.recording_files import (
+    LOG_NAME,
+    Content,
+    Parts,
+    check_outputs,
+    part_path,
+)
+from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
+from locatk.formats.sessions.messages import timestamp
+from locatk.formats.sessions.reader import Session
 
 START_NS = 1_700_000_000_000_000_000
 TOPIC = "/serial/robot"

@@ -23,8 +23,9 @@ import serial
 from serial.rfc2217 import PortManager
 from serial.tools import list_ports
 
-from locatk.formats.capture import holders, ports
-from locatk.formats.capture.listing import PortInfo
+from locatk.formats.capture import port_holders as holders
+from locatk.formats.capture import ports
+from locatk.formats.capture.port_listing import PortInfo
 from locatk.formats.capture.ports import SerialPort, port_of
 from locatk.formats.capture.source import Link, LinkLost, SourceError
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from locatk.formats.capture import receiver as receiver_module
-from locatk.formats.capture.clock import HostClock
-from locatk.formats.capture.receiver import Arrived, Back, Ended, Event, Lost, Receiver
+from locatk.formats.capture import reader_thread as receiver_module
+from locatk.formats.capture.host_clock import HostClock
+from locatk.formats.capture.reader_thread import Arrived, Back, Ended, Event, Lost, Receiver
 from locatk.formats.capture.source import Overruns, SourceError
 
 

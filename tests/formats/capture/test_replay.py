@@ -11,13 +11,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from locatk.formats import mcap_records
 from locatk.formats.capture import replay
 from locatk.formats.capture.ports import port_of
 from locatk.formats.capture.replay import ReplayLink, ReplayPort
 from locatk.formats.capture.source import LinkEnded, LinkLost, SourceError
-from locatk.formats.proto.serial_pb2 import SerialChunk
-from locatk.formats.session_writer import SessionWriter
+from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.sessions import mcap_records
+from locatk.formats.sessions.writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000
 PIECES = [b"a", b"bc" * 500, b"\0" * 4096, b"d"]

@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 import serial
 
-from locatk.formats.capture import serial_link
-from locatk.formats.capture.serial_link import (
+from locatk.formats.capture import connections as serial_link
+from locatk.formats.capture.connections import (
     MOST,
     DescriptorLink,
     PolledLink,

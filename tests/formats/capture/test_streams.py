@@ -13,14 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.polaris.array import SensorArray, bar
-from locatk.formats import arrays, messages, observations, tags, tracks
-from locatk.formats.capture.arrivals import Arrivals
-from locatk.formats.capture.streams import Stamped, Streams
-from locatk.formats.messages import Layout
-from locatk.formats.session import Session
-from locatk.formats.session_writer import SessionWriter
-from locatk.formats.tracks import LARGEST_BATCH
-from locatk.formats.wire.decoder import KINDS, Batch, Stream, Ticks
+from locatk.formats.artifacts import tags
+from locatk.formats.capture.arrival_times import Arrivals
+from locatk.formats.capture.device_messages import Stamped, Streams
+from locatk.formats.devices.decoder import KINDS, Batch, Stream, Ticks
+from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions import messages, observations
+from locatk.formats.sessions import trajectories as tracks
+from locatk.formats.sessions.messages import Layout
+from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.trajectories import LARGEST_BATCH
+from locatk.formats.sessions.writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

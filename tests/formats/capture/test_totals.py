@@ -7,7 +7,7 @@ from dataclasses import fields
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.formats.capture.totals import Totals
+from locatk.formats.capture.statistics import Totals
 
 counts = st.integers(0, 10**12)
 samples = st.dictionaries(st.sampled_from(("/a", "/b", "/c")), counts)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from locatk.formats.plot_series import expected_error, usual_top
-from locatk.formats.plot_units import digits, length, unit_for
+from locatk.formats.plots.series import expected_error, usual_top
+from locatk.formats.plots.units import digits, length, unit_for
 from locatk.formats.report.figures import share_of_points, thin
 
 

@@ -23,12 +23,12 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import GenericRecord, Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plot_ground import known
+from locatk.formats.plots.ground import known
+from locatk.formats.report.evaluation import error_panels, sigma_panels
 from locatk.formats.report.figures import MOST_POINTS
-from locatk.formats.report.judgement import error_panels, sigma_panels
 from locatk.formats.report.report import panels, render, write_report
 from locatk.formats.report.subject import Subject
-from locatk.formats.session import Session
+from locatk.formats.sessions.reader import Session
 
 START_NS = 1_767_225_600_000_000_000
 EVIL = "</script><img src=x onerror=alert(1)>"

@@ -22,8 +22,9 @@ from locatk.core.lighthouse.results import StationDetection
 from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.solution import GenericRecord, Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import seen_text
-from locatk.formats.report import seen, seen_reasons
+from locatk.formats.report import detection_tables as seen_text
+from locatk.formats.report import detections as seen
+from locatk.formats.report import rejection_reasons as seen_reasons
 
 ROOT = Path(__file__).resolve().parents[3]
 

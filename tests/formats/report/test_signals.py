@@ -24,15 +24,11 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.simulation import session as polaris_simulate
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import arrays, frames, halls, observations
-from locatk.formats.report import (
-    signals,
-    signals_drawing,
-    signals_lighthouse,
-    signals_reading,
-)
+from locatk.formats.report import signals, signals_drawing, signals_lighthouse, signals_reading
 from locatk.formats.report.panel import Panel
-from locatk.formats.session import Session
+from locatk.formats.sessions import frames, halls, observations
+from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions.reader import Session
 
 START_NS = 1_767_225_600_000_000_000
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -13,9 +13,10 @@ from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats import observations, trajectories
+from locatk.formats.exporters import trajectory_text as trajectories
 from locatk.formats.report.subjects import _beside, load
-from locatk.formats.solutions import write_solution
+from locatk.formats.sessions import observations
+from locatk.formats.sessions.solutions import write_solution
 
 START_NS = 1_767_225_600_000_000_000
 

@@ -1,0 +1,189 @@
+"""``locatk calibrate camera``: frames of the pattern say through which lens they were taken."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console, failures, options
+from locatk.core.errors import InputError, LocatkError
+
+if TYPE_CHECKING:
+    from locatk.core.dots.calibration.camera import CameraReport
+    from locatk.core.dots.frames import Frames
+    from locatk.core.dots.sheet import Manifest
+    from locatk.formats.sessions.reader import Session
+
+
+@click.command(short_help="Fit focal length, centre and lens of a camera.")
+@options.input_argument("session")
+@options.output("Camera to write (.toml).")
+@options.artifact
+@click.option("--device", metavar="NAME", help="Which camera, where the session has several.")
+@click.option(
+    "--focal-px",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="PX",
+    help="Focal length to keep.  [default: what the frames tell]",
+)
+@options.overwrite
+@options.as_json
+@options.verbosity
+def camera(
+    session: Path,
+    output: Path,
+    artifact: Path | None,
+    device: str | None,
+    focal_px: float | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Fit the camera of SESSION to the dots in its frames.
+
+    Any frames of the pattern tell the centre and the bend of the lens; take at least 5,
+    better 50, at several places of the sheet and turned in several directions. The focal
+    length is told by frames that are tilted, some of them by 5 degrees or more. Poses on
+    the sheet do not depend on it: where it is not told, a usual one is written, and the
+    exit status is 3 unless --focal-px was given.
+
+    The camera goes to `locatk solve --camera`, or into later sessions with
+    `locatk import --camera`.
+
+    \b
+    Examples:
+      locatk calibrate camera run.mcap -o camera.toml
+      locatk calibrate camera run.mcap -o camera.toml --focal-px 350
+      locatk calibrate camera run.mcap -o camera.toml --device left --json
+      locatk solve run.mcap -o solved.mcap --camera camera.toml
+    """
+    from locatk.core.dots.calibration.camera import CalibrateOptions, calibrate
+    from locatk.formats.artifacts import sheets
+    from locatk.formats.sessions import observations
+    from locatk.formats.sessions.reader import Session
+
+    inputs = [session, *([artifact] if artifact else [])]
+    options.guard_output(output, overwrite=overwrite, inputs=inputs)
+    opened = Session.open(session)
+    frames = _frames(opened, device)
+    manifest = sheets.read_manifest(artifact) if artifact else _manifest(opened)
+    known = CalibrateOptions(focal_px, observations.read_camera(opened))
+    with console.working("Looking at frames"):
+        try:
+            report = calibrate(frames, manifest, known)
+        except LocatkError as error:
+            if error.file is None:  # the core knows arrays, not files
+                error.file = str(session)
+            raise
+    sheets.write_camera(output, report.camera, overwrite=overwrite)
+    console.result(_text(session, output, report))
+    for note in report.notes:
+        console.say(f"{session.name}: {note}")
+    if as_json:
+        console.emit_json(_entry(session, output, frames.device, report))
+    if report.focal_from == "usual":
+        raise failures.Incomplete(
+            "The focal length is not known: give it with --focal-px, or add frames that are "
+            "tilted by 5 degrees or more"
+        )
+
+
+def _frames(session: Session, device: str | None) -> Frames:
+    from locatk.formats.sessions import observations
+
+    found = {frames.device: frames for frames in observations.read_frames(session)}
+    if device is None and len(found) > 1:
+        raise InputError(
+            f"several cameras: {', '.join(found)}",
+            file=session.path,
+            hint="Name one of them with --device",
+        )
+    if device is not None and device not in found:
+        raise InputError(
+            f"no camera {device!r}", file=session.path, hint=f"It has {', '.join(found)}"
+        )
+    return found[device or next(iter(found))]
+
+
+def _manifest(session: Session) -> Manifest:
+    from locatk.formats.sessions import observations
+
+    manifest = observations.read_manifest(session)
+    if manifest is None:
+        raise InputError(
+            "no manifest of the sheet",
+            file=session.path,
+            hint="Import the frames with --sheet, or give the manifest as --artifact",
+        )
+    return manifest
+
+
+FROM = {"given": "--focal-px", "camera": "the session's camera", "usual": "a guess"}
+"""What people are told of a focal length that the frames do not tell."""
+
+
+def _text(session: Path, output: Path, report: CameraReport) -> str:
+    """The camera for people: a table, and how well it explains the frames."""
+    found = report.camera
+    rows = [("focal length", f"{found.focal_px:.2f} px", _known(report.sigma_focal_px),
+             FROM.get(report.focal_from, report.focal_from))]  # fmt: skip
+    for axis, at, sigma in zip("xy", found.centre_px, report.sigma_centre_px, strict=True):
+        rows.append((f"centre {axis}", f"{at:.3f} px", _known(sigma), report.centre_from))
+    rows.append(("radial", f"{found.radial:.5f}", _known(report.sigma_radial), "frames"))
+    lines = [
+        f"{session} -> {output}: {report.used} of {report.seen} frames, {report.dots} dots",
+        console.table(("camera", "value", "sigma", "from"), rows),
+        f"dots miss by {report.rms_before_px:.3g} px (rms) without a lens, by "
+        f"{report.rms_px:.3g} px with this one; it draws the corners in by "
+        f"{100 * report.distortion:.2g} %",
+    ]
+    if math.isfinite(report.largest_tilt_rad):
+        lines.append(f"tilted by up to {math.degrees(report.largest_tilt_rad):.1f} degrees")
+    skipped = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in report.skipped.items())
+    lines.append(f"skipped: {skipped or 'nothing'}")
+    return "\n".join(lines)
+
+
+def _known(sigma: float) -> str:
+    return f"{sigma:.2g}" if math.isfinite(sigma) else "-"
+
+
+def _entry(session: Path, output: Path, device: str, report: CameraReport) -> dict[str, Any]:
+    """The one object of ``--json``; docs/formats.md."""
+    found = report.camera
+    return {
+        "version": 1,
+        "session": session,
+        "output": output,
+        "device": device,
+        "frames": {
+            "seen": report.seen,
+            "located": report.located,
+            "used": report.used,
+            "skipped": report.skipped,
+        },
+        "dots": report.dots,
+        "camera": {
+            "size_px": found.size,
+            "focal_px": found.focal_px,
+            "centre_px": found.centre_px,
+            "radial": found.radial,
+            "radial_per_px2": found.radial_px,
+        },
+        "sigma": {
+            "focal_px": report.sigma_focal_px,
+            "centre_px": report.sigma_centre_px,
+            "radial": report.sigma_radial,
+            "radial_per_px2": report.sigma_radial_px,
+        },
+        "focal_from": report.focal_from,
+        "centre_from": report.centre_from,
+        "rms_before_px": report.rms_before_px,
+        "rms_px": report.rms_px,
+        "largest_tilt_rad": report.largest_tilt_rad,
+        "sheet_aspect": report.aspect,
+        "sigma_sheet_aspect": report.sigma_aspect,
+        "notes": report.notes,
+    }

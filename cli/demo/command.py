@@ -1,0 +1,189 @@
+"""``locatk demo``: the whole way once, on simulated data."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import click
+
+from locatk.cli import console, options
+
+SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
+
+REPORT = "report.html"
+
+
+@click.command(short_help="Simulate, solve and evaluate, to see that all works.")
+@click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
+@options.output(
+    f"Report to write (.html).  [default: {REPORT}, in the folder of --keep if given]",
+    required=False,
+)
+@click.option(
+    "--keep",
+    type=options.PATH,
+    metavar="DIR",
+    help="Leave sessions, solutions, pictures and what to print in DIR.",
+)
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@options.overwrite
+@options.as_json
+@options.verbosity
+def command(
+    systems: tuple[str, ...],
+    output: Path | None,
+    keep: Path | None,
+    seed: int,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Simulate a session of each SYSTEM, solve it, compare it with the truth, and report.
+
+    Two robots drive under two Lighthouse stations whose places are unknown; a camera
+    drives over a printed A4 sheet of dots, of which some are missing and some are dust; a
+    bar of magnetometers drives over three tags of magnets that were laid by hand, iron bits
+    among them; a robot with four hall sensors finds where it is on a floor of landmarks, of
+    which one lacks a bar. No hardware and no network are needed.
+
+    \b
+    Examples:
+      locatk demo
+      locatk demo dots -o dots.html
+      locatk demo --keep demo
+      locatk demo --seed 7 --json
+    """
+    from locatk.formats.report.report import write_report
+
+    chosen = [name for name in SYSTEMS if name in systems or not systems]
+    report = output or (keep or Path()) / REPORT
+    if keep is not None:
+        options.make_folder(keep)
+        for path in (path for name in chosen for path, _ in kept(keep, name)):
+            options.guard_output(path, overwrite=overwrite)
+    options.guard_output(report, overwrite=overwrite)
+
+    start = time.perf_counter()
+    folder: AbstractContextManager[str | Path] = (
+        TemporaryDirectory(prefix="locatk-demo-") if keep is None else nullcontext(keep)
+    )
+    with folder as place:
+        ways = [whole_way(Path(place), name, seed, keep is not None, overwrite) for name in chosen]
+        with console.working("Reporting"):
+            write_report(report, [subject for _, subject in ways], overwrite=overwrite)
+    rows = [row for row, _ in ways]
+    took_s = time.perf_counter() - start
+
+    files = [] if keep is None else [item for name in chosen for item in kept(keep, name)]
+    if as_json:
+        console.emit_json(
+            {
+                "version": 1,
+                "systems": rows,
+                "report": report,
+                "files": [{"path": path, "next": words} for path, words in files],
+                "took_s": took_s,
+            }
+        )
+        return
+    console.result(table(rows))
+    console.say(
+        "error: mean distance from the truth, in the frame of the markers, the sheet, the site or "
+        "the map"
+    )
+    console.result(f"Wrote {report} in {took_s:.0f} s: open it in a browser")
+    if files:
+        width = max(len(str(path)) for path, _ in files)
+        for path, words in files:
+            console.result(f"{path!s:<{width}}  {words}")
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """One line a system."""
+
+    def mm(metres: float | None) -> str:
+        return "-" if metres is None else f"{1e3 * metres:.2g}"
+
+    return console.table(
+        ("system", "poses", "error [mm]", "published algorithm [mm]", "time [s]"),
+        [
+            (
+                row["system"],
+                row["poses"],
+                mm(row["mae_m"]),
+                mm(row["paper_mae_m"]),
+                f"{row['solve_s']:.2f}",
+            )
+            for row in rows
+        ],
+    )
+
+
+def kept(folder: Path, system: str) -> list[tuple[Path, str]]:
+    """What ``--keep`` leaves of a system, and for each file what to try next."""
+    from locatk.cli.demo.sessions import PRINTED
+
+    session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
+    tries = [
+        (session, f"locatk info {_quoted(session)}"),
+        (solution, f"locatk eval {_quoted(solution)} --truth {_quoted(session)}"),
+        (folder / f"{system}.png", f"locatk report {_quoted(solution)} -o {system}.svg"),
+    ]
+    if system in PRINTED:
+        tries.append((folder / PRINTED[system], "print it at 100 %, without fitting to the page"))
+    return tries
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
+
+
+def whole_way(
+    folder: Path, system: str, seed: int, pictured: bool, overwrite: bool
+) -> tuple[dict[str, Any], Any]:
+    """Simulate, solve and evaluate one system in ``folder``: its row of the table, and what
+    the report tells of it."""
+    from locatk.cli.demo.sessions import MAKERS, SPEED_MPS
+    from locatk.cli.solve.jobs import command_line
+    from locatk.cli.systems import Request, solve_session
+    from locatk.core.evaluation import evaluate, pair_devices
+    from locatk.formats.pipeline.provenance import source_facts
+    from locatk.formats.plots.solution import plot_solution
+    from locatk.formats.plots.time_axis import origin_ns
+    from locatk.formats.report import subjects
+    from locatk.formats.sessions import solutions
+
+    session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
+    with console.working(f"Simulating {system}"):
+        truths = MAKERS[system](folder, seed, overwrite)
+    with console.working(f"Solving {system}"):
+        solved = solve_session(session, Request())
+        speed = SPEED_MPS if system == "polaris" else None
+        paper = solve_session(session, Request(method="paper", speed=speed))
+        facts = {**source_facts(session), "command": command_line(session.name, Request())}
+        solutions.write_solution(
+            solution, solved.solution, source=session, facts=facts, overwrite=overwrite
+        )
+    subject = subjects.load(solution, session=session)
+    if pictured:
+        with console.working(f"Drawing {system}"):
+            plot_solution(
+                folder / f"{system}.png",
+                solved.solution,
+                truth=truths,
+                start_ns=origin_ns(subject.session, solved.solution),
+                overwrite=overwrite,
+            )
+    pairs, _ = pair_devices([t for t in paper.solution.trajectories if len(t)], truths)
+    row = {
+        "system": system,
+        "poses": solved.solution.poses,
+        "mae_m": None if subject.evaluation is None else subject.evaluation.mae,
+        "paper_mae_m": evaluate(pairs).mae if pairs else None,
+        "solve_s": solved.solve_s,
+    }
+    return row, subject

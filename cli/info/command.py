@@ -1,0 +1,178 @@
+"""``locatk info``: what is in a file."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console, failures, options
+from locatk.cli.info import lighthouse as info_lighthouse
+from locatk.cli.info.text import text
+from locatk.core.errors import FormatError
+
+if TYPE_CHECKING:
+    from locatk.formats.sessions.reader import Session
+
+
+@click.command(short_help="Say what is in a session, a solution or an artifact.")
+@options.input_argument("file")
+@options.as_json
+@options.verbosity
+def command(file: Path, as_json: bool) -> None:
+    """Say what is in FILE: a session or a solution (.mcap, of any tool), or an artifact
+    (.toml): a lighthouse scene, a receiver, a manifest of dot sheets, a camera, tags, a sensor
+    array, a map of landmarks, hall sensors.
+
+    Of Lighthouse it tells for each station its channel and serial number, how long a rotation
+    takes (in ticks of 48 MHz; with `ppm` from nominal where it was measured), sweeps, the
+    share of them that was decoded, and where its calibration is from.
+
+    A damaged or cut recording is described as far as it can be read; the exit status
+    is 3 then, and `locatk recover` saves what is left. Of a recording that holds more than
+    16 MB of samples only the index is read.
+
+    \b
+    Examples:
+      locatk info run.mcap
+      locatk info run.mcap --json
+      locatk info solved.mcap
+      locatk info scene.toml
+      locatk info receiver.toml
+      locatk info sheet.toml
+      locatk info tag.toml
+      locatk info map.toml
+    """
+    facts = _artifact(file) if file.suffix.lower() == ".toml" else _recording(file)
+    facts = {"version": 1, "file": str(file), "bytes": file.stat().st_size, **facts}
+    if as_json:
+        console.emit_json(facts)
+    else:
+        console.result(text(facts))
+    if facts.get("damage"):
+        hint = "; `locatk recover` saves what is left of it" if facts["recoverable"] else ""
+        raise failures.Incomplete(f"{facts['damage']} in {file}{hint}")
+
+
+def _artifact(file: Path) -> dict[str, Any]:
+    from locatk.formats.artifacts import hall_sensors, maps, sheets, tags, toml
+    from locatk.formats.artifacts import receiver as receivers
+    from locatk.formats.artifacts import scene as artifacts
+    from locatk.formats.sessions import description as describe
+
+    kinds: dict[str, Callable[[], dict[str, Any]]] = {
+        artifacts.SCENE_FORMAT: lambda: {
+            "kind": "scene",
+            "system": "lighthouse",
+            **info_lighthouse.scene(artifacts.read_scene(file)),
+        },
+        sheets.MANIFEST_FORMAT: lambda: {
+            "kind": "manifest",
+            "system": "dots",
+            **describe.manifest(sheets.read_manifest(file)),
+        },
+        sheets.CAMERA_FORMAT: lambda: {
+            "kind": "camera",
+            "system": "dots",
+            "camera": describe.camera(sheets.read_camera(file)),
+        },
+        tags.TAG_FORMAT: lambda: {
+            "kind": "tag",
+            "system": "polaris",
+            **describe.tags(tags.read_tags(file)),
+        },
+        tags.ARRAY_FORMAT: lambda: {
+            "kind": "array",
+            "system": "polaris",
+            "arrays": [describe.array(tags.read_array(file))],
+        },
+        maps.MAP_FORMAT: lambda: {
+            "kind": "map",
+            "system": "landmarks",
+            **describe.floor(maps.read_map(file)),
+        },
+        hall_sensors.HALLS_FORMAT: lambda: {
+            "kind": "halls",
+            "system": "landmarks",
+            "halls": [describe.hall_sensors(maps.read_halls(file))],
+        },
+        receivers.RECEIVER_FORMAT: lambda: {
+            "kind": "receiver",
+            "system": "lighthouse",
+            "receivers": [info_lighthouse.receiver(receivers.read_receiver(file))],
+        },
+    }
+    return kinds[toml.read(file).text("format", choices=tuple(kinds))]()
+
+
+def _recording(file: Path) -> dict[str, Any]:
+    from locatk.formats.sessions import capture_record as captured
+
+    session = _session(file)
+    facts = session.facts
+    described = {
+        "kind": facts.get("kind"),
+        "system": facts.get("system"),
+        "tool_version": facts.get("tool_version"),
+        "profile": session.profile,
+        "library": session.library,
+        "start_ns": session.start_ns,
+        "end_ns": session.end_ns,
+        "duration_s": captured.duration_s(session),
+        "streams": _streams(session),
+        "capture": captured.capture(session),
+        "attachments": [
+            {"name": item.name, "media_type": item.media_type, "bytes": item.size}
+            for item in session.attachments()
+        ],
+        "metadata": session.metadata(),
+        "unread_bytes": None,
+        "damage": session.damage,
+        "recoverable": session.damage is not None,
+    }
+    if facts.get("system") == "lighthouse":
+        described |= info_lighthouse.recording(session)
+    elif facts.get("system") in ("dots", "polaris", "landmarks"):
+        from locatk.formats.sessions import description as describe
+
+        described |= getattr(describe, facts["system"])(session)
+    return described
+
+
+def _session(file: Path) -> Session:
+    """The session in a file, or what is left of it."""
+    from locatk.formats.sessions.mcap_records import NotMcapError
+    from locatk.formats.sessions.reader import Session
+
+    try:
+        return Session.open(file)
+    except FormatError as error:
+        from locatk.formats.sessions.recovery.recover import left_in
+
+        where = "" if error.where is None else f" ({error.where})"
+        headless = isinstance(error.__context__, NotMcapError)
+        what = "it does not begin as an MCAP file" if headless else error.message + where
+        with contextlib.suppress(FormatError):
+            return left_in(file, what)
+        raise
+
+
+def _streams(session: Session) -> list[dict[str, Any]]:
+    from locatk.formats.sessions import capture_record as captured
+
+    samples = {each.topic: captured.samples(session, each.topic) for each in session.channels}
+    return [
+        {
+            "topic": channel.topic,
+            "schema": channel.schema,
+            "encoding": channel.encoding,
+            "messages": channel.count,
+            "rate_hz": captured.rate_hz(session, channel.count),
+            "samples": samples[channel.topic],
+            "samples_hz": captured.rate_hz(session, samples[channel.topic]),
+        }
+        for channel in session.channels
+    ]

@@ -1,0 +1,318 @@
+"""What `locatk info` found in a file, as text for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from locatk.cli import console
+from locatk.cli.info import capture as info_capture
+from locatk.cli.info import lighthouse as info_lighthouse
+from locatk.cli.info.capture import size
+
+MOST_TAGS = 20
+"""So many tags of a family are listed for people; ``--json`` holds them all."""
+
+MOST_CELLS = 5_000
+"""A larger map is not drawn."""
+
+SHOWN_ABOVE = {("locatk", key) for key in ("format_version", "tool_version", "kind", "system")}
+
+SIMULATED = "simulated_"
+"""Options of a simulation, and its truth: there are many, and some are long."""
+
+
+def text(facts: dict[str, Any]) -> str:
+    """A block of facts and a table of each kind of thing; ``facts`` are what ``--json`` says."""
+    kind = facts.get("kind") or "recording of another tool"
+    lines = [f"{facts['file']}: {kind}" + (f", {facts['system']}" if facts.get("system") else "")]
+    for label, value in (
+        ("size", size(facts["bytes"])),
+        ("made by", facts.get("library")),
+        ("start", when(facts.get("start_ns"))),
+        ("duration", _seconds(facts.get("duration_s"))),
+        ("devices", ", ".join(facts.get("devices", ()))),
+        ("sweeps", facts.get("sweeps")),
+        ("markers", facts.get("markers")),
+        ("scale", facts.get("scale")),
+        ("frames", facts.get("frames")),
+        ("print", _print(facts)),
+        ("camera", _camera(facts.get("camera"))),
+        ("samples", facts.get("samples")),
+        ("tag", _design(facts)),
+        ("magnet", _magnet(facts.get("magnet"))),
+        ("map", _floor(facts)),
+        ("bars", _bars(facts.get("bars"))),
+        ("patterns", _patterns(facts.get("patterns"))),
+        *info_capture.lines(facts.get("capture") or {}),
+        ("not read", _not_read(facts.get("unread_bytes"))),
+        ("damage", facts.get("damage")),
+    ):
+        if value not in (None, ""):
+            lines.append(f"  {label + ':':<10}{value}")
+    for note in facts.get("notes", ()):
+        lines.append(f"  note:     {note}")
+
+    def section(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
+        if rows:
+            lines.extend(["", console.table(header, rows)])
+
+    streams = facts.get("streams", ())
+    counted = any(s["samples"] is not None for s in streams)
+    section(
+        ("stream", "schema", "messages", "Hz", *(("samples", "Hz") if counted else ())),
+        [
+            (
+                *(s["topic"], s["schema"], s["messages"], _rate(s["rate_hz"])),
+                *((_known(s["samples"]), _rate(s["samples_hz"])) if counted else ()),
+            )
+            for s in streams
+        ],
+    )
+    section(*info_lighthouse.station_table(facts.get("stations", ()), facts.get("scale")))
+    section(*info_lighthouse.receiver_table(facts.get("receivers", ())))
+    section(
+        ("camera", "frames", "px"),
+        [(c["device"], c["frames"], _by(c["size_px"])) for c in facts.get("cameras", ())],
+    )
+    section(
+        ("sheet", "origin", "dots", "section", "paper [mm]", "pattern [mm]", "frame", "place"),
+        [
+            (
+                s["id"],
+                ",".join(map(str, s["origin"])),
+                _by(s["size"]),
+                ",".join(map(str, s["section"])),
+                _by(s["page_mm"]),
+                _by(s["pattern_mm"]),
+                s["frame"],
+                "-" if s["position_mm"] is None else _place(s),
+            )
+            for s in facts.get("sheets", ())
+        ],
+    )
+    section(
+        ("array", "sensors", "Hz", "left out", "width [mm]", "noise [uT]", "range [uT]", "sensor"),
+        [
+            (
+                a.get("device", "-"),
+                a["sensors"],
+                _rate(a.get("rate_hz")),
+                _known(a.get("left_out")),
+                f"{max(p[1] for p in a['position_mm']) - min(p[1] for p in a['position_mm']):.6g}",
+                _axes(a["noise_ut"]),
+                _axes(a["range_ut"]),
+                a["sensor"] or "-",
+            )
+            for a in facts.get("arrays", ())
+        ],
+    )
+    tags = facts.get("tags", [])
+    section(
+        ("tag", "cell:orientation", "as built (passes)", "place"),
+        [
+            (
+                t["id"],
+                " ".join(
+                    f"{c},{r}:{s}" for (c, r), s in zip(t["cells"], t["symbols"], strict=True)
+                ),
+                "-" if t["passes"] is None else t["passes"],
+                "-" if t["position_mm"] is None else _place(t),
+            )
+            for t in tags[:MOST_TAGS]
+        ],
+    )
+    if len(tags) > MOST_TAGS:
+        lines.append(f"... and {len(tags) - MOST_TAGS} more: see --json")
+    section(
+        ("robot", "sensors", "Hz", "left out", "noise [uT]", "range [mT]", "sensor", "places [mm]"),
+        [
+            (
+                h.get("device", "-"),
+                h["sensors"],
+                _rate(h.get("rate_hz")),
+                _known(h.get("left_out")),
+                _axes([h["noise_ut"]]),
+                _axes([h["range_mt"]]),
+                h["sensor"] or "-",
+                _places(h),
+            )
+            for h in facts.get("halls", ())
+        ],
+    )
+    if facts.get("map") and facts["rows"] * facts["columns"] <= MOST_CELLS:
+        lines.extend(["", *_drawn(facts["map"])])
+    # What is wrong comes first.
+    built = sorted(facts.get("built", ()), key=lambda b: not b["flags"])
+    section(
+        ("cell", "x [mm]", "y [mm]", "heading [deg]", "strength of bars", "visits", "flags"),
+        [
+            (
+                ",".join(map(str, b["cell"])),
+                f"{b['x_mm']:+.2f}",
+                f"{b['y_mm']:+.2f}",
+                f"{b['heading_deg']:+.2f}",
+                " ".join(f"{s:+.2f}" for s in b["strength"]),
+                b["visits"],
+                ", ".join(b["flags"]) or "-",
+            )
+            for b in built[:MOST_TAGS]
+        ],
+    )
+    if len(built) > MOST_TAGS:
+        lines.append(f"... and {len(built) - MOST_TAGS} more: see --json")
+    section(
+        ("attachment", "type", "bytes"),
+        [(a["name"], a["media_type"], a["bytes"]) for a in facts.get("attachments", ())],
+    )
+    left = [
+        (name, key, value)
+        for name, record in facts.get("metadata", {}).items()
+        for key, value in record.items()
+        if (name, key) not in SHOWN_ABOVE
+        and not info_capture.told(name, key)
+        and not info_lighthouse.shown(name, key)
+    ]
+    shown = [row for row in left if console.verbose() or not row[1].startswith(SIMULATED)]
+    section(("metadata", "key", "value"), shown)
+    if len(shown) < len(left):
+        lines.append(f"... and {len(left) - len(shown)} options of the simulation: see -v")
+    return "\n".join(lines)
+
+
+def _not_read(unread: int | None) -> str | None:
+    if unread is None:
+        return None
+    return f"the samples, which {size(unread)} of the file hold; the rest is from its index"
+
+
+def _print(facts: dict[str, Any]) -> str | None:
+    if "dpi" not in facts:
+        return None
+    scale = [facts["scale_x"], facts["scale_y"]]
+    measured = "" if scale == [1, 1] else f", scale {scale[0]:.6g} x {scale[1]:.6g}"
+    return (
+        f"{facts['codec']}, pitch {facts['pitch_mm']:.6g} mm, dots {facts['dot_mm']:.3g} mm, "
+        f"{facts['dpi']} dpi{measured}"
+    )
+
+
+def _camera(camera: dict[str, Any] | None) -> str | None:
+    if camera is None:
+        return None
+    x, y = camera["centre_px"]
+    return (
+        f"{_by(camera['size_px'])} px, focal length {camera['focal_px']:.6g} px, centre "
+        f"{x:.6g},{y:.6g}, radial {camera['radial']:.4g} ({camera['distortion_px']:.2g} px "
+        "in the corners)"
+    )
+
+
+def _design(facts: dict[str, Any]) -> str | None:
+    if "orientations" not in facts:
+        return None
+    family = "" if facts["family"] is None else f", a family of {facts['family']}"
+    apart = "" if facts["min_distance"] == 1 else f", {facts['min_distance']} steps apart"
+    return (
+        f"{facts['codec']}, {facts['magnets']} magnets of {facts['orientations']} orientations on "
+        f"{facts['order']} x {facts['order']} cells {facts['spacing_mm']:.6g} mm apart, "
+        f"{facts['clearance_mm']:.6g} mm below the sensors, {facts['capacity']} ids{family}{apart}"
+    )
+
+
+def _magnet(magnet: dict[str, Any] | None) -> str | None:
+    if magnet is None:
+        return None
+    grade = f"{magnet['grade']}, " if magnet["grade"] else ""
+    return (
+        f"{magnet['diameter_mm']:.6g} x {magnet['height_mm']:.6g} mm, {grade}"
+        f"{magnet['remanence_t']:.4g} T, {1e3 * magnet['moment_am2']:.4g} mA m2"
+    )
+
+
+def _floor(facts: dict[str, Any]) -> str | None:
+    if "alphabet" not in facts:
+        return None
+    holes = facts["rows"] * facts["columns"] - facts["landmarks"]
+    words = [
+        f"{facts['rows']} rows x {facts['columns']} columns {facts['pitch_mm']:.6g} mm apart",
+        *([facts["name"]] if facts["name"] else []),
+        f"alphabet {facts['alphabet']}, window {facts['window']}",
+        *([f"notices {facts['detect']} misread"] if facts["detect"] else []),
+        *([f"{holes} without a landmark"] if holes else []),
+        *([f"{facts['walls']} wall{'' if facts['walls'] == 1 else 's'}"] if facts["walls"] else []),
+        *([f"{len(facts['built'])} as built"] if facts["built"] else []),
+    ]
+    return ", ".join(words)
+
+
+def _bars(bars: dict[str, Any] | None) -> str | None:
+    if bars is None:
+        return None
+    return (
+        f"{' x '.join(f'{size:.6g}' for size in bars['size_mm'])} mm, {bars['remanence_t']:.4g} T, "
+        f"{bars['radius_mm']:.6g} mm from the centre, {bars['sensor_height_mm']:.6g} mm below the "
+        "sensors"
+    )
+
+
+def _patterns(patterns: dict[str, int] | None) -> str | None:
+    if patterns is None:
+        return None
+    return ", ".join(f"{count} {letters}" for letters, count in patterns.items() if count)
+
+
+def _drawn(rows: list[str]) -> list[str]:
+    """The floor as it lies, y up; the first row of the file is the lowest."""
+    width = len(str(len(rows) - 1))
+    tens = "".join(str(column // 10) if column % 10 == 0 else " " for column in range(len(rows[0])))
+    ones = "".join(str(column % 10) for column in range(len(rows[0])))
+    ruler = [ones] if len(rows[0]) <= 10 else [ones, tens]
+    return [
+        "map, seen from above, y up:",
+        *(f"  {number:>{width}}  {row}" for number, row in reversed(list(enumerate(rows)))),
+        *(f"  {'':>{width}}  {line}".rstrip() for line in ruler),
+    ]
+
+
+def _places(halls: dict[str, Any]) -> str:
+    pairs = zip(halls["names"], halls["position_mm"], strict=True)
+    return "  ".join(f"{name} {x:.6g},{y:.6g}" for name, (x, y) in pairs)
+
+
+def _axes(values: Sequence[float]) -> str:
+    """Numbers by axis, `-` where unknown."""
+    return " ".join(f"{value:.4g}" if math.isfinite(value) else "-" for value in values)
+
+
+def _place(found: dict[str, Any]) -> str:
+    x, y = found["position_mm"]
+    return f"{x:.6g},{y:.6g} mm, {found['heading_deg']:.4g} deg"
+
+
+def _by(pair: Sequence[float] | None) -> str:
+    return "-" if pair is None else f"{pair[0]:.6g} x {pair[1]:.6g}"
+
+
+def when(time_ns: int | None) -> str | None:
+    """A time of a recording for people, in UTC."""
+    if time_ns is None:
+        return None
+    try:
+        return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+    except (OverflowError, ValueError, OSError):  # a damaged stamp beyond the year 9999
+        return f"{time_ns} ns"
+
+
+def _seconds(value: float | None) -> str | None:
+    return None if value is None else f"{value:.3f} s"
+
+
+def _known(value: object) -> object:
+    return "-" if value is None else value
+
+
+def _rate(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}" if value >= 1000 else f"{value:.3g}"

@@ -1,0 +1,142 @@
+"""``locatk map export``: a map for vehicle controllers, master controls, ROS and CAD."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from locatk.cli import console, options
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from locatk.core.landmarks.map.floor import FloorMap
+
+ENDINGS = {".csv": "csv", ".json": "lif", ".lif": "lif", ".yaml": "ros", ".svg": "svg"}
+ENDINGS |= {".yml": "ros", ".dxf": "dxf"}
+FORMATS = ("csv", "lif", "ros", "svg", "dxf")
+
+
+def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
+    """The format asked for, else that of the ending."""
+    name = given or ENDINGS.get(path.suffix.lower(), "")
+    if name not in known:
+        raise click.UsageError(f"{path.name} does not tell the format; give --format.")
+    return name
+
+
+@click.command("export", short_help="Write a map for other tools.")
+@options.input_argument("map_file")
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(FORMATS),
+    help="[default: by the output's ending: .csv, .json (LIF), .yaml (ROS), .svg, .dxf]",
+)
+@options.output("File to write; `ros` writes its picture beside it (.pgm).")
+@click.option(
+    "--resolution",
+    "resolution_mm",
+    type=click.FloatRange(0, min_open=True),
+    default=10.0,
+    show_default=True,
+    metavar="MM",
+    help="Side of a pixel of `ros`.",
+)
+@options.overwrite
+@options.as_json
+@options.verbosity
+def command(
+    map_file: Path,
+    format_name: str | None,
+    output: Path,
+    resolution_mm: float,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Write the landmarks of MAP_FILE for other tools, as built where the map knows that.
+
+    `csv` is the table No;Code;X mm;Y mm;Attr1;..;Attr4 of vehicle controllers (Goetting),
+    `lif` the Layout Interchange Format 1.0.0 of VDMA for master controls, `ros` the YAML and
+    PGM of map_server, `svg` and `dxf` the floor at true size in layers. Docs: file formats.
+
+    \b
+    Examples:
+      locatk map export map.toml -o map.csv
+      locatk map export map.toml --format lif -o layout.json
+      locatk map export map.toml --format ros -o floor.yaml --resolution 5
+      locatk map export map.toml -o floor.dxf
+    """
+    from locatk.formats.artifacts.maps import read_map
+    from locatk.formats.output import atomic_write
+
+    format_name = format_of(output, format_name, FORMATS)
+    files = [output, output.with_suffix(".pgm")] if format_name == "ros" else [output]
+    if len(set(files)) < len(files):
+        raise click.UsageError("The picture of `ros` is the .pgm; end the output with .yaml.")
+    for path in files:
+        options.guard_output(path, overwrite=overwrite, inputs=[map_file])
+    floor = read_map(map_file)
+    with console.working("Drawing"):
+        written = _render(floor, format_name, files, resolution_mm, _stamp(map_file))
+    with contextlib.ExitStack() as stack:
+        for path, data in zip(files, written, strict=True):
+            stack.enter_context(atomic_write(path, overwrite=overwrite)).write(data)
+    count = len(floor.cells())
+    console.result(f"Wrote {' and '.join(map(str, files))}: {count} landmarks")
+    if floor.built:
+        console.say(f"{len(floor.built)} of them lie as built.")
+    if as_json:
+        console.emit_json(
+            {
+                "version": 1,
+                "input": map_file,
+                "format": format_name,
+                "outputs": files,
+                "landmarks": count,
+                "as_built": len(floor.built),
+            }
+        )
+
+
+def _render(
+    floor: FloorMap, format_name: str, files: list[Path], resolution_mm: float, stamp: datetime
+) -> list[bytes]:
+    """What each file is to hold."""
+    if format_name == "csv":
+        from locatk.formats.exporters.map_csv import dumps_csv
+
+        return [dumps_csv(floor).encode()]
+    if format_name == "lif":
+        from locatk.formats.exporters.map_lif import dumps_lif
+
+        return [dumps_lif(floor, stamp).encode()]
+    if format_name == "svg":
+        from locatk.formats.exporters import map_svg
+
+        return [map_svg.render(floor)]
+    if format_name == "dxf":
+        from locatk.formats.exporters.map_dxf import dumps_dxf
+
+        return [dumps_dxf(floor).encode()]
+    from locatk.formats.exporters import map_ros
+
+    pixel = resolution_mm / 1e3
+    picture = map_ros.pgm(map_ros.draw(floor, pixel))
+    return [map_ros.yaml(floor, files[1].name, pixel).encode(), picture]
+
+
+def _stamp(path: Path) -> datetime:
+    """When the map was written: the same file gives the same layout.
+
+    SOURCE_DATE_EPOCH, where it is set, is taken instead (reproducible-builds.org).
+    """
+    import os
+    from datetime import UTC, datetime
+
+    given = os.environ.get("SOURCE_DATE_EPOCH", "")
+    seconds = int(given) if given.isdigit() else int(path.stat().st_mtime)
+    return datetime.fromtimestamp(seconds, UTC)

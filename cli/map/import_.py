@@ -1,0 +1,128 @@
+"""``locatk map import``: a map from the places of landmarks in another tool's file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import click
+
+from locatk.cli import console, options
+from locatk.cli.map.export import format_of
+
+FORMATS = ("csv", "lif")
+ALPHABETS = ("6", "16", "compass")
+WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
+
+
+@click.command("import", short_help="Read a map from a table or a LIF layout.")
+@options.input_argument("source")
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(FORMATS),
+    help="[default: by the file's ending: .csv, .json (LIF)]",
+)
+@options.output("Map to write (.toml).")
+@click.option(
+    "--pitch",
+    "pitch_mm",
+    type=click.FloatRange(0, min_open=True),
+    metavar="MM",
+    help="Between neighbouring cells.  [default: the largest that fits the places]",
+)
+@click.option(
+    "--tolerance",
+    "tolerance_mm",
+    type=click.FloatRange(0, min_open=True),
+    default=10.0,
+    show_default=True,
+    metavar="MM",
+    help="How far a landmark may lie off its cell, along x or y.",
+)
+@options.input_option("--like", help="Map whose alphabet, window and bars this one has.")
+@click.option("--alphabet", type=click.Choice(ALPHABETS), help="[default: as --like, else 16]")
+@click.option("--window", type=click.Choice(WINDOWS), help="[default: as --like, else L]")
+@options.overwrite
+@options.as_json
+@options.verbosity
+def command(
+    source: Path,
+    format_name: str | None,
+    output: Path,
+    pitch_mm: float | None,
+    tolerance_mm: float,
+    like: Path | None,
+    alphabet: str | None,
+    window: str | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Make a map of the landmarks in SOURCE: a table as of `locatk map export`, or a LIF layout.
+
+    Pitch, rows and columns are found from the places. A landmark that lies a bit off its cell
+    is kept where it is, as built; one that is off by more than the tolerance is refused. What
+    such files do not hold (alphabet, window, bars) comes from the options. Check the map
+    afterwards: `locatk map check`.
+
+    \b
+    Examples:
+      locatk map import map.csv -o map.toml
+      locatk map import survey.csv -o map.toml --pitch 200 --like design.toml
+      locatk map import layout.json --format lif -o map.toml --alphabet 6 --window L
+    """
+    import numpy as np
+
+    from locatk.core.units import metres
+    from locatk.formats.artifacts.maps import dumps_map, loads_map, read_map, write_map
+    from locatk.formats.files import read_text
+
+    format_name = format_of(source, format_name, FORMATS)
+    inputs = [source] if like is None else [source, like]
+    options.guard_output(output, overwrite=overwrite, inputs=inputs)
+    text = read_text(source)
+    pitch = None if pitch_mm is None else metres(pitch_mm)
+    if format_name == "csv":
+        from locatk.formats.exporters.map_csv import loads_csv as loads
+    else:
+        from locatk.formats.exporters.map_lif import loads_lif as loads
+    floor = loads(text, file=source, pitch_m=pitch, tolerance_m=metres(tolerance_mm))
+    if like is not None:
+        design = read_map(like)
+        floor = replace(
+            floor,
+            alphabet=design.alphabet,
+            window=design.window,
+            detect=design.detect,
+            geometry=design.geometry,
+        )
+    floor = replace(floor, alphabet=alphabet or floor.alphabet, window=window or floor.window)
+    loads_map(dumps_map(floor), file=source)  # as strict with it as with a map by hand
+    write_map(output, floor, overwrite=overwrite)
+
+    rows, columns = floor.shape
+    count = len(floor.cells())
+    off = [max(abs(built.x_m), abs(built.y_m)) for built in floor.built.values()]
+    worst = float(np.max(off)) if off else 0.0
+    console.result(
+        f"Wrote {output}: {count} landmarks in {rows} rows and {columns} columns of "
+        f"{1e3 * floor.pitch_m:.6g} mm"
+    )
+    if off:
+        console.say(f"Off their cells or turned: {len(off)}, by {1e3 * worst:.3g} mm at most.")
+    if as_json:
+        console.emit_json(
+            {
+                "version": 1,
+                "input": source,
+                "output": output,
+                "rows": rows,
+                "columns": columns,
+                "landmarks": count,
+                "pitch_m": floor.pitch_m,
+                "origin_m": floor.origin_m,
+                "walls": len(floor.walls),
+                "as_built": len(off),
+                "largest_offset_m": worst,
+            }
+        )

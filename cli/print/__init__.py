@@ -1,0 +1,29 @@
+"""``locatk print``: artifacts on paper, at true size."""
+
+from __future__ import annotations
+
+import click
+
+from locatk.cli.print.landmarks import landmarks
+from locatk.cli.print.pattern import pattern
+from locatk.cli.print.tag import tag
+from locatk.cli.print.test_sheet import testsheet
+
+
+@click.group(short_help="Draw sheets at true size.")
+def command() -> None:
+    """Draw sheets at true size.
+
+    \b
+    Examples:
+      locatk print pattern -o sheet.pdf
+      locatk print tag tag.toml --id 262143 -o tag.pdf
+      locatk print landmarks map.toml -o pack.pdf
+      locatk print testsheet -o test.pdf
+    """
+
+
+command.add_command(pattern)
+command.add_command(tag)
+command.add_command(landmarks)
+command.add_command(testsheet)

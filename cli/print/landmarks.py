@@ -1,0 +1,251 @@
+"""``locatk print landmarks``: what a person needs who lays a floor of magnets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console, options
+from locatk.core.errors import OutputExistsError, error_context
+
+if TYPE_CHECKING:
+    from locatk.core.landmarks.drawing.pack import InstallationPack
+    from locatk.core.landmarks.drawing.true_size import FloorPage
+    from locatk.core.landmarks.map.floor import FloorMap
+    from locatk.core.materials import BillItem
+    from locatk.core.paper_sizes import Paper
+
+
+@click.command(short_help="Installation pack of a landmark floor.")
+@options.input_argument("map_file")
+@options.output("PDF to write.")
+@click.option(
+    "--templates", "templates_only", is_flag=True, help="Only the placement templates, 1 : 1."
+)
+@click.option(
+    "--floor",
+    "whole_floor",
+    is_flag=True,
+    help="Instead, the whole floor at true size, cut over papers or strips that share --overlap.",
+)
+@click.option(
+    "--paper",
+    "--size",
+    "paper_name",
+    default="A4",
+    show_default=True,
+    metavar="PAPER",
+    help="A0 to A5, Letter, Tabloid, WxHmm as in 600x900mm; for --floor also a roll by its "
+    "width, roll:914mm.",
+)
+@click.option(
+    "--margin",
+    "margin_mm",
+    type=click.FloatRange(0),
+    default=10.0,
+    show_default=True,
+    metavar="MM",
+    help="Left empty, for printers that cannot print to the edge; with --floor it holds rulers "
+    "and joining marks.",
+)
+@click.option(
+    "--overlap",
+    "overlap_mm",
+    type=click.FloatRange(0),
+    metavar="MM",
+    help="What neighbouring papers of --floor both hold; joining marks show where to cut.  "
+    "[default: 10]",
+)
+@click.option(
+    "--spares",
+    "spares_percent",
+    type=click.FloatRange(0, 1000),
+    default=5.0,
+    show_default=True,
+    metavar="PERCENT",
+    help="Bars to buy beyond four a landmark.",
+)
+@click.option(
+    "--bom",
+    type=options.PATH,
+    metavar="FILE.csv",
+    help="Write the bill of materials for a spreadsheet, too.",
+)
+@options.overwrite
+@options.as_json
+@options.verbosity
+def landmarks(
+    map_file: Path,
+    output: Path,
+    templates_only: bool,
+    whole_floor: bool,
+    paper_name: str,
+    margin_mm: float,
+    overlap_mm: float | None,
+    spares_percent: float,
+    bom: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Draw what it takes to lay the magnets of the map MAP_FILE.
+
+    The pack holds the floor's plan, a placement template at true size for each way in which
+    a landmark is laid (outlines, an arrow to each bar's north pole, the map's +y), the bill
+    of materials, a checklist, and a marking list of all landmarks. Print at 100 % and
+    measure the rulers. Landmarks are drawn as designed, also where the file knows how they
+    were built.
+
+    \b
+    Examples:
+      locatk print landmarks map.toml -o pack.pdf
+      locatk print landmarks map.toml -o templates.pdf --templates --paper A3
+      locatk print landmarks map.toml -o floor.pdf --floor --paper A0
+      locatk print landmarks map.toml -o floor.pdf --floor --paper roll:914mm --overlap 20
+      locatk print landmarks map.toml -o pack.pdf --spares 10 --bom parts.csv
+    """
+    from locatk.core.landmarks.design.materials import bill_of_materials
+    from locatk.core.paper_sizes import parse_paper
+    from locatk.formats.artifacts.maps import read_map
+    from locatk.formats.exporters.bill_of_materials import write_bill
+    from locatk.formats.output import atomic_write
+
+    if templates_only and whole_floor:
+        raise click.UsageError("--templates and --floor are different drawings; leave one out.")
+    if overlap_mm is not None and not whole_floor:
+        raise click.UsageError("--overlap is that of --floor.")
+    on = parse_paper(paper_name)
+    if on.is_roll and not whole_floor:
+        raise click.UsageError("A roll is for --floor; the pack needs sheets, as --paper A4.")
+    options.guard_output(output, overwrite=overwrite, inputs=[map_file])
+    if bom is not None:
+        options.guard_output(bom, overwrite=overwrite, inputs=[map_file])
+        if bom.resolve() == output.resolve():
+            raise OutputExistsError("drawing and materials would be one file", file=bom)
+    floor = read_map(map_file)
+    items = bill_of_materials(floor, spares_percent)
+    with error_context(map_file):
+        if whole_floor:
+            data, answer = _floor(floor, on, margin_mm, 10.0 if overlap_mm is None else overlap_mm)
+        else:
+            data, answer = _pack(floor, on, margin_mm, spares_percent, templates_only)
+    with atomic_write(output, overwrite=overwrite) as stream:
+        stream.write(data)
+    if bom is not None:
+        write_bill(bom, items, overwrite=overwrite)
+    console.result(_text(output, bom, floor, items, answer))
+    console.say("Print at 100 %, without scaling to fit, and measure the rulers.")
+    if as_json:
+        console.emit_json(
+            {
+                "version": 1,
+                "output": output,
+                "bom": bom,
+                "landmarks": len(floor.cells()),
+                "materials": [
+                    {"part": item.part, "count": item.count, "detail": item.detail}
+                    for item in items
+                ],
+                **answer,
+            }
+        )
+
+
+def _pack(
+    floor: FloorMap, on: Paper, margin_mm: float, spares_percent: float, templates_only: bool
+) -> tuple[bytes, dict[str, Any]]:
+    """The PDF, and what is in it."""
+    from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pack
+    from locatk.formats.printing.drawings import render_pages
+
+    made = draw_installation_pack(
+        floor,
+        on.size_mm,
+        parts=("templates",) if templates_only else PACK_PARTS,
+        paper_name=on.name,
+        margin_mm=margin_mm,
+        spares_percent=spares_percent,
+    )
+    with console.steps(len(made.pages), "Drawing") as done:
+        data = render_pages(made.pages, _title(floor), done=done)
+    return data, _pack_entry(made)
+
+
+def _floor(
+    floor: FloorMap, on: Paper, margin_mm: float, overlap_mm: float
+) -> tuple[bytes, dict[str, Any]]:
+    from locatk.core.landmarks.drawing.true_size import draw_floor
+    from locatk.formats.printing.drawings import render_floor
+
+    pages = draw_floor(floor, on, margin_mm=margin_mm, overlap_mm=overlap_mm)
+    with console.steps(len(pages), "Drawing") as done:
+        data = render_floor(pages, _title(floor), done=done)
+    return data, _floor_entry(pages)
+
+
+def _title(floor: FloorMap) -> str:
+    return f"locatk landmarks {floor.name}".strip()
+
+
+def _pack_entry(made: InstallationPack) -> dict[str, Any]:
+    """What ``--json`` says of a pack (docs/formats.md)."""
+    from locatk.core.landmarks.drawing.landmark import code_digit
+    from locatk.core.landmarks.landmark import name
+
+    return {
+        "pages": len(made.pages),
+        "page_mm": made.pages[0].size_mm,
+        "parts": {part: [first + 1, end] for part, (first, end) in made.parts.items()},
+        "templates": [
+            {
+                "code": code_digit(item.code),
+                "bars": name(item.code),
+                "cells": item.cells,
+                "page": item.page + 1,
+                "centre_mm": item.centre_mm,
+                "side_mm": item.side_mm,
+            }
+            for item in made.templates
+        ],
+    }
+
+
+def _floor_entry(pages: list[FloorPage]) -> dict[str, Any]:
+    """What ``--json`` says of a floor at true size (docs/formats.md)."""
+    return {
+        "pages": len(pages),
+        "page_mm": pages[0].size_mm,
+        "tiles": [
+            {
+                "id": page.tile.name,
+                "page": number,
+                "x_mm": round(page.tile.corner_mm[0], 6),
+                "y_mm": round(page.tile.corner_mm[1], 6),
+                "box_mm": page.tile.box,
+            }
+            for number, page in enumerate(pages, 1)
+        ],
+    }
+
+
+def _text(
+    output: Path,
+    bom: Path | None,
+    floor: FloorMap,
+    items: tuple[BillItem, ...],
+    answer: dict[str, Any],
+) -> str:
+    """What was drawn, for people."""
+    width, height = answer["page_mm"]
+    pages = answer["pages"]
+    files = f"{output} and {bom}" if bom is not None else str(output)
+    bars = sum(item.count for item in items if item.part.startswith("bar magnet"))
+    lines = [
+        f"Wrote {files}: {pages} page{'s' * (pages != 1)} of {width:g} x {height:g} mm",
+        f"{len(floor.cells())} landmarks, {bars} bars with spares",
+    ]
+    for part, (first, last) in answer.get("parts", {}).items():
+        where = f"page {first}" if first == last else f"pages {first} to {last}"
+        lines.append(f"  {part}: {where}")
+    return "\n".join(lines)

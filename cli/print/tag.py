@@ -1,0 +1,195 @@
+"""``locatk print tag``: templates on which magnets are laid by hand."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console, options
+from locatk.core.errors import InputError, error_context
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from locatk.core.polaris.drawing.cards import TagPages
+    from locatk.core.polaris.tag import TagLayout, Tags
+
+FORMATS = ("pdf", "svg")
+
+
+@click.command(short_help="Templates for placing a tag's magnets.")
+@options.input_argument("tag_file")
+@options.output("File to write.")
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(FORMATS),
+    help="`svg`: with several pages a file each, named by its number.  [default: by the "
+    "output's ending, else pdf]",
+)
+@click.option(
+    "--id",
+    "ids",
+    type=click.IntRange(0),
+    multiple=True,
+    help="Tag to draw; repeatable.  [default: all members of the family]",
+)
+@click.option(
+    "--size",
+    default="A4",
+    show_default=True,
+    metavar="PAPER",
+    help="A0 to A5, Letter, Tabloid, or WxHmm as in 600x900mm.",
+)
+@click.option(
+    "--landscape/--portrait",
+    default=None,
+    help="Turn the paper.  [default: whichever takes fewer pages]",
+)
+@click.option(
+    "--margin",
+    "margin_mm",
+    type=click.FloatRange(0),
+    default=10.0,
+    show_default=True,
+    metavar="MM",
+    help="Left empty, for printers that cannot print to the edge.",
+)
+@click.option(
+    "--mirror",
+    is_flag=True,
+    help="As seen from below, for magnets that are put in from the underside.",
+)
+@options.overwrite
+@options.as_json
+@options.verbosity
+def tag(
+    tag_file: Path,
+    output: Path,
+    format_name: str | None,
+    ids: tuple[int, ...],
+    size: str,
+    landscape: bool | None,
+    margin_mm: float,
+    mirror: bool,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Draw the tags of TAG_FILE at true size, as templates for placing their magnets.
+
+    Each magnet has an outline and an arrow to its north, which tells the angle clockwise
+    from forward: mark north on the rim of the disc, and turn the mark to the arrow. As many
+    tags as fit share a page, each with cut marks. Print at 100 % and measure the rulers.
+    Tags are drawn as designed, also where the file knows how they were built.
+
+    \b
+    Examples:
+      locatk print tag tag.toml -o tags.pdf
+      locatk print tag tag.toml --id 262143 --id 5 -o tags.pdf --size Letter
+      locatk print tag tag.toml --id 262143 -o tag.svg
+      locatk print tag tag.toml --id 7 -o below.pdf --mirror
+    """
+    from locatk.core.paper_sizes import paper_size
+    from locatk.core.polaris.drawing.cards import draw_tag_cards
+    from locatk.formats.artifacts.tags import read_tags
+
+    format_name = format_name or _ending(output)
+    tags = read_tags(tag_file)
+    _, paper_mm = paper_size(size)
+    drawn = draw_tag_cards(
+        tags,
+        _layouts(tag_file, tags, ids),
+        paper_mm,
+        landscape=landscape,
+        margin_mm=margin_mm,
+        mirror=mirror,
+    )
+    files = _files(output, format_name, len(drawn.pages))
+    for path in files:
+        options.guard_output(path, overwrite=overwrite, inputs=[tag_file])
+    _write(files, format_name, drawn, overwrite=overwrite)
+    console.result(_text(files, drawn))
+    console.say("Print at 100 %, without scaling to fit, and measure the rulers.")
+    if as_json:
+        console.emit_json(_entry(files, drawn))
+
+
+def _ending(output: Path) -> str:
+    ending = output.suffix.lower().removeprefix(".")
+    return ending if ending in FORMATS else "pdf"
+
+
+def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int, TagLayout]]:
+    """The tags to draw; an id that the solver would not read is refused."""
+    from locatk.core.polaris.codec import layout_of
+
+    if not ids and tags.ids is None and not tags.site:
+        raise click.UsageError(f"{tag_file} names no family, so any id may be meant; give --id.")
+    for number in ids:
+        if tags.ids is not None and number not in tags.ids:
+            raise InputError(
+                f"id {number} is no member of the family",
+                file=tag_file,
+                hint=f"It has {len(tags.ids)}, from {min(tags.ids)} to {max(tags.ids)}; without "
+                "--id all are drawn",
+            )
+    wanted = ids or tags.ids or tuple(sorted(tags.site))
+    with error_context(tag_file):
+        return [(number, layout_of(tags, number)) for number in wanted]
+
+
+def _files(output: Path, format_name: str, pages: int) -> list[Path]:
+    """One file for a PDF and for a single page, else one a page."""
+    if format_name == "pdf" or pages == 1:
+        return [output]
+    digits = len(str(pages))
+    return [output.with_stem(f"{output.stem}-{n:0{digits}}") for n in range(1, pages + 1)]
+
+
+def _write(files: Sequence[Path], format_name: str, drawn: TagPages, *, overwrite: bool) -> None:
+    """All is written whole before anything appears."""
+    from locatk.formats.output import atomic_write
+
+    ids = {item.tag_id for item in drawn.tags}
+    title = f"locatk tag {min(ids)}" if len(ids) == 1 else f"locatk, {len(ids)} tags"
+    if format_name == "pdf":
+        from locatk.formats.printing.drawings import (
+            render_pages,  # reportlab: not for the other format
+        )
+
+        hint = "Use a smaller paper, or --format svg"
+        contents = [render_pages(drawn.pages, title, hint=hint)]
+    else:
+        from locatk.formats.printing import tag_svg
+
+        contents = [tag_svg.render(page, title) for page in drawn.pages]
+    with contextlib.ExitStack() as stack:
+        for path, data in zip(files, contents, strict=True):
+            stack.enter_context(atomic_write(path, overwrite=overwrite)).write(data)
+
+
+def _text(files: Sequence[Path], drawn: TagPages) -> str:
+    """What was drawn, for people."""
+    count, pages = len(drawn.tags), len(drawn.pages)
+    names = str(files[0]) if len(files) == 1 else f"{files[0]} to {files[-1].name}"
+    width, height = drawn.pages[0].size_mm
+    return (
+        f"Wrote {names}: {count} tag{'s' * (count > 1)} on {pages} page{'s' * (pages > 1)} of "
+        f"{width:g} x {height:g} mm"
+    )
+
+
+def _entry(files: Sequence[Path], drawn: TagPages) -> dict[str, Any]:
+    """The same as ``--json`` (docs/commands.md)."""
+    return {
+        "version": 1,
+        "outputs": list(files),
+        "page_mm": drawn.pages[0].size_mm,
+        "tags": [
+            {"id": item.tag_id, "page": item.page + 1, "origin_mm": item.origin_mm}
+            for item in drawn.tags
+        ],
+    }

@@ -1,0 +1,1 @@
+"""``locatk solve``."""

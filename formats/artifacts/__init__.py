@@ -1,0 +1,1 @@
+"""Artifacts: TOML files that describe infrastructure, sensors and printers."""

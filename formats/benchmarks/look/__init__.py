@@ -1,0 +1,1 @@
+"""Benchmark of evaluation, reports and the demo."""

@@ -1,0 +1,223 @@
+"""The raw bytes of a recording, decoded again: with another device, or a better decoder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from locatk.core.errors import FormatError
+from locatk.formats.capture.device_messages import Stamped
+from locatk.formats.capture.ingestion import AUTO, SerialIntake
+from locatk.formats.capture.reader_thread import Arrived
+from locatk.formats.capture.statistics import RECORD, Totals
+from locatk.formats.devices.decoder import Options
+from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.sessions.reader import RECORD as SESSION
+from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.writer import CHANNELS, SessionWriter
+
+TOPIC = "/serial/"
+
+TURN_NS = 20_000_000
+"""Reads within so much time are decoded at once."""
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What came of the raw bytes.
+
+    Attributes
+    ----------
+    devices : dict of str to str
+        Name of the device in the session to what it was taken for.
+    totals : dict of str to Totals
+        By name.
+    remarks : list of str
+    system : str
+    """
+
+    devices: dict[str, str]
+    totals: dict[str, Totals]
+    remarks: list[str]
+    system: str
+
+
+def decode(
+    path: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    device: str | None = None,
+    options: Options | None = None,
+    artifacts: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+) -> Decoded:
+    """Write a session of the raw bytes of ``path`` and of what a decoder makes of them now.
+
+    Times, attachments and metadata stay; records that were decoded before are left out.
+
+    Parameters
+    ----------
+    path, output : path
+    device : str, optional
+        What sent the bytes; what the recording says where it is left out, else what they
+        look like.
+    options : Options, optional
+        For the decoder.
+    artifacts : mapping of str to str, optional
+        Attachments (name to text) to add, or to put in the place of those that are there.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        It is no session, is damaged, or holds no raw bytes.
+    InputError
+        There is no such device.
+    OutputExistsError
+        ``output`` is there.
+    """
+    session = Session.open(path)
+    topics = session.topics(TOPIC, SerialChunk.DESCRIPTOR.full_name)
+    if not topics:
+        raise FormatError(
+            f"no raw bytes (topic {TOPIC}<device>)",
+            file=session.path,
+            hint="Give a recording of `locatk capture`; `locatk emulate` sends what others hold",
+        )
+    said = session.metadata().get(RECORD, {})
+    name = device or said.get("device") or AUTO
+    attached = {**_attached(session), **(artifacts or {})}
+    intakes = {
+        topic: SerialIntake(
+            topic.removeprefix(TOPIC),
+            said.get("port", ""),
+            name,
+            options,
+            baud=int(said["baud"]) if said.get("baud", "").isdigit() else None,
+            artifacts=attached,
+        )
+        for topic in topics
+    }
+    with SessionWriter(output, system="", overwrite=overwrite) as writer:
+        for stamped in _messages(session, intakes):
+            writer.write(stamped.topic, stamped.message, stamped.time_ns, stamped.publish_ns)
+        for intake in intakes.values():
+            attached = {**intake.artifacts(), **attached}
+        for key, text in attached.items():
+            writer.attach_toml(key, text)
+        for info in session.attachments():
+            data = session.attachment(info.name)
+            if data is not None and info.name not in attached:
+                writer.attach(info.name, data, info.media_type, info.time_ns)
+        for key, record in session.metadata().items():
+            if key not in (SESSION, RECORD, CHANNELS):
+                writer.metadata(key, record)
+        decoded = _decoded(intakes)
+        writer.metadata(SESSION, {"system": decoded.system})
+        writer.metadata(RECORD, _facts(said, intakes, decoded, Path(session.path).name))
+    return decoded
+
+
+def _facts(
+    said: Mapping[str, str],
+    intakes: Mapping[str, SerialIntake],
+    decoded: Decoded,
+    source: str,
+) -> dict[str, str]:
+    """Entries of the record ``capture``: what the port has counted as it was, the rest anew."""
+    fresh: dict[str, str] = {}
+    for totals in decoded.totals.values():
+        fresh |= {key: text for key, text in totals.texts().items() if key not in LINE}
+    for intake in intakes.values():
+        fresh |= intake.clocks()
+    stays = {key: text for key, text in said.items() if not key.startswith(("samples:", "tick_"))}
+    return {**stays, **fresh, "device": ", ".join(decoded.devices.values()), "decoded_from": source}
+
+
+LINE = (
+    "gaps",
+    "gap_s",
+    "silences",
+    "overruns",
+    "dropped",
+    "line_errors",
+    "high_water_bytes",
+    "clock_step_s",
+)
+"""Entries of the metadata that the port has counted, not the decoder."""
+
+
+def _attached(session: Session) -> dict[str, str]:
+    texts = {}
+    for info in session.attachments():
+        data = session.attachment(info.name)
+        if data is not None and info.name.endswith(".toml"):
+            texts[info.name] = data.decode("utf-8", "replace")
+    return texts
+
+
+def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator[Stamped]:
+    """Raw bytes, records and the log of the recorder, in the order of the file."""
+    waiting: dict[str, list[Arrived]] = {topic: [] for topic in intakes}
+    begun = 0
+    expected = dict.fromkeys(intakes, 0)
+    for topic, time_ns, payload in session.messages([*intakes, "/log"]):
+        if topic == "/log":
+            line = Log.FromString(payload)
+            if line.name.startswith("locatk"):  # not of a device: those are decoded again
+                yield from _turn(intakes, waiting)
+                yield Stamped("/log", line, time_ns, time_ns)
+            continue
+        chunk = SerialChunk.FromString(payload)
+        hole = chunk.byte_offset != expected[topic]
+        again = chunk.byte_offset != 0 and (chunk.opened or hole)
+        if again or time_ns - begun >= TURN_NS:
+            yield from _turn(intakes, waiting)
+            begun = time_ns
+        if hole:
+            intakes[topic].skip_to(chunk.byte_offset)
+        if again:
+            yield from intakes[topic].restart(opened=chunk.opened)
+        expected[topic] = chunk.byte_offset + len(chunk.data)
+        waiting[topic].append(Arrived(time_ns, chunk.data, len(chunk.data)))
+    yield from _turn(intakes, waiting)
+    for intake in intakes.values():
+        yield from intake.finish()
+
+
+def _turn(
+    intakes: Mapping[str, SerialIntake], waiting: dict[str, list[Arrived]]
+) -> Iterator[Stamped]:
+    for topic, arrived in waiting.items():
+        if arrived:
+            yield from intakes[topic].take(arrived)
+            yield from intakes[topic].turn(arrived[-1].time_ns)
+            waiting[topic] = []
+
+
+def _decoded(intakes: Mapping[str, SerialIntake]) -> Decoded:
+    system = next((intake.system for intake in intakes.values() if intake.system), "")
+    devices: dict[str, str] = {}
+    totals: dict[str, Totals] = {}
+    remarks: list[str] = []
+    for topic, intake in intakes.items():
+        name = topic.removeprefix(TOPIC)
+        devices[name] = intake.device.name if intake.device else ""
+        totals[name] = Totals()
+        intake.count(totals[name])
+        remarks += intake.remarks()
+    return Decoded(devices, totals, remarks, system)
+
+
+def losses(decoded: Decoded) -> list[str]:
+    """What the decoder could not use, one phrase each."""
+    return [
+        phrase
+        for name, totals in decoded.totals.items()
+        for phrase in [*totals.losses(), *totals.doubts(decoded.devices[name])]
+    ]

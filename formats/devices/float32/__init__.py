@@ -1,0 +1,1 @@
+"""Devices that send bare float32 values."""

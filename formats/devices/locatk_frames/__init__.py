@@ -1,0 +1,1 @@
+"""The locatk serial protocol."""

@@ -1,0 +1,1 @@
+"""Exporters: poses, maps and lists in the formats of other programs."""

@@ -1,0 +1,118 @@
+"""Poses as Parquet: for pandas, Polars, DuckDB, Spark and R, with all that is known of them.
+
+The columns of the CSV form, then what it leaves out: exact times, frames, full covariances.
+What is not known is null. The columns are those of docs/formats.md; later versions only add.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from locatk.core.errors import LocatkError
+from locatk.core.trajectory import Trajectory
+from locatk.formats.exporters.trajectory_text import COLUMNS, SIGMA_AXES
+from locatk.formats.output import atomic_write, tool_version
+from locatk.formats.sessions.messages import triangle
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Of a pose's covariance: position, and rotation about the fixed axes x, y, z."""
+
+
+def _covariance_columns() -> tuple[str, ...]:
+    names = []
+    for i, first in enumerate(AXES):
+        for second in AXES[i:]:
+            units = ["rad" if axis.startswith("r") else "m" for axis in (first, second)]
+            unit = f"{units[0]}2" if units[0] == units[1] else "m_rad"
+            names.append(f"cov_{first}_{second}_{unit}")
+    return tuple(names)
+
+
+COVARIANCE = _covariance_columns()
+"""Columns of the upper triangle, row by row: ``cov_x_x_m2``, ``cov_x_rx_m_rad``, ..."""
+
+PREFIX = "locatk."
+"""Before each key of the file's metadata, which other tools write to as well."""
+
+
+def write_parquet(
+    path: str | os.PathLike[str],
+    trajectories: Sequence[Trajectory],
+    *,
+    facts: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write poses as one Parquet table, one row a pose, device after device.
+
+    Parameters
+    ----------
+    path : path
+        The output.
+    trajectories : sequence of Trajectory
+        One a device.
+    facts : mapping of str to str, optional
+        System, method, source and others, for the metadata of the schema.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    LocatkError
+        pyarrow is not installed.
+    OutputExistsError, MissingDataError
+        See :func:`locatk.formats.output.atomic_write`.
+    """
+    arrow, parquet = _pyarrow()
+    tables = [_table(arrow, trajectory) for trajectory in trajectories]
+    said = {**(facts or {}), "exported_by": f"locatk {tool_version()}"}
+    metadata = {f"{PREFIX}{key}": value for key, value in said.items()}
+    table = arrow.concat_tables(tables or [_table(arrow, _nothing())])
+    with atomic_write(path, overwrite=overwrite) as stream:
+        parquet.write_table(table.replace_schema_metadata(metadata), stream)
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise LocatkError(
+            "Parquet needs pyarrow, which is not installed",
+            hint='Install it: pip install "locatk[parquet]"',
+        ) from None
+    return pyarrow, pyarrow.parquet
+
+
+def _table(arrow: Any, trajectory: Trajectory) -> Any:
+    n = len(trajectory)
+
+    def texts(value: str) -> Any:
+        return arrow.repeat(arrow.scalar(value, arrow.string()), n)
+
+    def numbers(values: Any) -> list[Any]:
+        """A column each; nan, which says that nothing is known, becomes null."""
+        return [
+            arrow.array(np.ascontiguousarray(column), mask=np.isnan(column)) for column in values.T
+        ]
+
+    pose = np.hstack([trajectory.position, trajectory.quaternion])
+    # Whole seconds and the rest apart: as one float64 product, the last digits would differ.
+    seconds, rest = np.divmod(trajectory.time_ns, 1_000_000_000)
+    columns = [
+        arrow.array(seconds + rest / 1e9),
+        texts(trajectory.device),
+        *numbers(pose),
+        *numbers(trajectory.sigma[:, SIGMA_AXES]),
+        arrow.array(trajectory.time_ns),
+        texts(trajectory.frame),
+        *numbers(triangle(trajectory.covariance)),
+    ]
+    return arrow.table(columns, names=[*COLUMNS, "time_ns", "frame", *COVARIANCE])
+
+
+def _nothing() -> Trajectory:
+    return Trajectory.from_positions("", "", np.zeros(0, np.int64), np.zeros((0, 3)))

@@ -1,0 +1,1 @@
+"""Captures of Saleae logic analysers."""

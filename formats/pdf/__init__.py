@@ -1,1 +1,0 @@
-"""Sheets as PDF at true size."""

@@ -1,0 +1,1 @@
+"""Printing: sheets, tags and drawings at true size, as PDF, SVG and pixels."""

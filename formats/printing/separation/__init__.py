@@ -1,0 +1,1 @@
+"""Removal of black ink from PDF documents."""

@@ -1,0 +1,280 @@
+"""Pictures and shadings of a PDF without black ink.
+
+Samples are left as they are wherever a colour space can say the same of them: red, green
+and blue are the other side of cyan, magenta and yellow, and a list of 256 colours needs no
+black. So photos lose nothing and files grow by nothing; only where black is a channel of
+its own (CMYK), or a grey photo is a JPEG, are samples made anew.
+"""
+
+from __future__ import annotations
+
+import copy
+import zlib
+
+import numpy as np
+import pikepdf
+from numpy.typing import NDArray
+from pikepdf import Array, Dictionary, Name, Pdf, Stream, StreamDecodeLevel
+
+from locatk.formats.printing.separation import colours
+from locatk.formats.printing.separation.colours import Floats, Space
+
+JPEG_QUALITY = 95
+SHADES = 1024
+"""Steps of a shading's colours; a printer makes 256."""
+
+BLOCK = 1 << 20
+"""Pixels whose colours are computed at once."""
+
+Bytes = NDArray[np.uint8]
+
+
+class Left(Exception):
+    """What cannot be done without black; says why, in a few words in the plural."""
+
+
+def inks_space(pdf: Pdf) -> pikepdf.Object:
+    """Colour space of three numbers: cyan, magenta, yellow, and never black."""
+    to_cmyk = Stream(pdf, b"{0}")
+    to_cmyk.FunctionType = 4
+    to_cmyk.Domain = Array([0, 1] * 3)
+    to_cmyk.Range = Array([0, 1] * 4)
+    inks = Array([Name.Cyan, Name.Magenta, Name.Yellow])
+    made = Array([Name.DeviceN, inks, Name.DeviceCMYK, pdf.make_indirect(to_cmyk)])
+    return pdf.make_indirect(made)
+
+
+def picture(pdf: Pdf, image: Stream, named: pikepdf.Object | None, inks: pikepdf.Object) -> Stream:
+    """An image without black, as a new stream; ``image`` itself where it has no colours.
+
+    Parameters
+    ----------
+    pdf : Pdf
+        The document.
+    image : Stream
+    named : Dictionary or None
+        Colour spaces of the resources.
+    inks : Object
+        From :func:`inks_space`.
+
+    Raises
+    ------
+    Left
+        It cannot be converted.
+    """
+    if bool(image.get("/ImageMask", False)):
+        return image  # a stencil, in the colour that is set when it is painted
+    filters = _filters(image)
+    if "/JPXDecode" in filters:
+        return _jpeg_2000(pdf, image, named, inks)
+    found = colours.space(image.get("/ColorSpace"), named)
+    if found is None:
+        raise Left("images in a spot or Lab colour space")
+    bits = int(image.get("/BitsPerComponent", 8))
+    decode = _decode(image, found, bits)
+    is_jpeg = filters[-1:] == ["/DCTDecode"]
+    if found.kind == "rgb":
+        made = copy.copy(image)
+        made.ColorSpace = inks
+        made.Decode = Array([_number(1 - end) for end in decode.ravel()])
+        _convert_matte(pdf, made, found)
+    elif found.components == 1 and bits <= 8 and not (is_jpeg and found.kind != "indexed"):
+        _no_matte(image)
+        made = copy.copy(image)
+        made.ColorSpace = _palette(found, decode[0], bits)
+        if "/Decode" in made:
+            del made.Decode
+    else:
+        if isinstance(image.get("/Mask"), Array):
+            raise Left("images with a transparent colour")
+        _no_matte(image)
+        made = _with_samples(pdf, image, _lights(image, found, decode, bits), is_jpeg, inks)
+    if "/Alternates" in made:
+        del made.Alternates
+    return made
+
+
+def _filters(image: Stream) -> list[str]:
+    found = image.get("/Filter")
+    if found is None:
+        return []
+    return [str(name) for name in found] if isinstance(found, Array) else [str(found)]
+
+
+def _decode(image: Stream, found: Space, bits: int) -> Floats:
+    """(components, 2): what the smallest and the largest sample mean."""
+    if "/Decode" in image:
+        given = colours.numbers(image.Decode)
+        if given.size >= 2 * found.components:
+            return given[: 2 * found.components].reshape(-1, 2)
+    top = float((1 << bits) - 1) if found.kind == "indexed" else 1.0
+    return np.tile([0.0, top], (found.components, 1))
+
+
+def _palette(found: Space, decode: Floats, bits: int) -> Array:
+    top = (1 << bits) - 1
+    values = decode[0] + np.arange(top + 1) * (decode[1] - decode[0]) / top
+    table = np.zeros((top + 1, 4), np.uint8)
+    table[:, :3] = np.round(255 * found.cmy(values[:, None]))
+    return Array([Name.Indexed, Name.DeviceCMYK, top, pikepdf.String(table.tobytes())])
+
+
+def _lights(image: Stream, found: Space, decode: Floats, bits: int) -> Bytes:
+    """(height, width, 3): 255 where there is no ink."""
+    width, height = int(image.Width), int(image.Height)
+    if bits not in (8, 16):
+        raise Left("images of few bits in CMYK")
+    data = np.frombuffer(image.read_bytes(decode_level=StreamDecodeLevel.all), np.uint8)
+    step = bits // 8
+    wanted = width * height * found.components * step
+    if width < 1 or height < 1 or data.size < wanted:
+        raise Left("images that are cut short")
+    samples = data[:wanted:step].reshape(-1, found.components)
+    lights = np.empty((len(samples), 3), np.uint8)
+    for start in range(0, len(samples), BLOCK):
+        block = slice(start, start + BLOCK)
+        values = decode[:, 0] + samples[block] / 255.0 * (decode[:, 1] - decode[:, 0])
+        lights[block] = np.round(255 * (1 - found.cmy(values)))
+    return lights.reshape(height, width, 3)
+
+
+def _with_samples(
+    pdf: Pdf, image: Stream, lights: Bytes, is_jpeg: bool, inks: pikepdf.Object
+) -> Stream:
+    """A copy of ``image`` with other samples."""
+    made = pdf.make_stream(b"")
+    for key in image.keys():  # noqa: SIM118 - a Stream is no mapping
+        if key not in ("/Length", "/Filter", "/DecodeParms", "/SMaskInData"):
+            made[key] = image[key]
+    made.ColorSpace = inks
+    made.BitsPerComponent = 8
+    made.Decode = Array([1, 0] * 3)
+    made.Height, made.Width = lights.shape[:2]
+    if is_jpeg:
+        import cv2
+
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        _, data = cv2.imencode(".jpg", lights[..., ::-1], options)
+        made.write(data.tobytes(), filter=Name.DCTDecode, type_check=False)
+        return made
+    # Differences from the row above pack far better (PNG's predictor "up").
+    rows = lights.reshape(len(lights), -1)
+    coded = np.full((len(rows), rows.shape[1] + 1), 2, np.uint8)
+    coded[:, 1:] = np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
+    how = Dictionary(Predictor=15, Colors=3, BitsPerComponent=8, Columns=lights.shape[1])
+    packed = zlib.compress(coded.tobytes(), 6)
+    made.write(packed, filter=Name.FlateDecode, decode_parms=how, type_check=False)
+    return made
+
+
+def _jpeg_2000(
+    pdf: Pdf, image: Stream, named: pikepdf.Object | None, inks: pikepdf.Object
+) -> Stream:
+    """JPEG 2000, which brings its own colours: to a JPEG, where it is grey or RGB."""
+    import cv2
+
+    given = image.get("/ColorSpace")
+    found = None if given is None else colours.space(given, named)
+    plain = given is None or (found is not None and found.kind in ("grey", "rgb"))
+    if not plain or int(image.get("/SMaskInData", 0)) or "/Decode" in image:
+        raise Left("JPEG 2000 images")
+    if isinstance(image.get("/Mask"), Array) or _filters(image) != ["/JPXDecode"]:
+        raise Left("JPEG 2000 images")
+    _no_matte(image)
+    data = np.frombuffer(image.read_raw_bytes(), np.uint8)
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None or pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] != 3):
+        raise Left("JPEG 2000 images")
+    lights = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels[..., ::-1]
+    return _with_samples(pdf, image, np.ascontiguousarray(lights), True, inks)
+
+
+def _no_matte(image: Stream) -> None:
+    mask = image.get("/SMask")
+    if mask is not None and "/Matte" in mask:
+        raise Left("images blended with a matte")
+
+
+def _convert_matte(pdf: Pdf, made: Stream, found: Space) -> None:
+    mask = made.get("/SMask")
+    if mask is not None and "/Matte" in mask:
+        changed = copy.copy(mask)
+        matte = found.cmy(colours.numbers(mask.Matte)[None, :])[0]
+        changed.Matte = Array([_number(value) for value in matte])
+        made.SMask = pdf.make_indirect(changed)
+
+
+def shading(
+    pdf: Pdf, shaded: pikepdf.Object, named: pikepdf.Object | None, inks: pikepdf.Object
+) -> pikepdf.Object:
+    """A shading without black, as a new object.
+
+    Raises
+    ------
+    Left
+        It cannot be converted.
+    """
+    kind = int(shaded.ShadingType)
+    found = colours.space(shaded.get("/ColorSpace"), named)
+    if found is None or kind == 1:
+        raise Left("shadings by a formula, or in a spot or Lab colour space")
+    made = copy.copy(shaded)
+    if "/Background" in shaded:
+        cmy = found.cmy(colours.numbers(shaded.Background)[None, :])[0]
+    if "/Function" in shaded or (kind >= 4 and found.components == 1):
+        low, high = _parameter(shaded, kind)
+        made.Function = _colours_along(pdf, shaded, found, low, high)
+        made.ColorSpace = Name.DeviceCMYK
+        background = [*cmy, 0.0] if "/Background" in shaded else None
+    elif kind >= 4 and found.kind == "rgb":
+        decode = colours.numbers(shaded.Decode)
+        decode[4:] = 1 - decode[4:]
+        made.Decode = Array([_number(value) for value in decode])
+        made.ColorSpace = inks
+        background = [*cmy] if "/Background" in shaded else None
+    else:
+        raise Left("shadings of a mesh in CMYK")
+    if background is not None:
+        made.Background = Array([_number(value) for value in background])
+    return made
+
+
+def _parameter(shaded: pikepdf.Object, kind: int) -> tuple[float, float]:
+    """Range of the number that the colours of a shading are a function of."""
+    if kind >= 4:
+        low, high = colours.numbers(shaded.Decode)[4:6]
+    else:
+        low, high = colours.numbers(shaded.Domain)[:2] if "/Domain" in shaded else (0.0, 1.0)
+    return float(low), float(high)
+
+
+def _colours_along(
+    pdf: Pdf, shaded: pikepdf.Object, found: Space, low: float, high: float
+) -> pikepdf.Object:
+    """A sampled function from the parameter to CMYK without K."""
+    along = np.linspace(low, high, SHADES)
+    if "/Function" in shaded:
+        inner = colours.function(shaded.Function)
+        if inner is None:
+            raise Left("shadings by a formula, or in a spot or Lab colour space")
+        values = inner(along)
+    else:
+        values = along[:, None]
+    table = np.zeros((SHADES, 4), np.uint8)
+    table[:, :3] = np.round(255 * found.cmy(values))
+    made = Stream(pdf, table.tobytes())
+    made.FunctionType = 0
+    made.Domain = Array([_number(low), _number(high)])
+    made.Range = Array([0, 1] * 4)
+    made.Size = Array([SHADES])
+    made.BitsPerSample = 8
+    return pdf.make_indirect(made)
+
+
+def _number(value: float) -> float | int:
+    """As short as it can be written."""
+    rounded = round(float(value), 6)
+    return int(rounded) if rounded == int(rounded) else rounded

@@ -1,5 +1,0 @@
-"""Protobuf schemas of locatk (``*.proto``) and the code generated from them.
-
-Change a ``.proto`` file, then run ``python formats/proto/generate.py``; with
-``--check`` it only says whether the committed code is up to date.
-"""

@@ -1,0 +1,1 @@
+"""Sessions: MCAP files of observations, solutions and truth."""

@@ -1,0 +1,308 @@
+"""Batched protobuf messages to and from arrays, without a Python object a sample.
+
+A batch holds parallel repeated fields, packed and of fixed width, so that its bytes
+are arrays already: reading joins them field by field and looks at them once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.timestamp_pb2 import Timestamp
+from numpy.typing import NDArray
+
+from locatk.formats.schemas.lighthouse_pb2 import LighthouseCapture, LighthouseSweep
+from locatk.formats.schemas.magnetics_pb2 import HallArray, MagnetometerArray
+from locatk.formats.schemas.poses_pb2 import Odometry, PoseTrack
+from locatk.formats.schemas.serial_pb2 import Readings
+
+
+class BatchError(Exception):
+    """A message that is no valid batch; the caller knows file and topic."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A repeated field: its type on the wire and how many values make one entry."""
+
+    name: str
+    dtype: str
+    width: int = 1
+    optional: bool = False
+    """May be absent; its entries are then ``nan``, or 0 where they are whole numbers."""
+
+
+@dataclass(frozen=True)
+class Batches:
+    """Many messages as arrays.
+
+    Attributes
+    ----------
+    texts : dict of str to list of str
+        String fields, one value a message.
+    counts : (m,) int64 ndarray
+        Entries of each message.
+    columns : dict of str to ndarray
+        Repeated fields of all messages in a row: (n,), or (n, width).
+    """
+
+    texts: dict[str, list[str]]
+    counts: NDArray[np.int64]
+    columns: dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A message that is a batch: its string fields and its parallel repeated fields.
+
+    The first column must be the times. Fields that are not named are passed over.
+    """
+
+    message: type[Message]
+    texts: tuple[str, ...]
+    columns: tuple[Column, ...]
+    _tags: dict[int, int] = field(init=False, repr=False, compare=False)
+    _numbers: frozenset[int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # Tag byte on the wire (field number, length-delimited) to place below.
+        fields = self.message.DESCRIPTOR.fields_by_name
+        names = ["timestamp", *self.texts, *(column.name for column in self.columns)]
+        tags = {fields[name].number << 3 | 2: place for place, name in enumerate(names)}
+        if max(tags) > 127:
+            raise ValueError("field numbers above 15 have longer tags")
+        object.__setattr__(self, "_tags", tags)
+        object.__setattr__(self, "_numbers", frozenset(tag >> 3 for tag in tags))
+
+    def pack(self, once: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> Message:
+        """One message of what is said ``once`` and of ``columns``, each (n,) or (n, width);
+        see :class:`Column`."""
+        values = {
+            column.name: np.asarray(columns[column.name], column.dtype).ravel().tolist()
+            for column in self.columns
+            if column.name in columns
+        }
+        first = int(columns[self.columns[0].name][0])
+        return self.message(timestamp=timestamp(first), **once, **values)
+
+    def unpack(self, payloads: Iterable[bytes]) -> Batches:
+        """Arrays of all messages whose payloads are given.
+
+        Raises
+        ------
+        BatchError
+            A payload cannot be decoded, or its fields differ in length.
+        """
+        n_texts = len(self.texts)
+        sizes = [np.dtype(column.dtype).itemsize * column.width for column in self.columns]
+        texts: list[list[str]] = [[] for _ in self.texts]
+        parts: list[list[bytes]] = [[] for _ in self.columns]
+        counts: list[int] = []
+        for payload in payloads:
+            values = self._fields(payload)
+            if values is None:
+                values = self._fields(self._canonical(payload))
+                if values is None:
+                    raise BatchError("a message is damaged")
+            entries = len(values[1 + n_texts]) // sizes[0]
+            for place, (size, column) in enumerate(zip(sizes, self.columns, strict=True)):
+                data = values[1 + n_texts + place]
+                if len(data) != entries * size:
+                    if not column.optional or data:
+                        raise BatchError(
+                            f"a message with {entries} times has another number of {column.name}"
+                        )
+                    data = _absent(column, entries)
+                parts[place].append(data)
+            for place, text in enumerate(texts):
+                text.append(str(values[1 + place], "utf-8", "replace"))
+            counts.append(entries)
+        columns = {}
+        for column, part in zip(self.columns, parts, strict=True):
+            array = np.frombuffer(b"".join(part), column.dtype)
+            columns[column.name] = array if column.width == 1 else array.reshape(-1, column.width)
+        return Batches(
+            dict(zip(self.texts, texts, strict=True)), np.array(counts, np.int64), columns
+        )
+
+    def _fields(self, payload: bytes) -> list[bytes] | None:
+        """Raw bytes of each field; None where the wire is not as locatk writes it."""
+        values = [b""] * len(self._tags)
+        position, end = 0, len(payload)
+        try:
+            while position < end:
+                place = self._tags[payload[position]]
+                length = payload[position + 1]
+                position += 2
+                if length > 127:  # a varint of more than one byte
+                    length &= 127
+                    shift = 7
+                    while True:
+                        byte = payload[position]
+                        position += 1
+                        length |= (byte & 127) << shift
+                        if byte < 128:
+                            break
+                        shift += 7
+                if values[place]:
+                    return None  # a field in several pieces
+                values[place] = payload[position : position + length]
+                position += length
+        except (KeyError, IndexError):
+            return None
+        return values if position == end else None
+
+    def _canonical(self, payload: bytes) -> bytes:
+        """The same message with the fields of this layout alone, as locatk would write it.
+
+        Protobuf allows unpacked and split fields, and those of later versions.
+        """
+        try:
+            message = self.message.FromString(payload)
+        except DecodeError:
+            raise BatchError(f"a message is no valid {self.message.DESCRIPTOR.name}") from None
+        message.DiscardUnknownFields()
+        for descriptor, _ in message.ListFields():
+            if descriptor.number not in self._numbers:
+                message.ClearField(descriptor.name)
+        return message.SerializeToString()
+
+
+def _absent(column: Column, entries: int) -> bytes:
+    dtype = np.dtype(column.dtype)
+    value = np.nan if dtype.kind == "f" else 0
+    return np.full(entries * column.width, value, dtype).tobytes()
+
+
+TICKS = Column("device_ticks", "<i8", optional=True)
+"""A device's own clock as received, beside the times that were made of it."""
+
+SEQUENCE = Column("sequence", "<u4", optional=True)
+
+SWEEPS = Layout(
+    LighthouseSweep,
+    ("device",),
+    (
+        Column("time_ns", "<i8"),
+        Column("sensor", "<i4"),
+        Column("channel", "<i4"),
+        Column("polynomial", "<i4"),
+        Column("sweep", "<i4"),
+        Column("count", "<f8"),
+        TICKS,
+    ),
+)
+"""Times and numbers are unsigned on the wire; the reader refuses those that come out
+negative as the signed types of the arrays."""
+
+CAPTURES = Layout(
+    LighthouseCapture,
+    ("device",),
+    (
+        Column("time_ns", "<i8"),
+        Column("sensor", "<i4"),
+        Column("bits", "<u8"),
+        Column("polynomial", "<i4"),
+        Column("bit_offset", "<i4"),
+        TICKS,
+    ),
+)
+
+POSES = Layout(
+    PoseTrack,
+    ("device", "frame_id"),
+    (
+        Column("time_ns", "<i8"),
+        Column("position_m", "<f8", 3),
+        Column("quaternion_xyzw", "<f8", 4),
+        Column("covariance_m_rad", "<f8", 21, optional=True),
+    ),
+)
+
+ODOMETRY = Layout(
+    Odometry,
+    ("device", "frame_id"),
+    (
+        Column("time_ns", "<i8"),
+        Column("x_m", "<f8"),
+        Column("y_m", "<f8"),
+        Column("heading_rad", "<f8"),
+        TICKS,
+    ),
+)
+
+
+def magnetometers(sensors: int) -> Layout:
+    """Layout of the samples of an array of so many sensors, which the message tells."""
+    return Layout(
+        MagnetometerArray,
+        ("device", "frame_id"),
+        (
+            Column("time_ns", "<i8"),
+            Column("b_tesla", "<f4", 3 * sensors),
+            TICKS,
+            SEQUENCE,
+            Column("temperature_celsius", "<f4", optional=True),
+        ),
+    )
+
+
+def halls(sensors: int) -> Layout:
+    """Layout of the samples of so many hall sensors, which the message tells."""
+    return Layout(
+        HallArray,
+        ("device", "frame_id"),
+        (Column("time_ns", "<i8"), Column("b_tesla", "<f4", sensors), TICKS, SEQUENCE),
+    )
+
+
+def readings(values: int) -> Layout:
+    """Layout of samples of so many named values; their names are said once."""
+    return Layout(
+        Readings, ("device",), (Column("time_ns", "<i8"), Column("value", "<f8", values), TICKS)
+    )
+
+
+def timestamp(time_ns: int) -> Timestamp:
+    """Nanoseconds since the epoch as protobuf's type."""
+    seconds, nanos = divmod(int(time_ns), 1_000_000_000)
+    return Timestamp(seconds=seconds, nanos=nanos)
+
+
+def triangle(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 21) upper triangles, row by row, of (n, 6, 6) symmetric matrices."""
+    rows, columns = np.triu_indices(6)
+    return covariance[:, rows, columns]
+
+
+def symmetric(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 6, 6) matrices of (n, 21) upper triangles; inverse of :func:`triangle`."""
+    rows, columns = np.triu_indices(6)
+    full = np.empty((len(triangles), 6, 6))
+    full[:, rows, columns] = triangles
+    full[:, columns, rows] = triangles
+    return full
+
+
+def batch_edges(
+    time_ns: NDArray[np.int64], group: NDArray[Any], duration_ns: int, most: int
+) -> NDArray[np.int64]:
+    """(m + 1,) places at which sorted samples are cut into messages.
+
+    A cut is made where ``group`` changes, at each multiple of ``duration_ns`` of the
+    clock, and after ``most`` samples.
+    """
+    n = len(time_ns)
+    if n == 0:
+        return np.zeros(1, np.int64)
+    slot = time_ns // duration_ns
+    new = np.flatnonzero((np.diff(slot) != 0) | (np.diff(group) != 0)) + 1
+    starts = np.concatenate([[0], new])
+    pieces: Sequence[NDArray[np.int64]] = [
+        np.arange(start, stop, most) for start, stop in zip(starts, [*starts[1:], n], strict=True)
+    ]
+    return np.concatenate([*pieces, [n]]).astype(np.int64)

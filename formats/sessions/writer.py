@@ -1,0 +1,180 @@
+"""Sessions, written: whole or not at all, or live as they are recorded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from types import TracebackType
+from typing import IO, Any
+
+from google.protobuf.message import Message
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from locatk.core.errors import InputError
+from locatk.formats.output import atomic_write, tool_version
+from locatk.formats.sessions.reader import RECORD
+
+PROFILE = "locatk"
+FORMAT_VERSION = "1"
+
+CHANNELS = "channels"
+"""Name of the metadata record of a live recording that tells its channels: id to topic and
+schema. Should the chunk that introduces a channel be damaged, its messages are none the less
+known."""
+
+
+class SessionWriter:
+    """Writes a session; a context manager, on whose clean exit the file appears.
+
+    Messages should come in the order of their times: readers then need little memory.
+    Same calls, same bytes. A live recording goes to a ``stream`` of its own instead, which
+    is finished whatever ends the block.
+
+    Parameters
+    ----------
+    path : path
+        The output; see :func:`locatk.formats.output.atomic_write`.
+    kind : str
+        ``"session"`` or ``"solution"``.
+    system : str
+        ``"lighthouse"``, ``"polaris"``, ``"dots"`` or ``"landmarks"``.
+    facts : mapping of str to str, optional
+        More entries for the metadata record ``locatk``.
+    overwrite : bool
+        Replace an existing file.
+    live : stream, optional
+        Write to this open binary file, which is not closed, instead of to ``path``; tell the
+        channels in the metadata record :data:`CHANNELS`, too.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError
+        On entering, before anything is written.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        kind: str = "session",
+        system: str,
+        facts: Mapping[str, str] | None = None,
+        overwrite: bool = False,
+        live: IO[Any] | None = None,
+    ) -> None:
+        self._live = live is not None
+        self._output: AbstractContextManager[IO[Any]] = (
+            atomic_write(path, overwrite=overwrite) if live is None else nullcontext(live)
+        )
+        self._record = {
+            "format_version": FORMAT_VERSION,
+            "tool_version": tool_version(),
+            "kind": kind,
+            "system": system,
+            **(facts or {}),
+        }
+        self._writer: Writer | None = None
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, tuple[int, type[Message]]] = {}
+        self._sequence: dict[int, int] = {}
+
+    def __enter__(self) -> SessionWriter:
+        stream = self._output.__enter__()
+        self._writer = Writer(stream, compression=CompressionType.ZSTD)
+        self._writer.start(profile=PROFILE, library=f"locatk {tool_version()}")
+        self.metadata(RECORD, self._record)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None or self._live:
+            try:
+                self._open_writer.finish()
+            except BaseException as failure:
+                # The output must be removed, as after any failure inside the block.
+                self._output.__exit__(type(failure), failure, failure.__traceback__)
+                raise
+        self._output.__exit__(kind, error, trace)
+
+    @property
+    def _open_writer(self) -> Writer:
+        if self._writer is None:
+            raise RuntimeError("SessionWriter is used outside its `with` block")
+        return self._writer
+
+    def declare(self, topic: str, message_class: type[Message]) -> int:
+        """Register a topic ahead of its first message; returns the id of its channel.
+
+        In a live recording, flush after the first messages of new topics.
+        """
+        known = self._channels.get(topic)
+        if known is None:
+            known = (self._register(topic, message_class), message_class)
+            self._channels[topic] = known
+        channel, expected = known
+        if message_class is not expected:
+            raise TypeError(f"topic {topic} holds {expected.__name__}")
+        return channel
+
+    def flush(self) -> None:
+        """Write what is buffered, as a chunk of its own; a reader of the file then finds it."""
+        self._open_writer.flush()
+
+    def write(
+        self, topic: str, message: Message, time_ns: int, publish_ns: int | None = None
+    ) -> None:
+        """Write one message at ``time_ns`` (log time, ns since the epoch).
+
+        ``publish_ns`` is when its first sample was measured, where that is known better.
+
+        Raises
+        ------
+        InputError
+            The time is before 1970, which MCAP cannot say.
+        """
+        writer = self._open_writer
+        channel = self.declare(topic, type(message))
+        if not 0 <= time_ns < 1 << 64:
+            raise InputError(
+                f"time {time_ns} ns of {topic} is not in the range of MCAP",
+                hint="Give times as nanoseconds since 1970",
+            )
+        sequence = self._sequence.get(channel, 0)
+        self._sequence[channel] = (sequence + 1) & 0xFFFFFFFF
+        published = time_ns if publish_ns is None else publish_ns
+        writer.add_message(channel, time_ns, message.SerializeToString(), published, sequence)
+
+    def _register(self, topic: str, message_class: type[Message]) -> int:
+        name = message_class.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            files = build_file_descriptor_set(message_class)
+            self._schemas[name] = self._open_writer.register_schema(
+                name, "protobuf", files.SerializeToString()
+            )
+        channel: int = self._open_writer.register_channel(topic, "protobuf", self._schemas[name])
+        if self._live:
+            self.metadata(CHANNELS, {str(channel): f"{topic} {name}"})
+        return channel
+
+    def attach(self, name: str, data: bytes, media_type: str, time_ns: int = 0) -> None:
+        """Attach a file of a media type; artifacts with :meth:`attach_toml`."""
+        self._open_writer.add_attachment(time_ns, time_ns, name, media_type, data)
+
+    def metadata(self, name: str, record: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+        self._open_writer.add_metadata(name, dict(record))
+
+    def attach_toml(self, name: str, text: str) -> None:
+        """Attach an artifact as ``name``, as in ``attach_toml("scene.toml", text)``."""
+        self.attach(name, text.encode(), "application/toml")
+
+    def facts(self, facts: Mapping[str, object] | None) -> None:
+        """Write what is known of a recording as texts to the metadata record ``facts``."""
+        if facts:
+            self.metadata("facts", {key: str(value) for key, value in facts.items()})

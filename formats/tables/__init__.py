@@ -1,0 +1,1 @@
+"""Tables of columns: CSV and similar text."""

@@ -1,0 +1,168 @@
+"""`locatk print landmarks`, as a user runs it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pypdfium2
+import pytest
+
+from locatk.core.landmarks.landmark import name
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
+from locatk.formats.artifacts.maps import write_map
+
+CODES = np.array([[0, 3, 7], [7, HOLE_CODE, 15], [9, 9, 7]])
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    path = tmp_path / "map.toml"
+    write_map(path, FloorMap(CODES, name="hall"))
+    return path
+
+
+def words(path: Path, page: int) -> str:
+    text = pypdfium2.PdfDocument(str(path))[page - 1].get_textpage().get_text_range()
+    return " ".join(text.split())
+
+
+def test_a_pack(locatk, map_file: Path, tmp_path: Path) -> None:
+    out, parts = tmp_path / "pack.pdf", tmp_path / "parts.csv"
+    result = locatk(
+        "print", "landmarks", map_file, "-o", out, "--bom", parts, "--spares", 25, "--json"
+    )
+    assert result.exit_code == 0, result.stderr
+    assert "100 %" in result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["version"] == 1
+    assert (answer["output"], answer["bom"]) == (str(out), str(parts))
+    assert answer["landmarks"] == 8
+    assert answer["page_mm"] == [210, 297]
+    assert answer["pages"] == len(pypdfium2.PdfDocument(str(out)))
+    assert list(answer["parts"]) == ["plan", "templates", "materials", "checklist", "list"]
+    assert answer["parts"]["list"][1] == answer["pages"]
+    counts = {item["bars"]: (item["code"], item["cells"]) for item in answer["templates"]}
+    assert counts == {
+        "SSSS": ("0", 1), "NNSS": ("3", 1), "NNNS": ("7", 3), "NSSN": ("9", 2), "NNNN": ("f", 1),
+    }  # fmt: skip
+    for item in answer["templates"]:
+        said = words(out, item["page"])
+        assert f"Code {item['code']} = {item['bars']}" in said
+    sevens = next(item for item in answer["templates"] if item["code"] == "7")
+    assert "row 0: 2; row 1: 0; row 2: 2" in words(out, sevens["page"])
+    with parts.open() as stream:
+        rows = {row["part"]: int(row["count"]) for row in csv.DictReader(stream)}
+    assert (rows["bar magnet"], rows["bar magnet, spare"]) == (32, 8)
+    assert {item["part"]: item["count"] for item in answer["materials"]} == rows
+    listed = words(out, answer["parts"]["list"][0])
+    assert f"2 1 200 400 9 {name(9)}" in listed
+
+
+def test_templates_alone(locatk, map_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "templates.pdf"
+    result = locatk("print", "landmarks", map_file, "-o", out, "--templates", "--paper", "A3")
+    assert result.exit_code == 0, result.stderr
+    first, *rest = result.stdout.splitlines()
+    assert first.startswith(f"Wrote {out}: ")
+    assert "8 landmarks, 34 bars with spares" in rest
+    assert any("templates" in line for line in rest)
+    assert not any("plan" in line for line in rest)
+    assert "floor plan" not in words(out, 1)
+
+
+def test_the_floor_at_true_size(locatk, map_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "floor.pdf"
+    asked = ["--floor", "--paper", "roll:600mm", "--json"]
+    result = locatk("print", "landmarks", map_file, "-o", out, *asked)
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["pages"] == 1
+    (tile,) = answer["tiles"]
+    assert (tile["id"], tile["page"]) == ("c1r1", 1)
+    assert 600 in answer["page_mm"]
+    page = pypdfium2.PdfDocument(str(out))[0]
+    size = [side * 25.4 / 72 for side in page.get_size()]
+    assert size == pytest.approx(answer["page_mm"], abs=0.05)
+    left, bottom, right, top = tile["box_mm"]
+    assert tile["x_mm"] < -30
+    assert tile["x_mm"] + right - left > 430
+    assert tile["y_mm"] < -30
+    assert tile["y_mm"] + top - bottom > 430
+    result = locatk("print", "landmarks", map_file, "-o", tmp_path / "a4.pdf", "--floor", "--json")
+    answer = json.loads(result.stdout)
+    assert answer["pages"] > 1
+    assert answer["tiles"][0]["y_mm"] > answer["tiles"][-1]["y_mm"], "the first is the upper left"
+
+
+def test_same_map_same_bytes(locatk, map_file: Path, tmp_path: Path) -> None:
+    for more in ([], ["--floor"]):
+        made = []
+        for number in range(2):
+            out = tmp_path / f"{len(more)}-{number}.pdf"
+            assert locatk("print", "landmarks", map_file, "-o", out, *more).exit_code == 0
+            made.append(out.read_bytes())
+        assert made[0] == made[1]
+
+
+@pytest.mark.parametrize(
+    ("more", "status", "said"),
+    [
+        (["--templates", "--floor"], 2, "leave one out"),
+        (["--overlap", 20], 2, "--floor"),
+        (["--paper", "roll:914mm"], 2, "--floor"),
+        (["--floor", "--paper", "roll:wide"], 1, "roll:914mm"),
+        (["--paper", "A17"], 1, "A17"),
+        (["--size", "A5"], 0, "148 x 210"),
+        (["--paper", "105x105mm"], 1, "which paper 105x105"),
+        (["--floor", "--margin", 2], 1, "joining marks"),
+        (["--spares", -1], 2, "--spares"),
+        (["--bom", "same"], 1, "one file"),
+    ],
+)
+def test_what_is_asked_wrongly_is_told(
+    locatk, map_file: Path, tmp_path: Path, more: list[object], status: int, said: str
+) -> None:
+    out = tmp_path / "a.pdf"
+    more = [out if item == "same" else item for item in more]
+    result = locatk("print", "landmarks", map_file, "-o", out, *more)
+    assert result.exit_code == status, result.stderr
+    assert said in result.stdout + result.stderr
+    assert out.exists() == (status == 0)
+    assert "Traceback" not in result.stderr
+
+
+def test_nothing_is_replaced_unasked(locatk, map_file: Path, tmp_path: Path) -> None:
+    out, parts = tmp_path / "a.pdf", tmp_path / "parts.csv"
+    parts.write_text("mine")
+    refused = locatk("print", "landmarks", map_file, "-o", out, "--bom", parts)
+    assert refused.exit_code == 1
+    assert "--overwrite" in refused.stderr
+    assert not out.exists()
+    assert parts.read_text() == "mine"
+    done = locatk("print", "landmarks", map_file, "-o", out, "--bom", parts, "--overwrite")
+    assert done.exit_code == 0, done.stderr
+    before = map_file.read_bytes()
+    itself = locatk("print", "landmarks", map_file, "-o", map_file, "--overwrite")
+    assert itself.exit_code == 1
+    assert map_file.read_bytes() == before
+
+
+def test_maps_that_cannot_be_laid_are_named(locatk, tmp_path: Path) -> None:
+    missing = locatk("print", "landmarks", tmp_path / "none.toml", "-o", tmp_path / "a.pdf")
+    assert missing.exit_code == 1
+    assert "none.toml" in missing.stderr
+    tight = tmp_path / "tight.toml"
+    write_map(tight, FloorMap(CODES, pitch_m=0.05))
+    result = locatk("print", "landmarks", tight, "-o", tmp_path / "a.pdf")
+    assert result.exit_code == 1
+    assert str(tight) in result.stderr
+    assert "overlap" in result.stderr
+    broken = tmp_path / "broken.toml"
+    broken.write_text('format = "locatk-landmark-map"\nformat_version = 1\nrows = ["0z"]\n')
+    result = locatk("print", "landmarks", broken, "-o", tmp_path / "a.pdf")
+    assert result.exit_code == 1
+    assert str(broken) in result.stderr
+    assert not (tmp_path / "a.pdf").exists()

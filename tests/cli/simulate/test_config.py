@@ -1,0 +1,136 @@
+"""`--config` and `--print-config` of `locatk simulate`, and options of earlier versions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.formats.artifacts import maps
+from locatk.formats.simulation import dots, landmarks, lighthouse, polaris
+
+SYSTEMS = {"dots": dots, "landmarks": landmarks, "lighthouse": lighthouse, "polaris": polaris}
+
+SHORT = {
+    "dots": ("--frames", 2),
+    "landmarks": ("--strategy", "pass"),
+    "lighthouse": ("--duration", 2),
+    "polaris": ("--speed", 0.4),
+}
+"""Options for a short simulation."""
+
+
+def inputs(system: str, folder: Path) -> tuple[Path, ...]:
+    """The arguments that a command needs."""
+    if system != "landmarks":
+        return ()
+    path = folder / "map.toml"
+    if not path.exists():
+        maps.write_map(path, FloorMap(np.array([[1, 5], [9, 14]])))
+    return (path,)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_the_printed_file_changes_nothing(locatk, tmp_path: Path, system: str) -> None:
+    printed = locatk("simulate", system, "--print-config")
+    assert printed.exit_code == 0, printed.stderr
+    assert printed.stdout == SYSTEMS[system].CONFIG.dumps()
+    config = tmp_path / "sim.toml"
+    config.write_text(printed.stdout)
+    paths = [tmp_path / name for name in ("without.mcap", "with.mcap")]
+    for path, options in zip(paths, ((), ("--config", config)), strict=True):
+        result = locatk(
+            "simulate", system, *inputs(system, tmp_path), "-o", path, *SHORT[system], *options
+        )
+        assert result.exit_code == 0, result.stderr
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_options_and_their_file_give_the_same_session(locatk, tmp_path: Path, system: str) -> None:
+    printed = locatk("simulate", system, *SHORT[system], "--seed", 3, "--print-config")
+    config = tmp_path / "sim.toml"
+    config.write_text(printed.stdout)
+    paths = [tmp_path / name for name in ("options.mcap", "file.mcap")]
+    given = ((*SHORT[system], "--seed", 3), ("--config", config))
+    for path, options in zip(paths, given, strict=True):
+        result = locatk("simulate", system, *inputs(system, tmp_path), "-o", path, *options)
+        assert result.exit_code == 0, result.stderr
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_the_printed_file_holds_the_merged_settings(locatk, tmp_path: Path) -> None:
+    config = tmp_path / "sim.toml"
+    config.write_text(polaris.CONFIG.dumps({"robot.speed_mps": 0.3, "build.seed": 5}))
+    result = locatk("simulate", "polaris", "--config", config, "--speed", 0.2, "--print-config")
+    assert polaris.CONFIG.loads(result.stdout) == {"robot.speed_mps": 0.2, "build.seed": 5}
+
+
+def test_a_switch_of_the_file_is_turned_off(locatk, tmp_path: Path) -> None:
+    config = tmp_path / "sim.toml"
+    config.write_text(polaris.CONFIG.dumps({"odometry.recorded": True}))
+    result = locatk("simulate", "polaris", "--config", config, "--no-odometry", "--print-config")
+    assert polaris.CONFIG.loads(result.stdout) == {"odometry.recorded": False}
+
+
+@pytest.mark.parametrize(
+    ("system", "missing"), [("landmarks", "'MAP_FILE'"), ("polaris", "'-o' / '--output'")]
+)
+def test_what_a_simulation_needs_is_demanded(locatk, system: str, missing: str) -> None:
+    result = locatk("simulate", system)
+    assert result.exit_code == 2
+    assert missing in result.stderr
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_former_options_name_their_key(locatk, system: str) -> None:
+    config = SYSTEMS[system].CONFIG
+    for setting in config.settings:
+        for flag in setting.former_flag.split():
+            result = locatk("simulate", system, flag, "1")
+            assert result.exit_code == 2
+            assert f"{setting.name} in [{setting.table}]" in result.stderr
+    result = locatk("simulate", system, "--sped", 1)
+    assert result.exit_code == 2
+    assert "No such option" in result.stderr
+
+
+def test_the_configuration_is_not_overwritten(locatk, tmp_path: Path) -> None:
+    config = tmp_path / "sim.toml"
+    config.write_text(polaris.CONFIG.dumps())
+    result = locatk("simulate", "polaris", "--config", config, "-o", config, "--overwrite")
+    assert result.exit_code == 1
+    assert config.read_text() == polaris.CONFIG.dumps()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "missing key 'format'"),
+        ('format = "locatk-simulation-polaris"\nformat_version = 1\n[robt]\n', "robt"),
+        ("format = ", "not valid TOML"),
+    ],
+)
+def test_a_wrong_file_is_one_line(locatk, tmp_path: Path, text: str, said: str) -> None:
+    config = tmp_path / "sim.toml"
+    config.write_text(text)
+    result = locatk("simulate", "polaris", "--config", config, "-o", tmp_path / "run.mcap")
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert str(config) in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_help_has_groups_units_and_defaults(locatk, system: str) -> None:
+    text = locatk("simulate", system, "--help").stdout
+    config = SYSTEMS[system].CONFIG
+    flags = [setting for setting in config.settings if setting.flag]
+    assert 9 <= len(flags) <= 15
+    for setting in flags:
+        assert f"{setting.table.capitalize()}:" in text
+        assert setting.flag.split("/")[0] in text
+    assert " ".join(text.split()).count("[default: ") == len(flags)
+    assert "--print-config > sim.toml" in text

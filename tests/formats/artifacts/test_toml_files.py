@@ -1,0 +1,111 @@
+"""Artifacts as files and as attachments of sessions, whichever they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from locatk.core.dots.camera import Camera
+from locatk.core.dots.sheet import Manifest, Sheet
+from locatk.core.errors import ArtifactError, MissingDataError, OutputExistsError
+from locatk.core.landmarks.halls import HallSensors, circle
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
+from locatk.core.lighthouse.scene import Marker, Scene
+from locatk.core.polaris.array import SensorArray, bar
+from locatk.core.polaris.tag import Tags
+from locatk.formats.artifacts import maps, sheets, tags
+from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.artifacts.base import Artifact
+from locatk.formats.artifacts.hall_sensors import HALLS
+from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.writer import SessionWriter
+
+NOTE = 'a "b" \\ \n c'
+SHEET = Sheet("a", (0, 3000), (393, 555), (24, 32), (210.0, 297.0), (5.0, 7.5))
+
+ALL: dict[str, tuple[Artifact[Any], Any]] = {
+    "scene.toml": (
+        artifacts.SCENE,
+        Scene(markers=(Marker("a", np.array([0.1, 0.2, 0.0])),), notes=(NOTE,)),
+    ),
+    "sheet.toml": (sheets.MANIFEST, Manifest((SHEET,), codec="libdots", notes=(NOTE,))),
+    "camera.toml": (sheets.CAMERA, Camera((188, 120), 900.0, (93.5, 59.5))),
+    "tag.toml": (tags.TAGS, Tags(notes=(NOTE,))),
+    "array.toml": (tags.ARRAY, SensorArray(bar(3, 0.008))),
+    "map.toml": (maps.MAP, FloorMap(np.array([[1, HOLE_CODE], [3, 15]]), notes=(NOTE,))),
+    "halls.toml": (HALLS, HallSensors()),
+}
+
+every = pytest.mark.parametrize(("artifact", "value"), ALL.values(), ids=ALL)
+
+
+@every
+def test_files(tmp_path: Path, artifact: Artifact[Any], value: Any) -> None:
+    path = tmp_path / artifact.file
+    artifact.write(path, value)
+    text = artifact.dumps(value)
+    assert artifact.dumps(artifact.read(path)) == path.read_text("utf-8") == text
+    with pytest.raises(OutputExistsError):
+        artifact.write(path, value)
+    artifact.write(path, value, overwrite=True)
+    with pytest.raises(MissingDataError):
+        artifact.read(tmp_path / "none.toml")
+
+
+@pytest.mark.slow
+@every
+@given(text=st.text(max_size=80))
+def test_any_text_is_an_artifact_or_an_error(
+    artifact: Artifact[Any], value: Any, text: str
+) -> None:
+    with pytest.raises(ArtifactError):
+        artifact.loads(artifact.dumps(value) + "x" + text)
+
+
+def test_every_kind_has_a_name_of_its_own() -> None:
+    assert [artifact.file for artifact, _ in ALL.values()] == list(ALL)
+
+
+@every
+def test_errors_name_the_artifact_where_there_is_no_file(
+    artifact: Artifact[Any], value: Any
+) -> None:
+    with pytest.raises(ArtifactError) as caught:
+        artifact.loads(artifact.dumps(value).replace("format_version = 1", "format_version = 2"))
+    assert caught.value.file == f"<{artifact.file.removesuffix('.toml')}>"
+    assert caught.value.where == "format_version"
+
+
+def session(path: Path, **parts: str) -> Session:
+    """A session with these attachments; `_` stands for `-`."""
+    with SessionWriter(path, system="landmarks") as writer:
+        for name, text in parts.items():
+            writer.attach_toml(name.replace("_", "-") + ".toml", text)
+    return Session.open(path)
+
+
+@every
+def test_a_session_carries_it(tmp_path: Path, artifact: Artifact[Any], value: Any) -> None:
+    name, text = artifact.file.removesuffix(".toml"), artifact.dumps(value)
+    bearing = session(tmp_path / "run.mcap", **{name: text})
+    assert artifact.dumps(artifact.attached(bearing)) == text
+    assert artifact.attached(session(tmp_path / "none.mcap")) is None
+    with pytest.raises(ArtifactError, match=rf"run\.mcap:{name}\.toml"):
+        artifact.attached(session(tmp_path / "bad-run.mcap", **{name: "x"}))
+
+
+def test_a_device_may_have_its_own(tmp_path: Path) -> None:
+    shared, own = (HALLS.dumps(HallSensors(position_m=circle(r))) for r in (0.025, 0.03))
+    both = session(tmp_path / "both.mcap", halls=shared, halls_b=own)
+    for device, text in (("b", own), ("a", shared), (None, shared)):
+        found = HALLS.attached_for(both, device)
+        assert found is not None
+        assert HALLS.dumps(found) == text
+    assert HALLS.attached_for(session(tmp_path / "none.mcap"), "a") is None
+    with pytest.raises(ArtifactError, match=r"bad\.mcap:halls-b\.toml"):
+        HALLS.attached_for(session(tmp_path / "bad.mcap", halls=shared, halls_b="x"), "b")

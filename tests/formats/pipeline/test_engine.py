@@ -1,0 +1,113 @@
+"""The engine: every job has one result, whatever dies."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from locatk.formats.pipeline import pools
+from locatk.formats.pipeline.engine import Lost, Pool, in_order, run
+
+JOBS = """
+import os, signal, time
+from pathlib import Path
+
+def work(job):
+    folder, number, how = job
+    with open(folder / f"calls-{number}", "a") as stream:
+        stream.write("x")
+    if how == "deadly" or (how == "once" and (folder / f"calls-{number}").stat().st_size == 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if how == "exit":
+        os._exit(0)
+    if how == "raise":
+        raise ValueError("no good")
+    if how == "late":
+        time.sleep(0.3)
+    return number * number
+
+def environment(name):
+    return os.environ.get(name)
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """Jobs that other processes can import."""
+    (tmp_path / "locatk_test_jobs.py").write_text(JOBS)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    yield importlib.import_module("locatk_test_jobs")
+    import sys
+
+    del sys.modules["locatk_test_jobs"]
+
+
+def calls(folder: Path, number: int) -> int:
+    path = folder / f"calls-{number}"
+    return path.stat().st_size if path.exists() else 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pool", [pools.serial(), pools.processes(3)], ids=["serial", "processes"])
+def test_each_job_has_its_result(module: ModuleType, tmp_path: Path, pool: Pool) -> None:
+    kinds = ["late", "", "raise", "", "late", ""]
+    jobs = [(tmp_path, number, how) for number, how in enumerate(kinds)]
+    results = dict(run(module.work, jobs, pool))
+    assert results == {
+        0: 0,
+        1: 1,
+        2: Lost("ValueError: no good", "Please report it"),
+        3: 9,
+        4: 16,
+        5: 25,
+    }
+    assert [calls(tmp_path, number) for number in results] == [1] * 6
+
+
+@pytest.mark.slow
+def test_a_deadly_job_takes_no_other_along(module: ModuleType, tmp_path: Path) -> None:
+    kinds = ["late", "deadly", "late", "", "once", "exit", "", ""]
+    jobs = [(tmp_path, number, how) for number, how in enumerate(kinds)]
+    cleaned: list[int] = []
+    found = list(run(module.work, jobs, pools.processes(2), clean=lambda j: cleaned.append(j[1])))
+    assert sorted(number for number, _ in found) == list(range(8))  # nothing lost, nothing twice
+    results = dict(found)
+    died = Lost("its process died 2 times")
+    assert [n for n, result in results.items() if result == died] == [1, 5]
+    assert {n: r for n, r in results.items() if r != died} == {n: n * n for n in (0, 2, 3, 4, 6, 7)}
+    assert {1, 4, 5} <= set(cleaned)
+    assert calls(tmp_path, 1) <= 3  # with others, then twice alone
+    assert calls(tmp_path, 7) == 1  # after all deaths: left in peace
+
+
+def test_workers_have_our_environment_but_one_thread(
+    module: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.setenv("LOCATK_TEST", "later than the server that forks")
+    names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LOCATK_TEST"]
+    found = dict(run(module.environment, names, pools.processes(1)))
+    assert found == {0: "1", 1: "1", 2: "later than the server that forks"}
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+
+
+def test_an_interrupt_ends_the_workers(module: ModuleType, tmp_path: Path) -> None:
+    jobs = [(tmp_path, 0, ""), (tmp_path, 1, "late"), (tmp_path, 2, "late"), (tmp_path, 3, "late")]
+    cleaned: list[int] = []
+    results = run(module.work, jobs, pools.processes(2), clean=lambda job: cleaned.append(job[1]))
+    next(results)
+    with pytest.raises(KeyboardInterrupt):
+        results.throw(KeyboardInterrupt())
+    assert calls(tmp_path, 3) == 0
+    assert 1 in cleaned
+
+
+def test_results_are_told_in_order() -> None:
+    came = iter([(2, "c"), (0, "a"), (3, "d"), (1, "b")])
+    assert list(in_order(came)) == [(1, []), (2, ["a"]), (3, []), (4, ["b", "c", "d"])]

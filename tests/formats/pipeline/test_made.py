@@ -1,0 +1,84 @@
+"""What a solution was made from."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats.pipeline import provenance as made
+from locatk.formats.sessions.solutions import write_solution
+
+START_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(bytes(range(256)) * 9000)  # more than a block
+    return path
+
+
+def solution(poses: int = 3) -> Solution:
+    times = START_NS + np.arange(poses)
+    track = Trajectory.from_positions("red", "floor", times, np.ones((poses, 3)))
+    return Solution("lighthouse", "bundle", (track,))
+
+
+def test_source_facts_are_those_of_sha256sum(source: Path) -> None:
+    facts = made.source_facts(source)
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    assert facts == {"source": "run.mcap", "source_bytes": "2304000", "source_sha256": digest}
+    os.utime(source, (1, 1))
+    (source.parent / "copy").mkdir()
+    copy = Path(shutil.copy(source, source.parent / "copy"))
+    assert made.source_facts(copy) == facts
+
+
+def test_options_count_by_their_content(tmp_path: Path) -> None:
+    artifact = tmp_path / "tag.toml"
+    artifact.write_text("a = 1")
+    digest = made.options_digest({"method": "paper", "artifact": artifact, "speed": None})
+    moved = artifact.rename(tmp_path / "other.toml")
+    assert made.options_digest({"artifact": moved, "method": "paper"}) == digest
+    moved.write_text("a = 2")
+    changed = made.options_digest({"method": "paper", "artifact": moved})
+    others = [made.options_digest(asked) for asked in ({}, {"method": "paper"}, {"speed": 0.1})]
+    assert len({digest, changed, *others}) == 5
+
+
+def test_the_same_solution_is_known_again(source: Path, tmp_path: Path) -> None:
+    facts = {**made.source_facts(source), "options_sha256": "0"}
+    out = tmp_path / "solved.mcap"
+    assert made.same_solution(out, facts) is None
+    write_solution(out, solution(), source=source, facts=facts)
+    found = made.same_solution(out, facts)
+    assert found is not None
+    assert found.poses == 3
+    for name in facts:
+        assert made.same_solution(out, {**facts, name: "other"}) is None
+    assert made.same_solution(source, facts) is None
+    whole = out.read_bytes()
+    out.write_bytes(whole[:-50])
+    assert made.same_solution(out, facts) is None
+
+
+def test_only_our_own_is_replaced(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "solved.mcap"
+    write_solution(out, solution(), source=source)
+    assert made.is_ours(out, "run.mcap")
+    assert not made.is_ours(out, "walk.mcap")
+    whole = out.read_bytes()
+    out.write_bytes(whole[:-50])
+    assert made.is_ours(out, "run.mcap")
+    out.write_bytes(b"")
+    assert made.is_ours(out, "run.mcap")
+    out.write_text("precious")
+    assert not made.is_ours(out, "run.mcap")
+    assert not made.is_ours(tmp_path / "absent", "run.mcap")

@@ -1,0 +1,357 @@
+"""Sessions: written whole, read by others, and honest about damage."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import IO
+
+import mcap.reader
+import mcap.writer
+import pytest
+from mcap_protobuf.decoder import DecoderFactory
+
+from locatk.core.errors import (
+    FormatError,
+    InputError,
+    LocatkError,
+    MissingDataError,
+    OutputExistsError,
+)
+from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.sessions import mcap_records
+from locatk.formats.sessions.reader import AttachmentInfo, Channel, Session
+from locatk.formats.sessions.writer import PROFILE, SessionWriter
+
+CHUNKS = 3000
+
+
+def payload(number: int) -> bytes:
+    return random.Random(number).randbytes(900)
+
+
+def write(path: Path, chunks: int = CHUNKS, **options: bool) -> None:
+    """A session of about 3 MB: several MCAP chunks on two topics."""
+    with SessionWriter(path, system="lighthouse", facts={"place": "lab"}, **options) as writer:
+        writer.attach("scene.toml", b"x = 1\n", "application/toml", 7)
+        writer.metadata("facts", {"a": "1"})
+        for number in range(chunks):
+            message = SerialChunk(port="p", byte_offset=number, data=payload(number))
+            writer.write(f"/raw/{number % 2}", message, 1000 + number)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("session") / "run.mcap"
+    write(path)
+    return path
+
+
+def everything(session: Session) -> list[object]:
+    """All that can be read of a session, read."""
+    return [
+        session.channels,
+        session.metadata(),
+        session.attachments(),
+        [session.attachment(entry.name) for entry in session.attachments()],
+        list(session.messages()),
+    ]
+
+
+def test_round_trip(file: Path) -> None:
+    session = Session.open(file)
+    assert session.profile == PROFILE
+    assert session.channels == (
+        Channel("/raw/0", "locatk.SerialChunk", "protobuf", CHUNKS // 2),
+        Channel("/raw/1", "locatk.SerialChunk", "protobuf", CHUNKS // 2),
+    )
+    assert (session.start_ns, session.end_ns) == (1000, 1000 + CHUNKS - 1)
+    assert session.damage is None
+    assert session.attachments() == (AttachmentInfo("scene.toml", "application/toml", 6, 7),)
+    assert session.attachment("scene.toml") == b"x = 1\n"
+    assert session.attachment("none") is None
+    facts = session.facts
+    assert facts.pop("tool_version")
+    assert facts == {
+        "format_version": "1",
+        "kind": "session",
+        "system": "lighthouse",
+        "place": "lab",
+    }
+    assert session.metadata()["facts"] == {"a": "1"}
+    assert session.topics("/raw/") == ("/raw/0", "/raw/1")
+    assert session.topics("/raw/", "other.Schema") == ()
+    decoded = list(session.decoded("/raw/1", SerialChunk))
+    assert [time_ns for time_ns, _ in decoded] == list(range(1001, 1000 + CHUNKS, 2))
+    assert decoded[5][1].data == payload(11)
+    assert [topic for topic, _, _ in session.messages()][:3] == ["/raw/0", "/raw/1", "/raw/0"]
+    assert {topic for topic, _, _ in session.messages(["/raw/1"])} == {"/raw/1"}
+
+
+def test_same_calls_same_bytes(file: Path, tmp_path: Path) -> None:
+    write(tmp_path / "again.mcap")
+    assert (tmp_path / "again.mcap").read_bytes() == file.read_bytes()
+
+
+def test_the_stock_reader_reads_it(file: Path) -> None:
+    with open(file, "rb") as stream:
+        reader = mcap.reader.make_reader(
+            stream, validate_crcs=True, decoder_factories=[DecoderFactory()]
+        )
+        assert reader.get_header().profile == PROFILE
+        assert [entry.name for entry in reader.iter_metadata()] == ["locatk", "facts"]
+        assert [entry.data for entry in reader.iter_attachments()] == [b"x = 1\n"]
+        found = [
+            (channel.topic, message.log_time, decoded.byte_offset, decoded.data)
+            for _, channel, message, decoded in reader.iter_decoded_messages()
+        ]
+    assert found == [(f"/raw/{n % 2}", 1000 + n, n, payload(n)) for n in range(CHUNKS)]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_nothing_is_left_after_an_exception(tmp_path: Path, error: type[BaseException]) -> None:
+    def record() -> None:
+        with SessionWriter(tmp_path / "run.mcap", system="dots") as writer:
+            writer.write("/raw", SerialChunk(data=b"x"), 1)
+            raise error
+
+    with pytest.raises(error):
+        record()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_file_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"old")
+    with pytest.raises(OutputExistsError):
+        write(path, 1)
+    assert path.read_bytes() == b"old"
+    write(path, 1, overwrite=True)
+    assert len(list(Session.open(path).messages())) == 1
+
+
+def test_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(MissingDataError):
+        write(tmp_path / "no" / "run.mcap", 1)
+
+
+def test_times_before_1970_are_refused(tmp_path: Path) -> None:
+    def record() -> None:
+        with SessionWriter(tmp_path / "run.mcap", system="dots") as writer:
+            writer.write("/raw", SerialChunk(), -1)
+
+    with pytest.raises(InputError, match="range of MCAP"):
+        record()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_empty_session(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with SessionWriter(path, system="dots"):
+        pass
+    session = Session.open(path)
+    assert (session.start_ns, session.end_ns, session.channels) == (None, None, ())
+    assert list(session.messages()) == []
+
+
+def test_a_topic_has_one_schema(file: Path) -> None:
+    from locatk.formats.schemas.poses_pb2 import Odometry
+
+    with pytest.raises(FormatError, match=r"locatk\.SerialChunk"):
+        list(Session.open(file).decoded("/raw/0", Odometry))
+
+
+# ---- files that are not what they should be
+
+
+def one_line(error: LocatkError) -> None:
+    assert "\n" not in str(error)
+    assert error.file is not None
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"time,x,y\n1,2,3\n" * 50, b"\x89MCAP", b"\x00" * 5000, b"\x89MCAP0\r\n"]
+)
+@pytest.mark.parametrize("damaged_ok", [False, True])
+def test_other_files(tmp_path: Path, content: bytes, damaged_ok: bool) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(content)
+    if damaged_ok and content.startswith(b"\x89MCAP0"):
+        assert Session.open(path, damaged_ok=True).damage
+        return
+    with pytest.raises(FormatError) as caught:
+        Session.open(path, damaged_ok=damaged_ok)
+    one_line(caught.value)
+    assert caught.value.hint
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(MissingDataError):
+        Session.open(tmp_path / "none.mcap")
+    with pytest.raises(FormatError):
+        Session.open(tmp_path)
+
+
+def test_cut_anywhere_is_an_error_and_the_rest_is_told(file: Path, tmp_path: Path) -> None:
+    whole = file.read_bytes()
+    messages = list(Session.open(file).messages())
+    path = tmp_path / "cut.mcap"
+    rng = random.Random(1)
+    cuts = [1, 8, 20, len(whole) - 1, len(whole) - 9, len(whole) - 40]
+    cuts += [rng.randrange(8, len(whole)) for _ in range(60)]
+    most = 0
+    for cut in cuts:
+        path.write_bytes(whole[:cut])
+        with pytest.raises(FormatError) as caught:
+            Session.open(path)
+        one_line(caught.value)
+        if cut < 8:
+            continue
+        session = Session.open(path, damaged_ok=True)
+        assert session.damage
+        left = list(session.messages())
+        assert left == messages[: len(left)]
+        assert sum(channel.count for channel in session.channels) == len(left)
+        most = max(most, len(left))
+    assert most == CHUNKS
+
+
+def test_zeroed_tail_of_a_power_cut(file: Path, tmp_path: Path) -> None:
+    whole = file.read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[: len(whole) * 2 // 3] + bytes(len(whole) // 3))
+    with pytest.raises(FormatError):
+        Session.open(path)
+    assert list(Session.open(path, damaged_ok=True).messages())
+
+
+def test_a_flipped_byte_never_passes_as_data(tmp_path: Path) -> None:
+    """Either an error of one line, or messages and attachments as they were."""
+    good = tmp_path / "good.mcap"
+    write(good, 40)
+    whole = good.read_bytes()
+    expected = everything(Session.open(good))
+    path = tmp_path / "bad.mcap"
+    rng = random.Random(2)
+    errors = 0
+    places = [rng.randrange(len(whole)) for _ in range(500)]
+    for place in places:
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            found = everything(Session.open(path))
+        except LocatkError as error:
+            one_line(error)
+            errors += 1
+        else:
+            assert found[0] == expected[0]
+            assert found[2:] == expected[2:]
+        try:  # what `locatk info` does
+            everything(Session.open(path, damaged_ok=True))
+        except LocatkError as error:
+            one_line(error)
+    assert errors > 400
+
+
+def test_a_flipped_byte_in_a_chunk_names_the_checksum(file: Path, tmp_path: Path) -> None:
+    whole = bytearray(file.read_bytes())
+    whole[len(whole) // 2] ^= 1
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(whole)
+    with pytest.raises(FormatError, match="chunk is damaged") as caught:
+        list(Session.open(path).messages())
+    one_line(caught.value)
+    assert caught.value.hint
+
+
+def test_a_flipped_byte_in_an_attachment(file: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(file.read_bytes().replace(b"x = 1\n", b"x = 3\n"))
+    with pytest.raises(FormatError, match=r"scene\.toml is damaged") as caught:
+        Session.open(path).attachment("scene.toml")
+    one_line(caught.value)
+
+
+def test_garbage_behind_the_magic(tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    rng = random.Random(3)
+    for _ in range(200):
+        path.write_bytes(b"\x89MCAP0\r\n" + rng.randbytes(rng.randrange(300)))
+        with pytest.raises(FormatError):
+            Session.open(path)
+        assert Session.open(path, damaged_ok=True).damage
+
+
+# ---- MCAP of other tools
+
+
+def foreign(path: Path, **options: object) -> None:
+    with open(path, "wb") as stream:
+        writer = mcap.writer.Writer(stream, **options)  # type: ignore[arg-type]
+        writer.start()
+        schema = writer.register_schema("Thing", "jsonschema", b"{}")
+        channel = writer.register_channel("/thing", "json", schema)
+        silent = writer.register_channel("/silent", "json", 0)
+        assert silent
+        for number in range(100):
+            writer.add_message(channel, 50 - number % 7, b'{"n": %d}' % number, 0)
+        writer.add_metadata("who", {"me": "you"})
+        writer.add_attachment(1, 2, "a.txt", "text/plain", b"abc")
+        writer.finish()
+
+
+NONE = mcap.writer.CompressionType.NONE
+LZ4 = mcap.writer.CompressionType.LZ4
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"compression": LZ4},
+        {"compression": NONE, "enable_crcs": False},
+        {"chunk_size": 300},
+        {"use_chunking": False},
+        {"use_statistics": False},
+        {"repeat_channels": False},
+        {"index_types": mcap.writer.IndexType.NONE},
+        {"index_types": mcap.writer.IndexType.CHUNK},
+        {
+            "index_types": mcap.writer.IndexType.NONE,
+            "repeat_channels": False,
+            "repeat_schemas": False,
+            "use_statistics": False,
+            "use_summary_offsets": False,
+        },
+    ],
+)
+def test_mcap_of_other_tools(tmp_path: Path, options: dict[str, object]) -> None:
+    path = tmp_path / "other.mcap"
+    foreign(path, **options)
+    session = Session.open(path)
+    assert session.facts == {}
+    assert session.profile == ""
+    assert session.damage is None
+    assert (session.start_ns, session.end_ns) == (44, 50)
+    assert Channel("/thing", "Thing", "json", 100) in session.channels
+    assert Channel("/silent", "", "json", 0) in session.channels
+    assert session.metadata() == {"who": {"me": "you"}}
+    assert session.attachment("a.txt") == b"abc"
+    messages = list(session.messages())
+    assert messages == [("/thing", 50 - n % 7, b'{"n": %d}' % n) for n in range(100)]
+
+
+def test_messages_that_the_index_hides_are_missed(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_index = mcap_records.read_index
+
+    def forgetful(stream: IO[bytes]) -> mcap_records.Index:
+        index = read_index(stream)
+        del index.segments[0]
+        return index
+
+    monkeypatch.setattr(mcap_records, "read_index", forgetful)
+    with pytest.raises(FormatError, match="where the index says"):
+        list(Session.open(file).messages())

@@ -1,0 +1,45 @@
+"""Generated code is what protoc makes of the schemas."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+from locatk.formats.schemas import lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_generated_code_is_up_to_date(root: Path) -> None:
+    pytest.importorskip("grpc_tools", reason="grpcio-tools (extra dev) is not installed")
+    script = runpy.run_path(str(root / "formats" / "schemas" / "generate.py"))
+    assert script["stale"]() == []
+
+
+def test_names_of_the_messages() -> None:
+    modules = (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2)
+    names = {
+        message.full_name
+        for module in modules
+        for message in module.DESCRIPTOR.message_types_by_name.values()
+    }
+    assert names == {
+        "locatk.HallArray",
+        "locatk.LighthouseCapture",
+        "locatk.LighthouseSweep",
+        "locatk.MagnetometerArray",
+        "locatk.Odometry",
+        "locatk.PoseTrack",
+        "locatk.Readings",
+        "locatk.SerialChunk",
+    }
+
+
+def test_messages_are_documented(root: Path) -> None:
+    text = (root / "docs" / "formats.md").read_text("utf-8")
+    for module in (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2):
+        for message in module.DESCRIPTOR.message_types_by_name.values():
+            assert f"`{message.full_name}`" in text
+            for field in message.fields:
+                assert f"`{field.name}`" in text, f"{message.full_name}.{field.name}"
