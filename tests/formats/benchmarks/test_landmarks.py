@@ -67,7 +67,7 @@ EXACT = (
 
 def here(call: str) -> list[float]:
     """Instead of a process of its own."""
-    return [float(value) for value in eval(call.split(".", 1)[1], vars(landmarks_speed))]
+    return [float(value) for value in eval(call.removeprefix("landmarks.speed."), vars(landmarks_speed))]
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_rows_are_whole_and_absent_data_is_said(rows: dict[str, Figure]) -> None
 
 
 def test_a_figure_of_speed_is_taken_in_a_process_of_its_own() -> None:
-    found, seconds = timing.alone("landmarks_speed.search_time(5, 'L', '16', 2)")
+    found, seconds = timing.alone("landmarks.speed.search_time(5, 'L', '16', 2)")
     assert found == 2
     assert 0 < seconds < math.inf
 
