@@ -252,6 +252,7 @@ def test_a_recording_in_one_call_is_as_good() -> None:
     assert np.abs(error).max() < 12
 
 
+@pytest.mark.slow
 def test_memory_is_bounded() -> None:
     clock = TickClock(1000, 16)
     for minute in range(20):

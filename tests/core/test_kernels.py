@@ -701,6 +701,7 @@ SMALL_KERNELS = [kernel for kernel in CASES if kernel not in {"light_places", "l
 """Kernels without the large tables of sequences, whose arguments take microseconds to create."""
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(kernel=st.sampled_from(SMALL_KERNELS), data=st.data())
 def test_inconsistent_integers_raise_or_pass(kernel: str, data: st.DataObject) -> None:

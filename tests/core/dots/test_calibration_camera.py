@@ -148,6 +148,7 @@ def as_frames(images: Sequence[Image]) -> Frames:
 # ---- the camera
 
 
+@pytest.mark.slow
 def test_the_simulators_camera_comes_back(tilted: simulate.SimulatedSession) -> None:
     report = calibrate(tilted.frames, MANIFEST)
     check_lens(report)
@@ -277,6 +278,7 @@ def test_an_earlier_focal_length_is_kept_where_nothing_tells_a_better_one(
     assert calibrate(upright.frames, MANIFEST, of_another).focal_from == "usual"
 
 
+@pytest.mark.slow
 def test_without_bend_and_tilt_the_centre_is_the_middle() -> None:
     straight = Camera(SIZE, 360.0, TRUTH.centre_px)
     report = calibrate(simulated(15, straight).frames, MANIFEST)
@@ -446,6 +448,7 @@ def test_the_few_frames_that_are_tilted_or_turned_are_among_those_taken(
     assert select_diverse_frames(SIZE, result[:15], 120) == result[:15]
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_camera(upright: simulate.SimulatedSession) -> None:
     first, second = (calibrate(upright.frames, MANIFEST).camera for _ in range(2))
     assert first == second

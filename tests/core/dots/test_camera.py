@@ -19,6 +19,7 @@ def cameras(draw: st.DrawFn) -> Camera:
     return Camera(size, draw(st.floats(50, 2000)), centre, draw(st.floats(-0.9, 0.9)))
 
 
+@pytest.mark.slow
 @given(cameras(), st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8))
 @settings(max_examples=200, deadline=None)
 def test_distort_undoes_undistort(camera: Camera, where: list[tuple[float, float]]) -> None:
@@ -32,6 +33,7 @@ def test_distort_undoes_undistort(camera: Camera, where: list[tuple[float, float
     )
 
 
+@pytest.mark.slow
 @given(cameras(), st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8))
 @settings(max_examples=200, deadline=None)
 def test_undistort_undoes_distort(camera: Camera, where: list[tuple[float, float]]) -> None:

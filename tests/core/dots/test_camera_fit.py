@@ -158,6 +158,7 @@ def test_frames_that_contradict_each_other_are_believed_less() -> None:
     assert abs(errors(bowed)[:3]).max() < 4
 
 
+@pytest.mark.slow
 def test_wrong_dots_are_given_up() -> None:
     clean, with_faults = views(seed=5), views(wrong=0.1, seed=5)
     bend = fit_homographies(with_faults)
@@ -181,6 +182,7 @@ def test_bad_frames_count_little() -> None:
     assert abs(with_bad.centre - without.centre).max() < without.sigma[:2].max()
 
 
+@pytest.mark.slow
 def test_how_well_the_focal_length_is_known_depends_on_the_tilt() -> None:
     sigmas = []
     for tilt_deg in (10.0, 3.0, 0.0):

@@ -253,6 +253,7 @@ def test_first_bits_are_those_of_py_microdots() -> None:
         assert "".join(map(str, window[0] >> 1)) == bits
 
 
+@pytest.mark.slow
 @given(names, positions, positions, st.integers(1, 20), st.integers(1, 20), sections)
 @example("anoto", 0, 0, 9, 9, (0, 0))
 @example("libdots", SECTION_LENGTH - 100, SECTION_LENGTH - 100, 100, 100, (62, 62))

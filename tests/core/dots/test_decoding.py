@@ -203,6 +203,7 @@ def test_a_window_may_look_past_the_first_places(before: tuple[int, int], quarte
     assert fate(windows, bits, codec("anoto")) == (20, 0, 0)
 
 
+@pytest.mark.slow
 def test_answers_do_not_depend_on_their_company() -> None:
     rng = np.random.default_rng(5)
     windows = Windows("anoto", rng, 40, 10, 10)
@@ -344,6 +345,7 @@ def repeated() -> Iterator[tuple[int, int]]:
                 yield position, order
 
 
+@pytest.mark.slow
 def test_what_libdots_repeats_is_not_told() -> None:
     one = codec("libdots")
     positions = list(repeated())
@@ -357,6 +359,7 @@ def test_what_libdots_repeats_is_not_told() -> None:
     assert fate(longer, soft(longer.symbols), one) == (10, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "n"), [((6, 6), 150), ((8, 8), 150), ((12, 12), 100), ((17, 11), 100), ((40, 40), 20)]
 )

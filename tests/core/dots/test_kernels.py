@@ -198,6 +198,7 @@ def test_poses_are_the_same() -> None:
     np.testing.assert_allclose(mine.covariance, twin.covariance, rtol=1e-2, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_frames_without_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     images = drawn(9)
     mine = locate.localize_frames(images, ANOTO)

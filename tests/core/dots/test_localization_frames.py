@@ -306,6 +306,7 @@ def test_what_is_not_sure_is_rejected_and_says_so(shot: Shots) -> None:
     np.testing.assert_array_equal(lenient.accepted, lenient.confidence >= 0.9)
 
 
+@pytest.mark.slow
 def test_a_strip_of_few_rows_is_not_told(shot: Shots) -> None:
     # Rows tell y by the shifts between them; five rows have four, which many places share.
     shots = shots_of(shot, 24, 10)

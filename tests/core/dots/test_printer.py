@@ -166,6 +166,7 @@ def test_a_field_is_known_by_what_it_says(coarse: Ink) -> None:
     assert by_name(report)["B4"].right == 0
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_too_coarse_says_nothing_of_the_printer(coarse: Ink) -> None:
     report = calibrate(scan(coarse, 300, scan_dpi=300), (300, 300))
     for field in report.fields:

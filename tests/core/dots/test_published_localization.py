@@ -122,6 +122,7 @@ def test_frames_of_the_papers_camera() -> None:
     assert max(turn_off) < 0.5
 
 
+@pytest.mark.slow
 def test_dots_of_a_sixth_of_the_pitch_and_missing_dots() -> None:
     fate, _, _ = study(30, 2, dot=1 / 6)
     assert fate["right"] >= 22, fate

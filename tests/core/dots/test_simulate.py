@@ -101,6 +101,7 @@ def test_the_view_is_a_pinhole_over_the_paper(pitch: float, roll: float) -> None
     )
 
 
+@pytest.mark.slow
 def test_a_frame_is_what_opencv_draws_of_the_same_page() -> None:
     """Tilted, turned, distorted and blurred: circles on a fine page, warped, reduced."""
     camera = simulate.camera(0.045)

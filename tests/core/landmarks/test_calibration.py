@@ -87,7 +87,7 @@ class Case:
     laid: dict[Cell, InstalledLandmark]
 
 
-@pytest.fixture(scope="module", params=[5, 6])
+@pytest.fixture(scope="module", params=[5, pytest.param(6, marks=pytest.mark.slow)])
 def case(request: pytest.FixtureRequest) -> Case:
     """Two drives over twelve landmarks, by rows and by columns."""
     sessions = [
@@ -240,6 +240,7 @@ def test_unconnected_parts_are_reported() -> None:
     assert set(report.floor.built) == {(r, c) for r in (0, 2) for c in range(4)}
 
 
+@pytest.mark.slow
 def test_position_of_the_whole_floor_is_not_observable() -> None:
     moved = Faults(displaced=tuple((cell, (0.008, 0.003)) for cell in FLOOR.cells()))
     cells = ROWS[:6]

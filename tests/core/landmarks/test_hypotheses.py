@@ -108,6 +108,7 @@ def test_one_pass_with_nominal_errors() -> None:
     assert np.mean([one.found[0].code == one.right for one in nominal()]) > 0.92
 
 
+@pytest.mark.slow
 def test_probabilities_are_calibrated() -> None:
     probability = np.array([one.found[0].probability for one in nominal()])
     right = np.array([one.found[0].code == one.right for one in nominal()])

@@ -93,6 +93,7 @@ def test_it_finds_the_centre_and_aligns_with_the_bars(letters: str) -> None:
     assert report.time_ns == pytest.approx(bench.robot.time_s * 1e9, abs=3e7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_it_drives_the_window_from_landmark_to_landmark(seed: int) -> None:
     """Landmarks are displaced by some millimetres, so that the robot aligns with any bar."""
@@ -142,6 +143,7 @@ def test_rotations_of_all_windows() -> None:
 # ---- failures
 
 
+@pytest.mark.slow
 def test_a_robot_that_meets_nothing_gives_up() -> None:
     bench = Bench({})
     driver = PublishedDriver(GEOMETRY, 0.2)
@@ -152,6 +154,7 @@ def test_a_robot_that_meets_nothing_gives_up() -> None:
     assert bench.robot.time_s < 120
 
 
+@pytest.mark.slow
 def test_a_missing_neighbour_is_lost_and_the_robot_turns_back() -> None:
     bench = Bench({(0.2, 0.01): 5})
     driver = PublishedDriver(GEOMETRY, 0.2, landmarks=2, max_approaches=2)
@@ -162,6 +165,7 @@ def test_a_missing_neighbour_is_lost_and_the_robot_turns_back() -> None:
     assert [(r.searched, r.lost) for r in driver.reports[2:]] == [(True, False), (False, True)]
 
 
+@pytest.mark.slow
 def test_a_stuck_sensor_does_not_hold_the_robot_for_ever() -> None:
     class Stuck(Bench):
         def measure(self) -> Measurements:
@@ -177,6 +181,7 @@ def test_a_stuck_sensor_does_not_hold_the_robot_for_ever() -> None:
     assert bench.robot.time_s < 600
 
 
+@pytest.mark.slow
 def test_spins_without_a_centre_repeat_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver_module, "recognise_spin", lambda *_: None)
     bench = Bench({(0.2, 0.02): 7})
@@ -189,6 +194,7 @@ def test_spins_without_a_centre_repeat_the_first_step(monkeypatch: pytest.Monkey
     assert np.hypot(*(bench.robot.pose[:2] - [0.2, 0.02])) < 0.06
 
 
+@pytest.mark.slow
 def test_a_false_centre_is_refused_by_the_check_of_the_field() -> None:
     """The spins converge on a corner of the landmark, 29 mm from its centre, and read NSNS."""
     reports = []
@@ -277,6 +283,7 @@ def test_its_sessions_can_be_solved(sessions: list[SimulatedSession]) -> None:
     assert right >= 2
 
 
+@pytest.mark.slow
 def test_commands_depend_on_measurements_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """The driver orders the same motions for recorded measurements, without any simulator."""
     options = SimulationOptions("published", landmarks=2, rate_hz=100.0, seed=2)

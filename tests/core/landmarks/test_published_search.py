@@ -84,6 +84,7 @@ def test_spins_far_off_are_refused_and_not_misread() -> None:
     assert read >= 3
 
 
+@pytest.mark.slow
 def test_standing_on_the_bars_is_within_a_millimetre() -> None:
     # section 5.2.3: less than 1 mm and 1.5 degrees; where nothing is in the field but bars
     # a few percent off and sensors with offsets
@@ -126,6 +127,7 @@ def test_a_pass_alone_gives_a_centre_only() -> None:
     assert 0.006 < np.mean(errors) < 0.013
 
 
+@pytest.mark.slow
 def test_a_dead_sensor_is_gone_without() -> None:
     read = 0
     for run in simulate_passes(8, code_of("NNSS"), then="spin", aim_m=0.002, seed=4):

@@ -692,6 +692,7 @@ def test_passes_feel_the_closed_form() -> None:
             assert one.samples.time_ns[0] == SESSION_START_NS
 
 
+@pytest.mark.slow
 def test_what_follows_a_pass_is_near_the_centre() -> None:
     aims = [np.hypot(*one.end[:2]) for one in simulate_passes(150, 14, errors=NONE, then="stand")]
     assert np.mean(aims) == pytest.approx(0.007, rel=0.13)
@@ -708,6 +709,7 @@ def test_what_follows_a_pass_is_near_the_centre() -> None:
         assert np.hypot(second[:, 0], second[:, 1]).min() < 0.002
 
 
+@pytest.mark.slow
 def test_passes_err_as_facts_say() -> None:
     exact, generated = (simulate_passes(200, 14, errors=errors, seed=1) for errors in (NONE, None))
     scale, drift, strength = [], [], []

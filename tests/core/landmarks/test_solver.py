@@ -126,6 +126,7 @@ def test_map_of_another_floor_is_rejected(seed: int) -> None:
     assert "not_localised" in warning_codes(solution)
 
 
+@pytest.mark.slow
 def test_landmarks_are_detected_without_a_map() -> None:
     solution = solved(session(), None)
     assert not solution.trajectories
@@ -134,6 +135,7 @@ def test_landmarks_are_detected_without_a_map() -> None:
     assert "no_map" in warning_codes(solution)
 
 
+@pytest.mark.slow
 def test_part_of_a_floor_as_the_map() -> None:
     """Poses outside of it are dead reckoning, with its covariance."""
     part = FloorMap(CODES[:, :5])
@@ -228,6 +230,7 @@ def test_no_odometry_is_an_error() -> None:
         solve(session().samples, FLOOR)
 
 
+@pytest.mark.slow
 def test_landmark_that_is_not_on_the_map() -> None:
     codes = CODES.copy()
     codes[3, 5] = HOLE_CODE
@@ -236,6 +239,7 @@ def test_landmark_that_is_not_on_the_map() -> None:
     assert farthest(session(), solution) < 4e-3
 
 
+@pytest.mark.slow
 def test_landmark_that_is_not_on_the_floor() -> None:
     codes = CODES.copy()
     codes[2, 4] = HOLE_CODE
@@ -279,6 +283,7 @@ def test_number_and_positions_of_sensors(count: int) -> None:
     assert farthest(one, solution) < 4e-3
 
 
+@pytest.mark.slow
 def test_gaps_and_missing_values() -> None:
     samples = session().samples[0]
     random = np.random.default_rng(0)
@@ -327,6 +332,7 @@ def test_options_out_of_range_are_refused() -> None:
         SolveOptions(misread=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("residual_sigma", "warned", "poses"),
     [(1.9, False, True), (2.1, True, True), (11.9, True, True), (12.1, True, False)],

@@ -152,6 +152,7 @@ def test_sensor_positions(pose: Array) -> None:
     np.testing.assert_allclose(sensor_positions(pose[None], position_m)[0], want, atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 300), st.integers(1, 80), st.data())
 def test_thinned_keeps_the_reference_and_the_number_of_samples(

@@ -109,6 +109,7 @@ def test_covariances_agree_with_the_errors() -> None:
         assert np.isnan(spread[:, 2]).all()
 
 
+@pytest.mark.slow
 def test_trajectory_is_continuous() -> None:
     """Steps are those of the odometry, to a fraction of a millimetre."""
     one, trajectory = session(1)
@@ -118,6 +119,7 @@ def test_trajectory_is_continuous() -> None:
     assert np.abs(steps - want).max() < 4e-4
 
 
+@pytest.mark.slow
 def test_dead_reckoning_before_and_after_all_visits() -> None:
     """Half a metre of odometry on both sides of two visits."""
     one = session(2)[0]
@@ -184,6 +186,7 @@ def test_frame_of_odometry_does_not_matter() -> None:
     np.testing.assert_allclose(again.position, trajectory.position, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_difference_of_odometry_is_distributed_between_visits() -> None:
     """Two visits are farther apart than by odometry."""
     one = session(3, clean=True)[0]

@@ -159,12 +159,14 @@ def test_covariance_of_stations_is_that_of_noise_draws(draws: Any) -> None:
         np.testing.assert_allclose(told[large], found[large], rtol=0.3)
 
 
+@pytest.mark.slow
 def test_what_is_held_has_no_covariance(draws: Any) -> None:
     # Moving, turning and scaling the whole rig is held: nothing is known or unknown there.
     for _, found, told in draws:
         np.testing.assert_allclose(told, found, rtol=0.3, atol=0.02 * found[-1])
 
 
+@pytest.mark.slow
 def test_known_points_fix_a_station_without_gauge(world: Any) -> None:
     lamps = world.lamps(1)
     truth = rig_of(lamps, world.curve(15, flat=True))

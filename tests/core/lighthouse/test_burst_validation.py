@@ -90,6 +90,7 @@ def test_weak_bursts_are_taken_where_a_rotor_expects_them(light: Any) -> None:
     assert read.matches.evidence_bits[read.is_accepted].min() < MIN_STANDALONE_EVIDENCE_BITS
 
 
+@pytest.mark.slow
 def test_what_stands_on_its_own_is_not_talked_into_something_else(light: Any) -> None:
     senders = [light.Sender(3), light.Sender(3, zero_s=0.011), light.Sender(9, zero_s=0.002)]
     (line,), _ = light.of(senders, 10.0, light.Receiving(rim_s=1e-6))

@@ -136,6 +136,7 @@ def test_sweeps_are_no_flashes(light: Any, rate_hz: float) -> None:
     assert not is_mocap_flash(split_bursts(line)).any()
 
 
+@pytest.mark.slow
 def test_no_published_sweep_is_a_flash(published: Callable[[str], Edges]) -> None:
     for name in (CAPTURE, "fpga/take1.csv", "fpga/about_4m.csv"):
         assert not is_mocap_flash(split_bursts(published(name))).any()

@@ -209,6 +209,7 @@ def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: A
     assert jumps[2] < 0.5 * min(jumps[1], jumps[5])
 
 
+@pytest.mark.slow
 def test_one_station_has_no_other_to_be_verified_against(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
     sweeps = world.stream(lamps[:1], position_at, 4.0, sensors=SPAN)

@@ -70,6 +70,7 @@ def test_other_places_do_not(light: Any) -> None:
         assert np.mean(of[~read] >= 0) <= 0.05 + MAX_DECOY_FRACTION
 
 
+@pytest.mark.slow
 def test_noise_does_not(light: Any) -> None:
     noise = np.random.default_rng(7)
     lines = []

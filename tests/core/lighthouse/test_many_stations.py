@@ -178,6 +178,7 @@ def test_a_hall_of_stations_of_which_three_see_a_place(
     check(found, lamps, points, 1e-3 * length)
 
 
+@pytest.mark.slow
 def test_a_stretch_that_is_flat_does_not_make_a_floor(world: Any) -> None:
     lamps = world.lamps(1, 2, 5, 16)
     points = world.curve(400, flat=False)
@@ -198,6 +199,7 @@ def test_a_station_that_saw_a_corner_is_not_guessed(world: Any) -> None:
     assert set(found.left_out) == {2}
 
 
+@pytest.mark.slow
 def test_narrow_fields_of_bodies_are_not_called_floors(world: Any) -> None:
     # Photodiodes on a body of 8 cm, three metres off: a homography fits to 0.6 mrad.
     lamps = world.lamps(1, 2)
@@ -268,6 +270,7 @@ def test_recorded_stations_predict_each_other(tracker: Any) -> None:
     assert all(w.code != "wrong_station" for w in solution.warnings)
 
 
+@pytest.mark.slow
 def test_a_recorded_station_that_is_moved_in_the_scene_is_named(tracker: Any) -> None:
     stations = tuple(
         replace(s, position=s.position + ([0.05, 0.0, 0.0] if s.channel == 8 else [0.0] * 3))

@@ -149,6 +149,7 @@ def test_a_station_that_says_another_channel(light: Any) -> None:
     assert "channel 7" in warning.message
 
 
+@pytest.mark.slow
 def test_missed_sweeps_are_counted(light: Any) -> None:
     path = light.Receiving(spoiled=0.1, rim_s=1e-6)
     lines, passed = light.of([light.Sender(2)], 20.0, path, sensors=2)

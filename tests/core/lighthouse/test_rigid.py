@@ -298,6 +298,7 @@ def test_a_moved_station_is_reported() -> None:
     assert "channel 8 " in warning.message
 
 
+@pytest.mark.slow
 def test_a_mirrored_receiver_is_reported() -> None:
     stations = (station(1, (-1.5, 0.0, 1.8), 0), station(2, (1.2, -1.0, 1.8), 1))
     sweeps = record(stations, DECK, standing, 1.0)

@@ -76,6 +76,7 @@ def test_too_low_a_rate_is_refused() -> None:
         read_windows(np.zeros((1, 64), np.uint8), 12e6)
 
 
+@pytest.mark.slow
 def test_published_windows_are_read(data: Path) -> None:
     """More than the published decoder reads (79.6 %), and no station that is not there."""
     from locatk.formats.benchmarks.infrared.suite import published_windows

@@ -192,12 +192,14 @@ def test_no_wrong_bit_at_any_speed_profile(hand_installed: HandInstalledTags) ->
     assert set(hand_installed.ids) == {ID}
 
 
+@pytest.mark.slow
 def test_position_and_heading_of_tags_laid_by_hand(hand_installed: HandInstalledTags) -> None:
     """Five magnets 0.4 mm off put a tag 0.18 mm off and turn it by 0.3 degrees."""
     rms = np.sqrt(np.mean(hand_installed.pose**2, axis=0))
     assert np.all(rms < [4e-4, 4e-4, np.radians(0.6)])
 
 
+@pytest.mark.slow
 def test_covariance_of_the_pose_is_honest(hand_installed: HandInstalledTags) -> None:
     """Over 16 tags a mean square of 1 scatters by 0.35."""
     square = np.mean(hand_installed.z_pose**2, axis=0)
@@ -205,6 +207,7 @@ def test_covariance_of_the_pose_is_honest(hand_installed: HandInstalledTags) -> 
     assert np.all(square > 0.35)
 
 
+@pytest.mark.slow
 def test_covariance_of_the_magnets_is_honest(hand_installed: HandInstalledTags) -> None:
     """Angles to half of a sigma. Places across the track are worse: a bar that stands askew
     by less than the samples show leaves up to three of its own sigmas there."""
@@ -290,6 +293,7 @@ def test_mini_tag(world: Any) -> None:
     assert np.abs(np.array(errors)[:, 2]).max() < np.radians(1.0)
 
 
+@pytest.mark.slow
 def test_axes_that_are_converted_one_after_the_other(world: Any) -> None:
     """5.3 ms apart, as the published sensors do at 105 mm/s: 0.56 mm along the track."""
     delay = (0.0, 5.35e-3, 10.7e-3)

@@ -45,6 +45,7 @@ def shape_of(built: AsBuiltTag) -> np.ndarray:
     return np.r_[apart, np.cos(angle - along), np.sin(angle - along)]
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 10_000), st.integers(2, 8))
 def test_exact_passes_give_the_exact_shape(seed: int, count: int) -> None:
@@ -60,6 +61,7 @@ def test_exact_passes_give_the_exact_shape(seed: int, count: int) -> None:
     assert abs(np.sum(arms[:, 0] * offset[:, 1] - arms[:, 1] * offset[:, 0])) < 1e-9
 
 
+@pytest.mark.slow
 def test_scatter_is_that_of_the_passes() -> None:
     _, generated = passes(400, noise_m=2e-4, noise_rad=0.02)
     (report,) = calibrate(TAGS, generated).calibrated

@@ -173,6 +173,7 @@ def test_arguments_that_do_not_fit_are_a_mistake_of_the_caller() -> None:
 # --- as built
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.data())
 def test_with_tags_as_built_it_is_the_nearest_of_all_ids(data) -> None:

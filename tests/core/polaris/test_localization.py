@@ -155,6 +155,7 @@ def test_odometry_joins_the_tags(
     assert np.sqrt(np.mean(z**2)) < 3
 
 
+@pytest.mark.slow
 def test_odometry_of_another_device_is_not_used(world: Any, tour: tuple[Any, Samples]) -> None:
     course, recording = tour
     other = replace(odometry(world, course, scale=3.0), device="other")

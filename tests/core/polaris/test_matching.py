@@ -96,6 +96,7 @@ def test_the_position_pattern_comes_first() -> None:
         assert abs(np.angle(np.exp(1j * rotated))) < 1e-9
 
 
+@pytest.mark.slow
 def test_covariance_is_that_of_many_draws() -> None:
     """Of a tag whose magnets were set by hand, 0.4 mm each way, and measured well."""
     rng = np.random.default_rng(0)

@@ -121,6 +121,7 @@ def test_the_mini_tag_works() -> None:
     assert any("to within 0 mm" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_too_many_orientations() -> None:
     """6 degrees, as measured on the published tags: 8 are fine, 16 and 20 are not."""
     for orientations in (8, 16, 20):
@@ -162,6 +163,7 @@ def test_too_fast() -> None:
     assert any("too fast" in warning for warning in wild.warnings)
 
 
+@pytest.mark.slow
 def test_too_weak() -> None:
     result = evaluate_design(
         replace(Tags(), clearance_m=0.04, spacing_m=0.16), ReadingConditions(sensors=17)

@@ -125,6 +125,7 @@ def test_noise_is_never_less_than_the_quantum_allows(world: Any) -> None:
     assert np.all(estimate_noise(bare) > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_mm", [0.1, 0.3, 1.0, 4.0, 8.0])
 def test_one_pass_a_tag_and_all_of_it(step_mm: float, world: Any) -> None:
     course = world.line(length=1.2, speed=step_mm / 10)

@@ -125,6 +125,7 @@ def test_the_promise_holds_at_any_size(case) -> None:
     assert redundant.decode_word(tags, observed) == expected
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.sampled_from([t for t in DESIGNS if t.magnets > 5]), st.data())
 def test_three_misreads_of_a_whole_tag_are_noticed(tags: Tags, data) -> None:

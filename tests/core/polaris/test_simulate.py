@@ -189,6 +189,7 @@ def test_the_earth_turns_against_the_array(heading: float) -> None:
     assert read / UT == pytest.approx(np.broadcast_to(expected, read.shape), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_each_axis_is_measured_at_its_own_time() -> None:
     """Delays of whole frames, so that shifting the samples undoes them."""
     late = replace(EXACT, delay_s=np.array([0.003, 0.0, -0.002]))
@@ -213,6 +214,7 @@ def test_each_axis_is_measured_at_its_own_time() -> None:
     assert moved > 3 * UT
 
 
+@pytest.mark.slow
 def test_the_published_run_looks_like_its_simulation(data: Path) -> None:
     """Axes, signs and orientations against the real array over the real tag."""
     with open(data / "polaris" / "default" / "RawData_1.csv", newline="") as file:
@@ -440,6 +442,7 @@ def test_a_tour_crosses_the_tags_of_a_site_in_their_order() -> None:
     assert np.abs(along).max() < 5e-3
 
 
+@pytest.mark.slow
 def test_tags_in_a_row_are_crossed_on_one_straight_line() -> None:
     tags = Tags(site={k: PlanarPose(0.3 * k, 0.1 * k, 0.2 * k) for k in range(1, 4)})
     simulated = simulate(tags, PLAIN)

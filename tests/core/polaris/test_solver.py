@@ -361,6 +361,7 @@ def test_a_height_is_as_sure_as_the_scale_of_its_way(world: Any) -> None:
     assert np.all(sigma < 5e-4)
 
 
+@pytest.mark.slow
 def test_passes_are_merged_only_if_that_identifies_a_tag(
     world: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

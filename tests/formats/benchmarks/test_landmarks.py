@@ -67,7 +67,9 @@ EXACT = (
 
 def here(call: str) -> list[float]:
     """Instead of a process of its own."""
-    return [float(value) for value in eval(call.removeprefix("landmarks.speed."), vars(landmarks_speed))]
+    return [
+        float(value) for value in eval(call.removeprefix("landmarks.speed."), vars(landmarks_speed))
+    ]
 
 
 @pytest.fixture(scope="module")
