@@ -67,9 +67,8 @@ EXACT = (
 
 def here(call: str) -> list[float]:
     """Instead of a process of its own."""
-    return [
-        float(value) for value in eval(call.removeprefix("landmarks.speed."), vars(landmarks_speed))
-    ]
+    expression = call.removeprefix("landmarks.speed.")
+    return [float(value) for value in eval(expression, vars(landmarks_speed))]
 
 
 @pytest.fixture(scope="module")
