@@ -166,10 +166,11 @@ class LandmarkFit:
 class Hypothesis:
     """One explanation of a visit: a code, and the pose of the robot relative to the landmark.
 
-    The frame is the landmark's, rotated by quarter turns so that the robot's heading at the time
-    of the visit is nearest to 0. The code is the one that this robot reads: a landmark of the
-    code ``designed`` on the map that is visited under a map heading of ``q`` quarter turns (plus
-    the heading of :attr:`pose`) has ``code = rotated(designed, -q)``.
+    The frame is that of the landmark, rotated by a multiple of 90 degrees such that the heading
+    of the robot in it is within 45 degrees of 0 at the time of the visit. The code is the one that
+    this robot reads: a landmark of the code ``designed`` on the map that is visited under a map
+    heading of ``q`` quarter turns (plus the heading of :attr:`pose`) has ``code =
+    rotated(designed, -q)``.
 
     Attributes
     ----------
@@ -310,7 +311,8 @@ def detect_visits(
 ) -> list[DetectedVisit]:
     """Detect the landmark of each visit.
 
-    Successive visits to one landmark, which was passed on both sides, are merged.
+    Successive visits are merged if they belong to one landmark, which the robot passed on one
+    side and then on the other.
     """
     visits: list[DetectedVisit] = []
     for segment in segment_visits(recording, geometry, priors.drift, pitch_m):
@@ -647,7 +649,7 @@ def check_gains(
         if gain < 0:
             raise _opposite_sign_error(name, device)
         if abs(gain - 1) > MAX_GAIN_SIGMAS * priors.gain:
-            message = f"the gain of the {name} sensor is {gain:.2f} of that of the others"
+            message = f"the gain of the {name} sensor is {gain:.2f} times that of the others"
             warnings.append(SolverWarning("sensor_gain", message).about(device))
     return warnings
 

@@ -111,9 +111,9 @@ class Approach:
         Landmark nearest to the robot at that time.
     outcome : {"centre", "no_pattern", "wrong_pattern", "lost"}
         ``centre``: the right code was read, and the robot is within
-        :data:`MAX_CENTRE_DISTANCE_M` of the centre. ``no_pattern``: no spin was recognised.
-        ``wrong_pattern``: another code was read. ``lost``: no landmark was found, or the robot
-        took another position for the centre.
+        :data:`MAX_CENTRE_DISTANCE_M` of the centre. ``no_pattern``: the signals of the spin
+        match no code. ``wrong_pattern``: another code was read. ``lost``: the robot found no
+        landmark, or stopped at a position that is not the centre of one.
     searched : bool
         True if the landmark was met in a search, False if it was reached from a neighbour.
     spins : int

@@ -110,7 +110,7 @@ INITIAL_LOSS_SCALE_RAD = 10 * LOSS_SCALE_RAD
 
 
 @dataclass(frozen=True)
-class SceneEstimate:
+class DeviceSceneEstimate:
     """Scene estimated from rigid devices, with facts and warnings."""
 
     scene: Scene
@@ -171,7 +171,7 @@ class StationLink:
 
 def estimate_scene_from_devices(
     devices: Sequence[tuple[DeviceSweeps, Receiver]], channels: Sequence[int], scene: Scene
-) -> SceneEstimate:
+) -> DeviceSceneEstimate:
     """Estimate the stations from the sweeps of rigid devices.
 
     Parameters
@@ -184,7 +184,7 @@ def estimate_scene_from_devices(
 
     Returns
     -------
-    SceneEstimate
+    DeviceSceneEstimate
         In the axes of the first station that is linked to others.
 
     Raises
@@ -479,7 +479,7 @@ def _adjust_scene(
     channels: Sequence[int],
     scene: Scene,
     links: list[StationLink],
-) -> SceneEstimate:
+) -> DeviceSceneEstimate:
     """Adjust stations and device poses together, in the axes of the first station.
 
     ``joined`` are the indices in ``channels`` of ``stations``.
@@ -548,7 +548,7 @@ def _adjust_scene(
         frame=f"station-{channels[joined[0]]}",
         notes=tuple(warning.message for warning in warnings),
     )
-    return SceneEstimate(estimated, facts, warnings)
+    return DeviceSceneEstimate(estimated, facts, warnings)
 
 
 def _initial_states(

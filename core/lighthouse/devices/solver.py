@@ -29,7 +29,7 @@ from locatk.core.lighthouse.devices.device_sweeps import (
     select_device_sweeps,
 )
 from locatk.core.lighthouse.devices.scene_initialization import (
-    SceneEstimate,
+    DeviceSceneEstimate,
     estimate_scene_from_devices,
 )
 from locatk.core.lighthouse.devices.tracking import (
@@ -123,7 +123,7 @@ def solve_devices(
         recording, or no station determines the pose of a device.
     """
     scene = scene or Scene()
-    estimate = SceneEstimate(scene, LighthouseFacts(), ())
+    estimate = DeviceSceneEstimate(scene, LighthouseFacts(), ())
     if not scene.stations:
         estimate = _estimate_scene(sweeps, receivers, scene)
     tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
@@ -201,7 +201,7 @@ def merge_solutions(rigid: Solution, photodiodes: Solution) -> Solution:
 
 def _estimate_scene(
     sweeps: Sweeps, receivers: Mapping[str, Receiver], scene: Scene
-) -> SceneEstimate:
+) -> DeviceSceneEstimate:
     """Estimate the stations from the devices."""
     channels = received_channels(sweeps, receivers)
     devices = [
