@@ -16,6 +16,7 @@ from locatk.cli.app import app
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
     "README.md",
+    "CONTRIBUTING.md",
     # The page of commands is made from the commands and has a test of its own.
     *(
         path.relative_to(ROOT).as_posix()

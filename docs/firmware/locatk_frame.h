@@ -1,6 +1,6 @@
-/* Frames of the locatk protocol, for firmware: README.md beside this file tells them byte by byte.
+/* Encoder for frames of the locatk protocol; README.md in this folder specifies them.
  *
- * C99 or C++11; no memory is allocated and nothing else is needed. Part of locatk, BSD-3-Clause.
+ * C99 or C++11, without memory allocation or other files. Part of locatk, BSD-3-Clause.
  *
  *     static uint8_t memory[LOCATK_MEMORY(200)];    // room for payloads up to 200 bytes
  *     static locatk_writer out;
@@ -34,7 +34,7 @@
 #define LOCATK_COUNTS 1
 #define LOCATK_TEMPERATURE 2
 
-/* The count that says that a sensor gave nothing; as a float, that is NAN. */
+/* Count of a sensor without a value or with a saturated one; the float for it is NAN. */
 #define LOCATK_MISSING (-32768)
 
 /* Levels of a text. */
@@ -44,12 +44,12 @@
 #define LOCATK_ERROR 4
 #define LOCATK_FATAL 5
 
-/* The longest payload, and the bytes of memory that payloads up to a size need. */
+/* Largest payload, and the bytes of memory for payloads up to a size. */
 #define LOCATK_LONGEST_PAYLOAD 4084
 #define LOCATK_MEMORY(payload) ((payload) + 15 + ((payload) + 14) / 253)
 
-/* Payloads: a text or HELLO of so many characters, samples of so many values (3 a magnetometer,
- * 1 a hall sensor, 3 an odometry), captures, sweeps. */
+/* Sizes of payloads: text or HELLO by its characters, samples by their values (3 per magnetometer,
+ * 1 per hall sensor, 3 per odometry pose), captures, sweeps. */
 #define LOCATK_TEXT_PAYLOAD(characters) ((characters) + 8)
 #define LOCATK_SERIES_PAYLOAD(samples, values) (12 + 4 * (samples) * ((values) + 1))
 #define LOCATK_CAPTURES_PAYLOAD(captures) (16 * (captures))
@@ -58,25 +58,25 @@
 /* A float must be an IEEE 754 number of 32 bits, as on every processor with an Arduino core. */
 typedef char locatk_float_has_32_bits[sizeof(float) == 4 ? 1 : -1];
 
-/* What makes the frames of one node; a gateway has one for each. */
+/* Writer of the frames of one node; a gateway has one for each node. */
 typedef struct {
-    uint8_t *memory;   /* where locatk_end() leaves a frame */
-    uint16_t lead;     /* content is put from here on: COBS makes it longer */
-    uint16_t end;      /* behind the last byte that was put */
-    uint16_t limit;    /* behind the last that has room */
-    uint16_t sequence; /* of the next frame */
+    uint8_t *memory;   /* the finished frame, after locatk_end() */
+    uint16_t lead;     /* start of the content; COBS needs the space before it */
+    uint16_t end;      /* after the last byte of the content */
+    uint16_t limit;    /* after the last byte that fits */
+    uint16_t sequence; /* number of the next frame */
     uint8_t node;
-    uint8_t full; /* something had no room */
+    uint8_t full; /* the content did not fit */
 } locatk_writer;
 
-/* node: 0 where there is one device behind the port, else which of them. */
+/* node: 0 if the port has one device, otherwise the number of the device. */
 static inline void locatk_init(locatk_writer *w, uint8_t *memory, size_t size, uint8_t node)
 {
     uint16_t most = LOCATK_MEMORY(LOCATK_LONGEST_PAYLOAD);
     uint16_t usable = size < most ? (uint16_t)size : most;
     w->memory = memory;
     w->lead = (uint16_t)(1 + usable / 254);
-    /* Behind the content there must be room for a CRC and the delimiter. */
+    /* CRC and delimiter follow the content. */
     w->limit = usable > w->lead + 5 ? (uint16_t)(usable - 5) : w->lead;
     if (w->limit > w->lead + LOCATK_LONGEST_PAYLOAD + 8)
         w->limit = (uint16_t)(w->lead + LOCATK_LONGEST_PAYLOAD + 8);
@@ -130,7 +130,7 @@ static inline void locatk_put_bytes(locatk_writer *w, const void *bytes, size_t 
     while (count--) locatk_put_u8(w, *from++);
 }
 
-/* Start a frame; tick: when its first sample was measured. */
+/* Start a frame; tick: time of its first sample. */
 static inline void locatk_begin(locatk_writer *w, uint8_t type, uint32_t tick)
 {
     w->end = w->lead;
@@ -141,7 +141,7 @@ static inline void locatk_begin(locatk_writer *w, uint8_t type, uint32_t tick)
     locatk_put_u32(w, tick);
 }
 
-/* CRC-16/CCITT-FALSE. The polynomial 0x1021 has few terms: a byte at a time needs no table. */
+/* CRC-16/CCITT-FALSE. The polynomial 0x1021 has few terms, so that a byte needs no table. */
 static inline uint16_t locatk_crc16(const uint8_t *bytes, size_t count)
 {
     uint16_t crc = 0xFFFF;
@@ -166,12 +166,12 @@ static inline uint32_t locatk_crc32(const uint8_t *bytes, size_t count)
     return ~crc;
 }
 
-/* Finish the frame: it stands at w->memory, and so many bytes of it are to be sent. 0 where it
- * had no room; its sequence number is gone all the same, so that the receiver sees the loss. */
+/* Finish the frame in w->memory and return the number of bytes to send. If the frame did not fit,
+ * return 0; its sequence number is used up, so that the receiver detects the loss. */
 static inline size_t locatk_end(locatk_writer *w)
 {
     uint8_t *out = w->memory;
-    uint8_t *code = out++; /* of the block that is being written */
+    uint8_t *code = out++; /* code byte of the current block */
     const uint8_t *from = w->memory + w->lead;
     uint16_t size = (uint16_t)(w->end - w->lead);
     w->sequence++;
@@ -183,14 +183,14 @@ static inline size_t locatk_end(locatk_writer *w)
         locatk_put_u32(w, locatk_crc32(from, size));
     w->limit = (uint16_t)(w->limit - 4);
     size = (uint16_t)(w->end - w->lead);
-    /* COBS moves the body to the front; what it writes never overtakes what it reads. */
+    /* COBS moves the content to the front; writing never overtakes reading. */
     while (size--) {
         uint8_t byte = *from++;
         if (byte) {
             *out++ = byte;
             if (out - code < 255) continue;
             *code = 255;
-            if (!size) { /* a full block at the end has no other after it */
+            if (!size) { /* a full block at the end needs no empty block after it */
                 *out++ = 0;
                 return (size_t)(out - w->memory);
             }
@@ -204,8 +204,8 @@ static inline size_t locatk_end(locatk_writer *w)
     return (size_t)(out - w->memory);
 }
 
-/* Who this is (name and version of the firmware) and how many ticks a second its clock counts.
- * To be sent first of all, and each second. */
+/* HELLO: name and version of the firmware, and ticks per second of its clock. Send it first, and
+ * then every second. */
 static inline size_t locatk_hello(locatk_writer *w, uint32_t tick, uint32_t tick_hz,
                                   const char *name)
 {
@@ -216,7 +216,7 @@ static inline size_t locatk_hello(locatk_writer *w, uint32_t tick, uint32_t tick
     return locatk_end(w);
 }
 
-/* A line for people, in UTF-8. */
+/* A line of text for the log, in UTF-8. */
 static inline size_t locatk_text(locatk_writer *w, uint32_t tick, uint8_t level,
                                  const char *words)
 {
@@ -226,10 +226,10 @@ static inline size_t locatk_text(locatk_writer *w, uint32_t tick, uint8_t level,
     return locatk_end(w);
 }
 
-/* Start a frame of MAGNETOMETERS, HALLS or ODOMETRY (whose `sensors` is 1), with `step` ticks
- * from one sample to the next. To be put then: with LOCATK_COUNTS the scale (f32, microtesla of
- * a count); sample by sample all values (f32, or i16 with LOCATK_COUNTS); with
- * LOCATK_TEMPERATURE the temperature of each sample (f32). */
+/* Start a frame of MAGNETOMETERS, HALLS or ODOMETRY (`sensors` is 1), with `step` ticks between
+ * two samples. Then put: with LOCATK_COUNTS the scale (f32, microtesla per count); sample by
+ * sample all values (f32, or i16 with LOCATK_COUNTS); with LOCATK_TEMPERATURE the temperature of
+ * each sample (f32). */
 static inline void locatk_series(locatk_writer *w, uint8_t type, uint32_t tick, uint8_t sensors,
                                  uint8_t samples, uint8_t flags, uint32_t step)
 {
@@ -241,7 +241,7 @@ static inline void locatk_series(locatk_writer *w, uint8_t type, uint32_t tick, 
     locatk_put_u32(w, step);
 }
 
-/* One record of a frame of LIGHTHOUSE_CAPTURE; polynomial: -1 where it is not known. */
+/* Put one record of a LIGHTHOUSE_CAPTURE frame; polynomial: -1 if unknown. */
 static inline void locatk_put_capture(locatk_writer *w, uint32_t tick, uint8_t sensor,
                                       int8_t polynomial, int8_t bit_offset, uint64_t bits)
 {
@@ -253,8 +253,8 @@ static inline void locatk_put_capture(locatk_writer *w, uint32_t tick, uint8_t s
     locatk_put_u64(w, bits);
 }
 
-/* One record of a frame of LIGHTHOUSE_SWEEP; polynomial, sweep: -1 where it is not known;
- * count_256: steps of the 6 MHz bit clock since the rotor's zero, times 256. */
+/* Put one record of a LIGHTHOUSE_SWEEP frame; polynomial, sweep: -1 if unknown; count_256: steps
+ * of the 6 MHz bit clock since rotor zero, times 256. */
 static inline void locatk_put_sweep(locatk_writer *w, uint32_t tick, uint8_t sensor,
                                     uint8_t channel, int8_t polynomial, int8_t sweep,
                                     uint32_t count_256)

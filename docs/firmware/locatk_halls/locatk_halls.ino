@@ -1,6 +1,6 @@
-// Four analog hall sensors under a robot, as `locatk capture PORT --device locatk` takes it.
+// Four analog hall sensors under a robot, for `locatk capture PORT --device locatk`.
 //
-// Needs no library but locatk (see README.md one folder up). Part of locatk, BSD-3-Clause.
+// Library: locatk (see README.md in the parent folder). Part of locatk, BSD-3-Clause.
 
 #include "locatk_frame.h"
 
@@ -8,18 +8,18 @@ const char NAME[] = "locatk_halls 1.0";
 const uint32_t BAUD = 115200;
 const uint8_t PINS[] = {A0, A1, A2, A3};  // front, left, rear, right
 const uint8_t SENSORS = sizeof PINS;
-const uint8_t SAMPLES = 5;                // in one frame
-const uint32_t PERIOD_US = 4000;          // from one sample to the next
-const int MIDDLE = 512;                   // what the converter reads without a field
-// Microtesla of a count, positive where the field points up; negate the counts below if your
-// sensors look the other way. DRV5055A2: 50 mV/mT at 5 V, read with 10 bits of 5 V.
+const uint8_t SAMPLES = 5;                // per frame
+const uint32_t PERIOD_US = 4000;          // between two samples
+const int MIDDLE = 512;                   // reading without a field
+// Microtesla per count, positive if the field points up; negate the counts below if your
+// sensors are mounted upside down. DRV5055A2: 50 mV/mT at 5 V, read with 10 bits of 5 V.
 const float SCALE = 1000.0f * 5000.0f / 1024.0f / 50.0f;
 
 uint8_t memory[LOCATK_MEMORY(LOCATK_SERIES_PAYLOAD(SAMPLES, SENSORS))];
 locatk_writer out;
 int16_t counts[SAMPLES][SENSORS];
 uint8_t taken;
-uint32_t first_us;  // when the first of the taken samples was due
+uint32_t first_us;  // time of the first sample of the frame
 uint32_t due_us;
 uint32_t greeted_ms;
 
@@ -51,8 +51,8 @@ void setup() {
 void loop() {
   if (millis() - greeted_ms >= 1000) greet();
   uint32_t late_us = micros() - due_us;
-  if (late_us >= 0x80000000) return;  // it is not late yet: the difference is negative
-  if (late_us >= PERIOD_US) {         // too late to stand in one even series with those before
+  if (late_us >= 0x80000000) return;  // not due yet: the difference is negative
+  if (late_us >= PERIOD_US) {         // too late for the even series of this frame
     sendSamples();
     due_us += late_us;
   }

@@ -1,7 +1,7 @@
-// A bar of MLX90393 magnetometers on SPI, as `locatk capture PORT --device locatk` takes it.
+// A bar of MLX90393 magnetometers on SPI, for `locatk capture PORT --device locatk`.
 //
-// Libraries: "Adafruit MLX90393", and locatk (see README.md one folder up). For other sensors
-// replace the three functions below that name them. Part of locatk, BSD-3-Clause.
+// Libraries: "Adafruit MLX90393", and locatk (see README.md in the parent folder). For other
+// sensors, replace the three ...Sensor functions below. Part of locatk, BSD-3-Clause.
 
 #include <Adafruit_MLX90393.h>
 #include <math.h>
@@ -10,8 +10,8 @@
 
 const char NAME[] = "locatk_magnetometers 1.0";
 const uint32_t BAUD = 115200;         // 50 frames of 9 sensors take 56 % of it; USB ignores it
-const uint32_t PERIOD_US = 20000;     // twice a conversion at least, which takes 8.4 ms here
-const uint8_t CHIP_SELECT[] = {2, 3, 4, 5, 7, 9, 10, 11, 15};  // pins, in the bar's order
+const uint32_t PERIOD_US = 20000;     // at least two conversions of 8.4 ms
+const uint8_t CHIP_SELECT[] = {2, 3, 4, 5, 7, 9, 10, 11, 15};  // pins, in the order of the bar
 const uint8_t SENSORS = sizeof CHIP_SELECT;
 
 Adafruit_MLX90393 sensors[SENSORS];
@@ -19,8 +19,8 @@ bool found[SENSORS];
 
 uint8_t memory[LOCATK_MEMORY(LOCATK_SERIES_PAYLOAD(1, 3 * SENSORS))];
 locatk_writer out;
-uint32_t due_us;      // when the next sample is
-uint32_t started_us;  // when the conversions that run now were started
+uint32_t due_us;      // time of the next sample
+uint32_t started_us;  // start of the running conversions
 uint32_t greeted_ms;
 
 bool beginSensor(uint8_t n) {
@@ -30,7 +30,7 @@ bool beginSensor(uint8_t n) {
 
 void startSensor(uint8_t n) { sensors[n].startSingleMeasurement(); }
 
-// Microtesla along the bar's axes: x forward, y left, z up.
+// Field in microtesla along the axes of the bar: x forward, y left, z up.
 bool readSensor(uint8_t n, float *xyz) { return sensors[n].readMeasurement(xyz, xyz + 1, xyz + 2); }
 
 void sendFrame(size_t length) { Serial.write(out.memory, length); }
@@ -49,7 +49,7 @@ void startAll() {
 void setup() {
   Serial.begin(BAUD);
   locatk_init(&out, memory, sizeof memory, 0);
-  // Until its sensor is set up a chip must not listen to what the others are told.
+  // Deselect all chips, so that none receives commands for another one.
   for (uint8_t n = 0; n < SENSORS; n++) {
     pinMode(CHIP_SELECT[n], OUTPUT);
     digitalWrite(CHIP_SELECT[n], HIGH);
@@ -72,7 +72,7 @@ void setup() {
 void loop() {
   if (millis() - greeted_ms >= 1000) greet();
   uint32_t late_us = micros() - due_us;
-  if (late_us >= 0x80000000) return;  // it is not late yet: the difference is negative
+  if (late_us >= 0x80000000) return;  // not due yet: the difference is negative
   due_us += late_us < PERIOD_US / 2 ? PERIOD_US : late_us + PERIOD_US;
 
   locatk_series(&out, LOCATK_MAGNETOMETERS, started_us, SENSORS, 1, 0, 0);
@@ -81,6 +81,6 @@ void loop() {
     bool valid = found[n] && readSensor(n, xyz);
     for (uint8_t axis = 0; axis < 3; axis++) locatk_put_f32(&out, valid ? xyz[axis] : NAN);
   }
-  startAll();  // the next conversions run while this frame is sent
+  startAll();  // convert while this frame is sent
   sendFrame(locatk_end(&out));
 }
