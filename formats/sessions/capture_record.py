@@ -9,7 +9,7 @@ from dataclasses import fields
 from typing import Any
 
 from locatk.formats.capture.statistics import RECORD, Totals
-from locatk.formats.sessions.mcap_records import Segment
+from locatk.formats.sessions.mcap_file import Segment
 from locatk.formats.sessions.reader import Session
 
 MOST_READ = 16 << 20

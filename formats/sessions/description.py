@@ -23,7 +23,7 @@ from locatk.formats.sessions import capture_record as captured
 from locatk.formats.sessions import frames, halls
 from locatk.formats.sessions import magnetometers as arrays
 from locatk.formats.sessions.field_samples import Kind, NoGeometryError
-from locatk.formats.sessions.mcap_records import DamageError
+from locatk.formats.sessions.mcap_file import DamageError
 from locatk.formats.sessions.reader import Session
 
 

@@ -29,9 +29,9 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
 from locatk.formats import images
 from locatk.formats.artifacts import sheets
-from locatk.formats.sessions.message_index import Place, Places
+from locatk.formats.sessions.mcap_file import MessagePosition
 from locatk.formats.sessions.messages import timestamp
-from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.reader import RandomAccess, Session
 from locatk.formats.sessions.trajectories import (
     Timed,
     check_devices,
@@ -100,15 +100,15 @@ def read_frames(session: Session) -> list[Frames]:
             hint="Make one with `locatk import images` or `locatk import video`",
         )
     names = _names(session)
-    places = Places(session)
+    places = RandomAccess(session)
     return [_camera_frames(session, places, topic, names) for topic in sorted(topics)]
 
 
 def _camera_frames(
-    session: Session, places: Places, topic: str, names: Mapping[str, tuple[str, ...]]
+    session: Session, places: RandomAccess, topic: str, names: Mapping[str, tuple[str, ...]]
 ) -> Frames:
     device = topic.removeprefix(TOPIC)
-    found = sorted(places.of(topic), key=lambda place: place.time_ns)
+    found = sorted(places.positions(topic), key=lambda place: place.time_ns)
     own = names.get(device)
     if own is not None and len(own) != len(found):
         raise FormatError(
@@ -151,9 +151,9 @@ class _Images(Sequence[NDArray[np.uint8]]):
     def __init__(
         self,
         session: Session,
-        places: Places,
+        places: RandomAccess,
         topic: str,
-        found: Sequence[Place],
+        found: Sequence[MessagePosition],
         names: Sequence[str],
     ) -> None:
         self._session = session

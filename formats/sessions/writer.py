@@ -14,15 +14,10 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from locatk.core.errors import InputError
 from locatk.formats.output import atomic_write, tool_version
-from locatk.formats.sessions.reader import RECORD
+from locatk.formats.sessions.mcap_file import CHANNELS_RECORD, SESSION_RECORD
 
 PROFILE = "locatk"
 FORMAT_VERSION = "1"
-
-CHANNELS = "channels"
-"""Name of the metadata record of a live recording that tells its channels: id to topic and
-schema. Should the chunk that introduces a channel be damaged, its messages are none the less
-known."""
 
 
 class SessionWriter:
@@ -46,7 +41,7 @@ class SessionWriter:
         Replace an existing file.
     live : stream, optional
         Write to this open binary file, which is not closed, instead of to ``path``; tell the
-        channels in the metadata record :data:`CHANNELS`, too.
+        channels in the metadata record :data:`CHANNELS_RECORD`, too.
 
     Raises
     ------
@@ -84,7 +79,7 @@ class SessionWriter:
         stream = self._output.__enter__()
         self._writer = Writer(stream, compression=CompressionType.ZSTD)
         self._writer.start(profile=PROFILE, library=f"locatk {tool_version()}")
-        self.metadata(RECORD, self._record)
+        self.metadata(SESSION_RECORD, self._record)
         return self
 
     def __exit__(
@@ -159,7 +154,7 @@ class SessionWriter:
             )
         channel: int = self._open_writer.register_channel(topic, "protobuf", self._schemas[name])
         if self._live:
-            self.metadata(CHANNELS, {str(channel): f"{topic} {name}"})
+            self.metadata(CHANNELS_RECORD, {str(channel): f"{topic} {name}"})
         return channel
 
     def attach(self, name: str, data: bytes, media_type: str, time_ns: int = 0) -> None:

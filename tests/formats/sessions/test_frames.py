@@ -24,7 +24,7 @@ from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
 from locatk.formats import images
-from locatk.formats.sessions import frames, mcap_records, observations
+from locatk.formats.sessions import frames, mcap_file, observations
 from locatk.formats.sessions.frames import Shot
 from locatk.formats.sessions.reader import Session
 
@@ -95,14 +95,14 @@ def test_opening_reads_no_image_and_a_walk_unpacks_each_chunk_once(
     path = tmp_path / "run.mcap"
     frames.write_session(path, [camera_frames(130)], MANIFEST)
     unpacked: list[int] = []
-    unpack = mcap_records.unpacked
+    unpack = mcap_file.read_segment
 
     def counted(stream, segment):  # type: ignore[no-untyped-def]
         data = unpack(stream, segment)
         unpacked.append(len(data))
         return data
 
-    monkeypatch.setattr(mcap_records, "unpacked", counted)
+    monkeypatch.setattr(mcap_file, "read_segment", counted)
     (found,) = read(path)
     assert unpacked == []
     for _ in found.images:

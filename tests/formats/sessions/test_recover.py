@@ -21,11 +21,11 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from locatk.core.errors import FormatError, LocatkError, MissingDataError, OutputExistsError
 from locatk.formats.schemas.magnetics_pb2 import MagnetometerArray
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions.mcap_records import MAGIC, frames
+from locatk.formats.sessions.mcap_file import MAGIC, iter_records
 from locatk.formats.sessions.messages import timestamp
 from locatk.formats.sessions.reader import Session
-from locatk.formats.sessions.recovery import rewriting as mcap_rewrite
-from locatk.formats.sessions.recovery.recover import Recovered, left_in, recover
+from locatk.formats.sessions.recovery import recover as recovery
+from locatk.formats.sessions.recovery.recover import Recovered, Rewriter, recover
 
 START_NS = 1_700_000_000_000_000_000
 CHUNKS = 24
@@ -126,8 +126,8 @@ def whole(path: Path) -> Whole:
     """The recording at ``path``, taken apart."""
     data = path.read_bytes()
     spans: dict[int, list[tuple[int, int]]] = {}
-    for opcode, offset, content in frames(data[len(MAGIC) : -len(MAGIC)], len(MAGIC)):
-        spans.setdefault(opcode, []).append((offset, offset + 9 + len(content)))
+    for opcode, start, end in iter_records(data[: -len(MAGIC)][len(MAGIC) :], 0):
+        spans.setdefault(opcode, []).append((start + len(MAGIC) - 9, end + len(MAGIC)))
     left = iter(stock(path))
     messages: list[list[Flat]] = []
     with path.open("rb") as stream:
@@ -181,7 +181,7 @@ def check(
     assert damaged.read_bytes() == data
     if result is None:
         # The first chunk says what the messages are; that may be left nowhere else.
-        assert not intact or (0 not in intact and "that says what" in error)
+        assert not intact or (0 not in intact and "nothing identifies" in error)
         assert "\n" not in error
         assert not output.exists()
         return None
@@ -405,7 +405,7 @@ def test_the_chunk_that_names_the_channels_is_lost(good: Whole, tmp_path: Path, 
     data[start + 100] ^= 1
     path.write_bytes(data)
     if not told:
-        with pytest.raises(FormatError, match=r"what its \d+ messages are"):
+        with pytest.raises(FormatError, match=r"channels of all its \d+ messages"):
             recover(path, output)
         assert sorted(tmp_path.iterdir()) == [path]
         return
@@ -414,8 +414,9 @@ def test_the_chunk_that_names_the_channels_is_lost(good: Whole, tmp_path: Path, 
     assert (result.orphans, result.nameless) == (0, ())
     session = Session.open(output)
     assert len(list(session.decoded("/serial/bar", SerialChunk))) == 10 * (CHUNKS - 1)
-    assert left_in(path, "broken").damage == "broken"
-    assert left_in(path, "broken").channels[0].schema == "locatk.SerialChunk"
+    rest = Session.open(path, damaged_ok=True)
+    assert rest.damage
+    assert rest.channels[0].schema == "locatk.SerialChunk"
     named = session.metadata()["channels"]
     channels = {str(each.id): each.topic for each in session.index.channels.values()}
     assert {key: text.split()[0] for key, text in named.items()} == channels
@@ -438,7 +439,7 @@ def test_names_that_name_nothing(good: Whole, tmp_path: Path, names: dict[str, s
         writer.add_metadata("channels", names)
         start, end = good.chunks[1]
         stream.write(good.data[start:end])
-    with pytest.raises(FormatError, match="messages are"):
+    with pytest.raises(FormatError, match="channels of all its"):
         recover(tmp_path / "a.mcap", tmp_path / "out.mcap")
 
 
@@ -521,15 +522,15 @@ def test_what_cannot_be_read_back_does_not_appear(
     """A disk that keeps something else."""
     path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
     path.write_bytes(good.data)
-    read_back = mcap_rewrite.check
+    read_back = recovery.verify
 
-    def rotten(part: str, copy: mcap_rewrite.Copy) -> None:
+    def rotten(part: str, copy: Rewriter) -> None:
         with open(part, "r+b") as stream:
             stream.seek(5000)
             stream.write(b"rotten")
         read_back(part, copy)
 
-    monkeypatch.setattr(mcap_rewrite, "check", rotten)
+    monkeypatch.setattr(recovery, "verify", rotten)
     with pytest.raises(LocatkError, match="cannot be read back") as caught:
         recover(path, output)
     assert caught.value.exit_status == 1
@@ -540,13 +541,13 @@ def test_a_file_that_changes_meanwhile(
     good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
-    register = mcap_rewrite.Copy._register
+    register = Rewriter._register
 
-    def change(copy: mcap_rewrite.Copy, channel: object) -> None:
+    def change(copy: Rewriter, channel: object) -> None:
         path.write_bytes(path.read_bytes()[:20_000])
         register(copy, channel)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(mcap_rewrite.Copy, "_register", change)
+    monkeypatch.setattr(Rewriter, "_register", change)
     for options in ({}, {"use_chunking": False}):
         write(path, **options)
         with pytest.raises(FormatError):

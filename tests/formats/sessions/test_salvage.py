@@ -14,8 +14,8 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from locatk.formats.sessions.mcap_records import MAGIC, frames, read_messages
-from locatk.formats.sessions.recovery import validation as mcap_proof
+from locatk.formats.sessions.mcap_file import MAGIC, iter_records, read_messages
+from locatk.formats.sessions.recovery import validation
 from locatk.formats.sessions.recovery.salvage import Loss, Salvage, salvage
 
 NONE = mcap.writer.CompressionType.NONE
@@ -56,8 +56,8 @@ def spans(data: bytes, kind: Opcode) -> list[tuple[int, int]]:
     """(start, end) of the records of one kind in a whole file."""
     inside = data[len(MAGIC) : -len(MAGIC) if data.endswith(MAGIC) else len(data)]
     return [
-        (offset, offset + 9 + len(content))
-        for opcode, offset, content in frames(inside, len(MAGIC))
+        (start + len(MAGIC) - 9, end + len(MAGIC))
+        for opcode, start, end in iter_records(inside, 0)
         if opcode == kind
     ]
 
@@ -82,7 +82,7 @@ ALL = [0, 1, 100, 101, 200, 201]
 def test_a_whole_file_is_whole() -> None:
     found, left = times(file(extra=attach("a.txt", b"abc")))
     assert left == ALL
-    assert (found.losses, found.beside, found.copies, found.tail) == ([], [], 0, 0)
+    assert (found.losses, found.index_losses, found.copies, found.tail) == ([], [], 0, 0)
     assert found.ended
     assert found.statistics is not None
     assert found.index.header.library == "tests"
@@ -123,7 +123,7 @@ def test_wild_lengths(value: int) -> None:
 
     data = file(extra=extra)
     places = [
-        offset + 1 for opcode, offset, _ in frames(data[8:-8], 8) if opcode != Opcode.DATA_END
+        start for opcode, start, _ in iter_records(data[8:-8], 0) if opcode != Opcode.DATA_END
     ]
     for kind in (Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA):
         start, end = spans(data, kind)[1]
@@ -144,7 +144,7 @@ def chunk(packed: bytes, size: int, crc: int, compression: bytes) -> bytes:
 
 
 def test_bombs_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_proof, "LARGEST_RECORD", 1 << 20)
+    monkeypatch.setattr(validation, "MAX_RECORD_BYTES", 1 << 20)
     zeros = bytes(8 << 20)
     writer = zstandard.ZstdCompressor(write_content_size=False)
     for packed, name in (
@@ -263,6 +263,19 @@ def test_what_was_moved_is_still_verified() -> None:
     assert left == [0, 1, 200, 201]
     assert found.statistics is not None
     assert found.statistics.message_count == 6
+
+
+def test_a_summary_with_a_wrong_checksum_is_ignored() -> None:
+    data = bytearray(file())
+    start, end = spans(bytes(data), Opcode.STATISTICS)[0]
+    data[start + 9] ^= 2  # the number of messages; all lengths still agree
+    found, left = times(bytes(data))
+    assert left == ALL
+    assert found.statistics is None
+    assert not found.losses
+    assert [(loss.what, loss.end) for loss in found.index_losses] == [
+        ("index", len(data) - len(MAGIC))
+    ]
 
 
 # ---- messages outside chunks
