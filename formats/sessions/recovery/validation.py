@@ -20,12 +20,13 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from mcap import records
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
 from locatk.formats.sessions.mcap_file import (
     MAGIC,
     MESSAGE_HEAD,
+    PARSE_ERRORS,
     RECORD_HEAD,
     DamageError,
     decompress,
@@ -191,7 +192,7 @@ class DamagedFile:
             log_ns, create_ns = stream.read8(), stream.read8()
             name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
             size = stream.read8()
-        except (McapError, struct.error, ValueError):
+        except PARSE_ERRORS:
             return None
         is_valid = length == stream.count + size + 4
         return AttachmentHead(log_ns, create_ns, name, media_type, size) if is_valid else None
@@ -326,7 +327,7 @@ def _parse_filling(reader: Callable[[ReadDataStream], Any], source: IO[bytes], l
     stream = _StrictStream(source, length)
     try:
         record = reader(stream)
-    except (McapError, struct.error, ValueError, MemoryError, OverflowError):
+    except PARSE_ERRORS:
         return None
     return record if stream.count == length else None
 
