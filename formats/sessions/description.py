@@ -1,5 +1,7 @@
-"""What `locatk info` says of dots, polaris and landmarks: artifacts and recordings, as plain
-values."""
+"""Descriptions of artifacts and recordings of dots, polaris and landmarks for `locatk info`.
+
+They consist of plain values for JSON, in the units of the artifacts' files.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +22,21 @@ from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import maps, sheets
 from locatk.formats.artifacts import tags as tag_files
 from locatk.formats.sessions import capture_record as captured
-from locatk.formats.sessions import frames, halls
-from locatk.formats.sessions import magnetometers as arrays
-from locatk.formats.sessions.field_samples import Kind, NoGeometryError
+from locatk.formats.sessions import frames
+from locatk.formats.sessions.field_samples import (
+    HALLS,
+    MAGNETOMETERS,
+    MissingGeometryError,
+    SensorKind,
+    read_halls,
+    read_magnetometers,
+)
 from locatk.formats.sessions.mcap_file import DamageError
 from locatk.formats.sessions.reader import Session
 
 
 def manifest(found: Manifest) -> dict[str, Any]:
-    """How the sheets of a manifest were printed, and where they are."""
+    """Describe how the sheets of a manifest were printed, and their positions."""
     return {
         "codec": found.codec,
         "pitch_mm": found.pitch_mm,
@@ -56,28 +64,30 @@ def manifest(found: Manifest) -> dict[str, Any]:
 
 
 def camera(found: Camera) -> dict[str, Any]:
-    """A camera, and by how much its lens moves a corner of the frame."""
+    """Describe a camera, and the largest displacement of a corner of the frame by its lens."""
     width, height = found.size
     corners = np.array([(x, y) for x in (0, width - 1) for y in (0, height - 1)], float)
-    moved = np.linalg.norm(found.undistort(corners) - corners, axis=1).max()
+    displacement = np.linalg.norm(found.undistort(corners) - corners, axis=1).max()
     return {
         "size_px": found.size,
         "focal_px": found.focal_px,
         "centre_px": found.centre_px,
         "radial": found.radial,
-        "distortion_px": float(moved),
+        "distortion_px": float(displacement),
     }
 
 
 def damage(session: Session, error: LocatkError) -> dict[str, Any]:
-    """What is wrong with a session of which something could not be read, and whether it is
-    the file, of which `locatk recover` saves the rest."""
-    broken = session.damage is not None or isinstance(error.__context__, DamageError)
-    return {"damage": session.damage or error.message, "recoverable": broken}
+    """Describe the damage of a session that could not be read completely.
+
+    It is recoverable if the MCAP file is damaged, of which `locatk recover` saves the rest.
+    """
+    is_file_damaged = session.damage is not None or isinstance(error.__context__, DamageError)
+    return {"damage": session.damage or error.message, "recoverable": is_file_damaged}
 
 
 def dots(session: Session) -> dict[str, Any]:
-    """Frames, sheets and camera of a session; what is damaged is left out and said.
+    """Describe frames, sheets and camera of a session; damaged contents are left out and reported.
 
     A solution has sheets and no frames.
     """
@@ -93,20 +103,20 @@ def dots(session: Session) -> dict[str, Any]:
         if topics and not captured.is_few(session, topics):
             described |= _counted_frames(session, topics)
         elif topics:
-            found = frames.read_frames(session)
+            cameras = frames.read_frames(session)
             described["cameras"] = [
                 {"device": each.device, "frames": len(each), "size_px": _size(each.images)}
-                for each in found
+                for each in cameras
             ]
-            described["devices"] = [each.device for each in found]
-            described["frames"] = sum(map(len, found))
+            described["devices"] = [each.device for each in cameras]
+            described["frames"] = sum(map(len, cameras))
     except LocatkError as error:
         described |= damage(session, error)
     return described
 
 
 def _counted_frames(session: Session, topics: list[str]) -> dict[str, Any]:
-    """Frames of a large session, none of them looked at."""
+    """Describe the frames of a large session without reading any."""
     cameras = [
         {
             "device": topic.removeprefix(frames.TOPIC),
@@ -124,7 +134,7 @@ def _counted_frames(session: Session, topics: list[str]) -> dict[str, Any]:
 
 
 def _size(images: Any) -> list[int] | None:
-    """(width, height) of the first frame, None where there is none or it cannot be read."""
+    """Return (width, height) of the first frame; None without one, or if it cannot be read."""
     if not len(images):
         return None
     try:
@@ -135,7 +145,7 @@ def _size(images: Any) -> list[int] | None:
 
 
 def tags(found: Tags) -> dict[str, Any]:
-    """The design of tags, and what is known of each."""
+    """Describe the design of tags, and the known measurements of each."""
     magnet = found.magnet
     numbers = set(found.ids or ()) | set(found.built) | set(found.site)
     return {
@@ -162,7 +172,7 @@ def tags(found: Tags) -> dict[str, Any]:
 
 def _tag(found: Tags, number: int) -> dict[str, Any]:
     layout = codec.layout_of(found, number)
-    built, place = found.built.get(number), found.site.get(number)
+    built, pose = found.built.get(number), found.site.get(number)
     return {
         "id": number,
         "cells": layout.cells,
@@ -170,13 +180,13 @@ def _tag(found: Tags, number: int) -> dict[str, Any]:
         "passes": None if built is None else built.passes,
         "offset_mm": None if built is None else 1e3 * built.offset_m,
         "angle_deg": None if built is None else np.degrees(built.angle_rad),
-        "position_mm": None if place is None else [1e3 * place.x_m, 1e3 * place.y_m],
-        "heading_deg": None if place is None else float(np.degrees(place.heading_rad)),
+        "position_mm": None if pose is None else [1e3 * pose.x_m, 1e3 * pose.y_m],
+        "heading_deg": None if pose is None else float(np.degrees(pose.heading_rad)),
     }
 
 
 def array(found: SensorArray) -> dict[str, Any]:
-    """Where the sensors of an array sit, and how they measure; None where unknown."""
+    """Describe positions and properties of the sensors of an array."""
     return {
         "sensor": found.sensor,
         "sensors": len(found),
@@ -189,56 +199,63 @@ def array(found: SensorArray) -> dict[str, Any]:
 
 
 def polaris(session: Session) -> dict[str, Any]:
-    """Samples, arrays and tags of a session; what is damaged is left out and said.
+    """Describe samples, arrays and tags of a session; damaged contents are left out and reported.
 
     A solution has tags and no samples.
     """
-    return _described(
-        session, tag_files.attached_tags, tags, "arrays", arrays, lambda each: each.array, array
+    return _describe_samples(
+        session,
+        tag_files.attached_tags,
+        tags,
+        "arrays",
+        MAGNETOMETERS,
+        lambda: [(each, array(each.array)) for each in read_magnetometers(session)],
+        array,
     )
 
 
-def _described(
+def _describe_samples(
     session: Session,
-    attached: Callable[[Session], Any],
-    told: Callable[[Any], dict[str, Any]],
-    name: str,
-    samples: Any,
-    geometry: Callable[[Any], Any],
-    sensors: Callable[[Any], dict[str, Any]],
+    read_artifact: Callable[[Session], Any],
+    describe_artifact: Callable[[Any], dict[str, Any]],
+    key: str,
+    kind: SensorKind[Any],
+    read_samples: Callable[[], list[tuple[Samples | HallSamples, dict[str, Any]]]],
+    describe_sensors: Callable[[Any], dict[str, Any]],
 ) -> dict[str, Any]:
-    """What is ``attached``, as it is ``told``, and the samples that the module ``samples``
-    reads, under ``name``, with the ``sensors`` whose ``geometry`` they have. Of a large session
-    the samples are not read, nor where a device has none."""
+    """Describe the artifact and the samples of a session.
+
+    Samples are read only if they are few and every device has some; ``read_samples`` returns
+    them with the description of their sensors. Their descriptions get the name ``key``.
+    """
     described: dict[str, Any] = {}
-    kind = samples.KIND
     try:
-        known = attached(session)
-        if known is not None:
-            described |= told(known)
-        topics = session.topics(kind.topic, kind.schema)
-        small = captured.is_small(session, topics)
-        if topics and small and all(captured.messages(session, topic) for topic in topics):
-            found = samples.read_samples(session)
-            described[name] = [{**_recorded(each), **sensors(geometry(each))} for each in found]
-            described["samples"] = sum(map(len, found))
+        artifact = read_artifact(session)
+        if artifact is not None:
+            described |= describe_artifact(artifact)
+        topics = kind.topics(session)
+        is_small = captured.is_small(session, topics)
+        if topics and is_small and all(captured.messages(session, topic) for topic in topics):
+            recordings = read_samples()
+            described[key] = [{**_recorded(each), **sensors} for each, sensors in recordings]
+            described["samples"] = sum(len(each) for each, _ in recordings)
         elif topics:
             entries = [_unread(session, kind, topic) for topic in topics]
-            described[name] = [{**entry, **sensors(known)} for entry, known in entries]
+            described[key] = [{**entry, **describe_sensors(known)} for entry, known in entries]
             counts = [entry["samples"] for entry, _ in entries]
             described["samples"] = None if None in counts else sum(counts)
-            described["unread_bytes"] = None if small else captured.held_bytes(session, topics)
+            described["unread_bytes"] = None if is_small else captured.held_bytes(session, topics)
         if topics:
-            described["devices"] = [each["device"] for each in described[name]]
-    except NoGeometryError as error:
+            described["devices"] = [each["device"] for each in described[key]]
+    except MissingGeometryError as error:
         described["notes"] = [f"{error.message}. {error.hint}"]
     except LocatkError as error:
         described |= damage(session, error)
     return described
 
 
-def _unread(session: Session, kind: Kind[Any], topic: str) -> tuple[dict[str, Any], Any]:
-    """What is known of a device's samples before reading them, and its geometry."""
+def _unread(session: Session, kind: SensorKind[Any], topic: str) -> tuple[dict[str, Any], Any]:
+    """Describe the samples of a device without reading them; return also its geometry."""
     device = topic.removeprefix(kind.topic)
     geometry = kind.attached(session, device)
     if geometry is None:
@@ -264,14 +281,14 @@ def _recorded(found: Samples | HallSamples) -> dict[str, Any]:
 
 
 def floor(found: FloorMap) -> dict[str, Any]:
-    """A map of landmarks: its design, what lies where, and how it was really laid."""
-    geometry, laid = found.geometry, found.codes[found.codes != HOLE_CODE]
-    numbers = PATTERN_OF[laid]
+    """Describe a map of landmarks: its design, its cells, and the landmarks as built."""
+    geometry, codes = found.geometry, found.codes[found.codes != HOLE_CODE]
+    numbers = PATTERN_OF[codes]
     return {
         "name": found.name or None,
         "rows": found.shape[0],
         "columns": found.shape[1],
-        "landmarks": len(laid),
+        "landmarks": len(codes),
         "patterns": {
             letters: int(np.count_nonzero(numbers == number))
             for number, letters in enumerate(PATTERNS, 1)
@@ -312,7 +329,7 @@ def floor(found: FloorMap) -> dict[str, Any]:
 
 
 def hall_sensors(found: HallSensors) -> dict[str, Any]:
-    """Where hall sensors sit, and how they measure; None where unknown."""
+    """Describe positions and properties of hall sensors."""
     return {
         "sensor": found.sensor,
         "sensors": len(found),
@@ -324,10 +341,16 @@ def hall_sensors(found: HallSensors) -> dict[str, Any]:
 
 
 def landmarks(session: Session) -> dict[str, Any]:
-    """Samples, hall sensors and map of a session; what is damaged is left out and said.
+    """Describe samples, sensors and map of a session; damaged contents are left out and reported.
 
     A solution has a map and no samples.
     """
-    return _described(
-        session, maps.attached_map, floor, "halls", halls, lambda each: each.sensors, hall_sensors
+    return _describe_samples(
+        session,
+        maps.attached_map,
+        floor,
+        "halls",
+        HALLS,
+        lambda: [(each, hall_sensors(each.sensors)) for each in read_halls(session)],
+        hall_sensors,
     )

@@ -28,9 +28,7 @@ from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-from locatk.formats.sessions import foxglove as viewers
-from locatk.formats.sessions import frames
-from locatk.formats.sessions import point_clouds as viewer_points
+from locatk.formats.sessions import foxglove, frames
 from locatk.formats.sessions.solutions import write_solution
 
 START_NS = 1_700_000_000_000_000_000
@@ -237,25 +235,25 @@ def test_points_show_path_and_artifact(solved: tuple[str, Path]) -> None:
     elif system == "dots":  # the paper
         assert np.allclose([low, high], [[0, 0, 0], [0.21, 0.297, 0]], atol=1e-6)
     elif system == "polaris":
-        assert len(artifact) == 2 * (5 + viewer_points.POINTS_A_LINE)
+        assert len(artifact) == 2 * (5 + foxglove.POINTS_PER_LINE)
     elif system == "landmarks":
         assert len(artifact) == 16  # bars
 
 
 def test_a_device_named_as_its_frame_has_a_frame_of_its_own() -> None:
     each = track("map", "map")
-    [transform, *_] = [message for *_, message in viewers.transforms("/tf", each)]
+    [transform, *_] = [message for *_, message in foxglove.transforms("/tf", each)]
     assert (transform.parent_frame_id, transform.child_frame_id) == ("map", "map_body")
 
 
 def test_sheets_whose_places_are_not_known_are_frames_apart() -> None:
     """Nothing tells where one lies against the other, so nothing is claimed."""
-    scene = viewers.scene_update(TILES, [], START_NS)
+    scene = foxglove.scene_update(TILES, [], START_NS)
     assert {entity.id: entity.frame_id for entity in scene.entities} == {
         "sheet/a": "a",
         "sheet/b": "floor",
     }
-    assert set(viewer_points.artifact_points(scene, START_NS)) == {"a", "floor"}
+    assert set(foxglove.artifact_points(scene, START_NS)) == {"a", "floor"}
 
 
 def test_without_poses_the_artifact_is_there(tmp_path: Path) -> None:

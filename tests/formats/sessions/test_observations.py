@@ -479,12 +479,12 @@ def test_a_damaged_statement(tmp_path: Path, text: bytes) -> None:
 
 def test_poses_of_another_tool(tmp_path: Path) -> None:
     """PoseInFrame of anybody serves as truth and as estimate."""
-    from locatk.formats.sessions import foxglove as viewers
+    from locatk.formats.sessions import foxglove
 
     track = make_trajectory(20)
     path = tmp_path / "other.mcap"
     with SessionWriter(path, system="lighthouse") as writer:
-        for time_ns, topic, message in reversed(list(viewers.poses("/truth/R", track))):
+        for time_ns, topic, message in reversed(list(foxglove.poses("/truth/R", track))):
             writer.write(topic, message, time_ns)
             writer.write("/pose/R", message, time_ns)
     (truth,) = observations.read_truth(Session.open(path))

@@ -267,7 +267,7 @@ def test_what_was_moved_is_still_verified() -> None:
 
 def test_a_summary_with_a_wrong_checksum_is_ignored() -> None:
     data = bytearray(file())
-    start, end = spans(bytes(data), Opcode.STATISTICS)[0]
+    [(start, _)] = spans(bytes(data), Opcode.STATISTICS)
     data[start + 9] ^= 2  # the number of messages; all lengths still agree
     found, left = times(bytes(data))
     assert left == ALL
