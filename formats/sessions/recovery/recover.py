@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from google.protobuf.message import DecodeError
 from mcap.opcode import Opcode
@@ -31,9 +31,7 @@ from locatk.formats.sessions.mcap_file import (
     iter_records,
     parse,
     read_attachment,
-    read_messages,
     read_segment,
-    read_summary,
 )
 from locatk.formats.sessions.reader import open_mcap
 from locatk.formats.sessions.recovery.salvage import Loss, Salvage, salvage
@@ -194,7 +192,8 @@ def recover(
         writer.finish()
         stream.flush()
         try:
-            verify(stream.name, rewriter)
+            with open(stream.name, "rb") as written:
+                verify(written, rewriter)
         except DamageError as damage:
             raise LocatkError(
                 f"the output cannot be read back ({damage})",
@@ -353,27 +352,20 @@ class Rewriter:
         self._next_byte[new_id] = chunk.byte_offset + len(chunk.data)
 
 
-def verify(path: str, rewriter: Rewriter) -> None:
+def verify(stream: IO[bytes], rewriter: Rewriter) -> None:
     """Read back everything that was written.
 
     Raises
     ------
     DamageError
-        It cannot be read, or differs in number from what was written.
+        It is damaged, or differs in number from what was written.
     """
-    counts: Counter[int] = Counter()
-    with open(path, "rb") as stream:
-        index = read_summary(stream)
-        if index is None:
-            raise DamageError("the index is incomplete")
-        for segment in index.segments:
-            messages = read_messages(stream, segment, index.channels)
-            counts.update(channel for channel, _, _ in messages)
-        for entry in index.attachments:
-            read_attachment(stream, entry.offset)
-    if counts != rewriter.counts or index.counts != rewriter.counts:
+    found = salvage(stream)
+    if not found.is_whole:
+        raise DamageError("the file is damaged")
+    if found.index.counts != rewriter.counts:
         raise DamageError("other messages than were written")
-    if len(index.attachments) != rewriter.attachments:
+    if len(found.index.attachments) != rewriter.attachments:
         raise DamageError("other attachments than were written")
 
 
@@ -430,7 +422,7 @@ def _summarize(source: str, output: str, found: Salvage, rewriter: Rewriter) -> 
         losses=tuple(found.losses),
         tail=found.tail,
         ended=found.ended,
-        damaged=bool(found.losses or found.index_losses or found.copies or not found.ended),
+        damaged=not found.is_whole,
         complete=found.ended and is_intact and not rewriter.orphans,
     )
 

@@ -11,8 +11,8 @@ single flipped bit turns a message index into a message.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-import pkgutil
 import struct
 import zlib
 from collections import Counter
@@ -20,12 +20,14 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import IO, Any
 
+from google.protobuf import descriptor_pool
 from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
 from mcap import records
 from mcap.opcode import Opcode
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from locatk.formats import schemas
+from locatk.formats.schemas import lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2
 from locatk.formats.sessions.mcap_file import (
     CHANNELS_RECORD,
     MAGIC,
@@ -50,6 +52,9 @@ _WITH_CHECKSUM = (Opcode.CHUNK, Opcode.ATTACHMENT)
 _ANCHORS = (*_WITH_CHECKSUM, Opcode.METADATA, Opcode.DATA_END, Opcode.FOOTER)
 _ANCHORS_WITHOUT_CHUNKS = (*_ANCHORS, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Kinds of records at which a search may end, in files with chunks and without."""
+
+SCHEMAS = (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2)
+"""Modules whose import registers the messages of locatk in the descriptor pool."""
 
 MAX_CHANNEL_DIGITS = 5
 """Digits of the largest channel id, 65,535."""
@@ -124,6 +129,11 @@ class Salvage:
         """Number of unusable bytes at the end of a file that was not finished."""
         last = self.losses[-1] if self.losses and not self.ended else None
         return len(last) if last is not None and last.end == self.size else 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Nothing is damaged, not even the index."""
+        return self.ended and not (self.losses or self.index_losses or self.copies)
 
     @property
     def is_empty(self) -> bool:
@@ -270,19 +280,10 @@ class _Search:
         return end
 
     def _accept_attachment(self, position: int, end: int) -> int | None:
-        head = self._file.attachment_head(position)
-        if head is None or not self._file.is_attachment_intact(position, end):
+        entry = self._file.attachment_head(position)
+        if entry is None or not self._file.is_attachment_intact(position, end):
             return None
         self._is_verified = True
-        entry = records.AttachmentIndex(
-            offset=position,
-            length=end - position,
-            log_time=head.log_ns,
-            create_time=head.create_ns,
-            data_size=head.size,
-            name=head.name,
-            media_type=head.media_type,
-        )
         known = self._result.index.attachments
         if self._in_data_section or entry not in [replace(e, offset=position) for e in known]:
             known.append(entry)
@@ -430,8 +431,9 @@ class _Search:
             what = Opcode(opcode).name.lower().replace("_", " ") if is_known else "unknown record"
         chunk, attachment = file.chunk_head(position), file.attachment_head(position)
         if chunk is not None:
-            span = (chunk.start_ns, chunk.end_ns)
-            return Loss(position, end, "chunk", "", *(span if span[0] <= span[1] else ()))
+            start_ns, end_ns, _ = chunk
+            span = (start_ns, end_ns) if start_ns <= end_ns else ()
+            return Loss(position, end, "chunk", "", *span)
         name = "" if attachment is None else attachment.name
         return Loss(position, end, what if attachment is None else "attachment", name)
 
@@ -471,21 +473,13 @@ def restore_channels(index: Index) -> None:
 
 def _find_message_class(name: str) -> type[Message] | None:
     """Return the generated class of a message of locatk or foxglove, None if there is none."""
-    package, _, short = name.partition(".")
-    if not short.isidentifier():
+    package, _, short_name = name.partition(".")
+    if package == "foxglove" and short_name.isidentifier():
+        with contextlib.suppress(ImportError):
+            importlib.import_module(f"foxglove_schemas_protobuf.{short_name}_pb2")
+    elif package != "locatk":
         return None
-    if package == "foxglove":
-        modules = [f"foxglove_schemas_protobuf.{short}_pb2"]
-    elif package == "locatk":
-        names = [module.name for module in pkgutil.iter_modules(schemas.__path__)]
-        modules = [f"{schemas.__name__}.{each}" for each in names if each.endswith("_pb2")]
-    else:
+    try:
+        return GetMessageClass(descriptor_pool.Default().FindMessageTypeByName(name))
+    except KeyError:
         return None
-    for module in modules:
-        try:
-            found = getattr(importlib.import_module(module), short, None)
-        except ImportError:
-            continue
-        if isinstance(found, type) and issubclass(found, Message):
-            return found
-    return None

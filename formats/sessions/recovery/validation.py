@@ -65,15 +65,6 @@ _NEVER_AFTER_DATA_END = (Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MES
 _CONTENT_BYTES = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
 
 
-class ChunkHead(NamedTuple):
-    """Fields in front of the data of a chunk."""
-
-    start_ns: int
-    end_ns: int
-    size: int
-    crc: int
-
-
 class ChunkContent(NamedTuple):
     """Content of a chunk.
 
@@ -93,16 +84,6 @@ class ChunkContent(NamedTuple):
     span: tuple[int, int] | None
     definitions: list[tuple[Opcode, bytes]]
     key: tuple[int, int]
-
-
-class AttachmentHead(NamedTuple):
-    """Fields in front of the data of an attachment."""
-
-    log_ns: int
-    create_ns: int
-    name: str
-    media_type: str
-    size: int
 
 
 class DamagedFile:
@@ -156,32 +137,38 @@ class DamagedFile:
         self._stream.seek(position + RECORD_HEAD.size)
         return _parse_filling(READERS[opcode], self._stream, length) is not None
 
-    def chunk_head(self, position: int) -> ChunkHead | None:
-        """Return the head of a chunk if its lengths agree, even if the file ends inside it."""
+    def chunk_head(self, position: int) -> tuple[int, int, int] | None:
+        """Return the head of a chunk if its lengths agree, even if the file ends inside it.
+
+        Returns
+        -------
+        (int, int, int) or None
+            First and last log time in ns, and decompressed size in bytes.
+        """
         longest_name = 4
         head = self.read(position, RECORD_HEAD.size + _CHUNK.size + longest_name + 8)
         if len(head) < RECORD_HEAD.size + _CHUNK.size + 8:
             return None
         opcode, length = RECORD_HEAD.unpack_from(head)
-        start_ns, end_ns, size, crc, name_length = _CHUNK.unpack_from(head, RECORD_HEAD.size)
+        start_ns, end_ns, size, _, name_length = _CHUNK.unpack_from(head, RECORD_HEAD.size)
         data_length_at = RECORD_HEAD.size + _CHUNK.size + name_length
         if opcode != Opcode.CHUNK or len(head) < data_length_at + 8:
             return None
         data_length = int.from_bytes(head[data_length_at : data_length_at + 8], "little")
         is_valid = length == _CHUNK.size + name_length + 8 + data_length
-        return ChunkHead(start_ns, end_ns, size, crc) if is_valid else None
+        return (start_ns, end_ns, size) if is_valid else None
 
     def chunk(self, position: int, end: int) -> ChunkContent | None:
         """Return the content of a chunk whose head is valid; None if it is damaged."""
         head = self.chunk_head(position)
-        if head is None or head.size > MAX_RECORD_BYTES:
+        if head is None or head[2] > MAX_RECORD_BYTES:
             return None
         try:
             return inspect_chunk(decompress(self.content(position, end), position))
         except DamageError:
             return None
 
-    def attachment_head(self, position: int) -> AttachmentHead | None:
+    def attachment_head(self, position: int) -> records.AttachmentIndex | None:
         """Return the head of an attachment if its lengths agree, even of an incomplete one."""
         record_head = self.read(position, RECORD_HEAD.size)
         if len(record_head) < RECORD_HEAD.size or record_head[0] != Opcode.ATTACHMENT:
@@ -194,8 +181,11 @@ class DamagedFile:
             size = stream.read8()
         except PARSE_ERRORS:
             return None
-        is_valid = length == stream.count + size + 4
-        return AttachmentHead(log_ns, create_ns, name, media_type, size) if is_valid else None
+        if length != stream.count + size + 4:
+            return None
+        return records.AttachmentIndex(
+            position, RECORD_HEAD.size + length, log_ns, create_ns, size, name, media_type
+        )
 
     def is_attachment_intact(self, position: int, end: int) -> bool:
         """Return whether the checksum of an attachment is right, or was left out by the writer.

@@ -6,6 +6,7 @@ import contextlib
 import random
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import mcap.reader
 import mcap.writer
@@ -524,11 +525,11 @@ def test_what_cannot_be_read_back_does_not_appear(
     path.write_bytes(good.data)
     read_back = recovery.verify
 
-    def rotten(part: str, copy: Rewriter) -> None:
-        with open(part, "r+b") as stream:
+    def rotten(written: IO[bytes], rewriter: Rewriter) -> None:
+        with open(written.name, "r+b") as stream:
             stream.seek(5000)
             stream.write(b"rotten")
-        read_back(part, copy)
+        read_back(written, rewriter)
 
     monkeypatch.setattr(recovery, "verify", rotten)
     with pytest.raises(LocatkError, match="cannot be read back") as caught:
