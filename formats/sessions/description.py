@@ -35,44 +35,44 @@ from locatk.formats.sessions.mcap_file import DamageError
 from locatk.formats.sessions.reader import Session
 
 
-def manifest(found: Manifest) -> dict[str, Any]:
+def manifest(printed: Manifest) -> dict[str, Any]:
     """Describe how the sheets of a manifest were printed, and their positions."""
     return {
-        "codec": found.codec,
-        "pitch_mm": found.pitch_mm,
-        "dot_mm": found.dot_mm,
-        "offset_mm": found.offset_mm,
-        "dpi": found.dpi,
-        "scale_x": found.scale[0],
-        "scale_y": found.scale[1],
+        "codec": printed.codec,
+        "pitch_mm": printed.pitch_mm,
+        "dot_mm": printed.dot_mm,
+        "offset_mm": printed.offset_mm,
+        "dpi": printed.dpi,
+        "scale_x": printed.scale[0],
+        "scale_y": printed.scale[1],
         "sheets": [
             {
                 "id": sheet.id,
-                "frame": found.frame(number),
+                "frame": printed.frame(number),
                 "origin": sheet.origin,
                 "size": sheet.size,
                 "section": sheet.section,
                 "page_mm": sheet.page_mm,
-                "pattern_mm": [round(n * found.pitch_mm, 3) for n in sheet.size],
+                "pattern_mm": [round(n * printed.pitch_mm, 3) for n in sheet.size],
                 "position_mm": sheet.position_mm,
                 "heading_deg": None if sheet.position_mm is None else sheet.heading_deg,
             }
-            for number, sheet in enumerate(found.sheets)
+            for number, sheet in enumerate(printed.sheets)
         ],
-        "notes": list(found.notes),
+        "notes": list(printed.notes),
     }
 
 
-def camera(found: Camera) -> dict[str, Any]:
+def camera(lens: Camera) -> dict[str, Any]:
     """Describe a camera, and the largest displacement of a corner of the frame by its lens."""
-    width, height = found.size
+    width, height = lens.size
     corners = np.array([(x, y) for x in (0, width - 1) for y in (0, height - 1)], float)
-    displacement = np.linalg.norm(found.undistort(corners) - corners, axis=1).max()
+    displacement = np.linalg.norm(lens.undistort(corners) - corners, axis=1).max()
     return {
-        "size_px": found.size,
-        "focal_px": found.focal_px,
-        "centre_px": found.centre_px,
-        "radial": found.radial,
+        "size_px": lens.size,
+        "focal_px": lens.focal_px,
+        "centre_px": lens.centre_px,
+        "radial": lens.radial,
         "distortion_px": float(displacement),
     }
 
@@ -144,17 +144,17 @@ def _size(images: Any) -> list[int] | None:
     return [width, height]
 
 
-def tags(found: Tags) -> dict[str, Any]:
+def tags(design: Tags) -> dict[str, Any]:
     """Describe the design of tags, and the known measurements of each."""
-    magnet = found.magnet
-    numbers = set(found.ids or ()) | set(found.built) | set(found.site)
+    magnet = design.magnet
+    numbers = set(design.ids or ()) | set(design.built) | set(design.site)
     return {
-        "codec": found.codec,
-        "order": found.order,
-        "magnets": found.magnets,
-        "orientations": found.orientations,
-        "spacing_mm": 1e3 * found.spacing_m,
-        "clearance_mm": 1e3 * found.clearance_m,
+        "codec": design.codec,
+        "order": design.order,
+        "magnets": design.magnets,
+        "orientations": design.orientations,
+        "spacing_mm": 1e3 * design.spacing_m,
+        "clearance_mm": 1e3 * design.clearance_m,
         "magnet": {
             "diameter_mm": 1e3 * magnet.diameter_m,
             "height_mm": 1e3 * magnet.height_m,
@@ -162,17 +162,17 @@ def tags(found: Tags) -> dict[str, Any]:
             "grade": magnet.grade,
             "moment_am2": magnet.moment,
         },
-        "capacity": codec.capacity(found),
-        "family": None if found.ids is None else len(found.ids),
-        "min_distance": found.min_distance,
-        "tags": [_tag(found, number) for number in sorted(numbers)],
-        "notes": list(found.notes),
+        "capacity": codec.capacity(design),
+        "family": None if design.ids is None else len(design.ids),
+        "min_distance": design.min_distance,
+        "tags": [_tag(design, number) for number in sorted(numbers)],
+        "notes": list(design.notes),
     }
 
 
-def _tag(found: Tags, number: int) -> dict[str, Any]:
-    layout = codec.layout_of(found, number)
-    built, pose = found.built.get(number), found.site.get(number)
+def _tag(design: Tags, number: int) -> dict[str, Any]:
+    layout = codec.layout_of(design, number)
+    built, pose = design.built.get(number), design.site.get(number)
     return {
         "id": number,
         "cells": layout.cells,
@@ -185,16 +185,16 @@ def _tag(found: Tags, number: int) -> dict[str, Any]:
     }
 
 
-def array(found: SensorArray) -> dict[str, Any]:
+def array(sensors: SensorArray) -> dict[str, Any]:
     """Describe positions and properties of the sensors of an array."""
     return {
-        "sensor": found.sensor,
-        "sensors": len(found),
-        "position_mm": 1e3 * found.position_m,
-        "noise_ut": 1e6 * found.noise_t,
-        "delay_ms": 1e3 * found.delay_s,
-        "quantum_ut": 1e6 * np.where(found.quantum_t > 0, found.quantum_t, np.nan),
-        "range_ut": 1e6 * found.range_t,
+        "sensor": sensors.sensor,
+        "sensors": len(sensors),
+        "position_mm": 1e3 * sensors.position_m,
+        "noise_ut": 1e6 * sensors.noise_t,
+        "delay_ms": 1e3 * sensors.delay_s,
+        "quantum_ut": 1e6 * np.where(sensors.quantum_t > 0, sensors.quantum_t, np.nan),
+        "range_ut": 1e6 * sensors.range_t,
     }
 
 
@@ -270,36 +270,36 @@ def _unread(session: Session, kind: SensorKind[Any], topic: str) -> tuple[dict[s
     return entry, geometry
 
 
-def _recorded(found: Samples | HallSamples) -> dict[str, Any]:
-    span = float(found.time_ns[-1] - found.time_ns[0]) * 1e-9
+def _recorded(samples: Samples | HallSamples) -> dict[str, Any]:
+    span = float(samples.time_ns[-1] - samples.time_ns[0]) * 1e-9
     return {
-        "device": found.device,
-        "samples": len(found),
-        "rate_hz": (len(found) - 1) / span if span > 0 else None,
-        "left_out": int(np.count_nonzero(np.isnan(found.field_t))),
+        "device": samples.device,
+        "samples": len(samples),
+        "rate_hz": (len(samples) - 1) / span if span > 0 else None,
+        "left_out": int(np.count_nonzero(np.isnan(samples.field_t))),
     }
 
 
-def floor(found: FloorMap) -> dict[str, Any]:
+def floor(floor_map: FloorMap) -> dict[str, Any]:
     """Describe a map of landmarks: its design, its cells, and the landmarks as built."""
-    geometry, codes = found.geometry, found.codes[found.codes != HOLE_CODE]
+    geometry, codes = floor_map.geometry, floor_map.codes[floor_map.codes != HOLE_CODE]
     numbers = PATTERN_OF[codes]
     return {
-        "name": found.name or None,
-        "rows": found.shape[0],
-        "columns": found.shape[1],
+        "name": floor_map.name or None,
+        "rows": floor_map.shape[0],
+        "columns": floor_map.shape[1],
         "landmarks": len(codes),
         "patterns": {
             letters: int(np.count_nonzero(numbers == number))
             for number, letters in enumerate(PATTERNS, 1)
         },
-        "alphabet": found.alphabet,
-        "window": found.window,
-        "detect": found.detect,
-        "seed": found.seed,
-        "pitch_mm": 1e3 * found.pitch_m,
-        "origin_mm": [1e3 * each for each in found.origin_m],
-        "walls": len(found.walls),
+        "alphabet": floor_map.alphabet,
+        "window": floor_map.window,
+        "detect": floor_map.detect,
+        "seed": floor_map.seed,
+        "pitch_mm": 1e3 * floor_map.pitch_m,
+        "origin_mm": [1e3 * each for each in floor_map.origin_m],
+        "walls": len(floor_map.walls),
         "bars": {
             "size_mm": [
                 1e3 * size
@@ -311,7 +311,7 @@ def floor(found: FloorMap) -> dict[str, Any]:
             "circle_mm": 1e3 * geometry.circle_m,
             "threshold_mt": 1e3 * geometry.threshold_t,
         },
-        "map": maps.map_rows(found.codes),
+        "map": maps.map_rows(floor_map.codes),
         "built": [
             {
                 "cell": cell,
@@ -322,21 +322,21 @@ def floor(found: FloorMap) -> dict[str, Any]:
                 "visits": built.visits,
                 "flags": list(built.flags),
             }
-            for cell, built in sorted(found.built.items())
+            for cell, built in sorted(floor_map.built.items())
         ],
-        "notes": list(found.notes),
+        "notes": list(floor_map.notes),
     }
 
 
-def hall_sensors(found: HallSensors) -> dict[str, Any]:
+def hall_sensors(sensors: HallSensors) -> dict[str, Any]:
     """Describe positions and properties of hall sensors."""
     return {
-        "sensor": found.sensor,
-        "sensors": len(found),
-        "names": list(found.names),
-        "position_mm": 1e3 * found.position_m,
-        "noise_ut": 1e6 * found.noise_t,
-        "range_mt": 1e3 * found.range_t,
+        "sensor": sensors.sensor,
+        "sensors": len(sensors),
+        "names": list(sensors.names),
+        "position_mm": 1e3 * sensors.position_m,
+        "noise_ut": 1e6 * sensors.noise_t,
+        "range_mt": 1e3 * sensors.range_t,
     }
 
 

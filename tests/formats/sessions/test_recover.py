@@ -1,4 +1,4 @@
-"""Salvaged recordings: every whole chunk of any damage, nothing altered, and honest about it."""
+"""Recovery of damaged recordings: every intact chunk is saved, unchanged, and losses are listed."""
 
 from __future__ import annotations
 
@@ -44,11 +44,16 @@ Flat = tuple[str, int, int, int, bytes]
 
 
 def write(
-    path: Path, *, chunks: int = CHUNKS, finish: bool = True, told: bool = False, **options: object
+    path: Path,
+    *,
+    chunks: int = CHUNKS,
+    finish: bool = True,
+    listed: bool = False,
+    **options: object,
 ) -> None:
     """A recording as `locatk capture` makes it: small chunks, one after the other.
 
-    With ``told``, its channels stand in the metadata record ``channels`` as well; ``options``
+    With ``listed``, its channels stand in the metadata record ``channels`` as well; ``options``
     are those of the stock writer.
     """
     noise = random.Random(7)
@@ -63,7 +68,7 @@ def write(
             files = build_file_descriptor_set(kind).SerializeToString()
             schema = writer.register_schema(name, "protobuf", files)
             channels[topic] = writer.register_channel(topic, "protobuf", schema)
-            if told:
+            if listed:
                 writer.add_metadata("channels", {str(channels[topic]): f"{topic} {name}"})
         offset = 0
         for number in range(chunks):
@@ -302,7 +307,7 @@ def test_zeros_holes_and_garbage(good: Whole, tmp_path: Path, seed: int) -> None
 # ---- whole files, killed recordings, other tools
 
 
-def test_a_whole_file_stays_as_it_is(good: Whole, tmp_path: Path) -> None:
+def test_an_undamaged_file_is_copied(good: Whole, tmp_path: Path) -> None:
     result = check(good, good.data, tmp_path)
     assert result is not None
     assert result.complete
@@ -333,7 +338,7 @@ def test_attachments_stay_between_their_messages(good: Whole, tmp_path: Path) ->
     assert before[: len(before) // 2] == before[len(before) // 2 :]
 
 
-def test_stock_decoders_read_it(good: Whole, tmp_path: Path) -> None:
+def test_the_library_decodes_the_output(good: Whole, tmp_path: Path) -> None:
     check(good, good.data[: len(good.data) // 2], tmp_path)
     with (tmp_path / "out.mcap").open("rb") as stream:
         reader = mcap.reader.make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -347,7 +352,7 @@ def test_stock_decoders_read_it(good: Whole, tmp_path: Path) -> None:
 def test_a_killed_recording(good: Whole, tmp_path: Path) -> None:
     """Nothing is lost but the end; that it has none is said."""
     killed = tmp_path / "killed.mcap"
-    write(killed, finish=False, told=True)
+    write(killed, finish=False, listed=True)
     result = recover(killed, tmp_path / "out.mcap")
     assert stock(tmp_path / "out.mcap") == good.flat
     assert (result.complete, result.ended, result.tail, result.losses) == (False, False, 0, ())
@@ -358,7 +363,7 @@ def test_a_killed_recording(good: Whole, tmp_path: Path) -> None:
     assert (result.messages, result.tail) == (len(good.flat), 31)
 
 
-def test_bytes_that_are_missing(good: Whole, tmp_path: Path) -> None:
+def test_missing_bytes_are_counted(good: Whole, tmp_path: Path) -> None:
     """Told by the offsets of what is left; at the start only where that is known."""
 
     def missing(numbers: list[int], data: bytes = good.data) -> int | None:
@@ -377,7 +382,7 @@ def test_bytes_that_are_missing(good: Whole, tmp_path: Path) -> None:
     assert missing([0], good.data.replace(b"capture", b"copture")) == 0
 
 
-def test_lost_messages_are_counted_where_the_index_is_left(good: Whole, tmp_path: Path) -> None:
+def test_lost_messages_are_counted_if_the_index_is_intact(good: Whole, tmp_path: Path) -> None:
     damaged = bytearray(good.data)
     damaged[good.chunks[7][0] + 100] ^= 1
     damaged[good.attachments[1][0] + 100] ^= 1
@@ -397,15 +402,17 @@ def test_lost_messages_are_counted_where_the_index_is_left(good: Whole, tmp_path
     assert (result.lost_messages, result.lost_attachments) == (None, None)
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_the_chunk_that_names_the_channels_is_lost(good: Whole, tmp_path: Path, told: bool) -> None:
+@pytest.mark.parametrize("listed", [False, True])
+def test_the_chunk_that_defines_the_channels_is_lost(
+    good: Whole, tmp_path: Path, listed: bool
+) -> None:
     path, output = tmp_path / "killed.mcap", tmp_path / "out.mcap"
-    write(path, finish=False, told=told)
+    write(path, finish=False, listed=listed)
     data = bytearray(path.read_bytes())
     start = data.index(good.data[good.chunks[0][0] : good.chunks[0][1]])
     data[start + 100] ^= 1
     path.write_bytes(data)
-    if not told:
+    if not listed:
         with pytest.raises(FormatError, match=r"channels of all its \d+ messages"):
             recover(path, output)
         assert sorted(tmp_path.iterdir()) == [path]
@@ -433,7 +440,9 @@ def test_the_chunk_that_names_the_channels_is_lost(good: Whole, tmp_path: Path, 
         {"9" * 5000: "/a locatk.SerialChunk", "²": "/a locatk.SerialChunk"},
     ],
 )
-def test_names_that_name_nothing(good: Whole, tmp_path: Path, names: dict[str, str]) -> None:
+def test_invalid_channel_records_are_ignored(
+    good: Whole, tmp_path: Path, names: dict[str, str]
+) -> None:
     with (tmp_path / "a.mcap").open("wb") as stream:
         writer = mcap.writer.Writer(stream)
         writer.start()
@@ -517,7 +526,7 @@ def test_files_without_a_recording(tmp_path: Path, data: bytes) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_cannot_be_read_back_does_not_appear(
+def test_an_output_that_cannot_be_read_back_is_removed(
     good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that keeps something else."""
@@ -538,7 +547,7 @@ def test_what_cannot_be_read_back_does_not_appear(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_changes_meanwhile(
+def test_a_file_that_changes_during_recovery(
     good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
@@ -570,11 +579,12 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     path = tmp_path_factory.mktemp("small") / "run.mcap"
     contents = []
     for options in SMALL:
-        write(path, told=True, **options)  # type: ignore[arg-type]
+        write(path, listed=True, **options)  # type: ignore[arg-type]
         contents.append(path.read_bytes())
     return contents
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     which=st.integers(0, len(SMALL) - 1),

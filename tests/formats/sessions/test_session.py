@@ -1,4 +1,4 @@
-"""Sessions: written whole, read by others, and honest about damage."""
+"""Sessions: complete files, readable by other tools, with damage reported."""
 
 from __future__ import annotations
 
@@ -88,12 +88,12 @@ def test_round_trip(file: Path) -> None:
     assert {topic for topic, _, _ in session.messages(["/raw/1"])} == {"/raw/1"}
 
 
-def test_same_calls_same_bytes(file: Path, tmp_path: Path) -> None:
+def test_equal_calls_give_equal_bytes(file: Path, tmp_path: Path) -> None:
     write(tmp_path / "again.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == file.read_bytes()
 
 
-def test_the_stock_reader_reads_it(file: Path) -> None:
+def test_the_library_reads_sessions(file: Path) -> None:
     with open(file, "rb") as stream:
         reader = mcap.reader.make_reader(
             stream, validate_crcs=True, decoder_factories=[DecoderFactory()]
@@ -189,15 +189,18 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
         Session.open(tmp_path)
 
 
-def test_cut_anywhere_is_an_error_and_the_rest_is_told(file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("cuts", [9, pytest.param(60, marks=pytest.mark.slow)])
+def test_truncated_files_are_errors_and_their_rest_is_readable(
+    file: Path, tmp_path: Path, cuts: int
+) -> None:
     whole = file.read_bytes()
     messages = list(Session.open(file).messages())
     path = tmp_path / "cut.mcap"
     rng = random.Random(1)
-    cuts = [1, 8, 20, len(whole) - 1, len(whole) - 9, len(whole) - 40]
-    cuts += [rng.randrange(8, len(whole)) for _ in range(60)]
+    lengths = [1, 8, 20, len(whole) - 1, len(whole) - 9, len(whole) - 40]
+    lengths += [rng.randrange(8, len(whole)) for _ in range(cuts)]
     most = 0
-    for cut in cuts:
+    for cut in lengths:
         path.write_bytes(whole[:cut])
         with pytest.raises(FormatError) as caught:
             Session.open(path)
@@ -222,8 +225,9 @@ def test_zeroed_tail_of_a_power_cut(file: Path, tmp_path: Path) -> None:
     assert list(Session.open(path, damaged_ok=True).messages())
 
 
-def test_a_flipped_byte_never_passes_as_data(tmp_path: Path) -> None:
-    """Either an error of one line, or messages and attachments as they were."""
+@pytest.mark.parametrize("flips", [40, pytest.param(500, marks=pytest.mark.slow)])
+def test_flipped_bits_never_change_data(tmp_path: Path, flips: int) -> None:
+    """The result is an error of one line, or the original messages and attachments."""
     good = tmp_path / "good.mcap"
     write(good, 40)
     whole = good.read_bytes()
@@ -231,8 +235,7 @@ def test_a_flipped_byte_never_passes_as_data(tmp_path: Path) -> None:
     path = tmp_path / "bad.mcap"
     rng = random.Random(2)
     errors = 0
-    places = [rng.randrange(len(whole)) for _ in range(500)]
-    for place in places:
+    for place in [rng.randrange(len(whole)) for _ in range(flips)]:
         damaged = bytearray(whole)
         damaged[place] ^= 1 << rng.randrange(8)
         path.write_bytes(damaged)
@@ -248,7 +251,7 @@ def test_a_flipped_byte_never_passes_as_data(tmp_path: Path) -> None:
             everything(Session.open(path, damaged_ok=True))
         except LocatkError as error:
             one_line(error)
-    assert errors > 400
+    assert errors > 0.8 * flips
 
 
 def test_a_flipped_byte_in_a_chunk_names_the_checksum(file: Path, tmp_path: Path) -> None:
@@ -273,7 +276,7 @@ def test_a_flipped_byte_in_an_attachment(file: Path, tmp_path: Path) -> None:
 def test_garbage_behind_the_magic(tmp_path: Path) -> None:
     path = tmp_path / "bad.mcap"
     rng = random.Random(3)
-    for _ in range(200):
+    for _ in range(40):
         path.write_bytes(b"\x89MCAP0\r\n" + rng.randbytes(rng.randrange(300)))
         for damaged_ok in (False, True):
             with pytest.raises(FormatError):
@@ -339,7 +342,7 @@ def test_mcap_of_other_tools(tmp_path: Path, options: dict[str, object]) -> None
     assert messages == [("/thing", 50 - n % 7, b'{"n": %d}' % n) for n in range(100)]
 
 
-def test_messages_that_the_index_hides_are_missed(
+def test_messages_missing_from_the_index_are_noticed(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read_index = mcap_file.read_summary

@@ -1,4 +1,4 @@
-"""Records `station-<channel>`: numbers come back as they were; what is damaged is named."""
+"""Records `station-<channel>`: exact round trips, errors that name the record."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def write(
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(heard)
-def test_all_that_was_heard_comes_back(
+def test_station_reports_are_restored(
     tmp_path_factory: pytest.TempPathFactory, found: tuple[StationReport, ...]
 ) -> None:
     path = tmp_path_factory.mktemp("heard") / "run.mcap"
@@ -106,7 +106,9 @@ def test_the_calibration_of_the_scene_stays(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_what_cannot_be_is_not_written(tmp_path: Path, found: tuple[StationReport, ...]) -> None:
+def test_impossible_reports_are_not_written(
+    tmp_path: Path, found: tuple[StationReport, ...]
+) -> None:
     with pytest.raises(InputError):
         write(tmp_path / "run.mcap", found)
     assert list(tmp_path.iterdir()) == []
@@ -170,7 +172,7 @@ def test_wild_records(
     assert all(1 <= station.channel <= 16 for station in found)
 
 
-def test_a_station_of_another_place_is_noticed() -> None:
+def test_a_station_that_differs_from_the_scene_is_reported() -> None:
     place = Station(1, np.zeros(3), np.eye(3), FACTORY, id=0xA)
     scene = Scene(stations=(place,), ids={2: 0xB})
     found = (StationReport(1, 0xA), StationReport(2, 0xC), StationReport(3, 0xD), StationReport(4))
