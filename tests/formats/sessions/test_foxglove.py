@@ -235,6 +235,8 @@ def test_points_show_path_and_artifact(solved: tuple[str, Path]) -> None:
         assert np.allclose([low, high], [[0, 0.5, 0], [0.5, 1, 2]])
     elif system == "dots":  # the paper
         assert np.allclose([low, high], [[0, 0, 0], [0.21, 0.297, 0]], atol=1e-6)
+        outline = artifact[: foxglove.POINTS_PER_LINE]
+        assert outline[0] == outline[-1]  # it is closed
     elif system == "polaris":
         assert len(artifact) == 2 * (5 + foxglove.POINTS_PER_LINE)
     elif system == "landmarks":

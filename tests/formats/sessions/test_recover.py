@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import random
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -526,17 +528,18 @@ def test_files_without_a_recording(tmp_path: Path, data: bytes) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("position", [5000, -60], ids=["data", "index"])
 def test_an_output_that_cannot_be_read_back_is_removed(
-    good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, position: int
 ) -> None:
-    """A disk that keeps something else."""
+    """The disk stores other bytes than were written."""
     path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
     path.write_bytes(good.data)
     read_back = recovery.verify
 
     def rotten(written: IO[bytes], rewriter: Rewriter) -> None:
         with open(written.name, "r+b") as stream:
-            stream.seek(5000)
+            stream.seek(position, os.SEEK_END if position < 0 else os.SEEK_SET)
             stream.write(b"rotten")
         read_back(written, rewriter)
 
@@ -553,16 +556,23 @@ def test_a_file_that_changes_during_recovery(
     path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
     register = Rewriter._register
 
-    def change(copy: Rewriter, channel: object) -> None:
-        path.write_bytes(path.read_bytes()[:20_000])
-        register(copy, channel)  # type: ignore[arg-type]
+    def change_before_registration(change: Callable[[bytes], bytes]) -> None:
+        def changed(rewriter: Rewriter, channel: object) -> None:
+            path.write_bytes(change(path.read_bytes()))
+            register(rewriter, channel)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Rewriter, "_register", change)
-    for options in ({}, {"use_chunking": False}):
-        write(path, **options)
-        with pytest.raises(FormatError):
-            recover(path, output)
-        assert list(tmp_path.iterdir()) == [path]
+        monkeypatch.setattr(Rewriter, "_register", changed)
+
+    for change in (
+        lambda data: data[:20_000],
+        lambda data: data[:20_000] + b"\xff" * (len(data) - 20_000),
+    ):
+        change_before_registration(change)
+        for options in ({}, {"use_chunking": False}):
+            write(path, **options)
+            with pytest.raises(FormatError):
+                recover(path, output)
+            assert list(tmp_path.iterdir()) == [path]
 
 
 # ---- any damage at all

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import random
+import struct
+import tracemalloc
 from pathlib import Path
 from typing import IO
 
+import lz4.frame
 import mcap.reader
 import mcap.writer
 import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Chunk
 from mcap_protobuf.decoder import DecoderFactory
 
 from locatk.core.errors import (
@@ -20,7 +27,7 @@ from locatk.core.errors import (
 )
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import mcap_file
-from locatk.formats.sessions.reader import AttachmentInfo, Channel, Session
+from locatk.formats.sessions.reader import AttachmentInfo, Channel, RandomAccess, Session
 from locatk.formats.sessions.writer import PROFILE, SessionWriter
 
 CHUNKS = 3000
@@ -356,3 +363,89 @@ def test_messages_missing_from_the_index_are_noticed(
     monkeypatch.setattr(mcap_file, "read_summary", forgetful)
     with pytest.raises(FormatError, match="messages instead of"):
         list(Session.open(file).messages())
+    session = Session.open(file)
+    with pytest.raises(FormatError, match="messages instead of"):
+        RandomAccess(session).positions("/raw/0")
+
+
+def test_a_summary_with_a_wrong_checksum_is_an_error(file: Path, tmp_path: Path) -> None:
+    data = bytearray(file.read_bytes())
+    summary_start, _, _ = struct.unpack("<QQI", data[-28:-8])
+    summary = bytes(data[summary_start : -8 - mcap_file.FOOTER_BYTES])
+    (statistics,) = [
+        start
+        for opcode, start, _ in mcap_file.iter_records(summary, 0)
+        if opcode == Opcode.STATISTICS
+    ]
+    data[summary_start + statistics] ^= 2  # the number of messages; all lengths still agree
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="summary is damaged"):
+        Session.open(path)
+
+
+def test_damage_of_a_file_without_index_is_described(tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    foreign(path, index_types=mcap.writer.IndexType.NONE, chunk_size=300)
+    data = path.read_bytes()
+    position = data.index(bytes([Opcode.CHUNK]), 500)
+    path.write_bytes(data[: position + 60] + b"\xff" + data[position + 61 :])
+    session = Session.open(path)
+    assert session.damage is not None
+    assert session.damage.startswith("a damaged ")
+    assert 0 < len(list(session.messages())) < 100
+
+
+# ---- single messages
+
+
+def test_single_messages_are_checked(file: Path) -> None:
+    session = Session.open(file)
+    access = RandomAccess(session)
+    position = access.positions("/raw/1")[3]
+    message = SerialChunk.FromString(access.payload(position))
+    assert (message.byte_offset, message.data) == (7, payload(7))
+    wrong = [
+        position._replace(offset=position.offset + 1),
+        position._replace(offset=1 << 40),
+        position._replace(channel=position.channel + 1),
+        position._replace(time_ns=position.time_ns + 1),
+    ]
+    for each in wrong:
+        with pytest.raises(FormatError, match="not there"):
+            access.payload(each)
+    with file.open("rb") as stream:
+        data = bytes(mcap_file.read_segment(stream, position.segment))
+    with pytest.raises(mcap_file.DamageError):
+        mcap_file.message_payload(data[: position.offset + 100], position)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x05\x03",
+        struct.pack("<BQ", Opcode.MESSAGE, 21) + bytes(21),  # shorter than the head of a message
+        struct.pack("<BQ", Opcode.SCHEMA, 9) + bytes(8),
+        struct.pack("<BQ", Opcode.SCHEMA, 2**64 - 1) + bytes(8),
+    ],
+)
+def test_records_of_wrong_length_are_damage(data: bytes) -> None:
+    with pytest.raises(mcap_file.DamageError) as caught:
+        list(mcap_file.iter_records(data, 77))
+    assert caught.value.offset == 77
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_chunks_larger_than_stated_take_little_memory(compression: str) -> None:
+    zeros = bytes(8 << 20)
+    pack = zstandard.compress if compression == "zstd" else lz4.frame.compress
+    builder = RecordBuilder()
+    Chunk(compression, pack(zeros), 0, 0, 0, 10).write(builder)
+    content = builder.end()[mcap_file.RECORD_HEAD.size :]
+    tracemalloc.start()
+    try:
+        with pytest.raises(mcap_file.DamageError):
+            mcap_file.decompress(content, 0)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
