@@ -86,7 +86,7 @@ def command(
     found = chosen(read_trajectories(solution), devices, solution)
     poses = sum(map(len, found))
     if format_name != "parquet":  # where they are null
-        found = [exports.numbers(each) for each in found]
+        found = [exports.finite_poses(each) for each in found]
     lost = poses - sum(map(len, found))
     if lost == poses:
         raise InputError(f"none of the {poses} poses is a number", file=solution)
@@ -95,12 +95,12 @@ def command(
         tell(lost)
         return
 
-    planned = exports.parts(found, format_name, output)
+    planned = exports.plan_files(found, format_name, output)
     if planned[0].path != output:
         options.make_folder(output)
     for path in (path for part in planned for path in part.files):
         options.guard_output(path, overwrite=overwrite, inputs=[solution])
-    facts = exports.facts_of(solution)
+    facts = exports.read_origin(solution)
     for part in planned:
         exports.write(part, format_name, facts=facts, covariance=covariance, overwrite=overwrite)
         console.result(f"Wrote {part.path}: {sum(map(len, part.trajectories))} poses")
@@ -186,5 +186,5 @@ def text(found: list[Trajectory], format_name: str) -> bytes:
         )
     with TemporaryDirectory(prefix="locatk-export-") as folder:
         path = Path(folder) / "poses"
-        exports.write(exports.Part(path, tuple(found)), format_name)
+        exports.write(exports.OutputFile(path, tuple(found)), format_name)
         return path.read_bytes()

@@ -59,8 +59,8 @@ def lighthouse(session: Session, request: Request) -> Solved:
     sweeps = observations.read_sweeps(session)
     given = None if request.artifact is None else artifacts.read_scene(request.artifact)
     # Whatever scene it is, the stations know best how they were made.
-    sent = observations.read_heard(session)
-    scene = heard.with_heard(given or observations.read_scene(session), sent) or Scene()
+    sent = observations.read_station_reports(session)
+    scene = heard.add_station_data(given or observations.read_scene(session), sent) or Scene()
     odometry = observations.read_odometry(session)
     rigid = _rigid(sweeps, observations.read_receivers(session))
     more: dict[str, Any] = {"receivers": rigid} if rigid else {}
@@ -69,7 +69,8 @@ def lighthouse(session: Session, request: Request) -> Solved:
     solution = lighthouse.solve(sweeps, scene, options, odometry=odometry, **more)
     solve_s = time.perf_counter() - start
     other_stations = [
-        SolverWarning("other_station_id", message) for message in heard.strangers(scene, sent)
+        SolverWarning("other_station_id", message)
+        for message in heard.describe_unknown_stations(scene, sent)
     ]
     warnings = (*other_stations, *solution.warnings)
     return Solved(replace(solution, warnings=warnings), solve_s)
@@ -125,7 +126,7 @@ def polaris(session: Session, request: Request) -> Solved:
     _check(request, "polaris", methods=("joint", "paper"), refused=("scene", "camera"))
     given = request.artifact
     known = observations.read_tags(session) if given is None else tags.read_tags(given)
-    samples = observations.read_samples(session)
+    samples = observations.read_magnetometers(session)
     odometry = observations.read_odometry(session)
     grid = None
     if request.templates is not None:

@@ -1,4 +1,4 @@
-"""Files that are read whole: what goes wrong is an error of one line."""
+"""Input files that are read completely; system errors become errors of locatk."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import os
 from locatk.core.errors import FormatError, InputError, MissingDataError
 
 
-def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
-    """The bytes of a file, or the first ``most`` of them.
+def read_bytes(path: str | os.PathLike[str], max_bytes: int = -1) -> bytes:
+    """Read the bytes of a file, or the first ``max_bytes`` of them.
 
     Raises
     ------
@@ -19,7 +19,7 @@ def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
     """
     try:
         with open(path, "rb") as stream:
-            return stream.read(most)
+            return stream.read(max_bytes)
     except (FileNotFoundError, NotADirectoryError):
         raise MissingDataError("no such file", file=path) from None
     except OSError as error:
@@ -27,7 +27,7 @@ def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a file.
+    """Read the text of a file.
 
     Raises
     ------

@@ -1,7 +1,6 @@
-"""Files that are written whole or not at all, and never over another unasked.
+"""Output files: written completely or not at all, and never over another file by accident.
 
-Every writer of locatk (sessions, artifacts, tables, pictures) goes through
-:func:`atomic_write`.
+All writers of locatk (sessions, artifacts, tables, pictures) use :func:`atomic_write`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
 
 
 def tool_version() -> str:
-    """Version of the installed locatk, ``"0+unknown"`` in a bare source tree."""
+    """Return the version of the installed locatk, ``"0+unknown"`` if it is not installed."""
     try:
         return metadata.version("locatk")
     except metadata.PackageNotFoundError:
@@ -26,27 +25,25 @@ def tool_version() -> str:
 
 
 def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-    """Raise what :func:`atomic_write` would raise before it starts.
-
-    For commands that compute for long before they write.
+    """Check that ``path`` can be written, before a long computation.
 
     Raises
     ------
     OutputExistsError
-        ``path`` exists and ``overwrite`` is false, or is no regular file.
+        ``path`` exists and ``overwrite`` is false, or it is not a regular file.
     MissingDataError
         Its folder does not exist.
     """
     target = Path(path)
     if not os.path.isdir(target.parent):
         raise MissingDataError(
-            f"no folder {str(target.parent)!r} to write into", hint="Make the folder first"
+            f"no folder {str(target.parent)!r} to write into", hint="Create the folder first"
         )
-    # A device or a folder cannot be replaced by a file, not even when asked.
+    # A device or a folder cannot be replaced by a file, not even with --overwrite.
     if os.path.exists(target) and not os.path.isfile(target):
         raise OutputExistsError(f"output {str(target)!r} is not a regular file")
     if os.path.lexists(target) and not overwrite:
-        raise _exists(target)
+        raise _output_exists(target)
 
 
 @contextlib.contextmanager
@@ -55,25 +52,25 @@ def atomic_write(
 ) -> Iterator[IO[Any]]:
     """Open ``path`` for writing; it appears when the block ends without an exception.
 
-    What is written goes to a hidden file beside ``path``, is forced to the disk and
-    moved into place at the end; an exception of any kind removes it.
+    The data go to a hidden file in the same folder, which is synced to the disk and renamed at
+    the end; an exception of any kind removes it.
 
     Parameters
     ----------
     path : path
         The output.
     overwrite : bool
-        Replace what is there. Otherwise not even a file that another process puts
-        there in the meantime is touched.
+        Replace an existing file. Otherwise even a file that another process creates in the
+        meantime is kept.
     mode : {"wb", "w"}
-        Bytes, or UTF-8 text whose line ends are written as given.
+        Bytes, or UTF-8 text with line ends as given.
 
     Raises
     ------
     OutputExistsError, MissingDataError
         As :func:`check_output`.
     LocatkError
-        The system refuses to write: no permission, no space.
+        The system cannot write: no permission, no space.
     """
     check_output(path, overwrite=overwrite)
     target = Path(path)
@@ -82,7 +79,7 @@ def atomic_write(
     part = target.with_name(f".{target.name[:50]}.{secrets.token_hex(4)}.part")
     text: dict[str, Any] = {"encoding": "utf-8", "newline": ""} if mode == "w" else {}
     try:
-        with _one_line_errors(target, part):
+        with _errors_of_locatk(target, part):
             with open(part, mode.replace("w", "x"), **text) as stream:
                 yield stream
                 stream.flush()
@@ -98,18 +95,18 @@ def atomic_write(
 
 
 def _move_to_free_name(part: Path, target: Path) -> None:
-    """Rename ``part`` to ``target``, which must not exist: a plain rename would replace it."""
+    """Rename ``part`` to ``target``, which must not exist; a plain rename would replace it."""
     try:
         os.link(part, target)
     except FileExistsError:
-        raise _exists(target) from None
+        raise _output_exists(target) from None
     except OSError:
-        # No hard links on this file system (FAT, some network shares): take the
-        # name with an empty file first, which is as safe but for a crash in between.
+        # The file system has no hard links (FAT, some network shares): reserve the name with an
+        # empty file first, which is as safe except for a crash in between.
         try:
             open(target, "xb").close()
         except FileExistsError:
-            raise _exists(target) from None
+            raise _output_exists(target) from None
         try:
             os.replace(part, target)
         except BaseException:
@@ -119,18 +116,17 @@ def _move_to_free_name(part: Path, target: Path) -> None:
         part.unlink()
 
 
-def _exists(target: Path) -> OutputExistsError:
+def _output_exists(target: Path) -> OutputExistsError:
     return OutputExistsError(
         f"output {str(target)!r} exists", hint="Add --overwrite or choose another name"
     )
 
 
 @contextlib.contextmanager
-def _one_line_errors(target: Path, part: Path) -> Iterator[None]:
-    """Turn the system's refusal to write into an error of one line.
+def _errors_of_locatk(target: Path, part: Path) -> Iterator[None]:
+    """Convert system errors of the output to LocatkError.
 
-    Errors of locatk pass, and so do those that name another file: the block inside
-    :func:`atomic_write` may read some.
+    Errors of other files pass: the block inside :func:`atomic_write` may read some.
     """
     try:
         yield

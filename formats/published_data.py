@@ -1,4 +1,4 @@
-"""Where published data is found: tests and benchmarks look in the same places."""
+"""Folder of published recordings, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from pathlib import Path
 from locatk.core.errors import MissingDataError
 
 VARIABLE = "LOCATK_DATA"
+"""Environment variable that names the folder."""
 
 
 def data_folder(explicit: Path | None = None) -> Path | None:
-    """Folder with published recordings, or None where there is none.
+    """Return the folder with published recordings, or None if there is none.
 
-    The first that applies: ``explicit``; the environment variable ``LOCATK_DATA`` (None
-    where it names no folder: it is not passed over); ``../shared/data`` beside the
-    working folder, then beside the source tree.
+    It is ``explicit`` if given. Otherwise it is the folder that the environment variable
+    ``LOCATK_DATA`` names; if that is set and not a folder, the result is None. Without the
+    variable it is ``../shared/data`` next to the working folder, then next to the source tree.
 
     Raises
     ------
     MissingDataError
-        ``explicit`` is no folder.
+        ``explicit`` is not a folder.
     """
     if explicit is not None:
         if not Path(explicit).is_dir():

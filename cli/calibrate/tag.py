@@ -101,7 +101,7 @@ def _passes(
                 session = Session.open(path)
                 if same:
                     _check_same(tags, _attached(path), path)
-                samples = observations.read_samples(session)
+                samples = observations.read_magnetometers(session)
                 odometry = observations.read_odometry(session)
                 solution = polaris.solve(samples, design, wanted, odometry=odometry)
             if solution is None:

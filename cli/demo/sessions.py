@@ -84,7 +84,7 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     from locatk.core.polaris.tag import PlanarPose, Tags
     from locatk.formats.output import atomic_write
     from locatk.formats.printing.drawings import render_pages
-    from locatk.formats.sessions import magnetometers as arrays
+    from locatk.formats.sessions import field_samples
 
     ids = (262_143, 77, 123_456)
     tags = Tags(
@@ -107,7 +107,7 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
             seed=seed,
         ),
     )
-    arrays.write_session(
+    field_samples.write_magnetometers(
         folder / "polaris.mcap",
         [simulated.samples],
         tags=tags,
@@ -128,7 +128,7 @@ def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...
     from locatk.core.landmarks.simulation import session as simulate
     from locatk.formats.output import atomic_write
     from locatk.formats.printing.drawings import render_pages
-    from locatk.formats.sessions import halls
+    from locatk.formats.sessions import field_samples
 
     floor = design_map(DesignOptions(rows=6, columns=8, seed=seed))
     wanted = simulate.SimulationOptions(
@@ -139,7 +139,7 @@ def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...
         seed=seed,
     )
     simulated = simulate.simulate(floor, wanted)
-    halls.write_session(
+    field_samples.write_halls(
         folder / "landmarks.mcap",
         simulated.samples,
         floor=floor,

@@ -254,7 +254,7 @@ def _samples(
     """Import samples of an array; returns what ``--json`` says of them, and what was lost."""
     from locatk.formats.artifacts import tags
     from locatk.formats.importers.polaris_csv import PUBLISHED_TAGS
-    from locatk.formats.sessions import magnetometers as arrays
+    from locatk.formats.sessions import field_samples
 
     if rate is None or spacing is None:
         name = "--rate" if rate is None else "--spacing"
@@ -262,7 +262,7 @@ def _samples(
     known = PUBLISHED_TAGS if tag is None else tags.read_tags(tag)
     with console.working("Reading"):
         imported = read(path, rate_hz=rate, spacing_m=spacing / 1000)
-        arrays.write_session(
+        field_samples.write_magnetometers(
             output,
             [imported.samples],
             tags=known,

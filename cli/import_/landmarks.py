@@ -144,7 +144,7 @@ def import_samples(
     ``given`` holds :data:`OPTIONS`.
     """
     from locatk.formats.artifacts import maps
-    from locatk.formats.sessions import halls
+    from locatk.formats.sessions import field_samples
 
     volts = _volts(given["volts_per_tesla"], given["zero_volts"])
     start_ns = _start(given["start"])
@@ -160,7 +160,7 @@ def import_samples(
             downward=bool(given["downward"]),
             start_ns=start_ns,
         )
-        halls.write_session(
+        field_samples.write_halls(
             output,
             [imported.samples],
             floor=floor,

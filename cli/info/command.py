@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,6 @@ import click
 from locatk.cli import console, failures, options
 from locatk.cli.info import lighthouse as info_lighthouse
 from locatk.cli.info.text import text
-from locatk.core.errors import FormatError
 
 if TYPE_CHECKING:
     from locatk.formats.sessions.reader import Session
@@ -110,8 +108,9 @@ def _artifact(file: Path) -> dict[str, Any]:
 
 def _recording(file: Path) -> dict[str, Any]:
     from locatk.formats.sessions import capture_record as captured
+    from locatk.formats.sessions.reader import Session
 
-    session = _session(file)
+    session = Session.open(file, damaged_ok=True)
     facts = session.facts
     described = {
         "kind": facts.get("kind"),
@@ -140,24 +139,6 @@ def _recording(file: Path) -> dict[str, Any]:
 
         described |= getattr(describe, facts["system"])(session)
     return described
-
-
-def _session(file: Path) -> Session:
-    """The session in a file, or what is left of it."""
-    from locatk.formats.sessions.mcap_records import NotMcapError
-    from locatk.formats.sessions.reader import Session
-
-    try:
-        return Session.open(file)
-    except FormatError as error:
-        from locatk.formats.sessions.recovery.recover import left_in
-
-        where = "" if error.where is None else f" ({error.where})"
-        headless = isinstance(error.__context__, NotMcapError)
-        what = "it does not begin as an MCAP file" if headless else error.message + where
-        with contextlib.suppress(FormatError):
-            return left_in(file, what)
-        raise
 
 
 def _streams(session: Session) -> list[dict[str, Any]]:

@@ -47,7 +47,7 @@ def recording(session: Session) -> dict[str, Any]:
             return None
 
     known = tried(observations.read_scene) or Nothing()
-    heard = tried(observations.read_heard) or ()
+    heard = tried(observations.read_station_reports) or ()
     receivers = tried(observations.read_receivers) or {}
     detections = tried(_detections) or []
     counts, sweeps = tried(_sweeps) or (None, {})
@@ -104,7 +104,7 @@ def scene(
 ) -> dict[str, Any]:
     """Stations that are in the scene, were heard, solved or only seen in sweeps (``counts``,
     channel to count), and the rest of the scene."""
-    from locatk.formats.sessions.station_reports import strangers
+    from locatk.formats.sessions.station_reports import describe_unknown_stations
 
     measured = {each.channel: each for each in heard}
     solved = {each["channel"]: each for each in detections}
@@ -136,7 +136,7 @@ def scene(
         "scale": known.scale if known.stations else None,
         "planar": known.planar,
         "frame": known.frame,
-        "notes": [*known.notes, *strangers(known, list(measured.values()))],
+        "notes": [*known.notes, *describe_unknown_stations(known, list(measured.values()))],
     }
 
 

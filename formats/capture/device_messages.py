@@ -17,8 +17,7 @@ from locatk.formats.capture.arrival_times import Arrivals
 from locatk.formats.capture.device_clock import DeviceTime
 from locatk.formats.devices.decoder import Batch, Stream
 from locatk.formats.sessions import messages
-from locatk.formats.sessions.messages import Layout
-from locatk.formats.sessions.trajectories import LARGEST_BATCH
+from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, Layout
 
 SYSTEMS = {
     "magnetometers": "polaris",
@@ -121,8 +120,8 @@ class Streams:
             columns["device_ticks"] = batch.tick
         if batch.sequence is not None:
             columns["sequence"] = batch.sequence
-        for start in range(0, len(batch), LARGEST_BATCH):
-            part = slice(start, start + LARGEST_BATCH)
+        for start in range(0, len(batch), MAX_BATCH_SAMPLES):
+            part = slice(start, start + MAX_BATCH_SAMPLES)
             message = layout.pack(once, {key: column[part] for key, column in columns.items()})
             yield Stamped(topic, message, now_ns, int(time_ns[start]))
 

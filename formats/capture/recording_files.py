@@ -15,8 +15,8 @@ from locatk.formats.capture.device_messages import Stamped
 from locatk.formats.capture.live_file import LiveFile, check_idle
 from locatk.formats.capture.statistics import RECORD
 from locatk.formats.output import check_output
+from locatk.formats.sessions.mcap_file import SESSION_RECORD
 from locatk.formats.sessions.messages import timestamp
-from locatk.formats.sessions.reader import RECORD as SESSION
 from locatk.formats.sessions.writer import SessionWriter
 
 CHUNK = 1 << 19
@@ -138,7 +138,7 @@ class Parts:
         """Say whose session it is, once that is known."""
         if name and name != self._system:
             self._system = name
-            self._writer.metadata(SESSION, {"system": name})
+            self._writer.metadata(SESSION_RECORD, {"system": name})
 
     def attach(self, artifacts: Mapping[str, str]) -> None:
         """Attach what is not yet there, to this part and all that follow."""

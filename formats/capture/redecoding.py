@@ -16,9 +16,9 @@ from locatk.formats.capture.reader_thread import Arrived
 from locatk.formats.capture.statistics import RECORD, Totals
 from locatk.formats.devices.decoder import Options
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions.reader import RECORD as SESSION
+from locatk.formats.sessions.mcap_file import CHANNELS_RECORD, SESSION_RECORD
 from locatk.formats.sessions.reader import Session
-from locatk.formats.sessions.writer import CHANNELS, SessionWriter
+from locatk.formats.sessions.writer import SessionWriter
 
 TOPIC = "/serial/"
 
@@ -115,10 +115,10 @@ def decode(
             if data is not None and info.name not in attached:
                 writer.attach(info.name, data, info.media_type, info.time_ns)
         for key, record in session.metadata().items():
-            if key not in (SESSION, RECORD, CHANNELS):
+            if key not in (SESSION_RECORD, RECORD, CHANNELS_RECORD):
                 writer.metadata(key, record)
         decoded = _decoded(intakes)
-        writer.metadata(SESSION, {"system": decoded.system})
+        writer.metadata(SESSION_RECORD, {"system": decoded.system})
         writer.metadata(RECORD, _facts(said, intakes, decoded, Path(session.path).name))
     return decoded
 

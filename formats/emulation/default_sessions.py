@@ -10,8 +10,7 @@ from collections.abc import Callable
 from math import radians
 
 from locatk.core.errors import InputError
-from locatk.formats.sessions import halls, observations
-from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions import field_samples, observations
 
 IDS = (262_143, 77, 123_456)
 """Tags over which the bar drives."""
@@ -57,7 +56,7 @@ def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
     site = {number: PlanarPose(0.5 * k, 0.02 * k, radians(turn)) for k, (number, turn) in places}
     tags = Tags(codec="polaris-released", site=site)
     simulated = simulate(tags, SimulationOptions(route=IDS, rest_s=1.0, odometry=True, seed=seed))
-    arrays.write_session(
+    field_samples.write_magnetometers(
         path,
         [simulated.samples],
         tags=tags,
@@ -75,7 +74,7 @@ def _landmarks(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None
 
     floor = design_map(DesignOptions(rows=6, columns=8, seed=seed))
     simulated = simulate(floor, SimulationOptions(landmarks=6, seed=seed))
-    halls.write_session(
+    field_samples.write_halls(
         path,
         simulated.samples,
         floor=floor,

@@ -13,12 +13,11 @@ from locatk.formats.capture.statistics import RECORD
 from locatk.formats.devices import Device, device
 from locatk.formats.devices.recording import Recording
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions import halls
-from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions import field_samples
 from locatk.formats.sessions.observations import (
     read_halls,
+    read_magnetometers,
     read_odometry,
-    read_samples,
     read_sweeps,
 )
 from locatk.formats.sessions.reader import Session
@@ -103,7 +102,7 @@ def _usual(session: Session) -> str:
     """A device that sends what the session holds, by its name."""
     if session.topics("/", SerialChunk.DESCRIPTOR.full_name):
         return RAW
-    if session.topics(arrays.TOPIC, arrays.SCHEMA):
+    if field_samples.MAGNETOMETERS.topics(session):
         return "polaris-array"
     if session.topics(*SWEEPS):
         return "dotbot-gateway"
@@ -113,8 +112,8 @@ def _usual(session: Session) -> str:
 def _recording(session: Session) -> Recording:
     """The observations of a session, of whichever kinds it holds."""
     found = Recording(
-        samples=read_samples(session) if session.topics(arrays.TOPIC, arrays.SCHEMA) else (),
-        halls=read_halls(session) if session.topics(halls.TOPIC, halls.SCHEMA) else (),
+        samples=read_magnetometers(session) if field_samples.MAGNETOMETERS.topics(session) else (),
+        halls=read_halls(session) if field_samples.HALLS.topics(session) else (),
         sweeps=read_sweeps(session) if session.topics(*SWEEPS) else None,
         odometry=read_odometry(session),
     )

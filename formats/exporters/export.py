@@ -1,4 +1,4 @@
-"""Poses for other tools: which formats there are, and which files poses become."""
+"""Export of poses for other tools: table of formats, plan of the files, and writing."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters import trajectory_text
 from locatk.formats.output import atomic_write
 from locatk.formats.sessions.reader import Session
 
 FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
 
 ENDINGS = {"tum": ".tum", "kitti": ".txt"}
-"""Of the formats that hold one device a file."""
+"""File name endings of the formats that hold one device per file."""
 
 TEXTS = ("csv", "tum")
-"""Formats that are text, and one file: they can go through a pipe."""
+"""Formats that are a single text file, and can be written to a pipe."""
 
-OF_THE_FILE = ("kind", "format_version")
-"""Facts of a solution that say nothing of its poses."""
+FILE_FACTS = ("kind", "format_version")
+"""Facts of a solution that describe its file and not its poses."""
 
 
 @dataclass(frozen=True)
-class Part:
+class OutputFile:
     """One file to write.
 
     Attributes
     ----------
     path : Path
     trajectories : tuple of Trajectory
-        What goes into it.
+        Its content.
     times : Path or None
-        The file beside it for the times, which KITTI's format does not hold.
+        Additional file for the times, which the format of KITTI does not contain.
     """
 
     path: Path
@@ -45,15 +45,17 @@ class Part:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files that are written."""
+        """Paths of all files that are written."""
         return (self.path,) if self.times is None else (self.path, self.times)
 
 
-def parts(found: Sequence[Trajectory], format_name: str, output: Path) -> list[Part]:
-    """The files that poses become: ``output``, or in that folder one a device.
+def plan_files(
+    trajectories: Sequence[Trajectory], format_name: str, output: Path
+) -> list[OutputFile]:
+    """Plan the files of an export: ``output``, or one per device in this folder.
 
-    A folder where the format holds one device a file, and there are several or ``output``
-    is a folder already.
+    ``output`` is a folder if the format holds one device per file, and there are several devices
+    or the folder already exists.
 
     Raises
     ------
@@ -62,14 +64,14 @@ def parts(found: Sequence[Trajectory], format_name: str, output: Path) -> list[P
     """
     ending = ENDINGS.get(format_name)
     if ending is None:
-        return [Part(output, tuple(found))]
-    single = len(found) == 1 and not output.is_dir()
+        return [OutputFile(output, tuple(trajectories))]
+    is_single = len(trajectories) == 1 and not output.is_dir()
     planned = []
-    for each in found:
-        path = output if single else output / f"{each.device.replace('/', '_')}{ending}"
+    for each in trajectories:
+        path = output if is_single else output / f"{each.device.replace('/', '_')}{ending}"
         times = path.with_name(f"{path.stem}.times.txt") if format_name == "kitti" else None
-        planned.append(Part(path, (each,), times))
-    files = [path for part in planned for path in part.files]
+        planned.append(OutputFile(path, (each,), times))
+    files = [path for file in planned for path in file.files]
     for path in files:
         if files.count(path) > 1:
             raise InputError(
@@ -80,25 +82,25 @@ def parts(found: Sequence[Trajectory], format_name: str, output: Path) -> list[P
 
 
 def write(
-    part: Part,
+    file: OutputFile,
     format_name: str,
     *,
     facts: Mapping[str, str] | None = None,
     covariance: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write one file, and its times where it has such.
+    """Write one planned file, and its file of times if it has one.
 
     Parameters
     ----------
-    part : Part
-        As planned by :func:`parts` for this format.
+    file : OutputFile
+        As planned by :func:`plan_files` for this format.
     format_name : str
         One of :data:`FORMATS`.
     facts : mapping of str to str, optional
-        Where the poses come from; kept by the formats that have a place for it.
+        Origin of the poses; stored by ``parquet`` and ``ros2``.
     covariance : bool
-        In ``ros2``, poses with covariance too.
+        In ``ros2``, also write poses with covariance.
     overwrite : bool
         Replace existing files.
 
@@ -109,23 +111,23 @@ def write(
     """
     match format_name:
         case "csv":
-            trajectories.write_csv(part.path, part.trajectories, overwrite=overwrite)
+            trajectory_text.write_csv(file.path, file.trajectories, overwrite=overwrite)
         case "tum":
-            trajectories.write_tum(part.path, part.trajectories[0], overwrite=overwrite)
+            trajectory_text.write_tum(file.path, file.trajectories[0], overwrite=overwrite)
         case "kitti":
-            trajectories.write_kitti(part.path, part.trajectories[0], overwrite=overwrite)
-            assert part.times is not None
-            write_times(part.times, part.trajectories[0], overwrite=overwrite)
+            trajectory_text.write_kitti(file.path, file.trajectories[0], overwrite=overwrite)
+            assert file.times is not None
+            write_times(file.times, file.trajectories[0], overwrite=overwrite)
         case "parquet":
             from locatk.formats.exporters.parquet import write_parquet
 
-            write_parquet(part.path, part.trajectories, facts=facts, overwrite=overwrite)
+            write_parquet(file.path, file.trajectories, facts=facts, overwrite=overwrite)
         case "ros2":
             from locatk.formats.exporters.ros2 import write_ros2
 
             write_ros2(
-                part.path,
-                part.trajectories,
+                file.path,
+                file.trajectories,
                 facts=facts,
                 covariance=covariance,
                 overwrite=overwrite,
@@ -135,31 +137,31 @@ def write(
 
 
 def write_times(path: Path, trajectory: Trajectory, *, overwrite: bool = False) -> None:
-    """Write the time of each pose, a line each, in epoch seconds with nine decimals.
+    """Write the time of each pose, one per line, in epoch seconds with nine decimals.
 
-    What KITTI's ``times.txt`` is to its poses, but that it counts from the first one.
+    The ``times.txt`` of KITTI is similar, but counts from the first pose.
     """
     with atomic_write(path, overwrite=overwrite, mode="w") as stream:
-        times = map(trajectories.format_time, trajectory.time_ns.tolist())
+        times = map(trajectory_text.format_time, trajectory.time_ns.tolist())
         stream.writelines(f"{time}\n" for time in times)
 
 
-def numbers(trajectory: Trajectory) -> Trajectory:
-    """The poses that are numbers; the others can be written in no format but Parquet."""
+def finite_poses(trajectory: Trajectory) -> Trajectory:
+    """Return the poses that are finite; only Parquet can represent the others."""
     pose = np.hstack([trajectory.position, trajectory.quaternion])
-    whole = np.isfinite(pose).all(axis=1)
-    if whole.all():
+    is_finite = np.isfinite(pose).all(axis=1)
+    if is_finite.all():
         return trajectory
     return replace(
         trajectory,
-        time_ns=trajectory.time_ns[whole],
-        position=trajectory.position[whole],
-        quaternion=trajectory.quaternion[whole],
-        covariance=trajectory.covariance[whole],
+        time_ns=trajectory.time_ns[is_finite],
+        position=trajectory.position[is_finite],
+        quaternion=trajectory.quaternion[is_finite],
+        covariance=trajectory.covariance[is_finite],
     )
 
 
-def facts_of(path: Path) -> dict[str, str]:
-    """What the file of the poses says of them: system, method, source, version of the tool."""
+def read_origin(path: Path) -> dict[str, str]:
+    """Read the origin of the poses in a file: system, method, source, version of the tool."""
     facts = Session.open(path).facts
-    return {key: value for key, value in facts.items() if key not in OF_THE_FILE}
+    return {key: value for key, value in facts.items() if key not in FILE_FACTS}

@@ -1,7 +1,8 @@
-"""Poses as Parquet: for pandas, Polars, DuckDB, Spark and R, with all that is known of them.
+"""Export of poses as Parquet for pandas, Polars, DuckDB, Spark and R.
 
-The columns of the CSV form, then what it leaves out: exact times, frames, full covariances.
-What is not known is null. The columns are those of docs/formats.md; later versions only add.
+The columns are those of the CSV form, followed by exact times, frames and full covariances.
+Unknown values are null. The columns are documented in docs/formats.md; later versions only add
+columns.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.messages import triangle
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
-"""Of a pose's covariance: position, and rotation about the fixed axes x, y, z."""
+"""Axes of a pose's covariance: position, and rotation about the fixed axes x, y, z."""
 
 
 def _covariance_columns() -> tuple[str, ...]:
@@ -36,7 +37,7 @@ COVARIANCE = _covariance_columns()
 """Columns of the upper triangle, row by row: ``cov_x_x_m2``, ``cov_x_rx_m_rad``, ..."""
 
 PREFIX = "locatk."
-"""Before each key of the file's metadata, which other tools write to as well."""
+"""Prefix of the keys of locatk in the file's metadata, to which other tools also write."""
 
 
 def write_parquet(
@@ -46,16 +47,16 @@ def write_parquet(
     facts: Mapping[str, str] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write poses as one Parquet table, one row a pose, device after device.
+    """Write poses as one Parquet table, one row per pose, device after device.
 
     Parameters
     ----------
     path : path
         The output.
     trajectories : sequence of Trajectory
-        One a device.
+        One per device.
     facts : mapping of str to str, optional
-        System, method, source and others, for the metadata of the schema.
+        Origin of the poses (system, method, source ...), for the metadata of the schema.
     overwrite : bool
         Replace an existing file.
 
@@ -68,9 +69,9 @@ def write_parquet(
     """
     arrow, parquet = _pyarrow()
     tables = [_table(arrow, trajectory) for trajectory in trajectories]
-    said = {**(facts or {}), "exported_by": f"locatk {tool_version()}"}
-    metadata = {f"{PREFIX}{key}": value for key, value in said.items()}
-    table = arrow.concat_tables(tables or [_table(arrow, _nothing())])
+    origin = {**(facts or {}), "exported_by": f"locatk {tool_version()}"}
+    metadata = {f"{PREFIX}{key}": value for key, value in origin.items()}
+    table = arrow.concat_tables(tables or [_table(arrow, _empty_trajectory())])
     with atomic_write(path, overwrite=overwrite) as stream:
         parquet.write_table(table.replace_schema_metadata(metadata), stream)
 
@@ -94,13 +95,13 @@ def _table(arrow: Any, trajectory: Trajectory) -> Any:
         return arrow.repeat(arrow.scalar(value, arrow.string()), n)
 
     def numbers(values: Any) -> list[Any]:
-        """A column each; nan, which says that nothing is known, becomes null."""
+        """Return one column for each column of ``values``; nan (unknown) becomes null."""
         return [
             arrow.array(np.ascontiguousarray(column), mask=np.isnan(column)) for column in values.T
         ]
 
     pose = np.hstack([trajectory.position, trajectory.quaternion])
-    # Whole seconds and the rest apart: as one float64 product, the last digits would differ.
+    # Whole seconds and the rest are added, because a float64 product rounds the last digits.
     seconds, rest = np.divmod(trajectory.time_ns, 1_000_000_000)
     columns = [
         arrow.array(seconds + rest / 1e9),
@@ -114,5 +115,5 @@ def _table(arrow: Any, trajectory: Trajectory) -> Any:
     return arrow.table(columns, names=[*COLUMNS, "time_ns", "frame", *COVARIANCE])
 
 
-def _nothing() -> Trajectory:
+def _empty_trajectory() -> Trajectory:
     return Trajectory.from_positions("", "", np.zeros(0, np.int64), np.zeros((0, 3)))

@@ -1,14 +1,20 @@
-"""Poses as a ROS 2 bag: an MCAP file of CDR messages for evo, rosbags, RViz and ``ros2 bag``.
+"""Export of poses as a ROS 2 bag: an MCAP file of CDR messages.
 
-The messages of a device differ in their stamp and their numbers only, so that numpy lays out
-all of them at once: 25 times as fast as the encoder of ``mcap-ros2-support``, and four times
-with the writing of the file (100,000 poses and their transforms). Its writer is not used for a
-second reason: it cannot give channels the metadata that the profile asks for.
+evo, rosbags, RViz and ``ros2 bag`` read it.
 
-Sources: CDR is OMG's DDSI-RTPS 2.5, section 10, as rmw uses it (little-endian, alignment from
-behind the four bytes of the header); definitions are those of ROS 2's common_interfaces;
-rules of names, https://design.ros2.org/articles/topic_and_service_names.html; profile,
-https://mcap.dev/spec/registry#ros2; what a player reads, rosbag2_storage_mcap/src/mcap_storage.cpp.
+The messages of a device differ only in stamp and numbers, hence numpy encodes all of them at once.
+For 100,000 poses and their transforms this module needs 1.0 s (11.1 MB) and rosbags 0.11
+(``rosbag2.Writer`` with ``StoragePlugin.MCAP``, zstd, ``serialize_cdr``) 1.9 s (10.6 MB); its
+writer alone, with messages encoded here, 0.7 s. It is not used, because it writes a folder with
+``metadata.yaml`` instead of one file that appears atomically, writes no checksums, and has no
+metadata record for the origin of the poses. The writer of ``mcap-ros2-support`` encodes 25 times
+slower and cannot give channels the metadata that the profile requires.
+
+Sources: CDR is OMG's DDSI-RTPS 2.5, section 10, as rmw uses it (little-endian, alignment relative
+to the end of the four-byte header). Definitions are those of ROS 2's common_interfaces. Names:
+https://design.ros2.org/articles/topic_and_service_names.html. Profile:
+https://mcap.dev/spec/registry#ros2. Fields that a player reads:
+rosbag2_storage_mcap/src/mcap_storage.cpp of https://github.com/ros2/rosbag2.
 """
 
 from __future__ import annotations
@@ -28,19 +34,24 @@ from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.foxglove import child_frame
 
 UNKNOWN_VARIANCE = 1e6
-"""Variance of what was not observed, in m^2 or rad^2. ROS has no word for it; filters take a
-large one for "no information", zero for certainty, and NaN spoils them."""
+"""Variance of unobserved quantities, in m^2 or rad^2.
+
+ROS has no value for "unknown". Filters interpret a large variance as no information and zero as
+certainty, and fail on NaN.
+"""
 
 OFFERED_QOS = "[]"
-"""Value of ``offered_qos_profiles``, which the profile requires: no publisher is known, and
-players take their default (reliable, volatile). Distributions before Jazzy write its policies as
-numbers, later ones as names; the empty list means the same to all."""
+"""Value of ``offered_qos_profiles``, which the profile requires.
+
+No publisher is known, and players use their default (reliable, volatile). Distributions before
+Jazzy write policies as numbers, later ones as names; the empty list is valid for all.
+"""
 
 RECORD = "locatk_export"
-"""Name of the metadata record that tells where the poses come from."""
+"""Name of the metadata record with the origin of the poses."""
 
-LAST_NS = 2**31 * 1_000_000_000
-"""First time that ``builtin_interfaces/Time`` cannot say: 2038-01-19."""
+END_OF_TIME_NS = 2**31 * 1_000_000_000
+"""First time that ``builtin_interfaces/Time`` cannot represent: 2038-01-19."""
 
 _DEFINITIONS = {
     "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
@@ -49,7 +60,7 @@ _DEFINITIONS = {
     ),
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
 }
-"""The messages that are written, first lines of their schemas."""
+"""Definitions of the messages that are written."""
 
 _PARTS = {
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
@@ -66,10 +77,10 @@ _PARTS = {
     "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
 }
-"""What they are made of."""
+"""Definitions of their parts."""
 
 Stream = tuple[int, NDArray[np.int64], list[bytes]]
-"""Channel, times (n,) in ns, n messages."""
+"""Channel, times (n,) in ns, and n messages."""
 
 
 def write_ros2(
@@ -82,17 +93,18 @@ def write_ros2(
 ) -> None:
     """Write poses as a ROS 2 bag of one file.
 
-    ``geometry_msgs/msg/PoseStamped`` on ``/pose/<device>`` and ``tf2_msgs/msg/TFMessage`` on
-    ``/tf``, the device's frame in that of its poses. Log time and stamp are the pose's time.
+    ``geometry_msgs/msg/PoseStamped`` are written on ``/pose/<device>`` and
+    ``tf2_msgs/msg/TFMessage`` on ``/tf``, from the frame of the poses to the device's frame. Log
+    time and stamp are the pose's time.
 
     Parameters
     ----------
     path : path
-        The output; ``ros2 bag`` knows it by the ending ``.mcap``.
+        The output; ``ros2 bag`` recognizes it by the ending ``.mcap``.
     trajectories : sequence of Trajectory
-        One a device.
+        One per device.
     facts : mapping of str to str, optional
-        Where the poses come from, for the metadata record :data:`RECORD`.
+        Origin of the poses, for the metadata record :data:`RECORD`.
     covariance : bool
         Also ``geometry_msgs/msg/PoseWithCovarianceStamped`` on
         ``/pose_with_covariance/<device>``; see :func:`known_covariance`.
@@ -130,58 +142,58 @@ def write_ros2(
 
 
 def ros_names(devices: Sequence[str]) -> list[str]:
-    """Names of devices as parts of ROS 2 topics: letters, digits and single underscores.
+    """Convert names of devices to parts of ROS 2 topics: letters, digits, single underscores.
 
-    Everything else becomes an underscore; a name that would begin with a digit or an
-    underscore (a hidden topic) gets ``device_`` in front.
+    Other characters become an underscore. A name that would begin with a digit or an underscore
+    (a hidden topic) gets the prefix ``device_``.
 
     Raises
     ------
     InputError
-        Two of them become the same.
+        Two of them become equal.
 
     Examples
     --------
     >>> ros_names(["kiwi", "lab/blue robot", "17"])
     ['kiwi', 'lab_blue_robot', 'device_17']
     """
-    found: dict[str, str] = {}
+    device_of: dict[str, str] = {}
     for device in devices:
         name = re.sub(r"[^0-9A-Za-z]+", "_", device).rstrip("_")
         if not re.match("[A-Za-z]", name):
             name = f"device_{name.lstrip('_')}".rstrip("_")
-        if name in found:
+        if name in device_of:
             raise InputError(
-                f"devices {found[name]!r} and {device!r} have the same name in ROS, {name!r}",
-                hint="Export as csv or parquet, which keep names as they are",
+                f"devices {device_of[name]!r} and {device!r} have the same name in ROS, {name!r}",
+                hint="Export as csv or parquet, which keep the names",
             )
-        found[name] = device
-    return list(found)
+        device_of[name] = device
+    return list(device_of)
 
 
 def pose_stamped(trajectory: Trajectory) -> list[bytes]:
-    """``geometry_msgs/msg/PoseStamped`` in CDR, one a pose."""
+    """Encode one ``geometry_msgs/msg/PoseStamped`` per pose in CDR."""
     return _messages(trajectory, bytes(8) + _string(trajectory.frame), 0, _poses(trajectory))
 
 
 def pose_with_covariance(trajectory: Trajectory) -> list[bytes]:
-    """``geometry_msgs/msg/PoseWithCovarianceStamped`` in CDR, one a pose."""
+    """Encode one ``geometry_msgs/msg/PoseWithCovarianceStamped`` per pose in CDR."""
     flat = known_covariance(trajectory.covariance).reshape(-1, 36)
     numbers = np.hstack([_poses(trajectory), flat])
     return _messages(trajectory, bytes(8) + _string(trajectory.frame), 0, numbers)
 
 
 def transforms(trajectory: Trajectory) -> list[bytes]:
-    """``tf2_msgs/msg/TFMessage`` of one transform in CDR, one a pose."""
+    """Encode one ``tf2_msgs/msg/TFMessage`` with one transform per pose in CDR."""
     head = struct.pack("<I", 1) + bytes(8) + _string(trajectory.frame)
     return _messages(trajectory, head + _string(child_frame(trajectory)), 4, _poses(trajectory))
 
 
 def known_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 6, 6) covariances without NaN, as filters need them.
+    """Return (n, 6, 6) covariances without NaN, as filters need them.
 
-    What was not observed has the variance :data:`UNKNOWN_VARIANCE` and no correlation. ROS
-    orders as we do: x, y, z, and rotations about the fixed axes x, y, z.
+    Unobserved quantities get the variance :data:`UNKNOWN_VARIANCE` and no correlation. The order
+    of ROS is that of locatk: x, y, z, and rotations about the fixed axes x, y, z.
     """
     filled = np.nan_to_num(covariance, nan=0.0)
     row, column = np.nonzero(np.isnan(np.einsum("nii->ni", covariance)))
@@ -195,19 +207,19 @@ def _poses(trajectory: Trajectory) -> NDArray[np.float64]:
 
 
 def _string(text: str) -> bytes:
-    """A string of CDR: length with the final zero, bytes; padded for another length."""
+    """Encode a string in CDR: length with the final zero, bytes, padding for another length."""
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
 
 
 def _messages(
-    trajectory: Trajectory, head: bytes, stamp_at: int, numbers: NDArray[np.float64]
+    trajectory: Trajectory, head: bytes, stamp_offset: int, numbers: NDArray[np.float64]
 ) -> list[bytes]:
-    """CDR messages of ``head``, in which a stamp stands at ``stamp_at``, and doubles (n, k)."""
+    """Encode messages of ``head``, with the stamp at byte ``stamp_offset``, and doubles (n, k)."""
     n, k = numbers.shape
     header = b"\x00\x01\x00\x00"  # plain CDR, little-endian
     blank = header + head + bytes(-len(head) % 8) + bytes(8 * k)
-    size, start = len(blank), len(header) + stamp_at
+    size, start = len(blank), len(header) + stamp_offset
     layout = np.dtype(
         {
             "names": ["sec", "nanosec", "numbers"],
@@ -220,24 +232,24 @@ def _messages(
     table = np.frombuffer(content, layout)
     table["sec"], table["nanosec"] = np.divmod(trajectory.time_ns, 1_000_000_000)
     table["numbers"] = numbers
-    return [bytes(content[at : at + size]) for at in range(0, n * size, size)]
+    return [bytes(content[k : k + size]) for k in range(0, n * size, size)]
 
 
 def _check(trajectory: Trajectory) -> None:
     name = f"trajectory of device {trajectory.device!r}"
     if not trajectory.frame:
-        raise InputError(f"a frame without a name in the {name}", hint="export it as csv or tum")
+        raise InputError(f"a frame without a name in the {name}", hint="Export it as csv or tum")
     if not np.isfinite(_poses(trajectory)).all():
-        raise InputError(f"poses that are not numbers in the {name}", hint="leave them out")
-    if ((trajectory.time_ns < 0) | (trajectory.time_ns >= LAST_NS)).any():
+        raise InputError(f"poses that are not numbers in the {name}", hint="Leave them out")
+    if ((trajectory.time_ns < 0) | (trajectory.time_ns >= END_OF_TIME_NS)).any():
         raise InputError(
             f"a time that is not between 1970 and 2038 in the {name}",
-            hint="export it as csv or parquet",
+            hint="Export it as csv or parquet",
         )
 
 
 def _channels(writer: Writer) -> Callable[[str, str], int]:
-    """``channel(topic, message)`` gives the id of a topic's channel, made when it is new."""
+    """Return a function (topic, message) that registers a topic once and returns its channel."""
     schemas: dict[str, int] = {}
     channels: dict[str, int] = {}
 
@@ -254,15 +266,15 @@ def _channels(writer: Writer) -> Callable[[str, str], int]:
 
 
 def _definition(message: str) -> str:
-    """A message's definition followed by those of its parts, as ``ros2msg`` wants it."""
+    """Return the definition of a message and of its parts in the format ``ros2msg``."""
     text, parts = _DEFINITIONS[message], {}
-    open_texts = [text]
-    while open_texts:
-        for line in open_texts.pop().splitlines():
+    pending = [text]
+    while pending:
+        for line in pending.pop().splitlines():
             part = line.split()[0].removesuffix("[]")
             if part in _PARTS and part not in parts:
                 parts[part] = _PARTS[part]
-                open_texts.append(_PARTS[part])
+                pending.append(_PARTS[part])
     rule = "=" * 80
     return text + "".join(f"{rule}\nMSG: {part}\n{lines}" for part, lines in parts.items())
 
@@ -272,7 +284,7 @@ def _write(writer: Writer, streams: Sequence[Stream]) -> None:
     if not streams:
         return
     times = np.concatenate([time_ns for _, time_ns, _ in streams])
-    messages = [message for _, _, found in streams for message in found]
+    messages = [message for _, _, encoded in streams for message in encoded]
     channels = np.repeat([channel for channel, _, _ in streams], [len(m) for *_, m in streams])
     order = np.argsort(times, kind="stable")
     sequence: dict[int, int] = {}

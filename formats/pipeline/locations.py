@@ -24,8 +24,8 @@ from locatk.core.errors import (
     OutputExistsError,
 )
 from locatk.formats.output import check_output
-from locatk.formats.sessions.mcap_records import DamageError, read_index
-from locatk.formats.sessions.reader import RECORD, Session
+from locatk.formats.sessions.mcap_file import SESSION_RECORD, DamageError
+from locatk.formats.sessions.reader import Session, read_index
 
 STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss")
 """Protocols of object stores, where an object appears whole or not at all."""
@@ -206,7 +206,7 @@ def facts_of(place: str) -> dict[str, str]:
         with remote(place) as (store, key):
             stream: IO[bytes]
             with store.open(key, "rb", cache_type="readahead", block_size=1 << 16) as stream:
-                return dict(read_index(stream).metadata.get(RECORD, {}))
+                return dict(read_index(stream).metadata.get(SESSION_RECORD, {}))
     except (LocatkError, DamageError):
         return {}
 

@@ -18,7 +18,7 @@ from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
 from locatk.formats.files import read_bytes
 from locatk.formats.output import tool_version
-from locatk.formats.sessions.reader import Session, reading
+from locatk.formats.sessions.reader import Session, open_mcap
 from locatk.formats.sessions.solutions import read_solution
 
 _BLOCK = 1 << 20
@@ -33,7 +33,7 @@ def source_facts(path: str | os.PathLike[str]) -> dict[str, str]:
         It cannot be read.
     """
     digest, size = hashlib.sha256(), 0
-    with reading(path) as stream:
+    with open_mcap(path) as stream:
         while block := stream.read(_BLOCK):
             digest.update(block)
             size += len(block)

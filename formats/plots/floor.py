@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import Similarity
+from locatk.core.landmarks.drawing.floor_bars import (
+    MIN_DRAWN_STRENGTH,
+    bars_on_floor,
+    cells_near,
+)
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots.floor_bars import WEAK, bars_on_floor, cells_near
 
 Array = NDArray[np.float64]
 
@@ -110,7 +114,7 @@ def _bars(floor: FloorMap, cells: Sequence[tuple[int, int]]) -> tuple[Array, Arr
     laid = [bars_on_floor(floor, cell) for cell in cells]
     middle = np.concatenate([bars[0] for bars in laid])
     heading = np.concatenate([bars[1] for bars in laid])
-    strong = np.abs(np.concatenate([bars[2] for bars in laid])) >= WEAK
+    strong = np.abs(np.concatenate([bars[2] for bars in laid])) >= MIN_DRAWN_STRENGTH
     way = np.column_stack([np.cos(heading), np.sin(heading)])
     long = way * floor.geometry.bar_length_m / 2
     wide = way[:, ::-1] * [-1, 1] * floor.geometry.bar_width_m / 2

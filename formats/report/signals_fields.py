@@ -15,7 +15,7 @@ from locatk.core.solution import Solution
 from locatk.formats.report import signals_drawing as drawing
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_reading import MOST_DEVICES, excerpt
-from locatk.formats.sessions.field_samples import Kind
+from locatk.formats.sessions.field_samples import SensorKind
 from locatk.formats.sessions.messages import BatchError
 from locatk.formats.sessions.reader import Session
 
@@ -33,7 +33,7 @@ Draw = Callable[[str, str, Fields, Sequence[str]], list[Panel]]
 
 
 def each_device(
-    session: Session, solution: Solution, kind: Kind[Any], title: str, draw: Draw
+    session: Session, solution: Solution, kind: SensorKind[Any], title: str, draw: Draw
 ) -> list[Panel]:
     """Panels of all devices with samples of a kind, :data:`MOST_DEVICES` at most.
 
@@ -60,7 +60,7 @@ def each_device(
     return found
 
 
-def fields(session: Session, kind: Kind[Any], topic: str, payloads: list[bytes]) -> Fields:
+def fields(session: Session, kind: SensorKind[Any], topic: str, payloads: list[bytes]) -> Fields:
     """Samples of one device; where its sensors sit need not be known.
 
     Raises

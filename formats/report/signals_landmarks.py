@@ -19,7 +19,7 @@ from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_drawing import Event, envelope
 from locatk.formats.report.signals_fields import Fields, each_device
-from locatk.formats.sessions.halls import KIND
+from locatk.formats.sessions.field_samples import HALLS
 from locatk.formats.sessions.reader import Session
 
 Array = NDArray[np.float64]
@@ -49,13 +49,13 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
         whole = _whole(name, time_s, field_mt, names, events, start_ns, notes)
         return [whole, *_near(device, time_s, field_mt, names, seen, events)]
 
-    return each_device(session, solution, KIND, "Hall sensors of", drawn)
+    return each_device(session, solution, HALLS, "Hall sensors of", drawn)
 
 
 def _names(session: Session, device: str, count: int) -> list[str]:
     """Of the sensors; numbers where they are not told."""
     try:
-        sensors = KIND.attached(session, device)
+        sensors = HALLS.attached(session, device)
     except LocatkError:
         sensors = None
     if sensors is None or len(sensors) != count:

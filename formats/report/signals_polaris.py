@@ -20,7 +20,7 @@ from locatk.formats.report.figures import label
 from locatk.formats.report.panel import Panel
 from locatk.formats.report.signals_drawing import Event, envelope, number, short
 from locatk.formats.report.signals_fields import Fields, each_device
-from locatk.formats.sessions.magnetometers import KIND
+from locatk.formats.sessions.field_samples import MAGNETOMETERS
 from locatk.formats.sessions.reader import Session
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def panels(session: Session, solution: Solution) -> list[Panel]:
         seen = [each for each in detections if each.device == device]
         return [_whole(name, bar, seen, notes), *_near(device, bar, seen)]
 
-    return each_device(session, solution, KIND, "Magnetic field along", drawn)
+    return each_device(session, solution, MAGNETOMETERS, "Magnetic field along", drawn)
 
 
 class _Bar:
@@ -94,7 +94,7 @@ def _signed(value: float) -> str:
 def _across_mm(session: Session, device: str, count: int) -> Array | None:
     """Where the sensors sit across the bar, positive to the left; None where not known."""
     try:
-        array = KIND.attached(session, device)
+        array = MAGNETOMETERS.attached(session, device)
     except LocatkError:
         return None
     return None if array is None or len(array) != count else 1e3 * array.position_m[:, 1]

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from locatk.formats.sessions import capture_record as captured
-from locatk.formats.sessions import mcap_records
-from locatk.formats.sessions.mcap_records import DamageError, Segment
-from locatk.formats.sessions.reader import Session, reading
+from locatk.formats.sessions.mcap_file import DamageError, Segment, read_messages
+from locatk.formats.sessions.reader import Session, open_mcap
 
 MOST_READ = 8 << 20
 """Bytes of a recording that are read to be drawn; of a larger one, parts spread over it."""
@@ -52,10 +51,10 @@ def excerpt(session: Session, topics: Collection[str], *, most: int | None = Non
     chosen = _spread(segments, most)
     found: dict[str, list[bytes]] = {topic: [] for topic in sorted(topics)}
     damaged = 0
-    with reading(session.path) as stream:
+    with open_mcap(session.path) as stream:
         for segment in chosen:
             try:
-                for channel, _, payload in mcap_records.read_messages(stream, segment, names):
+                for channel, _, payload in read_messages(stream, segment, names):
                     found[names[channel]].append(payload)
             except DamageError:
                 damaged += 1

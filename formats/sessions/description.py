@@ -1,5 +1,7 @@
-"""What `locatk info` says of dots, polaris and landmarks: artifacts and recordings, as plain
-values."""
+"""Descriptions of artifacts and recordings of dots, polaris and landmarks for `locatk info`.
+
+They consist of plain values for JSON, in the units of the artifacts' files.
+"""
 
 from __future__ import annotations
 
@@ -20,64 +22,72 @@ from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import maps, sheets
 from locatk.formats.artifacts import tags as tag_files
 from locatk.formats.sessions import capture_record as captured
-from locatk.formats.sessions import frames, halls
-from locatk.formats.sessions import magnetometers as arrays
-from locatk.formats.sessions.field_samples import Kind, NoGeometryError
-from locatk.formats.sessions.mcap_records import DamageError
+from locatk.formats.sessions import frames
+from locatk.formats.sessions.field_samples import (
+    HALLS,
+    MAGNETOMETERS,
+    MissingGeometryError,
+    SensorKind,
+    read_halls,
+    read_magnetometers,
+)
+from locatk.formats.sessions.mcap_file import DamageError
 from locatk.formats.sessions.reader import Session
 
 
-def manifest(found: Manifest) -> dict[str, Any]:
-    """How the sheets of a manifest were printed, and where they are."""
+def manifest(printed: Manifest) -> dict[str, Any]:
+    """Describe how the sheets of a manifest were printed, and their positions."""
     return {
-        "codec": found.codec,
-        "pitch_mm": found.pitch_mm,
-        "dot_mm": found.dot_mm,
-        "offset_mm": found.offset_mm,
-        "dpi": found.dpi,
-        "scale_x": found.scale[0],
-        "scale_y": found.scale[1],
+        "codec": printed.codec,
+        "pitch_mm": printed.pitch_mm,
+        "dot_mm": printed.dot_mm,
+        "offset_mm": printed.offset_mm,
+        "dpi": printed.dpi,
+        "scale_x": printed.scale[0],
+        "scale_y": printed.scale[1],
         "sheets": [
             {
                 "id": sheet.id,
-                "frame": found.frame(number),
+                "frame": printed.frame(number),
                 "origin": sheet.origin,
                 "size": sheet.size,
                 "section": sheet.section,
                 "page_mm": sheet.page_mm,
-                "pattern_mm": [round(n * found.pitch_mm, 3) for n in sheet.size],
+                "pattern_mm": [round(n * printed.pitch_mm, 3) for n in sheet.size],
                 "position_mm": sheet.position_mm,
                 "heading_deg": None if sheet.position_mm is None else sheet.heading_deg,
             }
-            for number, sheet in enumerate(found.sheets)
+            for number, sheet in enumerate(printed.sheets)
         ],
-        "notes": list(found.notes),
+        "notes": list(printed.notes),
     }
 
 
-def camera(found: Camera) -> dict[str, Any]:
-    """A camera, and by how much its lens moves a corner of the frame."""
-    width, height = found.size
+def camera(lens: Camera) -> dict[str, Any]:
+    """Describe a camera, and the largest displacement of a corner of the frame by its lens."""
+    width, height = lens.size
     corners = np.array([(x, y) for x in (0, width - 1) for y in (0, height - 1)], float)
-    moved = np.linalg.norm(found.undistort(corners) - corners, axis=1).max()
+    displacement = np.linalg.norm(lens.undistort(corners) - corners, axis=1).max()
     return {
-        "size_px": found.size,
-        "focal_px": found.focal_px,
-        "centre_px": found.centre_px,
-        "radial": found.radial,
-        "distortion_px": float(moved),
+        "size_px": lens.size,
+        "focal_px": lens.focal_px,
+        "centre_px": lens.centre_px,
+        "radial": lens.radial,
+        "distortion_px": float(displacement),
     }
 
 
 def damage(session: Session, error: LocatkError) -> dict[str, Any]:
-    """What is wrong with a session of which something could not be read, and whether it is
-    the file, of which `locatk recover` saves the rest."""
-    broken = session.damage is not None or isinstance(error.__context__, DamageError)
-    return {"damage": session.damage or error.message, "recoverable": broken}
+    """Describe the damage of a session that could not be read completely.
+
+    It is recoverable if the MCAP file is damaged, of which `locatk recover` saves the rest.
+    """
+    is_file_damaged = session.damage is not None or isinstance(error.__context__, DamageError)
+    return {"damage": session.damage or error.message, "recoverable": is_file_damaged}
 
 
 def dots(session: Session) -> dict[str, Any]:
-    """Frames, sheets and camera of a session; what is damaged is left out and said.
+    """Describe frames, sheets and camera of a session; damaged contents are left out and reported.
 
     A solution has sheets and no frames.
     """
@@ -93,20 +103,20 @@ def dots(session: Session) -> dict[str, Any]:
         if topics and not captured.is_few(session, topics):
             described |= _counted_frames(session, topics)
         elif topics:
-            found = frames.read_frames(session)
+            cameras = frames.read_frames(session)
             described["cameras"] = [
                 {"device": each.device, "frames": len(each), "size_px": _size(each.images)}
-                for each in found
+                for each in cameras
             ]
-            described["devices"] = [each.device for each in found]
-            described["frames"] = sum(map(len, found))
+            described["devices"] = [each.device for each in cameras]
+            described["frames"] = sum(map(len, cameras))
     except LocatkError as error:
         described |= damage(session, error)
     return described
 
 
 def _counted_frames(session: Session, topics: list[str]) -> dict[str, Any]:
-    """Frames of a large session, none of them looked at."""
+    """Describe the frames of a large session without reading any."""
     cameras = [
         {
             "device": topic.removeprefix(frames.TOPIC),
@@ -124,7 +134,7 @@ def _counted_frames(session: Session, topics: list[str]) -> dict[str, Any]:
 
 
 def _size(images: Any) -> list[int] | None:
-    """(width, height) of the first frame, None where there is none or it cannot be read."""
+    """Return (width, height) of the first frame; None without one, or if it cannot be read."""
     if not len(images):
         return None
     try:
@@ -134,17 +144,17 @@ def _size(images: Any) -> list[int] | None:
     return [width, height]
 
 
-def tags(found: Tags) -> dict[str, Any]:
-    """The design of tags, and what is known of each."""
-    magnet = found.magnet
-    numbers = set(found.ids or ()) | set(found.built) | set(found.site)
+def tags(design: Tags) -> dict[str, Any]:
+    """Describe the design of tags, and the known measurements of each."""
+    magnet = design.magnet
+    numbers = set(design.ids or ()) | set(design.built) | set(design.site)
     return {
-        "codec": found.codec,
-        "order": found.order,
-        "magnets": found.magnets,
-        "orientations": found.orientations,
-        "spacing_mm": 1e3 * found.spacing_m,
-        "clearance_mm": 1e3 * found.clearance_m,
+        "codec": design.codec,
+        "order": design.order,
+        "magnets": design.magnets,
+        "orientations": design.orientations,
+        "spacing_mm": 1e3 * design.spacing_m,
+        "clearance_mm": 1e3 * design.clearance_m,
         "magnet": {
             "diameter_mm": 1e3 * magnet.diameter_m,
             "height_mm": 1e3 * magnet.height_m,
@@ -152,17 +162,17 @@ def tags(found: Tags) -> dict[str, Any]:
             "grade": magnet.grade,
             "moment_am2": magnet.moment,
         },
-        "capacity": codec.capacity(found),
-        "family": None if found.ids is None else len(found.ids),
-        "min_distance": found.min_distance,
-        "tags": [_tag(found, number) for number in sorted(numbers)],
-        "notes": list(found.notes),
+        "capacity": codec.capacity(design),
+        "family": None if design.ids is None else len(design.ids),
+        "min_distance": design.min_distance,
+        "tags": [_tag(design, number) for number in sorted(numbers)],
+        "notes": list(design.notes),
     }
 
 
-def _tag(found: Tags, number: int) -> dict[str, Any]:
-    layout = codec.layout_of(found, number)
-    built, place = found.built.get(number), found.site.get(number)
+def _tag(design: Tags, number: int) -> dict[str, Any]:
+    layout = codec.layout_of(design, number)
+    built, pose = design.built.get(number), design.site.get(number)
     return {
         "id": number,
         "cells": layout.cells,
@@ -170,75 +180,82 @@ def _tag(found: Tags, number: int) -> dict[str, Any]:
         "passes": None if built is None else built.passes,
         "offset_mm": None if built is None else 1e3 * built.offset_m,
         "angle_deg": None if built is None else np.degrees(built.angle_rad),
-        "position_mm": None if place is None else [1e3 * place.x_m, 1e3 * place.y_m],
-        "heading_deg": None if place is None else float(np.degrees(place.heading_rad)),
+        "position_mm": None if pose is None else [1e3 * pose.x_m, 1e3 * pose.y_m],
+        "heading_deg": None if pose is None else float(np.degrees(pose.heading_rad)),
     }
 
 
-def array(found: SensorArray) -> dict[str, Any]:
-    """Where the sensors of an array sit, and how they measure; None where unknown."""
+def array(sensors: SensorArray) -> dict[str, Any]:
+    """Describe positions and properties of the sensors of an array."""
     return {
-        "sensor": found.sensor,
-        "sensors": len(found),
-        "position_mm": 1e3 * found.position_m,
-        "noise_ut": 1e6 * found.noise_t,
-        "delay_ms": 1e3 * found.delay_s,
-        "quantum_ut": 1e6 * np.where(found.quantum_t > 0, found.quantum_t, np.nan),
-        "range_ut": 1e6 * found.range_t,
+        "sensor": sensors.sensor,
+        "sensors": len(sensors),
+        "position_mm": 1e3 * sensors.position_m,
+        "noise_ut": 1e6 * sensors.noise_t,
+        "delay_ms": 1e3 * sensors.delay_s,
+        "quantum_ut": 1e6 * np.where(sensors.quantum_t > 0, sensors.quantum_t, np.nan),
+        "range_ut": 1e6 * sensors.range_t,
     }
 
 
 def polaris(session: Session) -> dict[str, Any]:
-    """Samples, arrays and tags of a session; what is damaged is left out and said.
+    """Describe samples, arrays and tags of a session; damaged contents are left out and reported.
 
     A solution has tags and no samples.
     """
-    return _described(
-        session, tag_files.attached_tags, tags, "arrays", arrays, lambda each: each.array, array
+    return _describe_samples(
+        session,
+        tag_files.attached_tags,
+        tags,
+        "arrays",
+        MAGNETOMETERS,
+        lambda: [(each, array(each.array)) for each in read_magnetometers(session)],
+        array,
     )
 
 
-def _described(
+def _describe_samples(
     session: Session,
-    attached: Callable[[Session], Any],
-    told: Callable[[Any], dict[str, Any]],
-    name: str,
-    samples: Any,
-    geometry: Callable[[Any], Any],
-    sensors: Callable[[Any], dict[str, Any]],
+    read_artifact: Callable[[Session], Any],
+    describe_artifact: Callable[[Any], dict[str, Any]],
+    key: str,
+    kind: SensorKind[Any],
+    read_samples: Callable[[], list[tuple[Samples | HallSamples, dict[str, Any]]]],
+    describe_sensors: Callable[[Any], dict[str, Any]],
 ) -> dict[str, Any]:
-    """What is ``attached``, as it is ``told``, and the samples that the module ``samples``
-    reads, under ``name``, with the ``sensors`` whose ``geometry`` they have. Of a large session
-    the samples are not read, nor where a device has none."""
+    """Describe the artifact and the samples of a session.
+
+    Samples are read only if they are few and every device has some; ``read_samples`` returns
+    them with the description of their sensors. Their descriptions get the name ``key``.
+    """
     described: dict[str, Any] = {}
-    kind = samples.KIND
     try:
-        known = attached(session)
-        if known is not None:
-            described |= told(known)
-        topics = session.topics(kind.topic, kind.schema)
-        small = captured.is_small(session, topics)
-        if topics and small and all(captured.messages(session, topic) for topic in topics):
-            found = samples.read_samples(session)
-            described[name] = [{**_recorded(each), **sensors(geometry(each))} for each in found]
-            described["samples"] = sum(map(len, found))
+        artifact = read_artifact(session)
+        if artifact is not None:
+            described |= describe_artifact(artifact)
+        topics = kind.topics(session)
+        is_small = captured.is_small(session, topics)
+        if topics and is_small and all(captured.messages(session, topic) for topic in topics):
+            recordings = read_samples()
+            described[key] = [{**_recorded(each), **sensors} for each, sensors in recordings]
+            described["samples"] = sum(len(each) for each, _ in recordings)
         elif topics:
             entries = [_unread(session, kind, topic) for topic in topics]
-            described[name] = [{**entry, **sensors(known)} for entry, known in entries]
+            described[key] = [{**entry, **describe_sensors(known)} for entry, known in entries]
             counts = [entry["samples"] for entry, _ in entries]
             described["samples"] = None if None in counts else sum(counts)
-            described["unread_bytes"] = None if small else captured.held_bytes(session, topics)
+            described["unread_bytes"] = None if is_small else captured.held_bytes(session, topics)
         if topics:
-            described["devices"] = [each["device"] for each in described[name]]
-    except NoGeometryError as error:
+            described["devices"] = [each["device"] for each in described[key]]
+    except MissingGeometryError as error:
         described["notes"] = [f"{error.message}. {error.hint}"]
     except LocatkError as error:
         described |= damage(session, error)
     return described
 
 
-def _unread(session: Session, kind: Kind[Any], topic: str) -> tuple[dict[str, Any], Any]:
-    """What is known of a device's samples before reading them, and its geometry."""
+def _unread(session: Session, kind: SensorKind[Any], topic: str) -> tuple[dict[str, Any], Any]:
+    """Describe the samples of a device without reading them; return also its geometry."""
     device = topic.removeprefix(kind.topic)
     geometry = kind.attached(session, device)
     if geometry is None:
@@ -253,36 +270,36 @@ def _unread(session: Session, kind: Kind[Any], topic: str) -> tuple[dict[str, An
     return entry, geometry
 
 
-def _recorded(found: Samples | HallSamples) -> dict[str, Any]:
-    span = float(found.time_ns[-1] - found.time_ns[0]) * 1e-9
+def _recorded(samples: Samples | HallSamples) -> dict[str, Any]:
+    span = float(samples.time_ns[-1] - samples.time_ns[0]) * 1e-9
     return {
-        "device": found.device,
-        "samples": len(found),
-        "rate_hz": (len(found) - 1) / span if span > 0 else None,
-        "left_out": int(np.count_nonzero(np.isnan(found.field_t))),
+        "device": samples.device,
+        "samples": len(samples),
+        "rate_hz": (len(samples) - 1) / span if span > 0 else None,
+        "left_out": int(np.count_nonzero(np.isnan(samples.field_t))),
     }
 
 
-def floor(found: FloorMap) -> dict[str, Any]:
-    """A map of landmarks: its design, what lies where, and how it was really laid."""
-    geometry, laid = found.geometry, found.codes[found.codes != HOLE_CODE]
-    numbers = PATTERN_OF[laid]
+def floor(floor_map: FloorMap) -> dict[str, Any]:
+    """Describe a map of landmarks: its design, its cells, and the landmarks as built."""
+    geometry, codes = floor_map.geometry, floor_map.codes[floor_map.codes != HOLE_CODE]
+    numbers = PATTERN_OF[codes]
     return {
-        "name": found.name or None,
-        "rows": found.shape[0],
-        "columns": found.shape[1],
-        "landmarks": len(laid),
+        "name": floor_map.name or None,
+        "rows": floor_map.shape[0],
+        "columns": floor_map.shape[1],
+        "landmarks": len(codes),
         "patterns": {
             letters: int(np.count_nonzero(numbers == number))
             for number, letters in enumerate(PATTERNS, 1)
         },
-        "alphabet": found.alphabet,
-        "window": found.window,
-        "detect": found.detect,
-        "seed": found.seed,
-        "pitch_mm": 1e3 * found.pitch_m,
-        "origin_mm": [1e3 * each for each in found.origin_m],
-        "walls": len(found.walls),
+        "alphabet": floor_map.alphabet,
+        "window": floor_map.window,
+        "detect": floor_map.detect,
+        "seed": floor_map.seed,
+        "pitch_mm": 1e3 * floor_map.pitch_m,
+        "origin_mm": [1e3 * each for each in floor_map.origin_m],
+        "walls": len(floor_map.walls),
         "bars": {
             "size_mm": [
                 1e3 * size
@@ -294,7 +311,7 @@ def floor(found: FloorMap) -> dict[str, Any]:
             "circle_mm": 1e3 * geometry.circle_m,
             "threshold_mt": 1e3 * geometry.threshold_t,
         },
-        "map": maps.map_rows(found.codes),
+        "map": maps.map_rows(floor_map.codes),
         "built": [
             {
                 "cell": cell,
@@ -305,29 +322,35 @@ def floor(found: FloorMap) -> dict[str, Any]:
                 "visits": built.visits,
                 "flags": list(built.flags),
             }
-            for cell, built in sorted(found.built.items())
+            for cell, built in sorted(floor_map.built.items())
         ],
-        "notes": list(found.notes),
+        "notes": list(floor_map.notes),
     }
 
 
-def hall_sensors(found: HallSensors) -> dict[str, Any]:
-    """Where hall sensors sit, and how they measure; None where unknown."""
+def hall_sensors(sensors: HallSensors) -> dict[str, Any]:
+    """Describe positions and properties of hall sensors."""
     return {
-        "sensor": found.sensor,
-        "sensors": len(found),
-        "names": list(found.names),
-        "position_mm": 1e3 * found.position_m,
-        "noise_ut": 1e6 * found.noise_t,
-        "range_mt": 1e3 * found.range_t,
+        "sensor": sensors.sensor,
+        "sensors": len(sensors),
+        "names": list(sensors.names),
+        "position_mm": 1e3 * sensors.position_m,
+        "noise_ut": 1e6 * sensors.noise_t,
+        "range_mt": 1e3 * sensors.range_t,
     }
 
 
 def landmarks(session: Session) -> dict[str, Any]:
-    """Samples, hall sensors and map of a session; what is damaged is left out and said.
+    """Describe samples, sensors and map of a session; damaged contents are left out and reported.
 
     A solution has a map and no samples.
     """
-    return _described(
-        session, maps.attached_map, floor, "halls", halls, lambda each: each.sensors, hall_sensors
+    return _describe_samples(
+        session,
+        maps.attached_map,
+        floor,
+        "halls",
+        HALLS,
+        lambda: [(each, hall_sensors(each.sensors)) for each in read_halls(session)],
+        hall_sensors,
     )

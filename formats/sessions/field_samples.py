@@ -1,6 +1,7 @@
-"""Samples of field sensors in sessions, whichever they are: written in batches, read as arrays.
+"""Samples of magnetic field sensors in sessions: magnetometer arrays and hall sensors.
 
-:mod:`.arrays` says what that means for magnetometers, :mod:`.halls` for hall sensors.
+Samples are written in batches and read as arrays. The two kinds of sensors differ in their
+messages and in the artifact that holds their geometry (:class:`SensorKind`).
 """
 
 from __future__ import annotations
@@ -9,55 +10,61 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Generic, TypedDict, TypeVar
+from typing import Any, Generic, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
+from locatk.core.landmarks.halls import HallSamples, HallSensors
+from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.polaris.array import Samples, SensorArray
+from locatk.core.polaris.tag import Tags
 from locatk.core.trajectory import Trajectory
-from locatk.formats.sessions.messages import BatchError, Layout, batch_edges
+from locatk.formats.artifacts import maps as map_files
+from locatk.formats.artifacts import tags as tag_files
+from locatk.formats.sessions import messages
+from locatk.formats.sessions.messages import BatchError, Layout, TimedMessage, batch_edges
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import (
-    LARGEST_BATCH,
-    Timed,
-    known_streams,
+    reference_streams,
     write_streams,
     write_warnings,
 )
 from locatk.formats.sessions.writer import SessionWriter
 
-BATCH_NS = 500_000_000
-"""Longest time that one message covers."""
-
-G = TypeVar("G")
-"""The geometry of the sensors of one device."""
+Geometry = TypeVar("Geometry")
+"""Geometry of the sensors of one device."""
 
 
-class NoGeometryError(FormatError):
-    """Samples of sensors of which nobody knows where they sit: nothing is damaged."""
+class MissingGeometryError(FormatError):
+    """The positions of the sensors are unknown; the session is not damaged."""
 
 
 @dataclass(frozen=True)
-class Kind(Generic[G]):
-    """A kind of sensors, and how a session holds them.
+class SensorKind(Generic[Geometry]):
+    """Kind of sensors, and its representation in a session.
 
     Attributes
     ----------
     system : str
     topic : str
-        Before the device's name.
+        Prefix of the topics, in front of the device's name.
     layout : callable
-        Layout of the messages of so many sensors.
-    file, device_file : str, callable
-        Attachment of the geometry that all devices share, and that of one device alone.
-    dumps, attached : callable
-        The geometry as text, and as it is attached to a session for a device, or None.
+        Layout of the messages for a number of sensors.
+    file : str
+        Name of the attachment with the geometry that all devices share.
+    device_file : callable
+        Name of the attachment with the geometry of one device.
+    dumps : callable
+        Convert a geometry to TOML.
+    attached : callable
+        Read the geometry of a device that is attached to a session, or None.
     sensors, geometry : str
-        Their names for people, as in "magnetometers" and "array".
+        Names for messages, as in "magnetometers" and "array".
     makers : str
-        Commands that make such a session, for people.
+        Commands that make such a session, for messages.
     """
 
     system: str
@@ -65,8 +72,8 @@ class Kind(Generic[G]):
     layout: Callable[[int], Layout]
     file: str
     device_file: Callable[[str], str]
-    dumps: Callable[[G], str]
-    attached: Callable[[Session, str], G | None]
+    dumps: Callable[[Geometry], str]
+    attached: Callable[[Session, str], Geometry | None]
     sensors: str
     geometry: str
     makers: str
@@ -76,52 +83,62 @@ class Kind(Generic[G]):
         """Full name of the messages."""
         return str(self.layout(1).message.DESCRIPTOR.full_name)
 
+    def topics(self, session: Session) -> tuple[str, ...]:
+        """Return the topics of this kind in a session."""
+        return session.topics(self.topic, self.schema)
+
+
+MAGNETOMETERS: SensorKind[SensorArray] = SensorKind(
+    system="polaris",
+    topic="/magnetometers/",
+    layout=messages.magnetometers,
+    file=tag_files.ARRAY_FILE,
+    device_file=tag_files.array_file,
+    dumps=tag_files.dumps_array,
+    attached=tag_files.attached_array,
+    sensors="magnetometers",
+    geometry="array",
+    makers="`locatk import polaris-csv` or `locatk simulate polaris`",
+)
+
+HALLS: SensorKind[HallSensors] = SensorKind(
+    system="landmarks",
+    topic="/halls/",
+    layout=messages.halls,
+    file=map_files.HALLS_FILE,
+    device_file=map_files.halls_file,
+    dumps=map_files.dumps_halls,
+    attached=map_files.attached_halls,
+    sensors="hall sensors",
+    geometry="robot",
+    makers="`locatk import landmark-csv` or `locatk simulate landmarks`",
+)
+
 
 @dataclass(frozen=True)
-class Recorded(Generic[G]):
-    """Samples of one device: times (n,) in ns and fields (n, N) or (n, N, axes) in tesla."""
+class DeviceSamples(Generic[Geometry]):
+    """Samples of one device.
+
+    Attributes
+    ----------
+    device : str
+    geometry : Geometry
+    time_ns : (n,) int64 ndarray
+    field_t : (n, N) or (n, N, axes) ndarray
+        Fields of N sensors in tesla.
+    """
 
     device: str
-    geometry: G
+    geometry: Geometry
     time_ns: NDArray[np.int64]
     field_t: NDArray[np.float64]
 
 
-class Beside(TypedDict, total=False):
-    """What :func:`write` takes beside samples, whatever the sensors are."""
+class SessionExtras(TypedDict, total=False):
+    """Keyword arguments of the writers below that do not depend on the kind of sensors.
 
-    truth: Sequence[Trajectory]
-    odometry: Sequence[Trajectory]
-    facts: Mapping[str, object] | None
-    warnings: Sequence[str]
-    overwrite: bool
-
-
-def write(
-    path: str | os.PathLike[str],
-    kind: Kind[G],
-    samples: Sequence[Recorded[G]],
-    *,
-    artifact: tuple[str, str] | None = None,
-    truth: Sequence[Trajectory] = (),
-    odometry: Sequence[Trajectory] = (),
-    facts: Mapping[str, object] | None = None,
-    warnings: Sequence[str] = (),
-    overwrite: bool = False,
-) -> None:
-    """Write a session of samples and what is known beside them.
-
-    Parameters
+    Attributes
     ----------
-    path : path
-        The output.
-    kind : Kind
-    samples : sequence of Recorded
-        One a device, on its topic; the geometry is attached as one file, or where those of
-        the devices differ as a file each. Fields are kept as float32, which is finer than
-        any sensor.
-    artifact : (name, text), optional
-        An attachment: what is on the floor.
     truth, odometry : sequence of Trajectory
         As in :func:`locatk.formats.sessions.observations.write_session`.
     facts : mapping, optional
@@ -130,6 +147,36 @@ def write(
         Written to ``/log``.
     overwrite : bool
         Replace an existing file.
+    """
+
+    truth: Sequence[Trajectory]
+    odometry: Sequence[Trajectory]
+    facts: Mapping[str, object] | None
+    warnings: Sequence[str]
+    overwrite: bool
+
+
+def write_magnetometers(
+    path: str | os.PathLike[str],
+    samples: Sequence[Samples],
+    *,
+    tags: Tags | None = None,
+    **extras: Unpack[SessionExtras],
+) -> None:
+    """Write a session of samples of magnetometer arrays.
+
+    Parameters
+    ----------
+    path : path
+        The output.
+    samples : sequence of Samples
+        One per array, on ``/magnetometers/<device>``. The geometry is attached as
+        ``array.toml``; if the arrays differ, as one ``array-<device>.toml`` each. Fields are
+        stored as float32, which is finer than any sensor.
+    tags : Tags, optional
+        Tags on the floor, attached as ``tag.toml``.
+    **extras
+        See :class:`SessionExtras`.
 
     Raises
     ------
@@ -139,6 +186,99 @@ def write(
         There is no sample, times do not ascend or are before 1970, a field is infinite, or
         two devices or trajectories have the same name.
     """
+    artifact = None if tags is None else (tag_files.TAG_FILE, tag_files.dumps_tags(tags))
+    recordings = [DeviceSamples(s.device, s.array, s.time_ns, s.field_t) for s in samples]
+    _write(path, MAGNETOMETERS, recordings, artifact, **extras)
+
+
+def write_halls(
+    path: str | os.PathLike[str],
+    samples: Sequence[HallSamples],
+    *,
+    floor: FloorMap | None = None,
+    **extras: Unpack[SessionExtras],
+) -> None:
+    """Write a session of samples of hall sensors.
+
+    Parameters
+    ----------
+    path : path
+        The output.
+    samples : sequence of HallSamples
+        One per robot, on ``/halls/<device>``. Its sensors are attached as ``halls.toml``; if
+        those of the robots differ, as one ``halls-<device>.toml`` each. Fields are stored as
+        float32, which is finer than any sensor.
+    floor : FloorMap, optional
+        Map of the floor, attached as ``map.toml``.
+    **extras
+        See :class:`SessionExtras`.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError, InputError
+        As :func:`write_magnetometers`.
+    """
+    artifact = None if floor is None else (map_files.MAP_FILE, map_files.dumps_map(floor))
+    recordings = [DeviceSamples(s.device, s.sensors, s.time_ns, s.field_t) for s in samples]
+    _write(path, HALLS, recordings, artifact, **extras)
+
+
+def read_magnetometers(session: Session) -> list[Samples]:
+    """Read the samples of all magnetometer arrays of a session, sorted by device.
+
+    Raises
+    ------
+    FormatError
+        There are none, a message is damaged, times do not ascend, or the geometry is missing
+        (:class:`MissingGeometryError`) or of another number of sensors.
+    ArtifactError
+        The geometry is invalid.
+    """
+    return [
+        Samples(each.device, each.geometry, each.time_ns, each.field_t)
+        for each in _read(session, MAGNETOMETERS)
+    ]
+
+
+def read_halls(session: Session) -> list[HallSamples]:
+    """Read the samples of the hall sensors of all robots of a session, sorted by device.
+
+    Raises
+    ------
+    FormatError, ArtifactError
+        As :func:`read_magnetometers`.
+    """
+    return [
+        HallSamples(
+            each.device,
+            each.geometry,
+            each.time_ns,
+            _restore_saturation(each.field_t[:, :, 0], each.geometry.range_t),
+        )
+        for each in _read(session, HALLS)
+    ]
+
+
+def _restore_saturation(field_t: NDArray[np.float64], range_t: float) -> NDArray[np.float64]:
+    """Raise fields to the range that were at the range before they were rounded to float32."""
+    is_saturated = np.abs(field_t) >= np.float32(range_t)
+    saturated = np.copysign(np.maximum(np.abs(field_t), range_t), field_t)
+    return np.where(is_saturated, saturated, field_t)
+
+
+def _write(
+    path: str | os.PathLike[str],
+    kind: SensorKind[Geometry],
+    samples: Sequence[DeviceSamples[Geometry]],
+    artifact: tuple[str, str] | None,
+    *,
+    truth: Sequence[Trajectory] = (),
+    odometry: Sequence[Trajectory] = (),
+    facts: Mapping[str, object] | None = None,
+    warnings: Sequence[str] = (),
+    overwrite: bool = False,
+) -> None:
+    """Write a session of samples; ``artifact`` is the name and text of an attachment."""
     devices = [each.device for each in samples]
     for each in samples:
         if devices.count(each.device) > 1:
@@ -146,7 +286,7 @@ def write(
         _check(each.device, each.time_ns, each.field_t)
     if not any(len(each.time_ns) for each in samples):
         raise InputError("no sample at all")
-    streams = [*(_messages(kind, each) for each in samples), *known_streams(truth, odometry)]
+    streams = [*(_messages(kind, each) for each in samples), *reference_streams(truth, odometry)]
     with SessionWriter(path, system=kind.system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if artifact is not None:
@@ -161,37 +301,25 @@ def write(
         write_warnings(writer, warnings, end_ns)
 
 
-def _messages(kind: Kind[G], samples: Recorded[G]) -> Iterator[Timed]:
-    """Batches of one device."""
+def _messages(
+    kind: SensorKind[Geometry], samples: DeviceSamples[Geometry]
+) -> Iterator[TimedMessage]:
     n, sensors = samples.field_t.shape[:2]
     layout = kind.layout(sensors)
-    once: dict[str, str | int] = {
-        "device": samples.device,
-        "frame_id": samples.device,
-        "sensors": sensors,
-    }
+    fields = {"device": samples.device, "frame_id": samples.device, "sensors": sensors}
     columns: dict[str, NDArray[Any]] = {
         "time_ns": samples.time_ns,
         "b_tesla": samples.field_t.reshape(n, -1).astype(np.float32),
     }
-    edges = batch_edges(samples.time_ns, np.zeros(n, np.int64), BATCH_NS, LARGEST_BATCH).tolist()
+    edges = batch_edges(samples.time_ns, np.zeros(n, np.int64)).tolist()
     for start, stop in pairwise(edges):
-        message = layout.pack(once, {key: column[start:stop] for key, column in columns.items()})
+        message = layout.pack(fields, {key: column[start:stop] for key, column in columns.items()})
         yield int(samples.time_ns[start]), f"{kind.topic}{samples.device}", message
 
 
-def read(session: Session, kind: Kind[G]) -> list[Recorded[G]]:
-    """Samples of all devices of a session, sorted by device; fields are (n, N times axes).
-
-    Raises
-    ------
-    FormatError
-        There are none, a message is damaged, times do not ascend, or the geometry is missing
-        or of another number of sensors.
-    ArtifactError
-        The geometry is no valid one.
-    """
-    topics = session.topics(kind.topic, kind.schema)
+def _read(session: Session, kind: SensorKind[Geometry]) -> list[DeviceSamples[Geometry]]:
+    """Read the samples of all devices, sorted by device; fields are (n, N, axes)."""
+    topics = kind.topics(session)
     if not topics:
         raise FormatError(
             f"no samples of {kind.sensors} (topic {kind.topic}<device>)"
@@ -200,10 +328,12 @@ def read(session: Session, kind: Kind[G]) -> list[Recorded[G]]:
             file=session.path,
             hint=f"Make one with {kind.makers}",
         )
-    return [_recorded(session, kind, topic) for topic in topics]
+    return [_read_device(session, kind, topic) for topic in topics]
 
 
-def _recorded(session: Session, kind: Kind[G], topic: str) -> Recorded[G]:
+def _read_device(
+    session: Session, kind: SensorKind[Geometry], topic: str
+) -> DeviceSamples[Geometry]:
     device = topic.removeprefix(kind.topic)
     payloads = [payload for _, _, payload in session.messages([topic])]
     if not payloads:
@@ -221,45 +351,48 @@ def _recorded(session: Session, kind: Kind[G], topic: str) -> Recorded[G]:
     time_ns = batches.columns["time_ns"]
     if not len(time_ns):
         raise FormatError("messages without any sample", file=session.path, where=topic)
-    field = batches.columns["b_tesla"].astype(float).reshape(len(time_ns), sensors, -1)
+    field_t = batches.columns["b_tesla"].astype(float).reshape(len(time_ns), sensors, -1)
     try:
-        _check(device, time_ns, field)
+        _check(device, time_ns, field_t)
     except InputError as error:
         raise FormatError(error.message, file=session.path, where=topic) from None
-    return Recorded(device, _geometry(session, kind, topic, sensors), time_ns, field)
+    return DeviceSamples(device, _read_geometry(session, kind, topic, sensors), time_ns, field_t)
 
 
-def _geometry(session: Session, kind: Kind[G], topic: str, sensors: int) -> G:
+def _read_geometry(
+    session: Session, kind: SensorKind[Geometry], topic: str, sensors: int
+) -> Geometry:
     device = topic.removeprefix(kind.topic)
     geometry: Any = kind.attached(session, device)
     if geometry is None:
-        raise NoGeometryError(
+        raise MissingGeometryError(
             f"no geometry of the {kind.geometry} {device!r}",
             file=session.path,
             where=kind.file,
-            hint=f"Where the sensors sit is not known: `locatk decode {session.path} --artifact "
-            f"{kind.file} -o whole.mcap` adds it to a recording, else import it again",
+            hint="The positions of the sensors are unknown: "
+            f"`locatk decode {session.path} --artifact {kind.file} -o whole.mcap` adds them to a "
+            "recording; import other sessions again",
         )
     if len(geometry) != sensors:
         raise FormatError(
-            f"samples of {sensors} sensors, where the {kind.geometry} has {len(geometry)}",
+            f"samples of {sensors} sensors, but the {kind.geometry} has {len(geometry)}",
             file=session.path,
             where=topic,
         )
-    known: G = geometry
-    return known
+    checked: Geometry = geometry
+    return checked
 
 
 def _check(device: str, time_ns: NDArray[np.int64], field_t: NDArray[np.float64]) -> None:
-    """Refuse times that cannot be, and fields that no sensor gives."""
+    """Raise InputError for times that do not ascend or precede 1970, and for infinite fields."""
     if len(time_ns) and time_ns[0] < 0:
         raise InputError(f"sample 0 of {device} is older than 1970")
-    late = np.flatnonzero(np.diff(time_ns) <= 0)
-    if len(late):
-        number = int(late[0]) + 1
-        same = time_ns[number] == time_ns[number - 1]
-        what = "has the time of" if same else "is older than"
-        raise InputError(f"sample {number} of {device} {what} the one before it")
+    unordered = np.flatnonzero(np.diff(time_ns) <= 0)
+    if len(unordered):
+        number = int(unordered[0]) + 1
+        is_equal = time_ns[number] == time_ns[number - 1]
+        relation = "has the time of" if is_equal else "is older than"
+        raise InputError(f"sample {number} of {device} {relation} the one before it")
     infinite = np.isinf(field_t)
     if infinite.any():
         number, sensor = (int(n) for n in np.argwhere(infinite)[0][:2])

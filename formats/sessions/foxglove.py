@@ -1,8 +1,14 @@
-"""Foxglove messages: what Foxglove, Lichtblick and Rerun draw without being told how."""
+"""Foxglove messages, which Foxglove, Lichtblick and Rerun draw without configuration.
+
+Rerun does not know ``foxglove.SceneUpdate``, and opens no 3D view for poses and transforms alone
+(0.41; https://rerun.io/docs/howto/logging-and-ingestion/mcap). It opens one for a point cloud,
+hence paths and artifacts are written as point clouds too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
@@ -13,7 +19,9 @@ from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
@@ -23,23 +31,29 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
-from google.protobuf.message import Message
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from locatk.core.dots.sheet import Manifest
 from locatk.core.geometry import quaternion_from_heading, quaternion_from_matrix
+from locatk.core.landmarks.drawing.floor_bars import (
+    MIN_DRAWN_STRENGTH,
+    bars_on_floor,
+    cells_near,
+)
 from locatk.core.landmarks.landmark import name
 from locatk.core.landmarks.map.floor import Cell, FloorMap
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris import codec
 from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets, cell_positions, vertices
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots.floor_bars import WEAK, bars_on_floor, cells_near
-from locatk.formats.sessions.messages import timestamp
+from locatk.formats.sessions.messages import TimedMessage, timestamp
 from locatk.formats.sessions.reader import Session
 
-LONGEST_PATH = 5000
-"""Most points of a path that is drawn as one line; longer ones are thinned evenly."""
+MAX_PATH_POINTS = 5000
+"""Number of points of a path that is drawn as one line; longer paths are thinned evenly."""
+
+POINTS_PER_LINE = 400
+"""Number of points of an outline in a point cloud."""
 
 STATION_COLOR = Color(r=0.15, g=0.35, b=0.75, a=1.0)
 MARKER_COLOR = Color(r=0.85, g=0.25, b=0.2, a=1.0)
@@ -47,8 +61,8 @@ PAPER_COLOR = Color(r=0.35, g=0.35, b=0.35, a=1.0)
 PATTERN_COLOR = Color(r=0.6, g=0.6, b=0.6, a=1.0)
 MAGNET_COLOR = Color(r=0.75, g=0.15, b=0.15, a=1.0)
 BAR_COLORS = {1: Color(r=0.75, g=0.15, b=0.15, a=1.0), -1: Color(r=0.15, g=0.35, b=0.75, a=1.0)}
-"""Of a bar that is N, and of one that is S."""
-WEAK_COLOR = Color(r=0.6, g=0.6, b=0.6, a=0.4)
+"""Colours of bars with the north pole (1) or the south pole (-1) outside."""
+MISSING_COLOR = Color(r=0.6, g=0.6, b=0.6, a=0.4)
 TEXT_COLOR = Color(r=0.5, g=0.5, b=0.5, a=1.0)
 PATH_COLORS = tuple(
     Color(r=r, g=g, b=b, a=1.0)
@@ -61,20 +75,36 @@ PATH_COLORS = tuple(
         (0.35, 0.7, 0.9),
     )
 )
-"""Okabe and Ito's colours, told apart by the colour-blind too."""
+"""Okabe and Ito's colours, which colour-blind people can distinguish
+(https://jfly.uni-koeln.de/color/)."""
 
-Timed = tuple[int, str, Message]
+_PATH_PREFIX = "path/"
+"""Prefix of the ids of the entities that are no artifact."""
+
+_POINT = np.dtype([("xyz", "<f4", (3,)), ("rgba", "u1", (4,))])
+_POINT_FIELDS = [
+    *(
+        PackedElementField(name=name, offset=4 * i, type=PackedElementField.FLOAT32)
+        for i, name in enumerate("xyz")
+    ),
+    *(
+        PackedElementField(name=name, offset=12 + i, type=PackedElementField.UINT8)
+        for i, name in enumerate(("red", "green", "blue", "alpha"))
+    ),
+]
+
+# ---- poses
 
 
-def poses(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
-    """One ``PoseInFrame`` a pose."""
+def poses(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
+    """Yield one ``PoseInFrame`` per pose."""
     for time_ns, pose in _stamped(trajectory):
         message = PoseInFrame(timestamp=timestamp(time_ns), frame_id=trajectory.frame, pose=pose)
         yield time_ns, topic, message
 
 
-def transforms(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
-    """One ``FrameTransform`` a pose: the device's frame in the trajectory's."""
+def transforms(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
+    """Yield one ``FrameTransform`` per pose, from the trajectory's frame to the device's."""
     for time_ns, pose in _stamped(trajectory):
         message = FrameTransform(
             timestamp=timestamp(time_ns),
@@ -87,13 +117,13 @@ def transforms(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
 
 
 def child_frame(trajectory: Trajectory) -> str:
-    """Name of the device's own frame: the device's, unless the poses' frame has that name."""
+    """Return the name of the device's own frame: its name, unless the poses' frame has it."""
     return trajectory.device + ("_body" if trajectory.device == trajectory.frame else "")
 
 
 def path(trajectory: Trajectory, time_ns: int) -> PosesInFrame:
-    """The whole path in one message, at most :data:`LONGEST_PATH` poses of it."""
-    keep = thinned(len(trajectory))
+    """Return the path in one message, thinned to :data:`MAX_PATH_POINTS` poses."""
+    keep = _thinned_indices(len(trajectory))
     return PosesInFrame(
         timestamp=timestamp(time_ns),
         frame_id=trajectory.frame,
@@ -109,16 +139,20 @@ def path(trajectory: Trajectory, time_ns: int) -> PosesInFrame:
 
 
 def log(message: str, time_ns: int, *, warning: bool = False) -> Log:
-    """A line for the log panel."""
+    """Return a line for the log panel."""
     level = Log.WARNING if warning else Log.INFO
     return Log(timestamp=timestamp(time_ns), level=level, message=message, name="locatk")
 
 
-def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: int) -> SceneUpdate:
-    """Stations and markers, sheets of paper, tags, or landmarks, and paths as things to look at.
+# ---- scenes
 
-    Sizes are in the units of the scene, which has 0.1 m stations where its scale is
-    metric; sheets, tags and landmarks are in metres. An artifact of another kind is not drawn.
+
+def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: int) -> SceneUpdate:
+    """Return the artifact of a solution and its paths as a 3D scene.
+
+    Artifacts are the stations and markers of a :class:`Scene`, sheets of paper, tags, or
+    landmarks; other kinds are not drawn. Sizes are in the units of the scene, whose stations
+    measure 0.1 m if its scale is metric; sheets, tags and landmarks are in metres.
     """
     entities = []
     if isinstance(artifact, Scene):
@@ -128,11 +162,11 @@ def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: 
         sheets = range(len(artifact.sheets))
         entities += [_sheet(artifact, number, time_ns) for number in sheets]
     elif isinstance(artifact, Tags):
-        found = tags_in_frames(artifact, trajectories)
-        entities += [_tag(artifact, *where, time_ns) for where in found]
+        visible_tags = tags_in_frames(artifact, trajectories)
+        entities += [_tag(artifact, *tag, time_ns) for tag in visible_tags]
     elif isinstance(artifact, FloorMap):
-        near = cells_near(artifact, [t.position for t in trajectories])
-        entities += [_landmark(artifact, cell, time_ns) for cell in near]
+        cells = cells_near(artifact, [t.position for t in trajectories])
+        entities += [_landmark(artifact, cell, time_ns) for cell in cells]
     for number, trajectory in enumerate(trajectories):
         if len(trajectory) > 0:
             color = PATH_COLORS[number % len(PATH_COLORS)]
@@ -143,30 +177,29 @@ def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: 
 def tags_in_frames(
     tags: Tags, trajectories: Sequence[Trajectory]
 ) -> list[tuple[int, str, PlanarPose]]:
-    """Ids of the tags whose place is known, the frame of that place, and the place.
+    """Return id, frame and pose in this frame of each tag whose pose is known.
 
-    Those of the site; where there is none, the tags in whose frames there are poses.
+    These are the tags of the site; without a site, the tags whose frames contain poses.
     """
     if tags.site:
-        return [(number, "site", placed) for number, placed in sorted(tags.site.items())]
+        return [(number, "site", pose) for number, pose in sorted(tags.site.items())]
     frames = sorted({t.frame for t in trajectories})
     numbers = [(frame.removeprefix("tag-"), frame) for frame in frames if frame[:4] == "tag-"]
     return [(int(n), frame, PlanarPose(0.0, 0.0, 0.0)) for n, frame in numbers if n.isdecimal()]
 
 
-def trajectory(session: Session, topic: str, device: str) -> Trajectory:
-    """Poses of a ``PoseInFrame`` topic of any tool, in the order of their own times.
+def read_trajectory(session: Session, topic: str, device: str) -> Trajectory:
+    """Read the poses of a ``PoseInFrame`` topic of any tool, in the order of their timestamps.
 
-    The covariance is unknown. Where a message has no time of its own, its log time
-    is taken.
+    The covariance is unknown. The log time replaces the timestamp of messages without one.
     """
     times: list[int] = []
     rows: list[tuple[float, ...]] = []
     frame = ""
     for log_ns, message in session.decoded(topic, PoseInFrame):
         stamp, p, q = message.timestamp, message.pose.position, message.pose.orientation
-        own_ns = stamp.seconds * 1_000_000_000 + stamp.nanos
-        times.append(own_ns if message.HasField("timestamp") else log_ns)
+        stamp_ns = stamp.seconds * 1_000_000_000 + stamp.nanos
+        times.append(stamp_ns if message.HasField("timestamp") else log_ns)
         rows.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
         frame = frame or message.frame_id
     table = np.array(rows, np.float64).reshape(-1, 7)
@@ -202,9 +235,9 @@ def _vector(x: float, y: float, z: float) -> Vector3:
     return Vector3(x=x, y=y, z=z)
 
 
-def thinned(n: int) -> NDArray[np.int64]:
-    """Which of n poses are drawn."""
-    return np.unique(np.linspace(0, n - 1, min(n, LONGEST_PATH)).round().astype(np.int64))
+def _thinned_indices(n: int) -> NDArray[np.int64]:
+    """Return the indices of the poses that are drawn, of n poses."""
+    return np.unique(np.linspace(0, n - 1, min(n, MAX_PATH_POINTS)).round().astype(np.int64))
 
 
 def _station(station: Station, scene: Scene, time_ns: int) -> SceneEntity:
@@ -249,7 +282,7 @@ def _marker(marker: Marker, scene: Scene, time_ns: int) -> SceneEntity:
 
 
 def _sheet(manifest: Manifest, number: int, time_ns: int) -> SceneEntity:
-    """Rims of the paper and of the pattern on it."""
+    """Return the outlines of the paper and of the pattern on it."""
     sheet = manifest.sheets[number]
     origin, first = np.array(sheet.origin, float), np.array(sheet.first_mm)
     unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -269,17 +302,18 @@ def _sheet(manifest: Manifest, number: int, time_ns: int) -> SceneEntity:
     )
 
 
-def _tag(tags: Tags, tag_id: int, frame: str, placed: PlanarPose, time_ns: int) -> SceneEntity:
-    """The magnets, each with an arrow in its direction, in the rim of the grid."""
-    place, angle = as_built_magnets(tags, tag_id, codec.layout_of(tags, tag_id))
-    c, s = np.cos(placed.heading_rad), np.sin(placed.heading_rad)
-    turn, origin = np.array([[c, -s], [s, c]]), np.array([placed.x_m, placed.y_m])
-    corners = cell_positions(tags, vertices(tags.order)) @ turn.T + origin
-    headings = quaternion_from_heading(angle + placed.heading_rad).tolist()
+def _tag(tags: Tags, tag_id: int, frame: str, tag_pose: PlanarPose, time_ns: int) -> SceneEntity:
+    """Return the magnets, each with an arrow in its direction, and the outline of the grid."""
+    positions, angles = as_built_magnets(tags, tag_id, codec.layout_of(tags, tag_id))
+    c, s = np.cos(tag_pose.heading_rad), np.sin(tag_pose.heading_rad)
+    rotation, origin = np.array([[c, -s], [s, c]]), np.array([tag_pose.x_m, tag_pose.y_m])
+    corners = cell_positions(tags, vertices(tags.order)) @ rotation.T + origin
+    positions = positions @ rotation.T + origin
+    quaternions = quaternion_from_heading(angles + tag_pose.heading_rad)
     magnet, length = tags.magnet, tags.spacing_m / 3
     poses = [
         _pose((x, y, 0.0), quaternion)
-        for (x, y), quaternion in zip((place @ turn.T + origin).tolist(), headings, strict=True)
+        for (x, y), quaternion in zip(positions.tolist(), quaternions.tolist(), strict=True)
     ]
     size = _vector(magnet.diameter_m, magnet.diameter_m, magnet.height_m)
     return SceneEntity(
@@ -310,24 +344,24 @@ def _tag(tags: Tags, tag_id: int, frame: str, placed: PlanarPose, time_ns: int) 
 
 
 def _landmark(floor: FloorMap, cell: Cell, time_ns: int) -> SceneEntity:
-    """The bars, each with an arrow to its north pole, and the cell's row and column."""
+    """Return the bars, each with an arrow to its north pole, and the cell's row and column."""
     geometry = floor.geometry
-    middles, headings, strengths = bars_on_floor(floor, cell)
+    centres, headings, strengths = bars_on_floor(floor, cell)
     length, width, height = geometry.bar_length_m, geometry.bar_width_m, geometry.bar_height_m
     cubes, arrows = [], []
     for (x, y), quaternion, heading, strength in zip(
-        middles.tolist(),
+        centres.tolist(),
         quaternion_from_heading(headings).tolist(),
         headings.tolist(),
         strengths.tolist(),
         strict=True,
     ):
-        there = abs(strength) >= WEAK
-        color = BAR_COLORS[1 if strength > 0 else -1] if there else WEAK_COLOR
-        # The map's plane is that of the bars' tops.
-        below = _pose((x, y, -height / 2), quaternion)
-        cubes.append(CubePrimitive(pose=below, size=_vector(length, width, height), color=color))
-        if there:
+        is_present = abs(strength) >= MIN_DRAWN_STRENGTH
+        color = BAR_COLORS[1 if strength > 0 else -1] if is_present else MISSING_COLOR
+        # The plane z = 0 of the map contains the top faces of the bars.
+        pose = _pose((x, y, -height / 2), quaternion)
+        cubes.append(CubePrimitive(pose=pose, size=_vector(length, width, height), color=color))
+        if is_present:
             tail = x - length / 2 * np.cos(heading), y - length / 2 * np.sin(heading), width / 4
             arrows.append(
                 ArrowPrimitive(
@@ -367,11 +401,11 @@ def _loop(corners: NDArray[np.float64], color: Color, thickness: float) -> LineP
 
 
 def _line(trajectory: Trajectory, color: Color, time_ns: int) -> SceneEntity:
-    points = trajectory.position[thinned(len(trajectory))].tolist()
+    points = trajectory.position[_thinned_indices(len(trajectory))].tolist()
     return SceneEntity(
         timestamp=timestamp(time_ns),
         frame_id=trajectory.frame,
-        id=f"path/{trajectory.device}",
+        id=f"{_PATH_PREFIX}{trajectory.device}",
         metadata=_pairs({"device": trajectory.device, "poses": str(len(trajectory))}),
         lines=[
             LinePrimitive(
@@ -400,3 +434,59 @@ def _text(text: str, position: Sequence[float], above: float) -> TextPrimitive:
 
 def _pairs(facts: Mapping[str, str]) -> list[KeyValuePair]:
     return [KeyValuePair(key=key, value=value) for key, value in facts.items()]
+
+
+# ---- point clouds
+
+
+def path_points(trajectory: Trajectory, number: int, time_ns: int) -> PointCloud:
+    """Return the positions of path ``number``, thinned and coloured as its line in the scene."""
+    color = PATH_COLORS[number % len(PATH_COLORS)]
+    positions = trajectory.position[_thinned_indices(len(trajectory))]
+    return _cloud([(positions, color)], trajectory.frame, time_ns)
+
+
+def artifact_points(scene: SceneUpdate, time_ns: int) -> dict[str, PointCloud]:
+    """Return outlines and centres of the entities of a scene except paths, one cloud per frame."""
+    parts: dict[str, list[tuple[ArrayLike, Color]]] = {}
+    for entity in scene.entities:
+        if not entity.id.startswith(_PATH_PREFIX):
+            parts.setdefault(entity.frame_id, []).extend(_entity_points(entity))
+    return {frame: _cloud(clouds, frame, time_ns) for frame, clouds in parts.items() if clouds}
+
+
+def _entity_points(entity: SceneEntity) -> Iterator[tuple[ArrayLike, Color]]:
+    """Yield points (n, 3) in the entity's frame and their colour; lines have an identity pose."""
+    solids: list[Any] = [*entity.cubes, *entity.spheres, *entity.cylinders]
+    for solid in solids:
+        centre = solid.pose.position
+        yield [(centre.x, centre.y, centre.z)], solid.color
+    for line in entity.lines:
+        corners = np.array([(point.x, point.y, point.z) for point in line.points])
+        if line.type == LinePrimitive.LINE_LOOP:
+            corners = np.vstack([corners, corners[:1]])
+        yield _sample_line(corners), line.color
+
+
+def _sample_line(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return evenly spaced points on the polyline through ``corners``."""
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    path_length = np.append(0.0, np.cumsum(lengths))
+    sampled = np.linspace(0.0, path_length[-1], POINTS_PER_LINE)
+    return np.column_stack([np.interp(sampled, path_length, values) for values in corners.T])
+
+
+def _cloud(parts: list[tuple[ArrayLike, Color]], frame: str, time_ns: int) -> PointCloud:
+    counts = [len(np.asarray(positions)) for positions, _ in parts]
+    points = np.empty(sum(counts), _POINT)
+    points["xyz"] = np.concatenate([np.asarray(positions) for positions, _ in parts])
+    colors = np.array([(c.r, c.g, c.b, c.a) for _, c in parts])
+    points["rgba"] = np.repeat(np.rint(255 * colors).astype(np.uint8), counts, axis=0)
+    return PointCloud(
+        timestamp=timestamp(time_ns),
+        frame_id=frame,
+        pose=_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
+        point_stride=_POINT.itemsize,
+        fields=_POINT_FIELDS,
+        data=points.tobytes(),
+    )

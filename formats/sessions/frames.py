@@ -1,10 +1,10 @@
-"""Camera frames in sessions: written as they come, read one by one when they are asked for.
+"""Camera frames in sessions: written one by one, read when they are accessed.
 
-Image files that viewers show (PNG, JPEG, WebP) are kept byte by byte as
-``foxglove.CompressedImage``; everything else becomes ``foxglove.RawImage``, which the chunks
-of a session pack with zstd. Of frames of dots that takes as much room as PNG (0.67 to 0.76
-of the pixels with noise, PNG 0.74 to 0.80) and is read six times as fast (0.04 to 0.05 ms a
-frame of 188 x 120 px, PNG 0.25 ms).
+Image files that viewers show (PNG, JPEG, WebP) are stored unchanged as
+``foxglove.CompressedImage``. All other images become ``foxglove.RawImage``, compressed with zstd
+like everything in a session. Frames of dots then take as much space as PNG (0.67 to 0.76 bytes
+per pixel with noise, PNG 0.74 to 0.80) and are read six times as fast (0.04 to 0.05 ms per frame
+of 188 x 120 px, PNG 0.25 ms).
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
 from locatk.formats import images
 from locatk.formats.artifacts import sheets
-from locatk.formats.sessions.message_index import Place, Places
-from locatk.formats.sessions.messages import timestamp
-from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.mcap_file import MessagePosition
+from locatk.formats.sessions.messages import TimedMessage, timestamp
+from locatk.formats.sessions.reader import RandomAccess, Session
 from locatk.formats.sessions.trajectories import (
-    Timed,
     check_devices,
     truth_messages,
     write_streams,
@@ -42,7 +41,7 @@ from locatk.formats.sessions.trajectories import (
 from locatk.formats.sessions.writer import SessionWriter
 
 FRAMES_FILE = "frames.json"
-"""Name of the attachment that holds the names of the frames, where they have names."""
+"""Attachment with the names of the frames, if they differ from their numbers."""
 
 FRAMES_VERSION = 1
 
@@ -53,20 +52,20 @@ SCHEMAS = {
     "foxglove.RawImage": RawImage,
 }
 
-LARGEST_MODEL_ERROR_PX = 0.1
-"""Where the usual polynomial misses the camera's own model by more, it is not written."""
+MAX_MODEL_ERROR_PX = 0.1
+"""If the polynomial of viewers differs more from the camera's model, it is not written."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame on its way into a session.
+    """One frame to be written to a session.
 
     Attributes
     ----------
     time_ns : int
         Nanoseconds since the epoch.
     name : str
-        Of the file it came from, or its number.
+        Name of its file, or its number.
     image : bytes or ndarray
         An image file of ``format``, or pixels as in :class:`locatk.formats.images.Picture`.
     format : str
@@ -80,10 +79,10 @@ class Shot:
 
 
 def read_frames(session: Session) -> list[Frames]:
-    """The frames of all cameras of a session, one ``Frames`` a camera, sorted by device.
+    """List the frames of all cameras of a session, sorted by device.
 
-    No image is read yet: ``images[i]`` does that, and raises InputError where it cannot.
-    Frames come in the order of their log times.
+    No image is read: ``images[i]`` does that, and raises InputError if the image is damaged.
+    Frames are in the order of their log times.
 
     Raises
     ------
@@ -100,28 +99,27 @@ def read_frames(session: Session) -> list[Frames]:
             hint="Make one with `locatk import images` or `locatk import video`",
         )
     names = _names(session)
-    places = Places(session)
-    return [_camera_frames(session, places, topic, names) for topic in sorted(topics)]
+    messages = RandomAccess(session)
+    return [_camera_frames(session, messages, topic, names) for topic in sorted(topics)]
 
 
 def _camera_frames(
-    session: Session, places: Places, topic: str, names: Mapping[str, tuple[str, ...]]
+    session: Session, messages: RandomAccess, topic: str, names: Mapping[str, tuple[str, ...]]
 ) -> Frames:
     device = topic.removeprefix(TOPIC)
-    found = sorted(places.of(topic), key=lambda place: place.time_ns)
-    own = names.get(device)
-    if own is not None and len(own) != len(found):
+    positions = sorted(messages.positions(topic), key=lambda position: position.time_ns)
+    frame_names = names.get(device, tuple(map(str, range(len(positions)))))
+    if len(frame_names) != len(positions):
         raise FormatError(
-            f"{len(own)} names for {len(found)} frames of {device}",
+            f"{len(frame_names)} names for {len(positions)} frames of {device}",
             file=session.path,
             where=FRAMES_FILE,
         )
-    numbered = own or tuple(str(number) for number in range(len(found)))
     return Frames(
         device=device,
-        time_ns=np.array([place.time_ns for place in found], np.int64),
-        names=numbered,
-        images=_Images(session, places, topic, found, numbered),
+        time_ns=np.array([position.time_ns for position in positions], np.int64),
+        names=frame_names,
+        images=_Images(session, messages, topic, positions, frame_names),
     )
 
 
@@ -130,14 +128,14 @@ def _names(session: Session) -> dict[str, tuple[str, ...]]:
     if data is None:
         return {}
     try:
-        said = json.loads(data)
-        newer = said["version"] > FRAMES_VERSION
-        names = {str(key): tuple(map(str, value)) for key, value in said["names"].items()}
+        record = json.loads(data)
+        is_newer = record["version"] > FRAMES_VERSION
+        names = {str(key): tuple(map(str, value)) for key, value in record["names"].items()}
     except (ValueError, KeyError, TypeError, AttributeError):
         raise FormatError("damaged names", file=session.path, where=FRAMES_FILE) from None
-    if newer:
+    if is_newer:
         raise FormatError(
-            f"names of format {said['version']}, newer than this locatk",
+            f"names of format {record['version']}, newer than this locatk",
             file=session.path,
             where=FRAMES_FILE,
             hint="Update locatk",
@@ -146,26 +144,26 @@ def _names(session: Session) -> dict[str, tuple[str, ...]]:
 
 
 class _Images(Sequence[NDArray[np.uint8]]):
-    """Images of one camera, each read from the session when it is asked for."""
+    """Images of one camera, each read from the session when it is accessed."""
 
     def __init__(
         self,
         session: Session,
-        places: Places,
+        messages: RandomAccess,
         topic: str,
-        found: Sequence[Place],
+        positions: Sequence[MessagePosition],
         names: Sequence[str],
     ) -> None:
         self._session = session
-        self._places = places
+        self._messages = messages
         self._topic = topic
-        self._found = found
+        self._positions = positions
         self._names = names
         schemas = {channel.topic: channel.schema for channel in session.channels}
-        self._compressed = schemas[topic] == CompressedImage.DESCRIPTOR.full_name
+        self._is_compressed = schemas[topic] == CompressedImage.DESCRIPTOR.full_name
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._positions)
 
     @overload
     def __getitem__(self, index: int) -> NDArray[np.uint8]: ...
@@ -175,11 +173,11 @@ class _Images(Sequence[NDArray[np.uint8]]):
 
     def __getitem__(self, index: int | slice) -> NDArray[np.uint8] | _Images:
         if isinstance(index, slice):
-            found, names = self._found[index], self._names[index]
-            return _Images(self._session, self._places, self._topic, found, names)
-        payload = self._places.payload(self._found[index])
+            positions, names = self._positions[index], self._names[index]
+            return _Images(self._session, self._messages, self._topic, positions, names)
+        payload = self._messages.payload(self._positions[index])
         try:
-            return self._decoded(payload)
+            return self._decode(payload)
         except InputError as error:
             raise InputError(
                 f"frame {self._names[index]}: {error.message}",
@@ -187,9 +185,9 @@ class _Images(Sequence[NDArray[np.uint8]]):
                 where=self._topic,
             ) from None
 
-    def _decoded(self, payload: bytes) -> NDArray[np.uint8]:
+    def _decode(self, payload: bytes) -> NDArray[np.uint8]:
         try:
-            if self._compressed:
+            if self._is_compressed:
                 data = CompressedImage.FromString(payload).data
                 return images.grey(images.decode(data).pixels)
             raw = RawImage.FromString(payload)
@@ -208,18 +206,18 @@ def write_session(
     facts: Mapping[str, object] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write frames, the sheet they show and what is known beside them as a session.
+    """Write a session of frames, with the sheet that they show and reference data.
 
     Parameters
     ----------
     path : path
         The output.
     frames : sequence of Frames
-        One a camera. Their images are asked for one by one and written raw.
+        One per camera. Their images are accessed one by one and written raw.
     manifest : Manifest
         Attached as ``sheet.toml``.
     camera : Camera, optional
-        Attached as ``camera.toml``; for viewers on ``/calibration/<device>`` too.
+        Attached as ``camera.toml``; also written for viewers on ``/calibration/<device>``.
     truth : sequence of Trajectory
         As in :func:`locatk.formats.sessions.observations.write_session`.
     facts : mapping, optional
@@ -232,8 +230,8 @@ def write_session(
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.atomic_write`.
     InputError
-        There is no frame, times do not ascend or are before 1970, an image is no grey
-        picture, or two cameras or trajectories have the same name.
+        There is no frame, times do not ascend or are before 1970, an image is not grey, or two
+        cameras or trajectories have the same name.
     """
     devices = [each.device for each in frames]
     for name in devices:
@@ -267,12 +265,11 @@ def write_shots(
     warnings: Sequence[str] = (),
     overwrite: bool = False,
 ) -> dict[str, int]:
-    """Write frames as they come; returns how many there were of each device.
+    """Write frames from iterables; return the number of frames of each device.
 
-    Parameters as of :func:`write_session`, but ``cameras`` maps a device to its frames in
-    the order of time, all of them pixels or all of them image files. ``warnings`` are
-    written to ``/log`` at the end, when the frames have been taken: whoever makes the
-    frames may add to it.
+    Parameters are those of :func:`write_session`, but ``cameras`` maps a device to its frames in
+    the order of time, all of them pixels or all of them image files. ``warnings`` are written to
+    ``/log`` at the end, so that an iterable may add to them.
 
     Raises
     ------
@@ -292,35 +289,35 @@ def write_shots(
             for device, shots in cameras.items()
         ]
         end_ns = write_streams(writer, [*streams, *truth_messages(truth)])
-        counts = {device: len(found) for device, found in names.items()}
+        counts = {device: len(frame_names) for device, frame_names in names.items()}
         if not any(counts.values()):
             raise InputError("no camera frame at all")
         write_warnings(writer, warnings, end_ns)
-        # Frames that are called by their number need no list that says so.
-        own = {
-            device: found
-            for device, found in names.items()
-            if any(name != str(number) for number, name in enumerate(found))
+        # Frames whose names are their numbers are not listed.
+        listed = {
+            device: frame_names
+            for device, frame_names in names.items()
+            if any(name != str(number) for number, name in enumerate(frame_names))
         }
-        if own:
-            said = {"version": FRAMES_VERSION, "names": own}
-            writer.attach(FRAMES_FILE, json.dumps(said, indent=0).encode(), "application/json")
+        if listed:
+            record = {"version": FRAMES_VERSION, "names": listed}
+            writer.attach(FRAMES_FILE, json.dumps(record, indent=0).encode(), "application/json")
     return counts
 
 
 def _frame_messages(
     device: str, shots: Iterable[Shot], camera: Camera | None, names: list[str]
-) -> Iterator[Timed]:
-    """Messages of one camera; adds the frames' names to ``names``."""
-    before: int | None = None
+) -> Iterator[TimedMessage]:
+    """Yield the messages of one camera; append the names of its frames to ``names``."""
+    previous_ns: int | None = None
     for shot in shots:
-        if before is None and camera is not None:
+        if previous_ns is None and camera is not None:
             calibration = _calibration(camera, device, shot.time_ns)
             if calibration is not None:
                 yield shot.time_ns, f"/calibration/{device}", calibration
-        if before is not None and shot.time_ns < before:
+        if previous_ns is not None and shot.time_ns < previous_ns:
             raise InputError(f"frame {shot.name} of {device} is older than the one before it")
-        before = shot.time_ns
+        previous_ns = shot.time_ns
         names.append(shot.name)
         yield shot.time_ns, f"{TOPIC}{device}", _image_message(shot, device)
 
@@ -334,10 +331,10 @@ def _image_message(shot: Shot, device: str) -> CompressedImage | RawImage:
             format=shot.format,
         )
     pixels = shot.image
-    fits = (pixels.ndim == 2 and pixels.dtype in (np.uint8, np.uint16)) or (
+    is_supported = (pixels.ndim == 2 and pixels.dtype in (np.uint8, np.uint16)) or (
         pixels.ndim == 3 and pixels.shape[2] in (3, 4) and pixels.dtype == np.uint8
     )
-    if not fits or 0 in pixels.shape:
+    if not is_supported or 0 in pixels.shape:
         raise InputError(
             f"frame {shot.name} of {device} has {pixels.dtype} values of shape {pixels.shape}"
         )
@@ -354,20 +351,22 @@ def _image_message(shot: Shot, device: str) -> CompressedImage | RawImage:
 
 
 def _calibration(camera: Camera, device: str, time_ns: int) -> CameraCalibration | None:
-    """The camera as viewers know it, None where their polynomial cannot say what it does.
+    """Return the camera in the model of viewers; None if their polynomial cannot represent it.
 
-    A point without distortion at radius u is seen at ``u C(k u^2)``, where C generates the
-    Catalan numbers: 1, k, 2 k^2, 5 k^3 are the first coefficients of the polynomial.
+    A point at undistorted radius u is imaged at radius ``u C(k u^2)``, with the generating
+    function C of the Catalan numbers: 1, k, 2 k^2, 5 k^3 are the first coefficients of the
+    polynomial.
     """
     k = camera.radial
     coefficients = (k, 2 * k**2, 0.0, 0.0, 5 * k**3)
     (width, height), (x, y), focal = camera.size, camera.centre_px, camera.focal_px
     corners = np.array([(a, b) for a in (0, width - 1) for b in (0, height - 1)], float)
-    flat = (camera.undistort(corners) - (x, y)) / focal
-    square = (flat * flat).sum(axis=1, keepdims=True)
+    undistorted = (camera.undistort(corners) - (x, y)) / focal
+    radius2 = (undistorted * undistorted).sum(axis=1, keepdims=True)
     k1, k2, _, _, k3 = coefficients
-    bent = (x, y) + focal * flat * (1 + square * (k1 + square * (k2 + square * k3)))
-    if not np.abs(bent - corners).max() <= LARGEST_MODEL_ERROR_PX:
+    factor = 1 + radius2 * (k1 + radius2 * (k2 + radius2 * k3))
+    distorted = (x, y) + focal * undistorted * factor
+    if not np.abs(distorted - corners).max() <= MAX_MODEL_ERROR_PX:
         return None
     return CameraCalibration(
         timestamp=timestamp(time_ns),

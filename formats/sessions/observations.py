@@ -1,7 +1,7 @@
-"""What a session holds, for a solver: sweeps, samples, frames, truth, odometry, artifacts.
+"""Contents of a session for a solver: sweeps, samples, frames, truth, odometry, artifacts.
 
-Solutions and trajectories have modules of their own; what a caller needs of them is
-offered here too.
+Lighthouse sweeps are read and written here. The readers of the other contents are re-exported
+from their modules.
 """
 
 from __future__ import annotations
@@ -16,29 +16,28 @@ from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.trajectory import Trajectory
-from locatk.formats.artifacts import receiver as receiver_files
-from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.artifacts.maps import attached_map as read_map
-from locatk.formats.artifacts.receiver import read_receivers
+from locatk.formats.artifacts.receiver import read_receivers, texts_of
+from locatk.formats.artifacts.scene import SCENE_FILE, dumps_scene
 from locatk.formats.artifacts.scene import attached_scene as read_scene
 from locatk.formats.artifacts.sheets import attached_camera as read_camera
 from locatk.formats.artifacts.sheets import attached_manifest as read_manifest
 from locatk.formats.artifacts.tags import attached_tags as read_tags
-from locatk.formats.sessions import station_reports as heard_stations
+from locatk.formats.sessions.field_samples import read_halls, read_magnetometers
 from locatk.formats.sessions.frames import read_frames
-from locatk.formats.sessions.halls import read_samples as read_halls
-from locatk.formats.sessions.magnetometers import read_samples
-from locatk.formats.sessions.messages import SWEEPS, batch_edges
+from locatk.formats.sessions.messages import MAX_BATCH_NS, SWEEPS, TimedMessage, batch_edges
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution, read_trajectories, write_solution
-from locatk.formats.sessions.station_reports import read_heard
+from locatk.formats.sessions.station_reports import (
+    add_station_data,
+    read_station_reports,
+    station_records,
+)
 from locatk.formats.sessions.trajectories import (
-    LARGEST_BATCH,
-    Timed,
-    known_streams,
     read_batches,
     read_odometry,
     read_truth,
+    reference_streams,
     write_streams,
 )
 from locatk.formats.sessions.writer import SessionWriter
@@ -47,14 +46,14 @@ __all__ = [
     "read_camera",
     "read_frames",
     "read_halls",
-    "read_heard",
+    "read_magnetometers",
     "read_manifest",
     "read_map",
     "read_odometry",
     "read_receivers",
-    "read_samples",
     "read_scene",
     "read_solution",
+    "read_station_reports",
     "read_sweeps",
     "read_tags",
     "read_trajectories",
@@ -65,12 +64,20 @@ __all__ = [
     "write_sweeps",
 ]
 
-BATCH_NS = 500_000_000
-"""Longest time that one message of an imported or simulated session covers."""
+_SWEEP_RANGES = {
+    "time_ns": (0, np.iinfo(np.int64).max),
+    "sensor": (0, np.iinfo(np.int32).max),
+    "channel": (1, 16),
+    "polynomial": (-1, 31),
+    "sweep": (-1, 1),
+}
+
+MAX_LISTED_TOPICS = 5
+"""Number of topics that the message about a session without sweeps lists."""
 
 
 def read_sweeps(session: Session) -> Sweeps:
-    """All lighthouse sweeps of a session, in the order of the file.
+    """Read all lighthouse sweeps of a session, in file order.
 
     Raises
     ------
@@ -84,7 +91,7 @@ def read_sweeps(session: Session) -> Sweeps:
             if session.facts
             else "not a session of locatk: no topic /lighthouse/<device>",
             file=session.path,
-            hint=_contents(session),
+            hint=_describe_topics(session),
         )
     batches = read_batches(session, topics, SWEEPS)
     names = batches.texts["device"]
@@ -107,24 +114,19 @@ def read_sweeps(session: Session) -> Sweeps:
 
 
 def _check_ranges(sweeps: Sweeps, path: str | None) -> None:
-    allowed = {
-        "time_ns": (0, np.iinfo(np.int64).max),
-        "sensor": (0, np.iinfo(np.int32).max),
-        "channel": (1, 16),
-        "polynomial": (-1, 31),
-        "sweep": (-1, 1),
-    }
-    for name, (low, high) in allowed.items():
+    for name, (low, high) in _SWEEP_RANGES.items():
         values = getattr(sweeps, name)
-        if len(values) and (values.min() < low or values.max() > high):
-            bad = values[(values < low) | (values > high)][0]
+        invalid = values[(values < low) | (values > high)]
+        if len(invalid):
             raise FormatError(
-                f"{name} {bad} of a sweep is not in {low}..{high}", file=path, where="/lighthouse"
+                f"{name} {invalid[0]} of a sweep is not in {low}..{high}",
+                file=path,
+                where="/lighthouse",
             )
 
 
-def sweep_messages(sweeps: Sweeps, *, batch_ns: int = BATCH_NS) -> Iterator[Timed]:
-    """Batches of ``sweeps`` by device and time, ascending in the time of their first."""
+def sweep_messages(sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> Iterator[TimedMessage]:
+    """Yield batches of ``sweeps`` by device and time, ascending in the time of the first sweep."""
     _check_ranges(sweeps, None)
     order = np.lexsort((sweeps.time_ns, sweeps.device))
     columns = {
@@ -133,7 +135,7 @@ def sweep_messages(sweeps: Sweeps, *, batch_ns: int = BATCH_NS) -> Iterator[Time
         if not column.optional
     }
     device = sweeps.device[order]
-    edges = batch_edges(columns["time_ns"], device, batch_ns, LARGEST_BATCH)
+    edges = batch_edges(columns["time_ns"], device, max_duration_ns=batch_ns)
     starts, stops = edges[:-1], edges[1:]
     for number in np.argsort(columns["time_ns"][starts], kind="stable"):
         part = slice(starts[number], stops[number])
@@ -142,10 +144,10 @@ def sweep_messages(sweeps: Sweeps, *, batch_ns: int = BATCH_NS) -> Iterator[Time
         yield int(columns["time_ns"][part.start]), f"/lighthouse/{name}", message
 
 
-def write_sweeps(writer: SessionWriter, sweeps: Sweeps, *, batch_ns: int = BATCH_NS) -> None:
+def write_sweeps(writer: SessionWriter, sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> None:
     """Write ``sweeps`` on ``/lighthouse/<device>``, batched by device and time.
 
-    ``batch_ns`` is the time that one message covers, in nanoseconds.
+    One message covers at most ``batch_ns`` nanoseconds.
     """
     for time_ns, topic, message in sweep_messages(sweeps, batch_ns=batch_ns):
         writer.write(topic, message, time_ns)
@@ -164,7 +166,7 @@ def write_session(
     receivers: Mapping[str, Receiver] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a session of sweeps with what is known beside them.
+    """Write a session of sweeps, with reference data and artifacts.
 
     Parameters
     ----------
@@ -175,20 +177,20 @@ def write_session(
     sweeps : Sweeps
         The observations, on ``/lighthouse/<device>``.
     truth : sequence of Trajectory
-        Reference poses: exact on ``/truth_track/<device>``, one message a pose for
+        Reference poses: exact on ``/truth_track/<device>``, one message per pose for
         viewers on ``/truth/<device>``.
     odometry : sequence of Trajectory
-        Its plane part (x, y, heading) is written, on ``/odometry/<device>``.
+        The planar part (x, y, heading) is written on ``/odometry/<device>``.
     scene : Scene, optional
         Attached as ``scene.toml``.
     facts : mapping, optional
-        Where the data comes from; written as texts to the metadata record ``facts``.
+        Origin of the data; written as texts to the metadata record ``facts``.
     stations : sequence of StationReport
-        What was measured of each station, in a metadata record ``station-<channel>`` each.
-        Calibrations and serial numbers that they sent go into the scene, where it has none of
-        its own for their channels.
+        Written as one metadata record ``station-<channel>`` each. Calibrations and serial
+        numbers that the stations transmitted are added to the scene, if it has none for their
+        channels.
     receivers : mapping of str to Receiver, optional
-        By device; attached as ``receiver.toml``, or where the devices differ as
+        By device; attached as ``receiver.toml``, or if the devices differ as one
         ``receiver-<device>.toml`` each.
     overwrite : bool
         Replace an existing file.
@@ -199,27 +201,28 @@ def write_session(
         See :func:`locatk.formats.output.atomic_write`.
     InputError
         A time is before 1970, two trajectories have the same device or two stations the same
-        channel, or a receiver cannot be.
+        channel, or a receiver is impossible.
     """
-    records = heard_stations.records_of(stations)
-    scene = heard_stations.with_heard(scene, stations)
+    records = station_records(stations)
+    scene = add_station_data(scene, stations)
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
-    places = receiver_files.texts_of(receivers or {}, devices)
-    streams = [sweep_messages(sweeps), *known_streams(truth, odometry)]
+    receiver_texts = texts_of(receivers or {}, devices)
+    streams = [sweep_messages(sweeps), *reference_streams(truth, odometry)]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if scene is not None:
-            writer.attach_toml(artifacts.SCENE_FILE, artifacts.dumps_scene(scene))
-        for name, text in places.items():
+            writer.attach_toml(SCENE_FILE, dumps_scene(scene))
+        for name, text in receiver_texts.items():
             writer.attach_toml(name, text)
         for name, record in records.items():
             writer.metadata(name, record)
         write_streams(writer, streams)
 
 
-def _contents(session: Session) -> str:
+def _describe_topics(session: Session) -> str:
     topics = [channel.topic for channel in session.channels]
     if not topics:
-        return "the file holds no messages at all"
-    more = "" if len(topics) <= 5 else f" and {len(topics) - 5} more"
-    return f"it holds {', '.join(topics[:5])}{more}"
+        return "The file contains no messages"
+    hidden = len(topics) - MAX_LISTED_TOPICS
+    more = f" and {hidden} more" if hidden > 0 else ""
+    return f"It contains {', '.join(topics[:MAX_LISTED_TOPICS])}{more}"

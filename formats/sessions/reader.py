@@ -1,36 +1,38 @@
-"""Sessions: MCAP files with protobuf messages, read fast.
+"""Sessions: MCAP files of protobuf messages.
 
-What is in them is said in docs/formats.md; how sweeps and poses become messages, in
-:mod:`locatk.formats.sessions.messages`; :mod:`locatk.formats.sessions.writer` writes them.
+Their contents are listed in docs/formats.md. :mod:`locatk.formats.sessions.writer` writes them,
+:mod:`locatk.formats.sessions.messages` converts messages to arrays and back.
 """
 
 from __future__ import annotations
 
 import os
 import stat
-import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, TypeVar
 
 from google.protobuf.message import DecodeError, Message
-from mcap.opcode import Opcode
-from mcap.records import Attachment
 
 from locatk.core.errors import FormatError, InputError, MissingDataError
-from locatk.formats.sessions import mcap_records
-from locatk.formats.sessions.mcap_records import DamageError, Index, NotMcapError
-
-RECORD = "locatk"
-"""Name of the metadata record that every file of locatk carries."""
+from locatk.formats.sessions import mcap_file
+from locatk.formats.sessions.mcap_file import (
+    SESSION_RECORD,
+    DamageError,
+    Index,
+    MessagePosition,
+    NotMcapError,
+    Segment,
+)
+from locatk.formats.sessions.recovery.salvage import describe_damage, salvage
 
 _MessageT = TypeVar("_MessageT", bound=Message)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One topic of a session, the name of its schema and how many messages it holds."""
+    """One topic of a session, the name of its schema and the number of its messages."""
 
     topic: str
     schema: str
@@ -40,7 +42,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class AttachmentInfo:
-    """One attachment of a session; ``time_ns`` is when it was written."""
+    """One attachment of a session; ``time_ns`` is the time at which it was written."""
 
     name: str
     media_type: str
@@ -54,18 +56,17 @@ class Session:
     Attributes
     ----------
     path : str
-        The file.
     profile, library : str
-        What the header says of the program that wrote it; ``profile`` is
+        Entries of the header about the program that wrote the file; ``profile`` is
         ``"locatk"`` for files of locatk.
     channels : tuple of Channel
         In the order in which they were registered.
     start_ns, end_ns : int or None
         Log times of the first and the last message; None without messages.
     damage : str or None
-        What is wrong with the file, where it was opened in spite of it.
+        Description of the damage, if the file was opened in spite of it.
     index : Index
-        Where the records are, for :mod:`locatk.formats.sessions.message_index`.
+        Positions of all records.
     """
 
     def __init__(self, path: str | os.PathLike[str], index: Index) -> None:
@@ -88,43 +89,48 @@ class Session:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], *, damaged_ok: bool = False) -> Session:
-        """Open a session and read what it holds, not yet the messages.
+        """Open a session and read its index; messages are read later.
 
         Parameters
         ----------
         path : path
             An MCAP file of any tool.
         damaged_ok : bool
-            Take a file that is cut short or damaged for what is left in it;
-            :attr:`damage` then says what is wrong.
+            Open a file that is cut short or damaged with the contents that can be salvaged;
+            :attr:`damage` then describes the damage.
 
         Raises
         ------
         MissingDataError
             There is no such file.
         FormatError
-            It is empty, not MCAP, cut short or damaged.
+            It is empty, not MCAP, cut short or damaged; with ``damaged_ok``, nothing can be
+            salvaged.
         """
-        with reading(path) as stream:
+        with open_mcap(path) as stream:
             try:
-                return cls(path, mcap_records.read_index(stream))
-            except NotMcapError:
-                raise
+                return cls(path, read_index(stream))
             except DamageError as damage:
                 if not damaged_ok:
                     raise
-                index = mcap_records.walk_index(stream)
-                index.damage = index.damage or str(damage)
-                return cls(path, index)
+                found = salvage(stream)
+                if found.is_empty:
+                    raise
+                found.index.damage = _describe(damage)
+                return cls(path, found.index)
 
     def topics(self, prefix: str, schema: str | None = None) -> tuple[str, ...]:
-        """Topics that start with ``prefix`` and, if given, have this schema; sorted."""
-        found = {
+        """Return the topics that start with ``prefix`` and, if given, have this schema; sorted."""
+        topics = {
             channel.topic
             for channel in self.channels
             if channel.topic.startswith(prefix) and schema in (None, channel.schema)
         }
-        return tuple(sorted(found))
+        return tuple(sorted(topics))
+
+    def channel_ids(self, topics: Collection[str]) -> set[int]:
+        """Return the ids of the channels of ``topics``."""
+        return {entry.id for entry in self.index.channels.values() if entry.topic in topics}
 
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, log time in ns, payload) of each message, in file order.
@@ -132,30 +138,26 @@ class Session:
         Parameters
         ----------
         topics : iterable of str, optional
-            Only these; all by default.
+            Topics to read; all by default.
 
         Raises
         ------
         FormatError
-            A chunk is damaged, or holds other messages than the index says.
+            A chunk is damaged, or the number of messages differs from that of the index.
         """
         names = None if topics is None else frozenset(topics)
-        wanted = {
+        topic_of = {
             entry.id: entry.topic
             for entry in self.index.channels.values()
             if names is None or entry.topic in names
         }
-        expected = sum(self.index.counts[channel] for channel in wanted)
-        seen = 0
-        with reading(self.path) as stream:
-            for segment in self.index.segments:
-                if segment.channels is not None and segment.channels.isdisjoint(wanted):
-                    continue
-                for channel, time_ns, data in mcap_records.read_messages(stream, segment, wanted):
-                    seen += 1
-                    yield wanted[channel], time_ns, data
-            if seen != expected:
-                raise DamageError(f"{seen} messages where the index says {expected}")
+        count = 0
+        with open_mcap(self.path) as stream:
+            for segment in self.index.segments_with(topic_of):
+                for channel, time_ns, data in mcap_file.read_messages(stream, segment, topic_of):
+                    count += 1
+                    yield topic_of[channel], time_ns, data
+            _check_count(self.index, count, topic_of)
 
     def decoded(
         self, topic: str, message_class: type[_MessageT]
@@ -184,49 +186,133 @@ class Session:
                 ) from None
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name; of equal names the later one wins, key by key."""
+        """Return the metadata records by name; of equal names the later one wins, key by key."""
         return {name: dict(record) for name, record in self.index.metadata.items()}
 
     @property
     def facts(self) -> dict[str, str]:
-        """The record ``locatk``: kind, system, versions; empty for another tool's file."""
-        return dict(self.index.metadata.get(RECORD, {}))
+        """Metadata record ``locatk``: kind, system, versions; empty for files of other tools."""
+        return dict(self.index.metadata.get(SESSION_RECORD, {}))
 
     def attachments(self) -> tuple[AttachmentInfo, ...]:
-        """What is attached, without reading it."""
+        """List the attachments without reading them."""
         return tuple(
             AttachmentInfo(entry.name, entry.media_type, entry.data_size, entry.log_time)
             for entry in self.index.attachments
         )
 
     def attachment(self, name: str) -> bytes | None:
-        """Content of the last attachment of this name, or None.
+        """Return the content of the last attachment of this name, or None.
 
         Raises
         ------
         FormatError
             It is damaged.
         """
-        entries = [entry for entry in self.index.attachments if entry.name == name]
-        if not entries:
+        offsets = [entry.offset for entry in self.index.attachments if entry.name == name]
+        if not offsets:
             return None
-        offset = entries[-1].offset
-        with reading(self.path) as stream:
-            content = mcap_records.record_at(stream, offset, Opcode.ATTACHMENT)
-            crc = int.from_bytes(content[-4:], "little")
-            if crc and zlib.crc32(content[:-4]) != crc:
-                raise DamageError(f"attachment {name} is damaged (wrong checksum)", offset)
-            return mcap_records.parse(Attachment.read, content, offset).data
+        with open_mcap(self.path) as stream:
+            try:
+                return mcap_file.read_attachment(stream, offsets[-1]).data
+            except DamageError as damage:
+                raise DamageError(f"attachment {name} is damaged ({damage})", offsets[-1]) from None
+
+
+class RandomAccess:
+    """Single messages of a session in any order; holds one decompressed chunk.
+
+    Parameters
+    ----------
+    session : Session
+        Its file must not change in the meantime.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._segment: Segment | None = None
+        self._data: bytes | memoryview = b""
+
+    def positions(self, topic: str) -> list[MessagePosition]:
+        """Return the positions of the messages of a topic, in file order.
+
+        Raises
+        ------
+        FormatError
+            The index is damaged, or lists another number of messages than it counts.
+        """
+        channels = self._session.channel_ids([topic])
+        with open_mcap(self._session.path) as stream:
+            found = [
+                position
+                for segment in self._session.index.segments_with(channels)
+                for position in mcap_file.find_messages(stream, segment, channels)
+            ]
+            _check_count(self._session.index, len(found), channels)
+        return found
+
+    def payload(self, position: MessagePosition) -> bytes:
+        """Return the payload of one message; fast if the previous one was in the same chunk.
+
+        Raises
+        ------
+        FormatError
+            The chunk is damaged, or another record is at this position.
+        """
+        if self._segment is not position.segment:
+            with open_mcap(self._session.path) as stream:
+                self._data = mcap_file.read_segment(stream, position.segment)
+                self._segment = position.segment
+        with damage_as_format_error(self._session.path):
+            return mcap_file.message_payload(self._data, position)
+
+
+def read_index(stream: IO[bytes]) -> Index:
+    """Read the index of a file; if its writer made none, all records are read.
+
+    Raises
+    ------
+    DamageError
+        The file is not MCAP, cut short, or its summary is damaged.
+    """
+    index = mcap_file.read_summary(stream)
+    if index is None:
+        found = salvage(stream)
+        index = found.index
+        index.damage = describe_damage(found)
+    return index
+
+
+def _check_count(index: Index, count: int, channels: Iterable[int]) -> None:
+    expected = sum(index.counts[channel] for channel in channels)
+    if count != expected:
+        raise DamageError(f"{count} messages instead of the {expected} that the index counts")
+
+
+def _describe(damage: DamageError) -> str:
+    if isinstance(damage, NotMcapError):
+        return "it does not begin as an MCAP file"
+    return str(damage) if damage.offset is None else f"{damage} (byte {damage.offset})"
 
 
 @contextmanager
-def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
-    """The open MCAP file; whatever is wrong with it becomes an error of one line."""
+def open_mcap(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+    """Open an MCAP file; system errors and :class:`DamageError` become errors of locatk.
+
+    Raises
+    ------
+    MissingDataError
+        There is no such file.
+    InputError
+        It cannot be read.
+    FormatError
+        It is not a regular file, or its content is damaged.
+    """
     try:
-        # A pipe would be waited for, for ever, and nothing of it can be read twice.
-        if not stat.S_ISREG(kind := os.stat(path).st_mode) and not stat.S_ISDIR(kind):
+        # Opening a pipe would block, and nothing in it can be read twice.
+        if not stat.S_ISREG(mode := os.stat(path).st_mode) and not stat.S_ISDIR(mode):
             raise FormatError("not a regular file", file=path)
-        with open(path, "rb") as stream:
+        with open(path, "rb") as stream, damage_as_format_error(path):
             yield stream
     except (FileNotFoundError, NotADirectoryError):
         raise MissingDataError("no such file", file=path) from None
@@ -234,6 +320,13 @@ def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         raise FormatError("a folder, not an MCAP file", file=path) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", file=path) from error
+
+
+@contextmanager
+def damage_as_format_error(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Convert :class:`DamageError` to a FormatError with file, byte and remedy."""
+    try:
+        yield
     except NotMcapError as damage:
         raise FormatError(
             str(damage),
@@ -245,5 +338,5 @@ def reading(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
             str(damage),
             file=path,
             where=None if damage.offset is None else f"byte {damage.offset}",
-            hint=f"`locatk recover {os.fspath(path)} -o whole.mcap` saves what is left of it",
+            hint=f"`locatk recover {os.fspath(path)} -o whole.mcap` saves the undamaged rest",
         ) from None

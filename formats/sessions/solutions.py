@@ -1,4 +1,4 @@
-"""Solutions on disk: poses for programs and viewers, with all that the solver said."""
+"""Solutions on disk: poses for programs and viewers, and the complete result of the solver."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ from locatk.core.polaris.tag import Tags
 from locatk.core.solution import GenericRecord, Solution, SolverWarning, from_json, to_json
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import maps, sheets, tags
-from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.sessions import foxglove as viewers
-from locatk.formats.sessions import point_clouds as viewer_points
+from locatk.formats.artifacts import scene as scene_files
+from locatk.formats.sessions import foxglove
+from locatk.formats.sessions.messages import TimedMessage
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import (
-    Timed,
     check_devices,
     read_poses,
     read_tracks,
@@ -42,12 +41,12 @@ SOLUTION_FILE = "solution.json"
 SOLUTION_VERSION = 1
 
 ARTIFACTS: tuple[tuple[type, str, Callable[[Any], str]], ...] = (
-    (Scene, artifacts.SCENE_FILE, artifacts.dumps_scene),
+    (Scene, scene_files.SCENE_FILE, scene_files.dumps_scene),
     (Manifest, sheets.SHEET_FILE, sheets.dumps_manifest),
     (Tags, tags.TAG_FILE, tags.dumps_tags),
     (FloorMap, maps.MAP_FILE, maps.dumps_map),
 )
-"""What a solution may stand on, and as what it is attached."""
+"""Type, attachment name and TOML writer of the artifacts that a solution can refer to."""
 
 RESULT_TYPES: dict[str, tuple[type, type]] = {
     "lighthouse": (StationDetection, LighthouseFacts),
@@ -58,9 +57,9 @@ RESULT_TYPES: dict[str, tuple[type, type]] = {
 """Types of the detections and of the facts of each system."""
 
 UNSPECIFIED = "unspecified"
-"""Code of a warning of which the file has the message only (before ``warnings`` was written)."""
+"""Code of warnings in files of earlier versions, which contain the messages only."""
 
-# Tuples, not unions, which isinstance takes twice as long for: there are a million values.
+# Tuples, because isinstance is twice as slow with unions, and there can be a million values.
 _PLAIN, _LISTS, _ARRAYS = (str, int), (list, tuple), (np.ndarray, np.generic)
 
 _ENCODER = json.JSONEncoder(allow_nan=False)
@@ -74,18 +73,18 @@ def write_solution(
     facts: Mapping[str, str] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a solution as MCAP; the topics are those of docs/formats.md.
+    """Write a solution as MCAP, with the topics of docs/formats.md.
 
     Parameters
     ----------
     path : path
         The output.
     solution : Solution
-        What a solver answered; it may hold no poses at all.
+        Result of a solver; it may have no poses.
     source : path
-        The session that was solved; its name is kept.
+        The session that was solved; its name is stored.
     facts : mapping of str to str, optional
-        What it was made from, for the metadata record ``locatk``: ``command``,
+        Origin of the solution, for the metadata record ``locatk``: ``command``,
         ``source_bytes`` and more (:mod:`locatk.formats.pipeline.provenance`).
     overwrite : bool
         Replace an existing file.
@@ -98,7 +97,7 @@ def write_solution(
     check_devices(solution.trajectories, "solved")
     artifact = solution.artifact
     starts = [int(t.time_ns[0]) for t in solution.trajectories if len(t) > 0]
-    start = min(starts, default=0)
+    start_ns = min(starts, default=0)
     name = Path(source).name
     record = {**(facts or {}), "method": solution.method, "source": name}
     with SessionWriter(
@@ -107,17 +106,18 @@ def write_solution(
         for kind, file, dumps in ARTIFACTS:
             if isinstance(artifact, kind):
                 writer.attach_toml(file, dumps(artifact))
-        text = _json(plain(_statement(solution, name)))
+        text = _encode(plain(_solution_record(solution, name)))
         writer.attach(SOLUTION_FILE, text.encode(), "application/json")
-        streams = [iter(_once(solution, start))]
+        streams = [iter(_static_messages(solution, start_ns))]
         for t in solution.trajectories:
             streams.append(track_messages(f"/solution/{t.device}", t))
-            streams.append(viewers.poses(f"/pose/{t.device}", t))
-            streams.append(viewers.transforms("/tf", t))
+            streams.append(foxglove.poses(f"/pose/{t.device}", t))
+            streams.append(foxglove.transforms("/tf", t))
         write_streams(writer, streams)
 
 
-def _statement(solution: Solution, source: str) -> dict[str, Any]:
+def _solution_record(solution: Solution, source: str) -> dict[str, Any]:
+    """Return the content of ``solution.json``."""
     return {
         "version": SOLUTION_VERSION,
         "system": solution.system,
@@ -134,76 +134,76 @@ def _statement(solution: Solution, source: str) -> dict[str, Any]:
     }
 
 
-def _json(value: Any, depth: int = 0) -> str:
-    """JSON text with a line for each key of the upper levels and for each entry of a list of
-    objects: there may be 100,000 of them, which an indented text makes three times slower."""
-    space, below = "\n" + " " * depth, "\n" + " " * (depth + 1)
+def _encode(value: Any, depth: int = 0) -> str:
+    """Return JSON with a line for each key of the upper levels and each object of a list.
+
+    There can be 100,000 objects; with ``indent`` the standard encoder is three times slower.
+    """
+    end, separator = "\n" + " " * depth, "\n" + " " * (depth + 1)
     if isinstance(value, dict) and value and depth < 2:
-        pairs = (f"{json.dumps(key)}: {_json(item, depth + 1)}" for key, item in value.items())
-        return "{" + below + ("," + below).join(pairs) + space + "}"
+        pairs = (f"{json.dumps(key)}: {_encode(item, depth + 1)}" for key, item in value.items())
+        return "{" + separator + ("," + separator).join(pairs) + end + "}"
     if isinstance(value, list) and value and isinstance(value[0], dict):
         items = (_ENCODER.encode(item) for item in value)
-        return "[" + below + ("," + below).join(items) + space + "]"
+        return "[" + separator + ("," + separator).join(items) + end + "]"
     return _ENCODER.encode(value)
 
 
-def _once(solution: Solution, start: int) -> list[Timed]:
-    """What is said once, at the start: the artifact, whole paths, the log."""
-    scene = viewers.scene_update(solution.artifact, solution.trajectories, start)
-    said: list[Timed] = [(start, "/scene", scene)]
-    for frame, cloud in viewer_points.artifact_points(scene, start).items():
-        said.append((start, f"/artifact_points/{frame}", cloud))
+def _static_messages(solution: Solution, start_ns: int) -> list[TimedMessage]:
+    """Return the messages at the start of a solution: the artifact, whole paths, the log."""
+    scene = foxglove.scene_update(solution.artifact, solution.trajectories, start_ns)
+    messages: list[TimedMessage] = [(start_ns, "/scene", scene)]
+    for frame, cloud in foxglove.artifact_points(scene, start_ns).items():
+        messages.append((start_ns, f"/artifact_points/{frame}", cloud))
     for number, t in enumerate(solution.trajectories):
         if len(t) > 0:
-            said.append((start, f"/path/{t.device}", viewers.path(t, start)))
-            points = viewer_points.path_points(t, number, start)
-            said.append((start, f"/path_points/{t.device}", points))
+            messages.append((start_ns, f"/path/{t.device}", foxglove.path(t, start_ns)))
+            points = foxglove.path_points(t, number, start_ns)
+            messages.append((start_ns, f"/path_points/{t.device}", points))
     for warning in solution.warnings:
-        said.append((start, "/log", viewers.log(warning.message, start)))
+        messages.append((start_ns, "/log", foxglove.log(warning.message, start_ns)))
     for reason, count in solution.rejected.items():
         if count:
-            line = viewers.log(f"rejected {count}: {reason}", start, warning=True)
-            said.append((start, "/log", line))
-    return said
+            line = foxglove.log(f"rejected {count}: {reason}", start_ns, warning=True)
+            messages.append((start_ns, "/log", line))
+    return messages
 
 
 def read_solution(path: str | os.PathLike[str]) -> Solution:
-    """The solution that :func:`write_solution` wrote.
+    """Read a solution that :func:`write_solution` wrote.
 
     Raises
     ------
     MissingDataError, FormatError
-        See :meth:`Session.open`; also where the file holds no solution.
+        See :meth:`Session.open`; FormatError also if the file contains no solution.
     """
     session = Session.open(path)
     data = session.attachment(SOLUTION_FILE)
     if data is None:
-        raise FormatError(
-            "no solution", file=path, hint="Give a file that `locatk solve` has written"
-        )
+        raise FormatError("no solution", file=path, hint="Give a file written by `locatk solve`")
     try:
-        said = json.loads(data)
-        if said["version"] > SOLUTION_VERSION:
+        record = json.loads(data)
+        if record["version"] > SOLUTION_VERSION:
             raise FormatError(
-                f"solution of format {said['version']}, newer than this locatk",
+                f"solution of format {record['version']}, newer than this locatk",
                 file=path,
                 where=SOLUTION_FILE,
                 hint="Update locatk",
             )
-        system = str(said["system"])
+        system = str(record["system"])
         detection_type, facts_type = RESULT_TYPES.get(system, (GenericRecord, GenericRecord))
         return Solution(
             system=system,
-            method=str(said["method"]),
-            trajectories=_trajectories(session, said["devices"]),
-            rejected={str(key): int(count) for key, count in said["rejected"].items()},
-            detections=tuple(from_json(detection_type, each) for each in said["detections"]),
-            artifact=artifacts.attached_scene(session)
+            method=str(record["method"]),
+            trajectories=_trajectories(session, record["devices"]),
+            rejected={str(key): int(count) for key, count in record["rejected"].items()},
+            detections=tuple(from_json(detection_type, each) for each in record["detections"]),
+            artifact=scene_files.attached_scene(session)
             or sheets.attached_manifest(session)
             or tags.attached_tags(session)
             or maps.attached_map(session),
-            warnings=_warnings(said),
-            facts=from_json(facts_type, said["facts"]) if said["facts"] else None,
+            warnings=_warnings(record),
+            facts=from_json(facts_type, record["facts"]) if record["facts"] else None,
         )
     except LocatkError:
         raise
@@ -211,35 +211,35 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
         raise FormatError("damaged solution", file=path, where=SOLUTION_FILE) from None
 
 
-def _warnings(statement: Mapping[str, Any]) -> tuple[SolverWarning, ...]:
+def _warnings(record: Mapping[str, Any]) -> tuple[SolverWarning, ...]:
     """Return the warnings of ``solution.json``; earlier versions have their messages only."""
-    if "warnings" not in statement:
-        return tuple(SolverWarning(UNSPECIFIED, str(note)) for note in statement["notes"])
-    return tuple(from_json(SolverWarning, each) for each in statement["warnings"])
+    if "warnings" not in record:
+        return tuple(SolverWarning(UNSPECIFIED, str(note)) for note in record["notes"])
+    return tuple(from_json(SolverWarning, each) for each in record["warnings"])
 
 
 def _trajectories(session: Session, devices: list[dict[str, Any]]) -> tuple[Trajectory, ...]:
-    """Trajectories in the solver's order; those without a pose have no messages."""
+    """Return the trajectories in the solver's order; those without a pose have no messages."""
     tracks = {track.device: track for track in read_tracks(session, "/solution/")}
-    found = []
+    trajectories = []
     for entry in devices:
         device, frame = str(entry["device"]), str(entry["frame"])
-        nothing = np.zeros(0, np.int64)
         track = tracks.get(device)
         if track is None:
-            track = Trajectory.from_positions(device, frame, nothing, np.zeros((0, 3)))
+            no_time_ns = np.zeros(0, np.int64)
+            track = Trajectory.from_positions(device, frame, no_time_ns, np.zeros((0, 3)))
         if len(track) != entry["poses"]:
             raise FormatError(
-                f"{len(track)} poses of {device} where there were {entry['poses']}",
+                f"{len(track)} poses of {device} instead of {entry['poses']}",
                 file=session.path,
                 where=f"/solution/{device}",
             )
-        found.append(track)
-    return tuple(found)
+        trajectories.append(track)
+    return tuple(trajectories)
 
 
 def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[Trajectory]:
-    """Trajectories of a solution or a session, one a device, sorted by device.
+    """Read the trajectories of a solution or a session, one per device, sorted by device.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[
         An MCAP file.
     kind : {"auto", "solution", "truth"}
         Solved poses (``/solution/``, else ``PoseInFrame`` on ``/pose/``), reference
-        poses (``/truth``), or what there is, in this order.
+        poses (``/truth``), or the first of them that exists.
 
     Raises
     ------
@@ -264,9 +264,9 @@ def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[
         found = read_truth(session)
     if not found:
         hints = {
-            "auto": "solve it first: `locatk solve`",
-            "solution": "solve it first: `locatk solve`",
-            "truth": "import it with its reference: `locatk import ... --truth`",
+            "auto": "Solve it first: `locatk solve`",
+            "solution": "Solve it first: `locatk solve`",
+            "truth": "Import it with its reference: `locatk import ... --truth`",
         }
         what = {"auto": "poses", "solution": "solved poses", "truth": "reference poses"}[kind]
         raise FormatError(f"no {what}", file=path, hint=hints[kind])
@@ -274,12 +274,12 @@ def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[
 
 
 def plain(value: Any) -> Any:
-    """``value`` in types that JSON knows: numpy numbers and arrays resolved, nan as null.
+    """Convert ``value`` to types of JSON: numpy numbers and arrays to Python's, nan to null.
 
     Raises
     ------
     InputError
-        It holds something that JSON cannot say.
+        It contains another type.
     """
     if value is None or isinstance(value, _PLAIN):
         return value

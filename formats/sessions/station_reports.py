@@ -1,8 +1,7 @@
-"""What was heard of each base station, in the metadata of a session: ``station-<channel>``.
+"""Reports on base stations in the metadata of a session: ``station-<channel>``.
 
-The entries are texts; numbers come back as they were. A station's calibration is not among
-them: it is in ``scene.toml`` under ``[[calibrations]]``, where people and solvers look for
-it, and the record names only its source.
+The entries are texts; numbers are restored exactly. The calibration of a station is not among
+them: it is in ``scene.toml`` under ``[[calibrations]]``, and the record names only its source.
 """
 
 from __future__ import annotations
@@ -16,51 +15,54 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.recording import StationReport
 from locatk.core.lighthouse.scene import Scene
-from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.artifacts.scene import attached_scene
 from locatk.formats.sessions.reader import Session
 
 PREFIX = "station-"
-"""Of the records' names, before the channel."""
+"""Prefix of the names of the records, in front of the channel."""
 
 _COUNTS = ("sweeps", "missed", "frames", "damaged")
 _OPTIONAL = ("missed",)
 
 
-def record_of(station: StationReport) -> dict[str, str]:
-    """The metadata record of a station; what is not known has no entry."""
-    known = {
+def station_record(station: StationReport) -> dict[str, str]:
+    """Return the metadata record of a station; unknown values have no entry."""
+    values = {
         "id": None if station.id is None else f"{station.id:08x}",
         "period_ticks": None if station.period_ticks is None else repr(float(station.period_ticks)),
         **{key: getattr(station, key) for key in _COUNTS},
         "calibration": None if station.calibration is None else station.calibration.source,
     }
-    return {key: str(value) for key, value in known.items() if value is not None}
+    return {key: str(value) for key, value in values.items() if value is not None}
 
 
-def records_of(stations: Sequence[StationReport]) -> dict[str, dict[str, str]]:
-    """Metadata records (name to entries) of the stations of a session, ascending in channel.
+def station_records(stations: Sequence[StationReport]) -> dict[str, dict[str, str]]:
+    """Return the metadata records (name to entries) of stations, ascending in channel.
 
     Raises
     ------
     InputError
-        Two stations have the same channel, or a number cannot be.
+        Two stations have the same channel, or a number is out of range.
     """
     records: dict[str, dict[str, str]] = {}
     for station in sorted(stations, key=lambda each: each.channel):
         name = f"{PREFIX}{station.channel}"
         if name in records:
-            raise InputError(f"two stations were heard on channel {station.channel}")
-        records[name] = record_of(station)
+            raise InputError(f"two stations on channel {station.channel}")
+        records[name] = station_record(station)
         try:
-            _station(name, records[name], {})
+            _parse_record(name, records[name], {})
         except ValueError as error:
-            raise InputError(f"the station heard on channel {station.channel}: {error}") from None
+            raise InputError(f"the station on channel {station.channel}: {error}") from None
     return records
 
 
-def with_heard(scene: Scene | None, stations: Sequence[StationReport]) -> Scene | None:
-    """``scene`` with the calibrations and serial numbers that the stations sent themselves,
-    where it has none of its own for their channels."""
+def add_station_data(scene: Scene | None, stations: Sequence[StationReport]) -> Scene | None:
+    """Add the calibrations and serial numbers that stations transmitted to ``scene``.
+
+    Those that the scene already has for a channel are kept. Returns ``scene`` itself if there is
+    nothing to add.
+    """
     calibrations = {each.channel: each.calibration for each in stations if each.calibration}
     ids = {each.channel: each.id for each in stations if each.id is not None}
     if not calibrations and not ids:
@@ -73,50 +75,50 @@ def with_heard(scene: Scene | None, stations: Sequence[StationReport]) -> Scene 
     )
 
 
-def strangers(scene: Scene, stations: Sequence[StationReport]) -> list[str]:
-    """What to say where a station that was heard is not the one of the scene on its channel."""
+def describe_unknown_stations(scene: Scene, stations: Sequence[StationReport]) -> list[str]:
+    """Describe the stations of a recording that differ from that of the scene on their channel."""
     notes = []
     for each in stations:
-        known = scene.station(each.channel)
-        number = scene.ids.get(each.channel) if known is None else known.id
-        if number is None or each.id is None or number == each.id:
+        station = scene.station(each.channel)
+        scene_id = scene.ids.get(each.channel) if station is None else station.id
+        if scene_id is None or each.id is None or scene_id == each.id:
             continue
         notes.append(
-            f"on channel {each.channel} the scene has the station {number:08x}, and the "
-            f"recording heard {each.id:08x}: is it the scene of this place?"
+            f"channel {each.channel}: the scene contains station {scene_id:08x}, the recording "
+            f"was made with station {each.id:08x}. Check that the scene is of this site"
         )
     return notes
 
 
-def read_heard(session: Session) -> tuple[StationReport, ...]:
-    """The stations that a recording heard, ascending in channel; none where it does not tell.
+def read_station_reports(session: Session) -> tuple[StationReport, ...]:
+    """Read the reports on the stations of a recording, ascending in channel; may be empty.
 
     Raises
     ------
     FormatError
-        A record is damaged: MCAP does not guard them with a checksum.
+        A record is damaged: metadata of MCAP have no checksum.
     ArtifactError
-        The scene is damaged, which holds the calibrations.
+        The scene, which contains the calibrations, is damaged.
     """
     names = [name for name in session.metadata() if name.startswith(PREFIX)]
     if not names:
         return ()
-    scene = artifacts.attached_scene(session) or Scene()
+    scene = attached_scene(session) or Scene()
     records = session.metadata()
-    found = []
+    reports = []
     for name in names:
         try:
-            found.append(_station(name, records[name], scene.calibrations))
+            reports.append(_parse_record(name, records[name], scene.calibrations))
         except ValueError as error:
-            place = name if len(name) < 20 and name.isprintable() else ascii(name[:20])
-            raise FormatError(str(error), file=session.path, where=place) from None
-    return tuple(sorted(found, key=lambda each: each.channel))
+            where = name if len(name) < 20 and name.isprintable() else ascii(name[:20])
+            raise FormatError(str(error), file=session.path, where=where) from None
+    return tuple(sorted(reports, key=lambda each: each.channel))
 
 
-def _station(
+def _parse_record(
     name: str, record: Mapping[str, str], calibrations: Mapping[int, Calibration]
 ) -> StationReport:
-    """The station of a record; raises ValueError, which says what is wrong."""
+    """Return the report of a record; raises ValueError with a message for people."""
     channel = name.removeprefix(PREFIX)
     if not re.fullmatch("[1-9]|1[0-6]", channel, re.ASCII):
         raise ValueError(f"channel {channel[:20]!r} is not in 1..16")
@@ -130,7 +132,8 @@ def _station(
         except ValueError:
             period = math.nan
         if not 0 < period < math.inf:
-            raise ValueError(f"period_ticks {record['period_ticks'][:20]!r} is no number above 0")
+            stated = record["period_ticks"][:20]
+            raise ValueError(f"period_ticks {stated!r} is not a number above 0")
     counts: dict[str, int] = {}
     for key in _COUNTS:
         text = record.get(key, None if key in _OPTIONAL else "0")

@@ -1,4 +1,4 @@
-"""Trajectories in sessions: exact batches for programs, one message a pose for viewers."""
+"""Trajectories in sessions: exact batches for programs, one message per pose for viewers."""
 
 from __future__ import annotations
 
@@ -7,34 +7,31 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.trajectory import Trajectory
-from locatk.formats.sessions import foxglove as viewers
+from locatk.formats.sessions import foxglove
 from locatk.formats.sessions.messages import (
+    MAX_BATCH_SAMPLES,
     ODOMETRY,
     POSES,
     BatchError,
     Batches,
     Layout,
+    TimedMessage,
     symmetric,
     triangle,
 )
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
-LARGEST_BATCH = 1024
-"""Most samples in one message."""
-
-Timed = tuple[int, str, Message]
-"""Time in ns, topic and message."""
+# ---- writing
 
 
-def track_messages(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
-    """Exact batches of the poses of one device."""
+def track_messages(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
+    """Yield exact batches of the poses of one device."""
     columns: dict[str, NDArray[Any]] = {
         "time_ns": trajectory.time_ns,
         "position_m": trajectory.position,
@@ -45,8 +42,8 @@ def track_messages(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
     return _batched(POSES, topic, trajectory, columns)
 
 
-def odometry_messages(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
-    """Batches of the plane part of a trajectory: x, y and heading."""
+def odometry_messages(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
+    """Yield batches of the planar part of a trajectory: x, y and heading."""
     columns = {
         "time_ns": trajectory.time_ns,
         "x_m": trajectory.position[:, 0],
@@ -58,48 +55,50 @@ def odometry_messages(topic: str, trajectory: Trajectory) -> Iterator[Timed]:
 
 def _batched(
     layout: Layout, topic: str, trajectory: Trajectory, columns: Mapping[str, NDArray[Any]]
-) -> Iterator[Timed]:
+) -> Iterator[TimedMessage]:
     texts = {"device": trajectory.device, "frame_id": trajectory.frame}
-    for start in range(0, len(trajectory), LARGEST_BATCH):
-        part = {key: column[start : start + LARGEST_BATCH] for key, column in columns.items()}
+    for start in range(0, len(trajectory), MAX_BATCH_SAMPLES):
+        part = {key: column[start : start + MAX_BATCH_SAMPLES] for key, column in columns.items()}
         yield int(part["time_ns"][0]), topic, layout.pack(texts, part)
 
 
-def truth_messages(truth: Iterable[Trajectory]) -> list[Iterator[Timed]]:
-    """Streams of reference poses: exact ones, and one message a pose for viewers."""
+def truth_messages(truth: Iterable[Trajectory]) -> list[Iterator[TimedMessage]]:
+    """Return streams of reference poses: exact batches, and one message per pose for viewers."""
     streams = []
     for trajectory in truth:
         streams.append(track_messages(f"/truth_track/{trajectory.device}", trajectory))
-        streams.append(viewers.poses(f"/truth/{trajectory.device}", trajectory))
+        streams.append(foxglove.poses(f"/truth/{trajectory.device}", trajectory))
     return streams
 
 
-def known_streams(
+def reference_streams(
     truth: Sequence[Trajectory], odometry: Sequence[Trajectory]
-) -> list[Iterator[Timed]]:
-    """Streams of the trajectories that are known beside what was recorded.
+) -> list[Iterator[TimedMessage]]:
+    """Return the streams of reference poses and odometry.
 
     Raises
     ------
     InputError
-        Two of them have the same device.
+        Two trajectories of the same kind have the same device.
     """
-    for kind, trajectories in (("truth", truth), ("odometry", odometry)):
-        check_devices(trajectories, kind)
-    driven = [odometry_messages(f"/odometry/{each.device}", each) for each in odometry]
-    return [*truth_messages(truth), *driven]
+    check_devices(truth, "truth")
+    check_devices(odometry, "odometry")
+    return [
+        *truth_messages(truth),
+        *(odometry_messages(f"/odometry/{each.device}", each) for each in odometry),
+    ]
 
 
 def write_warnings(writer: SessionWriter, warnings: Iterable[str], end_ns: int) -> None:
     """Write warnings to ``/log``, at the end of a session."""
     for line in warnings:
-        writer.write("/log", viewers.log(line, end_ns, warning=True), end_ns)
+        writer.write("/log", foxglove.log(line, end_ns, warning=True), end_ns)
 
 
-def write_streams(writer: SessionWriter, streams: Iterable[Iterator[Timed]]) -> int:
+def write_streams(writer: SessionWriter, streams: Iterable[Iterator[TimedMessage]]) -> int:
     """Write messages of several ascending streams in the order of their times.
 
-    Returns the time of the last one, 0 where there is none.
+    Returns the time of the last one, 0 without messages.
     """
     time_ns = 0
     for time_ns, topic, message in heapq.merge(*streams, key=lambda item: item[0]):
@@ -108,60 +107,63 @@ def write_streams(writer: SessionWriter, streams: Iterable[Iterator[Timed]]) -> 
 
 
 def check_devices(trajectories: Sequence[Trajectory], kind: str) -> None:
-    """Refuse two trajectories of one device: they would share a topic."""
+    """Raise InputError if two trajectories have the same device: they would share a topic."""
     names = [trajectory.device for trajectory in trajectories]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two {kind} trajectories of device {name!r}")
 
 
-def read_truth(session: Session) -> list[Trajectory]:
-    """Reference poses of a session, one trajectory a device; empty without any.
+# ---- reading
 
-    Taken from ``/truth_track/<device>``; from the ``foxglove.PoseInFrame`` on
-    ``/truth/<device>`` for devices that have no such topic (other tools' files).
+
+def read_truth(session: Session) -> list[Trajectory]:
+    """Read the reference poses of a session, one trajectory per device; may be empty.
+
+    They are taken from ``/truth_track/<device>``. For devices without such a topic (files of
+    other tools) they are the ``foxglove.PoseInFrame`` messages on ``/truth/<device>``.
     """
     exact = read_tracks(session, "/truth_track/")
-    known = {f"/truth/{trajectory.device}" for trajectory in exact}
-    return exact + read_poses(session, "/truth/", known)
+    exact_topics = {f"/truth/{trajectory.device}" for trajectory in exact}
+    return exact + read_poses(session, "/truth/", exact_topics)
 
 
 def read_odometry(session: Session) -> list[Trajectory]:
-    """Odometry of a session as trajectories in the plane, covariance unknown."""
-    found = []
-    for name in session.topics("/odometry/", "locatk.Odometry"):
-        batches = read_batches(session, [name], ODOMETRY)
+    """Read the odometry of a session as planar trajectories of unknown covariance."""
+    trajectories = []
+    for topic in session.topics("/odometry/", "locatk.Odometry"):
+        batches = read_batches(session, [topic], ODOMETRY)
         columns = batches.columns
         n = len(columns["time_ns"])
         position = np.column_stack([columns["x_m"], columns["y_m"], np.zeros(n)])
         quaternion = quaternion_from_heading(columns["heading_rad"])
         covariance = np.full((n, 6, 6), np.nan)
-        found.append(_trajectory(batches, name, position, quaternion, covariance))
-    return found
+        trajectories.append(_trajectory(batches, topic, position, quaternion, covariance))
+    return trajectories
 
 
 def read_tracks(session: Session, prefix: str) -> list[Trajectory]:
-    """Trajectories of the ``locatk.PoseTrack`` topics that start with ``prefix``."""
-    found = []
-    for name in session.topics(prefix, "locatk.PoseTrack"):
-        batches = read_batches(session, [name], POSES)
+    """Read the trajectories of the ``locatk.PoseTrack`` topics that start with ``prefix``."""
+    trajectories = []
+    for topic in session.topics(prefix, "locatk.PoseTrack"):
+        batches = read_batches(session, [topic], POSES)
         columns = batches.columns
+        position, quaternion = columns["position_m"], columns["quaternion_xyzw"]
         covariance = symmetric(columns["covariance_m_rad"])
-        found.append(
-            _trajectory(
-                batches, name, columns["position_m"], columns["quaternion_xyzw"], covariance
-            )
-        )
-    return found
+        trajectories.append(_trajectory(batches, topic, position, quaternion, covariance))
+    return trajectories
 
 
 def read_poses(session: Session, prefix: str, skip: Iterable[str] = ()) -> list[Trajectory]:
-    """Trajectories of the ``foxglove.PoseInFrame`` topics that start with ``prefix``.
+    """Read the trajectories of the ``foxglove.PoseInFrame`` topics that start with ``prefix``.
 
-    The covariance is unknown. ``skip`` names topics to leave out.
+    The covariance is unknown. Topics in ``skip`` are left out.
     """
     topics = set(session.topics(prefix, "foxglove.PoseInFrame")) - set(skip)
-    return [viewers.trajectory(session, name, name.removeprefix(prefix)) for name in sorted(topics)]
+    return [
+        foxglove.read_trajectory(session, topic, topic.removeprefix(prefix))
+        for topic in sorted(topics)
+    ]
 
 
 def _trajectory(
@@ -177,7 +179,7 @@ def _trajectory(
 
 
 def read_batches(session: Session, topics: Iterable[str], layout: Layout) -> Batches:
-    """All batches of ``topics``, in the order of the file.
+    """Read all batches of ``topics``, in file order.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Sessions, written: whole or not at all, or live as they are recorded."""
+"""Writer of sessions: complete files, which appear at the end, and live recordings."""
 
 from __future__ import annotations
 
@@ -14,23 +14,18 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from locatk.core.errors import InputError
 from locatk.formats.output import atomic_write, tool_version
-from locatk.formats.sessions.reader import RECORD
+from locatk.formats.sessions.mcap_file import CHANNELS_RECORD, SESSION_RECORD
 
 PROFILE = "locatk"
 FORMAT_VERSION = "1"
 
-CHANNELS = "channels"
-"""Name of the metadata record of a live recording that tells its channels: id to topic and
-schema. Should the chunk that introduces a channel be damaged, its messages are none the less
-known."""
-
 
 class SessionWriter:
-    """Writes a session; a context manager, on whose clean exit the file appears.
+    """Writer of a session; a context manager. The file appears when the block ends normally.
 
-    Messages should come in the order of their times: readers then need little memory.
-    Same calls, same bytes. A live recording goes to a ``stream`` of its own instead, which
-    is finished whatever ends the block.
+    Messages should be written in the order of their times: readers then need little memory.
+    Equal calls give equal bytes. A live recording is written to an open stream instead, and is
+    finished even if the block ends with an exception.
 
     Parameters
     ----------
@@ -41,12 +36,12 @@ class SessionWriter:
     system : str
         ``"lighthouse"``, ``"polaris"``, ``"dots"`` or ``"landmarks"``.
     facts : mapping of str to str, optional
-        More entries for the metadata record ``locatk``.
+        Additional entries of the metadata record ``locatk``.
     overwrite : bool
         Replace an existing file.
     live : stream, optional
-        Write to this open binary file, which is not closed, instead of to ``path``; tell the
-        channels in the metadata record :data:`CHANNELS`, too.
+        Write to this open binary file instead of to ``path``, and do not close it. The channels
+        are also listed in the metadata record :data:`CHANNELS_RECORD`.
 
     Raises
     ------
@@ -84,7 +79,7 @@ class SessionWriter:
         stream = self._output.__enter__()
         self._writer = Writer(stream, compression=CompressionType.ZSTD)
         self._writer.start(profile=PROFILE, library=f"locatk {tool_version()}")
-        self.metadata(RECORD, self._record)
+        self.metadata(SESSION_RECORD, self._record)
         return self
 
     def __exit__(
@@ -97,7 +92,7 @@ class SessionWriter:
             try:
                 self._open_writer.finish()
             except BaseException as failure:
-                # The output must be removed, as after any failure inside the block.
+                # The incomplete output must be removed, as after a failure inside the block.
                 self._output.__exit__(type(failure), failure, failure.__traceback__)
                 raise
         self._output.__exit__(kind, error, trace)
@@ -109,34 +104,39 @@ class SessionWriter:
         return self._writer
 
     def declare(self, topic: str, message_class: type[Message]) -> int:
-        """Register a topic ahead of its first message; returns the id of its channel.
+        """Register a topic before its first message; return the id of its channel.
 
         In a live recording, flush after the first messages of new topics.
         """
-        known = self._channels.get(topic)
-        if known is None:
-            known = (self._register(topic, message_class), message_class)
-            self._channels[topic] = known
-        channel, expected = known
-        if message_class is not expected:
-            raise TypeError(f"topic {topic} holds {expected.__name__}")
+        if topic not in self._channels:
+            self._channels[topic] = (self._register(topic, message_class), message_class)
+        channel, registered_class = self._channels[topic]
+        if message_class is not registered_class:
+            raise TypeError(f"topic {topic} holds {registered_class.__name__}")
         return channel
 
     def flush(self) -> None:
-        """Write what is buffered, as a chunk of its own; a reader of the file then finds it."""
+        """Write the buffered messages as a chunk, so that readers of the file find them."""
         self._open_writer.flush()
 
     def write(
         self, topic: str, message: Message, time_ns: int, publish_ns: int | None = None
     ) -> None:
-        """Write one message at ``time_ns`` (log time, ns since the epoch).
+        """Write one message.
 
-        ``publish_ns`` is when its first sample was measured, where that is known better.
+        Parameters
+        ----------
+        topic : str
+        message : Message
+        time_ns : int
+            Log time in ns since the epoch.
+        publish_ns : int, optional
+            Time of the first sample, if it is known better.
 
         Raises
         ------
         InputError
-            The time is before 1970, which MCAP cannot say.
+            The time is before 1970, which MCAP cannot represent.
         """
         writer = self._open_writer
         channel = self.declare(topic, type(message))
@@ -159,11 +159,11 @@ class SessionWriter:
             )
         channel: int = self._open_writer.register_channel(topic, "protobuf", self._schemas[name])
         if self._live:
-            self.metadata(CHANNELS, {str(channel): f"{topic} {name}"})
+            self.metadata(CHANNELS_RECORD, {str(channel): f"{topic} {name}"})
         return channel
 
     def attach(self, name: str, data: bytes, media_type: str, time_ns: int = 0) -> None:
-        """Attach a file of a media type; artifacts with :meth:`attach_toml`."""
+        """Attach a file of a media type; for artifacts see :meth:`attach_toml`."""
         self._open_writer.add_attachment(time_ns, time_ns, name, media_type, data)
 
     def metadata(self, name: str, record: Mapping[str, str]) -> None:
@@ -171,10 +171,10 @@ class SessionWriter:
         self._open_writer.add_metadata(name, dict(record))
 
     def attach_toml(self, name: str, text: str) -> None:
-        """Attach an artifact as ``name``, as in ``attach_toml("scene.toml", text)``."""
+        """Attach an artifact: ``attach_toml("scene.toml", text)``."""
         self.attach(name, text.encode(), "application/toml")
 
     def facts(self, facts: Mapping[str, object] | None) -> None:
-        """Write what is known of a recording as texts to the metadata record ``facts``."""
+        """Write facts about a recording, as texts, to the metadata record ``facts``."""
         if facts:
             self.metadata("facts", {key: str(value) for key, value in facts.items()})

@@ -22,7 +22,7 @@ from locatk.core.landmarks.simulation.session import (
 )
 from locatk.formats.artifacts import maps
 from locatk.formats.files import read_text
-from locatk.formats.sessions import halls
+from locatk.formats.sessions import field_samples
 from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
 from locatk.formats.simulation.settings import (
     ANY_NUMBER,
@@ -575,7 +575,7 @@ def write_simulation(
     driver = published_driver(floor, options) if options.strategy == "published" else None
     simulated = simulate(floor, options, driver)
     warnings = _warnings(simulated)
-    halls.write_session(
+    field_samples.write_halls(
         output,
         simulated.samples,
         floor=floor,

@@ -17,7 +17,7 @@ from locatk.core.polaris.simulation.session import (
     usual_bar,
 )
 from locatk.formats.artifacts import tags as tag_files
-from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions import field_samples
 from locatk.formats.simulation.config import SimulationConfig
 from locatk.formats.simulation.settings import (
     ANY_NUMBER,
@@ -441,7 +441,7 @@ def write_simulation(
     options = simulation_options(settings)
     simulated = simulate(tags, options)
     warnings = _warnings(simulated)
-    arrays.write_session(
+    field_samples.write_magnetometers(
         output,
         [simulated.samples],
         tags=tags,

@@ -180,7 +180,7 @@ def test_what_was_heard_goes_into_the_session(locatk, tmp_path: Path, asked: lis
         "Warning: the end is cut off",
     ]
     session = Session.open(out)
-    assert [(s.id, s.period_ticks) for s in observations.read_heard(session)] == [
+    assert [(s.id, s.period_ticks) for s in observations.read_station_reports(session)] == [
         (0x4CC60647, 958985.25),
         (None, None),
     ]

@@ -1,4 +1,4 @@
-"""Files that are read whole."""
+"""Input files that are read completely."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.formats.files import read_bytes, read_text
 
 
-def test_what_is_there_is_read(tmp_path: Path) -> None:
+def test_existing_files_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_bytes("\ufeffgrün\r\n".encode())
     assert read_bytes(path) == path.read_bytes()
@@ -18,7 +18,7 @@ def test_what_is_there_is_read(tmp_path: Path) -> None:
     assert read_text(path) == "\ufeffgrün\r\n"
 
 
-def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+def test_errors_name_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(FormatError, match=r"not UTF-8 text in .*a\.txt"):

@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all, and never over another unasked."""
+"""Output files appear completely or not at all, and replace others only on request."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_nothing_is_left_after_an_exception(
         assert target.read_bytes() == b"old"
 
 
-def test_existing_output_is_refused_before_the_work(tmp_path: Path) -> None:
+def test_existing_output_is_refused_before_the_computation(tmp_path: Path) -> None:
     target = tmp_path / "out.bin"
     target.write_bytes(b"old")
     with pytest.raises(OutputExistsError) as caught, atomic_write(target):
@@ -72,7 +72,9 @@ def test_existing_output_is_refused_before_the_work(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_race_cannot_clobber(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
+def test_a_file_created_in_the_meantime_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
     """Another process makes the file while we write, with and without hard links."""
     if not links:
 
@@ -122,7 +124,7 @@ def test_only_regular_files_are_replaced(tmp_path: Path, overwrite: bool) -> Non
             pytest.fail("entered")
 
 
-def test_refusal_of_the_system_is_one_line(tmp_path: Path) -> None:
+def test_system_errors_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(LocatkError) as caught, atomic_write(tmp_path / ("n" * 300)):
         pass
     assert "cannot write" in str(caught.value)

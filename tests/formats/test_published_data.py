@@ -1,4 +1,4 @@
-"""Where published data is looked for."""
+"""Folder of published recordings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from locatk.core.errors import MissingDataError
 from locatk.formats.published_data import VARIABLE, data_folder
 
 
-def test_the_first_place_that_is_named_wins(
+def test_the_order_of_the_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given, named, beside = tmp_path / "given", tmp_path / "named", tmp_path / "shared" / "data"

@@ -1,4 +1,4 @@
-"""Generated code is what protoc makes of the schemas."""
+"""The generated code agrees with the schemas."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from locatk.formats.benchmarks import Figure
 from locatk.formats.benchmarks.capture.serial_line import block, capture, sender
 from locatk.formats.benchmarks.timing import SEED
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions import mcap_records
+from locatk.formats.sessions import mcap_file
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.recovery.recover import recover
 from locatk.formats.sessions.writer import SessionWriter
@@ -181,7 +181,7 @@ def _chunks(path: Path) -> list[Chunk]:
     (wanted,) = (each.id for each in session.index.channels.values() if each.topic == TOPIC)
     with open(path, "rb") as stream:
         for segment in session.index.segments:
-            messages = mcap_records.read_messages(stream, segment, {wanted})
+            messages = mcap_file.read_messages(stream, segment, {wanted})
             end = segment.offset + segment.length
             found.append((segment.offset, end, [data for _, _, data in messages]))
     return found

@@ -1,37 +1,53 @@
-"""Salvaging a recording: what is left of a damaged file, as a new whole one.
+"""Recovery of a damaged recording: its intact contents as a new file.
 
-What is found (:mod:`.mcap_salvage`) is written anew in the order of the file, messages,
-attachments and metadata as they were, and is read back before the output appears.
+The contents (:mod:`.salvage`) are rewritten in the order of the file: messages, attachments and
+metadata as they were. The output is read back before it appears under its name.
 """
 
 from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
+from google.protobuf.message import DecodeError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from locatk.core.errors import FormatError, LocatkError, OutputExistsError
-from locatk.formats.capture.statistics import RECORD as CAPTURE
+from locatk.formats.capture.statistics import RECORD as CAPTURE_RECORD
 from locatk.formats.output import atomic_write, check_output, tool_version
-from locatk.formats.sessions.mcap_records import DamageError
-from locatk.formats.sessions.reader import RECORD, Session, reading
-from locatk.formats.sessions.recovery import rewriting as mcap_rewrite
+from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.sessions.mcap_file import (
+    CHANNELS_RECORD,
+    MESSAGE_HEAD,
+    SESSION_RECORD,
+    DamageError,
+    Segment,
+    iter_records,
+    parse,
+    read_attachment,
+    read_segment,
+)
+from locatk.formats.sessions.reader import open_mcap
 from locatk.formats.sessions.recovery.salvage import Loss, Salvage, salvage
+from locatk.formats.sessions.recovery.validation import inspect_chunk
 from locatk.formats.sessions.writer import PROFILE
 
-RECOVERED = "recovered"
-"""Metadata record that says what was saved and what was lost."""
+RECOVERED_RECORD = "recovered"
+"""Name of the metadata record that lists what was saved and what was lost."""
 
-MOST_RANGES = 100
-"""So many lost ranges are named in the metadata."""
+MAX_LISTED_RANGES = 100
+"""Number of lost ranges that this record lists."""
 
 
 @dataclass(frozen=True)
-class Topic:
-    """What became of one topic.
+class RecoveredTopic:
+    """Saved and lost messages of one topic.
 
     Attributes
     ----------
@@ -39,10 +55,10 @@ class Topic:
     saved : int
         Messages.
     lost : int or None
-        Messages; None where the file does not tell how many there were.
+        Messages; None if the file does not state how many there were.
     missing_bytes : int or None
-        Of ``locatk.SerialChunk``: received bytes that are not in what was saved, by their
-        offsets; None for other schemas. What may be missing at the end is not known.
+        For ``locatk.SerialChunk``: received bytes that are missing between the saved ones, by
+        their offsets; None for other schemas. Bytes missing at the end are unknown.
     """
 
     topic: str
@@ -54,37 +70,37 @@ class Topic:
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was saved, and what was not.
+    """Result of a recovery.
 
     Attributes
     ----------
     source, output : str
-    topics : tuple of Topic
+    topics : tuple of RecoveredTopic
     chunks, attachments, metadata : int
         Saved.
     damaged_chunks : int
-        Not saved; those of which not even the head can be read are not counted.
+        Not saved; chunks without a readable head are not counted.
     lost_attachments, lost_metadata : int or None
-        None where the file does not tell how many there were.
+        None if the file does not state how many there were.
     orphans : int
-        Messages in whole chunks whose channel is defined nowhere; not saved.
+        Messages in intact chunks whose channel is defined nowhere; not saved.
     nameless : tuple of str
-        Topics whose schema is lost; saved without.
+        Topics whose schema is lost; saved without it.
     losses : tuple of Loss
-        Bytes of the source that are no good.
+        Unusable bytes of the source.
     tail : int
-        How many of them are at the end of a source that lacks its end.
+        Number of them at the end of a source that was not finished.
     ended : bool
-        The source was written to its end. If not, what followed is not known.
+        The source was finished by its writer. If not, the contents of its end are unknown.
     damaged : bool
-        Something is wrong with the source, be it only its index.
+        The source is damaged, possibly only its index.
     complete : bool
         Nothing was lost.
     """
 
     source: str
     output: str
-    topics: tuple[Topic, ...]
+    topics: tuple[RecoveredTopic, ...]
     chunks: int
     attachments: int
     metadata: int
@@ -101,42 +117,29 @@ class Recovered:
 
     @property
     def messages(self) -> int:
-        """Saved, of all topics."""
+        """Saved messages of all topics."""
         return sum(topic.saved for topic in self.topics)
 
     @property
     def lost_messages(self) -> int | None:
-        """Of all topics; None where the file does not tell how many there were."""
+        """Lost messages of all topics; None if the file does not state how many there were."""
         lost = [topic.lost for topic in self.topics]
         return None if None in lost else sum(each or 0 for each in lost)
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes of the source that are no good."""
+        """Number of unusable bytes of the source."""
         return sum(map(len, self.losses))
-
-
-def left_in(path: str | os.PathLike[str], damage: str) -> Session:
-    """What is left in a damaged file, as a session that can be read; its
-    :attr:`~.session.Session.damage` is ``damage``.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-        There is no such file, or nothing of MCAP is left in it.
-    """
-    index = _found(path).index
-    index.damage = damage
-    return Session(path, index)
 
 
 def recover(
     path: str | os.PathLike[str], output: str | os.PathLike[str], *, overwrite: bool = False
 ) -> Recovered:
-    """Write what is left of ``path`` to a new file; ``path`` is not touched.
+    """Write the intact contents of ``path`` to a new file; ``path`` is not changed.
 
-    Messages keep their times, sequence numbers and order, metadata and attachments their place
-    among them; channels may get other ids. A metadata record ``recovered`` says what was lost.
+    Messages keep their times, sequence numbers and order, metadata and attachments their
+    position among them. Channels may get other ids. A metadata record ``recovered`` lists the
+    losses.
 
     Parameters
     ----------
@@ -154,114 +157,283 @@ def recover(
     FormatError
         Nothing is left, or the file changes while it is read.
     LocatkError
-        What was written cannot be read back: the disk is no good.
+        The output cannot be read back: the disk is damaged.
     """
     if os.path.exists(output) and os.path.exists(path) and os.path.samefile(path, output):
         raise OutputExistsError("the output is the input", file=output, hint="Choose another -o")
     check_output(output, overwrite=overwrite)
-    found = _found(path)
+    with open_mcap(path) as stream:
+        found = salvage(stream)
+    if found.is_empty:
+        raise FormatError(
+            "nothing of a recording (MCAP) is left in it",
+            file=path,
+            hint="Give a file that `locatk capture` or another recorder made",
+        )
     index, version = found.index, tool_version()
     # Only the first part of a recording begins with the first byte that was received.
-    begins = CAPTURE in index.metadata and index.metadata[CAPTURE].get("part", "1") == "1"
+    capture = index.metadata.get(CAPTURE_RECORD)
+    is_first_part = capture is not None and capture.get("part", "1") == "1"
     with atomic_write(output, overwrite=overwrite) as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(
-            profile=index.header.profile or (PROFILE if RECORD in index.metadata else ""),
+            profile=index.header.profile or (PROFILE if SESSION_RECORD in index.metadata else ""),
             library=f"{index.header.library} (recovered by locatk {version})".strip(),
         )
-        copy = mcap_rewrite.Copy(writer, found, first_byte=0 if begins else None)
-        for piece in mcap_rewrite.pieces(path, found):
-            copy.take(piece)
-        recovered = _summed_up(os.fspath(path), os.fspath(output), found, copy)
+        rewriter = Rewriter(writer, found, first_byte=0 if is_first_part else None)
+        for item in iter_contents(path, found):
+            rewriter.add(item)
+        recovered = _summarize(os.fspath(path), os.fspath(output), found, rewriter)
         if not recovered.messages and not recovered.complete:
-            raise _nothing_left(path, recovered)
-        writer.add_metadata(RECOVERED, {"tool_version": version, **_record(recovered)})
+            raise _no_message_error(path, recovered)
+        writer.add_metadata(
+            RECOVERED_RECORD, {"tool_version": version, **_metadata_record(recovered)}
+        )
         writer.finish()
         stream.flush()
         try:
-            mcap_rewrite.check(stream.name, copy)
+            with open(stream.name, "rb") as written:
+                verify(written, rewriter)
         except DamageError as damage:
             raise LocatkError(
-                f"what was written cannot be read back ({damage})",
+                f"the output cannot be read back ({damage})",
                 file=output,
                 hint="Check the disk, or write to another one",
             ) from None
     return recovered
 
 
-def _found(path: str | os.PathLike[str]) -> Salvage:
-    with reading(path) as stream:
-        found = salvage(stream)
+def iter_contents(
+    path: str | os.PathLike[str], found: Salvage
+) -> Iterator[bytes | memoryview | Attachment | Metadata]:
+    """Yield the intact contents of a file in its order; messages as the records of a chunk.
+
+    Raises
+    ------
+    FormatError
+        The file has changed since it was searched.
+    """
     index = found.index
-    if not (index.segments or index.attachments or found.metadata or found.statistics):
-        raise FormatError(
-            "nothing of a recording (MCAP) is left in it",
-            file=path,
-            hint="Give a file that `locatk capture` or another recorder made",
-        )
-    mcap_rewrite.name_channels(index)
-    return found
+    items: list[tuple[int, Any]] = [
+        *((segment.offset, segment) for segment in index.segments),
+        *((entry.offset, entry) for entry in index.attachments),
+        *found.metadata,
+    ]
+    with open_mcap(path) as stream:
+        for offset, item in sorted(items, key=lambda entry: entry[0]):
+            if isinstance(item, Metadata):
+                yield item
+            elif isinstance(item, Segment):
+                data = read_segment(stream, item)
+                inspect_chunk(data)
+                yield data
+            else:
+                yield read_attachment(stream, offset)
 
 
-def _nothing_left(path: str | os.PathLike[str], recovered: Recovered) -> FormatError:
+class Rewriter:
+    """Writes the intact contents of a file with ``writer``.
+
+    Attributes
+    ----------
+    topics : dict of int to (str, str)
+        Topic and schema name of each channel, by its new id.
+    new_ids : dict of int to int
+        New ids of the channels, by their old ids.
+    counts : Counter of int
+        Messages written, by new id.
+    missing : dict of int to int
+        Bytes that the offsets of raw bytes skip, by new id of their channels.
+    orphans : int
+        Messages left out, because their channel is unknown.
+    nameless : list of str
+        Topics whose schema is lost; they are written without it.
+    attachments, metadata : int
+        Written.
+    """
+
+    def __init__(self, writer: Writer, found: Salvage, *, first_byte: int | None) -> None:
+        self._writer = writer
+        self._first_byte = first_byte
+        self._schemas: dict[int, Schema] = {}
+        self.new_ids: dict[int, int] = {}
+        self._new_schemas: dict[tuple[str, str, bytes], int] = {}
+        self._new_channels: dict[tuple[Any, ...], int] = {}
+        self._next_byte: dict[int, int | None] = {}
+        self.topics: dict[int, tuple[str, str]] = {}
+        self.counts: Counter[int] = Counter()
+        self.missing: dict[int, int] = {}
+        self.orphans = 0
+        self.nameless: list[str] = []
+        self.attachments = 0
+        self.metadata = 0
+        index = found.index
+        for schema in index.schemas.values():
+            if (Opcode.SCHEMA, schema.id) not in found.conflicts:
+                self._schemas[schema.id] = schema
+        for _, channel in sorted(index.channels.items()):
+            # Ids with several definitions are valid only behind each definition.
+            if (Opcode.CHANNEL, channel.id) not in found.conflicts and (
+                (Opcode.SCHEMA, channel.schema_id) not in found.conflicts
+            ):
+                self._register(channel)
+
+    def add(self, item: bytes | memoryview | Attachment | Metadata) -> None:
+        """Write one item of :func:`iter_contents`."""
+        if isinstance(item, Attachment):
+            self._writer.flush()  # else it would precede messages that came earlier
+            self._writer.add_attachment(
+                item.create_time, item.log_time, item.name, item.media_type, item.data
+            )
+            self.attachments += 1
+        elif isinstance(item, Metadata):
+            self._writer.flush()
+            record = item.metadata
+            if item.name == CHANNELS_RECORD:
+                new_keys = {str(old): str(new) for old, new in self.new_ids.items()}
+                record = {new_keys[key]: text for key, text in record.items() if key in new_keys}
+            self._writer.add_metadata(item.name, record)
+            self.metadata += 1
+        else:
+            self._add_records(item)
+
+    def _add_records(self, data: bytes | memoryview) -> None:
+        for opcode, start, end in iter_records(data, 0):
+            if opcode == Opcode.MESSAGE:
+                old_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, start)
+                new_id = self.new_ids.get(old_id)
+                if new_id is None:
+                    self.orphans += 1
+                    continue
+                payload = bytes(data[start + MESSAGE_HEAD.size : end])
+                self._writer.add_message(new_id, log_ns, payload, publish_ns, sequence)
+                self.counts[new_id] += 1
+                if new_id in self.missing:
+                    self._count_missing_bytes(new_id, payload)
+            elif opcode == Opcode.SCHEMA:
+                schema = parse(Schema.read, data[start:end], start)
+                self._schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                self._register(parse(Channel.read, data[start:end], start))
+
+    def _register(self, channel: Channel) -> None:
+        """Assign this channel to the messages of its id that follow."""
+        schema = self._schemas.get(channel.schema_id)
+        definition = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+        metadata = tuple(sorted(channel.metadata.items()))
+        key = (channel.topic, channel.message_encoding, definition, metadata)
+        if key not in self._new_channels:
+            if schema is not None and definition not in self._new_schemas:
+                self._new_schemas[definition] = self._writer.register_schema(*definition)
+            new_id = self._writer.register_channel(
+                channel.topic,
+                channel.message_encoding,
+                self._new_schemas[definition] if schema else 0,
+                channel.metadata,
+            )
+            self._new_channels[key] = new_id
+            self.topics[new_id] = (channel.topic, definition[0])
+            if schema is None and channel.schema_id:
+                self.nameless.append(channel.topic)
+            serial = (SerialChunk.DESCRIPTOR.full_name, "protobuf")
+            if (definition[0], channel.message_encoding) == serial:
+                self.missing[new_id] = 0
+                self._next_byte[new_id] = self._first_byte
+        self.new_ids[channel.id] = self._new_channels[key]
+
+    def _count_missing_bytes(self, new_id: int, payload: bytes) -> None:
+        try:
+            chunk = SerialChunk.FromString(payload)
+        except DecodeError:
+            return
+        expected = self._next_byte[new_id]
+        if expected is not None:
+            self.missing[new_id] += max(0, chunk.byte_offset - expected)
+        self._next_byte[new_id] = chunk.byte_offset + len(chunk.data)
+
+
+def verify(stream: IO[bytes], rewriter: Rewriter) -> None:
+    """Read back everything that was written.
+
+    Raises
+    ------
+    DamageError
+        It is damaged, or differs in number from what was written.
+    """
+    found = salvage(stream)
+    if not found.is_whole:
+        raise DamageError("the file is damaged")
+    if found.index.counts != rewriter.counts:
+        raise DamageError("other messages than were written")
+    if len(found.index.attachments) != rewriter.attachments:
+        raise DamageError("other attachments than were written")
+
+
+def _no_message_error(path: str | os.PathLike[str], recovered: Recovered) -> FormatError:
     if recovered.orphans:
         return FormatError(
-            f"nothing is left that says what its {recovered.orphans} messages are", file=path
+            f"the channels of all its {recovered.orphans} messages are lost, nothing identifies "
+            "them",
+            file=path,
         )
-    return FormatError("no whole chunk is left, there is no message to save", file=path)
+    return FormatError("no chunk is intact, there is no message to save", file=path)
 
 
-def _summed_up(source: str, output: str, found: Salvage, copy: mcap_rewrite.Copy) -> Recovered:
-    told = found.statistics
+def _summarize(source: str, output: str, found: Salvage, rewriter: Rewriter) -> Recovered:
+    statistics = found.statistics
     unknown: int | None = None if found.losses or not found.ended else 0
     missing: Counter[int] = Counter()
     lost_attachments = lost_metadata = unknown
-    if told is not None:
-        missing = Counter(told.channel_message_counts) - found.index.counts
-        lost_attachments = max(0, told.attachment_count - copy.attachments)
-        lost_metadata = max(0, told.metadata_count - copy.metadata)
-    intact = not (missing or lost_attachments or lost_metadata) if told else not found.losses
+    if statistics is not None:
+        missing = Counter(statistics.channel_message_counts) - found.index.counts
+        lost_attachments = max(0, statistics.attachment_count - rewriter.attachments)
+        lost_metadata = max(0, statistics.metadata_count - rewriter.metadata)
+    is_intact = (
+        not (missing or lost_attachments or lost_metadata) if statistics else not found.losses
+    )
     lost: Counter[int | str] = Counter()
     for channel, count in missing.items():
-        lost[copy.new_ids.get(channel, f"channel {channel}")] += count
+        lost[rewriter.new_ids.get(channel, f"channel {channel}")] += count
     topics = [
-        Topic(
+        RecoveredTopic(
             topic,
             schema,
-            copy.counts[new],
-            lost[new] if told else unknown,
-            copy.missing.get(new),
+            rewriter.counts[new_id],
+            lost[new_id] if statistics else unknown,
+            rewriter.missing.get(new_id),
         )
-        for new, (topic, schema) in copy.topics.items()
+        for new_id, (topic, schema) in rewriter.topics.items()
     ]
-    topics += [Topic(name, "", 0, count) for name, count in lost.items() if isinstance(name, str)]
+    topics += [
+        RecoveredTopic(name, "", 0, count) for name, count in lost.items() if isinstance(name, str)
+    ]
     return Recovered(
         source=source,
         output=output,
         topics=tuple(topics),
         chunks=sum(segment.is_chunk for segment in found.index.segments),
-        attachments=copy.attachments,
-        metadata=copy.metadata,
+        attachments=rewriter.attachments,
+        metadata=rewriter.metadata,
         damaged_chunks=sum(loss.what == "chunk" for loss in found.losses),
         lost_attachments=lost_attachments,
         lost_metadata=lost_metadata,
-        orphans=copy.orphans,
-        nameless=tuple(copy.nameless),
+        orphans=rewriter.orphans,
+        nameless=tuple(rewriter.nameless),
         losses=tuple(found.losses),
         tail=found.tail,
         ended=found.ended,
-        damaged=bool(found.losses or found.beside or found.copies or not found.ended),
-        complete=found.ended and intact and not copy.orphans,
+        damaged=not found.is_whole,
+        complete=found.ended and is_intact and not rewriter.orphans,
     )
 
 
-def _record(recovered: Recovered) -> dict[str, str]:
-    """What became of the source, as texts for the metadata."""
+def _metadata_record(recovered: Recovered) -> dict[str, str]:
+    """Return the result as texts, for the metadata of the output."""
     ranges = [
         f"{loss.start}-{loss.end} {loss.what} {loss.name}".rstrip()
-        for loss in recovered.losses[:MOST_RANGES]
+        for loss in recovered.losses[:MAX_LISTED_RANGES]
     ]
-    if len(recovered.losses) > MOST_RANGES:
+    if len(recovered.losses) > MAX_LISTED_RANGES:
         ranges.append("...")
     values = {
         "source": Path(recovered.source).name,

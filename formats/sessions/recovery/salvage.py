@@ -1,15 +1,18 @@
-"""What is left of a damaged MCAP file: cut short, zeroed, overwritten or with flipped bits.
+"""Search of a damaged MCAP file for everything that is intact.
 
-The records are walked as they follow each other. Where one is not what it should be, the next
-one that proves itself (:mod:`.mcap_proof`) is searched for, and what lies between is lost.
+The file may be cut short, zeroed, overwritten or have flipped bits. Its records are read one after
+the other. If one is damaged, the next acceptable one (:mod:`.validation`) is searched, and the
+bytes between are lost.
 
-Messages outside chunks have no checksum. They are taken as they are where a file has no
-chunks; beside chunks only where the statistics at the end confirm them, as one flipped bit
-makes a message of an index.
+Messages outside chunks have no checksum. They are accepted if the file has no chunks. In a file
+with chunks they are accepted only if the statistics at its end confirm their number, because a
+single flipped bit turns a message index into a message.
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import struct
 import zlib
 from collections import Counter
@@ -17,48 +20,61 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import IO, Any
 
+from google.protobuf import descriptor_pool
+from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
 from mcap import records
 from mcap.opcode import Opcode
+from mcap_protobuf.schema import build_file_descriptor_set
 
-from locatk.formats.sessions.mcap_records import (
-    LOOSE_SEGMENT,
+from locatk.formats.schemas import lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2
+from locatk.formats.sessions.mcap_file import (
+    CHANNELS_RECORD,
     MAGIC,
+    MAX_RUN_BYTES,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
     DamageError,
     Index,
     Segment,
-    frames,
+    iter_records,
 )
 from locatk.formats.sessions.recovery.validation import (
-    LARGEST_RECORD,
-    MESSAGE,
+    MAX_RECORD_BYTES,
     READERS,
-    Evidence,
-    exact,
+    DamagedFile,
+    parse_exactly,
 )
 
 _FOOTER = struct.Struct("<QQI")
 
-_CHECKSUM = (Opcode.CHUNK, Opcode.ATTACHMENT)
-_GUARDED = (*_CHECKSUM, Opcode.METADATA, Opcode.DATA_END, Opcode.FOOTER)
-_LOOSE = (*_GUARDED, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_WITH_CHECKSUM = (Opcode.CHUNK, Opcode.ATTACHMENT)
+_ANCHORS = (*_WITH_CHECKSUM, Opcode.METADATA, Opcode.DATA_END, Opcode.FOOTER)
+_ANCHORS_WITHOUT_CHUNKS = (*_ANCHORS, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Kinds of records at which a search may end, in files with chunks and without."""
+
+SCHEMAS = (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2)
+"""Modules whose import registers the messages of locatk in the descriptor pool."""
+
+MAX_CHANNEL_DIGITS = 5
+"""Digits of the largest channel id, 65,535."""
 
 
 @dataclass(frozen=True)
 class Loss:
-    """Bytes of the file that are no good.
+    """Unusable bytes of the file.
 
     Attributes
     ----------
     start, end : int
         The first byte, and the one after the last.
     what : str
-        ``"chunk"``, ``"attachment"``, ... where such a record begins; ``"zeros"`` where all
+        ``"chunk"``, ``"attachment"``, ... if such a record begins there; ``"zeros"`` if all bytes
         are zero; else ``"bytes"``.
     name : str
-        Of an attachment, where it can be read.
+        Name of an attachment, if it is readable.
     start_ns, end_ns : int or None
-        Log times of the messages in a chunk, where its head can be read.
+        Log times of the messages in a chunk, if its head is readable.
     """
 
     start: int
@@ -74,35 +90,35 @@ class Loss:
 
 @dataclass
 class Salvage:
-    """What is left of a file, and what is not.
+    """Intact and lost contents of a file.
 
     Attributes
     ----------
     size : int
-        Of the file.
+        Bytes of the file.
     index : Index
-        What is left; of its chunks each checksum was right.
+        Intact contents; the checksum of each of its chunks was right.
     metadata : list of (int, Metadata)
-        Offset and content of each record, in the order of the file.
+        Offset and content of each record, in file order.
     losses : list of Loss
-        Where messages, attachments or metadata were, or may have been.
-    beside : list of Loss
-        Where none were: in the index at the end, and behind the end.
+        Bytes in the data section, which may have held messages, attachments or metadata.
+    index_losses : list of Loss
+        Bytes in the summary and behind the end, which held none.
     copies : int
-        Chunks that are there a second time, and left out.
+        Chunks that are in the file a second time, and left out.
     ended : bool
-        The file has its footer: whoever wrote it came to the end.
+        The file has its footer: its writer finished it.
     statistics : Statistics or None
-        What the file should hold, where its index is whole.
+        Number of messages, attachments and metadata records, if the summary is intact.
     conflicts : set of (Opcode, int)
-        Kinds and ids of schemas and channels that chunks define in several ways.
+        Kinds and ids of schemas and channels of which chunks contain different definitions.
     """
 
     size: int
     index: Index = field(default_factory=Index)
     metadata: list[tuple[int, records.Metadata]] = field(default_factory=list)
     losses: list[Loss] = field(default_factory=list)
-    beside: list[Loss] = field(default_factory=list)
+    index_losses: list[Loss] = field(default_factory=list)
     copies: int = 0
     ended: bool = False
     statistics: records.Statistics | None = None
@@ -110,166 +126,190 @@ class Salvage:
 
     @property
     def tail(self) -> int:
-        """Bytes at the end that are no good, of a file that lacks its end."""
+        """Number of unusable bytes at the end of a file that was not finished."""
         last = self.losses[-1] if self.losses and not self.ended else None
         return len(last) if last is not None and last.end == self.size else 0
 
+    @property
+    def is_whole(self) -> bool:
+        """Nothing is damaged, not even the index."""
+        return self.ended and not (self.losses or self.index_losses or self.copies)
+
+    @property
+    def is_empty(self) -> bool:
+        """Nothing of a recording is left."""
+        found = (self.index.segments, self.index.attachments, self.metadata, self.statistics)
+        return not any(found)
+
 
 def salvage(stream: IO[bytes]) -> Salvage:
-    """Find what is left of an MCAP file; reads all of it, and holds one record at a time.
+    """Find the intact contents of an MCAP file; reads all of it, and holds one record at a time.
 
-    Where a file has no chunks, messages outside chunks are searched for as well.
+    If the file has no chunks, messages outside chunks are searched as well. Channels whose
+    definition is lost are restored from the metadata record :data:`CHANNELS_RECORD`.
     """
-    walk = _Walk(stream, _GUARDED)
-    found = walk.run()
-    if found.losses and walk.is_mcap and not walk.chunked:
-        found = _Walk(stream, _LOOSE).run()
-    return found
+    search = _Search(stream, _ANCHORS)
+    result = search.run()
+    if result.losses and search.is_mcap and not search.has_chunks:
+        result = _Search(stream, _ANCHORS_WITHOUT_CHUNKS).run()
+    restore_channels(result.index)
+    return result
 
 
-class _Walk:
-    """One walk through a file; a search may end at records of the ``anchors``."""
+def describe_damage(result: Salvage) -> str | None:
+    """Describe the first damage of a file; None if it is whole."""
+    for loss in (*result.losses, *result.index_losses):
+        return f"a damaged {loss.what} at byte {loss.start}"
+    return None if result.ended else f"the file is cut short at byte {result.size}"
+
+
+class _Search:
+    """One pass through a file; a search after damage may end at records of the ``anchors``.
+
+    Attributes
+    ----------
+    is_mcap : bool
+        The file begins or ends as MCAP.
+    has_chunks : bool
+        Messages are in chunks, even if all of them are damaged.
+    """
 
     def __init__(self, stream: IO[bytes], anchors: Collection[Opcode]) -> None:
-        self._file = Evidence(stream)
+        self._file = DamagedFile(stream)
         self._anchors = anchors
-        self.found = Salvage(self._file.size)
-        ends = (self._file.at(0, 8), self._file.at(max(0, self.found.size - 8), 8))
+        self._result = Salvage(self._file.size)
+        ends = (self._file.read(0, 8), self._file.read(max(0, self._file.size - 8), 8))
         self.is_mcap = MAGIC in ends
-        self.chunked = False
-        """Messages are in chunks, even if all of them are damaged."""
-        self._guarded = False
-        """The record just taken has a checksum."""
-        self._doubtful: int | None = None
-        """Where the last record began, if it has none."""
-        self._in_data = True
+        self.has_chunks = False
+        self._is_verified = False  # the last record has a checksum, which is right
+        self._unverified_start: int | None = None  # of the last record, if it has no checksum
+        self._in_data_section = True
         self._summary_start = 0
         self._recordings = 0
-        self._keys: set[tuple[int, int]] = set()
-        self._proven: dict[tuple[Opcode, int], bytes] = {}
+        self._chunk_keys: set[tuple[int, int]] = set()
+        self._verified_definitions: dict[tuple[Opcode, int], bytes] = {}
+        # Runs of messages outside chunks
         self._runs: list[Segment] = []
         self._in_run = False
         self._run_counts: Counter[int] = Counter()
         self._run_span: tuple[int, int] | None = None
 
     def run(self) -> Salvage:
-        """Walk from the first byte to the last."""
-        found, file = self.found, self._file
+        """Search from the first byte to the last."""
+        result, file = self._result, self._file
         first, position = file.record(len(MAGIC)), 0
-        if file.at(0, len(MAGIC)) != MAGIC and first is not None and first[0] == Opcode.HEADER:
+        if file.read(0, len(MAGIC)) != MAGIC and first is not None and first[0] == Opcode.HEADER:
             position = len(MAGIC)
-            found.beside.append(Loss(0, position))
+            result.index_losses.append(Loss(0, position))
         while position < file.size:
-            self._guarded = False
-            end = self._take(position)
+            self._is_verified = False
+            end = self._accept(position)
             if end is None:
                 position = self._lose(position)
             else:
-                self._doubtful = None if self._guarded else position
+                self._unverified_start = None if self._is_verified else position
                 position = end
-        found.ended = found.ended or file.at(max(8, file.size - 8), 8) == MAGIC
+        result.ended = result.ended or file.read(max(8, file.size - 8), 8) == MAGIC
         if self._recordings > 1:
-            found.statistics = None  # of one of several recordings, one behind the other
+            result.statistics = None  # it describes one of several concatenated recordings
         self._settle_runs()
-        found.index.segments.sort(key=lambda segment: segment.offset)
-        return found
+        result.index.segments.sort(key=lambda segment: segment.offset)
+        return result
 
-    # ---- what is good
+    # ---- intact records
 
-    def _take(self, position: int) -> int | None:
-        """Book the record at ``position`` and give its end; None where it is no good."""
+    def _accept(self, position: int) -> int | None:
+        """Register the record at ``position`` and return its end; None if it is damaged."""
         file = self._file
-        if file.at(position, len(MAGIC)) == MAGIC:
+        if file.read(position, len(MAGIC)) == MAGIC:
             return position + len(MAGIC)
         found = file.record(position)
         if found is None:
             return None
         opcode, end = found
         if opcode == Opcode.CHUNK:
-            return self._take_chunk(position, end)
+            return self._accept_chunk(position, end)
         if opcode == Opcode.ATTACHMENT:
-            return self._take_attachment(position, end)
+            return self._accept_attachment(position, end)
         if opcode == Opcode.MESSAGE:
-            return self._take_message(position, end)
+            return self._accept_message(position, end)
         if opcode == Opcode.FOOTER:
-            self._take_footer(position, end)
+            self._accept_footer(position, end)
         elif opcode == Opcode.DATA_END:
-            self._in_data, self._summary_start = False, end
+            self._in_data_section, self._summary_start = False, end
         elif opcode in (Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX):
-            self.chunked = True
+            self.has_chunks = True
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._define(opcode, file.content(position, end), proven=False)
-        elif opcode in (Opcode.METADATA, Opcode.HEADER):
-            record = exact(READERS[opcode], file.content(position, end))
-            take = self._take_header if opcode == Opcode.HEADER else self._take_metadata
-            take(position, record)
+            self._define(opcode, file.content(position, end), is_verified=False)
+        elif opcode == Opcode.METADATA:
+            self._accept_metadata(
+                position, parse_exactly(READERS[opcode], file.content(position, end))
+            )
+        elif opcode == Opcode.HEADER:
+            if not self._recordings:
+                header = parse_exactly(READERS[opcode], file.content(position, end))
+                self._result.index.header = header
+            self._recordings += 1
+            self._in_data_section, self._result.ended = True, False
         return end
 
-    def _take_header(self, position: int, header: records.Header) -> None:
-        if not self._recordings:
-            self.found.index.header = header
-        self._recordings += 1
-        self._in_data, self.found.ended = True, False
-
-    def _take_chunk(self, position: int, end: int) -> int | None:
-        inside = self._file.chunk(position, end)
-        if inside is None:
+    def _accept_chunk(self, position: int, end: int) -> int | None:
+        content = self._file.chunk(position, end)
+        if content is None:
             return None
-        self._guarded, self.chunked, self._in_run = True, True, False
-        found, index = self.found, self.found.index
-        # A walk without a stumble comes to each chunk once, so that two may well be the same.
-        stumbled = found.losses or found.beside or not self._in_data or self._recordings > 1
-        if inside.key in self._keys and stumbled:
-            found.copies += 1
+        self._is_verified, self.has_chunks, self._in_run = True, True, False
+        result, index = self._result, self._result.index
+        # In an undamaged file equal chunks are no copies: each is reached once.
+        is_damaged = (
+            result.losses
+            or result.index_losses
+            or not self._in_data_section
+            or self._recordings > 1
+        )
+        if content.key in self._chunk_keys and is_damaged:
+            result.copies += 1
             return end
-        self._keys.add(inside.key)
-        for opcode, content in inside.definitions:
-            self._define(opcode, content, proven=True)
-        index.counts.update(inside.counts)
-        self._span(inside.span)
-        channels = frozenset(inside.counts)
+        self._chunk_keys.add(content.key)
+        for opcode, definition in content.definitions:
+            self._define(opcode, definition, is_verified=True)
+        index.counts.update(content.counts)
+        if content.span is not None:
+            index.include_times(*content.span)
+        channels = frozenset(content.counts)
         index.segments.append(Segment(position, end - position, True, channels))
         return end
 
-    def _take_attachment(self, position: int, end: int) -> int | None:
-        head = self._file.attachment_head(position)
-        if head is None or not self._file.attachment_is_right(position, end):
+    def _accept_attachment(self, position: int, end: int) -> int | None:
+        entry = self._file.attachment_head(position)
+        if entry is None or not self._file.is_attachment_intact(position, end):
             return None
-        self._guarded = True
-        entry = records.AttachmentIndex(
-            offset=position,
-            length=end - position,
-            log_time=head.log_ns,
-            create_time=head.create_ns,
-            data_size=head.size,
-            name=head.name,
-            media_type=head.media_type,
-        )
-        known = self.found.index.attachments
-        if self._in_data or entry not in [replace(each, offset=position) for each in known]:
+        self._is_verified = True
+        known = self._result.index.attachments
+        if self._in_data_section or entry not in [replace(e, offset=position) for e in known]:
             known.append(entry)
         return end
 
-    def _take_metadata(self, position: int, record: records.Metadata) -> None:
-        found = self.found
-        if self._in_data or all(record != known for _, known in found.metadata):
-            found.metadata.append((position, record))
-            found.index.metadata.setdefault(record.name, {}).update(record.metadata)
+    def _accept_metadata(self, position: int, record: records.Metadata) -> None:
+        result = self._result
+        if self._in_data_section or all(record != known for _, known in result.metadata):
+            result.metadata.append((position, record))
+            result.index.add_metadata(record)
 
-    def _take_message(self, position: int, end: int) -> int | None:
-        if not self._in_data:
+    def _accept_message(self, position: int, end: int) -> int | None:
+        if not self._in_data_section:
             return end
         if (
-            not self._file.goes_on(end)
+            not self._file.is_record_or_end(end)
             and self._file.search(position + 1, end, self._anchors) < end
         ):
-            return None  # its length is wrong: it would swallow others
-        channel, _, time_ns, _ = MESSAGE.unpack(self._file.at(position + 9, MESSAGE.size))
+            return None  # its length is wrong: it would contain other records
+        head = self._file.read(position + RECORD_HEAD.size, MESSAGE_HEAD.size)
+        channel, _, time_ns, _ = MESSAGE_HEAD.unpack(head)
         self._run_counts[channel] += 1
         first, last = self._run_span or (time_ns, time_ns)
         self._run_span = min(first, time_ns), max(last, time_ns)
         start = self._runs[-1].offset if self._in_run else position
-        if self._in_run and end - start <= LOOSE_SEGMENT:
+        if self._in_run and end - start <= MAX_RUN_BYTES:
             self._runs[-1] = Segment(start, end - start, False)
         else:
             self._runs.append(Segment(position, end - position, False))
@@ -277,116 +317,169 @@ class _Walk:
         return end
 
     def _settle_runs(self) -> None:
-        """Keep messages outside chunks, or give them up; see the head of this module."""
-        found, index = self.found, self.found.index
-        together, told = index.counts + self._run_counts, found.statistics
-        if self.chunked and (told is None or dict(together) != told.channel_message_counts):
-            found.losses += [Loss(r.offset, r.offset + r.length, "message") for r in self._runs]
-            found.losses.sort(key=lambda loss: loss.start)
+        """Accept the messages outside chunks, or none of them (see the module's docstring)."""
+        result, index = self._result, self._result.index
+        counts, statistics = index.counts + self._run_counts, result.statistics
+        if self.has_chunks and (
+            statistics is None or dict(counts) != statistics.channel_message_counts
+        ):
+            result.losses += [Loss(r.offset, r.offset + r.length, "message") for r in self._runs]
+            result.losses.sort(key=lambda loss: loss.start)
             return
-        index.counts = together
+        index.counts = counts
         index.segments += self._runs
-        self._span(self._run_span)
+        if self._run_span is not None:
+            index.include_times(*self._run_span)
 
-    def _take_footer(self, position: int, end: int) -> None:
-        """Take the summary in front of the footer, if its checksum is right."""
-        found = self.found
-        found.ended, self._in_data = True, False
-        summary = self._summary(position, end)
+    def _accept_footer(self, position: int, end: int) -> None:
+        """Accept the summary in front of the footer, if its checksum is right."""
+        result = self._result
+        result.ended, self._in_data_section = True, False
+        summary = self._read_summary(position, end)
         if summary is None:
-            found.beside.append(Loss(self._summary_start or position, end, "index"))
+            result.index_losses.append(Loss(self._summary_start or position, end, "index"))
             return
-        start, told, proven = summary
-        for opcode, inside in told:
+        start, summary_records, is_verified = summary
+        for opcode, content in summary_records:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(Opcode(opcode), inside, proven=proven)
+                self._define(Opcode(opcode), content, is_verified=is_verified)
             elif opcode == Opcode.STATISTICS:
-                found.statistics = exact(READERS[opcode], inside)
-        # What was lost in front of the footer may have been this summary, which is whole.
-        if found.losses and found.losses[-1].end == position:
-            loss = found.losses.pop()
+                result.statistics = parse_exactly(READERS[opcode], content)
+        # The bytes lost in front of the footer may be this summary, which is intact.
+        if result.losses and result.losses[-1].end == position:
+            loss = result.losses.pop()
             if loss.start < start:
-                found.losses.append(replace(loss, end=start))
+                result.losses.append(replace(loss, end=start))
 
-    def _summary(self, position: int, end: int) -> tuple[int, list[tuple[int, bytes]], bool] | None:
-        """Where the summary is that belongs to the footer at ``position``, its records, and
-        whether it has a checksum; None where that or a record is wrong."""
+    def _read_summary(
+        self, position: int, end: int
+    ) -> tuple[int, list[tuple[int, bytes]], bool] | None:
+        """Read the summary that belongs to the footer at ``position``.
+
+        Returns
+        -------
+        (int, list of (opcode, content), bool) or None
+            Start, records, and whether they have a checksum. None if the checksum or a record
+            is wrong.
+        """
         file = self._file
-        told_start, _, crc = _FOOTER.unpack(file.content(position, end))
-        footer = file.at(position, end - position - 4)
-        # Bytes that are missing before it, or too many, have moved it away from its place.
-        for start in (told_start, self._summary_start):
-            if not len(MAGIC) <= start <= position or position - start > LARGEST_RECORD:
+        stated_start, _, crc = _FOOTER.unpack(file.content(position, end))
+        footer = file.read(position, end - position - 4)
+        # Missing or additional bytes in front of the summary move it from its stated position.
+        for start in (stated_start, self._summary_start):
+            if not len(MAGIC) <= start <= position or position - start > MAX_RECORD_BYTES:
                 continue
-            data = file.at(start, position - start)
+            data = file.read(start, position - start)
             if crc and zlib.crc32(footer, zlib.crc32(data)) != crc:
                 continue
             try:
-                told = [(opcode, bytes(inside)) for opcode, _, inside in frames(data, start)]
+                found = [(opcode, data[a:b]) for opcode, a, b in iter_records(data, start)]
             except DamageError:
                 continue
-            return start, told, bool(crc)
+            return start, found, bool(crc)
         return None
 
-    def _define(self, opcode: Opcode, content: bytes, *, proven: bool) -> None:
-        """Note a schema or a channel; one under a checksum is better than one without."""
-        record: Any = exact(READERS[opcode], content)
+    def _define(self, opcode: Opcode, content: bytes, *, is_verified: bool) -> None:
+        """Register a schema or a channel; one with a checksum replaces one without."""
+        record: Any = parse_exactly(READERS[opcode], content)
         if record is None:
             return
-        index, key = self.found.index, (opcode, record.id)
+        index, key = self._result.index, (opcode, record.id)
         known: dict[int, Any] = index.schemas if opcode == Opcode.SCHEMA else index.channels
-        if not proven:
+        if not is_verified:
             known.setdefault(record.id, record)
-            return
-        if self._proven.setdefault(key, content) == content:
+        elif self._verified_definitions.setdefault(key, content) == content:
             known[record.id] = record
         else:
-            self.found.conflicts.add(key)
+            self._result.conflicts.add(key)
 
-    def _span(self, span: tuple[int, int] | None) -> None:
-        index = self.found.index
-        if span is not None:
-            index.start_ns = span[0] if index.start_ns is None else min(index.start_ns, span[0])
-            index.end_ns = span[1] if index.end_ns is None else max(index.end_ns, span[1])
-
-    # ---- what is not
+    # ---- damaged records
 
     def _lose(self, position: int) -> int:
-        """Book what begins at ``position`` as lost, up to where the walk can go on."""
-        file, found = self._file, self.found
-        if self._doubtful is not None:
-            # Its length was believed as it was no longer than the file; it may have hidden one.
-            start, self._doubtful = self._doubtful, None
-            hidden = file.search(start + 1, position, _CHECKSUM)
+        """Register a loss at ``position``; return the position of the next acceptable record."""
+        file, result = self._file, self._result
+        if self._unverified_start is not None:
+            # The length of the last record has no checksum: the record may hide another one.
+            start, self._unverified_start = self._unverified_start, None
+            hidden = file.search(start + 1, position, _WITH_CHECKSUM)
             if hidden < position:
-                found.losses.append(Loss(start, hidden))
+                result.losses.append(Loss(start, hidden))
                 return hidden
-        loss = self._damaged(position)
+        loss = self._classify(position)
         end = loss.end
         if end == position:
             end = file.search(position + 1, file.size, self._anchors)
         elif not loss.name:
-            # Its length may be wrong, and lead to a record by chance: look inside. Not into an
-            # attachment whose name can be read, which may be a recording.
-            end = file.search(position + 1, end, _CHECKSUM)
-        if loss.what == "bytes" and file.only_zeros(position, end):
+            # The length may be wrong and end at another record by chance: search inside, except
+            # inside an attachment with a readable name, which may itself be a recording.
+            end = file.search(position + 1, end, _WITH_CHECKSUM)
+        if loss.what == "bytes" and file.is_zero(position, end):
             loss = replace(loss, what="zeros")
         self._in_run = False
-        self.chunked = self.chunked or loss.what in ("chunk", "message index", "chunk index")
-        (found.losses if self._in_data else found.beside).append(replace(loss, end=end))
+        self.has_chunks |= loss.what in ("chunk", "message index", "chunk index")
+        losses = result.losses if self._in_data_section else result.index_losses
+        losses.append(replace(loss, end=end))
         return end
 
-    def _damaged(self, position: int) -> Loss:
-        """What seems to begin at ``position``; ``end`` is ``position`` where that is unknown."""
+    def _classify(self, position: int) -> Loss:
+        """Classify the damaged record at ``position``, which is also its ``end`` if unknown."""
         file, end, what = self._file, position, "bytes"
-        frame = file.frame(position)
-        if frame is not None and frame[0] and self._file.goes_on(frame[1]):
-            opcode, end = frame
-            known = opcode <= Opcode.DATA_END
-            what = Opcode(opcode).name.lower().replace("_", " ") if known else "unknown record"
+        head = file.record_head(position)
+        if head is not None and head[0] and file.is_record_or_end(head[1]):
+            opcode, end = head
+            is_known = opcode <= Opcode.DATA_END
+            what = Opcode(opcode).name.lower().replace("_", " ") if is_known else "unknown record"
         chunk, attachment = file.chunk_head(position), file.attachment_head(position)
         if chunk is not None:
-            span = (chunk.start_ns, chunk.end_ns)
-            return Loss(position, end, "chunk", "", *(span if span[0] <= span[1] else ()))
+            start_ns, end_ns, _ = chunk
+            span = (start_ns, end_ns) if start_ns <= end_ns else ()
+            return Loss(position, end, "chunk", "", *span)
         name = "" if attachment is None else attachment.name
         return Loss(position, end, what if attachment is None else "attachment", name)
+
+
+# ---- channels without definition
+
+
+def restore_channels(index: Index) -> None:
+    """Add channels and schemas whose definition is lost but that a live recording listed.
+
+    Such channels are in the metadata record :data:`CHANNELS_RECORD`. Their schemas are those of
+    this version of locatk and of its foxglove package.
+    """
+    for key, text in index.metadata.get(CHANNELS_RECORD, {}).items():
+        topic, _, name = text.rpartition(" ")
+        if not (key.isascii() and key.isdigit() and len(key) <= MAX_CHANNEL_DIGITS):
+            continue
+        channel = index.channels.get(int(key))
+        if int(key) >= 1 << 16 or (
+            channel is not None and (channel.schema_id in index.schemas or channel.schema_id == 0)
+        ):
+            continue
+        message_class = _find_message_class(name)
+        if not topic or message_class is None:
+            continue
+        if channel is None:
+            known_ids = [schema.id for schema in index.schemas.values() if schema.name == name]
+            used_ids = [0, *index.schemas, *(c.schema_id for c in index.channels.values())]
+            schema_id = known_ids[0] if known_ids else max(used_ids) + 1
+            channel = records.Channel(int(key), topic, "protobuf", {}, schema_id)
+            index.channels[channel.id] = channel
+        if channel.schema_id not in index.schemas:
+            files = build_file_descriptor_set(message_class).SerializeToString()
+            schema = records.Schema(channel.schema_id, files, "protobuf", name)
+            index.schemas[schema.id] = schema
+
+
+def _find_message_class(name: str) -> type[Message] | None:
+    """Return the generated class of a message of locatk or foxglove, None if there is none."""
+    package, _, short_name = name.partition(".")
+    if package == "foxglove" and short_name.isidentifier():
+        with contextlib.suppress(ImportError):
+            importlib.import_module(f"foxglove_schemas_protobuf.{short_name}_pb2")
+    elif package != "locatk":
+        return None
+    try:
+        return GetMessageClass(descriptor_pool.Default().FindMessageTypeByName(name))
+    except KeyError:
+        return None

@@ -1,9 +1,10 @@
-"""What a record of a damaged MCAP file must be like to be believed, and how to find such ones.
+"""Criteria by which a record of a damaged MCAP file is accepted, and the search for such records.
 
-A chunk and an attachment prove themselves by their checksum (where the writer left it out: by
-lengths that agree, and content that is records), the other kinds by lengths that agree to the
-last byte and texts that are UTF-8. No length is believed before that, so that a flipped bit
-asks neither for memory nor for time. Specification: https://mcap.dev/spec
+A chunk and an attachment are accepted by their checksum. If the writer left it out, their
+lengths must agree and the content of a chunk must consist of records. Records of other kinds
+must have lengths that agree to the last byte, and texts in UTF-8. No length is used before it
+was checked, so that a flipped bit costs neither memory nor time.
+Specification: https://mcap.dev/spec
 """
 
 from __future__ import annotations
@@ -19,27 +20,35 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from mcap import records
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from locatk.formats.sessions import mcap_records
-from locatk.formats.sessions.mcap_records import MAGIC, DamageError
+from locatk.formats.sessions.mcap_file import (
+    MAGIC,
+    MESSAGE_HEAD,
+    PARSE_ERRORS,
+    RECORD_HEAD,
+    DamageError,
+    decompress,
+    iter_records,
+    parse,
+)
 
-LARGEST_RECORD = 1 << 30
-"""Bytes of a record, and of a chunk when unpacked, that are believed; only attachments may be
-larger, as they are not held here."""
+MAX_RECORD_BYTES = 1 << 30
+"""Largest record, and largest decompressed chunk, that is accepted.
 
-LARGEST_HEAD = 1 << 16
-"""Bytes of the names of an attachment that are believed."""
+Attachments may be larger, because they are not held in memory here.
+"""
 
-CHAIN = 4
-"""So many records in a row make a message outside chunks believable."""
+MAX_HEAD_BYTES = 1 << 16
+"""Largest name and media type of an attachment that are accepted."""
 
-FIRST_BLOCK, BLOCK = 1 << 16, 1 << 20
-"""Bytes that are searched at once."""
+MIN_CHAIN_RECORDS = 4
+"""Number of consecutive records after which a message outside chunks is accepted in a search."""
 
-FRAME = struct.Struct("<BQ")
-MESSAGE = struct.Struct("<HIQQ")
+FIRST_BLOCK_BYTES, BLOCK_BYTES = 1 << 16, 1 << 20
+"""Size of the blocks in which a file is searched: the next record is mostly near."""
+
 _CHUNK = struct.Struct("<QQQII")
 
 READERS: dict[int, Callable[[ReadDataStream], Any]] = {
@@ -52,22 +61,24 @@ READERS: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.METADATA: records.Metadata.read,
     Opcode.METADATA_INDEX: records.MetadataIndex.read,
 }
-_NOT_BEHIND_DATA = (Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
-_LENGTHS = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
+_NEVER_AFTER_DATA_END = (Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
+_CONTENT_BYTES = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
 
 
-class ChunkHead(NamedTuple):
-    """What a chunk says of itself."""
+class ChunkContent(NamedTuple):
+    """Content of a chunk.
 
-    start_ns: int
-    end_ns: int
-    size: int
-    crc: int
-
-
-class Inside(NamedTuple):
-    """What a chunk holds: messages by channel and their times, schemas and channels, and what
-    only a copy of it has in common with it."""
+    Attributes
+    ----------
+    counts : Counter of int
+        Messages by channel.
+    span : (int, int) or None
+        First and last log time in ns.
+    definitions : list of (Opcode, bytes)
+        Schemas and channels.
+    key : (int, int)
+        Length and checksum, by which copies of the chunk are recognized.
+    """
 
     counts: Counter[int]
     span: tuple[int, int] | None
@@ -75,172 +86,175 @@ class Inside(NamedTuple):
     key: tuple[int, int]
 
 
-class AttachmentHead(NamedTuple):
-    """What an attachment says of itself."""
-
-    log_ns: int
-    create_ns: int
-    name: str
-    media_type: str
-    size: int
-
-
-class Evidence:
-    """The bytes of a file that may be damaged; holds no more than one record."""
+class DamagedFile:
+    """Access to the bytes and records of a file that may be damaged; holds one record."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
         self.size = stream.seek(0, os.SEEK_END)
 
-    def at(self, offset: int, length: int) -> bytes:
-        """Bytes of the file; fewer where it ends."""
+    def read(self, offset: int, length: int) -> bytes:
+        """Read bytes of the file; fewer at its end."""
         self._stream.seek(offset)
         return self._stream.read(max(0, min(length, self.size - offset)))
 
-    def frame(self, position: int) -> tuple[int, int] | None:
-        """Opcode and end of what may be a record; None where it does not fit."""
-        head = self.at(position, FRAME.size)
-        if len(head) < FRAME.size:
+    def record_head(self, position: int) -> tuple[int, int] | None:
+        """Return opcode and end of a possible record; None if it is longer than the file."""
+        head = self.read(position, RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
             return None
-        opcode, length = FRAME.unpack(head)
-        end = position + FRAME.size + length
+        opcode, length = RECORD_HEAD.unpack(head)
+        end = position + RECORD_HEAD.size + length
         return (opcode, end) if end <= self.size else None
 
     def content(self, position: int, end: int) -> bytes:
-        """What is in the record from ``position`` to ``end``."""
-        return self.at(position + FRAME.size, end - position - FRAME.size)
+        """Read the content of the record from ``position`` to ``end``."""
+        return self.read(position + RECORD_HEAD.size, end - position - RECORD_HEAD.size)
 
     def record(self, position: int) -> tuple[Opcode, int] | None:
-        """Kind and end of the record at ``position``, whose lengths all agree; else None."""
-        frame = self.frame(position)
-        if frame is None or not 0 < frame[0] <= Opcode.DATA_END:
+        """Return kind and end of the record at ``position``; None if its lengths disagree."""
+        head = self.record_head(position)
+        if head is None or not 0 < head[0] <= Opcode.DATA_END:
             return None
-        opcode, end = Opcode(frame[0]), frame[1]
-        return (opcode, end) if self._agrees(opcode, position, end) else None
+        opcode, end = Opcode(head[0]), head[1]
+        return (opcode, end) if self._has_valid_lengths(opcode, position, end) else None
 
-    def _agrees(self, opcode: Opcode, position: int, end: int) -> bool:
-        length = end - position - FRAME.size
+    def _has_valid_lengths(self, opcode: Opcode, position: int, end: int) -> bool:
+        length = end - position - RECORD_HEAD.size
         if opcode == Opcode.ATTACHMENT:
             return self.attachment_head(position) is not None
-        if length > LARGEST_RECORD:
+        if length > MAX_RECORD_BYTES:
             return False
         if opcode == Opcode.CHUNK:
             return self.chunk_head(position) is not None
         if opcode == Opcode.MESSAGE:
-            return length >= MESSAGE.size
+            return length >= MESSAGE_HEAD.size
         if opcode == Opcode.MESSAGE_INDEX:
-            inner = int.from_bytes(self.at(position + FRAME.size + 2, 4), "little")
+            inner = int.from_bytes(self.read(position + RECORD_HEAD.size + 2, 4), "little")
             return length == 6 + inner and inner % 16 == 0
-        if opcode in _LENGTHS:
-            return length == _LENGTHS[opcode]
-        self._stream.seek(position + FRAME.size)
-        return _filling(READERS[opcode], self._stream, length) is not None
+        if opcode in _CONTENT_BYTES:
+            return length == _CONTENT_BYTES[opcode]
+        self._stream.seek(position + RECORD_HEAD.size)
+        return _parse_filling(READERS[opcode], self._stream, length) is not None
 
-    def chunk_head(self, position: int) -> ChunkHead | None:
-        """Head of a chunk whose lengths agree, even where the file ends inside it."""
-        longest = 4
-        head = self.at(position, FRAME.size + _CHUNK.size + longest + 8)
-        if len(head) < FRAME.size + _CHUNK.size + 8:
-            return None
-        opcode, length = FRAME.unpack_from(head)
-        start_ns, end_ns, size, crc, name = _CHUNK.unpack_from(head, FRAME.size)
-        at = FRAME.size + _CHUNK.size + name
-        if opcode != Opcode.CHUNK or len(head) < at + 8:
-            return None
-        packed = int.from_bytes(head[at : at + 8], "little")
-        good = length == _CHUNK.size + name + 8 + packed
-        return ChunkHead(start_ns, end_ns, size, crc) if good else None
+    def chunk_head(self, position: int) -> tuple[int, int, int] | None:
+        """Return the head of a chunk if its lengths agree, even if the file ends inside it.
 
-    def chunk(self, position: int, end: int) -> Inside | None:
-        """What a chunk holds whose head agrees; None where its content is damaged."""
+        Returns
+        -------
+        (int, int, int) or None
+            First and last log time in ns, and decompressed size in bytes.
+        """
+        longest_name = 4
+        head = self.read(position, RECORD_HEAD.size + _CHUNK.size + longest_name + 8)
+        if len(head) < RECORD_HEAD.size + _CHUNK.size + 8:
+            return None
+        opcode, length = RECORD_HEAD.unpack_from(head)
+        start_ns, end_ns, size, _, name_length = _CHUNK.unpack_from(head, RECORD_HEAD.size)
+        data_length_at = RECORD_HEAD.size + _CHUNK.size + name_length
+        if opcode != Opcode.CHUNK or len(head) < data_length_at + 8:
+            return None
+        data_length = int.from_bytes(head[data_length_at : data_length_at + 8], "little")
+        is_valid = length == _CHUNK.size + name_length + 8 + data_length
+        return (start_ns, end_ns, size) if is_valid else None
+
+    def chunk(self, position: int, end: int) -> ChunkContent | None:
+        """Return the content of a chunk whose head is valid; None if it is damaged."""
         head = self.chunk_head(position)
-        if head is None or head.size > LARGEST_RECORD:
+        if head is None or head[2] > MAX_RECORD_BYTES:
             return None
         try:
-            return inside(mcap_records.decompress(self.content(position, end), position))
+            return inspect_chunk(decompress(self.content(position, end), position))
         except DamageError:
             return None
 
-    def attachment_head(self, position: int) -> AttachmentHead | None:
-        """Head of an attachment whose lengths agree, even where the file ends inside it."""
-        frame = self.at(position, FRAME.size)
-        if len(frame) < FRAME.size or frame[0] != Opcode.ATTACHMENT:
+    def attachment_head(self, position: int) -> records.AttachmentIndex | None:
+        """Return the head of an attachment if its lengths agree, even of an incomplete one."""
+        record_head = self.read(position, RECORD_HEAD.size)
+        if len(record_head) < RECORD_HEAD.size or record_head[0] != Opcode.ATTACHMENT:
             return None
-        _, length = FRAME.unpack(frame)
-        stream = _Strict(self._stream, LARGEST_HEAD)  # which goes on behind the frame
+        _, length = RECORD_HEAD.unpack(record_head)
+        stream = _StrictStream(self._stream, MAX_HEAD_BYTES)  # continues behind the record head
         try:
             log_ns, create_ns = stream.read8(), stream.read8()
             name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
             size = stream.read8()
-        except (McapError, struct.error, ValueError):
+        except PARSE_ERRORS:
             return None
-        good = length == stream.count + size + 4
-        return AttachmentHead(log_ns, create_ns, name, media_type, size) if good else None
+        if length != stream.count + size + 4:
+            return None
+        return records.AttachmentIndex(
+            position, RECORD_HEAD.size + length, log_ns, create_ns, size, name, media_type
+        )
 
-    def attachment_is_right(self, position: int, end: int) -> bool:
-        """Whether the checksum of the attachment is right, or the writer left it out.
+    def is_attachment_intact(self, position: int, end: int) -> bool:
+        """Return whether the checksum of an attachment is right, or was left out by the writer.
 
-        Zeros before a checksum of zero are rather the hole that a power cut leaves.
+        Zeros in front of a checksum of zero are rather the hole that a power cut leaves.
         """
-        last = self.at(end - 5, 5)
+        last = self.read(end - 5, 5)
         crc = int.from_bytes(last[1:], "little")
         if crc == 0:
-            return last[:1] != b"\0" and self.goes_on(end)
-        return self._crc(position + FRAME.size, end - 4) == crc
+            return last[:1] != b"\0" and self.is_record_or_end(end)
+        return self._crc(position + RECORD_HEAD.size, end - 4) == crc
 
-    def goes_on(self, position: int) -> bool:
-        """Whether a record seems to begin at ``position``, or the file ends there."""
+    def is_record_or_end(self, position: int) -> bool:
+        """Return whether a record seems to begin at ``position``, or the file ends there."""
         return (
             position == self.size
-            or self.at(position, len(MAGIC)) == MAGIC
+            or self.read(position, len(MAGIC)) == MAGIC
             or self.record(position) is not None
         )
 
     def _crc(self, start: int, end: int) -> int:
         crc = 0
-        for offset in range(start, end, BLOCK):
-            crc = zlib.crc32(self.at(offset, min(BLOCK, end - offset)), crc)
+        for offset in range(start, end, BLOCK_BYTES):
+            crc = zlib.crc32(self.read(offset, min(BLOCK_BYTES, end - offset)), crc)
         return crc
 
-    def only_zeros(self, start: int, end: int) -> bool:
-        """Whether all bytes from ``start`` to ``end`` are zero."""
+    def is_zero(self, start: int, end: int) -> bool:
+        """Return whether all bytes from ``start`` to ``end`` are zero."""
         return not any(
-            self.at(offset, min(BLOCK, end - offset)).strip(b"\0")
-            for offset in range(start, end, BLOCK)
+            self.read(offset, min(BLOCK_BYTES, end - offset)).strip(b"\0")
+            for offset in range(start, end, BLOCK_BYTES)
         )
 
-    # ---- the next record after damage
+    # ---- search for the next record after damage
 
     def search(self, start: int, limit: int, kinds: Collection[Opcode]) -> int:
-        """First byte from ``start`` on at which a record of one of the ``kinds`` proves itself;
-        ``limit`` where there is none before it."""
-        offset, length = start, FIRST_BLOCK
+        """Return the first position from ``start`` of an acceptable record of one of ``kinds``.
+
+        Returns ``limit`` if there is none before it.
+        """
+        offset, length = start, FIRST_BLOCK_BYTES
         while offset < limit:
             length = min(length, limit - offset)
-            block = self.at(offset, length + FRAME.size - 1)
-            for place in self._candidates(block, offset, kinds):
-                if self._proves(place, kinds):
-                    return place
-            offset, length = offset + length, BLOCK
+            block = self.read(offset, length + RECORD_HEAD.size - 1)
+            for position in self._candidates(block, offset, kinds):
+                if self._is_acceptable(position, kinds):
+                    return position
+            offset, length = offset + length, BLOCK_BYTES
         return limit
 
     def _candidates(self, block: bytes, offset: int, kinds: Collection[Opcode]) -> Iterator[int]:
-        """Where in ``block``, which is at ``offset``, a record that fits may begin."""
+        """Yield positions in ``block``, which is at ``offset``, that look like a record head."""
         data = np.frombuffer(block, np.uint8)
-        n = len(data) - FRAME.size + 1
+        n = len(data) - RECORD_HEAD.size + 1
         if n <= 0:
             return
-        # No record has 2^40 bytes: almost everywhere these three bytes are not all zero.
+        # No record has 2^40 bytes: the three highest bytes of its length are zero, which they
+        # rarely are elsewhere.
         zero = data == 0
         begins = zero[6 : n + 6] & zero[7 : n + 7] & zero[8 : n + 8] & ~zero[:n]
-        places = np.flatnonzero(begins)
-        places = places[np.isin(data[places], [int(kind) for kind in kinds])]
-        heads = np.lib.stride_tricks.sliding_window_view(data, FRAME.size)[places, 1:]
+        positions = np.flatnonzero(begins)
+        positions = positions[np.isin(data[positions], [int(kind) for kind in kinds])]
+        heads = np.lib.stride_tricks.sliding_window_view(data, RECORD_HEAD.size)[positions, 1:]
         lengths = np.ascontiguousarray(heads).view("<u8")[:, 0].astype(np.int64)
-        for place in places[lengths <= self.size - offset - places - FRAME.size]:
-            yield offset + int(place)
+        fits = lengths <= self.size - offset - positions - RECORD_HEAD.size
+        for position in positions[fits]:
+            yield offset + int(position)
 
-    def _proves(self, position: int, kinds: Collection[Opcode]) -> bool:
+    def _is_acceptable(self, position: int, kinds: Collection[Opcode]) -> bool:
         found = self.record(position)
         if found is None or found[0] not in kinds:
             return False
@@ -248,20 +262,20 @@ class Evidence:
         if opcode == Opcode.CHUNK:
             return self.chunk(position, end) is not None
         if opcode == Opcode.ATTACHMENT:
-            return self.attachment_is_right(position, end)
+            return self.is_attachment_intact(position, end)
         if opcode == Opcode.FOOTER:
-            return self.at(end, len(MAGIC)) == MAGIC
+            return self.read(end, len(MAGIC)) == MAGIC
         if opcode == Opcode.DATA_END:
-            follows = self.record(end)
-            return follows is not None and follows[0] not in _NOT_BEHIND_DATA
+            next_record = self.record(end)
+            return next_record is not None and next_record[0] not in _NEVER_AFTER_DATA_END
         if opcode == Opcode.MESSAGE:
-            return self._chain(position)
-        # Zeros make a record without a name.
-        record = exact(READERS[opcode], self.content(position, end))
+            return self._begins_chain(position)
+        # Zeros parse as a record without a name.
+        record = parse_exactly(READERS[opcode], self.content(position, end))
         return bool(record.topic if opcode == Opcode.CHANNEL else record.name)
 
-    def _chain(self, position: int) -> bool:
-        for _ in range(CHAIN):
+    def _begins_chain(self, position: int) -> bool:
+        for _ in range(MIN_CHAIN_RECORDS):
             found = self.record(position)
             if found is None:
                 return False
@@ -271,15 +285,15 @@ class Evidence:
         return True
 
 
-class _Strict(ReadDataStream):
-    """Gives as many bytes as asked for, as its parent may not, and no more than ``limit``."""
+class _StrictStream(ReadDataStream):
+    """Stream that fails if fewer bytes are left than asked for, or more than ``limit`` are read."""
 
     def __init__(self, stream: IO[bytes], limit: int) -> None:
         super().__init__(stream)
         self._limit = limit
 
     def read(self, length: int) -> bytes:
-        if length > self._limit - self.count:  # before memory is asked for
+        if length > self._limit - self.count:  # before memory is allocated
             raise EndOfFile
         data = super().read(length)
         if len(data) != length:
@@ -288,58 +302,47 @@ class _Strict(ReadDataStream):
 
     def read_prefixed_string(self) -> str:
         text = super().read_prefixed_string()
-        if "\0" in text:  # zeros are UTF-8, and what a power cut leaves
+        if "\0" in text:  # zeros are valid UTF-8, and a power cut leaves them
             raise ValueError
         return text
 
 
-def exact(reader: Callable[[ReadDataStream], Any], content: bytes) -> Any:
-    """The record that fills ``content`` to its last byte, or None."""
-    return _filling(reader, BytesIO(content), len(content))
+def parse_exactly(reader: Callable[[ReadDataStream], Any], content: bytes) -> Any:
+    """Return the record that fills ``content`` to its last byte, or None."""
+    return _parse_filling(reader, BytesIO(content), len(content))
 
 
-def _filling(reader: Callable[[ReadDataStream], Any], source: IO[bytes], length: int) -> Any:
-    """The record that fills the next ``length`` bytes, or None; read only as far as it is one."""
-    stream = _Strict(source, length)
+def _parse_filling(reader: Callable[[ReadDataStream], Any], source: IO[bytes], length: int) -> Any:
+    """Return the record that fills the next ``length`` bytes of ``source``, or None."""
+    stream = _StrictStream(source, length)
     try:
         record = reader(stream)
-    except (McapError, struct.error, ValueError, MemoryError, OverflowError):
+    except PARSE_ERRORS:
         return None
     return record if stream.count == length else None
 
 
-def inside(data: bytes | memoryview) -> Inside | None:
-    """What ``data`` holds; None where it is not records one after the other.
+def inspect_chunk(data: bytes | memoryview) -> ChunkContent:
+    """List the content of a decompressed chunk.
 
     Raises
     ------
     DamageError
-        A schema or a channel cannot be read.
+        ``data`` do not consist of records, or a schema or a channel cannot be parsed.
     """
     times: list[int] = []
     counts: Counter[int] = Counter()
     definitions: list[tuple[Opcode, bytes]] = []
-    position, end = 0, len(data)
-    unpack_frame, unpack_message = FRAME.unpack_from, MESSAGE.unpack_from
-    while position < end:  # no call a record: a chunk may hold tens of thousands
-        if position + 9 > end:
-            return None
-        opcode, length = unpack_frame(data, position)
-        start = position + 9
-        position = start + length
-        if position > end:
-            return None
-        if opcode == 5:  # MESSAGE
-            if length < 22:
-                return None
-            channel, _, time_ns, _ = unpack_message(data, start)
+    for opcode, start, end in iter_records(data, 0):
+        if opcode == 5:  # Opcode.MESSAGE; a chunk may hold tens of thousands
+            channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(data, start)
             counts[channel] += 1
             times.append(time_ns)
-        elif opcode == 3 or opcode == 4:  # SCHEMA, CHANNEL
-            content = bytes(data[start:position])
-            mcap_records.parse(READERS[opcode], content, start)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            content = bytes(data[start:end])
+            parse(READERS[opcode], content, start)
             definitions.append((Opcode(opcode), content))
-    return Inside(
+    return ChunkContent(
         counts,
         (min(times), max(times)) if times else None,
         definitions,

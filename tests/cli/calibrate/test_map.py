@@ -14,7 +14,7 @@ from locatk.core.landmarks.simulation import session as simulate
 from locatk.core.landmarks.simulation.floor import install_landmarks
 from locatk.core.landmarks.simulation.session import Faults, SimulatedSession, SimulationOptions
 from locatk.formats.artifacts import maps
-from locatk.formats.sessions import halls
+from locatk.formats.sessions import field_samples
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import read_odometry
 
@@ -43,7 +43,7 @@ def write(
     path: Path, session: SimulatedSession, floor: FloorMap | None = FLOOR, **more: object
 ) -> Path:
     given: dict = {"truth": session.truth, "odometry": session.odometry, **more}
-    halls.write_session(path, session.samples, floor=floor, **given)
+    field_samples.write_halls(path, session.samples, floor=floor, **given)
     return path
 
 

@@ -23,7 +23,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from locatk.core.solution import Solution
 from locatk.formats.artifacts.scene import dumps_scene
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions import halls, observations
+from locatk.formats.sessions import field_samples, observations
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution
 
@@ -457,8 +457,8 @@ def test_landmarks_are_found_in_what_was_captured(captured: Path, locatk: Any) -
     for key in ("x_m", "y_m"):
         assert found[key] == pytest.approx(expected[key], abs=5e-4)
     assert found["heading_rad"] == pytest.approx(expected["heading_rad"], abs=5e-3)
-    first = halls.read_samples(Session.open(captured / "landmarks.mcap"))[0]
-    second = halls.read_samples(Session.open(captured / "landmarks-captured.mcap"))[0]
+    first = field_samples.read_halls(Session.open(captured / "landmarks.mcap"))[0]
+    second = field_samples.read_halls(Session.open(captured / "landmarks-captured.mcap"))[0]
     np.testing.assert_allclose(second.field_t, first.field_t, atol=1e-6)
     # Times go on as the device's do, but for what a busy machine is late.
     offset = (second.time_ns - first.time_ns) - (second.time_ns - first.time_ns)[0]

@@ -12,8 +12,7 @@ import pytest
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.formats.sessions import capture_record as captured
-from locatk.formats.sessions import halls
-from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions import field_samples
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -54,7 +53,7 @@ def live(path: Path, capture: dict[str, str] | None = None) -> Path:
         "car", SensorArray(bar(9, 0.02)), time_ns, 1e-6 * rng.normal(size=(1000, 9, 3))
     )
     plain = path.with_name("plain.mcap")
-    arrays.write_session(plain, [samples])
+    field_samples.write_magnetometers(plain, [samples])
     source = Session.open(plain)
     with SessionWriter(path, system="polaris") as writer:
         writer.metadata("capture", CAPTURE if capture is None else capture)
@@ -62,7 +61,7 @@ def live(path: Path, capture: dict[str, str] | None = None) -> Path:
             data = source.attachment(entry.name)
             assert data is not None
             writer.attach(entry.name, data, entry.media_type)
-        message_class = arrays.KIND.layout(1).message
+        message_class = field_samples.MAGNETOMETERS.layout(1).message
         for time, message in source.decoded("/magnetometers/car", message_class):
             writer.write("/magnetometers/car", message, time)
     plain.unlink()
@@ -140,15 +139,15 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: object) -> None:
         raise AssertionError("messages are read")
 
-    monkeypatch.setattr(captured, "MOST_READ", 0)
-    monkeypatch.setattr(captured, "MOST_CHUNKS", 0)
+    monkeypatch.setattr(captured, "MAX_DESCRIBED_BYTES", 0)
+    monkeypatch.setattr(captured, "MAX_DESCRIBED_CHUNKS", 0)
     monkeypatch.setattr(Session, "messages", refuse)
 
 
 def test_a_large_session_of_magnetometers(locatk, tmp_path: Path, monkeypatch) -> None:
     path = live(tmp_path / "run.mcap")
     read = facts(locatk, path)
-    monkeypatch.setattr(captured, "MOST_READ", 0)
+    monkeypatch.setattr(captured, "MAX_DESCRIBED_BYTES", 0)
     monkeypatch.setattr(Session, "messages", None)
     answer = facts(locatk, path)
     assert answer["unread_bytes"] == sum(s.length for s in Session.open(path).index.segments)
@@ -168,7 +167,7 @@ def test_a_large_session_that_does_not_count(locatk, tmp_path: Path, large: None
     sensors = HallSensors()
     field = np.zeros((50, len(sensors)))
     time_ns = START_NS + 10_000_000 * np.arange(50)
-    halls.write_session(path, [HallSamples("robot", sensors, time_ns, field)])
+    field_samples.write_halls(path, [HallSamples("robot", sensors, time_ns, field)])
     answer = facts(locatk, path)
     assert (answer["devices"], answer["samples"]) == (["robot"], None)
     assert answer["halls"][0]["rate_hz"] is None

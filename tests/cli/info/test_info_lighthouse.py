@@ -122,7 +122,7 @@ def test_a_large_session_has_the_sweeps_that_were_counted(
     locatk, write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write(tmp_path / "1.mcap", stations=HEARD)
-    monkeypatch.setattr(captured, "MOST_READ", 0)
+    monkeypatch.setattr(captured, "MAX_DESCRIBED_BYTES", 0)
     assert [station["sweeps"] for station in facts(locatk, path)["stations"]] == [40, 7]
 
 
@@ -130,7 +130,7 @@ def test_another_station_than_that_of_the_scene(locatk, write, tmp_path: Path) -
     place = Station(1, np.zeros(3), np.eye(3), FACTORY, id=0xBAD)
     path = write(tmp_path / "1.mcap", stations=HEARD, scene=Scene(stations=(place,)))
     [note] = facts(locatk, path)["notes"]
-    assert note.startswith("on channel 1 the scene has the station 00000bad")
+    assert note.startswith("channel 1: the scene contains station 00000bad")
     assert note in locatk("info", path).stdout
 
 

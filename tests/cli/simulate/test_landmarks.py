@@ -25,7 +25,7 @@ from locatk.core.landmarks.simulation.session import (
     simulate,
 )
 from locatk.formats.artifacts import maps
-from locatk.formats.sessions.halls import read_samples
+from locatk.formats.sessions.field_samples import read_halls
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import read_odometry, read_truth
 
@@ -98,7 +98,7 @@ swapped_sensors = [["front", "left"]]
 def holds(path: Path, wanted: SimulatedSession) -> Session:
     """The session at ``path``, which holds what was simulated."""
     session = Session.open(path)
-    (samples,) = read_samples(session)
+    (samples,) = read_halls(session)
     assert samples.field_t == pytest.approx(
         wanted.samples[0].field_t, rel=1e-6, abs=1e-12, nan_ok=True
     )
@@ -205,7 +205,7 @@ def test_each_option_reaches_the_session(locatk, floor: Path) -> None:
     )
     wanted = simulate(FloorMap(CODES), options)
     session = Session.open(out)
-    (samples,) = read_samples(session)
+    (samples,) = read_halls(session)
     assert np.array_equal(samples.time_ns, wanted.samples[0].time_ns)
     read, exact = samples.field_t, wanted.samples[0].field_t
     assert np.array_equal(np.isnan(read), np.isnan(exact))

@@ -15,7 +15,7 @@ from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.simulation.session import CARS, SimulationOptions, simulate, usual_bar
 from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.formats.artifacts import tags as artifacts
-from locatk.formats.sessions.magnetometers import read_samples
+from locatk.formats.sessions.field_samples import read_magnetometers
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import read_odometry, read_truth
 
@@ -98,7 +98,7 @@ def test_a_session_holds_samples_bar_tag_and_truth(locatk, tmp_path: Path) -> No
     assert crossing["time_s"] == pytest.approx(wanted.crossings[0].time_ns * 1e-9, abs=1e-6)
     session = Session.open(out)
     assert session.facts["system"] == "polaris"
-    (samples,) = read_samples(session)
+    (samples,) = read_magnetometers(session)
     assert samples.field_t == pytest.approx(wanted.samples.field_t, rel=1e-6)
     assert np.array_equal(samples.time_ns, wanted.samples.time_ns)
     assert samples.array.position_m == pytest.approx(wanted.samples.array.position_m)
@@ -171,7 +171,7 @@ def test_each_option_reaches_the_samples(locatk, tmp_path: Path) -> None:
     wanted = simulate(SITE, options)
     assert "in site, over tag 7, 3" in result.stdout
     session = Session.open(out)
-    (samples,) = read_samples(session)
+    (samples,) = read_magnetometers(session)
     assert np.array_equal(samples.time_ns, wanted.samples.time_ns)
     read, exact = samples.field_t, wanted.samples.field_t
     assert np.array_equal(np.isnan(read), np.isnan(exact))
@@ -189,7 +189,7 @@ def test_the_miniature_car_has_its_own_tag_and_bar(locatk, tmp_path: Path) -> No
     result = locatk("simulate", "polaris", "-o", out, "--car", "mini", "--id", 77)
     assert result.exit_code == 0, result.stderr
     session = Session.open(out)
-    (samples,) = read_samples(session)
+    (samples,) = read_magnetometers(session)
     assert len(samples.array) == 3
     assert np.diff(samples.time_ns) == pytest.approx(1e9 / 17, abs=1)
     assert artifacts.attached_tags(session) == CARS["mini"].tags
@@ -203,14 +203,14 @@ def test_another_bar_and_the_measured_noise(locatk, tmp_path: Path) -> None:
     artifacts.write_array(file, own)
     result = locatk("simulate", "polaris", "-o", out, "--array", file, "--rate", 40)
     assert result.exit_code == 0, result.stderr
-    (samples,) = read_samples(Session.open(out))
+    (samples,) = read_magnetometers(Session.open(out))
     assert samples.array.position_m == pytest.approx(own.position_m)
     assert samples.array.noise_t == pytest.approx(own.noise_t)
     result = locatk(
         "simulate", "polaris", "-o", out, "--rate", 60, "--measured-noise", "--overwrite"
     )
     assert result.exit_code == 0, result.stderr
-    (samples,) = read_samples(Session.open(out))
+    (samples,) = read_magnetometers(Session.open(out))
     assert samples.array.noise_t == pytest.approx([0.89e-6, 0.86e-6, 1.24e-6])
 
 
@@ -286,7 +286,7 @@ def test_an_array_of_the_command_line_replaces_the_sensors_of_the_file(
     )
     result = locatk("simulate", "polaris", "-o", out, "--config", config, "--array", file)
     assert result.exit_code == 0, result.stderr
-    (samples,) = read_samples(Session.open(out))
+    (samples,) = read_magnetometers(Session.open(out))
     assert len(samples.array) == 5
 
 

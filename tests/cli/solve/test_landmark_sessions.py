@@ -22,7 +22,7 @@ from locatk.core.landmarks.results import LandmarkDetection, LandmarkFacts, Robo
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import maps
-from locatk.formats.sessions import halls, observations, solutions
+from locatk.formats.sessions import field_samples, observations, solutions
 from locatk.formats.sessions.reader import Session
 
 START_NS = 1_700_000_000_000_000_000
@@ -62,7 +62,7 @@ def record(
     """A session of nothing but noise."""
     field = np.random.default_rng(1).normal(size=(40, 4)) * 1e-4
     time_ns = START_NS + 10_000_000 * np.arange(40)
-    halls.write_session(
+    field_samples.write_halls(
         path,
         [HallSamples(device, HallSensors(noise_t=1e-4), time_ns, field) for device in devices],
         floor=floor,

@@ -28,8 +28,7 @@ from locatk.core.polaris.tag import (
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import tags
-from locatk.formats.sessions import magnetometers as arrays
-from locatk.formats.sessions import observations, solutions
+from locatk.formats.sessions import field_samples, observations, solutions
 from locatk.formats.sessions.reader import Session
 
 START_NS = 1_700_000_000_000_000_000
@@ -71,7 +70,7 @@ def test_a_published_recording_becomes_a_session(locatk, tmp_path: Path) -> None
     }
     assert "the design of the published tags" in result.stderr
     session = Session.open(out)
-    (samples,) = observations.read_samples(session)
+    (samples,) = observations.read_magnetometers(session)
     assert samples.field_t.shape == (60, 9, 3)
     assert np.ptp(samples.array.position_m[:, 1]) == pytest.approx(0.16)
     known = observations.read_tags(session)
@@ -109,7 +108,7 @@ def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
     assert f"{run}:22: sensor 2 has more than an MLX90393" in result.stderr
     assert "Incomplete: 5 of 1620 values are left out." in result.stderr
     session = Session.open(out)
-    (samples,) = observations.read_samples(session)
+    (samples,) = observations.read_magnetometers(session)
     assert np.count_nonzero(np.isnan(samples.field_t)) == 5
     assert len(session.topics("/log")) == 1
 
@@ -200,7 +199,7 @@ def test_info_of_a_session_with_damaged_samples(locatk, tmp_path: Path) -> None:
     from locatk.formats.schemas.magnetics_pb2 import MagnetometerArray
     from locatk.formats.sessions.writer import SessionWriter
 
-    (samples,) = observations.read_samples(session)
+    (samples,) = observations.read_magnetometers(session)
     message = next(iter(session.decoded("/magnetometers/bar", MagnetometerArray)))[1]
     bad = tmp_path / "bad.mcap"
     with SessionWriter(bad, system="polaris") as writer:
@@ -220,7 +219,7 @@ def record(path: Path, known: Tags | None = TAGS) -> Path:
     field = np.random.default_rng(1).normal(size=(40, 9, 3)) * 1e-6
     time_ns = START_NS + 10_000_000 * np.arange(40)
     samples = Samples("bar", SensorArray(bar(9, 0.02)), time_ns, field)
-    arrays.write_session(path, [samples], tags=known)
+    field_samples.write_magnetometers(path, [samples], tags=known)
     return path
 
 

@@ -16,7 +16,7 @@ from locatk.formats.capture.ports import port_of
 from locatk.formats.capture.replay import ReplayLink, ReplayPort
 from locatk.formats.capture.source import LinkEnded, LinkLost, SourceError
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions import mcap_records
+from locatk.formats.sessions.reader import read_index
 from locatk.formats.sessions.writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000
@@ -181,7 +181,7 @@ def many() -> list[bytes]:
 
 def test_a_session_that_is_cut_short(tmp_path: Path) -> None:
     file = write(tmp_path / "run.mcap", many())
-    segments = mcap_records.read_index(file.open("rb")).segments
+    segments = read_index(file.open("rb")).segments
     assert len(segments) > 2
     file.write_bytes(file.read_bytes()[: segments[-1].offset + 100])
     port = ReplayPort(f"replay:{file}", speed=0)
@@ -191,13 +191,13 @@ def test_a_session_that_is_cut_short(tmp_path: Path) -> None:
     assert len(pieces) > 50
     # Not the end of the recording: it is lost, and that is what the recorder will say.
     assert isinstance(end, LinkLost)
-    assert "inside a record" in str(end)
-    assert "inside a record" in port.describe()["damage"]
+    assert "cut short" in str(end)
+    assert "cut short" in port.describe()["damage"]
 
 
 def test_a_flipped_byte(tmp_path: Path) -> None:
     file = write(tmp_path / "run.mcap", many())
-    segment = mcap_records.read_index(file.open("rb")).segments[1]
+    segment = read_index(file.open("rb")).segments[1]
     data = bytearray(file.read_bytes())
     data[segment.offset + segment.length // 2] ^= 4
     file.write_bytes(data)

@@ -17,12 +17,10 @@ from locatk.formats.artifacts import tags
 from locatk.formats.capture.arrival_times import Arrivals
 from locatk.formats.capture.device_messages import Stamped, Streams
 from locatk.formats.devices.decoder import KINDS, Batch, Stream, Ticks
-from locatk.formats.sessions import magnetometers as arrays
-from locatk.formats.sessions import messages, observations
+from locatk.formats.sessions import field_samples, messages, observations
 from locatk.formats.sessions import trajectories as tracks
-from locatk.formats.sessions.messages import Layout
+from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, Layout
 from locatk.formats.sessions.reader import Session
-from locatk.formats.sessions.trajectories import LARGEST_BATCH
 from locatk.formats.sessions.writer import SessionWriter
 
 START_NS = 1_700_000_000_000_000_000
@@ -115,17 +113,17 @@ def test_every_value_comes_through(kind: str, node: str) -> None:
 
 
 def test_long_batches_are_several_messages() -> None:
-    n = 2 * LARGEST_BATCH + 1
+    n = 2 * MAX_BATCH_SAMPLES + 1
     ends = np.arange(1, n + 1)
     stream, layout = STREAMS["halls"]
     columns = values("halls", n)
     streams = Streams("red")
     made = list(streams.messages([Batch(stream, ends, columns)], arrivals_of(ends), START_NS))
     batches = unpacked(made, layout)
-    assert batches.counts.tolist() == [LARGEST_BATCH, LARGEST_BATCH, 1]
+    assert batches.counts.tolist() == [MAX_BATCH_SAMPLES, MAX_BATCH_SAMPLES, 1]
     np.testing.assert_array_equal(batches.columns["b_tesla"], columns["b_tesla"])
     assert [each.publish_ns for each in made] == [
-        START_NS + k * LARGEST_BATCH * 20 * MS for k in range(3)
+        START_NS + k * MAX_BATCH_SAMPLES * 20 * MS for k in range(3)
     ]
     assert streams.samples == {"/halls/red": n}
 
@@ -280,7 +278,7 @@ def test_what_was_recorded_reads_like_what_was_written(tmp_path: Path) -> None:
             for each in streams.messages(batches, arrivals, START_NS):
                 writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
     session = Session.open(tmp_path / "run.mcap")
-    (samples,) = arrays.read_samples(session)
+    (samples,) = field_samples.read_magnetometers(session)
     assert samples.device == "red"
     np.testing.assert_array_equal(
         samples.field_t.reshape(50, -1), columns["magnetometers"]["b_tesla"]

@@ -20,8 +20,7 @@ from locatk.formats.devices.recording import Recording
 from locatk.formats.emulation.default_sessions import SYSTEMS, simulate_session
 from locatk.formats.emulation.source import source_of
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions import halls, observations
-from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions import field_samples, observations
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -55,13 +54,13 @@ def odometry(device: str) -> Trajectory:
 
 def of_samples(path: Path) -> Session:
     samples = Samples("bar", SensorArray(bar(9, 0.02)), TIMES, np.zeros((5, 9, 3)))
-    arrays.write_session(path, [samples], odometry=[odometry("bar")])
+    field_samples.write_magnetometers(path, [samples], odometry=[odometry("bar")])
     return Session.open(path)
 
 
 def of_halls(path: Path) -> Session:
     samples = HallSamples("robot", HallSensors(), TIMES, np.zeros((5, 4)))
-    halls.write_session(path, [samples], odometry=[odometry("robot")])
+    field_samples.write_halls(path, [samples], odometry=[odometry("robot")])
     return Session.open(path)
 
 

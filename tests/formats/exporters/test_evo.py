@@ -150,7 +150,7 @@ def test_deltas(locatk, evo: Evo, tmp_path: Path, delta: str, more: tuple[object
     same(found["rpe"]["rotation_deg"], theirs)
 
 
-def test_orientations_are_taken_at_their_word(locatk, evo: Evo, tmp_path: Path) -> None:
+def test_orientations_are_used_as_given(locatk, evo: Evo, tmp_path: Path) -> None:
     """Points as TUM: evo turns their identity orientations along."""
     rows = np.arange(0, 20, 0.1)
     for name, seed in (("estimate", 3), ("truth", None)):

@@ -1,4 +1,4 @@
-"""Poses as Parquet, read by pyarrow alone."""
+"""Export of poses as Parquet, read with pyarrow."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def parquet():  # type: ignore[no-untyped-def]
     return pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
 
 
-def test_nothing_is_lost(parquet, tmp_path: Path) -> None:
+def test_all_values_are_written(parquet, tmp_path: Path) -> None:
     path, tracks = tmp_path / "poses.parquet", [track("red"), track("lab/blue", "map", seed=2)]
     write_parquet(path, tracks)
     table = parquet.read_table(path)
@@ -76,7 +76,7 @@ def test_columns_are_those_of_csv_and_more(parquet, tmp_path: Path) -> None:
         assert rows["time_s"].to_pylist() == text
 
 
-def test_what_is_not_known_is_null(parquet, tmp_path: Path) -> None:
+def test_unknown_values_are_null(parquet, tmp_path: Path) -> None:
     write_parquet(tmp_path / "poses.parquet", [track("red")])
     table = parquet.read_table(tmp_path / "poses.parquet")
     assert table["sigma_x_m"].null_count == 0
@@ -85,7 +85,7 @@ def test_what_is_not_known_is_null(parquet, tmp_path: Path) -> None:
     assert not np.isnan([x for x in table["cov_x_rz_m_rad"].to_pylist() if x is not None]).any()
 
 
-def test_the_schema_tells_where_it_comes_from(parquet, tmp_path: Path) -> None:
+def test_the_schema_contains_the_origin(parquet, tmp_path: Path) -> None:
     path = tmp_path / "poses.parquet"
     facts = {"system": "dots", "method": "lattice", "source": "Fahrt 1 \u00fc.mcap"}
     write_parquet(path, [track("red")], facts=facts)
@@ -105,7 +105,7 @@ def test_no_poses_are_a_table_without_rows(parquet, tmp_path: Path) -> None:
     assert parquet.read_table(tmp_path / "none.parquet").num_rows == 0
 
 
-def test_same_input_same_bytes_and_never_over_another_file(parquet, tmp_path: Path) -> None:
+def test_equal_input_gives_equal_bytes_and_existing_files_are_kept(parquet, tmp_path: Path) -> None:
     path = tmp_path / "poses.parquet"
     write_parquet(path, [track("red")])
     before = path.read_bytes()
@@ -116,7 +116,7 @@ def test_same_input_same_bytes_and_never_over_another_file(parquet, tmp_path: Pa
     assert path.read_bytes() == before
 
 
-def test_without_pyarrow_it_says_what_to_install(
+def test_the_error_without_pyarrow_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)

@@ -336,7 +336,7 @@ def written(session: ImportedSession, path: Path) -> None:
     again = Session.open(path)
     sweeps = observations.read_sweeps(again)
     assert sorted(sweeps.count.tolist()) == sorted(session.sweeps.count.tolist())
-    assert len(observations.read_heard(again)) == len(session.stations)
+    assert len(observations.read_station_reports(again)) == len(session.stations)
     assert observations.read_receivers(again).keys() == session.receivers.keys()
     observations.read_scene(again)
     assert len(observations.read_truth(again)) == len(session.truth)
@@ -397,7 +397,7 @@ def records(rng: np.random.Generator, folder: Path, further: bool) -> None:
     texts = [artifacts.dumps_scene(SCENE).encode(), receivers.dumps_receiver(DECK).encode()]
     scene, receiver = (damaged(text, texts, rng) if rng.random() < 0.3 else text for text in texts)
     names = [f"station-{channel}" for channel in (1, 4)]
-    whole = [heard.record_of(station) for station in HEARD]
+    whole = [heard.station_record(station) for station in HEARD]
     entries = [text.encode() for record in whole for text in record.values()]
     path = folder / "run.mcap"
     with SessionWriter(path, system="lighthouse", overwrite=True) as writer:
@@ -415,7 +415,7 @@ def records(rng: np.random.Generator, folder: Path, further: bool) -> None:
     session = Session.open(path, damaged_ok=True)
     info_lighthouse.recording(session)
     info_lighthouse.station_table(info_lighthouse.recording(session)["stations"])
-    observations.read_heard(session)
+    observations.read_station_reports(session)
     observations.read_receivers(session)
 
 

@@ -13,6 +13,11 @@ from matplotlib.collections import PolyCollection
 from matplotlib.text import Text
 
 from locatk.core.geometry import Similarity, quaternion_from_heading
+from locatk.core.landmarks.drawing.floor_bars import (
+    MAX_DRAWN_LANDMARKS,
+    bars_on_floor,
+    cells_near,
+)
 from locatk.core.landmarks.drawing.landmark import bar_outlines
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import AsBuiltLandmark, FloorMap
@@ -20,7 +25,6 @@ from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plots.floor import MOST_NAMED, floor_of
-from locatk.formats.plots.floor_bars import MOST_LANDMARKS, bars_on_floor, cells_near
 from locatk.formats.plots.solution import draw
 
 FLOOR = FloorMap(np.array([[7, -1], [12, 5]]), origin_m=(1.0, -2.0))
@@ -153,7 +157,7 @@ def test_other_systems_have_no_floor() -> None:
 
 def test_of_a_large_floor_only_what_is_near_is_drawn() -> None:
     large = FloorMap(np.full((60, 60), 3), origin_m=(1.0, -2.0))
-    assert len(large.cells()) > MOST_LANDMARKS
+    assert len(large.cells()) > MAX_DRAWN_LANDMARKS
     path = solution(large, []).trajectories[0].position
     near = cells_near(large, [path, np.full((1, 3), np.nan)])
     assert set(near) == {(row, column) for row in range(4) for column in range(5)}

@@ -26,8 +26,7 @@ from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.report import signals, signals_drawing, signals_lighthouse, signals_reading
 from locatk.formats.report.panel import Panel
-from locatk.formats.sessions import frames, halls, observations
-from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.sessions import field_samples, frames, observations
 from locatk.formats.sessions.reader import Session
 
 START_NS = 1_767_225_600_000_000_000
@@ -65,7 +64,7 @@ def lighthouse(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Solut
 def polaris(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Solution]:
     made = polaris_simulate.simulate()
     path = tmp_path_factory.mktemp("signals") / "run.mcap"
-    arrays.write_session(path, [made.samples], tags=made.tags)
+    field_samples.write_magnetometers(path, [made.samples], tags=made.tags)
     return Session.open(path), polaris_solver.solve([made.samples], made.tags)
 
 
@@ -96,7 +95,7 @@ def hall_session(path: Path, n: int = 30_000, device: str = "robot") -> tuple[Se
     field = 1e-6 * np.sin(np.arange(n))[:, None] * np.ones(4)
     field[n // 3, 1] = 0.031
     time_ns = START_NS + np.arange(n) * 5_000_000
-    halls.write_session(path, [HallSamples(device, HallSensors(), time_ns, field)])
+    field_samples.write_halls(path, [HallSamples(device, HallSensors(), time_ns, field)])
     return Session.open(path), field
 
 
@@ -244,7 +243,7 @@ def test_a_dead_sensor_and_a_short_recording_are_drawn(tmp_path: Path) -> None:
     made = polaris_simulate.simulate().samples
     field = made.field_t[:30].copy()
     field[:, 4] = np.nan
-    arrays.write_session(
+    field_samples.write_magnetometers(
         tmp_path / "run.mcap", [Samples("bar", made.array, made.time_ns[:30], field)]
     )
     nothing = Solution("polaris", "joint", ())
@@ -277,7 +276,7 @@ def test_names_of_sensors_are_no_html(tmp_path: Path) -> None:
     sensors = HallSensors(names=("<b>x</b>", "b", "c", "d"))
     time_ns = START_NS + np.arange(50) * 5_000_000
     samples = HallSamples("robot", sensors, time_ns, np.zeros((50, 4)))
-    halls.write_session(tmp_path / "run.mcap", [samples])
+    field_samples.write_halls(tmp_path / "run.mcap", [samples])
     bad = landmark(0.1, refused="<i>why</i>", pattern="<u>")
     for panel in signals.panels(Session.open(tmp_path / "run.mcap"), landmarks_solution(bad)):
         text = panel.figure.to_json()
@@ -332,7 +331,7 @@ def test_a_large_recording_is_drawn_in_parts_and_says_so(
     n = 400_000
     time_ns = START_NS + np.arange(n) * 5_000_000
     field = 1e-3 * rng.normal(size=(n, 4))
-    halls.write_session(
+    field_samples.write_halls(
         tmp_path / "run.mcap", [HallSamples("robot", HallSensors(), time_ns, field)]
     )
     session = Session.open(tmp_path / "run.mcap")
@@ -399,7 +398,7 @@ def test_many_devices_are_named_where_they_are_not_drawn(tmp_path: Path) -> None
     samples = [
         HallSamples(f"robot-{k}", HallSensors(), time_ns, np.zeros((50, 4))) for k in range(6)
     ]
-    halls.write_session(tmp_path / "run.mcap", samples)
+    field_samples.write_halls(tmp_path / "run.mcap", samples)
     found = signals.panels(Session.open(tmp_path / "run.mcap"), Solution("landmarks", "field", ()))
     assert len(found) == signals_reading.MOST_DEVICES
     assert "Not drawn: robot-4, robot-5." in found[0].note

@@ -1,5 +1,6 @@
-"""Solutions and sessions as Foxglove, Lichtblick, Rerun and PlotJuggler get them: with the stock
-reader and decoder alone, nothing of locatk's own reading."""
+"""Solutions and sessions for Foxglove, Lichtblick, Rerun and PlotJuggler.
+
+They are read with the reader and decoder of mcap, as these viewers do it."""
 
 from __future__ import annotations
 
@@ -28,9 +29,7 @@ from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-from locatk.formats.sessions import foxglove as viewers
-from locatk.formats.sessions import frames
-from locatk.formats.sessions import point_clouds as viewer_points
+from locatk.formats.sessions import foxglove, frames
 from locatk.formats.sessions.solutions import write_solution
 
 START_NS = 1_700_000_000_000_000_000
@@ -158,7 +157,7 @@ def test_schemas_are_those_that_viewers_know(solved: tuple[str, Path]) -> None:
         assert (folder / f"{schema.removeprefix('foxglove.')}_pb2.py").exists()
 
 
-def test_all_that_is_drawn_hangs_on_one_frame(solved: tuple[str, Path]) -> None:
+def test_all_entities_are_connected_to_one_frame(solved: tuple[str, Path]) -> None:
     """Transforms form one tree, whose root is the frame of the artifact, the paths, the poses."""
     system, path = solved
     found = look(path)
@@ -190,7 +189,7 @@ def test_the_scene_shows_the_artifact(solved: tuple[str, Path]) -> None:
     assert first.topic == "/scene"  # there before the first pose
 
 
-def test_poses_move_and_logs_tell(solved: tuple[str, Path]) -> None:
+def test_poses_and_logs_are_shown(solved: tuple[str, Path]) -> None:
     _, path = solved
     found = look(path)
     for device in ("red", "blue"):
@@ -236,29 +235,31 @@ def test_points_show_path_and_artifact(solved: tuple[str, Path]) -> None:
         assert np.allclose([low, high], [[0, 0.5, 0], [0.5, 1, 2]])
     elif system == "dots":  # the paper
         assert np.allclose([low, high], [[0, 0, 0], [0.21, 0.297, 0]], atol=1e-6)
+        outline = artifact[: foxglove.POINTS_PER_LINE]
+        assert outline[0] == outline[-1]  # it is closed
     elif system == "polaris":
-        assert len(artifact) == 2 * (5 + viewer_points.POINTS_A_LINE)
+        assert len(artifact) == 2 * (5 + foxglove.POINTS_PER_LINE)
     elif system == "landmarks":
         assert len(artifact) == 16  # bars
 
 
 def test_a_device_named_as_its_frame_has_a_frame_of_its_own() -> None:
     each = track("map", "map")
-    [transform, *_] = [message for *_, message in viewers.transforms("/tf", each)]
+    [transform, *_] = [message for *_, message in foxglove.transforms("/tf", each)]
     assert (transform.parent_frame_id, transform.child_frame_id) == ("map", "map_body")
 
 
-def test_sheets_whose_places_are_not_known_are_frames_apart() -> None:
+def test_sheets_of_unknown_position_have_separate_frames() -> None:
     """Nothing tells where one lies against the other, so nothing is claimed."""
-    scene = viewers.scene_update(TILES, [], START_NS)
+    scene = foxglove.scene_update(TILES, [], START_NS)
     assert {entity.id: entity.frame_id for entity in scene.entities} == {
         "sheet/a": "a",
         "sheet/b": "floor",
     }
-    assert set(viewer_points.artifact_points(scene, START_NS)) == {"a", "floor"}
+    assert set(foxglove.artifact_points(scene, START_NS)) == {"a", "floor"}
 
 
-def test_without_poses_the_artifact_is_there(tmp_path: Path) -> None:
+def test_the_artifact_is_shown_without_poses(tmp_path: Path) -> None:
     path = tmp_path / "solved.mcap"
     nothing = Trajectory.from_positions("red", "floor", np.zeros(0, np.int64), np.zeros((0, 3)))
     write_solution(path, Solution("lighthouse", "paper", (nothing,), {}, (), SCENE), source="run")
@@ -302,7 +303,7 @@ def record(folder: Path, shot: frames.Shot) -> list[Seen]:
     return look(path)
 
 
-def test_the_layout_asks_for_what_there_is(solved: tuple[str, Path], root: Path) -> None:
+def test_the_layout_refers_to_existing_topics(solved: tuple[str, Path], root: Path) -> None:
     """docs/locatk-layout.json: panels in their places, topics and fields of solutions."""
     _, path = solved
     layout = json.loads((root / "docs" / "locatk-layout.json").read_text())
@@ -325,7 +326,9 @@ def test_the_layout_asks_for_what_there_is(solved: tuple[str, Path], root: Path)
         assert isinstance(value, float)
 
 
-def test_rerun_makes_archetypes_of_it(solved: tuple[str, Path], tmp_path: Path) -> None:
+def test_rerun_converts_the_messages_to_archetypes(
+    solved: tuple[str, Path], tmp_path: Path
+) -> None:
     """Where `rerun` is: paths and artifacts become points, poses and transforms are understood."""
     system, path = solved
     folder = os.environ.get("LOCATK_RERUN")

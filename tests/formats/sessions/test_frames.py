@@ -1,4 +1,4 @@
-"""Camera frames in sessions: nothing is changed, nothing is held, nothing is lost silently."""
+"""Camera frames in sessions: stored unchanged, read on access, errors reported."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
 from locatk.formats import images
-from locatk.formats.sessions import frames, mcap_records, observations
+from locatk.formats.sessions import frames, mcap_file, observations
 from locatk.formats.sessions.frames import Shot
 from locatk.formats.sessions.reader import Session
 
@@ -51,7 +51,7 @@ def read(path: Path) -> list[Frames]:
 # ---- round trips
 
 
-def test_frames_come_back_as_they_were(tmp_path: Path) -> None:
+def test_frames_are_restored(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     left, right = camera_frames(90, "left"), camera_frames(60, "right", 10**9 + 7)
     place = np.arange(6.0).reshape(2, 3)
@@ -74,7 +74,7 @@ def test_frames_come_back_as_they_were(tmp_path: Path) -> None:
     assert session.facts["system"] == "dots"
 
 
-def test_any_frame_can_be_asked_for_in_any_order(tmp_path: Path) -> None:
+def test_frames_are_read_in_any_order(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     given_ = camera_frames(130)  # three chunks
     frames.write_session(path, [given_], MANIFEST)
@@ -88,21 +88,21 @@ def test_any_frame_can_be_asked_for_in_any_order(tmp_path: Path) -> None:
         found.images[130]
 
 
-def test_opening_reads_no_image_and_a_walk_unpacks_each_chunk_once(
+def test_opening_reads_no_image_and_iteration_decompresses_each_chunk_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A session of any length is read with the memory of one chunk."""
     path = tmp_path / "run.mcap"
     frames.write_session(path, [camera_frames(130)], MANIFEST)
     unpacked: list[int] = []
-    unpack = mcap_records.unpacked
+    unpack = mcap_file.read_segment
 
     def counted(stream, segment):  # type: ignore[no-untyped-def]
         data = unpack(stream, segment)
         unpacked.append(len(data))
         return data
 
-    monkeypatch.setattr(mcap_records, "unpacked", counted)
+    monkeypatch.setattr(mcap_file, "read_segment", counted)
     (found,) = read(path)
     assert unpacked == []
     for _ in found.images:
@@ -111,7 +111,7 @@ def test_opening_reads_no_image_and_a_walk_unpacks_each_chunk_once(
     assert max(unpacked) < 2 << 20
 
 
-def test_other_readers_see_the_same(tmp_path: Path) -> None:
+def test_the_library_reads_the_same_frames(tmp_path: Path) -> None:
     """The stock reader of MCAP and OpenCV, which share nothing with ours."""
     path = tmp_path / "run.mcap"
     given_ = camera_frames(3)
@@ -131,7 +131,7 @@ def test_other_readers_see_the_same(tmp_path: Path) -> None:
     assert set(attached) == {"sheet.toml", "camera.toml", "frames.json"}
 
 
-def test_files_are_kept_byte_by_byte(tmp_path: Path) -> None:
+def test_image_files_are_stored_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     (picture,) = noise(1)
     data = {kind: cv2.imencode(f".{kind}", picture)[1].tobytes() for kind in ("png", "jpeg")}
@@ -147,7 +147,7 @@ def test_files_are_kept_byte_by_byte(tmp_path: Path) -> None:
     assert found.names == ("1", "2")
 
 
-def test_numbers_need_no_list_of_names(tmp_path: Path) -> None:
+def test_frame_numbers_are_not_listed_as_names(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     frames.write_shots(path, {"c": [Shot(n, str(n), noise(1)[0]) for n in range(3)]})
     session = Session.open(path)
@@ -156,13 +156,13 @@ def test_numbers_need_no_list_of_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["caf\u00e9 \u2603.png", "a\udce9.png", 'quote".png', "new\nline"])
-def test_names_of_any_kind(tmp_path: Path, name: str) -> None:
+def test_frame_names_of_any_kind(tmp_path: Path, name: str) -> None:
     path = tmp_path / "run.mcap"
     frames.write_shots(path, {"c": [Shot(1, name, noise(1)[0])]})
     assert read(path)[0].names == (name,)
 
 
-def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
+def test_equal_frames_give_equal_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         frames.write_session(tmp_path / name, [camera_frames(5)], MANIFEST, camera=CAMERA)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -173,7 +173,7 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-0.95, 0.95), st.floats(100, 3000), st.floats(60, 127), st.floats(40, 79))
-def test_viewers_are_told_the_camera_truly_or_not_at_all(
+def test_the_camera_model_for_viewers_is_accurate_or_left_out(
     bend: float, focal: float, x: float, y: float
 ) -> None:
     """OpenCV's model with what is written puts points where ours has them."""
@@ -225,7 +225,7 @@ def test_two_cameras_of_one_name_and_no_frames(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_session_without_frames_says_so(tmp_path: Path) -> None:
+def test_a_session_without_frames_is_an_error(tmp_path: Path) -> None:
     from locatk.formats.sessions.writer import SessionWriter
 
     with SessionWriter(tmp_path / "run.mcap", system="dots"):
@@ -235,7 +235,7 @@ def test_a_session_without_frames_says_so(tmp_path: Path) -> None:
     assert "locatk import images" in (caught.value.hint or "")
 
 
-def test_a_damaged_chunk_costs_its_own_frames_only(tmp_path: Path) -> None:
+def test_a_damaged_chunk_affects_only_its_frames(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     frames.write_session(path, [camera_frames(130)], MANIFEST)
     segments = Session.open(path).index.segments
@@ -256,7 +256,7 @@ def test_a_damaged_chunk_costs_its_own_frames_only(tmp_path: Path) -> None:
         readable += 1
     assert 130 * 0.3 < readable < 130 * 0.9
     (message,) = messages
-    assert "wrong checksum" in message or "cannot be unpacked" in message
+    assert "wrong checksum" in message or "cannot be decompressed" in message
     assert str(path) in message
 
 
@@ -286,7 +286,7 @@ def test_a_frame_that_cannot_be_read_is_named(
     assert (caught.value.file, caught.value.where) == (str(path), "/camera/c")
 
 
-def test_names_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_invalid_frame_names_are_refused(tmp_path: Path) -> None:
     from locatk.formats.sessions.writer import SessionWriter
 
     raw = RawImage(width=1, height=1, step=1, encoding="mono8", data=b"a")
@@ -369,7 +369,7 @@ def test_colour_becomes_luminance(extension: str) -> None:
 
 @pytest.mark.parametrize("extension", [".png", ".tiff"])
 @pytest.mark.parametrize("depth", [np.uint8, np.uint16])
-def test_what_is_transparent_lies_over_white(extension: str, depth: type) -> None:
+def test_transparent_pixels_are_blended_with_white(extension: str, depth: type) -> None:
     top = np.iinfo(depth).max
     picture = np.zeros((2, 3, 4), depth)
     picture[0, :, 3] = [0, top // 2, top]
@@ -388,7 +388,7 @@ def test_sixteen_bit_files_keep_their_bits(extension: str) -> None:
     np.testing.assert_array_equal(images.grey(pixels), deep >> 4)
 
 
-def test_twelve_bits_of_colour_are_not_thrown_away() -> None:
+def test_twelve_bits_of_colour_are_kept() -> None:
     """In 16 bits they are almost black; the upper 8 bits alone would leave 16 greys."""
     deep = noise(1, (120, 188, 3), np.uint16)[0] >> 4
     data = cv2.imencode(".png", deep)[1].tobytes()
@@ -396,7 +396,7 @@ def test_twelve_bits_of_colour_are_not_thrown_away() -> None:
     assert np.abs(images.grey(images.decode(data).pixels).astype(int) - theirs).max() <= 1
 
 
-def test_one_bit_a_pixel() -> None:
+def test_one_bit_per_pixel() -> None:
     from PIL import Image
 
     bits = noise(1)[0] > 127
@@ -408,7 +408,7 @@ def test_one_bit_a_pixel() -> None:
 
 
 @pytest.mark.parametrize("extension", KINDS)
-def test_no_cut_file_passes_for_a_whole_one(extension: str) -> None:
+def test_truncated_image_files_are_errors(extension: str) -> None:
     (picture,) = noise(1, (40, 60))
     data = cv2.imencode(extension, picture)[1].tobytes()
     whole = images.grey(images.decode(data).pixels)

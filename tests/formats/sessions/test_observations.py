@@ -1,4 +1,4 @@
-"""Observations and solutions: exact through a file, and readable by others."""
+"""Observations and solutions: exact round trips, and files that other tools read."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_sweeps_round_trip(tmp_path: Path, n: int, batch_ns: int) -> None:
 
 
 def test_batches_are_bounded_in_time_and_number() -> None:
-    sweeps = make_sweeps(20_000)
+    sweeps = make_sweeps(5000)
     for batch_ns, most in ((20_000_000, 1024), (10**15, 1024)):
         for time_ns, topic, message in observations.sweep_messages(sweeps, batch_ns=batch_ns):
             assert isinstance(message, LighthouseSweep)
@@ -136,12 +136,13 @@ def test_batches_are_bounded_in_time_and_number() -> None:
             assert message.time_ns[-1] - time_ns < batch_ns
             assert message.timestamp.ToNanoseconds() == time_ns
     many = list(observations.sweep_messages(sweeps, batch_ns=10**15))
-    assert len(many) < 30
+    assert len(many) < 10
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), n=st.integers(1, 60), batch_ns=st.integers(1, 10**10))
-def test_any_sweeps_survive_a_file(data: st.DataObject, n: int, batch_ns: int) -> None:
+def test_sweeps_of_any_values_are_restored(data: st.DataObject, n: int, batch_ns: int) -> None:
     def draw(dtype: type, elements: st.SearchStrategy[int | float]) -> np.ndarray:
         return data.draw(hnp.arrays(dtype, n, elements=elements))
 
@@ -164,6 +165,7 @@ def test_any_sweeps_survive_a_file(data: st.DataObject, n: int, batch_ns: int) -
         assert rows(observations.read_sweeps(Session.open(path))) == rows(sweeps)
 
 
+@settings(max_examples=25, deadline=None)
 @given(
     st.integers(0, 5).flatmap(
         lambda n: st.tuples(
@@ -171,7 +173,7 @@ def test_any_sweeps_survive_a_file(data: st.DataObject, n: int, batch_ns: int) -
         )
     )
 )
-def test_every_wire_form_of_protobuf_is_read(values: tuple[list[int], ...]) -> None:
+def test_every_encoding_of_protobuf_is_read(values: tuple[list[int], ...]) -> None:
     """Unpacked, in pieces, in another order, with fields of a later version."""
     times, sensors, channels = values
     n = len(times)
@@ -213,6 +215,7 @@ def test_every_wire_form_of_protobuf_is_read(values: tuple[list[int], ...]) -> N
     assert batches.columns["count"].tolist() == [0.5] * n * len(forms)
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.binary(max_size=200))
 def test_garbage_is_a_batch_or_an_error(payload: bytes) -> None:
     try:
@@ -223,6 +226,7 @@ def test_garbage_is_a_batch_or_an_error(payload: bytes) -> None:
     assert lengths == {int(batches.counts[0])}
 
 
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 7))
 def test_a_flipped_bit_of_a_batch_is_a_batch_or_an_error(place: int, bit: int) -> None:
     payload = bytearray(next(observations.sweep_messages(make_sweeps(50)))[2].SerializeToString())
@@ -255,7 +259,7 @@ def test_values_out_of_range_are_refused(tmp_path: Path, name: str, value: int) 
         observations.read_sweeps(Session.open(path))
 
 
-def test_a_file_without_sweeps_says_what_it_holds(tmp_path: Path) -> None:
+def test_the_error_of_a_file_without_sweeps_lists_its_topics(tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     with open(other, "wb") as stream:
         writer = mcap.writer.Writer(stream)
@@ -279,8 +283,8 @@ def test_a_file_without_sweeps_says_what_it_holds(tmp_path: Path) -> None:
 
 def test_session_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    sweeps = make_sweeps(3000)
-    truth = [make_trajectory(2500), make_trajectory(1, "G", 1)]
+    sweeps = make_sweeps(2000)
+    truth = [make_trajectory(1100), make_trajectory(1, "G", 1)]
     heading = np.linspace(-3, 3, 50)
     flat = Trajectory(
         "R",
@@ -332,7 +336,7 @@ def test_session_round_trip(tmp_path: Path) -> None:
     assert again.read_bytes() == path.read_bytes()
 
 
-def test_plain_session_has_none_of_the_rest(tmp_path: Path) -> None:
+def test_a_session_without_reference_data(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     observations.write_session(path, system="lighthouse", sweeps=make_sweeps(10))
     session = Session.open(path)
@@ -343,7 +347,7 @@ def test_plain_session_has_none_of_the_rest(tmp_path: Path) -> None:
         observations.read_trajectories(path)
 
 
-def test_bad_sessions_leave_nothing(tmp_path: Path) -> None:
+def test_invalid_sessions_leave_no_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     twice = [make_trajectory(3), make_trajectory(3)]
     with pytest.raises(InputError, match="two truth"):
@@ -399,7 +403,7 @@ def test_solution_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_solution_as_others_see_it(tmp_path: Path) -> None:
+def test_the_library_reads_solutions(tmp_path: Path) -> None:
     """With the stock reader and decoder: every topic of docs/formats.md."""
     path = tmp_path / "solved.mcap"
     wanted = solution()
@@ -458,7 +462,7 @@ def test_a_solution_without_poses(tmp_path: Path) -> None:
     assert observations.read_solution(path) == nothing
 
 
-def test_a_session_is_no_solution(tmp_path: Path) -> None:
+def test_a_session_is_not_a_solution(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     observations.write_session(path, system="lighthouse", sweeps=make_sweeps(10))
     with pytest.raises(FormatError, match="no solution") as caught:
@@ -469,7 +473,7 @@ def test_a_session_is_no_solution(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", [b"", b"[]", b"{}", b'{"version": 1}', b'{"version": "x"}', b'{"version": 99}', b"\xff"]
 )
-def test_a_damaged_statement(tmp_path: Path, text: bytes) -> None:
+def test_a_damaged_solution_record(tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "solved.mcap"
     with SessionWriter(path, kind="solution", system="lighthouse") as writer:
         writer.attach("solution.json", text, "application/json")
@@ -479,12 +483,12 @@ def test_a_damaged_statement(tmp_path: Path, text: bytes) -> None:
 
 def test_poses_of_another_tool(tmp_path: Path) -> None:
     """PoseInFrame of anybody serves as truth and as estimate."""
-    from locatk.formats.sessions import foxglove as viewers
+    from locatk.formats.sessions import foxglove
 
     track = make_trajectory(20)
     path = tmp_path / "other.mcap"
     with SessionWriter(path, system="lighthouse") as writer:
-        for time_ns, topic, message in reversed(list(viewers.poses("/truth/R", track))):
+        for time_ns, topic, message in reversed(list(foxglove.poses("/truth/R", track))):
             writer.write(topic, message, time_ns)
             writer.write("/pose/R", message, time_ns)
     (truth,) = observations.read_truth(Session.open(path))

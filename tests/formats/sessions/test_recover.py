@@ -1,11 +1,14 @@
-"""Salvaged recordings: every whole chunk of any damage, nothing altered, and honest about it."""
+"""Recovery of damaged recordings: every intact chunk is saved, unchanged, and losses are listed."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import random
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import mcap.reader
 import mcap.writer
@@ -21,11 +24,11 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from locatk.core.errors import FormatError, LocatkError, MissingDataError, OutputExistsError
 from locatk.formats.schemas.magnetics_pb2 import MagnetometerArray
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions.mcap_records import MAGIC, frames
+from locatk.formats.sessions.mcap_file import MAGIC, iter_records
 from locatk.formats.sessions.messages import timestamp
 from locatk.formats.sessions.reader import Session
-from locatk.formats.sessions.recovery import rewriting as mcap_rewrite
-from locatk.formats.sessions.recovery.recover import Recovered, left_in, recover
+from locatk.formats.sessions.recovery import recover as recovery
+from locatk.formats.sessions.recovery.recover import Recovered, Rewriter, recover
 
 START_NS = 1_700_000_000_000_000_000
 CHUNKS = 24
@@ -43,11 +46,16 @@ Flat = tuple[str, int, int, int, bytes]
 
 
 def write(
-    path: Path, *, chunks: int = CHUNKS, finish: bool = True, told: bool = False, **options: object
+    path: Path,
+    *,
+    chunks: int = CHUNKS,
+    finish: bool = True,
+    listed: bool = False,
+    **options: object,
 ) -> None:
     """A recording as `locatk capture` makes it: small chunks, one after the other.
 
-    With ``told``, its channels stand in the metadata record ``channels`` as well; ``options``
+    With ``listed``, its channels stand in the metadata record ``channels`` as well; ``options``
     are those of the stock writer.
     """
     noise = random.Random(7)
@@ -62,7 +70,7 @@ def write(
             files = build_file_descriptor_set(kind).SerializeToString()
             schema = writer.register_schema(name, "protobuf", files)
             channels[topic] = writer.register_channel(topic, "protobuf", schema)
-            if told:
+            if listed:
                 writer.add_metadata("channels", {str(channels[topic]): f"{topic} {name}"})
         offset = 0
         for number in range(chunks):
@@ -126,8 +134,8 @@ def whole(path: Path) -> Whole:
     """The recording at ``path``, taken apart."""
     data = path.read_bytes()
     spans: dict[int, list[tuple[int, int]]] = {}
-    for opcode, offset, content in frames(data[len(MAGIC) : -len(MAGIC)], len(MAGIC)):
-        spans.setdefault(opcode, []).append((offset, offset + 9 + len(content)))
+    for opcode, start, end in iter_records(data[: -len(MAGIC)][len(MAGIC) :], 0):
+        spans.setdefault(opcode, []).append((start + len(MAGIC) - 9, end + len(MAGIC)))
     left = iter(stock(path))
     messages: list[list[Flat]] = []
     with path.open("rb") as stream:
@@ -181,7 +189,7 @@ def check(
     assert damaged.read_bytes() == data
     if result is None:
         # The first chunk says what the messages are; that may be left nowhere else.
-        assert not intact or (0 not in intact and "that says what" in error)
+        assert not intact or (0 not in intact and "nothing identifies" in error)
         assert "\n" not in error
         assert not output.exists()
         return None
@@ -301,7 +309,7 @@ def test_zeros_holes_and_garbage(good: Whole, tmp_path: Path, seed: int) -> None
 # ---- whole files, killed recordings, other tools
 
 
-def test_a_whole_file_stays_as_it_is(good: Whole, tmp_path: Path) -> None:
+def test_an_undamaged_file_is_copied(good: Whole, tmp_path: Path) -> None:
     result = check(good, good.data, tmp_path)
     assert result is not None
     assert result.complete
@@ -332,7 +340,7 @@ def test_attachments_stay_between_their_messages(good: Whole, tmp_path: Path) ->
     assert before[: len(before) // 2] == before[len(before) // 2 :]
 
 
-def test_stock_decoders_read_it(good: Whole, tmp_path: Path) -> None:
+def test_the_library_decodes_the_output(good: Whole, tmp_path: Path) -> None:
     check(good, good.data[: len(good.data) // 2], tmp_path)
     with (tmp_path / "out.mcap").open("rb") as stream:
         reader = mcap.reader.make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -346,7 +354,7 @@ def test_stock_decoders_read_it(good: Whole, tmp_path: Path) -> None:
 def test_a_killed_recording(good: Whole, tmp_path: Path) -> None:
     """Nothing is lost but the end; that it has none is said."""
     killed = tmp_path / "killed.mcap"
-    write(killed, finish=False, told=True)
+    write(killed, finish=False, listed=True)
     result = recover(killed, tmp_path / "out.mcap")
     assert stock(tmp_path / "out.mcap") == good.flat
     assert (result.complete, result.ended, result.tail, result.losses) == (False, False, 0, ())
@@ -357,7 +365,7 @@ def test_a_killed_recording(good: Whole, tmp_path: Path) -> None:
     assert (result.messages, result.tail) == (len(good.flat), 31)
 
 
-def test_bytes_that_are_missing(good: Whole, tmp_path: Path) -> None:
+def test_missing_bytes_are_counted(good: Whole, tmp_path: Path) -> None:
     """Told by the offsets of what is left; at the start only where that is known."""
 
     def missing(numbers: list[int], data: bytes = good.data) -> int | None:
@@ -376,7 +384,7 @@ def test_bytes_that_are_missing(good: Whole, tmp_path: Path) -> None:
     assert missing([0], good.data.replace(b"capture", b"copture")) == 0
 
 
-def test_lost_messages_are_counted_where_the_index_is_left(good: Whole, tmp_path: Path) -> None:
+def test_lost_messages_are_counted_if_the_index_is_intact(good: Whole, tmp_path: Path) -> None:
     damaged = bytearray(good.data)
     damaged[good.chunks[7][0] + 100] ^= 1
     damaged[good.attachments[1][0] + 100] ^= 1
@@ -396,16 +404,18 @@ def test_lost_messages_are_counted_where_the_index_is_left(good: Whole, tmp_path
     assert (result.lost_messages, result.lost_attachments) == (None, None)
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_the_chunk_that_names_the_channels_is_lost(good: Whole, tmp_path: Path, told: bool) -> None:
+@pytest.mark.parametrize("listed", [False, True])
+def test_the_chunk_that_defines_the_channels_is_lost(
+    good: Whole, tmp_path: Path, listed: bool
+) -> None:
     path, output = tmp_path / "killed.mcap", tmp_path / "out.mcap"
-    write(path, finish=False, told=told)
+    write(path, finish=False, listed=listed)
     data = bytearray(path.read_bytes())
     start = data.index(good.data[good.chunks[0][0] : good.chunks[0][1]])
     data[start + 100] ^= 1
     path.write_bytes(data)
-    if not told:
-        with pytest.raises(FormatError, match=r"what its \d+ messages are"):
+    if not listed:
+        with pytest.raises(FormatError, match=r"channels of all its \d+ messages"):
             recover(path, output)
         assert sorted(tmp_path.iterdir()) == [path]
         return
@@ -414,8 +424,9 @@ def test_the_chunk_that_names_the_channels_is_lost(good: Whole, tmp_path: Path, 
     assert (result.orphans, result.nameless) == (0, ())
     session = Session.open(output)
     assert len(list(session.decoded("/serial/bar", SerialChunk))) == 10 * (CHUNKS - 1)
-    assert left_in(path, "broken").damage == "broken"
-    assert left_in(path, "broken").channels[0].schema == "locatk.SerialChunk"
+    rest = Session.open(path, damaged_ok=True)
+    assert rest.damage
+    assert rest.channels[0].schema == "locatk.SerialChunk"
     named = session.metadata()["channels"]
     channels = {str(each.id): each.topic for each in session.index.channels.values()}
     assert {key: text.split()[0] for key, text in named.items()} == channels
@@ -431,14 +442,16 @@ def test_the_chunk_that_names_the_channels_is_lost(good: Whole, tmp_path: Path, 
         {"9" * 5000: "/a locatk.SerialChunk", "²": "/a locatk.SerialChunk"},
     ],
 )
-def test_names_that_name_nothing(good: Whole, tmp_path: Path, names: dict[str, str]) -> None:
+def test_invalid_channel_records_are_ignored(
+    good: Whole, tmp_path: Path, names: dict[str, str]
+) -> None:
     with (tmp_path / "a.mcap").open("wb") as stream:
         writer = mcap.writer.Writer(stream)
         writer.start()
         writer.add_metadata("channels", names)
         start, end = good.chunks[1]
         stream.write(good.data[start:end])
-    with pytest.raises(FormatError, match="messages are"):
+    with pytest.raises(FormatError, match="channels of all its"):
         recover(tmp_path / "a.mcap", tmp_path / "out.mcap")
 
 
@@ -515,43 +528,51 @@ def test_files_without_a_recording(tmp_path: Path, data: bytes) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_cannot_be_read_back_does_not_appear(
-    good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("position", [5000, -60], ids=["data", "index"])
+def test_an_output_that_cannot_be_read_back_is_removed(
+    good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, position: int
 ) -> None:
-    """A disk that keeps something else."""
+    """The disk stores other bytes than were written."""
     path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
     path.write_bytes(good.data)
-    read_back = mcap_rewrite.check
+    read_back = recovery.verify
 
-    def rotten(part: str, copy: mcap_rewrite.Copy) -> None:
-        with open(part, "r+b") as stream:
-            stream.seek(5000)
+    def rotten(written: IO[bytes], rewriter: Rewriter) -> None:
+        with open(written.name, "r+b") as stream:
+            stream.seek(position, os.SEEK_END if position < 0 else os.SEEK_SET)
             stream.write(b"rotten")
-        read_back(part, copy)
+        read_back(written, rewriter)
 
-    monkeypatch.setattr(mcap_rewrite, "check", rotten)
+    monkeypatch.setattr(recovery, "verify", rotten)
     with pytest.raises(LocatkError, match="cannot be read back") as caught:
         recover(path, output)
     assert caught.value.exit_status == 1
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_changes_meanwhile(
+def test_a_file_that_changes_during_recovery(
     good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
-    register = mcap_rewrite.Copy._register
+    register = Rewriter._register
 
-    def change(copy: mcap_rewrite.Copy, channel: object) -> None:
-        path.write_bytes(path.read_bytes()[:20_000])
-        register(copy, channel)  # type: ignore[arg-type]
+    def change_before_registration(change: Callable[[bytes], bytes]) -> None:
+        def changed(rewriter: Rewriter, channel: object) -> None:
+            path.write_bytes(change(path.read_bytes()))
+            register(rewriter, channel)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(mcap_rewrite.Copy, "_register", change)
-    for options in ({}, {"use_chunking": False}):
-        write(path, **options)
-        with pytest.raises(FormatError):
-            recover(path, output)
-        assert list(tmp_path.iterdir()) == [path]
+        monkeypatch.setattr(Rewriter, "_register", changed)
+
+    for change in (
+        lambda data: data[:20_000],
+        lambda data: data[:20_000] + b"\xff" * (len(data) - 20_000),
+    ):
+        change_before_registration(change)
+        for options in ({}, {"use_chunking": False}):
+            write(path, **options)
+            with pytest.raises(FormatError):
+                recover(path, output)
+            assert list(tmp_path.iterdir()) == [path]
 
 
 # ---- any damage at all
@@ -568,11 +589,12 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     path = tmp_path_factory.mktemp("small") / "run.mcap"
     contents = []
     for options in SMALL:
-        write(path, told=True, **options)  # type: ignore[arg-type]
+        write(path, listed=True, **options)  # type: ignore[arg-type]
         contents.append(path.read_bytes())
     return contents
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     which=st.integers(0, len(SMALL) - 1),

@@ -1,4 +1,4 @@
-"""What is believed of a damaged file, and what is not."""
+"""Records of damaged files that are accepted or rejected."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from locatk.formats.sessions.mcap_records import MAGIC, frames, read_messages
-from locatk.formats.sessions.recovery import validation as mcap_proof
+from locatk.formats.sessions.mcap_file import MAGIC, iter_records, read_messages
+from locatk.formats.sessions.recovery import validation
 from locatk.formats.sessions.recovery.salvage import Loss, Salvage, salvage
 
 NONE = mcap.writer.CompressionType.NONE
@@ -56,8 +56,8 @@ def spans(data: bytes, kind: Opcode) -> list[tuple[int, int]]:
     """(start, end) of the records of one kind in a whole file."""
     inside = data[len(MAGIC) : -len(MAGIC) if data.endswith(MAGIC) else len(data)]
     return [
-        (offset, offset + 9 + len(content))
-        for opcode, offset, content in frames(inside, len(MAGIC))
+        (start + len(MAGIC) - 9, end + len(MAGIC))
+        for opcode, start, end in iter_records(inside, 0)
         if opcode == kind
     ]
 
@@ -79,10 +79,10 @@ def times(data: bytes) -> tuple[Salvage, list[int]]:
 ALL = [0, 1, 100, 101, 200, 201]
 
 
-def test_a_whole_file_is_whole() -> None:
+def test_an_undamaged_file_has_no_losses() -> None:
     found, left = times(file(extra=attach("a.txt", b"abc")))
     assert left == ALL
-    assert (found.losses, found.beside, found.copies, found.tail) == ([], [], 0, 0)
+    assert (found.losses, found.index_losses, found.copies, found.tail) == ([], [], 0, 0)
     assert found.ended
     assert found.statistics is not None
     assert found.index.header.library == "tests"
@@ -90,7 +90,7 @@ def test_a_whole_file_is_whole() -> None:
     assert [entry.name for entry in found.index.attachments] == ["a.txt"] * 3
 
 
-def test_a_chunk_that_is_cut_tells_its_times() -> None:
+def test_the_times_of_a_truncated_chunk_are_reported() -> None:
     data = file()
     start, end = spans(data, Opcode.CHUNK)[1]
     found, left = times(data[: end - 3])
@@ -105,7 +105,7 @@ def test_killed_between_two_records() -> None:
     assert (found.losses, found.ended, found.tail) == ([], False, 0)
 
 
-def test_zeros_are_named() -> None:
+def test_zeros_are_reported_as_such() -> None:
     data = file(finish=False)
     found, left = times(data + bytes(100_000))
     assert left == ALL
@@ -123,7 +123,7 @@ def test_wild_lengths(value: int) -> None:
 
     data = file(extra=extra)
     places = [
-        offset + 1 for opcode, offset, _ in frames(data[8:-8], 8) if opcode != Opcode.DATA_END
+        start for opcode, start, _ in iter_records(data[8:-8], 0) if opcode != Opcode.DATA_END
     ]
     for kind in (Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA):
         start, end = spans(data, kind)[1]
@@ -143,8 +143,8 @@ def chunk(packed: bytes, size: int, crc: int, compression: bytes) -> bytes:
     return struct.pack("<BQ", Opcode.CHUNK, len(head) + len(packed)) + head + packed
 
 
-def test_bombs_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_proof, "LARGEST_RECORD", 1 << 20)
+def test_decompression_bombs_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validation, "MAX_RECORD_BYTES", 1 << 20)
     zeros = bytes(8 << 20)
     writer = zstandard.ZstdCompressor(write_content_size=False)
     for packed, name in (
@@ -194,7 +194,7 @@ def test_an_index_does_not_hide_a_chunk() -> None:
     assert found.losses
 
 
-def test_one_flipped_bit_makes_no_message_of_an_index() -> None:
+def test_an_index_with_a_flipped_bit_is_no_message() -> None:
     data = file()
     for start, _ in spans(data, Opcode.MESSAGE_INDEX):
         damaged = bytearray(data)
@@ -204,7 +204,7 @@ def test_one_flipped_bit_makes_no_message_of_an_index() -> None:
         assert [loss.what for loss in found.losses] == ["message"]
 
 
-def test_copies_are_left_out_and_strays_are_not() -> None:
+def test_copies_are_left_out_and_moved_chunks_are_kept() -> None:
     data = file(extra=attach("a.txt", b"abc"))
     start, end = spans(data, Opcode.CHUNK)[1]
     found, left = times(data + b"garbage" + data[start:])
@@ -227,7 +227,7 @@ def test_a_recording_inside_an_attachment_is_not_searched() -> None:
     assert found.losses == [Loss(start, end, "attachment", "inner.mcap")]
 
 
-def test_zeros_are_no_texts() -> None:
+def test_zeros_are_not_accepted_as_text() -> None:
     """A power cut leaves zeros behind, which are no worse UTF-8 than letters."""
     data = file(extra=lambda writer, _: writer.add_metadata("name", {"key": "some value"}))
     start, end = spans(data, Opcode.METADATA)[2]
@@ -241,7 +241,7 @@ def test_zeros_are_no_texts() -> None:
         assert len(found.index.attachments) == 2
 
 
-def test_two_recordings_one_behind_the_other() -> None:
+def test_two_concatenated_recordings() -> None:
     """Ids of the one are not those of the other."""
     first, second = file(), file(chunks=1, topic="/other")
     found, left = times(first + second)
@@ -255,7 +255,7 @@ def test_two_recordings_one_behind_the_other() -> None:
     assert not found.ended
 
 
-def test_what_was_moved_is_still_verified() -> None:
+def test_a_moved_summary_is_still_verified() -> None:
     """The index at the end says how much there was, even where it is not at its place."""
     data = file()
     start, end = spans(data, Opcode.CHUNK)[1]
@@ -263,6 +263,19 @@ def test_what_was_moved_is_still_verified() -> None:
     assert left == [0, 1, 200, 201]
     assert found.statistics is not None
     assert found.statistics.message_count == 6
+
+
+def test_a_summary_with_a_wrong_checksum_is_ignored() -> None:
+    data = bytearray(file())
+    [(start, _)] = spans(bytes(data), Opcode.STATISTICS)
+    data[start + 9] ^= 2  # the number of messages; all lengths still agree
+    found, left = times(bytes(data))
+    assert left == ALL
+    assert found.statistics is None
+    assert not found.losses
+    assert [(loss.what, loss.end) for loss in found.index_losses] == [
+        ("index", len(data) - len(MAGIC))
+    ]
 
 
 # ---- messages outside chunks
@@ -285,7 +298,7 @@ def test_messages_outside_chunks() -> None:
     assert times(hole)[1] == [0, 100, 101, 200, 201]
 
 
-def test_messages_beside_chunks_are_believed_where_they_are_counted() -> None:
+def test_messages_beside_chunks_are_accepted_if_the_statistics_count_them() -> None:
     data = file(compression=NONE)
     start, end = spans(data, Opcode.CHUNK)[1]
     loose = data[start + 9 + 40 : end]
@@ -303,7 +316,7 @@ def test_a_large_hole(tmp_path: Path) -> None:
     """In blocks, not at once; the hole takes no room on the disk."""
     data = file()
     start, _ = spans(data, Opcode.CHUNK)[2]
-    path, hole = tmp_path / "hole.mcap", 50_000_000
+    path, hole = tmp_path / "hole.mcap", 8_000_000
     with path.open("wb") as stream:
         stream.write(data[:start])
         stream.seek(hole)
@@ -315,7 +328,7 @@ def test_a_large_hole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89", MAGIC, MAGIC * 2, b"a,b\n1,2\n" * 99, bytes(999)])
-def test_what_is_no_recording(data: bytes) -> None:
+def test_files_that_are_no_recording(data: bytes) -> None:
     found, left = times(data)
     assert left == []
     assert not found.metadata

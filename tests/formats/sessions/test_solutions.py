@@ -76,7 +76,7 @@ def rewritten(path: Path, table: dict[str, Any]) -> Path:
 
 
 @pytest.mark.parametrize("solution", SOLUTIONS, ids=lambda each: each.system)
-def test_typed_results_come_back(tmp_path: Path, solution: Solution) -> None:
+def test_typed_results_are_restored(tmp_path: Path, solution: Solution) -> None:
     path = tmp_path / "solved.mcap"
     write_solution(path, solution, source="run.mcap")
     assert read_solution(path) == solution

@@ -1,4 +1,4 @@
-"""Records `station-<channel>`: numbers come back as they were; what is damaged is named."""
+"""Records `station-<channel>`: exact round trips, errors that name the record."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.reader import Session
-from locatk.formats.sessions.station_reports import read_heard, strangers
+from locatk.formats.sessions.station_reports import describe_unknown_stations, read_station_reports
 from locatk.formats.sessions.writer import SessionWriter
 
 NONE = np.zeros(0, np.int32)
@@ -63,11 +63,11 @@ def write(
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(heard)
-def test_all_that_was_heard_comes_back(
+def test_station_reports_are_restored(
     tmp_path_factory: pytest.TempPathFactory, found: tuple[StationReport, ...]
 ) -> None:
     path = tmp_path_factory.mktemp("heard") / "run.mcap"
-    read = read_heard(write(path, found))
+    read = read_station_reports(write(path, found))
     assert [plain(station) for station in read] == [plain(station) for station in found]
     scene = observations.read_scene(Session.open(path))
     known = [s for s in found if s.id is not None or s.calibration is not None]
@@ -89,7 +89,7 @@ def test_the_calibration_of_the_scene_stays(tmp_path: Path) -> None:
     assert scene is not None
     assert [scene.calibrations[c].source for c in (1, 2)] == ["estimated", "factory"]
     assert scene.ids == {1: 9, 2: 8}
-    assert [s.id for s in read_heard(session)] == [7, 8]
+    assert [s.id for s in read_station_reports(session)] == [7, 8]
     assert session.metadata()["station-1"]["calibration"] == "factory"
 
 
@@ -106,7 +106,9 @@ def test_the_calibration_of_the_scene_stays(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_what_cannot_be_is_not_written(tmp_path: Path, found: tuple[StationReport, ...]) -> None:
+def test_impossible_reports_are_not_written(
+    tmp_path: Path, found: tuple[StationReport, ...]
+) -> None:
     with pytest.raises(InputError):
         write(tmp_path / "run.mcap", found)
     assert list(tmp_path.iterdir()) == []
@@ -140,7 +142,7 @@ def test_a_damaged_record_is_named(
     with SessionWriter(path, system="lighthouse") as writer:
         writer.metadata(name, {key: text})
     with pytest.raises(FormatError, match=words) as caught:
-        read_heard(Session.open(path))
+        read_station_reports(Session.open(path))
     assert caught.value.where == (name if name.isprintable() else ascii(name))
     assert len(str(caught.value)) < 300
 
@@ -164,15 +166,15 @@ def test_wild_records(
         for name, record in records.items():
             writer.metadata(name, record)
     try:
-        found = read_heard(Session.open(path))
+        found = read_station_reports(Session.open(path))
     except LocatkError:
         return
     assert all(1 <= station.channel <= 16 for station in found)
 
 
-def test_a_station_of_another_place_is_noticed() -> None:
+def test_a_station_that_differs_from_the_scene_is_reported() -> None:
     place = Station(1, np.zeros(3), np.eye(3), FACTORY, id=0xA)
     scene = Scene(stations=(place,), ids={2: 0xB})
     found = (StationReport(1, 0xA), StationReport(2, 0xC), StationReport(3, 0xD), StationReport(4))
-    [note] = strangers(scene, found)
-    assert note.startswith("on channel 2 the scene has the station 0000000b")
+    [note] = describe_unknown_stations(scene, found)
+    assert note.startswith("channel 2: the scene contains station 0000000b")
