@@ -15,7 +15,7 @@ from locatk.core.errors import InputError, LocatkError, MissingDataError
 
 if TYPE_CHECKING:
     from locatk.formats.emulation.emulator import Totals
-    from locatk.formats.emulation.source import Source
+    from locatk.formats.emulation.sources import Source
     from locatk.formats.sessions.reader import Session
 
 SYSTEMS = ("polaris", "landmarks", "lighthouse", "dots")
@@ -125,7 +125,7 @@ def command(
       locatk emulate run.mcap --rate 3e6 --loop 0 --json
     """
     from locatk.formats.emulation.emulator import Emulator
-    from locatk.formats.emulation.pseudo_port import PseudoPort
+    from locatk.formats.emulation.pseudo_terminal import PseudoPort
 
     _refuse_contradictions(source, save, given)
     with ExitStack() as stack:
@@ -176,8 +176,7 @@ def _source(
     ``stack``."""
     import tempfile
 
-    from locatk.formats.emulation.default_sessions import simulate_session
-    from locatk.formats.emulation.source import source_of
+    from locatk.formats.emulation.sources import simulate_session, source_of
     from locatk.formats.sessions.reader import Session
 
     path = Path(source)
@@ -201,9 +200,8 @@ def _parts(found: Source, given: dict[str, Any]) -> tuple[Any, Any, Any]:
     """Pace, faults and plan, of what was said on the command line."""
     from math import inf
 
+    from locatk.formats.emulation.byte_stream import Constant, Faults, Pace, Recorded, repeated
     from locatk.formats.emulation.emulator import Plan
-    from locatk.formats.emulation.faults import Faults
-    from locatk.formats.emulation.pacing import Constant, Pace, Recorded, repeated
 
     packets = repeated(found.packets, given["loop"])
     pace: Pace

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from locatk.core.errors import LocatkError
-from locatk.formats.capture.port_holders import busy, forbidden, holders
-from locatk.formats.capture.source import LinkEnded, LinkLost, Overruns, SourceError
+from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
+from locatk.formats.capture.port_listing import busy, forbidden, holders
 from locatk.formats.importers.video import Video, is_cut
 
 FORMATS = ("jpeg", "png")

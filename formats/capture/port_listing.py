@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import re
+import stat
 import sys
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from locatk.formats.capture.port_holders import holders
+from locatk.formats.capture.links import SourceError
 
 TTYS = Path("/sys/class/tty")
 
@@ -113,3 +117,205 @@ def _natural(name: str) -> list[tuple[int, str]]:
     """Sorts ttyS10 after ttyS9."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+
+PROC = Path("/proc")
+
+USUAL = "ModemManager, a serial monitor (Arduino IDE, screen, minicom), another locatk capture"
+
+MASTERS = ("/dev/ptmx", "/dev/pts/ptmx")
+
+_Pair = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A process that has a port open.
+
+    Attributes
+    ----------
+    pid : int
+    name : str
+        Of its command, as ``ps`` shows it: 15 characters at most; of an interpreter, with
+        what it runs.
+    """
+
+    pid: int
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.name} (pid {self.pid})"
+
+
+def holders(paths: Iterable[str]) -> dict[str, tuple[Holder, ...]]:
+    """Processes that have each of ``paths`` open, as far as the user may see them.
+
+    A path may be a symbolic link; a device is the same under all its names.
+    """
+    devices: dict[_Pair, set[int]] = defaultdict(set)
+    nodes: dict[_Pair, set[int]] = defaultdict(set)
+    wanted: dict[str, tuple[set[int], set[int]]] = {}
+    for path in paths:
+        status = _status(path)
+        if status is not None:
+            node = (status.st_dev, status.st_ino)
+            wanted[path] = (devices[_device(status)], nodes[node])
+        else:
+            wanted[path] = (set(), set())
+    if devices:
+        for pid, pair in _open_devices():
+            if pair in devices:
+                devices[pair].add(pid)
+        for pid, pair in _locks():
+            if pair in nodes:
+                nodes[pair].add(pid)
+    return {
+        path: tuple(Holder(pid, name) for pid in sorted(opened | locked) if (name := _name(pid)))
+        for path, (opened, locked) in wanted.items()
+    }
+
+
+def busy(name: str, path: str) -> SourceError:
+    """The error of a port that somebody has open already."""
+    seen = [
+        holder
+        for holder in holders([path])[path]
+        if holder.pid == os.getpid() or not _serves(holder.pid, path)
+    ]
+    if not seen:
+        return SourceError(
+            f"{name} is in use by another program",
+            hint=f"End it: usually {USUAL}; `sudo lsof {path}` names it",
+        )
+    names = " and ".join(
+        "this program itself" if holder.pid == os.getpid() else str(holder) for holder in seen
+    )
+    hint = "End it, or choose another port: `locatk capture --list`"
+    if any(holder.name == "ModemManager" for holder in seen):
+        hint = "It lets go after half a minute; for good: sudo systemctl disable --now ModemManager"
+    return SourceError(f"{name} is in use by {names}", hint=hint)
+
+
+def forbidden(name: str, path: str) -> SourceError:
+    """The error of a port that this user may not open."""
+    return SourceError(f"no permission to open {name}", hint=_permission(path))
+
+
+def is_pty(path: str) -> bool:
+    """Whether it is an end of a pseudo-terminal, by Linux' list of devices."""
+    status = _status(path)
+    return status is not None and _is_pty(status)
+
+
+def _permission(path: str) -> str:
+    status = _status(path)
+    if status is None or sys.platform == "win32":
+        return "Ask who administers this computer"
+    if status.st_mode & 0o060 != 0o060 or status.st_gid == 0:
+        return f"Only its owner may: sudo chmod a+rw {path}, or a udev rule, which stays"
+    import grp
+    import pwd
+
+    try:
+        group = grp.getgrgid(status.st_gid)
+    except KeyError:
+        return f"It belongs to the group {status.st_gid}, which has no name here"
+    try:
+        is_member = pwd.getpwuid(os.geteuid()).pw_name in group.gr_mem
+    except KeyError:
+        is_member = False
+    if is_member:
+        return f"You joined the group {group.gr_name} since you logged in: log in again"
+    return f"Join the group {group.gr_name}: sudo usermod -aG {group.gr_name} $USER; log in again"
+
+
+def _status(path: str) -> os.stat_result | None:
+    try:
+        return os.stat(path)
+    except OSError:
+        return None
+
+
+def _is_pty(status: os.stat_result) -> bool:
+    return stat.S_ISCHR(status.st_mode) and 136 <= os.major(status.st_rdev) <= 143
+
+
+def _device(status: os.stat_result) -> _Pair:
+    """The device behind a node, wherever the node is. Pseudo-terminals of other containers
+    have the same numbers, but a file system of their own."""
+    if not stat.S_ISCHR(status.st_mode):
+        return status.st_dev, status.st_ino
+    return status.st_dev if _is_pty(status) else -1, status.st_rdev
+
+
+def _open_devices() -> Iterator[tuple[int, _Pair]]:
+    """(pid, device) of all that is open below /dev."""
+    try:
+        pids = [entry for entry in os.listdir(PROC) if entry.isdigit()]
+    except OSError:
+        return
+    for pid in pids:
+        folder = f"{PROC}/{pid}/fd"
+        try:
+            numbers = os.listdir(folder)
+        except OSError:
+            continue  # another user's, or it has ended
+        for number in numbers:
+            link = f"{folder}/{number}"
+            try:
+                # Others are not looked at: a file on a server that is away would block.
+                if not os.readlink(link).startswith("/dev/"):
+                    continue
+                status = os.stat(link)
+            except OSError:
+                continue
+            yield int(pid), _device(status)
+
+
+def _locks() -> Iterator[tuple[int, _Pair]]:
+    """(pid, node) of the locks on whole files, which are told of all users."""
+    try:
+        lines = (PROC / "locks").read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        return
+    for line in lines:
+        # 1: FLOCK  ADVISORY  WRITE 6929 00:1a:3 0 EOF
+        fields = line.split()
+        if len(fields) < 6 or fields[1] != "FLOCK":
+            continue
+        try:
+            pid = int(fields[4])
+            major, minor, inode = fields[5].split(":")
+            yield pid, (os.makedev(int(major, 16), int(minor, 16)), int(inode))
+        except ValueError:
+            continue
+
+
+def _name(pid: int) -> str:
+    """Name of a process, ``""`` where it has ended."""
+    name = _line(PROC / str(pid) / "comm")
+    if not name.startswith("python"):
+        return name
+    words = _line(PROC / str(pid) / "cmdline").replace("\0", " ").split()[1:]
+    if "-c" in words[:3]:
+        return name
+    run = [Path(word).name for word in words if not word.startswith("-")]
+    return f"{name} {' '.join(run[:2])}".strip()
+
+
+def _serves(pid: int, path: str) -> bool:
+    """Whether a process is the other end of a pseudo-terminal, which keeps it open."""
+    if not is_pty(path):
+        return False
+    folder = PROC / str(pid) / "fd"
+    try:
+        return any(os.readlink(each) in MASTERS for each in folder.iterdir())
+    except OSError:
+        return False
+
+
+def _line(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

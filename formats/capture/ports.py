@@ -29,11 +29,17 @@ from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-from locatk.formats.capture.connections import DescriptorLink, PolledLink, RemoteLink, SerialLink
-from locatk.formats.capture.port_holders import busy, forbidden, is_pty
-from locatk.formats.capture.port_listing import PortInfo, attached
+from locatk.formats.capture.links import (
+    DescriptorLink,
+    Link,
+    PolledLink,
+    Port,
+    RemoteLink,
+    SerialLink,
+    SourceError,
+)
+from locatk.formats.capture.port_listing import PortInfo, attached, busy, forbidden, is_pty
 from locatk.formats.capture.replay import ReplayPort
-from locatk.formats.capture.source import Link, Port, SourceError
 
 URLS = ("socket", "rfc2217", "replay", "loop", "spy", "alt", "hwgrep", "cp2110")
 

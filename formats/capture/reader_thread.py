@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from locatk.formats.capture.host_clock import HostClock
-from locatk.formats.capture.source import Link, LinkEnded, LinkLost, Overruns, Port
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.links import Link, LinkEnded, LinkLost, Overruns, Port
 
 WAIT_S = 0.1
 """Longest wait for a byte: so long it takes to notice that the recording is over."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError
-from locatk.formats.capture.host_clock import HostClock
+from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import Intake
 from locatk.formats.capture.reader_thread import Arrived, Back, Ended, Event, Lost, Receiver
 from locatk.formats.capture.recording_files import CHUNK, Parts

@@ -10,8 +10,7 @@ from pathlib import Path
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import FormatError
-from locatk.formats.capture.device_messages import Stamped
-from locatk.formats.capture.ingestion import AUTO, SerialIntake
+from locatk.formats.capture.ingestion import AUTO, SerialIntake, Stamped
 from locatk.formats.capture.reader_thread import Arrived
 from locatk.formats.capture.statistics import RECORD, Totals
 from locatk.formats.devices.decoder import Options

@@ -13,7 +13,7 @@ import time
 from collections.abc import Generator
 
 from locatk.core.errors import InputError, LocatkError
-from locatk.formats.capture.source import LinkEnded, LinkLost, Overruns, SourceError
+from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 

@@ -16,15 +16,14 @@ from pathlib import Path
 from locatk.core.errors import InputError, LocatkError
 from locatk.formats.capture import attachments as artifacts
 from locatk.formats.capture import ports, replay
-from locatk.formats.capture.host_clock import HostClock
+from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import AUTO, CameraIntake, Intake, SerialIntake
-from locatk.formats.capture.live_file import DiskFullError
+from locatk.formats.capture.links import Link, Port, SourceError
 from locatk.formats.capture.reader_thread import BACKOFF_S, Receiver
 from locatk.formats.capture.recorder import Limits, Recorder
-from locatk.formats.capture.recording_files import Content, Parts, check_outputs
-from locatk.formats.capture.source import Link, Port, SourceError
+from locatk.formats.capture.recording_files import Content, DiskFullError, Parts, check_outputs
 from locatk.formats.capture.statistics import Recorded, Status
-from locatk.formats.devices import device as device_named
+from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Options
 
 CAMERA = "camera:"
@@ -213,7 +212,7 @@ def _port(wanted: Wanted, clock: HostClock) -> Port:
             speed=wanted.speed,
             format=wanted.image,
         )
-    known = None if wanted.device == AUTO else device_named(wanted.device)
+    known = None if wanted.device == AUTO else find_device(wanted.device)
     baud = wanted.baud or (known.baud if known else 115_200)
     return ports.port_of(wanted.port, baud=baud, speed=wanted.speed)
 

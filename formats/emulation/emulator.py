@@ -10,10 +10,8 @@ import math
 import time
 from dataclasses import asdict, dataclass
 
-from locatk.formats.emulation.faults import Faults
-from locatk.formats.emulation.pacing import LARGEST, Pace
-from locatk.formats.emulation.pseudo_port import PseudoPort
-from locatk.formats.emulation.pseudo_terminal import Terminal
+from locatk.formats.emulation.byte_stream import LARGEST, Faults, Pace
+from locatk.formats.emulation.pseudo_terminal import PseudoPort, Terminal
 
 TICK_S = 0.004
 """Shortest time between two writes: 12 kB at 3 MB/s, where the kernel holds 20 kB."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from locatk.formats.devices.float32.detection import (
+from locatk.formats.devices.float32.frame_matching import (
     LAST_COUNT,
     OTHER_COUNT,
     STAY,

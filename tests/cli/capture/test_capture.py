@@ -25,10 +25,10 @@ from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import tags
 from locatk.formats.capture import port_listing as listing
 from locatk.formats.capture import ports
-from locatk.formats.capture.live_file import LiveFile
+from locatk.formats.capture.links import Overruns
 from locatk.formats.capture.port_listing import PortInfo
 from locatk.formats.capture.recorder import Status
-from locatk.formats.capture.source import Overruns
+from locatk.formats.capture.recording_files import LiveFile
 from locatk.formats.capture.statistics import Totals
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
 from locatk.formats.sessions.reader import Session

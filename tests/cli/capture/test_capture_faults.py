@@ -171,7 +171,7 @@ def test_signals_finish_the_file(
 
 SLOW_END = """
 import time
-from locatk.formats.capture import live_file
+from locatk.formats.capture import recording_files as live_file
 real = live_file.LiveFile.write
 def write(self, data):
     time.sleep(0.02)

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from locatk.cli.emulate import SYSTEMS
-from locatk.formats.emulation import default_sessions as simulated
-from locatk.formats.emulation.faults import Faults
+from locatk.formats.emulation import sources as simulated
+from locatk.formats.emulation.byte_stream import Faults
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.formats.capture.arrival_times import KEPT, Arrivals
+from locatk.formats.capture.clocks import KEPT, Arrivals
 
 reads = st.lists(
     st.tuples(st.integers(1, 50), st.integers(0, 10_000)), min_size=1, max_size=30

@@ -20,7 +20,7 @@ import pytest
 from locatk.formats import images
 from locatk.formats.capture import camera
 from locatk.formats.capture.camera import CameraLink, Frame, port_of
-from locatk.formats.capture.source import LinkEnded, LinkLost, SourceError
+from locatk.formats.capture.links import LinkEnded, LinkLost, SourceError
 
 SIZE = (64, 48)
 GREYS = list(range(20, 220, 20))
@@ -177,7 +177,7 @@ def test_the_libraries_say_nothing(tmp_path: Path) -> None:
     code = """
 import sys
 from locatk.formats.capture.camera import port_of
-from locatk.formats.capture.source import SourceError
+from locatk.formats.capture.links import SourceError
 for place in sys.argv[1:]:
     try:
         port_of(place, clock=lambda: 0).open()

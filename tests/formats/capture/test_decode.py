@@ -18,9 +18,8 @@ from locatk.formats.capture.reader_thread import Arrived
 from locatk.formats.capture.recording_files import LOG_NAME, Content, Parts
 from locatk.formats.capture.redecoding import decode, losses
 from locatk.formats.capture.statistics import RECORD
-from locatk.formats.devices import device
-from locatk.formats.devices.decoder import Options
-from locatk.formats.devices.recording import Recording
+from locatk.formats.devices import find_device
+from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
 from locatk.formats.sessions import messages
 from locatk.formats.sessions.reader import Session
@@ -131,7 +130,9 @@ def some_halls(n: int = 400) -> HallSamples:
 def test_binary_devices_alike(
     tmp_path: Path, name: str, recording: Recording, topic: str, layout: Any
 ) -> None:
-    sent = [((time_ns - START_NS) // MS, data) for time_ns, data in device(name).encode(recording)]
+    sent = [
+        ((time_ns - START_NS) // MS, data) for time_ns, data in find_device(name).encode(recording)
+    ]
     live = record(tmp_path / "live.mcap", name, sent)
     decode(live, tmp_path / "again.mcap")
 

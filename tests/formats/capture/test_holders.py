@@ -13,8 +13,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from locatk.formats.capture import port_holders as holding
-from locatk.formats.capture.port_holders import Holder, busy, forbidden, holders, is_pty
+from locatk.formats.capture import port_listing as holding
+from locatk.formats.capture.port_listing import Holder, busy, forbidden, holders, is_pty
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has /proc")
 

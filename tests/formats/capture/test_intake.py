@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
 from locatk.formats import devices as wire
-from locatk.formats.capture.device_messages import Stamped
-from locatk.formats.capture.ingestion import PAUSE_NS, CameraIntake, SerialIntake
+from locatk.formats.capture.ingestion import PAUSE_NS, CameraIntake, SerialIntake, Stamped
 from locatk.formats.capture.reader_thread import Arrived
 from locatk.formats.capture.statistics import Totals
 from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks

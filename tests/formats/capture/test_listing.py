@@ -13,8 +13,7 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from locatk.formats.capture import port_listing as listing
-from locatk.formats.capture.port_holders import Holder
-from locatk.formats.capture.port_listing import PortInfo, attached, ports
+from locatk.formats.capture.port_listing import Holder, PortInfo, attached, ports
 
 
 def usb(device: str, **known: object) -> ListPortInfo:

@@ -12,8 +12,8 @@ from typing import IO, Any
 import pytest
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
-from locatk.formats.capture import live_file
-from locatk.formats.capture.live_file import AHEAD, DiskFullError, LiveFile
+from locatk.formats.capture import recording_files as live_file
+from locatk.formats.capture.recording_files import AHEAD, DiskFullError, LiveFile
 
 
 class Disk:

@@ -11,13 +11,13 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
-from locatk.formats.capture import live_file
+from locatk.formats.capture import recording_files as live_file
 from locatk.formats.capture import recording_files as parts
-from locatk.formats.capture.device_messages import Stamped
-from locatk.formats.capture.live_file import DiskFullError
+from locatk.formats.capture.ingestion import Stamped
 from locatk.formats.capture.recording_files import (
     LOG_NAME,
     Content,
+    DiskFullError,
     Parts,
     check_outputs,
     part_path,

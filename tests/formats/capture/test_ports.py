@@ -23,11 +23,11 @@ import serial
 from serial.rfc2217 import PortManager
 from serial.tools import list_ports
 
-from locatk.formats.capture import port_holders as holders
+from locatk.formats.capture import port_listing as holders
 from locatk.formats.capture import ports
+from locatk.formats.capture.links import Link, LinkLost, SourceError
 from locatk.formats.capture.port_listing import PortInfo
 from locatk.formats.capture.ports import SerialPort, port_of
-from locatk.formats.capture.source import Link, LinkLost, SourceError
 
 BAUD = 115_200
 EVERY_BYTE = bytes(range(256)) * 12

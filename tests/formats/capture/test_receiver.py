@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from locatk.formats.capture import reader_thread as receiver_module
-from locatk.formats.capture.host_clock import HostClock
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.links import Overruns, SourceError
 from locatk.formats.capture.reader_thread import Arrived, Back, Ended, Event, Lost, Receiver
-from locatk.formats.capture.source import Overruns, SourceError
 
 
 @pytest.fixture

@@ -15,14 +15,15 @@ from typing import Any
 import pytest
 
 from locatk.core.errors import LocatkError, OutputExistsError
-from locatk.formats.capture import live_file, recorder
 from locatk.formats.capture import reader_thread as receiver
+from locatk.formats.capture import recorder
+from locatk.formats.capture import recording_files as live_file
 from locatk.formats.capture import recording_files as parts
 from locatk.formats.capture import setup as session
-from locatk.formats.capture.host_clock import HostClock
-from locatk.formats.capture.live_file import DiskFullError, LiveFile
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.links import Overruns, SourceError
 from locatk.formats.capture.reader_thread import Receiver
-from locatk.formats.capture.source import Overruns, SourceError
+from locatk.formats.capture.recording_files import DiskFullError, LiveFile
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from locatk.formats.capture import replay
+from locatk.formats.capture.links import LinkEnded, LinkLost, SourceError
 from locatk.formats.capture.ports import port_of
 from locatk.formats.capture.replay import ReplayLink, ReplayPort
-from locatk.formats.capture.source import LinkEnded, LinkLost, SourceError
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import mcap_records
 from locatk.formats.sessions.writer import SessionWriter

@@ -19,15 +19,16 @@ from typing import Any
 import pytest
 import serial
 
-from locatk.formats.capture import connections as serial_link
-from locatk.formats.capture.connections import (
+from locatk.formats.capture import links as serial_link
+from locatk.formats.capture.links import (
     MOST,
     DescriptorLink,
+    LinkLost,
+    Overruns,
     PolledLink,
     RemoteLink,
     SerialLink,
 )
-from locatk.formats.capture.source import LinkLost, Overruns
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.formats.artifacts import tags
-from locatk.formats.capture.arrival_times import Arrivals
-from locatk.formats.capture.device_messages import Stamped, Streams
+from locatk.formats.capture.clocks import Arrivals
+from locatk.formats.capture.ingestion import Stamped, Streams
 from locatk.formats.devices.decoder import KINDS, Batch, Stream, Ticks
 from locatk.formats.sessions import magnetometers as arrays
 from locatk.formats.sessions import messages, observations

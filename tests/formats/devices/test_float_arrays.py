@@ -16,16 +16,15 @@ from locatk.core.errors import InputError
 from locatk.core.polaris import mlx90393
 from locatk.core.polaris.array import Samples
 from locatk.formats.artifacts.tags import loads_array
-from locatk.formats.devices.decoder import Batch, Decoder, Options, Stream
-from locatk.formats.devices.float32.arrays import (
+from locatk.formats.devices import find_device
+from locatk.formats.devices.decoder import Batch, Decoder, Options, Recording, Stream
+from locatk.formats.devices.float32.decoder import (
     MagxDecoder,
     PolarisDecoder,
     encode_magx,
     encode_polaris,
-    magx_artifacts,
     polaris_artifacts,
 )
-from locatk.formats.devices.recording import Recording
 from locatk.formats.importers.polaris_csv import read_polaris
 
 COUNT_UT = np.array([0.150, 0.150, 0.242])
@@ -662,4 +661,4 @@ def test_the_published_bars_are_known(sensors: int, spacing_m: float, rate_hz: f
 
 
 def test_the_place_of_magx_sensors_is_not_known() -> None:
-    assert magx_artifacts(Stream("magnetometers", sensors=8)) == {}
+    assert find_device("magx-array").default_artifacts(Stream("magnetometers", sensors=8)) == {}

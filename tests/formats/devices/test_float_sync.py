@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.polaris.mlx90393 import HALLCONF_SCALE, QUANTUM_UT
-from locatk.formats.devices.float32.detection import (
+from locatk.formats.devices.float32.frame_matching import (
     LOOK,
     Layout,
     Lock,

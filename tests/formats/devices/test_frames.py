@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.formats.devices import device
+from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Batch, Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames import payloads
 from locatk.formats.devices.locatk_frames.decoder import PIECE, FrameDecoder
@@ -65,7 +65,7 @@ def one(type: int, payload: bytes, tick: int = 7) -> tuple[Batch, FrameDecoder]:
 
 
 def test_the_device_is_known() -> None:
-    assert isinstance(device("locatk").decode(Options()), FrameDecoder)
+    assert isinstance(find_device("locatk").create_decoder(Options()), FrameDecoder)
 
 
 def test_magnetometers() -> None:

@@ -13,10 +13,9 @@ from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
-from locatk.formats.devices import device
-from locatk.formats.devices.decoder import Options
+from locatk.formats.devices import find_device
+from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.devices.locatk_frames.decoder import FrameDecoder
-from locatk.formats.devices.recording import Recording
 
 START_NS = 1_700_000_000_123_456_789
 
@@ -70,7 +69,9 @@ def decoded(recording: Recording) -> tuple[dict[tuple[str, str], Any], FrameDeco
     """Columns, ticks with them, by kind and node."""
     decoder = FrameDecoder(Options())
     found: dict[tuple[str, str], Any] = {}
-    for batch in decoder.feed(b"".join(frame for _, frame in device("locatk").encode(recording))):
+    for batch in decoder.feed(
+        b"".join(frame for _, frame in find_device("locatk").encode(recording))
+    ):
         columns = found.setdefault((batch.stream.kind, batch.stream.node), {})
         for name, column in {**batch.columns, "tick": batch.tick}.items():
             columns.setdefault(name, []).append(column)
@@ -117,7 +118,7 @@ def test_everything_comes_back() -> None:
 
 
 def test_frames_come_in_the_order_of_time() -> None:
-    frames = list(device("locatk").encode(everything()))
+    frames = list(find_device("locatk").encode(everything()))
     stamps = [time_ns for time_ns, _ in frames]
     assert stamps == sorted(stamps)
     assert stamps[0] == START_NS
@@ -185,4 +186,4 @@ INFINITE = HallSamples("it", HallSensors(), times(2, 10), np.full((2, 4), np.inf
 )
 def test_what_no_frame_tells(recording: Recording, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        device("locatk").encode(recording)
+        find_device("locatk").encode(recording)

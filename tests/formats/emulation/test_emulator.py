@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError, OutputExistsError
+from locatk.formats.emulation.byte_stream import Constant, Faults, Recorded, repeated
 from locatk.formats.emulation.emulator import Emulator, Plan, Totals
-from locatk.formats.emulation.faults import Faults
-from locatk.formats.emulation.pacing import Constant, Recorded, repeated
-from locatk.formats.emulation.pseudo_port import PseudoPort
+from locatk.formats.emulation.pseudo_terminal import PseudoPort
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pseudo-terminals of Linux")
 

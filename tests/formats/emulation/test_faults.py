@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
-from locatk.formats.emulation.faults import Faults, Strikes
+from locatk.formats.emulation.byte_stream import Faults, Strikes
 
 DATA = np.random.default_rng(0).bytes(200_000)
 

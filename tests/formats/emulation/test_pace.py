@@ -7,7 +7,7 @@ from itertools import islice
 
 import pytest
 
-from locatk.formats.emulation.pacing import LARGEST, ONE_PIECE_NS, Constant, Recorded, repeated
+from locatk.formats.emulation.byte_stream import LARGEST, ONE_PIECE_NS, Constant, Recorded, repeated
 
 MS = 1_000_000
 PACKETS = [(5 * MS, b"a"), (5 * MS, b"b"), (10 * MS, b"cc"), (30 * MS, b"d")]

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
-from locatk.formats.emulation.pseudo_port import PseudoPort
-from locatk.formats.emulation.pseudo_terminal import Terminal
+from locatk.formats.emulation.pseudo_terminal import PseudoPort, Terminal
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pseudo-terminals of Linux")
 

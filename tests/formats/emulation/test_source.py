@@ -16,9 +16,8 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats import devices as wire
-from locatk.formats.devices.recording import Recording
-from locatk.formats.emulation.default_sessions import SYSTEMS, simulate_session
-from locatk.formats.emulation.source import source_of
+from locatk.formats.devices.decoder import Recording
+from locatk.formats.emulation.sources import SYSTEMS, simulate_session, source_of
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import halls, observations
 from locatk.formats.sessions import magnetometers as arrays
