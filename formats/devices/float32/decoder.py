@@ -1,12 +1,17 @@
-"""Frames of bare float32 followed through a stream, whatever happens to its bytes.
+"""Devices ``polaris-array`` and ``magx-array``: arrays whose firmware sends bare float32.
 
-A frame is given when the one after it goes on from it. Where one does not, each byte of the
-next frames is tried for a start: the values of the right one are close to the last good
-ones, those of the others are of other sensors, or no fields at all. Values that no sensor
-can have sent become ``nan``, alone, where the frame is not in doubt.
+A frame is x, y, z of sensor 1, 2, ... in microtesla, as little-endian float32: no header, no
+length, no checksum. Polaris (github.com/wjk5117/Polaris) has nine sensors, or three on the
+miniature car: 108 or 36 bytes. MagX (github.com/dychen24/magx) has eight, and one more float
+for the battery that its firmware never sets: 100 bytes.
 
-What nothing tells, and what is taken for right: bytes changed so that each float is a whole
-number of counts and close to the one before, and whole frames lost.
+A frame is returned when the next one continues it. If it does not, each byte of the next frames
+is tested as a start: the values of the right start are close to the last valid ones; those of
+the others belong to other sensors, or are no fields. Values that no sensor can have sent become
+NaN if their frame is certain otherwise.
+
+Undetectable, and accepted: bytes changed such that each float is an integer number of counts and
+close to the previous one, and the loss of whole frames.
 """
 
 from __future__ import annotations
@@ -23,417 +28,459 @@ from locatk.core.polaris import mlx90393
 from locatk.formats.artifacts import tags
 from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream
 from locatk.formats.devices.float32.frame_matching import (
-    GOOD,
-    LOOK,
-    Choice,
+    GOOD_MEAN_COST,
+    LOOKAHEAD_FRAMES,
     Floats,
-    Layout,
-    Lock,
+    FrameLayout,
+    FrameModel,
     Mask,
-    Phases,
-    choose,
-    in_order,
-    leaps,
-    phases,
-    sound,
+    PhaseChoice,
+    PhaseCosts,
+    choose_phase,
+    evaluate_phases,
+    find_isolated_jumps,
+    has_sound_prefixes,
+    keeps_sensor_order,
 )
-from locatk.formats.devices.float32.synchronization import LEAST, Found, acquire, find_run, majority
+from locatk.formats.devices.float32.synchronization import (
+    MIN_RUN_FRAMES,
+    Acquisition,
+    acquire,
+    find_run,
+    majority_position,
+)
 
-STEP, WINDOW, KEPT = 432, 3888, 864
-"""Bytes after which the start of a frame is looked for again, at most at a time, and of
-them that stay for the next time. A stream is cut at these whatever pieces it came in."""
+SEARCH_STEP_BYTES, SEARCH_WINDOW_BYTES, KEPT_BYTES = 432, 3888, 864
+"""The search for the start of frames is repeated after so many new bytes, in a window of at most
+so many; so many of them remain for the next window. The stream is cut at these bytes however its
+pieces arrive."""
 
-AT_ONCE, AT_FIRST = 4096, 16
-"""Frames checked at once, and after damage."""
+MAX_STRIDE_FRAMES, MIN_STRIDE_FRAMES = 4096, 16
+"""Frames checked at a time, at most and after damage."""
 
-PATIENCE = 40
-"""Frames after which the values before the damage are no longer expected to go on."""
+MAX_MISSED_FRAMES = 40
+"""Frames after which the values before the damage are no longer compared."""
+
+MAX_VOTES = 16
+"""Latest pauses that decide on the start of a frame."""
+
+MAX_REMARKS = 20
 
 _TEXT = re.compile(rb"(No sensor \d+ found[ -~]*|Sensor \d+ reset [ -~]*)\r?\n")
 
 _REMARKS = {
-    "first": "which sensor is the first is taken from the first byte that came, as the line "
-    "never paused between samples: hold a magnet over one end to be sure",
-    "guess": "which sensor is the first is a guess: reception began within a sample and the line "
-    "never paused. Start the capture before the device, or hold a magnet over one end",
-    "alike": "the sensors measure so alike that neither their number nor the first of them is "
-    "sure: hold a magnet over one end",
-    "moved": "pauses tell that samples start elsewhere than was assumed: before byte {} the "
+    "first": "the first sensor is assumed from the first received byte, because the line never "
+    "paused between samples: hold a magnet over one end to check",
+    "guess": "the first sensor is a guess: reception began within a sample and the line never "
+    "paused. Start the capture before the device, or hold a magnet over one end",
+    "alike": "the sensors measure such similar values that neither their number nor the first of "
+    "them is certain: hold a magnet over one end",
+    "moved": "pauses show that samples start at another byte than assumed: before byte {} the "
     "sensors were in a wrong order",
-    "turned": "from byte {} on, which sensor is the first is a guess: bytes were lost, and neither "
-    "values nor pauses tell how to go on",
+    "shifted": "from byte {} on the first sensor is a guess: bytes were lost, and neither values "
+    "nor pauses show the new start",
     "values": "single values that no sensor can have sent are left out, from byte {} on",
-    "text": "the device says: {}",
-    "none": "no samples of such an array in the first {} bytes: is it this device, and its baud?",
+    "text": "message of the device: {}",
+    "none": "no samples of such an array in the first {} bytes: check --device and --baud",
 }
 
 
 class FloatArrayDecoder:
-    """Decoder of arrays whose frames have one of some layouts; see :mod:`.decoder`."""
+    """Decoder of arrays whose frames have one of several layouts; see :class:`.decoder.Decoder`.
 
-    def __init__(self, layouts: tuple[Layout, ...]) -> None:
+    It is in one of three states: without a frame model (:meth:`_acquire_step`), with a model but
+    without a frame that continues it (:meth:`_search_step`), or with a held frame that waits for
+    its successor (:meth:`_track_step`). Steps do not depend on how the bytes are cut.
+    """
+
+    def __init__(self, layouts: tuple[FrameLayout, ...]) -> None:
         self.counts = Counts()
         self.remarks: list[str] = []
         self._layouts = layouts
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._data = b""
         self._base = 0  # Bytes before _data.
-        self._at = 0  # In _data: the held frame, or where to search.
+        self._position = 0  # In _data: the held frame, or the start of the search.
         self._pauses: list[int] = []
-        self._silent = False
-        self._opened = 0
-        self._first: int | None = 0
-        self._length = STEP
-        self._lock: Lock | None = None
-        self._hint: Lock | None = None
-        self._held = False
-        self._grid = 0
-        self._stride = AT_FIRST
+        self._was_silent = False
+        self._connected_at = 0
+        self._first_byte: int | None = 0
+        self._window_bytes = SEARCH_STEP_BYTES
+        self._model: FrameModel | None = None
+        self._hint: FrameModel | None = None
+        self._holds_frame = False
+        self._frame_start = 0  # Of any earlier frame, which determines the phase.
+        self._stride = MIN_STRIDE_FRAMES
         self._gap = 0
-        self._seen = False
-        self._misses = 0
-        self._votes: deque[int] = deque(maxlen=16)
-        self._out: list[tuple[Layout, NDArray[np.int64], Floats]] = []
-
-    # ---- the contract
+        self._has_frames = False
+        self._missed = 0
+        self._votes: deque[int] = deque(maxlen=MAX_VOTES)
+        self._output: list[tuple[FrameLayout, NDArray[np.int64], Floats]] = []
 
     def feed(self, data: bytes, *, pause: bool = False) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.feed`."""
-        self._silent |= pause
+        """Return the samples that these bytes confirm."""
+        self._was_silent |= pause
         if not data:
             return []
-        # Before the first byte nobody listened: that is no pause.
-        if self._silent and self.counts.bytes > self._opened:
+        # The time before the first byte of a connection is no pause.
+        if self._was_silent and self.counts.bytes > self._connected_at:
             self._pauses.append(self.counts.bytes)
-        self._silent = False
+        self._was_silent = False
         self.counts.bytes += len(data)
-        self._data = self._data[self._at :] + data
-        self._base += self._at
-        self._at = 0
-        return self._work(final=False)
+        self._data = self._data[self._position :] + data
+        self._base += self._position
+        self._position = 0
+        return self._run(final=False)
 
     def restart(self) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.restart`."""
+        """Return the held samples, and search for the start of a frame again."""
         batches = self.finish()
-        self._data, self._at, self._base = b"", 0, self.counts.bytes
-        self._opened = self._first = self._base
-        self._lock, self._hint = None, self._lock or self._hint
-        self._held = self._seen = self._silent = False
-        self._gap, self._length = 0, STEP
+        self._data, self._position, self._base = b"", 0, self.counts.bytes
+        self._connected_at = self._first_byte = self._base
+        self._model, self._hint = None, self._model or self._hint
+        self._holds_frame = self._has_frames = self._was_silent = False
+        self._gap, self._window_bytes = 0, SEARCH_STEP_BYTES
         self._pauses.clear()
         self._votes.clear()
         return batches
 
     def finish(self) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.finish`."""
-        return self._work(final=True)
+        """Return the held samples."""
+        return self._run(final=True)
 
-    @np.errstate(all="ignore")  # Any bytes are floats; many are no numbers.
-    def _work(self, final: bool) -> list[Batch]:
-        going = True
-        while going:
-            if self._lock is None:
-                going = self._hunt(final)
-            elif self._held:
-                going = self._track(self._lock, final)
+    @np.errstate(all="ignore")  # Any bytes are floats; many of them are NaN.
+    def _run(self, final: bool) -> list[Batch]:
+        """Take steps while the data suffice; return the samples."""
+        can_continue = True
+        while can_continue:
+            if self._model is None:
+                can_continue = self._acquire_step(final)
+            elif self._holds_frame:
+                can_continue = self._track_step(self._model, final)
             else:
-                going = self._search(self._lock, final)
+                can_continue = self._search_step(self._model, final)
         if final:
-            self._close_gap()
-        here = self._base + self._at
-        self._pauses = [p for p in self._pauses if p >= here]
+            self._count_gap()
+        position = self._base + self._position
+        self._pauses = [p for p in self._pauses if p >= position]
         batches = []
-        for layout in dict.fromkeys(piece[0] for piece in self._out):
-            pieces = [piece for piece in self._out if piece[0] == layout]
+        for layout in dict.fromkeys(piece[0] for piece in self._output):
+            pieces = [piece for piece in self._output if piece[0] == layout]
             end = np.concatenate([piece[1] for piece in pieces])
             batches.append(_batch(layout, end, np.concatenate([piece[2] for piece in pieces])))
-        self._out.clear()
+        self._output.clear()
         return batches
 
-    # ---- states: each step is the same whatever pieces the bytes came in
+    # ---- states: each step returns whether another one is possible
 
-    def _hunt(self, final: bool) -> bool:
-        """Look for frames where nothing is known."""
-        window = self._data[self._at : self._at + WINDOW]
-        full = len(window) == WINDOW
-        ended = final and not full
-        found = None
-        least = 2 if ended else LEAST
-        if not (full or ended) or find_run(window, self._layouts[0].floats, least):
-            while found is None and self._length <= len(window):
-                found = self._acquire(window[: self._length], LEAST, self._length == WINDOW)
-                self._length += STEP
-            if found is None and ended:
-                found = self._acquire(window, least, True)
-            if found is None and not (full or ended):
+    def _acquire_step(self, final: bool) -> bool:
+        """Search for frames without a model."""
+        window = self._data[self._position : self._position + SEARCH_WINDOW_BYTES]
+        is_full = len(window) == SEARCH_WINDOW_BYTES
+        is_end = final and not is_full
+        acquisition = None
+        least = 2 if is_end else MIN_RUN_FRAMES
+        if not (is_full or is_end) or find_run(window, self._layouts[0].floats, least):
+            while acquisition is None and self._window_bytes <= len(window):
+                acquisition = self._acquire(
+                    window[: self._window_bytes],
+                    MIN_RUN_FRAMES,
+                    self._window_bytes == SEARCH_WINDOW_BYTES,
+                )
+                self._window_bytes += SEARCH_STEP_BYTES
+            if acquisition is None and is_end:
+                acquisition = self._acquire(window, least, True)
+            if acquisition is None and not (is_full or is_end):
                 return False
-        self._length = STEP
-        if found is not None:
-            self._lock, self._hint = found.lock, None
-            self._grid = self._base + self._at + found.start
-            self._misses = 0
-            if found.assumed:
-                self._say("turned" if self._seen else found.assumed, self._base + self._at)
+        self._window_bytes = SEARCH_STEP_BYTES
+        position = self._base + self._position
+        if acquisition is not None:
+            self._model, self._hint = acquisition.model, None
+            self._frame_start = position + acquisition.start
+            self._missed = 0
+            if acquisition.assumption:
+                self._remark("shifted" if self._has_frames else acquisition.assumption, position)
             return True
-        texts = self._tell_text(window)
-        passed = len(window) if ended else WINDOW - KEPT
+        text_end = self._report_text(window)
+        passed = len(window) if is_end else SEARCH_WINDOW_BYTES - KEPT_BYTES
         self._gap += passed
-        self._at += passed
-        self._first = None
-        if not texts and not self.counts.frames and self.counts.bytes:
-            self._say("none", self._base + self._at)
-        return not ended
+        self._position += passed
+        self._first_byte = None
+        if not text_end and not self.counts.frames and self.counts.bytes:
+            self._remark("none", self._base + self._position)
+        return not is_end
 
-    def _acquire(self, window: bytes, least: int, decide: bool) -> Found | None:
-        here = self._base + self._at
-        first = None if self._first is None else self._first - here
+    def _acquire(self, window: bytes, least: int, decide: bool) -> Acquisition | None:
+        position = self._base + self._position
+        first = None if self._first_byte is None else self._first_byte - position
         return acquire(
             window,
-            [p - here for p in self._pauses if p >= here],
+            [p - position for p in self._pauses if p >= position],
             self._layouts,
-            first=self._tell_text(window) or first,
+            first=self._report_text(window) or first,
             hint=self._hint,
             least=least,
             decide=decide,
         )
 
-    def _search(self, lock: Lock, final: bool) -> bool:
-        """Look for a frame that goes on from the last good one."""
-        size = lock.layout.size
-        there = len(self._data) - self._at
-        if there < size or (there < (LOOK + 1) * size and not final):
+    def _search_step(self, model: FrameModel, final: bool) -> bool:
+        """Search for a frame that continues the last valid one."""
+        size = model.layout.size
+        available = len(self._data) - self._position
+        if available < size or (available < (LOOKAHEAD_FRAMES + 1) * size and not final):
             return False
-        among, choice = self._phases(lock, self._at, 1)
-        if choice.fits and self._accept(among, choice, lock, self._at, self._at):
+        position = self._position
+        candidates, choice = self._evaluate_phases(model, position, 1)
+        if choice.is_accepted and self._accept(candidates, choice, model, position, position):
             return True
-        self._at += size
+        self._position += size
         self._gap += size
-        self._misses += 1
-        if self._misses > PATIENCE:
-            self._lock, self._hint, self._first = None, lock, None
+        self._missed += 1
+        if self._missed > MAX_MISSED_FRAMES:
+            self._model, self._hint, self._first_byte = None, model, None
             self._votes.clear()
         return True
 
-    def _track(self, lock: Lock, final: bool) -> bool:
-        """Give the frames of which the next one goes on from them."""
-        size = lock.layout.size
-        n = min((len(self._data) - self._at) // size, self._stride)
+    def _track_step(self, model: FrameModel, final: bool) -> bool:
+        """Release the frames that their successors continue."""
+        size = model.layout.size
+        n = min((len(self._data) - self._position) // size, self._stride)
         if n < 2:
             if final:
-                self._release(lock, 1)
-                self._held = False
+                self._release(model, 1)
+                self._holds_frame = False
             return final
-        frames = self._frames(lock, self._at, n)
-        wild = lock.wild(frames)
-        hurt = wild & ~lock.blind
-        before = np.concatenate([lock.last[None], frames[:-1]])
-        apart = lock.apart(frames, before)
-        cost = lock.cost(apart, hurt).sum(axis=1)
-        doubt = cost > GOOD * lock.layout.floats
-        if doubt.any():
-            far = np.flatnonzero(doubt)
-            doubt[far] = ~in_order(lock, frames[far], before[far], cost[far])
-        doubt |= hurt.any(axis=1)
-        doubt[0] = False
-        good = int(np.argmax(doubt)) if doubt.any() else n
-        moved = self._vote(lock, good)
-        if moved is not None:
-            good = (moved - self._base - self._at) // size
-        lock = self._release(lock, good - 1, wild[: good - 1] | leaps(lock, apart[:good]))
-        if moved is not None:
-            self._move(lock, moved)
+        frames = self._frames(model, self._position, n)
+        impossible = model.is_impossible(frames)
+        damaged = impossible & ~model.ignored
+        before = np.concatenate([model.last[None], frames[:-1]])
+        deviations = model.deviations(frames, before)
+        cost = model.cost(deviations, damaged).sum(axis=1)
+        is_doubtful = cost > GOOD_MEAN_COST * model.layout.floats
+        if is_doubtful.any():
+            rows = np.flatnonzero(is_doubtful)
+            is_doubtful[rows] = ~keeps_sensor_order(model, frames[rows], before[rows], cost[rows])
+        is_doubtful |= damaged.any(axis=1)
+        is_doubtful[0] = False
+        good = int(np.argmax(is_doubtful)) if is_doubtful.any() else n
+        new_start = self._start_by_pauses(model, good)
+        if new_start is not None:
+            good = (new_start - self._base - self._position) // size
+        left_out = impossible[: good - 1] | find_isolated_jumps(model, deviations[:good])
+        model = self._release(model, good - 1, left_out)
+        if new_start is not None:
+            self._correct_start(model, new_start)
             return True
         if good < n:
-            self._stride = AT_FIRST
-            return self._mend(lock, final)
-        self._stride = min(2 * self._stride, AT_ONCE)
+            self._stride = MIN_STRIDE_FRAMES
+            return self._resynchronize(model, final)
+        self._stride = min(2 * self._stride, MAX_STRIDE_FRAMES)
         return True
 
-    def _mend(self, lock: Lock, final: bool) -> bool:
-        """The frame after the held one does not go on from it: find out why."""
-        size, held = lock.layout.size, self._at
-        if len(self._data) - held < (LOOK + 1) * size and not final:
+    def _resynchronize(self, model: FrameModel, final: bool) -> bool:
+        """Decide why the frame after the held one does not continue it."""
+        size, held = model.layout.size, self._position
+        if len(self._data) - held < (LOOKAHEAD_FRAMES + 1) * size and not final:
             return False
         n = min((len(self._data) - held) // size - 1, 2)
-        hurt = lock.hurt(self._frames(lock, held + size, n))
-        # Where the next frames are fields, none starts within a float, or at another axis.
-        among, choice = self._phases(lock, held + 1, 1 if hurt.any() else 4 * lock.step)
-        few_hurt = among.few_hurt[:2, among.offset == size - 1]
-        if few_hurt.all() and (choice.stays or not choice.leads):
-            # Single values were damaged, or all have moved: a shift would have to explain it.
-            self._release(lock, 1)
+        damaged = model.is_damaged(self._frames(model, held + size, n))
+        # If the next frames are fields, no frame starts within a float or at another axis.
+        step = 1 if damaged.any() else 4 * model.shift_step
+        candidates, choice = self._evaluate_phases(model, held + 1, step)
+        is_mostly_intact = candidates.is_mostly_intact[:2, candidates.offset == size - 1]
+        if is_mostly_intact.all() and (choice.is_unshifted or not choice.has_clear_lead):
+            # Single values were damaged, or all have moved; a shift would need a clear lead.
+            self._release(model, 1)
             return True
-        frame = self._frames(lock, held, 1)[0]
-        tail = lock.cost(lock.apart(frame), lock.hurt(frame))[::-1]
-        self._held = False
-        if (choice.stays and few_hurt[0]) or sound(tail):
-            lock, earliest = self._release(lock, 1), held + size
+        frame = self._frames(model, held, 1)[0]
+        tail = model.cost(model.deviations(frame), model.is_damaged(frame))[::-1]
+        self._holds_frame = False
+        if (choice.is_unshifted and is_mostly_intact[0]) or has_sound_prefixes(tail):
+            model, earliest = self._release(model, 1), held + size
         else:
             self._gap += size
-            self._at += size
+            self._position += size
             earliest = held + 1
-        if choice.fits:
-            self._accept(among, choice, lock, held + 1, earliest)
+        if choice.is_accepted:
+            self._accept(candidates, choice, model, held + 1, earliest)
         return True
 
-    def _move(self, lock: Lock, start: int) -> None:
-        """Pauses tell that frames start elsewhere, and this one here."""
-        self._say("moved", start)
-        later = (start - self._base - self._at) % lock.layout.size // 4
-        self._lock = self._release(lock, 1).turned(later)
-        self._held = False
-        self._grid = start
-        self._gap += start - self._base - self._at
-        self._at = start - self._base
+    def _correct_start(self, model: FrameModel, start: int) -> None:
+        """Continue with frames that start at byte ``start``, as pauses show."""
+        self._remark("moved", start)
+        skipped = start - self._base - self._position
+        shift = skipped % model.layout.size // 4
+        self._model = self._release(model, 1).shifted(shift)
+        self._holds_frame = False
+        self._frame_start = start
+        self._gap += start - self._base - self._position
+        self._position = start - self._base
         self._votes.clear()
 
-    # ---- what the states do
+    # ---- parts of the steps
 
-    def _phases(self, lock: Lock, origin: int, step: int) -> tuple[Phases, Choice]:
-        """Of the frames that start at each ``step``-th byte, up to the last of one frame
-        from ``origin`` on, and which of them it is."""
-        size = lock.layout.size
+    def _evaluate_phases(
+        self, model: FrameModel, origin: int, step: int
+    ) -> tuple[PhaseCosts, PhaseChoice]:
+        """Evaluate each ``step``-th byte of one frame from ``origin`` on as start of a frame."""
+        size = model.layout.size
         offset = np.arange(size - 1, -1, -step)
-        among = phases(lock, self._data[origin : origin + (LOOK + 1) * size], offset)
-        here = self._base + origin
-        lost = (self._grid - here - offset) % size
-        silent = [(p - here) % size for p in self._pauses if 0 <= p - here < LOOK * size]
-        pauses = (offset[:, None] == np.array(silent, np.int64)).sum(axis=1)
-        return among, choose(among, lock.layout, lost, pauses)
+        piece = self._data[origin : origin + (LOOKAHEAD_FRAMES + 1) * size]
+        candidates = evaluate_phases(model, piece, offset)
+        position = self._base + origin
+        lost = (self._frame_start - position - offset) % size
+        paused = [
+            (p - position) % size
+            for p in self._pauses
+            if 0 <= p - position < LOOKAHEAD_FRAMES * size
+        ]
+        pauses = (offset[:, None] == np.array(paused, np.int64)).sum(axis=1)
+        return candidates, choose_phase(candidates, model.layout, lost, pauses)
 
     def _accept(
-        self, among: Phases, choice: Choice, lock: Lock, origin: int, earliest: int
+        self,
+        candidates: PhaseCosts,
+        choice: PhaseChoice,
+        model: FrameModel,
+        origin: int,
+        earliest: int,
     ) -> bool:
-        """Hold the first frame on the chosen phase that is whole."""
+        """Hold the first intact frame on the chosen phase; return whether there is one."""
         best = choice.best
-        starts = origin + among.offset[best] + lock.layout.size * np.arange(LOOK)
-        self._grid = self._base + int(starts[0])
-        usable = (among.cost[:, best] <= choice.most) & among.sound[:, best]
-        usable &= among.few_hurt[:, best] & (starts >= earliest)
+        frame_offsets = model.layout.size * np.arange(LOOKAHEAD_FRAMES)
+        starts = origin + candidates.offset[best] + frame_offsets
+        self._frame_start = self._base + int(starts[0])
+        usable = (candidates.cost[:, best] <= choice.max_cost) & candidates.is_sound[:, best]
+        usable &= candidates.is_mostly_intact[:, best] & (starts >= earliest)
         if not usable.any():
             return False
         start = int(starts[np.argmax(usable)])
-        self._gap += start - self._at
-        self._at = start
-        self._close_gap()
-        self._seen = self._held = True
-        self._misses = 0
-        if not choice.clear:
-            self._say("turned", self._base + start)
+        self._gap += start - self._position
+        self._position = start
+        self._count_gap()
+        self._has_frames = self._holds_frame = True
+        self._missed = 0
+        if not choice.is_unambiguous:
+            self._remark("shifted", self._base + start)
         return True
 
-    def _vote(self, lock: Lock, good: int) -> int | None:
-        """Where a pause is of which so many others tell that a frame starts there, in the
-        good frames after the held one."""
-        size = lock.layout.size
-        held = self._base + self._at
-        step = 4 * lock.step
+    def _start_by_pauses(self, model: FrameModel, good: int) -> int | None:
+        """Return a pause within the next frames if most pauses show another start of a frame."""
+        size = model.layout.size
+        held = self._base + self._position
+        step = 4 * model.shift_step
         for pause in self._pauses:
-            if lock.sure or not size <= pause - held < good * size:
+            if model.is_unambiguous or not size <= pause - held < good * size:
                 continue
-            place = (pause - held) % size
-            self._votes.append(-1 if place % step else place)
-            if place and majority(self._votes) == place:
+            phase = (pause - held) % size
+            self._votes.append(-1 if phase % step else phase)
+            if phase and majority_position(self._votes) == phase:
                 return pause
         return None
 
-    def _release(self, lock: Lock, n: int, without: Mask | None = None) -> Lock:
-        """Give the next n frames, but for some values."""
+    def _release(self, model: FrameModel, n: int, left_out: Mask | None = None) -> FrameModel:
+        """Return the next n frames, except some values, and the model after them."""
         if not n:
-            return lock
-        layout = lock.layout
-        frames = self._frames(lock, self._at, n)
-        without = lock.wild(frames) if without is None else without
-        hurt = without[:, : 3 * layout.sensors].any(axis=1)
+            return model
+        layout = model.layout
+        frames = self._frames(model, self._position, n)
+        left_out = model.is_impossible(frames) if left_out is None else left_out
+        is_incomplete = left_out[:, : 3 * layout.sensors].any(axis=1)
         values = frames[:, : 3 * layout.sensors]
-        if hurt.any():
-            values = np.where(without, np.float32(np.nan), frames)[:, : 3 * layout.sensors]
-            row = int(np.argmax(hurt))
-            self._say("values", self._base + self._at + row * layout.size)
-        ends = self._base + self._at + layout.size * np.arange(1, n + 1, dtype=np.int64)
-        self._out.append((layout, ends, values))
-        self._at += n * layout.size
+        position = self._base + self._position
+        if is_incomplete.any():
+            values = np.where(left_out, np.float32(np.nan), frames)[:, : 3 * layout.sensors]
+            self._remark("values", position + int(np.argmax(is_incomplete)) * layout.size)
+        ends = position + layout.size * np.arange(1, n + 1, dtype=np.int64)
+        self._output.append((layout, ends, values))
+        self._position += n * layout.size
         self.counts.frames += n
-        self._lock = lock.followed(frames[-1], without[-1])
-        return self._lock
+        self._model = model.updated(frames[-1], left_out[-1])
+        return self._model
 
-    def _close_gap(self) -> None:
-        if self._seen and self._gap:
+    def _count_gap(self) -> None:
+        if self._has_frames and self._gap:
             self.counts.skipped += self._gap
             self.counts.bad += 1
         self._gap = 0
 
-    def _frames(self, lock: Lock, at: int, n: int) -> Floats:
-        floats = lock.layout.floats
-        return np.frombuffer(self._data, "<f4", n * floats, at).reshape(n, floats)
+    def _frames(self, model: FrameModel, position: int, n: int) -> Floats:
+        floats = model.layout.floats
+        return np.frombuffer(self._data, "<f4", n * floats, position).reshape(n, floats)
 
-    def _tell_text(self, window: bytes) -> int:
-        """Say what the firmware writes where it finds no sensor; where that ends."""
+    def _report_text(self, window: bytes) -> int:
+        """Report error messages of the firmware as remarks; return the end of the last one."""
         end = 0
         for text in _TEXT.finditer(window):
             end = text.end()
-            self._say("text", text[1].decode().strip())
+            self._remark("text", text[1].decode().strip())
         return end
 
-    def _say(self, what: str, about: object = "") -> None:
-        key = f"{what} {about}" if what == "text" else what
-        if key not in self._said and len(self._said) < 20:
-            self._said.add(key)
-            self.remarks.append(_REMARKS[what].format(about))
+    def _remark(self, key: str, argument: object = "") -> None:
+        identity = f"{key} {argument}" if key == "text" else key
+        if identity not in self._reported and len(self._reported) < MAX_REMARKS:
+            self._reported.add(identity)
+            self.remarks.append(_REMARKS[key].format(argument))
 
 
-def _batch(layout: Layout, end: NDArray[np.int64], values: Floats) -> Batch:
-    """Frames in microtesla of the parts as records in tesla of the array: the part's X looks
-    to the right, Y back and Z down."""
+def _batch(layout: FrameLayout, end: NDArray[np.int64], values: Floats) -> Batch:
+    """Return frames in microtesla of the parts as records in tesla along the array's axes.
+
+    X of the part points right, Y back and Z down.
+    """
     by_part = values.reshape(len(values), layout.sensors, 3)
     field_t = np.multiply(by_part[:, :, [1, 0, 2]], -1e-6, dtype=np.float64)
     stream = Stream("magnetometers", sensors=layout.sensors)
     return Batch(stream, end, {"b_tesla": field_t.reshape(len(values), -1)})
 
 
-POLARIS = (Layout(9), Layout(3))
-MAGX = (Layout(8, spare=1),)
+POLARIS_LAYOUTS = (FrameLayout(9), FrameLayout(3))
+MAGX_LAYOUTS = (FrameLayout(8, spare=1),)
 
 
 class PolarisDecoder(FloatArrayDecoder):
     """Decoder of the device ``polaris-array``."""
 
     def __init__(self, options: Options) -> None:
-        super().__init__(POLARIS)
+        super().__init__(POLARIS_LAYOUTS)
 
 
 class MagxDecoder(FloatArrayDecoder):
     """Decoder of the device ``magx-array``."""
 
     def __init__(self, options: Options) -> None:
-        super().__init__(MAGX)
+        super().__init__(MAGX_LAYOUTS)
 
 
 def encode_polaris(recording: Recording) -> Iterator[tuple[int, bytes]]:
-    """Yield (time in ns, bytes) of the first array of a recording, a frame a sample.
+    """Return (time in ns, bytes) of the first array of a recording, one frame per sample.
 
     Raises
     ------
     InputError
-        There is none, or it has neither nine nor three sensors.
+        There is no array, or it has neither nine nor three sensors.
     """
-    return _encoded(recording, POLARIS, "polaris-array")
+    return _encode(recording, POLARIS_LAYOUTS, "polaris-array")
 
 
 def encode_magx(recording: Recording) -> Iterator[tuple[int, bytes]]:
-    """Yield (time in ns, bytes) of the first array of a recording, a frame a sample.
+    """Return (time in ns, bytes) of the first array of a recording, one frame per sample.
 
     Raises
     ------
     InputError
-        There is none, or it has not eight sensors.
+        There is no array, or it does not have eight sensors.
     """
-    return _encoded(recording, MAGX, "magx-array")
+    return _encode(recording, MAGX_LAYOUTS, "magx-array")
 
 
 def polaris_artifacts(stream: Stream) -> dict[str, str]:
-    """``array.toml`` of the published bar: nine sensors 20 mm apart, or the three of the
-    miniature car 8 mm apart, which the published firmware sets to FILTER_5."""
+    """Return ``array.toml`` of the published bar with the published settings.
+
+    It has nine sensors 20 mm apart, or the three of the miniature car 8 mm apart, which the
+    published firmware sets to FILTER_5. MagX was published with seven layouts of eight sensors
+    (Codes/optimization/config.py of the release), so that it has no such function.
+    """
     if stream.sensors == 9:
         array = mlx90393.published_bar(9, 0.020, mlx90393.Settings())
     elif stream.sensors == 3:
@@ -443,18 +490,18 @@ def polaris_artifacts(stream: Stream) -> dict[str, str]:
     return {tags.ARRAY_FILE: tags.dumps_array(array)}
 
 
-def _encoded(
-    recording: Recording, layouts: tuple[Layout, ...], name: str
+def _encode(
+    recording: Recording, layouts: tuple[FrameLayout, ...], name: str
 ) -> Iterator[tuple[int, bytes]]:
     if not recording.samples:
         raise InputError(f"no samples of magnetometers, which {name} sends")
     samples = recording.samples[0]
     fitting = [layout for layout in layouts if layout.sensors == len(samples.array)]
     if not fitting:
-        wanted = " or ".join(str(layout.sensors) for layout in layouts)
-        raise InputError(f"{len(samples.array)} sensors, where {name} has {wanted}")
+        allowed = " or ".join(str(layout.sensors) for layout in layouts)
+        raise InputError(f"{len(samples.array)} sensors, but {name} has {allowed}")
     frames = np.zeros((len(samples), fitting[0].floats), "<f4")
-    # The part's X looks to the right, Y back and Z down.
+    # X of the part points right, Y back and Z down.
     by_part = -samples.field_t[:, :, [1, 0, 2]] * 1e6
     frames[:, : 3 * fitting[0].sensors] = by_part.reshape(len(samples), -1)
     times = samples.time_ns.tolist()
