@@ -149,7 +149,7 @@ def find_device(name: str) -> Device:
         except Exception as error:  # Code of another package may raise anything.
             raise InputError(f"the device {name!r} cannot be loaded ({error})") from error
         if not isinstance(device, Device):
-            raise InputError(f"the entry point {entry.value} of {name!r} is not a Device")
+            raise InputError(f"the device {name!r} of {entry.value} is not a Device")
         return device
     others = sorted(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))
     raise InputError(

@@ -178,7 +178,7 @@ def run_sketch(firmware: Path, host: Path, tmp_path: Path, name: str, seconds: i
     # HELLO: number 0 first, then each second.
     assert done.stdout.count(name.encode()) == seconds + 1
     (log,) = (columns for stream, columns in found.items() if stream.kind == "log")
-    assert log["text"][0] == f"hello from {name} 1.0, 1000000 ticks a second"
+    assert log["text"][0] == f"hello from {name} 1.0, 1000000 ticks/s"
     assert log["sequence"][0] == 0
     return found, log
 
@@ -236,5 +236,8 @@ def test_page_and_header_name_the_same_types(firmware: Path) -> None:
     assert on_page == types
     defined = {name: int(n) for name, n in re.findall(r"#define LOCATK_([A-Z_]+) (\d+)", header)}
     assert types.items() <= defined.items()
-    assert defined["VERSION"] == payloads.VERSION
-    assert (defined["COUNTS"], defined["TEMPERATURE"]) == (payloads.COUNTS, payloads.TEMPERATURE)
+    assert defined["VERSION"] == payloads.PROTOCOL_VERSION
+    assert (defined["COUNTS"], defined["TEMPERATURE"]) == (
+        payloads.HAS_COUNTS,
+        payloads.HAS_TEMPERATURE,
+    )

@@ -135,9 +135,9 @@ def test_frames_come_in_the_order_of_time() -> None:
             assert abs(int(batch.tick.max()) - (time_ns - START_NS) // 1000) <= 1
             assert batch.tick.max() - batch.tick.min() <= 20_000
     assert hellos == [
-        (START_NS, "", "hello from bar, 1000000 ticks a second"),
-        (START_NS, "1", "hello from second bar, 1000000 ticks a second"),
-        (START_NS, "2", "hello from other, 1000000 ticks a second"),
+        (START_NS, "", "hello from bar, 1000000 ticks/s"),
+        (START_NS, "1", "hello from second bar, 1000000 ticks/s"),
+        (START_NS, "2", "hello from other, 1000000 ticks/s"),
     ]
     assert sum(frame[1] == 1 for _, frame in frames) == 6  # each second, of each node
 
@@ -175,7 +175,7 @@ INFINITE = HallSamples("it", HallSensors(), times(2, 10), np.full((2, 4), np.inf
 @pytest.mark.parametrize(
     ("recording", "message"),
     [
-        (Recording(), "nothing in the recording"),
+        (Recording(), "recording contains nothing"),
         (Recording(sweeps=sweeps(channel=np.full(200, 17))), "channel 17 of sweep 0"),
         (Recording(sweeps=sweeps(count=np.full(200, np.nan))), "count nan of sweep 0"),
         (Recording(sweeps=sweeps(sensor=np.full(200, 256))), "sensor 256 of sweep 0"),
