@@ -14,8 +14,8 @@ from locatk.cli.signals import asked_to_stop
 from locatk.core.errors import InputError, LocatkError, MissingDataError
 
 if TYPE_CHECKING:
-    from locatk.formats.emulation.emulator import Totals
-    from locatk.formats.emulation.sources import Source
+    from locatk.formats.emulation.emulator import EmulationCounts
+    from locatk.formats.emulation.sources import ByteSource
     from locatk.formats.sessions.reader import Session
 
 SYSTEMS = ("polaris", "landmarks", "lighthouse", "dots")
@@ -171,12 +171,12 @@ def _source(
     overwrite: bool,
     seed: int,
     stack: ExitStack,
-) -> tuple[Source, Session]:
+) -> tuple[ByteSource, Session]:
     """What is to be sent, and of which session; one that is not saved lives as long as
     ``stack``."""
     import tempfile
 
-    from locatk.formats.emulation.sources import simulate_session, source_of
+    from locatk.formats.emulation.sources import select_source, write_simulated_session
     from locatk.formats.sessions.reader import Session
 
     path = Path(source)
@@ -185,7 +185,7 @@ def _source(
         path = save or Path(folder, f"{source}.mcap")
         options.guard_output(path, overwrite=overwrite)
         with console.working("Simulating"):
-            simulate_session(source, path, seed=seed, overwrite=overwrite)
+            write_simulated_session(source, path, seed=seed, overwrite=overwrite)
     elif not path.exists():
         raise MissingDataError(
             "no such session",
@@ -193,32 +193,38 @@ def _source(
             hint=f"Give a file, or a system: {', '.join(SYSTEMS[:-1])}",
         )
     session = Session.open(path)
-    return source_of(session, device), session
+    return select_source(session, device), session
 
 
-def _parts(found: Source, given: dict[str, Any]) -> tuple[Any, Any, Any]:
+def _parts(found: ByteSource, given: dict[str, Any]) -> tuple[Any, Any, Any]:
     """Pace, faults and plan, of what was said on the command line."""
     from math import inf
 
-    from locatk.formats.emulation.byte_stream import Constant, Faults, Pace, Recorded, repeated
-    from locatk.formats.emulation.emulator import Plan
+    from locatk.formats.emulation.byte_stream import (
+        ConstantRate,
+        LineFaults,
+        Pace,
+        RecordedPace,
+        repeat_packets,
+    )
+    from locatk.formats.emulation.emulator import EmulationPlan
 
-    packets = repeated(found.packets, given["loop"])
+    packets = repeat_packets(found.packets, given["loop"])
     pace: Pace
     if given["rate"] is not None:
-        pace = Constant(packets, given["rate"])
+        pace = ConstantRate(packets, given["rate"])
     else:
-        pace = Recorded(packets, given["speed"] or inf)
-    plan = Plan(
+        pace = RecordedPace(packets, given["speed"] or inf)
+    plan = EmulationPlan(
         wait=not given["no_wait"],
         lossless=given["speed"] == 0,
         unplug_every_s=given["unplug_every_s"],
         away_s=1.0 if given["away_s"] is None else given["away_s"],
     )
-    return pace, Faults(given["drop"], given["flip"], given["seed"]), plan
+    return pace, LineFaults(given["drop"], given["flip"], given["seed"]), plan
 
 
-def _what(source: str, found: Source) -> str:
+def _what(source: str, found: ByteSource) -> str:
     how = "bytes as recorded" if found.recorded else "bytes made"
     return f"{found.device}, {how} of {source}"
 
@@ -235,7 +241,7 @@ def _how_long(session: Session, given: dict[str, Any]) -> str:
     return f", {seconds:.1f} s, then it is unplugged"
 
 
-def _reader(port: str, found: Source, session: Session | None) -> str:
+def _reader(port: str, found: ByteSource, session: Session | None) -> str:
     """What to type in another terminal; with what the session knows beside the bytes."""
     from locatk.formats.capture import attachments as artifacts
 
@@ -247,7 +253,7 @@ def _reader(port: str, found: Source, session: Session | None) -> str:
     return shlex.join([*words, "-o", "capture.mcap"])
 
 
-def _summary(totals: Totals) -> str:
+def _summary(totals: EmulationCounts) -> str:
     parts = [f"sent {totals.sent} of {totals.made} bytes"]
     for count, text in (
         (totals.dropped, "dropped"),

@@ -1,4 +1,4 @@
-"""What a device would send of a session: the bytes as they were recorded, or made again."""
+"""Bytes that an emulated device sends: recorded, encoded from a session, or simulated."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from locatk.formats.sessions.observations import (
 from locatk.formats.sessions.reader import Session
 
 RAW = "raw"
-"""The device whose bytes are kept as they are."""
+"""Device whose bytes are stored without decoding."""
 
 SWEEPS = ("/lighthouse/", "locatk.LighthouseSweep")
 """Topic and schema."""
 
 
 @dataclass(frozen=True)
-class Source:
-    """Something to send.
+class ByteSource:
+    """Bytes of a device.
 
     Attributes
     ----------
     device : str
-        Which device sends it.
+        Name of the device.
     recorded : bool
-        Whether the bytes are those that were recorded.
+        The bytes are those of the recording.
     packets : callable
-        Gives (time in ns, bytes) from the start, each time it is called.
+        Returns (time in ns, bytes) from the start, at each call.
     """
 
     device: str
@@ -51,43 +51,44 @@ class Source:
     packets: Callable[[], Iterator[tuple[int, bytes]]]
 
 
-def source_of(session: Session, name: str | None = None) -> Source:
-    """What the device ``name`` would send of a session.
+def select_source(session: Session, name: str | None = None) -> ByteSource:
+    """Return the bytes that the device ``name`` would send of a session.
 
-    Recorded bytes of this device are taken as they are; else the decoded streams are
-    encoded. Without a name it is the device that recorded the session, or one whose bytes
-    such a session can come from.
+    Recorded bytes of this device are used unchanged; otherwise the decoded streams are encoded.
+    The default device is the one that recorded the session, or one that sends such streams.
 
     Raises
     ------
     InputError
-        There is no such device, or it sends nothing that the session holds.
+        There is no such device, or it sends nothing that the session contains.
     FormatError
         A stream of the session is damaged.
     """
-    by = session.metadata().get(RECORD, {}).get("device") or None
-    wanted = name or by or _usual(session)
-    sender = find_device(wanted)
+    recorded_by = session.metadata().get(RECORD, {}).get("device") or None
+    wanted = name or recorded_by or _default_device(session)
+    device = find_device(wanted)
     topics = session.topics("/", SerialChunk.DESCRIPTOR.full_name)
-    if topics and wanted in (RAW, by or wanted):
+    if topics and wanted in (RAW, recorded_by or wanted):
         if len(topics) > 1:
             raise InputError(
                 f"raw bytes of {len(topics)} ports",
                 file=session.path,
                 hint="Give a session of one port",
             )
-        return Source(wanted, True, partial(_chunks, session, topics[0]))
-    if not sender.encoder:
+        return ByteSource(wanted, True, partial(_recorded_packets, session, topics[0]))
+    if not device.encoder:
         raise InputError(
-            f"nothing that the device {wanted!r} sends",
+            f"no data that the device {wanted!r} sends",
             file=session.path,
-            hint="Name another --device",
+            hint="Give another --device",
         )
-    return Source(wanted, False, partial(_encoded, session, sender, _recording(session)))
+    return ByteSource(
+        wanted, False, partial(_encoded_packets, session, device, _read_recording(session))
+    )
 
 
-def _chunks(session: Session, topic: str) -> Iterator[tuple[int, bytes]]:
-    """Bytes of a session, read by read, at the times of the reads."""
+def _recorded_packets(session: Session, topic: str) -> Iterator[tuple[int, bytes]]:
+    """Yield the bytes of each read of a recording, with its time."""
     for _, time_ns, payload in session.messages([topic]):
         try:
             yield time_ns, SerialChunk.FromString(payload).data
@@ -95,14 +96,16 @@ def _chunks(session: Session, topic: str) -> Iterator[tuple[int, bytes]]:
             raise FormatError("a message is damaged", file=session.path, where=topic) from None
 
 
-def _encoded(session: Session, sender: Device, recording: Recording) -> Iterator[tuple[int, bytes]]:
-    """Bytes that a device makes of observations."""
+def _encoded_packets(
+    session: Session, device: Device, recording: Recording
+) -> Iterator[tuple[int, bytes]]:
+    """Yield the bytes that a device makes of observations."""
     with error_context(session.path):
-        yield from sender.encode(recording)
+        yield from device.encode(recording)
 
 
-def _usual(session: Session) -> str:
-    """A device that sends what the session holds, by its name."""
+def _default_device(session: Session) -> str:
+    """Return the name of a device that sends the streams of the session."""
     if session.topics("/", SerialChunk.DESCRIPTOR.full_name):
         return RAW
     if session.topics(arrays.TOPIC, arrays.SCHEMA):
@@ -112,42 +115,42 @@ def _usual(session: Session) -> str:
     return "locatk"
 
 
-def _recording(session: Session) -> Recording:
-    """The observations of a session, of whichever kinds it holds."""
-    found = Recording(
+def _read_recording(session: Session) -> Recording:
+    """Return the observations of a session."""
+    recording = Recording(
         samples=read_samples(session) if session.topics(arrays.TOPIC, arrays.SCHEMA) else (),
         halls=read_halls(session) if session.topics(halls.TOPIC, halls.SCHEMA) else (),
         sweeps=read_sweeps(session) if session.topics(*SWEEPS) else None,
         odometry=read_odometry(session),
     )
-    if not (found.samples or found.halls or found.sweeps or found.odometry):
+    if not (recording.samples or recording.halls or recording.sweeps or recording.odometry):
         raise InputError(
-            "nothing that comes over a serial port",
+            "no data that a serial device sends",
             file=session.path,
-            hint="Of images make a video; `locatk capture camera:FILE` takes it"
+            hint="Convert the images to a video and use `locatk capture camera:FILE`"
             if session.topics("/", "foxglove.CompressedImage")
             else "Give a session of magnetometers, hall sensors, sweeps or odometry",
         )
-    return found
+    return recording
 
 
-IDS = (262_143, 77, 123_456)
-"""Tags over which the bar drives."""
+TAG_IDS = (262_143, 77, 123_456)
+"""Tags on the route of the magnetometer bar."""
 
 
-def simulate_session(
+def write_simulated_session(
     system: str, path: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False
 ) -> None:
-    """Write a session of a system, with its artifacts and its truth.
+    """Write a simulated session of a system, with its artifacts and its truth.
 
     Parameters
     ----------
     system : str
         One of :data:`SYSTEMS`.
     path : path
-        The output.
+        Output.
     seed : int
-        The same gives the same session.
+        Seed of the simulator.
     overwrite : bool
         Replace an existing file.
 
@@ -160,21 +163,23 @@ def simulate_session(
     """
     if system not in SYSTEMS:
         raise InputError(
-            f"no serial port on a device of {system}",
+            f"the devices of {system} have no serial port",
             hint="Record its camera with `locatk capture camera:VIDEO`",
         )
     SYSTEMS[system](path, seed, overwrite)
 
 
 def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
-    """The paper's bar over three tags, from rest."""
+    """Simulate the paper's bar over three tags, starting at rest."""
     from locatk.core.polaris.simulation.session import SimulationOptions, simulate
     from locatk.core.polaris.tag import PlanarPose, Tags
 
-    places = enumerate(zip(IDS, (0.0, 90.0, 200.0), strict=True))
-    site = {number: PlanarPose(0.5 * k, 0.02 * k, radians(turn)) for k, (number, turn) in places}
+    poses = enumerate(zip(TAG_IDS, (0.0, 90.0, 200.0), strict=True))
+    site = {tag: PlanarPose(0.5 * k, 0.02 * k, radians(deg)) for k, (tag, deg) in poses}
     tags = Tags(codec="polaris-released", site=site)
-    simulated = simulate(tags, SimulationOptions(route=IDS, rest_s=1.0, odometry=True, seed=seed))
+    simulated = simulate(
+        tags, SimulationOptions(route=TAG_IDS, rest_s=1.0, odometry=True, seed=seed)
+    )
     arrays.write_session(
         path,
         [simulated.samples],
@@ -186,8 +191,7 @@ def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
 
 
 def _landmarks(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
-    """The paper's robot on a floor of 6 x 8 landmarks, of which it visits enough to be sure
-    where it is."""
+    """Simulate the paper's robot on a floor of 6 x 8 landmarks, of which it visits six."""
     from locatk.core.landmarks.design.generation import DesignOptions, design_map
     from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
 
@@ -204,7 +208,7 @@ def _landmarks(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None
 
 
 def _lighthouse(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:
-    """Two robots under two stations."""
+    """Simulate two robots under two stations."""
     from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 
     simulated = simulate(SimulationOptions(robots=2, seed=seed))
@@ -223,4 +227,4 @@ SYSTEMS: dict[str, Callable[[str | os.PathLike[str], int, bool], None]] = {
     "landmarks": _landmarks,
     "lighthouse": _lighthouse,
 }
-"""Those whose devices have a serial port."""
+"""Systems whose devices have a serial port."""

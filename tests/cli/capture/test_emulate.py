@@ -18,7 +18,7 @@ import pytest
 
 from locatk.cli.emulate import SYSTEMS
 from locatk.formats.emulation import sources as simulated
-from locatk.formats.emulation.byte_stream import Faults
+from locatk.formats.emulation.byte_stream import LineFaults
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
@@ -98,8 +98,8 @@ def test_json_tells_the_port_and_then_what_became_of_the_bytes(
     counted = {name: last.pop(name) for name in ("sent", "dropped", "flipped")}
     assert last == {**known, "made": 10_000, **lost}
     assert counted["sent"] == len(b"".join(got)) == 10_000 - counted["dropped"]
-    expected = Faults(0.05, 0.01, seed=3)
-    assert b"".join(got) == expected.spoil(2 * DATA)
+    expected = LineFaults(0.05, 0.01, seed=3)
+    assert b"".join(got) == expected.apply(2 * DATA)
     assert counted["dropped"] == expected.dropped > 0
     assert counted["flipped"] == expected.flipped > 0
 
@@ -167,7 +167,7 @@ def test_all_systems_are_offered() -> None:
         (["absent.mcap"], 1, "Error: no such session in absent.mcap. Hint: Give a file, or a sys"),
         (["dots"], 1, "Hint: Record its camera with `locatk capture camera:VIDEO`"),
         (["RUN", "--device", "nonsense"], 1, "Error: no device 'nonsense'. Hint: Known devices"),
-        (["RUN", "--device", "lines"], 1, "Error: nothing that comes over a serial port in RUN"),
+        (["RUN", "--device", "lines"], 1, "Error: no data that a serial device sends in RUN"),
         (["RUN", "--link", "RUN"], 1, "Error: the path of the port is taken in RUN. Hint: Cho"),
         (["RUN", "--link", "absent/port"], 1, "Error: no folder for the port"),
         (["EMPTY"], 1, "Error: nothing to send in EMPTY."),
