@@ -94,6 +94,6 @@ def command(
 
 def _counted(totals: Any) -> dict[str, Any]:
     """What the decoder counts; the rest is of the port."""
-    from locatk.formats.capture.redecoding import LINE
+    from locatk.formats.capture.redecoding import LINE_STATISTICS
 
-    return {key: value for key, value in vars(totals).items() if key not in LINE}
+    return {key: value for key, value in vars(totals).items() if key not in LINE_STATISTICS}

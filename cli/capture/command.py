@@ -14,7 +14,7 @@ from locatk.cli.capture.options import DURATION, PACE, SIZE, names_option
 from locatk.cli.signals import asked_to_stop
 
 if TYPE_CHECKING:
-    from locatk.formats.capture.statistics import Recorded
+    from locatk.formats.capture.statistics import RecordingResult
 
 
 def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> dict[str, str]:
@@ -170,7 +170,7 @@ def command(
         silence_s=silence,
         reserve_bytes=int(reserve),
     )
-    wanted = session.Wanted(
+    wanted = session.CaptureRequest(
         port=port,
         device=device,
         output=output,
@@ -222,7 +222,7 @@ DEVICES_WITHOUT_COLUMNS = (
 def _list(as_json: bool) -> None:
     from locatk.formats.capture import port_listing as listing
 
-    found = listing.ports()
+    found = listing.find_ports_with_users()
     if as_json:
         console.emit_json({"version": 1, "ports": [vars(port) for port in found]})
     elif found:
@@ -231,7 +231,7 @@ def _list(as_json: bool) -> None:
         console.say("No serial port found. `locatk emulate polaris` makes one to try.")
 
 
-def _report(recorded: Recorded, device: str, as_json: bool) -> None:
+def _report(recorded: RecordingResult, device: str, as_json: bool) -> None:
     console.result(capture_text.summary(recorded))
     if as_json:
         console.emit_json(capture_text.as_json(recorded))

@@ -13,7 +13,7 @@ import click
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.formats.capture.statistics import Recorded, Status
+    from locatk.formats.capture.statistics import CaptureStatus, RecordingResult
 
 
 ENDS = {
@@ -49,7 +49,7 @@ class Live:
             self.wipe()
             console.warn(text)
 
-    def show(self, status: Status) -> None:
+    def show(self, status: CaptureStatus) -> None:
         """How it goes."""
         if not self._shown:
             return
@@ -88,7 +88,7 @@ def live() -> Iterator[Live]:
         made.wipe()
 
 
-def status_line(status: Status) -> str:
+def status_line(status: CaptureStatus) -> str:
     """One line: what comes, what is lost, how full things are."""
     totals = status.totals
     away = status.away_s
@@ -127,7 +127,7 @@ def number(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def summary(recorded: Recorded) -> str:
+def summary(recorded: RecordingResult) -> str:
     """What came of a recording, for people."""
     totals = recorded.totals
     seconds = (recorded.ended_ns - recorded.started_ns) * 1e-9
@@ -165,7 +165,7 @@ def _clock(clocks: dict[str, str], device: str) -> str:
     return words if late is None else f"{words}; 95 % arrive within {1e3 * float(late):.1f} ms"
 
 
-def as_json(recorded: Recorded) -> dict[str, Any]:
+def as_json(recorded: RecordingResult) -> dict[str, Any]:
     """The same for programs; docs/commands.md."""
     return {
         "version": 1,

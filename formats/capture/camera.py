@@ -20,23 +20,23 @@ from typing import Any, NamedTuple
 
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
-from locatk.formats.capture.port_listing import busy, forbidden, holders
+from locatk.formats.capture.port_listing import busy_error, find_port_users, permission_error
 from locatk.formats.importers.video import Video, is_cut
 
 FORMATS = ("jpeg", "png")
 
 JPEG_QUALITY = 95
 
-PATIENCE_S = 1.0
+MAX_FRAME_GAP_S = 1.0
 """A camera that gives no frame for so long is lost; single frames do fail."""
 
 TIMEOUT_MS = 5_000
 """After which a network stream that says nothing is given up; V4L2 has 10 s of its own."""
 
-MOST_BYTES = 64 << 20
+MAX_WAITING_BYTES = 64 << 20
 """Pixels that may wait to be read."""
 
-AT_ONCE = 8
+MAX_READ_FRAMES = 8
 """Frames of one read, which takes long enough to pack them."""
 
 
@@ -62,7 +62,7 @@ class CameraPort:
         self._format = format
         self._grey = grey
         self._found: dict[str, str] = {}
-        self.comes_again = not self._is_file()
+        self.can_reconnect = not self._is_file()
 
     def _is_file(self) -> bool:
         """Whether it has an end: not a number, an address, or a device such as /dev/video0."""
@@ -125,9 +125,9 @@ class CameraPort:
         path = f"/dev/video{self._place}" if self._place.isdecimal() else self._place
         if os.path.exists(path):
             if not os.access(path, os.R_OK | os.W_OK):
-                return forbidden(self.name, path)
-            if holders([path])[path]:
-                return busy(self.name, path)
+                return permission_error(self.name, path)
+            if find_port_users([path])[path]:
+                return busy_error(self.name, path)
         there = sorted(str(each) for each in Path("/dev").glob("video*"))
         return SourceError(
             f"no camera {self._place}",
@@ -223,7 +223,9 @@ class CameraLink:
             self._changed.wait_for(lambda: self._waiting or self._end, max(0.0, wait_s))
             if not self._waiting and self._end is not None:
                 raise self._end
-            taken = [self._waiting.popleft() for _ in range(min(AT_ONCE, len(self._waiting)))]
+            taken = [
+                self._waiting.popleft() for _ in range(min(MAX_READ_FRAMES, len(self._waiting)))
+            ]
             self._bytes -= sum(pixels.nbytes for _, pixels in taken)
             self._changed.notify_all()
         return [self._packed(time_ns, pixels) for time_ns, pixels in taken]
@@ -270,11 +272,11 @@ class CameraLink:
             if shot is not None:
                 last = time.monotonic()
                 with self._changed:
-                    if self._waiting and self._bytes + shot[1].nbytes > MOST_BYTES:
+                    if self._waiting and self._bytes + shot[1].nbytes > MAX_WAITING_BYTES:
                         self.dropped += 1
                     else:
                         self._put(shot)
-            elif time.monotonic() - last > PATIENCE_S:
+            elif time.monotonic() - last > MAX_FRAME_GAP_S:
                 return LinkLost("no more frames: unplugged, or the stream has ended")
             else:
                 time.sleep(0.01)
@@ -295,7 +297,7 @@ class CameraLink:
             due = begun + position_s / self._speed if self._speed else begun
             with self._changed:
                 self._changed.wait_for(lambda: self._closing, max(0.0, due - time.monotonic()))
-                self._changed.wait_for(lambda: self._closing or self._bytes < MOST_BYTES)
+                self._changed.wait_for(lambda: self._closing or self._bytes < MAX_WAITING_BYTES)
                 if self._closing:
                     return LinkEnded("closed")
                 self._put((self._clock(), shot[1]))

@@ -50,12 +50,12 @@ class HostClock:
         return self._wall() - self.now()
 
 
-KEPT = 1 << 16
+MIN_KEPT_READS = 1 << 16
 """So many reads are remembered at least: decoders that look for the start of a frame hold
 records back."""
 
 
-class Arrivals:
+class ArrivalTimes:
     """Places in a stream of bytes, and when each was read.
 
     Parameters
@@ -67,16 +67,16 @@ class Arrivals:
 
     def __init__(self, byte_ns: float = 0.0) -> None:
         self.byte_ns = byte_ns
-        self._end = np.zeros(2 * KEPT, np.int64)
-        self._time = np.zeros(2 * KEPT, np.int64)
+        self._end = np.zeros(2 * MIN_KEPT_READS, np.int64)
+        self._time = np.zeros(2 * MIN_KEPT_READS, np.int64)
         self._count = 0
 
     def add(self, end: int, time_ns: int) -> None:
         """The bytes up to ``end`` had arrived at ``time_ns``; both never descend."""
         if self._count == len(self._end):
             for array in (self._end, self._time):
-                array[:KEPT] = array[-KEPT:]
-            self._count = KEPT
+                array[:MIN_KEPT_READS] = array[-MIN_KEPT_READS:]
+            self._count = MIN_KEPT_READS
         self._end[self._count] = end
         self._time[self._count] = time_ns
         self._count += 1
@@ -99,12 +99,12 @@ class Arrivals:
         return np.minimum(found, self._count - 1)
 
 
-WINDOW_NS = 5_000_000_000
+RATE_WINDOW_NS = 5_000_000_000
 """Over so much time ticks are compared with arrivals, twice: what comes late at the end of
 one window is missing in the next."""
 
 
-class DeviceTime:
+class DeviceClock:
     """Times of what one device measured.
 
     Parameters
@@ -157,7 +157,7 @@ class DeviceTime:
             self._ticked += int(tick_step[usable].sum())
             self._passed += int(time_step[usable].sum())
         self._last[topic] = (int(tick[-1]), int(read_ns[-1]))
-        if self._passed >= WINDOW_NS * len(self._last):
+        if self._passed >= RATE_WINDOW_NS * len(self._last):
             self._judge(1e9 * self._ticked / self.ticks.hz / self._passed)
             self._ticked = self._passed = 0
 

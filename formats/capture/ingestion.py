@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -16,18 +16,16 @@ from numpy.typing import NDArray
 
 from locatk.core.clock_sync import TickClock
 from locatk.formats.artifacts import hall_sensors
-from locatk.formats.capture.clocks import Arrivals, DeviceTime
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.statistics import Totals
+from locatk.formats.capture.clocks import ArrivalTimes, DeviceClock
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.devices import Device, find_device
 from locatk.formats.devices.decoder import Batch, Counts, Decoder, Options, Stream
+from locatk.formats.devices.identification import MAX_IDENTIFICATION_S, Identifier, Verdict
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import frames, messages
 from locatk.formats.sessions.messages import Layout
 from locatk.formats.sessions.trajectories import LARGEST_BATCH
-
-if TYPE_CHECKING:
-    from locatk.formats.devices.identification import Identifier, Verdict
 
 PAUSE_NS = 3_000_000
 """A line that is silent for longer is between two frames: within a frame bytes follow each
@@ -53,19 +51,19 @@ class Intake(Protocol):
     declared: Sequence[tuple[str, type[Message]]]
     system: str
 
-    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
+    def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
         """Messages of what was read."""
 
-    def turn(self, now_ns: int) -> Iterator[Stamped]:
+    def turn(self, now_ns: int) -> Iterator[StampedMessage]:
         """Time has gone on, whether or not something was read."""
 
-    def restart(self) -> Iterator[Stamped]:
+    def restart(self) -> Iterator[StampedMessage]:
         """The line was lost and is there again."""
 
-    def finish(self) -> Iterator[Stamped]:
+    def finish(self) -> Iterator[StampedMessage]:
         """Nothing more comes."""
 
-    def count(self, totals: Totals) -> None:
+    def count(self, totals: CaptureStatistics) -> None:
         """Put what was counted into ``totals``."""
 
     def remarks(self) -> list[str]:
@@ -127,8 +125,8 @@ class SerialIntake:
         self._first_ns: int | None = None
         text = (artifacts or {}).get(hall_sensors.HALLS_FILE)
         halls = () if text is None else hall_sensors.loads_halls(text).names
-        self._streams = Streams(name, halls)
-        self._arrivals = Arrivals()
+        self._streams = MessageEncoder(name, halls)
+        self._arrivals = ArrivalTimes()
         self._known: dict[tuple[str, str], Stream] = {}
         self._asked: set[Stream] = set()
         self._counts = Counts()
@@ -137,19 +135,17 @@ class SerialIntake:
         self._identifier: Identifier | None = None
         self._held: list[tuple[bytes, bool] | None] = []  # None: opened again
         if device_name == AUTO:
-            from locatk.formats.devices.identification import Identifier
-
             self._identifier = Identifier(self._options)
         else:
-            self._decide(find_device(device_name))
+            self._set_device(find_device(device_name))
 
-    def _decide(self, found: Device) -> None:
+    def _set_device(self, found: Device) -> None:
         self.device = found
         self._decoder = found.create_decoder(self._options)
         if not self._port.startswith(UNPACED):
             self._arrivals.byte_ns = 10e9 / (self._baud or found.baud)
 
-    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
+    def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
         """Messages of what was read: all raw ones, then the records."""
         pieces: list[tuple[bool, list[bytes]]] = []
         for each in arrived:
@@ -170,7 +166,7 @@ class SerialIntake:
             if pause or not pieces:
                 pieces.append((pause, []))
             pieces[-1][1].append(each.data)
-            yield Stamped(self.topic, chunk, each.time_ns, each.time_ns)
+            yield StampedMessage(self.topic, chunk, each.time_ns, each.time_ns)
         for pause, data in pieces:
             yield from self._records(partial(self._feed, b"".join(data), pause))
 
@@ -183,13 +179,12 @@ class SerialIntake:
         self._identifier.feed(data, pause=pause)
         return self._identified(self._identifier.verdict())
 
-    def turn(self, now_ns: int) -> Iterator[Stamped]:
+    def turn(self, now_ns: int) -> Iterator[StampedMessage]:
         """Settle what the device is, when it was listened to for long enough."""
-        if self._identifier is not None and self._first_ns is not None:
-            from locatk.formats.devices.identification import LISTEN_S
-
-            if now_ns - self._first_ns > LISTEN_S * 1e9:
-                yield from self._records(self._settle)
+        if self._identifier is None or self._first_ns is None:
+            return
+        if now_ns - self._first_ns > MAX_IDENTIFICATION_S * 1e9:
+            yield from self._records(self._settle)
 
     def _settle(self) -> list[Batch]:
         return [] if self._identifier is None else self._identified(self._identifier.settle())
@@ -200,14 +195,14 @@ class SerialIntake:
         if self._fed:
             self._said.append(f"the device is taken for {verdict.device}: {verdict.why}")
         self._identifier = None
-        self._decide(find_device(verdict.device))
+        self._set_device(find_device(verdict.device))
         held, self._held = self._held, []
         batches = []
         for piece in held:
             batches += self._again() if piece is None else self._feed(*piece)
         return batches
 
-    def restart(self, *, opened: bool = True) -> Iterator[Stamped]:
+    def restart(self, *, opened: bool = True) -> Iterator[StampedMessage]:
         """What is half received is dropped; byte offsets go on. Not ``opened`` where only
         bytes are missing from a recording."""
         self._opened = opened
@@ -226,20 +221,20 @@ class SerialIntake:
             self._said.append(f"{offset - self._offset} bytes are missing at byte {self._offset}")
         self._offset = offset
 
-    def finish(self) -> Iterator[Stamped]:
+    def finish(self) -> Iterator[StampedMessage]:
         """What the decoder held back."""
         yield from self._records(self._settle)
         if self._decoder is not None:
             yield from self._records(self._decoder.finish)
 
-    def _records(self, decode: Callable[[], list[Batch]]) -> list[Stamped]:
+    def _records(self, decode: Callable[[], list[Batch]]) -> list[StampedMessage]:
         """Messages of what ``decode`` gives. Whatever it raises ends the decoding, and not
         the recording: the bytes go on."""
         try:
             batches = decode()
             made = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
         except Exception as error:  # of a decoder that may be somebody else's
-            self._give_up(error)
+            self._stop_decoding(error)
             return []
         for batch in batches:
             if len(batch):
@@ -247,7 +242,7 @@ class SerialIntake:
                 self.system = self.system or SYSTEMS.get(batch.stream.kind, "")
         return made
 
-    def _give_up(self, error: Exception) -> None:
+    def _stop_decoding(self, error: Exception) -> None:
         self._said.append(
             f"the decoder failed ({type(error).__name__}: {error}): from here on there are only "
             "raw bytes. Please report it"
@@ -258,7 +253,7 @@ class SerialIntake:
         self._decoder = self._identifier = None
         self._held = []
 
-    def count(self, totals: Totals) -> None:
+    def count(self, totals: CaptureStatistics) -> None:
         """What the decoder counted, and how many records there are of each topic."""
         totals.bytes = self._fed
         if self._decoder is not None:
@@ -330,7 +325,7 @@ class CameraIntake:
         self._name, self._format = name, format
         self._frames = self._bytes = self._first_ns = self._last_ns = 0
 
-    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
+    def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
         """One message a frame."""
         for each in arrived:
             for time_ns, image, *_ in each.data:
@@ -344,21 +339,21 @@ class CameraIntake:
                     data=image,
                     format=self._format,
                 )
-                yield Stamped(self.topic, message, time_ns, time_ns)
+                yield StampedMessage(self.topic, message, time_ns, time_ns)
 
-    def turn(self, now_ns: int) -> Iterator[Stamped]:
+    def turn(self, now_ns: int) -> Iterator[StampedMessage]:
         """Nothing."""
         return iter(())
 
-    def restart(self) -> Iterator[Stamped]:
+    def restart(self) -> Iterator[StampedMessage]:
         """Nothing: each frame stands alone."""
         return iter(())
 
-    def finish(self) -> Iterator[Stamped]:
+    def finish(self) -> Iterator[StampedMessage]:
         """Nothing."""
         return iter(())
 
-    def count(self, totals: Totals) -> None:
+    def count(self, totals: CaptureStatistics) -> None:
         """Frames and their bytes."""
         totals.bytes, totals.frames = self._bytes, self._frames
         totals.samples = {self.topic: self._frames}
@@ -389,14 +384,14 @@ SYSTEMS = {
 }
 """Kind of records to the system that solves them."""
 
-SHORTEST_S = 0.01
+MIN_RATE_SPAN_S = 0.01
 """Of less there is no rate."""
 
 LEVELS = (Log.UNKNOWN, Log.DEBUG, Log.INFO, Log.WARNING, Log.ERROR, Log.FATAL)
 
 
 @dataclass(frozen=True)
-class Stamped:
+class StampedMessage:
     """A message on its way into a session: when it was complete, and measured."""
 
     topic: str
@@ -405,7 +400,7 @@ class Stamped:
     publish_ns: int
 
 
-class Streams:
+class MessageEncoder:
     """Messages of the batches that a decoder gives.
 
     Parameters
@@ -431,7 +426,7 @@ class Streams:
         self.remarks: list[str] = []
         self._first: dict[str, int] = {}
         self._last: dict[str, int] = {}
-        self._times_of: dict[str, DeviceTime] = {}
+        self._times_of: dict[str, DeviceClock] = {}
         self.samples: Counter[str] = Counter()
 
     def device(self, stream: Stream) -> str:
@@ -444,7 +439,7 @@ class Streams:
         return {
             topic: (self.samples[topic] - 1) / span
             for topic, span in spans.items()
-            if span > SHORTEST_S
+            if span > MIN_RATE_SPAN_S
         }
 
     def clocks(self) -> dict[str, TickClock]:
@@ -457,8 +452,8 @@ class Streams:
             known.restart()
 
     def messages(
-        self, batches: Sequence[Batch], arrivals: Arrivals, now_ns: int
-    ) -> Iterator[Stamped]:
+        self, batches: Sequence[Batch], arrivals: ArrivalTimes, now_ns: int
+    ) -> Iterator[StampedMessage]:
         """Messages of ``batches``, all complete at ``now_ns``; what was measured when, is told
         by the device's ticks where it has any, else by the arrival of the last byte."""
         for batch in batches:
@@ -469,7 +464,9 @@ class Streams:
             else:
                 yield from self._records(batch, self._times(batch, arrivals), now_ns)
 
-    def _records(self, batch: Batch, time_ns: NDArray[np.int64], now_ns: int) -> Iterator[Stamped]:
+    def _records(
+        self, batch: Batch, time_ns: NDArray[np.int64], now_ns: int
+    ) -> Iterator[StampedMessage]:
         stream, device = batch.stream, self.device(batch.stream)
         topic, layout, once = _form(stream, device)
         time_ns = self._ascending(topic, time_ns)
@@ -485,7 +482,7 @@ class Streams:
         for start in range(0, len(batch), LARGEST_BATCH):
             part = slice(start, start + LARGEST_BATCH)
             message = layout.pack(once, {key: column[part] for key, column in columns.items()})
-            yield Stamped(topic, message, now_ns, int(time_ns[start]))
+            yield StampedMessage(topic, message, now_ns, int(time_ns[start]))
 
     def _in_order(self, names: tuple[str, ...], field: NDArray[Any]) -> NDArray[Any]:
         """Fields (n, N) of sensors that a device names, in the order of ``halls.toml``."""
@@ -501,14 +498,14 @@ class Streams:
             )
         return field
 
-    def _times(self, batch: Batch, arrivals: Arrivals) -> NDArray[np.int64]:
+    def _times(self, batch: Batch, arrivals: ArrivalTimes) -> NDArray[np.int64]:
         ticks = batch.stream.ticks
         if batch.tick is None or ticks is None:
             return arrivals.wire_ns(batch.end)
         device = self.device(batch.stream)
         known = self._times_of.get(device)
         if known is None or known.ticks != ticks:
-            known = self._times_of[device] = DeviceTime(ticks)
+            known = self._times_of[device] = DeviceClock(ticks)
         believed = known.rate is None
         times = known.times(batch.stream.kind, batch.tick, arrivals.read_ns(batch.end))
         if believed and known.rate is not None:
@@ -526,13 +523,15 @@ class Streams:
         self._last[topic] = int(rising[-1])
         return rising
 
-    def _log(self, batch: Batch, read_ns: NDArray[np.int64], now_ns: int) -> Iterator[Stamped]:
+    def _log(
+        self, batch: Batch, read_ns: NDArray[np.int64], now_ns: int
+    ) -> Iterator[StampedMessage]:
         name = self.device(batch.stream)
         rows = zip(batch.columns["level"], batch.columns["text"], read_ns.tolist(), strict=True)
         for level, text, time_ns in rows:
             stamp = messages.timestamp(time_ns)
             line = Log(timestamp=stamp, level=LEVELS[int(level)], message=str(text), name=name)
-            yield Stamped("/log", line, now_ns, time_ns)
+            yield StampedMessage("/log", line, now_ns, time_ns)
 
 
 def _form(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:

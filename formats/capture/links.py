@@ -77,12 +77,12 @@ class Port(Protocol):
     ----------
     name : str
         As the user named it.
-    comes_again : bool
+    can_reconnect : bool
         Whether it is worth trying to open it again when it was lost.
     """
 
     name: str
-    comes_again: bool
+    can_reconnect: bool
 
     def open(self) -> Link:
         """Open it, or the same device where it is now.
@@ -97,19 +97,19 @@ class Port(Protocol):
         """What is known of it, for the session's metadata: VID:PID, serial number, baud."""
 
 
-PIECE = 65_536
+READ_BYTES = 65_536
 """Bytes that are asked for at once."""
 
-FULL = 4_095
+TERMINAL_READ_BYTES = 4_095
 """The most that a Linux terminal gives at once; after a smaller piece nothing is left."""
 
-MOST = 1 << 20
+MAX_READ_BYTES = 1 << 20
 """Bytes after which a read returns though there are more."""
 
-PAUSE_S = 0.002
+POLL_INTERVAL_S = 0.002
 """Between two looks at a port that nobody can wait for."""
 
-GONE = "unplugged, or closed by the other side"
+UNPLUGGED = "unplugged, or closed by the other side"
 
 _COUNTERS = struct.Struct("20i")
 """``struct serial_icounter_struct``: cts, dsr, rng, dcd, rx, tx, frame, overrun, parity, brk,
@@ -141,21 +141,21 @@ class DescriptorLink:
             ready, _, _ = select.select([self._number], [], [], max(0.0, wait_s))
             if not ready:
                 return b""
-            first = self._receive(PIECE)
+            first = self._receive(READ_BYTES)
         except BlockingIOError:
             return b""
         except (OSError, ValueError) as error:  # ValueError: closed meanwhile
             raise LinkLost(_why(error)) from error
         if not first:
             raise LinkLost(self._why_empty())
-        return first if len(first) < FULL else self._more(first)
+        return first if len(first) < TERMINAL_READ_BYTES else self._more(first)
 
     def _more(self, first: bytes) -> bytes:
         pieces = [first]
         size = last = len(first)
-        while last >= FULL and size < MOST:
+        while last >= TERMINAL_READ_BYTES and size < MAX_READ_BYTES:
             try:
-                piece = self._receive(PIECE)
+                piece = self._receive(READ_BYTES)
             except OSError:
                 break  # nothing left, or broken: the next read finds it so
             # Not ready, a terminal gives b"" as well: here that tells nothing.
@@ -215,7 +215,7 @@ class SerialLink(DescriptorLink):
         poll.register(self._number)
         hung_up = select.POLLHUP | select.POLLERR | select.POLLNVAL
         if any(events & hung_up for _, events in poll.poll(0)):
-            return GONE
+            return UNPLUGGED
         return "ready, but empty: another program reads from it, or it was unplugged"
 
     def close(self) -> None:
@@ -249,12 +249,12 @@ class PolledLink:
                 left = end - time.monotonic()
                 if left <= 0:
                     return b""
-                time.sleep(min(left, PAUSE_S))
+                time.sleep(min(left, POLL_INTERVAL_S))
             data = bytes(self._port.read(there))
         except (OSError, TypeError) as error:  # TypeError: closed meanwhile
             raise LinkLost(_why(error)) from error
         if not data:
-            raise LinkLost(GONE)
+            raise LinkLost(UNPLUGGED)
         return data
 
     def overruns(self) -> Overruns | None:
@@ -293,7 +293,7 @@ class RemoteLink:
             piece = None if self._ended else self._queue.get(timeout=max(0.0, wait_s))
             while piece is not None:
                 pieces.append(piece)
-                if len(pieces) >= MOST:
+                if len(pieces) >= MAX_READ_BYTES:
                     break
                 piece = self._queue.get_nowait()
             self._ended = piece is None
@@ -339,5 +339,5 @@ def _counters(number: int) -> tuple[int, ...] | None:
 def _why(error: Exception) -> str:
     number = getattr(error, "errno", None)
     if number in (errno.EIO, errno.ENXIO, errno.ENODEV):
-        return GONE
+        return UNPLUGGED
     return os.strerror(number) if number else str(error)

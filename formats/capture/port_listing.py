@@ -14,7 +14,7 @@ from typing import Any
 
 from locatk.formats.capture.links import SourceError
 
-TTYS = Path("/sys/class/tty")
+TTY_CLASS_DIR = Path("/sys/class/tty")
 
 Identity = tuple[int, int, str | None, str]
 """What a USB port keeps when it is plugged in again: vendor, product, serial number, and
@@ -58,14 +58,14 @@ class PortInfo:
         return self.vid, self.pid, self.serial_number, interface
 
 
-def ports() -> list[PortInfo]:
+def find_ports_with_users() -> list[PortInfo]:
     """All ports with their holders, in natural order of their names."""
-    found = attached()
-    held = holders(info.device for info in found)
+    found = find_ports()
+    held = find_port_users(info.device for info in found)
     return [replace(info, holder=", ".join(map(str, held[info.device])) or None) for info in found]
 
 
-def attached() -> list[PortInfo]:
+def find_ports() -> list[PortInfo]:
     """All ports, without looking for holders."""
     found = [_info(port) for port in _comports() if _is_there(port.device)]
     return sorted(found, key=lambda info: _natural(info.device))
@@ -108,7 +108,7 @@ def _is_there(device: str) -> bool:
     if sys.platform != "linux" or not name.startswith("ttyS"):
         return True
     try:
-        return (TTYS / name / "type").read_text(encoding="ascii").strip() != "0"
+        return (TTY_CLASS_DIR / name / "type").read_text(encoding="ascii").strip() != "0"
     except OSError:
         return True
 
@@ -119,17 +119,19 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
-PROC = Path("/proc")
+PROC_DIR = Path("/proc")
 
-USUAL = "ModemManager, a serial monitor (Arduino IDE, screen, minicom), another locatk capture"
+USUAL_HOLDERS = (
+    "ModemManager, a serial monitor (Arduino IDE, screen, minicom), another locatk capture"
+)
 
-MASTERS = ("/dev/ptmx", "/dev/pts/ptmx")
+PTY_MASTERS = ("/dev/ptmx", "/dev/pts/ptmx")
 
 _Pair = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Holder:
+class PortUser:
     """A process that has a port open.
 
     Attributes
@@ -147,7 +149,7 @@ class Holder:
         return f"{self.name} (pid {self.pid})"
 
 
-def holders(paths: Iterable[str]) -> dict[str, tuple[Holder, ...]]:
+def find_port_users(paths: Iterable[str]) -> dict[str, tuple[PortUser, ...]]:
     """Processes that have each of ``paths`` open, as far as the user may see them.
 
     A path may be a symbolic link; a device is the same under all its names.
@@ -170,22 +172,22 @@ def holders(paths: Iterable[str]) -> dict[str, tuple[Holder, ...]]:
             if pair in nodes:
                 nodes[pair].add(pid)
     return {
-        path: tuple(Holder(pid, name) for pid in sorted(opened | locked) if (name := _name(pid)))
+        path: tuple(PortUser(pid, name) for pid in sorted(opened | locked) if (name := _name(pid)))
         for path, (opened, locked) in wanted.items()
     }
 
 
-def busy(name: str, path: str) -> SourceError:
+def busy_error(name: str, path: str) -> SourceError:
     """The error of a port that somebody has open already."""
     seen = [
         holder
-        for holder in holders([path])[path]
+        for holder in find_port_users([path])[path]
         if holder.pid == os.getpid() or not _serves(holder.pid, path)
     ]
     if not seen:
         return SourceError(
             f"{name} is in use by another program",
-            hint=f"End it: usually {USUAL}; `sudo lsof {path}` names it",
+            hint=f"End it: usually {USUAL_HOLDERS}; `sudo lsof {path}` names it",
         )
     names = " and ".join(
         "this program itself" if holder.pid == os.getpid() else str(holder) for holder in seen
@@ -196,7 +198,7 @@ def busy(name: str, path: str) -> SourceError:
     return SourceError(f"{name} is in use by {names}", hint=hint)
 
 
-def forbidden(name: str, path: str) -> SourceError:
+def permission_error(name: str, path: str) -> SourceError:
     """The error of a port that this user may not open."""
     return SourceError(f"no permission to open {name}", hint=_permission(path))
 
@@ -251,11 +253,11 @@ def _device(status: os.stat_result) -> _Pair:
 def _open_devices() -> Iterator[tuple[int, _Pair]]:
     """(pid, device) of all that is open below /dev."""
     try:
-        pids = [entry for entry in os.listdir(PROC) if entry.isdigit()]
+        pids = [entry for entry in os.listdir(PROC_DIR) if entry.isdigit()]
     except OSError:
         return
     for pid in pids:
-        folder = f"{PROC}/{pid}/fd"
+        folder = f"{PROC_DIR}/{pid}/fd"
         try:
             numbers = os.listdir(folder)
         except OSError:
@@ -275,7 +277,7 @@ def _open_devices() -> Iterator[tuple[int, _Pair]]:
 def _locks() -> Iterator[tuple[int, _Pair]]:
     """(pid, node) of the locks on whole files, which are told of all users."""
     try:
-        lines = (PROC / "locks").read_text(encoding="ascii", errors="replace").splitlines()
+        lines = (PROC_DIR / "locks").read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:
         return
     for line in lines:
@@ -293,10 +295,10 @@ def _locks() -> Iterator[tuple[int, _Pair]]:
 
 def _name(pid: int) -> str:
     """Name of a process, ``""`` where it has ended."""
-    name = _line(PROC / str(pid) / "comm")
+    name = _line(PROC_DIR / str(pid) / "comm")
     if not name.startswith("python"):
         return name
-    words = _line(PROC / str(pid) / "cmdline").replace("\0", " ").split()[1:]
+    words = _line(PROC_DIR / str(pid) / "cmdline").replace("\0", " ").split()[1:]
     if "-c" in words[:3]:
         return name
     run = [Path(word).name for word in words if not word.startswith("-")]
@@ -307,9 +309,9 @@ def _serves(pid: int, path: str) -> bool:
     """Whether a process is the other end of a pseudo-terminal, which keeps it open."""
     if not is_pty(path):
         return False
-    folder = PROC / str(pid) / "fd"
+    folder = PROC_DIR / str(pid) / "fd"
     try:
-        return any(os.readlink(each) in MASTERS for each in folder.iterdir())
+        return any(os.readlink(each) in PTY_MASTERS for each in folder.iterdir())
     except OSError:
         return False
 

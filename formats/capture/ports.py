@@ -38,14 +38,20 @@ from locatk.formats.capture.links import (
     SerialLink,
     SourceError,
 )
-from locatk.formats.capture.port_listing import PortInfo, attached, busy, forbidden, is_pty
+from locatk.formats.capture.port_listing import (
+    PortInfo,
+    busy_error,
+    find_ports,
+    is_pty,
+    permission_error,
+)
 from locatk.formats.capture.replay import ReplayPort
 
 URLS = ("socket", "rfc2217", "replay", "loop", "spy", "alt", "hwgrep", "cp2110")
 
-CONNECT_S = 5.0
+CONNECT_TIMEOUT_S = 5.0
 
-LARGEST_BAUD_ERROR = 0.05
+MAX_BAUD_ERROR_FRACTION = 0.05
 """Beyond it a UART takes the last bit of a byte for its neighbour."""
 
 LIST = "See `locatk capture --list`"
@@ -106,7 +112,7 @@ class SerialPort:
 
     def __init__(self, name: str, *, baud: int) -> None:
         self.name = name
-        self.comes_again = not name.lower().startswith("loop:")
+        self.can_reconnect = not name.lower().startswith("loop:")
         self._baud = baud
         self._resolved: str | None = None
         self._info: PortInfo | None = None
@@ -116,7 +122,7 @@ class SerialPort:
         """See :class:`.source.Port`."""
         link, path = open_serial(self._place(), self._baud)
         self._resolved = path if "://" in path else os.path.realpath(path)
-        now = attached()
+        now = find_ports()
         self._info = _info_of(self._resolved, now) or self._info
         self._twins = {info.location for info in self._like(now)}
         return link
@@ -148,7 +154,7 @@ class SerialPort:
             return self.name
         if os.path.islink(self.name) and os.path.exists(self.name):
             return self.name
-        now = attached()
+        now = find_ports()
         # Cheap adapters have no serial number, or all the same; then the socket tells.
         like = self._like(now)
         same = [info for info in like if info.location == before.location]
@@ -179,7 +185,7 @@ class SocketPort:
     Not pyserial's, which throws away what the other side says first.
     """
 
-    comes_again = True
+    can_reconnect = True
 
     def __init__(self, name: str, host: str, number: int) -> None:
         self.name = name
@@ -190,7 +196,7 @@ class SocketPort:
     def open(self) -> Link:
         """See :class:`.source.Port`."""
         try:
-            connection = socket.create_connection((self._host, self._number), CONNECT_S)
+            connection = socket.create_connection((self._host, self._number), CONNECT_TIMEOUT_S)
         except (OSError, UnicodeError) as error:
             raise _unreachable(error, self.name) from error
         connection.setblocking(False)
@@ -238,7 +244,7 @@ def open_serial(url: str, baud: int) -> tuple[Link, str]:
     with contextlib.suppress(ValueError, NotImplementedError):  # drivers without such a mode
         port.set_low_latency_mode(True)
     actual = _actual_baud(port.fileno())
-    if actual and abs(actual - baud) > LARGEST_BAUD_ERROR * baud:
+    if actual and abs(actual - baud) > MAX_BAUD_ERROR_FRACTION * baud:
         port.close()
         raise _wrong_baud(url, baud, actual)
     # A pseudo-terminal would stay closed to others even after its holder was killed.
@@ -258,15 +264,15 @@ def _explained(errors: list[BaseException], name: str, path: str, baud: int) -> 
         return _wrong_baud(name, baud)
     number = next((number for number in map(_number, errors) if number), None)
     if number in (errno.ENOENT, errno.ENOTDIR):
-        known = {os.path.basename(info.device): info.device for info in attached()}
+        known = {os.path.basename(info.device): info.device for info in find_ports()}
         near = difflib.get_close_matches(os.path.basename(path), known, 3, 0.7)
         meant = " or ".join(known[each] for each in near)
         hint = f"{LIST}; did you mean {meant}?" if meant else LIST
         return SourceError(f"no such port {path}", hint=hint)
     if number in (errno.EBUSY, errno.EAGAIN):
-        return busy(name, path)
+        return busy_error(name, path)
     if number in (errno.EACCES, errno.EPERM):
-        return forbidden(name, path)
+        return permission_error(name, path)
     if number in (errno.ENOTTY, errno.EISDIR):
         kind = "a folder" if os.path.isdir(path) else "no serial port"
         return SourceError(f"{name} is {kind}", hint=f"{LIST}; replay:FILE.mcap plays a session")

@@ -13,10 +13,10 @@ from typing import Any
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.links import Link, LinkEnded, LinkLost, Overruns, Port
 
-WAIT_S = 0.1
+READ_TIMEOUT_S = 0.1
 """Longest wait for a byte: so long it takes to notice that the recording is over."""
 
-LEAST_S = 0.001
+MIN_READ_INTERVAL_S = 0.001
 """Shortest time between reads. A stamp is late by no more, and a fast line is read in pieces
 of some kilobytes instead of byte by byte; the smallest buffers of a kernel (4096 bytes) take
 20 ms to overflow at 2 Mbaud."""
@@ -24,15 +24,15 @@ of some kilobytes instead of byte by byte; the smallest buffers of a kernel (409
 BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 """Between attempts to open a port again; the last one is repeated."""
 
-HANGING_S = 3.0
+MAX_STOP_WAIT_S = 3.0
 """Longest wait for the thread at the end."""
 
-COUNT_S = 0.5
+COUNTER_INTERVAL_S = 0.5
 """Between looks at the kernel's counters."""
 
 
 @dataclass(frozen=True)
-class Arrived:
+class ReceivedData:
     """What one read gave: bytes of a serial line, or frames of a camera."""
 
     time_ns: int
@@ -41,7 +41,7 @@ class Arrived:
 
 
 @dataclass(frozen=True)
-class Lost:
+class ConnectionLost:
     """The connection broke."""
 
     time_ns: int
@@ -49,7 +49,7 @@ class Lost:
 
 
 @dataclass(frozen=True)
-class Back:
+class Reconnected:
     """It is there again, perhaps elsewhere."""
 
     time_ns: int
@@ -57,17 +57,17 @@ class Back:
 
 
 @dataclass(frozen=True)
-class Ended:
+class SourceEnded:
     """Nothing more will come; ``error`` where that is not as it should be."""
 
     time_ns: int
     error: str | None = None
 
 
-Event = Arrived | Lost | Back | Ended
+Event = ReceivedData | ConnectionLost | Reconnected | SourceEnded
 
 
-class Receiver:
+class PortReader:
     """Reads a port in a thread of its own and opens it again when it was lost.
 
     Parameters
@@ -76,17 +76,17 @@ class Receiver:
     link : Link
         The port, opened.
     clock : HostClock
-    most_bytes : int
+    max_waiting_bytes : int
         When so many wait to be written, reading stops until there is room: the system's own
         buffers then fill, and count what they lose.
     """
 
     def __init__(
-        self, port: Port, link: Link, clock: HostClock, *, most_bytes: int = 64 << 20
+        self, port: Port, link: Link, clock: HostClock, *, max_waiting_bytes: int = 64 << 20
     ) -> None:
         self._port, self._clock = port, clock
         self._link: Link | None = link
-        self._most = most_bytes
+        self._most = max_waiting_bytes
         self._events: deque[Event] = deque()
         self._stop = threading.Event()
         self._attempts = 0
@@ -112,13 +112,13 @@ class Receiver:
         ended: one that hangs in a driver is left behind."""
         if not self._stop.is_set():
             self._stop.set()
-            self._thread.join(HANGING_S)
+            self._thread.join(MAX_STOP_WAIT_S)
         return not self._thread.is_alive()
 
     def take(self) -> Sequence[Event]:
         """All that has happened since the last call."""
         events = [self._events.popleft() for _ in range(len(self._events))]
-        self._taken += sum(event.size for event in events if isinstance(event, Arrived))
+        self._taken += sum(event.size for event in events if isinstance(event, ReceivedData))
         return events
 
     @property
@@ -141,7 +141,7 @@ class Receiver:
         try:
             self._receive()
         except Exception as error:  # whatever a driver raises must not end in silence
-            self._events.append(Ended(self._clock.now(), f"{type(error).__name__}: {error}"))
+            self._events.append(SourceEnded(self._clock.now(), f"{type(error).__name__}: {error}"))
         finally:
             self._close()
 
@@ -150,29 +150,29 @@ class Receiver:
         while not self._stop.is_set():
             begun = time.monotonic()
             try:
-                self._read(WAIT_S)
+                self._read(READ_TIMEOUT_S)
             except LinkEnded:
-                self._events.append(Ended(self._clock.now()))
+                self._events.append(SourceEnded(self._clock.now()))
                 return
             except LinkLost as lost:
                 self._close()
-                if not self._port.comes_again:
-                    self._events.append(Ended(self._clock.now(), str(lost)))
+                if not self._port.can_reconnect:
+                    self._events.append(SourceEnded(self._clock.now(), str(lost)))
                     return
-                self._events.append(Lost(self._clock.now(), str(lost)))
+                self._events.append(ConnectionLost(self._clock.now(), str(lost)))
                 if not self._reopen():
                     return
                 where = self._port.describe().get("resolved", self._port.name)
-                self._events.append(Back(self._clock.now(), where))
+                self._events.append(Reconnected(self._clock.now(), where))
                 continue
             while self.received - self._taken > self._most and not self._stop.is_set():
                 self.held_up += 1
                 self._stop.wait(0.05)
-            if begun - counted > COUNT_S:
+            if begun - counted > COUNTER_INTERVAL_S:
                 counted = begun
                 self._count()
-            left = begun + LEAST_S - time.monotonic()
-            if left > 0 and self._port.comes_again:  # what is played has its own pace
+            left = begun + MIN_READ_INTERVAL_S - time.monotonic()
+            if left > 0 and self._port.can_reconnect:  # what is played has its own pace
                 time.sleep(left)
         self._read_rest()
 
@@ -184,14 +184,14 @@ class Receiver:
         self._attempts = 0
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
         self.heard_ns = self._clock.now()
-        self._events.append(Arrived(self.heard_ns, data, size))
+        self._events.append(ReceivedData(self.heard_ns, data, size))
         self.received += size
         self.high_water = max(self.high_water, self.received - self._taken)
         return size
 
     def _read_rest(self) -> None:
         """What the system still holds; from a device that never stops, not for long."""
-        until = time.monotonic() + WAIT_S
+        until = time.monotonic() + READ_TIMEOUT_S
         try:
             while time.monotonic() < until and self._read(0.0):
                 pass

@@ -16,20 +16,27 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import Intake
-from locatk.formats.capture.reader_thread import Arrived, Back, Ended, Event, Lost, Receiver
-from locatk.formats.capture.recording_files import CHUNK, Parts
-from locatk.formats.capture.statistics import Recorded, Status, Totals
+from locatk.formats.capture.reader_thread import (
+    ConnectionLost,
+    Event,
+    PortReader,
+    ReceivedData,
+    Reconnected,
+    SourceEnded,
+)
+from locatk.formats.capture.recording_files import CHUNK_BYTES, RecordingFiles
+from locatk.formats.capture.statistics import CaptureStatistics, CaptureStatus, RecordingResult
 
-TURN_S = 0.02
+WRITE_INTERVAL_S = 0.02
 """Between looks at what was received: one message of each stream covers about so much."""
 
-SHOW_S = 1.0
+STATUS_INTERVAL_S = 1.0
 """Between looks at rates, disk, silence and clock."""
 
-DOUBT_S = 5.0
+FRAME_CHECK_S = 5.0
 """After so long bytes without a frame are told of."""
 
-AHEAD_S = 300.0
+DISK_WARNING_S = 300.0
 """A disk that will be full sooner than this is told of."""
 
 
@@ -49,7 +56,7 @@ class Limits:
         So much of the disk stays free.
     flush_s : float
         So often what was recorded is given to the system: the most that is lost when the
-        program is killed, with :data:`TURN_S`.
+        program is killed, with :data:`WRITE_INTERVAL_S`.
     sync_s : float
         So often it is forced to the disk: the most that is lost with the power.
     """
@@ -71,8 +78,8 @@ def _pieces(events: Sequence[Event]) -> Iterator[list[Event]]:
     size = 0
     for event in events:
         piece.append(event)
-        size += event.size if isinstance(event, Arrived) else 0
-        if size >= CHUNK:
+        size += event.size if isinstance(event, ReceivedData) else 0
+        if size >= CHUNK_BYTES:
             yield piece
             piece, size = [], 0
     yield piece
@@ -83,34 +90,34 @@ class Recorder:
 
     Parameters
     ----------
-    receiver : Receiver
+    receiver : PortReader
         Not yet started.
     intake : Intake
-    parts : Parts
+    parts : RecordingFiles
     clock : HostClock
     limits : Limits
     tell : callable
         Takes lines for people as they come: gaps, silence, a disk that fills.
     show : callable
-        Takes a :class:`Status` once a second.
+        Takes a :class:`CaptureStatus` once a second.
     """
 
     def __init__(
         self,
-        receiver: Receiver,
+        receiver: PortReader,
         intake: Intake,
-        parts: Parts,
+        parts: RecordingFiles,
         clock: HostClock,
         limits: Limits,
         *,
         tell: Callable[[str], None],
-        show: Callable[[Status], None],
+        show: Callable[[CaptureStatus], None],
     ) -> None:
         self._receiver, self._intake, self._parts = receiver, intake, parts
         self._clock, self._limits = clock, limits
         self._tell, self._show = tell, show
-        self._totals = Totals()
-        self._part_began = Totals()
+        self._totals = CaptureStatistics()
+        self._part_began = CaptureStatistics()
         self._lost_ns: int | None = None
         self._step_s = 0.0
         self._held_up = 0
@@ -118,7 +125,7 @@ class Recorder:
         self._flushed_bytes = 0
         self._doubted = False
 
-    def run(self, stop: threading.Event) -> Recorded:
+    def run(self, stop: threading.Event) -> RecordingResult:
         """Record until ``stop`` is set, a limit is reached, or nothing more can come.
 
         The files are finished when this returns, whatever ended it.
@@ -146,7 +153,7 @@ class Recorder:
         finally:
             self._receiver.stop()
             syncing.set()
-        recorded = Recorded(
+        recorded = RecordingResult(
             totals=self._count(),
             paths=self._parts.paths,
             device=self._device(),
@@ -187,7 +194,7 @@ class Recorder:
     def _turns(self, stop: threading.Event) -> tuple[str, bool]:
         """Write what comes, turn after turn; returns why it ended and whether that is bad."""
         flushed = shown = time.monotonic()
-        before = Totals()
+        before = CaptureStatistics()
         while True:
             over = self._over(stop)
             ended = None
@@ -199,7 +206,7 @@ class Recorder:
             if now - flushed >= self._limits.flush_s:
                 flushed = now
                 self._flush()
-            if now - shown >= SHOW_S:
+            if now - shown >= STATUS_INTERVAL_S:
                 totals = self._count()
                 full = self._second(totals, before, now - shown)
                 before, shown = totals, now
@@ -209,7 +216,7 @@ class Recorder:
                 return ended.error or "end of the source", ended.error is not None
             if over:
                 return over, False
-            stop.wait(TURN_S)
+            stop.wait(WRITE_INTERVAL_S)
 
     def _over(self, stop: threading.Event) -> str:
         """Why it is time to end, ``""`` while it is not."""
@@ -227,22 +234,22 @@ class Recorder:
     def _elapsed_s(self) -> float:
         return (self._clock.now() - self._start_ns) * 1e-9
 
-    def _write(self, events: Sequence[Event]) -> Ended | None:
+    def _write(self, events: Sequence[Event]) -> SourceEnded | None:
         """Write what the receiver tells, in its order; returns its end where there is one."""
-        arrived: list[Arrived] = []
+        arrived: list[ReceivedData] = []
         ended = None
         for event in events:
-            if isinstance(event, Arrived):
+            if isinstance(event, ReceivedData):
                 arrived.append(event)
                 self._heard_ns, self._silent = event.time_ns, False
                 continue
             self._take(arrived)
             arrived = []
-            if isinstance(event, Lost):
+            if isinstance(event, ConnectionLost):
                 self._lost_ns = event.time_ns
                 self._totals.gaps += 1
                 self._say(f"connection lost: {event.why}", event.time_ns)
-            elif isinstance(event, Back):
+            elif isinstance(event, Reconnected):
                 self._close_gap(event)
             else:
                 ended = event
@@ -254,12 +261,12 @@ class Recorder:
             self._say(remark)
         return ended
 
-    def _take(self, arrived: Sequence[Arrived]) -> None:
+    def _take(self, arrived: Sequence[ReceivedData]) -> None:
         if arrived:
             self._rotate()  # with the first byte of a part, so that none is empty
             self._parts.write(self._intake.take(arrived))
 
-    def _close_gap(self, event: Back) -> None:
+    def _close_gap(self, event: Reconnected) -> None:
         assert self._lost_ns is not None
         away_s = (event.time_ns - self._lost_ns) * 1e-9
         self._totals.gap_s += away_s
@@ -278,13 +285,13 @@ class Recorder:
         for remark in self._intake.remarks():
             self._say(remark)
 
-    def _second(self, totals: Totals, before: Totals, took_s: float) -> str:
+    def _second(self, totals: CaptureStatistics, before: CaptureStatistics, took_s: float) -> str:
         """What is looked at once a second; returns why to stop, ``""`` for no reason."""
         fresh = totals.since(before)
         free = self._parts.file.free()
         rate = fresh.bytes / took_s
         self._show(
-            Status(
+            CaptureStatus(
                 self._elapsed_s(),
                 None if self._lost_ns is None else (self._clock.now() - self._lost_ns) * 1e-9,
                 rate,
@@ -312,10 +319,10 @@ class Recorder:
                 f"nothing received for {silent_s:.0f} s: is it on, does it send, is the baud right?"
             )
 
-    def _look_for_frames(self, totals: Totals) -> None:
+    def _look_for_frames(self, totals: CaptureStatistics) -> None:
         """Bytes and nothing in them: the most usual fault of all."""
         device = self._device()
-        if not self._doubted and device and self._elapsed_s() >= DOUBT_S and totals.bytes:
+        if not self._doubted and device and self._elapsed_s() >= FRAME_CHECK_S and totals.bytes:
             self._doubted = True
             for doubt in totals.doubts(device):
                 self._say(f"{doubt}: is it this device (--device auto), is its baud right?")
@@ -338,7 +345,7 @@ class Recorder:
         if left <= 0:
             return "the disk is full but for the reserve"
         per_s = self._parts.bytes_written / max(self._elapsed_s(), 1.0)
-        if per_s > 0 and left / per_s < AHEAD_S:
+        if per_s > 0 and left / per_s < DISK_WARNING_S:
             if not self._disk_told:
                 self._say(f"the disk is full in {left / per_s:.0f} s at this rate")
             self._disk_told = True
@@ -365,7 +372,7 @@ class Recorder:
         self._parts.log(text, time_ns or self._start_ns, level=Log.WARNING)
         self._tell(text)
 
-    def _count(self) -> Totals:
+    def _count(self) -> CaptureStatistics:
         """All that is counted, as of now."""
         totals = self._totals
         self._intake.count(totals)
@@ -374,7 +381,7 @@ class Recorder:
         totals.dropped = self._receiver.dropped
         totals.high_water_bytes = self._receiver.high_water
         totals.clock_step_s = self._step_s
-        return Totals(**vars(totals))
+        return CaptureStatistics(**vars(totals))
 
     def _facts(self, ended: str) -> dict[str, str]:
         """What the part that ends now holds, for its metadata."""

@@ -17,26 +17,26 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from locatk.core.errors import LocatkError, OutputExistsError
-from locatk.formats.capture.ingestion import Stamped
+from locatk.formats.capture.ingestion import StampedMessage
 from locatk.formats.capture.statistics import RECORD
 from locatk.formats.output import check_output
 from locatk.formats.sessions.messages import timestamp
 from locatk.formats.sessions.reader import RECORD as SESSION
 from locatk.formats.sessions.writer import SessionWriter
 
-CHUNK = 1 << 19
+CHUNK_BYTES = 1 << 19
 """A chunk is written when it has so many bytes, if not before. Half of what the MCAP writer
 takes before it writes one unasked."""
 
 LOG_NAME = "locatk capture"
 """Who says what the recorder writes to ``/log``."""
 
-PER_CHUNK = 512
+INDEX_BYTES_PER_CHUNK = 512
 """Bytes of the index at the end of a file by chunk, at most."""
 
 
 @dataclass(frozen=True)
-class Content:
+class FileContent:
     """What every part begins with.
 
     Attributes
@@ -59,14 +59,14 @@ def part_path(path: Path, number: int) -> Path:
     return path.with_name(f"{path.stem}-{number:03d}{path.suffix}")
 
 
-class Parts:
+class RecordingFiles:
     """Writes a recording; :meth:`next_part` goes on in a new file.
 
     Parameters
     ----------
     path : path
         The file, or where ``numbered`` the name from which those of the parts are made.
-    content : Content
+    content : FileContent
     numbered : bool
         There may be several parts.
     overwrite : bool
@@ -79,7 +79,7 @@ class Parts:
     """
 
     def __init__(
-        self, path: Path, content: Content, *, numbered: bool = False, overwrite: bool = False
+        self, path: Path, content: FileContent, *, numbered: bool = False, overwrite: bool = False
     ) -> None:
         self._path, self._content = path, content
         self._numbered, self._overwrite = numbered, overwrite
@@ -152,13 +152,13 @@ class Parts:
                 self._artifacts[name] = text
                 self._writer.attach_toml(name, text)
 
-    def write(self, stamped: Iterable[Stamped]) -> None:
+    def write(self, stamped: Iterable[StampedMessage]) -> None:
         """Write messages, in the order in which they come."""
         for each in stamped:
             self._writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
             self._last_ns = max(self._last_ns, each.time_ns)
             self._pending += each.message.ByteSize()
-            if self._pending >= CHUNK:  # before the writer does, who makes no room
+            if self._pending >= CHUNK_BYTES:  # before the writer does, who makes no room
                 self.flush()
 
     def log(self, text: str, time_ns: int, *, level: int = Log.WARNING) -> None:
@@ -179,7 +179,7 @@ class Parts:
         """
         self._chunks += self._pending > 0
         self._pending = 0
-        self.file.make_room(4 * CHUNK + PER_CHUNK * self._chunks)
+        self.file.make_room(4 * CHUNK_BYTES + INDEX_BYTES_PER_CHUNK * self._chunks)
         self._writer.flush()
 
     def next_part(self, facts: Mapping[str, str]) -> None:
@@ -228,11 +228,11 @@ def check_outputs(
         check_output(each, overwrite=overwrite)
 
 
-AHEAD = 4 << 20
+RESERVED_BYTES = 4 << 20
 """Bytes of the disk that are taken before they are needed, so that a recording whose disk is
 full can still be finished."""
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FULL_DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """What the system says of a disk, a quota or a file system's largest file that is full."""
 
 _KEEP_SIZE = 1
@@ -297,14 +297,14 @@ class LiveFile:
             with contextlib.suppress(OSError):
                 self._file.truncate(self._size)
                 self._file.seek(self._size)
-            if isinstance(error, OSError) and error.errno in FULL:
+            if isinstance(error, OSError) and error.errno in FULL_DISK_ERRNOS:
                 raise DiskFullError(_words(error.errno), file=self.path) from error
             raise
         self._size += done
         return done
 
     def make_room(self, more: int) -> None:
-        """Take ``more`` bytes of the disk beyond what is written, and :data:`AHEAD`.
+        """Take ``more`` bytes of the disk beyond what is written, and :data:`RESERVED_BYTES`.
 
         Where the file system cannot do that, nothing happens.
 
@@ -314,13 +314,13 @@ class LiveFile:
             There is no room; what was taken before is still there to finish the file.
         """
         wanted = self._size + more
-        if not self._takes_ahead or wanted + AHEAD // 2 <= self._taken:
+        if not self._takes_ahead or wanted + RESERVED_BYTES // 2 <= self._taken:
             return
-        number = _fallocate(self._file.fileno(), self._size, more + AHEAD)
-        if number in FULL:
+        number = _fallocate(self._file.fileno(), self._size, more + RESERVED_BYTES)
+        if number in FULL_DISK_ERRNOS:
             raise DiskFullError(_words(number), file=self.path)
         if number == 0:
-            self._taken = wanted + AHEAD
+            self._taken = wanted + RESERVED_BYTES
         elif number != errno.EINTR:
             self._takes_ahead = False
 

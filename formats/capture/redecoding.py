@@ -10,9 +10,9 @@ from pathlib import Path
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import FormatError
-from locatk.formats.capture.ingestion import AUTO, SerialIntake, Stamped
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.statistics import RECORD, Totals
+from locatk.formats.capture.ingestion import AUTO, SerialIntake, StampedMessage
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.statistics import RECORD, CaptureStatistics
 from locatk.formats.devices.decoder import Options
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import RECORD as SESSION
@@ -21,26 +21,26 @@ from locatk.formats.sessions.writer import CHANNELS, SessionWriter
 
 TOPIC = "/serial/"
 
-TURN_NS = 20_000_000
+BATCH_NS = 20_000_000
 """Reads within so much time are decoded at once."""
 
 
 @dataclass(frozen=True)
-class Decoded:
+class RedecodingResult:
     """What came of the raw bytes.
 
     Attributes
     ----------
     devices : dict of str to str
         Name of the device in the session to what it was taken for.
-    totals : dict of str to Totals
+    totals : dict of str to CaptureStatistics
         By name.
     remarks : list of str
     system : str
     """
 
     devices: dict[str, str]
-    totals: dict[str, Totals]
+    totals: dict[str, CaptureStatistics]
     remarks: list[str]
     system: str
 
@@ -53,7 +53,7 @@ def decode(
     options: Options | None = None,
     artifacts: Mapping[str, str] | None = None,
     overwrite: bool = False,
-) -> Decoded:
+) -> RedecodingResult:
     """Write a session of the raw bytes of ``path`` and of what a decoder makes of them now.
 
     Times, attachments and metadata stay; records that were decoded before are left out.
@@ -125,20 +125,20 @@ def decode(
 def _facts(
     said: Mapping[str, str],
     intakes: Mapping[str, SerialIntake],
-    decoded: Decoded,
+    decoded: RedecodingResult,
     source: str,
 ) -> dict[str, str]:
     """Entries of the record ``capture``: what the port has counted as it was, the rest anew."""
     fresh: dict[str, str] = {}
     for totals in decoded.totals.values():
-        fresh |= {key: text for key, text in totals.texts().items() if key not in LINE}
+        fresh |= {key: text for key, text in totals.texts().items() if key not in LINE_STATISTICS}
     for intake in intakes.values():
         fresh |= intake.clocks()
     stays = {key: text for key, text in said.items() if not key.startswith(("samples:", "tick_"))}
     return {**stays, **fresh, "device": ", ".join(decoded.devices.values()), "decoded_from": source}
 
 
-LINE = (
+LINE_STATISTICS = (
     "gaps",
     "gap_s",
     "silences",
@@ -160,9 +160,9 @@ def _attached(session: Session) -> dict[str, str]:
     return texts
 
 
-def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator[Stamped]:
+def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator[StampedMessage]:
     """Raw bytes, records and the log of the recorder, in the order of the file."""
-    waiting: dict[str, list[Arrived]] = {topic: [] for topic in intakes}
+    waiting: dict[str, list[ReceivedData]] = {topic: [] for topic in intakes}
     begun = 0
     expected = dict.fromkeys(intakes, 0)
     for topic, time_ns, payload in session.messages([*intakes, "/log"]):
@@ -170,12 +170,12 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
             line = Log.FromString(payload)
             if line.name.startswith("locatk"):  # not of a device: those are decoded again
                 yield from _turn(intakes, waiting)
-                yield Stamped("/log", line, time_ns, time_ns)
+                yield StampedMessage("/log", line, time_ns, time_ns)
             continue
         chunk = SerialChunk.FromString(payload)
         hole = chunk.byte_offset != expected[topic]
         again = chunk.byte_offset != 0 and (chunk.opened or hole)
-        if again or time_ns - begun >= TURN_NS:
+        if again or time_ns - begun >= BATCH_NS:
             yield from _turn(intakes, waiting)
             begun = time_ns
         if hole:
@@ -183,15 +183,15 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
         if again:
             yield from intakes[topic].restart(opened=chunk.opened)
         expected[topic] = chunk.byte_offset + len(chunk.data)
-        waiting[topic].append(Arrived(time_ns, chunk.data, len(chunk.data)))
+        waiting[topic].append(ReceivedData(time_ns, chunk.data, len(chunk.data)))
     yield from _turn(intakes, waiting)
     for intake in intakes.values():
         yield from intake.finish()
 
 
 def _turn(
-    intakes: Mapping[str, SerialIntake], waiting: dict[str, list[Arrived]]
-) -> Iterator[Stamped]:
+    intakes: Mapping[str, SerialIntake], waiting: dict[str, list[ReceivedData]]
+) -> Iterator[StampedMessage]:
     for topic, arrived in waiting.items():
         if arrived:
             yield from intakes[topic].take(arrived)
@@ -199,21 +199,21 @@ def _turn(
             waiting[topic] = []
 
 
-def _decoded(intakes: Mapping[str, SerialIntake]) -> Decoded:
+def _decoded(intakes: Mapping[str, SerialIntake]) -> RedecodingResult:
     system = next((intake.system for intake in intakes.values() if intake.system), "")
     devices: dict[str, str] = {}
-    totals: dict[str, Totals] = {}
+    totals: dict[str, CaptureStatistics] = {}
     remarks: list[str] = []
     for topic, intake in intakes.items():
         name = topic.removeprefix(TOPIC)
         devices[name] = intake.device.name if intake.device else ""
-        totals[name] = Totals()
+        totals[name] = CaptureStatistics()
         intake.count(totals[name])
         remarks += intake.remarks()
-    return Decoded(devices, totals, remarks, system)
+    return RedecodingResult(devices, totals, remarks, system)
 
 
-def losses(decoded: Decoded) -> list[str]:
+def losses(decoded: RedecodingResult) -> list[str]:
     """What the decoder could not use, one phrase each."""
     return [
         phrase

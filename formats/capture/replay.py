@@ -38,7 +38,7 @@ class ReplayPort:
         ``speed`` is negative or no number.
     """
 
-    comes_again = False
+    can_reconnect = False
 
     def __init__(self, name: str, *, speed: float = 1.0) -> None:
         if not (math.isfinite(speed) and speed >= 0):

@@ -19,10 +19,15 @@ from locatk.formats.capture import ports, replay
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import AUTO, CameraIntake, Intake, SerialIntake
 from locatk.formats.capture.links import Link, Port, SourceError
-from locatk.formats.capture.reader_thread import BACKOFF_S, Receiver
+from locatk.formats.capture.reader_thread import BACKOFF_S, PortReader
 from locatk.formats.capture.recorder import Limits, Recorder
-from locatk.formats.capture.recording_files import Content, DiskFullError, Parts, check_outputs
-from locatk.formats.capture.statistics import Recorded, Status
+from locatk.formats.capture.recording_files import (
+    DiskFullError,
+    FileContent,
+    RecordingFiles,
+    check_outputs,
+)
+from locatk.formats.capture.statistics import CaptureStatus, RecordingResult
 from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Options
 
@@ -31,7 +36,7 @@ NAME, CAMERA_NAME = "robot", "camera"
 
 
 @dataclass(frozen=True)
-class Wanted:
+class CaptureRequest:
     """What to record, and how; the options of ``locatk capture``."""
 
     port: str
@@ -66,20 +71,20 @@ class Wanted:
 
 
 def record(
-    wanted: Wanted,
+    wanted: CaptureRequest,
     stop: threading.Event,
     *,
     tell: Callable[[str], None] = lambda text: None,
-    show: Callable[[Status], None] = lambda status: None,
+    show: Callable[[CaptureStatus], None] = lambda status: None,
     ready: Callable[[str], None] = lambda port: None,
     waiting: Callable[[str], None] = lambda port: None,
-) -> Recorded:
+) -> RecordingResult:
     """Record until ``stop`` is set, a limit of ``wanted`` is reached or the source is at its
     end.
 
     Parameters
     ----------
-    wanted : Wanted
+    wanted : CaptureRequest
     stop : threading.Event
     tell, show : callable
         See :class:`.recorder.Recorder`.
@@ -110,21 +115,21 @@ def record(
     try:
         ready(port.name)
         facts = _facts(wanted, port, clock)
-        parts = Parts(
+        parts = RecordingFiles(
             wanted.output,
-            Content(facts, content, intake.declared),
+            FileContent(facts, content, intake.declared),
             numbered=wanted.numbered,
             overwrite=wanted.overwrite,
         )
     except BaseException:
         link.close()
         raise
-    receiver = Receiver(port, link, clock)
+    receiver = PortReader(port, link, clock)
     recorder = Recorder(receiver, intake, parts, clock, wanted.limits, tell=tell, show=show)
     return recorder.run(stop)
 
 
-def _artifacts(wanted: Wanted) -> dict[str, str]:
+def _artifacts(wanted: CaptureRequest) -> dict[str, str]:
     """What goes into the session: of what is played what that holds, and what is given."""
     played: dict[str, str] = {}
     for path in _played(wanted.port):
@@ -185,7 +190,7 @@ def _check_disk(folder: Path, reserve: int) -> None:
         )
 
 
-def _intake(wanted: Wanted, content: Mapping[str, str]) -> Intake:
+def _intake(wanted: CaptureRequest, content: Mapping[str, str]) -> Intake:
     if wanted.is_camera:
         if wanted.device != AUTO:
             raise InputError(
@@ -202,7 +207,7 @@ def _intake(wanted: Wanted, content: Mapping[str, str]) -> Intake:
     )
 
 
-def _port(wanted: Wanted, clock: HostClock) -> Port:
+def _port(wanted: CaptureRequest, clock: HostClock) -> Port:
     if wanted.is_camera:
         from locatk.formats.capture import camera  # OpenCV, which bytes do not need
 
@@ -217,7 +222,7 @@ def _port(wanted: Wanted, clock: HostClock) -> Port:
     return ports.port_of(wanted.port, baud=baud, speed=wanted.speed)
 
 
-def _facts(wanted: Wanted, port: Port, clock: HostClock) -> dict[str, str]:
+def _facts(wanted: CaptureRequest, port: Port, clock: HostClock) -> dict[str, str]:
     """What is known at the start, for the metadata record ``capture``."""
     known = {} if wanted.is_camera or wanted.device == AUTO else {"device": wanted.device}
     return {

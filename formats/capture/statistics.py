@@ -12,7 +12,7 @@ RECORD = "capture"
 
 
 @dataclass
-class Totals:
+class CaptureStatistics:
     """Counted since the start.
 
     Attributes
@@ -55,7 +55,7 @@ class Totals:
     clock_step_s: float = 0.0
     samples: dict[str, int] = field(default_factory=dict)
 
-    def since(self, before: Totals) -> Totals:
+    def since(self, before: CaptureStatistics) -> CaptureStatistics:
         """What was counted since ``before``; the high water and the clock's step are not
         counts and stay."""
         kept = ("high_water_bytes", "clock_step_s", "samples")
@@ -67,7 +67,7 @@ class Totals:
         samples = {
             topic: count - before.samples.get(topic, 0) for topic, count in self.samples.items()
         }
-        return Totals(
+        return CaptureStatistics(
             **counted,
             high_water_bytes=self.high_water_bytes,
             clock_step_s=self.clock_step_s,
@@ -112,7 +112,7 @@ class Totals:
 
 
 @dataclass(frozen=True)
-class Status:
+class CaptureStatus:
     """How it goes, once a second."""
 
     elapsed_s: float
@@ -120,13 +120,13 @@ class Status:
     """For how long the connection has been lost; None while it is there."""
     bytes_per_s: float
     frames_per_s: float
-    totals: Totals
+    totals: CaptureStatistics
     file_bytes: int
     free_bytes: int | None
 
 
 @dataclass
-class Recorded:
+class RecordingResult:
     """What came of a recording.
 
     Attributes
@@ -142,7 +142,7 @@ class Recorded:
         Whether it ended for something that went wrong.
     """
 
-    totals: Totals
+    totals: CaptureStatistics
     paths: list[Path]
     device: str
     started_ns: int

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from dataclasses import fields
 from typing import Any
 
-from locatk.formats.capture.statistics import RECORD, Totals
+from locatk.formats.capture.statistics import RECORD, CaptureStatistics
 from locatk.formats.sessions.mcap_records import Segment
 from locatk.formats.sessions.reader import Session
 
@@ -19,7 +19,7 @@ MOST_CHUNKS = 1000
 """Chunks whose indexes are read to find the messages of a topic."""
 
 _NUMBERS = {"started_ns", "ended_ns", "part", "parts", "baud", "unplugged"} | {
-    each.name for each in fields(Totals)
+    each.name for each in fields(CaptureStatistics)
 }
 _PREFIXES = ("samples:", "tick_")
 _LARGEST = 1 << 64

@@ -27,9 +27,9 @@ from locatk.formats.capture import port_listing as listing
 from locatk.formats.capture import ports
 from locatk.formats.capture.links import Overruns
 from locatk.formats.capture.port_listing import PortInfo
-from locatk.formats.capture.recorder import Status
+from locatk.formats.capture.recorder import CaptureStatus
 from locatk.formats.capture.recording_files import LiveFile
-from locatk.formats.capture.statistics import Totals
+from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
@@ -293,7 +293,7 @@ def unopened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             asked.append(name)
             raise AssertionError("the port was opened")
 
-        return SimpleNamespace(name=name, comes_again=False, open=fail, describe=dict)
+        return SimpleNamespace(name=name, can_reconnect=False, open=fail, describe=dict)
 
     monkeypatch.setattr(ports, "port_of", port_of)
     return asked
@@ -343,7 +343,7 @@ def test_wrong_usage(
         (["--artifact", "WRONG"], "wrong.toml"),
         (["--artifact", "TAG", "--artifact", "OTHER"], "a second tag.toml"),
         (["--artifact", "OLD"], "no artifact is attached"),
-        (["--artifact", "GONE"], "No such file"),
+        (["--artifact", "UNPLUGGED"], "No such file"),
         (["-o", "THERE"], "exists"),
         (["-o", "NOFOLDER"], "no folder"),
         (["-o", "FOLDER", "--overwrite"], "not a regular file"),
@@ -363,7 +363,7 @@ def test_refused(
         "WRONG": "wrong.toml",
         "TAG": "tag.toml",
         "OTHER": "other.toml",
-        "GONE": "gone.toml",
+        "UNPLUGGED": "gone.toml",
         "OLD": "old.mcap",
         "THERE": "there.mcap",
         "NOFOLDER": "no/run.mcap",
@@ -461,9 +461,9 @@ def test_what_is_neither(text: str) -> None:
 
 
 def test_the_live_line() -> None:
-    totals = Totals(bad=2, lost=3, overruns=4, gaps=1, high_water_bytes=5_000)
+    totals = CaptureStatistics(bad=2, lost=3, overruns=4, gaps=1, high_water_bytes=5_000)
     line = capture_text.status_line(
-        Status(3723.4, None, 2.5e6, 812.4, totals, 7_000_000, 80_000_000_000)
+        CaptureStatus(3723.4, None, 2.5e6, 812.4, totals, 7_000_000, 80_000_000_000)
     )
     assert line.split("  ") == [
         "1:02:03",
@@ -477,11 +477,15 @@ def test_the_live_line() -> None:
         "file 7 MB",
         "disk 80 GB left",
     ]
-    quiet = capture_text.status_line(Status(5.0, None, 0.0, 0.0, Totals(), 0, None))
+    quiet = capture_text.status_line(
+        CaptureStatus(5.0, None, 0.0, 0.0, CaptureStatistics(), 0, None)
+    )
     assert quiet.startswith("0:05  0 B/s")
     assert "gap" not in quiet
     assert "disk" not in quiet
-    away = capture_text.status_line(Status(9.0, 3.2, 0.0, 0.0, Totals(gaps=2), 0, None))
+    away = capture_text.status_line(
+        CaptureStatus(9.0, 3.2, 0.0, 0.0, CaptureStatistics(gaps=2), 0, None)
+    )
     assert away.startswith("0:09  away for 3 s  ")
     assert "2 gaps" in away
 
@@ -499,7 +503,7 @@ def test_on_a_terminal_the_line_stays_one(
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "50")
-    status = Status(5.0, None, 1e6, 10.0, Totals(), 10**6, 10**9)
+    status = CaptureStatus(5.0, None, 1e6, 10.0, CaptureStatistics(), 10**6, 10**9)
     with capture_text.live() as live:
         live.show(status)
         live.show(status)
@@ -523,7 +527,7 @@ def test_who_listens_may_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(click, "echo", broken)
     live = capture_text.Live()
     live.tell("one")
-    live.show(Status(5.0, None, 1e6, 10.0, Totals(), 10**6, 10**9))
+    live.show(CaptureStatus(5.0, None, 1e6, 10.0, CaptureStatistics(), 10**6, 10**9))
     live.tell("two")
     live.wipe()
     assert len(heard) == 1
@@ -537,7 +541,7 @@ def test_losses_of_the_line_are_in_the_json(
     read, write = os.pipe()
 
     class Port:
-        name, comes_again = "uart", True
+        name, can_reconnect = "uart", True
 
         def open(self) -> Any:
             return self
@@ -588,7 +592,7 @@ PORT = PortInfo(
 
 
 def test_the_list_of_ports(locatk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listing, "ports", lambda: [PORT])
+    monkeypatch.setattr(listing, "find_ports_with_users", lambda: [PORT])
     result = locatk("capture", "--list")
     assert result.exit_code == 0
     assert result.stderr == ""
@@ -603,7 +607,7 @@ def test_the_list_of_ports(locatk: Any, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_no_ports(locatk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listing, "ports", list)
+    monkeypatch.setattr(listing, "find_ports_with_users", list)
     result = locatk("capture", "--list")
     assert (result.exit_code, result.stdout) == (0, "")
     assert "No serial port found" in result.stderr
@@ -630,7 +634,7 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(LiveFile, "free", lambda self: 1)
     from locatk.formats.capture import recorder
 
-    monkeypatch.setattr(recorder, "SHOW_S", 0.0)
+    monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.0)
     result = capture("--json")
     assert result.exit_code == 3
     assert "Incomplete: the disk is full but for the reserve" in result.stderr

@@ -206,7 +206,7 @@ def test_doubled_signals(
 HANG = """
 import sys, time
 from locatk.formats.capture import receiver, serial_link
-receiver.HANGING_S = 15.0
+receiver.MAX_STOP_WAIT_S = 15.0
 real = serial_link.DescriptorLink.read
 def read(self, wait_s):
     data = real(self, wait_s)

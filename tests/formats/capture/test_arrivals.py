@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.formats.capture.clocks import KEPT, Arrivals
+from locatk.formats.capture.clocks import MIN_KEPT_READS, ArrivalTimes
 
 reads = st.lists(
     st.tuples(st.integers(1, 50), st.integers(0, 10_000)), min_size=1, max_size=30
@@ -15,8 +15,8 @@ reads = st.lists(
 """(ends, times) of reads, times not always later."""
 
 
-def filled(table: np.ndarray, byte_ns: float = 0.0) -> Arrivals:
-    arrivals = Arrivals(byte_ns)
+def filled(table: np.ndarray, byte_ns: float = 0.0) -> ArrivalTimes:
+    arrivals = ArrivalTimes(byte_ns)
     for end, time_ns in table.tolist():
         arrivals.add(end, time_ns)
     return arrivals
@@ -56,13 +56,16 @@ def test_what_is_not_there_yet_has_the_last_time() -> None:
     assert filled(np.array([(10, 7), (20, 9)])).read_ns(np.array([21])).tolist() == [9]
 
 
-@pytest.mark.parametrize("n", [2 * KEPT, 2 * KEPT + 1, 3 * KEPT + 17, 4 * KEPT + 1])
+@pytest.mark.parametrize(
+    "n",
+    [2 * MIN_KEPT_READS, 2 * MIN_KEPT_READS + 1, 3 * MIN_KEPT_READS + 17, 4 * MIN_KEPT_READS + 1],
+)
 def test_a_long_recording_takes_no_more_room_and_forgets_only_what_is_old(n: int) -> None:
-    arrivals = Arrivals()
+    arrivals = ArrivalTimes()
     room = sum(each.nbytes for each in vars(arrivals).values() if isinstance(each, np.ndarray))
     for k in range(n):
         arrivals.add(3 * (k + 1), 1_000 * (k + 1))
-    ends = np.arange(3 * (n - KEPT) + 1, 3 * n + 1)
+    ends = np.arange(3 * (n - MIN_KEPT_READS) + 1, 3 * n + 1)
     assert arrivals.read_ns(ends).tolist() == (1_000 * -(-ends // 3)).tolist()
     after = sum(each.nbytes for each in vars(arrivals).values() if isinstance(each, np.ndarray))
     assert after == room

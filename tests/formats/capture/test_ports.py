@@ -125,7 +125,7 @@ def test_bytes_of_a_terminal(terminal: Terminal, opened: Opened) -> None:
     assert gathered(link, len(EVERY_BYTE)) == EVERY_BYTE
     assert link.read(0.001) == b""
     assert link.overruns() is None
-    assert port.comes_again
+    assert port.can_reconnect
     assert port.describe() == {
         "port": terminal.path,
         "resolved": terminal.path,
@@ -291,7 +291,7 @@ def test_a_device_that_is_no_terminal() -> None:
 def plugged(monkeypatch: pytest.MonkeyPatch) -> list[PortInfo]:
     """The ports of this computer, for the test to change."""
     now: list[PortInfo] = []
-    monkeypatch.setattr(ports, "attached", lambda: list(now))
+    monkeypatch.setattr(ports, "find_ports", lambda: list(now))
     return now
 
 
@@ -508,7 +508,7 @@ def served(
 def test_a_socket(opened: Opened) -> None:
     number, thread = served(lambda connection: connection.sendall(b"hello" + EVERY_BYTE), 2)
     port = port_of(f"socket://127.0.0.1:{number}", baud=BAUD)
-    assert port.comes_again
+    assert port.can_reconnect
     for _ in range(2):
         link = opened(port)
         # What the server said before anybody read is not thrown away.
@@ -597,7 +597,7 @@ def test_a_remote_port(opened: Opened) -> None:
     remote = Remote(EVERY_BYTE)
     number, thread = served(remote, 2)
     port = port_of(f"rfc2217://127.0.0.1:{number}", baud=57_600)
-    assert port.comes_again
+    assert port.can_reconnect
     for _ in range(2):
         link = opened(port)
         assert remote.port.baudrate == 57_600
@@ -625,7 +625,7 @@ def test_loop(opened: Opened) -> None:
     port = port_of("loop://", baud=BAUD)
     link = opened(port)
     assert link.read(0.001) == b""
-    assert not port.comes_again
+    assert not port.can_reconnect
     assert port.describe() == {"port": "loop://", "resolved": "loop://", "baud": str(BAUD)}
 
 
@@ -707,7 +707,7 @@ def test_socat_ends_and_starts_again(tmp_path: Path, opened: Opened) -> None:
             with open(names[0], "wb", buffering=0) as stream:
                 stream.write(EVERY_BYTE)
                 assert gathered(link, len(EVERY_BYTE)) == EVERY_BYTE
-            found = holders.holders([str(names[1])])[str(names[1])]
+            found = holders.find_port_users([str(names[1])])[str(names[1])]
             assert os.getpid() in {holder.pid for holder in found}
             socat.terminate()
         assert "unplugged" in lost(link)

@@ -22,7 +22,7 @@ from locatk.formats.capture import recording_files as parts
 from locatk.formats.capture import setup as session
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.links import Overruns, SourceError
-from locatk.formats.capture.reader_thread import Receiver
+from locatk.formats.capture.reader_thread import PortReader
 from locatk.formats.capture.recording_files import DiskFullError, LiveFile
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
@@ -139,7 +139,9 @@ def test_a_disk_that_is_slow_costs_no_byte(
         return real(self, data)
 
     monkeypatch.setattr(LiveFile, "write", slow)
-    monkeypatch.setattr(session, "Receiver", lambda *args: Receiver(*args, most_bytes=50_000))
+    monkeypatch.setattr(
+        session, "PortReader", lambda *args: PortReader(*args, max_waiting_bytes=50_000)
+    )
     sent = pieces(200, size=1000)
     running = start(flush_s=0.02)
     port.send(*sent)
@@ -215,7 +217,9 @@ def test_whatever_comes_together(
     monkeypatch.setattr(LiveFile, "write", sometimes_slow)
     monkeypatch.setattr(receiver, "BACKOFF_S", (0.001, 0.01))
     most = chance.choice([2_000, 1 << 20])
-    monkeypatch.setattr(session, "Receiver", lambda *args: Receiver(*args, most_bytes=most))
+    monkeypatch.setattr(
+        session, "PortReader", lambda *args: PortReader(*args, max_waiting_bytes=most)
+    )
     rotation = chance.choice([{}, {"rotate_s": 0.05}, {"rotate_bytes": 20_000}])
     running = start(flush_s=chance.choice([0.0, 0.02]), **rotation)
     sent = bytearray()
@@ -311,7 +315,7 @@ def test_a_silence_while_it_is_away_is_no_second_warning(port: Any, start: Any) 
 
 
 def test_it_breaks_for_good(port: Any, start: Any, raw_bytes: Any) -> None:
-    port.comes_again = False
+    port.can_reconnect = False
     running = start()
     port.send(b"half")
     port.lose("cut short")
@@ -345,7 +349,7 @@ def test_a_driver_that_fails(port: Any, start: Any, raw_bytes: Any) -> None:
 def test_a_driver_that_hangs_does_not_hold_the_file(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(receiver, "HANGING_S", 0.2)
+    monkeypatch.setattr(receiver, "MAX_STOP_WAIT_S", 0.2)
     hanging, go_on = threading.Event(), threading.Event()
 
     def hang() -> bytes:
@@ -396,7 +400,7 @@ def test_a_disk_that_was_slow_is_no_silence(
         return real(self, data)
 
     running = start(silence_s=0.3, flush_s=0.01)
-    monkeypatch.setattr(recorder, "SHOW_S", 0.0)  # looked at in the very turn
+    monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.0)  # looked at in the very turn
     monkeypatch.setattr(LiveFile, "write", stall)
     port.send(os.urandom(5000))
     assert stalled.wait(10)
@@ -417,7 +421,7 @@ def test_bytes_in_which_no_frame_is_found_are_told_of_once(
     port: Any, start: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The wrong device, or the wrong baud."""
-    monkeypatch.setattr(recorder, "DOUBT_S", 0.1)
+    monkeypatch.setattr(recorder, "FRAME_CHECK_S", 0.1)
     running = start("locatk")
     port.send(b"\x80" * 500)
     running.until_said("no frame of locatk in 500 bytes")
@@ -507,7 +511,7 @@ def test_sizes_hold_for_what_comes_at_once(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch, limits: Any
 ) -> None:
     """3 MB a turn, and the line goes on: no hole, and not much more than was asked for."""
-    monkeypatch.setattr(recorder, "TURN_S", 0.3)
+    monkeypatch.setattr(recorder, "WRITE_INTERVAL_S", 0.3)
     given = bytearray()
 
     def again() -> bytes:
@@ -830,7 +834,7 @@ def test_the_output_is_what_is_played(start: Any, tmp_path: Path, port: Any) -> 
     (path,) = running.end().paths
     before = path.read_bytes()
     for name in (f"replay:{path}", f"replay:{path}#{RAW}", f"replay://{path}"):
-        wanted = session.Wanted(name, "raw", path, overwrite=True)
+        wanted = session.CaptureRequest(name, "raw", path, overwrite=True)
         with pytest.raises(OutputExistsError):
             session.record(wanted, threading.Event())
     assert path.read_bytes() == before
@@ -845,7 +849,7 @@ def recorded_alone(port: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(session.ports, "port_of", lambda *args, **more: port)
 
     def run(**talk: Callable[[Any], None]) -> Any:
-        wanted = session.Wanted("scripted", "raw", tmp_path / "alone.mcap")
+        wanted = session.CaptureRequest("scripted", "raw", tmp_path / "alone.mcap")
         return session.record(wanted, threading.Event(), **talk)
 
     return run

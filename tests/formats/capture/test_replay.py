@@ -66,7 +66,7 @@ def test_the_same_pieces(session: Path) -> None:
             link.read(0.0)
         assert link.overruns() is None
         link.close()
-    assert not port.comes_again
+    assert not port.can_reconnect
     assert port.describe() == {
         "port": f"replay:{session}",
         "resolved": str(session),

@@ -9,8 +9,8 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.formats import devices as wire
 from locatk.formats.capture.ingestion import SerialIntake
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.statistics import Totals
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.devices.lines.decoder import LineDecoder
 
@@ -59,9 +59,9 @@ def test_a_device_of_another_package(
     monkeypatch.setattr(wire, "_load", lambda target: made)
     intake = SerialIntake("red", "", "mine")
     data = b"1,2\n3,4\n5,6\n"
-    topics = [each.topic for each in intake.take([Arrived(10**18, data, len(data))])]
+    topics = [each.topic for each in intake.take([ReceivedData(10**18, data, len(data))])]
     assert "/readings/red" in topics
-    totals = Totals()
+    totals = CaptureStatistics()
     intake.count(totals)
     assert totals.samples["/readings/red"] >= 2
 
