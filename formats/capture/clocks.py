@@ -1,4 +1,4 @@
-"""The host's clock of a recording: anchored once to the epoch, never set back."""
+"""Clocks of a recording: the host's, arrival times of bytes, and tick counters of devices."""
 
 from __future__ import annotations
 
@@ -15,22 +15,24 @@ Ints = NDArray[np.int64]
 
 
 def steady_ns() -> int:
-    """Nanoseconds of a clock that nobody sets; it runs on while the machine sleeps, where
-    the system has such a clock."""
+    """Return nanoseconds of a monotonic clock.
+
+    It includes the time in which the machine sleeps, if the system has such a clock.
+    """
     boot = getattr(time, "CLOCK_BOOTTIME", None)
     return time.monotonic_ns() if boot is None else time.clock_gettime_ns(boot)
 
 
 class HostClock:
-    """Nanoseconds since 1970 that only ever grow.
+    """Nanoseconds since 1970 that never decrease.
 
-    The wall clock is read once. When somebody, or NTP, sets it later, the times of the
-    recording stay as they were and :meth:`stepped_ns` tells by how much the two differ.
+    The wall clock is read once. If it is set later, by hand or NTP, the times of the recording do
+    not change, and :meth:`stepped_ns` returns the difference.
 
     Parameters
     ----------
     steady, wall : callable
-        The clocks, in ns; tests give their own.
+        Monotonic clock and wall clock, in ns.
     """
 
     def __init__(
@@ -42,27 +44,25 @@ class HostClock:
         self._anchor = wall() - steady()
 
     def now(self) -> int:
-        """Time in ns since the epoch."""
+        """Return the time in ns since the epoch."""
         return self._anchor + self._steady()
 
     def stepped_ns(self) -> int:
-        """By how much the wall clock was set since the start; positive when forward."""
+        """Return the time by which the wall clock was set since the start; positive if forward."""
         return self._wall() - self.now()
 
 
 MIN_KEPT_READS = 1 << 16
-"""So many reads are remembered at least: decoders that look for the start of a frame hold
-records back."""
+"""Reads whose times are kept: decoders that search for the start of a frame hold records back."""
 
 
 class ArrivalTimes:
-    """Places in a stream of bytes, and when each was read.
+    """Times at which the bytes of a stream were read.
 
     Parameters
     ----------
     byte_ns : float
-        How long one byte takes on the wire. Frames that came in one read are told apart by
-        the bytes between their ends.
+        Transmission time of one byte, which separates frames of one read.
     """
 
     def __init__(self, byte_ns: float = 0.0) -> None:
@@ -72,7 +72,7 @@ class ArrivalTimes:
         self._count = 0
 
     def add(self, end: int, time_ns: int) -> None:
-        """The bytes up to ``end`` had arrived at ``time_ns``; both never descend."""
+        """Add a read: the bytes up to ``end`` had arrived at ``time_ns``; neither may decrease."""
         if self._count == len(self._end):
             for array in (self._end, self._time):
                 array[:MIN_KEPT_READS] = array[-MIN_KEPT_READS:]
@@ -82,12 +82,14 @@ class ArrivalTimes:
         self._count += 1
 
     def read_ns(self, end: Ints) -> Ints:
-        """(n,) when the reads were that brought the bytes before ``end`` (n,)."""
+        """Return the times (n,) of the reads with the bytes before ``end`` (n,)."""
         return self._time[self._place(end)]
 
     def wire_ns(self, end: Ints) -> Ints:
-        """(n,) when the last byte before ``end`` (n,) was on the wire, as near as is known:
-        earlier than its read by the bytes that came after it, never before the read before.
+        """Return estimated times (n,) on the wire of the last byte before ``end`` (n,).
+
+        That is the time of its read, minus the transmission time of the bytes after it, but not
+        before the previous read.
         """
         place = self._place(end)
         late = (self.byte_ns * (self._end[place] - end)).astype(np.int64)
@@ -100,12 +102,16 @@ class ArrivalTimes:
 
 
 RATE_WINDOW_NS = 5_000_000_000
-"""Over so much time ticks are compared with arrivals, twice: what comes late at the end of
-one window is missing in the next."""
+"""Duration of the two windows in which ticks are compared with arrival times: a delay at the end
+of one window makes the next one shorter."""
 
 
 class DeviceClock:
-    """Times of what one device measured.
+    """Clock model of one device, as long as its tick rate is plausible.
+
+    :class:`locatk.core.clock_sync.TickClock` estimates drifts in ppm. The ticks of a device whose
+    rate is far from the nominal one, such as a firmware that counts milliseconds or a recording
+    that is replayed faster, are not related to the host's time.
 
     Parameters
     ----------
@@ -114,30 +120,32 @@ class DeviceClock:
     Attributes
     ----------
     ticks : Ticks
-    clock : TickClock
+    model : TickClock
     rate : float or None
-        By how much its clock runs faster than it says, where it cannot be believed.
+        Ratio of its tick rate to the nominal one, if that is not plausible.
     """
 
     def __init__(self, ticks: Ticks) -> None:
         self.ticks = ticks
-        self.clock = TickClock(ticks.hz, ticks.bits)
+        self.model = TickClock(ticks.hz, ticks.bits)
         self.rate: float | None = None
         self._last: dict[str, tuple[int, int]] = {}
         self._ticked = self._passed = 0
         self._before: float | None = None
 
     def times(self, topic: str, tick: Ints, read_ns: Ints) -> Ints | None:
-        """Host times (n,) of ``tick`` (n,), none later than its arrival; None where the clock
-        cannot be believed. ``topic`` tells the streams of the device apart."""
+        """Return host times (n,) of ``tick`` (n,), none after its arrival.
+
+        Return None if the tick rate is implausible. ``topic`` separates the streams of the device.
+        """
         self._compare(topic, tick, read_ns)
         if self.rate is not None:
             return None
-        return np.minimum(self.clock.times(tick, read_ns), read_ns)
+        return np.minimum(self.model.times(tick, read_ns), read_ns)
 
     def restart(self) -> None:
-        """The device was away."""
-        self.clock.restart()
+        """Restart the model after a reconnect."""
+        self.model.restart()
         self._last.clear()
         self._ticked = self._passed = 0
         self._before = self.rate = None

@@ -1,4 +1,4 @@
-"""What was read becomes messages: raw bytes as they are, and what a decoder makes of them."""
+"""Conversion of received data to messages of a session: raw bytes, and records of a decoder."""
 
 from __future__ import annotations
 
@@ -28,55 +28,55 @@ from locatk.formats.sessions.messages import Layout
 from locatk.formats.sessions.trajectories import LARGEST_BATCH
 
 PAUSE_NS = 3_000_000
-"""A line that is silent for longer is between two frames: within a frame bytes follow each
-other, or wait for the next millisecond of USB."""
+"""Silence of the line that separates two frames: within a frame, bytes follow each other, or wait
+for the next millisecond of USB."""
 
 AUTO = "auto"
 
 UNPACED = ("replay:", "socket:", "rfc2217:", "loop:")
-"""Ports whose bytes do not come one after the other at a baud."""
+"""Ports whose bytes are not spaced by a baud rate."""
 
 
 class Intake(Protocol):
-    """What becomes of what was read.
+    """Converts received data to messages.
 
     Attributes
     ----------
     declared : sequence of (str, type)
-        Topics that are sure to come, with their messages.
+        Topics that are certain to occur, with their messages.
     system : str
-        Whose session it is, ``""`` while that is not known.
+        System of the session, ``""`` while it is unknown.
     """
 
     declared: Sequence[tuple[str, type[Message]]]
     system: str
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
-        """Messages of what was read."""
+        """Return the messages of received data."""
 
     def turn(self, now_ns: int) -> Iterator[StampedMessage]:
-        """Time has gone on, whether or not something was read."""
+        """Return the messages that are due at ``now_ns``, whether or not data were received."""
 
     def restart(self) -> Iterator[StampedMessage]:
-        """The line was lost and is there again."""
+        """Return the messages that were pending back, after a reconnect."""
 
     def finish(self) -> Iterator[StampedMessage]:
-        """Nothing more comes."""
+        """Return the messages that were pending back, at the end."""
 
     def count(self, totals: CaptureStatistics) -> None:
-        """Put what was counted into ``totals``."""
+        """Write the counts into ``totals``."""
 
     def remarks(self) -> list[str]:
-        """What must be known to use the records, and was not said yet."""
+        """Return new facts that a user of the records must know."""
 
     def clocks(self) -> dict[str, str]:
-        """What is known of the devices' clocks, as entries of the metadata record."""
+        """Return the parameters of the devices' clocks, as entries of the metadata record."""
 
     def rates(self) -> dict[str, float]:
-        """Records a second by topic, from the first to the last."""
+        """Return records per second by topic, between the first and the last."""
 
     def artifacts(self) -> dict[str, str]:
-        """Artifacts that are known without being told, name to text."""
+        """Return artifacts that follow from the device, name to text."""
 
 
 class SerialIntake:
@@ -85,17 +85,17 @@ class SerialIntake:
     Parameters
     ----------
     name : str
-        Of the device, in topics.
+        Name of the device in topics.
     port : str
-        As the user named it.
+        Port as given by the user.
     device_name : str
-        Of :data:`locatk.formats.devices.DEVICES` or an entry point, or ``"auto"``.
+        Name in :data:`locatk.formats.devices.DEVICES`, of an entry point, or ``"auto"``.
     options : Options
-        For the decoder.
+        Options of the decoder.
     baud : int, optional
-        Of the port; the device's own where it is left out.
+        Baud rate of the port; that of the device by default.
     artifacts : mapping of str to str
-        What is attached to the session: name to text.
+        Attachments of the session: name to text.
 
     Raises
     ------
@@ -128,12 +128,12 @@ class SerialIntake:
         self._streams = MessageEncoder(name, halls)
         self._arrivals = ArrivalTimes()
         self._known: dict[tuple[str, str], Stream] = {}
-        self._asked: set[Stream] = set()
+        self._with_artifacts: set[Stream] = set()
         self._counts = Counts()
-        self._said: list[str] = []
+        self._remarks: list[str] = []
         self._decoder: Decoder | None = None
         self._identifier: Identifier | None = None
-        self._held: list[tuple[bytes, bool] | None] = []  # None: opened again
+        self._pending: list[tuple[bytes, bool] | None] = []  # None: opened again
         if device_name == AUTO:
             self._identifier = Identifier(self._options)
         else:
@@ -146,7 +146,7 @@ class SerialIntake:
             self._arrivals.byte_ns = 10e9 / (self._baud or found.baud)
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
-        """Messages of what was read: all raw ones, then the records."""
+        """Return the messages of received data: first all raw ones, then the records."""
         pieces: list[tuple[bool, list[bytes]]] = []
         for each in arrived:
             chunk = SerialChunk(
@@ -175,12 +175,12 @@ class SerialIntake:
             return self._decoder.feed(data, pause=pause)
         if self._identifier is None:
             return []
-        self._held.append((data, pause))
+        self._pending.append((data, pause))
         self._identifier.feed(data, pause=pause)
         return self._identified(self._identifier.verdict())
 
     def turn(self, now_ns: int) -> Iterator[StampedMessage]:
-        """Settle what the device is, when it was listened to for long enough."""
+        """End the identification of the device after MAX_IDENTIFICATION_S."""
         if self._identifier is None or self._first_ns is None:
             return
         if now_ns - self._first_ns > MAX_IDENTIFICATION_S * 1e9:
@@ -193,47 +193,51 @@ class SerialIntake:
         if verdict is None:
             return []
         if self._fed:
-            self._said.append(f"the device is taken for {verdict.device}: {verdict.why}")
+            self._remarks.append(f"identified device: {verdict.device} ({verdict.why})")
         self._identifier = None
         self._set_device(find_device(verdict.device))
-        held, self._held = self._held, []
+        pending, self._pending = self._pending, []
         batches = []
-        for piece in held:
-            batches += self._again() if piece is None else self._feed(*piece)
+        for piece in pending:
+            batches += self._restart_decoder() if piece is None else self._feed(*piece)
         return batches
 
     def restart(self, *, opened: bool = True) -> Iterator[StampedMessage]:
         """What is half received is dropped; byte offsets go on. Not ``opened`` where only
         bytes are missing from a recording."""
         self._opened = opened
-        yield from self._records(self._again)
-        self._streams.restart()  # after what was held back, which is of the time before
+        yield from self._records(self._restart_decoder)
+        self._streams.restart()  # after what was pending back, which is of the time before
 
-    def _again(self) -> list[Batch]:
+    def _restart_decoder(self) -> list[Batch]:
         if self._decoder is not None:
             return self._decoder.restart()
-        self._held += [None] * (self._identifier is not None)
+        self._pending += [None] * (self._identifier is not None)
         return []
 
     def skip_to(self, offset: int) -> None:
-        """Of a recording that is not whole: the next byte is number ``offset``."""
+        """Continue at byte ``offset`` after a hole in an incomplete recording."""
         if offset > self._offset > 0:
-            self._said.append(f"{offset - self._offset} bytes are missing at byte {self._offset}")
+            self._remarks.append(
+                f"{offset - self._offset} bytes are missing at byte {self._offset}"
+            )
         self._offset = offset
 
     def finish(self) -> Iterator[StampedMessage]:
-        """What the decoder held back."""
+        """Return the records that the decoder pending back."""
         yield from self._records(self._settle)
         if self._decoder is not None:
             yield from self._records(self._decoder.finish)
 
     def _records(self, decode: Callable[[], list[Batch]]) -> list[StampedMessage]:
-        """Messages of what ``decode`` gives. Whatever it raises ends the decoding, and not
-        the recording: the bytes go on."""
+        """Return the messages of the batches of ``decode``.
+
+        An exception ends the decoding, but not the recording of the bytes.
+        """
         try:
             batches = decode()
             made = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
-        except Exception as error:  # of a decoder that may be somebody else's
+        except Exception as error:  # The decoder may be of another package.
             self._stop_decoding(error)
             return []
         for batch in batches:
@@ -243,18 +247,18 @@ class SerialIntake:
         return made
 
     def _stop_decoding(self, error: Exception) -> None:
-        self._said.append(
-            f"the decoder failed ({type(error).__name__}: {error}): from here on there are only "
-            "raw bytes. Please report it"
+        self._remarks.append(
+            f"the decoder failed ({type(error).__name__}: {error}); only raw bytes are recorded "
+            "from now on. Please report this error"
         )
         if self._decoder is not None:
             self._counts = self._decoder.counts
-            self._said += self._decoder.remarks
+            self._remarks += self._decoder.remarks
         self._decoder = self._identifier = None
-        self._held = []
+        self._pending = []
 
     def count(self, totals: CaptureStatistics) -> None:
-        """What the decoder counted, and how many records there are of each topic."""
+        """Write the counts of the decoder, and the records per topic, into ``totals``."""
         totals.bytes = self._fed
         if self._decoder is not None:
             self._counts = self._decoder.counts
@@ -264,21 +268,20 @@ class SerialIntake:
         totals.samples = dict(self._streams.samples)
 
     def remarks(self) -> list[str]:
-        """Of the decoder and of the identification."""
-        said, self._said = self._said + self._streams.remarks, []
+        """Return new remarks of the decoder and the identification."""
+        remarks, self._remarks = self._remarks + self._streams.remarks, []
         self._streams.remarks = []
         if self._decoder is not None:
-            said += self._decoder.remarks
+            remarks += self._decoder.remarks
             self._decoder.remarks.clear()
-        return said
+        return remarks
 
     def clocks(self) -> dict[str, str]:
-        """Of each device's clock against the host's: offset, drift, and how late the latest
-        twentieth of what it sends arrives."""
+        """Return offset, drift and jitter (95th percentile of the delay) of each device's clock."""
         found: dict[str, str] = {}
         for name, clock in self._streams.clocks().items():
             if clock.jitter_ns is not None and clock.jitter_ns[1] < 0:
-                continue  # ticks ahead of their arrival are of no clock that runs with ours
+                continue  # Ticks ahead of their arrival belong to no clock in step with the host.
             if clock.offset_ns is not None:
                 found[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
             if clock.drift_ppm is not None:
@@ -289,31 +292,31 @@ class SerialIntake:
         return found
 
     def rates(self) -> dict[str, float]:
-        """Of what was decoded."""
+        """Return decoded records per second by topic."""
         return self._streams.rates()
 
     def artifacts(self) -> dict[str, str]:
-        """Sensors of devices that are what they are."""
+        """Return the default artifacts of the device, by its streams."""
         if self.device is None:
             return {}
         found: dict[str, str] = {}
         for stream in self._known.values():
-            if stream not in self._asked:
-                self._asked.add(stream)
+            if stream not in self._with_artifacts:
+                self._with_artifacts.add(stream)
                 try:
                     found |= self.device.default_artifacts(stream)
-                except Exception as error:  # of a device that may be somebody else's
-                    self._said.append(f"no artifacts of {self.device.name}: {error}")
+                except Exception as error:  # The device may be of another package.
+                    self._remarks.append(f"no artifacts of {self.device.name}: {error}")
         return found
 
 
 class CameraIntake:
-    """Frames of a camera, already packed as image files.
+    """Frames of a camera, encoded as image files.
 
     Parameters
     ----------
     name : str
-        Of the camera, in topics.
+        Name of the camera in topics.
     format : str
         ``"png"`` or ``"jpeg"``.
     """
@@ -326,7 +329,7 @@ class CameraIntake:
         self._frames = self._bytes = self._first_ns = self._last_ns = 0
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
-        """One message a frame."""
+        """Return one message per frame."""
         for each in arrived:
             for time_ns, image, *_ in each.data:
                 self._first_ns = self._first_ns or time_ns
@@ -342,37 +345,37 @@ class CameraIntake:
                 yield StampedMessage(self.topic, message, time_ns, time_ns)
 
     def turn(self, now_ns: int) -> Iterator[StampedMessage]:
-        """Nothing."""
+        """Return nothing."""
         return iter(())
 
     def restart(self) -> Iterator[StampedMessage]:
-        """Nothing: each frame stands alone."""
+        """Return nothing, because frames are independent."""
         return iter(())
 
     def finish(self) -> Iterator[StampedMessage]:
-        """Nothing."""
+        """Return nothing."""
         return iter(())
 
     def count(self, totals: CaptureStatistics) -> None:
-        """Frames and their bytes."""
+        """Write the number of frames and their bytes into ``totals``."""
         totals.bytes, totals.frames = self._bytes, self._frames
         totals.samples = {self.topic: self._frames}
 
     def remarks(self) -> list[str]:
-        """None."""
+        """Return nothing."""
         return []
 
     def clocks(self) -> dict[str, str]:
-        """None: a frame has the time at which it was taken from the driver."""
+        """Return nothing: a frame has the time at which it was taken from the driver."""
         return {}
 
     def rates(self) -> dict[str, float]:
-        """Of the frames."""
+        """Return frames per second."""
         span_s = (self._last_ns - self._first_ns) * 1e-9
         return {self.topic: (self._frames - 1) / span_s} if span_s > 0 else {}
 
     def artifacts(self) -> dict[str, str]:
-        """None."""
+        """Return nothing."""
         return {}
 
 
@@ -382,17 +385,17 @@ SYSTEMS = {
     "lighthouse": "lighthouse",
     "captures": "lighthouse",
 }
-"""Kind of records to the system that solves them."""
+"""System that solves a kind of records."""
 
 MIN_RATE_SPAN_S = 0.01
-"""Of less there is no rate."""
+"""Shortest time from which a rate is computed."""
 
 LEVELS = (Log.UNKNOWN, Log.DEBUG, Log.INFO, Log.WARNING, Log.ERROR, Log.FATAL)
 
 
 @dataclass(frozen=True)
 class StampedMessage:
-    """A message on its way into a session: when it was complete, and measured."""
+    """Message of a session, with the times of its completion and of its measurement."""
 
     topic: str
     message: Message
@@ -401,28 +404,27 @@ class StampedMessage:
 
 
 class MessageEncoder:
-    """Messages of the batches that a decoder gives.
+    """Converts batches of a decoder to messages with times of the host's clock.
 
     Parameters
     ----------
     name : str
-        Of the device; those behind it, if several, are ``<name>-<node>``.
+        Name of the device; if there are several behind the port, they are ``<name>-<node>``.
     halls : sequence of str
-        Names of the hall sensors in the order that ``halls.toml`` has them; empty where that
-        is not known.
+        Names of the hall sensors in the order of ``halls.toml``; empty if unknown.
 
     Attributes
     ----------
     samples : Counter
-        Records by topic, so far.
+        Records by topic.
     remarks : list of str
-        What must be known to use the records.
+        Facts that a user of the records must know.
     """
 
     def __init__(self, name: str, halls: Sequence[str] = ()) -> None:
         self._name = name
         self._halls = tuple(halls)
-        self._doubted: set[tuple[str, ...]] = set()
+        self._reported_names: set[tuple[str, ...]] = set()
         self.remarks: list[str] = []
         self._first: dict[str, int] = {}
         self._last: dict[str, int] = {}
@@ -430,11 +432,11 @@ class MessageEncoder:
         self.samples: Counter[str] = Counter()
 
     def device(self, stream: Stream) -> str:
-        """Name of the device whose records these are."""
+        """Return the name of the device of a stream."""
         return f"{self._name}-{stream.node}" if stream.node else self._name
 
     def rates(self) -> dict[str, float]:
-        """Records a second by topic, from the first to the last."""
+        """Return records per second by topic, between the first and the last."""
         spans = {topic: (self._last[topic] - first) * 1e-9 for topic, first in self._first.items()}
         return {
             topic: (self.samples[topic] - 1) / span
@@ -443,19 +445,22 @@ class MessageEncoder:
         }
 
     def clocks(self) -> dict[str, TickClock]:
-        """By device, of those that tell their ticks and can be believed."""
-        return {name: known.clock for name, known in self._times_of.items() if known.rate is None}
+        """Return the clock model of each device that sends plausible ticks."""
+        return {name: clock.model for name, clock in self._times_of.items() if clock.rate is None}
 
     def restart(self) -> None:
-        """The devices were away: their clocks may have begun anew."""
-        for known in self._times_of.values():
-            known.restart()
+        """Restart the clock models after a reconnect."""
+        for clock in self._times_of.values():
+            clock.restart()
 
     def messages(
         self, batches: Sequence[Batch], arrivals: ArrivalTimes, now_ns: int
     ) -> Iterator[StampedMessage]:
-        """Messages of ``batches``, all complete at ``now_ns``; what was measured when, is told
-        by the device's ticks where it has any, else by the arrival of the last byte."""
+        """Yield the messages of ``batches``, which were all complete at ``now_ns``.
+
+        Times of measurements are those of the device's ticks, if it sends any, or else the arrival
+        times of their last bytes.
+        """
         for batch in batches:
             if len(batch) == 0:
                 continue
@@ -468,7 +473,7 @@ class MessageEncoder:
         self, batch: Batch, time_ns: NDArray[np.int64], now_ns: int
     ) -> Iterator[StampedMessage]:
         stream, device = batch.stream, self.device(batch.stream)
-        topic, layout, once = _form(stream, device)
+        topic, layout, once = _stream_layout(stream, device)
         time_ns = self._ascending(topic, time_ns)
         self._first.setdefault(topic, int(time_ns[0]))
         self.samples[topic] += len(batch)
@@ -485,16 +490,16 @@ class MessageEncoder:
             yield StampedMessage(topic, message, now_ns, int(time_ns[start]))
 
     def _in_order(self, names: tuple[str, ...], field: NDArray[Any]) -> NDArray[Any]:
-        """Fields (n, N) of sensors that a device names, in the order of ``halls.toml``."""
+        """Return fields (n, N) in the order of ``halls.toml``, by the names that a device sends."""
         if not names or not self._halls or names == self._halls:
             return field
         if sorted(names) == sorted(self._halls):
             return field[:, [names.index(name) for name in self._halls]]
-        if names not in self._doubted:
-            self._doubted.add(names)
+        if names not in self._reported_names:
+            self._reported_names.add(names)
             self.remarks.append(
-                f"hall sensors are named {', '.join(names)}, and in halls.toml "
-                f"{', '.join(self._halls)}: they are taken in their order"
+                f"the device names its hall sensors {', '.join(names)}, halls.toml names them "
+                f"{', '.join(self._halls)}: they are assigned in order"
             )
         return field
 
@@ -503,20 +508,20 @@ class MessageEncoder:
         if batch.tick is None or ticks is None:
             return arrivals.wire_ns(batch.end)
         device = self.device(batch.stream)
-        known = self._times_of.get(device)
-        if known is None or known.ticks != ticks:
-            known = self._times_of[device] = DeviceClock(ticks)
-        believed = known.rate is None
-        times = known.times(batch.stream.kind, batch.tick, arrivals.read_ns(batch.end))
-        if believed and known.rate is not None:
+        clock = self._times_of.get(device)
+        if clock is None or clock.ticks != ticks:
+            clock = self._times_of[device] = DeviceClock(ticks)
+        believed = clock.rate is None
+        times = clock.times(batch.stream.kind, batch.tick, arrivals.read_ns(batch.end))
+        if believed and clock.rate is not None:
             self.remarks.append(
-                f"the clock of {device} runs {known.rate:.2g} times as fast as it says: samples "
+                f"the clock of {device} runs {clock.rate:.2g} times as fast as stated: samples "
                 "have the times of their arrival"
             )
         return arrivals.wire_ns(batch.end) if times is None else times
 
     def _ascending(self, topic: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The same times, each later than the one before it by a nanosecond at least."""
+        """Return times that increase by at least a nanosecond, also across batches."""
         steps = np.arange(len(time_ns))
         last = self._last.get(topic, -1)
         rising = np.maximum.accumulate(np.maximum(time_ns - steps, last + 1)) + steps
@@ -534,8 +539,8 @@ class MessageEncoder:
             yield StampedMessage("/log", line, now_ns, time_ns)
 
 
-def _form(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
-    """Topic, layout and what is said once of a stream of a device."""
+def _stream_layout(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
+    """Return topic, layout and constant fields of a stream of a device."""
     field: dict[str, Any] = {"device": device, "frame_id": device, "sensors": stream.sensors}
     if stream.kind == "magnetometers":
         return f"/magnetometers/{device}", messages.magnetometers(stream.sensors), field
@@ -551,4 +556,4 @@ def _form(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
     if stream.kind == "readings":
         once = {"device": device, "names": stream.names}
         return f"/readings/{device}", messages.readings(len(stream.names)), once
-    raise ValueError(f"no such kind of records: {stream.kind}")
+    raise ValueError(f"unknown kind of records: {stream.kind}")

@@ -1,4 +1,9 @@
-"""Where bytes come from: the contract between ports and the recorder."""
+"""Contract between ports and the recorder, and links: open connections.
+
+A read takes all bytes that have arrived, in large pieces, and does not wait for more, so that
+its time is that of its bytes. It raises :class:`LinkLost` when a port was unplugged, which
+pyserial does not notice: such a port is always ready and always empty.
+"""
 
 from __future__ import annotations
 
@@ -18,74 +23,75 @@ from locatk.core.errors import LocatkError
 
 
 class SourceError(LocatkError, OSError):
-    """A port that cannot be opened, with a hint what to do."""
+    """A port cannot be opened; the hint states a remedy."""
 
 
 class LinkLost(Exception):
-    """The connection broke: unplugged, or closed by the other side. It may come again."""
+    """The connection was lost, because it was unplugged or closed by the other side."""
 
 
 class LinkEnded(Exception):
-    """Nothing more will come: the end of what is replayed."""
+    """The source is at its end, such as a replayed file."""
 
 
 @dataclass(frozen=True)
 class Overruns:
-    """What the kernel counted of a UART since it was opened."""
+    """Error counters of a UART since it was opened, as counted by the kernel."""
 
     overrun: int = 0
-    """Bytes that the UART itself lost."""
+    """Bytes lost by the UART."""
     buffer: int = 0
-    """Bytes that the kernel's buffer had no room for."""
+    """Bytes lost because the buffer of the kernel was full."""
     frame: int = 0
     """Bytes without a stop bit."""
     parity: int = 0
-    """Bytes of wrong parity."""
+    """Bytes with wrong parity."""
 
     @property
     def lost(self) -> int:
-        """Bytes that did not arrive."""
+        """Number of bytes that did not arrive."""
         return self.overrun + self.buffer
 
 
 class Link(Protocol):
-    """An open connection."""
+    """Open connection."""
 
     def read(self, wait_s: float) -> Any:
-        """What has arrived, all of it: bytes of a line, or a list of a camera's frames; waits
-        for the first, at most ``wait_s``, and is empty then.
+        """Return all bytes of a line, or frames of a camera, that have arrived.
+
+        Wait for the first one, at most ``wait_s``; then return an empty result.
 
         Raises
         ------
         LinkLost
-            The connection broke.
+            The connection was lost.
         LinkEnded
-            It is at its end.
+            The source is at its end.
         """
 
     def overruns(self) -> Overruns | None:
-        """Of this link, since it was opened; None where nobody counts."""
+        """Return the error counters of this link since it was opened; None if there are none."""
 
     def close(self) -> None:
-        """Give it back; never raises."""
+        """Close the connection; never raises."""
 
 
 class Port(Protocol):
-    """Something that can be opened, again and again.
+    """Source of bytes or camera frames that can be opened repeatedly.
 
     Attributes
     ----------
     name : str
-        As the user named it.
+        Name given by the user.
     can_reconnect : bool
-        Whether it is worth trying to open it again when it was lost.
+        It may be opened again after the connection was lost.
     """
 
     name: str
     can_reconnect: bool
 
     def open(self) -> Link:
-        """Open it, or the same device where it is now.
+        """Open it, or the same device at its present path.
 
         Raises
         ------
@@ -94,20 +100,20 @@ class Port(Protocol):
         """
 
     def describe(self) -> dict[str, str]:
-        """What is known of it, for the session's metadata: VID:PID, serial number, baud."""
+        """Return facts for the session's metadata: VID:PID, serial number, baud rate."""
 
 
 READ_BYTES = 65_536
-"""Bytes that are asked for at once."""
+"""Bytes requested per read."""
 
 TERMINAL_READ_BYTES = 4_095
-"""The most that a Linux terminal gives at once; after a smaller piece nothing is left."""
+"""Most bytes that a Linux terminal returns per read; after fewer bytes it is empty."""
 
 MAX_READ_BYTES = 1 << 20
-"""Bytes after which a read returns though there are more."""
+"""Bytes after which a read returns although more have arrived."""
 
 POLL_INTERVAL_S = 0.002
-"""Between two looks at a port that nobody can wait for."""
+"""Interval between two checks of a port that does not support waiting."""
 
 UNPLUGGED = "unplugged, or closed by the other side"
 
@@ -117,14 +123,14 @@ buf_overrun, and nine reserved (Linux, include/uapi/linux/serial.h)."""
 
 
 class DescriptorLink:
-    """A link with a file descriptor, for which the system can wait.
+    """Link with a file descriptor, for which the system can wait.
 
     Parameters
     ----------
     number : int
-        The descriptor, which does not block.
+        The descriptor, which is non-blocking.
     receive : callable
-        Takes the most bytes to give; gives those that are there.
+        Takes the largest number of bytes; returns those that have arrived.
     close : callable
     """
 
@@ -136,7 +142,7 @@ class DescriptorLink:
         self._close = close
 
     def read(self, wait_s: float) -> bytes:
-        """See :class:`.source.Link`."""
+        """Return the bytes that have arrived; see :class:`Link`."""
         try:
             ready, _, _ = select.select([self._number], [], [], max(0.0, wait_s))
             if not ready:
@@ -145,9 +151,9 @@ class DescriptorLink:
         except BlockingIOError:
             return b""
         except (OSError, ValueError) as error:  # ValueError: closed meanwhile
-            raise LinkLost(_why(error)) from error
+            raise LinkLost(_reason(error)) from error
         if not first:
-            raise LinkLost(self._why_empty())
+            raise LinkLost(self._reason_empty())
         return first if len(first) < TERMINAL_READ_BYTES else self._more(first)
 
     def _more(self, first: bytes) -> bytes:
@@ -157,36 +163,36 @@ class DescriptorLink:
             try:
                 piece = self._receive(READ_BYTES)
             except OSError:
-                break  # nothing left, or broken: the next read finds it so
-            # Not ready, a terminal gives b"" as well: here that tells nothing.
+                break  # Empty or broken; the next read reports it.
+            # A terminal that is not ready returns b"" as well, so that it is no error here.
             pieces.append(piece)
             last = len(piece)
             size += last
         return b"".join(pieces)
 
-    def _why_empty(self) -> str:
+    def _reason_empty(self) -> str:
         return "closed by the other side"
 
     def overruns(self) -> Overruns | None:
-        """Nobody counts."""
+        """Return None, because there are no counters."""
         return None
 
     def close(self) -> None:
-        """See :class:`.source.Link`."""
+        """Close the connection."""
         self._number = -1
         with contextlib.suppress(Exception):
             self._close()
 
 
 class SerialLink(DescriptorLink):
-    """A serial port of a POSIX system.
+    """Serial port of a POSIX system.
 
     Parameters
     ----------
     port : serial.Serial
-        Opened.
+        Open port.
     exclusive : bool
-        Let no other program open it, not even one that takes no lock (``TIOCEXCL``).
+        Prevent other programs from opening it, even those that take no lock (``TIOCEXCL``).
     """
 
     def __init__(self, port: Any, *, exclusive: bool) -> None:
@@ -195,89 +201,90 @@ class SerialLink(DescriptorLink):
         self._exclusive = exclusive
         if exclusive:
             _set_exclusive(number, True)
-        self._at_opening = _counters(number)
-        self._counted = None if self._at_opening is None else Overruns()
+        self._initial_counters = _counters(number)
+        self._overruns = None if self._initial_counters is None else Overruns()
 
     def overruns(self) -> Overruns | None:
-        """What the kernel counted since the port was opened, or, once it is gone, up to the
-        last time it was asked; None where the driver does not count."""
+        """Return the kernel's counters since the port was opened; None if the driver has none.
+
+        Once the port is gone, the last known ones are returned.
+        """
         now = _counters(self._number)
-        if now is not None and self._at_opening is not None:
-            # 32 bits each, which start again.
-            since = [(a - b) & 0xFFFFFFFF for a, b in zip(now, self._at_opening, strict=True)]
-            self._counted = Overruns(
+        if now is not None and self._initial_counters is not None:
+            # The counters have 32 bits and wrap.
+            since = [(a - b) & 0xFFFFFFFF for a, b in zip(now, self._initial_counters, strict=True)]
+            self._overruns = Overruns(
                 overrun=since[7], buffer=since[10], frame=since[6], parity=since[8]
             )
-        return self._counted
+        return self._overruns
 
-    def _why_empty(self) -> str:
+    def _reason_empty(self) -> str:
         poll = select.poll()
         poll.register(self._number)
         hung_up = select.POLLHUP | select.POLLERR | select.POLLNVAL
         if any(events & hung_up for _, events in poll.poll(0)):
             return UNPLUGGED
-        return "ready, but empty: another program reads from it, or it was unplugged"
+        return "ready but empty: another program reads from it, or it was unplugged"
 
     def close(self) -> None:
-        """See :class:`.source.Link`."""
+        """Close the port and allow other programs to open it."""
         if self._exclusive:
             _set_exclusive(self._number, False)
         super().close()
 
 
 class PolledLink:
-    """A port of pyserial that must be asked again and again: on Windows, ``loop://``,
-    ``spy://``.
+    """Port of pyserial that must be polled: on Windows, ``loop://``, ``spy://``.
 
     Parameters
     ----------
     port : serial.SerialBase
-        Opened, with a timeout of 0.
+        Open port, with a timeout of 0.
     """
 
     def __init__(self, port: Any) -> None:
         self._port = port
 
     def read(self, wait_s: float) -> bytes:
-        """See :class:`.source.Link`."""
+        """Return the bytes that have arrived; see :class:`Link`."""
         end = time.monotonic() + wait_s
         try:
             while True:
-                there = self._port.in_waiting
-                if there:
+                available = self._port.in_waiting
+                if available:
                     break
-                left = end - time.monotonic()
-                if left <= 0:
+                remaining = end - time.monotonic()
+                if remaining <= 0:
                     return b""
-                time.sleep(min(left, POLL_INTERVAL_S))
-            data = bytes(self._port.read(there))
+                time.sleep(min(remaining, POLL_INTERVAL_S))
+            data = bytes(self._port.read(available))
         except (OSError, TypeError) as error:  # TypeError: closed meanwhile
-            raise LinkLost(_why(error)) from error
+            raise LinkLost(_reason(error)) from error
         if not data:
             raise LinkLost(UNPLUGGED)
         return data
 
     def overruns(self) -> Overruns | None:
-        """Nobody counts."""
+        """Return None, because there are no counters."""
         return None
 
     def close(self) -> None:
-        """See :class:`.source.Link`."""
+        """Close the port."""
         with contextlib.suppress(Exception):
             self._port.close()
 
 
 class RemoteLink:
-    """A port behind ``rfc2217://``.
+    """Port behind ``rfc2217://``.
 
-    A thread of pyserial fills a queue, a byte an entry, None at the end. Its ``read`` takes
-    no byte any more once that thread has ended, and whoever asks how much is there learns
-    nothing of the end; so the bytes are taken from the queue itself.
+    A thread of pyserial fills a queue with single bytes, and None at the end. pyserial's ``read``
+    returns no bytes once that thread has ended, and the number of waiting bytes does not show the
+    end; so the bytes are taken from the queue itself.
 
     Parameters
     ----------
     port : serial.rfc2217.Serial
-        Opened.
+        Open port.
     """
 
     def __init__(self, port: Any) -> None:
@@ -287,7 +294,7 @@ class RemoteLink:
         self._ended = False
 
     def read(self, wait_s: float) -> bytes:
-        """See :class:`.source.Link`."""
+        """Return the bytes that have arrived; see :class:`Link`."""
         pieces: list[bytes] = []
         try:
             piece = None if self._ended else self._queue.get(timeout=max(0.0, wait_s))
@@ -298,18 +305,18 @@ class RemoteLink:
                 piece = self._queue.get_nowait()
             self._ended = piece is None
         except queue.Empty:
-            # It may have died without a word; in this order, or its last bytes are missed.
+            # The thread may have died; checked in this order, or its last bytes are missed.
             self._ended = not self._thread.is_alive() and self._queue.empty()
         if self._ended and not pieces:
             raise LinkLost("closed by the other side")
         return b"".join(pieces)
 
     def overruns(self) -> Overruns | None:
-        """RFC 2217 has messages for it, which pyserial does not keep."""
+        """Return None: pyserial does not store the messages of RFC 2217 about overruns."""
         return None
 
     def close(self) -> None:
-        """See :class:`.source.Link`."""
+        """Close the port."""
         with contextlib.suppress(Exception):
             self._port.close()
 
@@ -325,7 +332,7 @@ def _set_exclusive(number: int, exclusive: bool) -> None:
 
 
 def _counters(number: int) -> tuple[int, ...] | None:
-    """The kernel's counters of a UART; None where it has none."""
+    """Return the kernel's counters of a UART; None if it has none."""
     try:
         import fcntl
         from termios import TIOCGICOUNT
@@ -336,7 +343,7 @@ def _counters(number: int) -> tuple[int, ...] | None:
         return None
 
 
-def _why(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     number = getattr(error, "errno", None)
     if number in (errno.EIO, errno.ENXIO, errno.ENODEV):
         return UNPLUGGED

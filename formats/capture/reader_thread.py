@@ -1,5 +1,4 @@
-"""The thread that reads the port, and nothing else: bytes and what happens to the line, in
-the order in which they came."""
+"""Thread that only reads the port: received data and events of the line, in their order."""
 
 from __future__ import annotations
 
@@ -14,26 +13,26 @@ from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.links import Link, LinkEnded, LinkLost, Overruns, Port
 
 READ_TIMEOUT_S = 0.1
-"""Longest wait for a byte: so long it takes to notice that the recording is over."""
+"""Longest wait for a byte, and so the delay until the end of the recording is noticed."""
 
 MIN_READ_INTERVAL_S = 0.001
-"""Shortest time between reads. A stamp is late by no more, and a fast line is read in pieces
-of some kilobytes instead of byte by byte; the smallest buffers of a kernel (4096 bytes) take
-20 ms to overflow at 2 Mbaud."""
+"""Shortest time between reads. Timestamps are late by at most this, and a fast line is read in
+pieces of some kilobytes instead of single bytes; the smallest buffers of a kernel (4096 bytes)
+take 20 ms to overflow at 2 Mbaud."""
 
 BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
-"""Between attempts to open a port again; the last one is repeated."""
+"""Delays between attempts to reconnect; the last one is repeated."""
 
 MAX_STOP_WAIT_S = 3.0
 """Longest wait for the thread at the end."""
 
 COUNTER_INTERVAL_S = 0.5
-"""Between looks at the kernel's counters."""
+"""Interval between reads of the kernel's error counters."""
 
 
 @dataclass(frozen=True)
 class ReceivedData:
-    """What one read gave: bytes of a serial line, or frames of a camera."""
+    """Result of one read: bytes of a serial line, or frames of a camera."""
 
     time_ns: int
     data: Any
@@ -42,7 +41,7 @@ class ReceivedData:
 
 @dataclass(frozen=True)
 class ConnectionLost:
-    """The connection broke."""
+    """The connection was lost."""
 
     time_ns: int
     why: str
@@ -50,7 +49,7 @@ class ConnectionLost:
 
 @dataclass(frozen=True)
 class Reconnected:
-    """It is there again, perhaps elsewhere."""
+    """The port was opened again, perhaps at another path."""
 
     time_ns: int
     where: str
@@ -58,7 +57,7 @@ class Reconnected:
 
 @dataclass(frozen=True)
 class SourceEnded:
-    """Nothing more will come; ``error`` where that is not as it should be."""
+    """No more data will come; ``error`` is set if that is unexpected."""
 
     time_ns: int
     error: str | None = None
@@ -68,17 +67,17 @@ Event = ReceivedData | ConnectionLost | Reconnected | SourceEnded
 
 
 class PortReader:
-    """Reads a port in a thread of its own and opens it again when it was lost.
+    """Reads a port in a thread of its own, and reconnects when the connection is lost.
 
     Parameters
     ----------
     port : Port
     link : Link
-        The port, opened.
+        The open port.
     clock : HostClock
     max_waiting_bytes : int
-        When so many wait to be written, reading stops until there is room: the system's own
-        buffers then fill, and count what they lose.
+        When so many bytes wait to be written, reading stops until there is space: then the buffers
+        of the system fill up, and count their losses.
     """
 
     def __init__(
@@ -86,7 +85,7 @@ class PortReader:
     ) -> None:
         self._port, self._clock = port, clock
         self._link: Link | None = link
-        self._most = max_waiting_bytes
+        self._max_waiting = max_waiting_bytes
         self._events: deque[Event] = deque()
         self._stop = threading.Event()
         self._attempts = 0
@@ -95,8 +94,8 @@ class PortReader:
         self.heard_ns = 0
         """When the last of them were read."""
         self._taken = 0
-        self._before = Overruns()  # of links that are closed
-        self._now = Overruns()
+        self._overruns_before = Overruns()  # Of links closed before.
+        self._overruns_now = Overruns()
         self._dropped_before = self._dropped = 0
         self.high_water = 0
         self.held_up = 0
@@ -104,27 +103,29 @@ class PortReader:
         self._thread = threading.Thread(target=self._run, name="locatk-receiver", daemon=True)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> bool:
-        """Read what has arrived by now, close the port and end the thread; returns whether it
-        ended: one that hangs in a driver is left behind."""
+        """Read the bytes that have arrived, close the port and end the thread.
+
+        Return False if the thread hangs in a driver; it is remaining behind then.
+        """
         if not self._stop.is_set():
             self._stop.set()
             self._thread.join(MAX_STOP_WAIT_S)
         return not self._thread.is_alive()
 
     def take(self) -> Sequence[Event]:
-        """All that has happened since the last call."""
+        """Return all events since the last call."""
         events = [self._events.popleft() for _ in range(len(self._events))]
         self._taken += sum(event.size for event in events if isinstance(event, ReceivedData))
         return events
 
     @property
     def overruns(self) -> Overruns:
-        """What the kernel counted, of all links."""
-        before, now = self._before, self._now
+        """Error counters of the kernel, summed over all links."""
+        before, now = self._overruns_before, self._overruns_now
         return Overruns(
             before.overrun + now.overrun,
             before.buffer + now.buffer,
@@ -134,13 +135,13 @@ class PortReader:
 
     @property
     def dropped(self) -> int:
-        """Frames of a camera that came faster than they were taken."""
+        """Frames of a camera that arrived faster than they were taken."""
         return self._dropped_before + self._dropped
 
     def _run(self) -> None:
         try:
             self._receive()
-        except Exception as error:  # whatever a driver raises must not end in silence
+        except Exception as error:  # Any error of a driver must be reported.
             self._events.append(SourceEnded(self._clock.now(), f"{type(error).__name__}: {error}"))
         finally:
             self._close()
@@ -148,7 +149,7 @@ class PortReader:
     def _receive(self) -> None:
         counted = 0.0
         while not self._stop.is_set():
-            begun = time.monotonic()
+            start = time.monotonic()
             try:
                 self._read(READ_TIMEOUT_S)
             except LinkEnded:
@@ -165,15 +166,15 @@ class PortReader:
                 where = self._port.describe().get("resolved", self._port.name)
                 self._events.append(Reconnected(self._clock.now(), where))
                 continue
-            while self.received - self._taken > self._most and not self._stop.is_set():
+            while self.received - self._taken > self._max_waiting and not self._stop.is_set():
                 self.held_up += 1
                 self._stop.wait(0.05)
-            if begun - counted > COUNTER_INTERVAL_S:
-                counted = begun
+            if start - counted > COUNTER_INTERVAL_S:
+                counted = start
                 self._count()
-            left = begun + MIN_READ_INTERVAL_S - time.monotonic()
-            if left > 0 and self._port.can_reconnect:  # what is played has its own pace
-                time.sleep(left)
+            remaining = start + MIN_READ_INTERVAL_S - time.monotonic()
+            if remaining > 0 and self._port.can_reconnect:  # A replayed source has its own pace.
+                time.sleep(remaining)
         self._read_rest()
 
     def _read(self, wait_s: float) -> int:
@@ -190,7 +191,7 @@ class PortReader:
         return size
 
     def _read_rest(self) -> None:
-        """What the system still holds; from a device that never stops, not for long."""
+        """Read the bytes that the system still holds, for a limited time."""
         until = time.monotonic() + READ_TIMEOUT_S
         try:
             while time.monotonic() < until and self._read(0.0):
@@ -199,25 +200,25 @@ class PortReader:
             return
 
     def _reopen(self) -> bool:
-        # Counted on over links that break before they gave anything.
+        # The count continues over links that break before any data arrive.
         while not self._stop.wait(BACKOFF_S[min(self._attempts, len(BACKOFF_S) - 1)]):
             self._attempts += 1
             try:
                 self._link = self._port.open()
                 return True
-            except Exception:  # not there yet, or a driver that is not ready
+            except Exception:  # Not available yet, or its driver is not ready.
                 continue
         return False
 
     def _count(self) -> None:
         if self._link is not None:
-            self._now = self._link.overruns() or self._now
+            self._overruns_now = self._link.overruns() or self._overruns_now
             self._dropped = getattr(self._link, "dropped", 0)
 
     def _close(self) -> None:
         if self._link is not None:
             self._count()
-            self._before, self._now = self.overruns, Overruns()
+            self._overruns_before, self._overruns_now = self.overruns, Overruns()
             self._dropped_before, self._dropped = self.dropped, 0
             self._link.close()
             self._link = None

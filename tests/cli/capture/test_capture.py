@@ -172,11 +172,11 @@ def test_auto_finds_out(locatk: Any, old: Path, tmp_path: Path, raw_bytes: Any) 
     report = json.loads(result.stdout)
     assert report["device"] == "lines"
     assert report["samples"] == {"/readings/robot": 60}
-    assert "Warning: the device is taken for lines" in result.stderr
+    assert "Warning: identified device: lines" in result.stderr
     assert raw_bytes(path) == TEXT
     assert facts(path)["device"] == "lines"
     (_, said), *_ = Session.open(path).decoded("/log", Log)
-    assert said.message.startswith("the device is taken for lines")
+    assert said.message.startswith("identified device: lines")
 
 
 def test_auto_of_noise_is_raw(locatk: Any, tmp_path: Path, raw_bytes: Any) -> None:
@@ -186,7 +186,7 @@ def test_auto_of_noise_is_raw(locatk: Any, tmp_path: Path, raw_bytes: Any) -> No
     result = locatk("capture", f"replay:{source}", "--speed", 0, "-o", path, "--json")
     assert json.loads(result.stdout)["device"] == "raw"
     assert result.exit_code == 3
-    assert "no frame of a device that is known in 3000 bytes" in result.stderr
+    assert "no frame of a known device in 3000 bytes" in result.stderr
     assert raw_bytes(path) == noise
 
 
@@ -196,10 +196,10 @@ def test_a_port_that_is_silent(locatk: Any, tmp_path: Path, raw_bytes: Any) -> N
     given = ("--device", "raw", "-o", path, "--duration", "1.3s", "--silence", "200ms", "--json")
     result = locatk("capture", "loop://", *given)
     assert result.exit_code == 3
-    assert "Incomplete: nothing was received" in result.stderr
+    assert "Incomplete: no data were received" in result.stderr
     report = json.loads(result.stdout)
     assert (report["ended"], report["silences"], report["bytes"]) == ("duration", 1, 0)
-    assert "Warning: nothing received for 1 s" in result.stderr
+    assert "Warning: no data received for 1 s" in result.stderr
     assert raw_bytes(path) == b""
     live = [line for line in result.stderr.splitlines() if line.startswith("0:01  ")]
     assert len(live) == 1
@@ -338,17 +338,17 @@ def test_wrong_usage(
     ("given", "words"),
     [
         (["--device", "nonsense"], "no device 'nonsense'"),
-        (["--name", "a/b"], "the name 'a/b' cannot be in a topic"),
-        (["--name", "a b"], "cannot be in a topic"),
+        (["--name", "a/b"], "the name 'a/b' cannot be part of a topic"),
+        (["--name", "a b"], "cannot be part of a topic"),
         (["--artifact", "WRONG"], "wrong.toml"),
         (["--artifact", "TAG", "--artifact", "OTHER"], "a second tag.toml"),
-        (["--artifact", "OLD"], "no artifact is attached"),
+        (["--artifact", "OLD"], "the session contains no artifact"),
         (["--artifact", "UNPLUGGED"], "No such file"),
         (["-o", "THERE"], "exists"),
         (["-o", "NOFOLDER"], "no folder"),
         (["-o", "FOLDER", "--overwrite"], "not a regular file"),
         (["--rotate", "10min", "-o", "PARTED"], "parted-002.mcap"),
-        (["--reserve", "100000TB"], "are free on the disk"),
+        (["--reserve", "100000TB"], "of the disk are free"),
     ],
 )
 def test_refused(
@@ -413,7 +413,7 @@ def test_what_is_played_is_not_overwritten(locatk: Any, old: Path) -> None:
 def test_a_camera_is_no_serial_device(locatk: Any, tmp_path: Path) -> None:
     result = locatk("capture", "camera:0", "--device", "lines", "-o", tmp_path / "run.mcap")
     assert result.exit_code == 1
-    assert "a camera is no lines" in result.stderr
+    assert "a camera is not a lines" in result.stderr
 
 
 def test_the_end_of_a_damaged_source_is_told(
@@ -637,6 +637,6 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.0)
     result = capture("--json")
     assert result.exit_code == 3
-    assert "Incomplete: the disk is full but for the reserve" in result.stderr
+    assert "Incomplete: the disk is full up to --reserve" in result.stderr
     assert TEXT.startswith(raw_bytes(tmp_path / "run.mcap"))
     assert "the disk is full" in json.loads(result.stdout)["ended"]

@@ -296,7 +296,7 @@ def test_unplugged_and_plugged_in_again(
     assert report["samples"]["/readings/robot"] == 4  # none of "5," and "6"
     lines = log(path)
     assert lines[0].startswith("connection lost: ")
-    assert lines[1].startswith("connected again to ")
+    assert lines[1].startswith("reconnected to ")
     assert facts(path)["gaps"] == "1"
     assert f"Warning: {lines[0]}" in capture.stderr
 
@@ -376,7 +376,7 @@ def test_a_disk_that_fills(line: Any, process: Any, small_disk: Path, raw_bytes:
     with sending(port, 1.2e6) as sent:
         assert capture.end() == 3
     assert "the disk is full in" in capture.stderr
-    assert "Incomplete: the disk is full but for the reserve" in capture.stderr
+    assert "Incomplete: the disk is full up to --reserve" in capture.stderr
     assert Session.open(path).damage is None
     kept = raw_bytes(path)
     assert bytes(sent).startswith(kept)

@@ -134,7 +134,7 @@ def test_a_video_that_is_cut_short(video: Path) -> None:
     frames, end = shown(port_of(str(video), clock=ticks(), speed=0).open())
     assert 0 < len(frames) < len(GREYS)
     assert isinstance(end, LinkLost)
-    assert "cut short" in str(end)
+    assert "truncated" in str(end)
 
 
 def refused(place: str) -> SourceError:
@@ -304,7 +304,7 @@ def test_a_camera_is_unplugged(driver: Callable[[list[bool]], Capture]) -> None:
 
 def test_a_camera_that_gives_nothing(driver: Callable[[list[bool]], Capture]) -> None:
     capture = driver([])
-    assert str(refused("0")) == "camera:0 gives no frame"
+    assert str(refused("0")) == "camera:0 provides no frame"
     assert capture.released
 
 

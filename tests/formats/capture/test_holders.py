@@ -134,7 +134,7 @@ def test_a_member_must_log_in_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pwd.getpwuid", lambda uid: SimpleNamespace(pw_name="ada"))
     group = SimpleNamespace(gr_name="dialout", gr_mem=["ada"])
     monkeypatch.setattr(grp, "getgrgid", lambda gid: group)
-    assert "since you logged in: log in again" in str(permission_error("robot", "/dev/x").hint)
+    assert "after your login: log in again" in str(permission_error("robot", "/dev/x").hint)
 
 
 @pytest.mark.parametrize(("mode", "gid"), [(0o600, 987), (0o660, 0), (0o640, 987)])

@@ -400,7 +400,7 @@ def test_auto_loses_nothing_while_it_listens(auto: Any) -> None:
     expected = [0.0, 50 * MS - 4 * byte_ns, 50 * MS]
     np.testing.assert_allclose(np.array(times_of(made)) - START_NS, expected, atol=2)
     (remark,) = intake.remarks()
-    assert remark == "the device is taken for quads: four bytes each"
+    assert remark == "identified device: quads (four bytes each)"
     list(intake.take(reads(b"mnop", start_ns=START_NS + 60 * MS)))
     assert counted(intake).frames == 4
 

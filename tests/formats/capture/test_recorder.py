@@ -279,7 +279,7 @@ def test_unplugged_and_plugged_in_again(
     assert not recorded.failed
     lines = log_lines(path)
     assert lines[0] == "connection lost: pulled out"
-    assert lines[1].startswith("connected again to scripted after ")
+    assert lines[1].startswith("reconnected to scripted after ")
     assert running.said == lines
     facts = Session.open(path).metadata()["capture"]
     assert facts["gaps"] == "1"
@@ -373,7 +373,7 @@ def test_a_driver_that_hangs_does_not_hold_the_file(
 @pytest.mark.slow
 def test_silence_is_told_once_until_something_comes(port: Any, start: Any, log_lines: Any) -> None:
     running = start(silence_s=0.2)
-    running.until_said("nothing received for 0 s")
+    running.until_said("no data received for 0 s")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 8)
     assert len(running.said) == 1
@@ -568,7 +568,7 @@ def test_parts_hold_every_byte_once(
     assert recorded.file_bytes == sum(path.stat().st_size for path in recorded.paths)
     ended = [Session.open(path).metadata()["capture"]["ended"] for path in recorded.paths]
     assert ended[-1] == "stopped"
-    assert set(ended[:-1]) == {"goes on in the next part"}
+    assert set(ended[:-1]) == {"continued in the next part"}
 
 
 @pytest.mark.slow
@@ -619,7 +619,7 @@ def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
     running = start(reserve_bytes=5_000_000)
     sent = pieces(60, size=1000)
     port.send(*sent)
-    running.until_said("the disk is full in")
+    running.until_said("the disk will be full in")
     free = 4_000_000
     last = pieces(30, size=1000)
     running.when_shown = lambda: port.send(*last)
@@ -630,7 +630,7 @@ def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
     assert b"".join(sent + last).startswith(kept)
     assert len(kept) >= 60_000
     assert recorded.totals.bytes == len(kept)
-    assert any("the disk is full in" in line for line in log_lines(*recorded.paths))
+    assert any("the disk will be full in" in line for line in log_lines(*recorded.paths))
 
 
 def test_a_disk_that_nobody_can_ask_is_no_matter(
@@ -698,7 +698,7 @@ def test_a_disk_that_fails_ends_it_in_words(
     recorded = running.result()
     assert recorded.failed
     assert os.strerror(errno.EIO) in recorded.ended
-    assert "4 bytes" in recorded.ended  # that were received are not in it
+    assert "4 received bytes" in recorded.ended  # that were received are not in it
     left = Session.open(path, damaged_ok=True).decoded(RAW, SerialChunk)
     assert b"".join(chunk.data for _, chunk in left) == b"kept"
 
@@ -781,14 +781,14 @@ def test_a_read_only_disk(port: Any, start: Any, small_disk: Path) -> None:
 
 
 def test_a_disk_that_is_full_already(port: Any, start: Any, small_disk: Path) -> None:
-    refused(start, DiskFullError, "only 9 MB are free", output=small_disk / "run.mcap")
+    refused(start, DiskFullError, "only 9 MB of the disk are free", output=small_disk / "run.mcap")
     assert port.asked == 0
     assert not list(small_disk.iterdir())
 
 
 @pytest.mark.parametrize("name", ["a/b", "a b", "a\nb"])
 def test_names_that_are_no_topics(port: Any, start: Any, name: str) -> None:
-    refused(start, LocatkError, "cannot be in a topic", name=name)
+    refused(start, LocatkError, "cannot be part of a topic", name=name)
     assert port.asked == 0
 
 

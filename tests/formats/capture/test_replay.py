@@ -149,7 +149,7 @@ def test_names_with_a_number_sign(tmp_path: Path) -> None:
 def test_no_raw_bytes(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no raw bytes") as error:
         ReplayPort(f"replay:{write(tmp_path / 'run.mcap', topics=())}").open()
-    assert "It holds /log" in str(error.value.hint)
+    assert "It contains /log" in str(error.value.hint)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no session at all"])
@@ -164,13 +164,13 @@ def test_no_session(tmp_path: Path, content: bytes | None) -> None:
 
 @pytest.mark.parametrize("name", ["replay:", "replay://"])
 def test_no_file(name: str) -> None:
-    with pytest.raises(SourceError, match="names no file"):
+    with pytest.raises(SourceError, match="has no file name"):
         port_of(name, baud=9600).open()
 
 
 @pytest.mark.parametrize("speed", [-1.0, float("nan"), float("inf")])
 def test_no_speed(session: Path, speed: float) -> None:
-    with pytest.raises(SourceError, match="is no speed"):
+    with pytest.raises(SourceError, match="is not a valid speed"):
         port_of(f"replay:{session}", baud=9600, speed=speed)
 
 

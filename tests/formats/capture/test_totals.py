@@ -60,12 +60,12 @@ def test_each_loss_is_said() -> None:
 
 
 def test_doubts_whether_it_is_this_device() -> None:
-    assert CaptureStatistics().doubts("lines") == ["nothing was received"]
+    assert CaptureStatistics().doubts("lines") == ["no data were received"]
     assert CaptureStatistics(bytes=9).doubts("raw") == []
     assert CaptureStatistics(bytes=9).doubts("lines") == ["no frame of lines in 9 bytes"]
     assert CaptureStatistics(bytes=9, frames=1, skipped=4).doubts("lines") == []
     assert CaptureStatistics(bytes=9, frames=1, skipped=5).doubts("lines") == [
-        "5 of 9 bytes are in no frame of lines"
+        "5 of 9 bytes are in no valid frame of lines"
     ]
 
 
