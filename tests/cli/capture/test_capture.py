@@ -19,7 +19,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.cli.capture import text as capture_text
-from locatk.cli.capture.options import DURATION, PACE, SIZE
+from locatk.cli.capture.options import DURATION, ROTATION, SIZE
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import tags
@@ -81,7 +81,7 @@ def test_bytes_and_records(capture: Any, tmp_path: Path, raw_bytes: Any) -> None
     assert raw_bytes(path) == TEXT
     lines = result.stdout.splitlines()
     assert lines[0].startswith(f"{path}: 0:00, {capture_text.size(len(TEXT))} received from lines")
-    assert "0 bad, 0 missing" in lines[0]
+    assert "0 bad, 0 missing" in lines[1]
     assert lines[0].endswith("end of the source")
     assert any(line.split()[:2] == ["/readings/robot", "60"] for line in lines)
     assert result.stderr.startswith("Recording replay:")
@@ -306,17 +306,17 @@ def unopened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         (["/dev/x"], "Missing option '-o'"),
         (["/dev/x", "-o", "OUT", "--meta", "robot"], "'robot' is not of the form KEY=VALUE"),
         (["/dev/x", "-o", "OUT", "--meta", "=7"], "is not of the form KEY=VALUE"),
-        (["/dev/x", "-o", "OUT", "--duration", "5 parsecs"], "is no time"),
-        (["/dev/x", "-o", "OUT", "--duration", "0"], "is no time"),
+        (["/dev/x", "-o", "OUT", "--duration", "5 parsecs"], "is not a time"),
+        (["/dev/x", "-o", "OUT", "--duration", "0"], "is not a time"),
         (["/dev/x", "-o", "OUT", "--duration", "-1s"], ""),
-        (["/dev/x", "-o", "OUT", "--max-size", "much"], "is no size"),
-        (["/dev/x", "-o", "OUT", "--max-size", "9" * 400], "is no size"),
+        (["/dev/x", "-o", "OUT", "--max-size", "much"], "is not a size"),
+        (["/dev/x", "-o", "OUT", "--max-size", "9" * 400], "is not a size"),
         (["/dev/x", "-o", "OUT", "--rotate", "sometimes"], "is no"),
         (["/dev/x", "-o", "OUT", "--rotate", "1us"], ""),
-        (["/dev/x", "-o", "OUT", "--rotate", "1B"], "too little"),
-        (["/dev/x", "-o", "OUT", "--silence", "0"], "is no time"),
-        (["/dev/x", "-o", "OUT", "--columns", "a,,b"], "names with commas"),
-        (["/dev/x", "-o", "OUT", "--columns", "a,a"], "each once"),
+        (["/dev/x", "-o", "OUT", "--rotate", "1B"], "too small"),
+        (["/dev/x", "-o", "OUT", "--silence", "0"], "is not a time"),
+        (["/dev/x", "-o", "OUT", "--columns", "a,,b"], "distinct names"),
+        (["/dev/x", "-o", "OUT", "--columns", "a,a"], "distinct names"),
         (["/dev/x", "-o", "OUT", "--baud", "0"], ""),
         (["/dev/x", "-o", "OUT", "--speed", "-1"], ""),
     ],
@@ -439,7 +439,7 @@ def test_the_end_of_a_damaged_source_is_told(
 def test_times(text: str, seconds: float) -> None:
     assert DURATION.convert(text, None, None) == pytest.approx(seconds)
     if seconds >= 1:
-        assert PACE.convert(text, None, None) == ("time", pytest.approx(seconds))
+        assert ROTATION.convert(text, None, None) == ("time", pytest.approx(seconds))
 
 
 @pytest.mark.parametrize(
@@ -447,12 +447,12 @@ def test_times(text: str, seconds: float) -> None:
 )
 def test_sizes(text: str, count: float) -> None:
     assert SIZE.convert(text, None, None) == count
-    assert PACE.convert(text, None, None) == ("size", count)
+    assert ROTATION.convert(text, None, None) == ("size", count)
 
 
 @pytest.mark.parametrize("text", ["", "s", "1e3", "5 GiBs", "1,5s", "--", "1m2s", "nan", "inf"])
 def test_what_is_neither(text: str) -> None:
-    for kind in (DURATION, SIZE, PACE):
+    for kind in (DURATION, SIZE, ROTATION):
         with pytest.raises(click.BadParameter):
             kind.convert(text, None, None)  # type: ignore[attr-defined]
 
@@ -461,7 +461,7 @@ def test_what_is_neither(text: str) -> None:
 
 
 def test_the_live_line() -> None:
-    totals = CaptureStatistics(bad=2, lost=3, overruns=4, gaps=1, high_water_bytes=5_000)
+    totals = CaptureStatistics(bad=2, lost=3, overruns=4, gaps=1, high_water_bytes=5_000_000)
     line = capture_text.status_line(
         CaptureStatus(3723.4, None, 2.5e6, 812.4, totals, 7_000_000, 80_000_000_000)
     )
@@ -473,9 +473,9 @@ def test_the_live_line() -> None:
         "3 missing",
         "4 overrun",
         "1 gap",
-        "buffer 5 kB",
+        "backlog 5 MB",
         "file 7 MB",
-        "disk 80 GB left",
+        "disk 80 GB",
     ]
     quiet = capture_text.status_line(
         CaptureStatus(5.0, None, 0.0, 0.0, CaptureStatistics(), 0, None)
@@ -483,6 +483,7 @@ def test_the_live_line() -> None:
     assert quiet.startswith("0:05  0 B/s")
     assert "gap" not in quiet
     assert "disk" not in quiet
+    assert "backlog" not in quiet
     away = capture_text.status_line(
         CaptureStatus(9.0, 3.2, 0.0, 0.0, CaptureStatistics(gaps=2), 0, None)
     )

@@ -75,8 +75,8 @@ def test_the_path_is_all_that_is_printed(locatk: Callable, run: Path, tmp_path: 
         result = locatk("emulate", run, "--link", link)
     assert result.exit_code == 0, result.stderr
     assert result.stdout == f"{link}\n"
-    assert f"locatk, bytes as recorded of {run}, " in result.stderr
-    assert f"as: locatk capture {link} --device locatk " in result.stderr
+    assert f"locatk, recorded bytes of {run}, " in result.stderr
+    assert f"for example: locatk capture {link} --device locatk " in result.stderr
     assert result.stderr.endswith("Sent 5000 of 5000 bytes\n")
     assert b"".join(got) == DATA
     assert not os.path.lexists(link)
@@ -114,7 +114,7 @@ def test_unplugging_is_counted(locatk: Callable, run: Path, tmp_path: Path) -> N
     assert told["unplugs"] == 1
     assert told["sent"] == len(b"".join(got)) > 0
     assert told["unheard"] == 5000 - told["sent"] > 0
-    assert "lost while nobody listened, unplugged 1 time\n" in result.stderr
+    assert "lost while the port was closed, unplugged 1 time\n" in result.stderr
 
 
 def test_as_fast_as_possible(locatk: Callable, run: Path, tmp_path: Path) -> None:
@@ -170,14 +170,14 @@ def test_all_systems_are_offered() -> None:
         (["RUN", "--device", "lines"], 1, "Error: no data that a serial device sends in RUN"),
         (["RUN", "--link", "RUN"], 1, "Error: the path of the port is taken in RUN. Hint: Cho"),
         (["RUN", "--link", "absent/port"], 1, "Error: no folder for the port"),
-        (["EMPTY"], 1, "Error: nothing to send in EMPTY."),
+        (["EMPTY"], 1, "Error: no bytes to send in EMPTY."),
         (["TEXT"], 1, "Error: not an MCAP file"),
         (["RUN", "--drop", "2"], 2, "--drop"),
         (["RUN", "--speed", "-1"], 2, "--speed"),
         (["RUN", "--speed", "2", "--rate", "9"], 2, "--speed or --rate, not both"),
         (["RUN", "--speed", "0", "--no-wait"], 2, "--no-wait"),
-        (["RUN", "--away", "2"], 2, "--away is of --unplug-every"),
-        (["RUN", "--save", "x.mcap"], 2, "--save is of a SYSTEM"),
+        (["RUN", "--away", "2"], 2, "--away needs --unplug-every"),
+        (["RUN", "--save", "x.mcap"], 2, "--save applies to a SYSTEM"),
         ([], 2, "SESSION|SYSTEM"),
     ],
 )
