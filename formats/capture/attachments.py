@@ -42,13 +42,13 @@ def attachments(paths: Iterable[Path]) -> dict[str, str]:
     InputError
         Two artifacts of one kind, or a session without any.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for path in paths:
         for name, text in _of(path).items():
-            if found.get(name, text) != text:
+            if texts.get(name, text) != text:
                 raise InputError(f"a second {name}", file=path, hint="Give one of each kind")
-            found[name] = text
-    return found
+            texts[name] = text
+    return texts
 
 
 def _of(path: Path) -> dict[str, str]:
@@ -63,7 +63,7 @@ def _of(path: Path) -> dict[str, str]:
 
 def _of_session(path: Path) -> dict[str, str]:
     session = Session.open(path)
-    found = {}
+    texts = {}
     for info in session.attachments():
         stem, dash, _ = info.name.partition("-")
         loads = ATTACHED.get(f"{stem}.toml" if dash and stem in BY_DEVICE else info.name)
@@ -71,9 +71,9 @@ def _of_session(path: Path) -> dict[str, str]:
         if loads is not None and data is not None:
             text = data.decode("utf-8", "replace")
             loads(text, file=f"{path}:{info.name}")
-            found[info.name] = text
-    if not found:
+            texts[info.name] = text
+    if not texts:
         raise InputError(
             "the session contains no artifact", file=path, hint="Give the artifacts (.toml)"
         )
-    return found
+    return texts

@@ -61,7 +61,7 @@ class CameraPort:
         self._speed = speed
         self._format = format
         self._grey = grey
-        self._found: dict[str, str] = {}
+        self._properties: dict[str, str] = {}
         self.can_reconnect = not self._is_file()
 
     def _is_file(self) -> bool:
@@ -97,7 +97,7 @@ class CameraPort:
                 else "Check that no other program uses it",
             )
         height, width = first[1].shape[:2]
-        self._found = {
+        self._properties = {
             "width": str(width),
             "height": str(height),
             "fps": f"{_rate(capture):g}",
@@ -119,7 +119,7 @@ class CameraPort:
         These are ``width``, ``height``, ``fps`` (0 if unknown) and ``backend``, that of OpenCV.
         """
         grey = {"grey": "true"} if self._grey else {}
-        return {"port": self.name, "format": self._format, **grey, **self._found}
+        return {"port": self.name, "format": self._format, **grey, **self._properties}
 
     def _explain_error(self, is_file: bool) -> SourceError:
         if is_file or "://" in self._address:

@@ -83,7 +83,7 @@ class ArrivalTimes:
 
     def read_ns(self, end: Ints) -> Ints:
         """Return the times (n,) of the reads with the bytes before ``end`` (n,)."""
-        return self._time[self._place(end)]
+        return self._time[self._read_index(end)]
 
     def wire_ns(self, end: Ints) -> Ints:
         """Return estimated times (n,) on the wire of the last byte before ``end`` (n,).
@@ -91,14 +91,14 @@ class ArrivalTimes:
         That is the time of its read, minus the transmission time of the bytes after it, but not
         before the previous read.
         """
-        place = self._place(end)
-        late = (self.byte_ns * (self._end[place] - end)).astype(np.int64)
-        before = np.where(place > 0, self._time[place - 1], np.iinfo(np.int64).min)
-        return np.maximum(self._time[place] - late, np.minimum(before, self._time[place]))
+        index = self._read_index(end)
+        late = (self.byte_ns * (self._end[index] - end)).astype(np.int64)
+        before = np.where(index > 0, self._time[index - 1], np.iinfo(np.int64).min)
+        return np.maximum(self._time[index] - late, np.minimum(before, self._time[index]))
 
-    def _place(self, end: Ints) -> Ints:
-        found = np.searchsorted(self._end[: self._count], end, side="left")
-        return np.minimum(found, self._count - 1)
+    def _read_index(self, end: Ints) -> Ints:
+        index = np.searchsorted(self._end[: self._count], end, side="left")
+        return np.minimum(index, self._count - 1)
 
 
 RATE_WINDOW_NS = 5_000_000_000
@@ -155,13 +155,13 @@ class DeviceClock:
         if last is not None:
             tick_step = np.diff(tick, prepend=last[0])
             time_step = np.diff(read_ns, prepend=last[1])
-            most_ns = np.inf
+            max_step_ns = np.inf
             if self.ticks.bits < 63:
                 tick_step &= (1 << self.ticks.bits) - 1
-                most_ns = 0.5e9 * (1 << self.ticks.bits) / self.ticks.hz
-            # Over a silence, or backward, nobody knows how often the counter began anew.
-            usable = (tick_step >= 0) & (time_step < most_ns)
-            usable &= tick_step * (1e9 / self.ticks.hz) < most_ns
+                max_step_ns = 0.5e9 * (1 << self.ticks.bits) / self.ticks.hz
+            # After a long silence, or backward, the number of wraps of the counter is unknown.
+            usable = (tick_step >= 0) & (time_step < max_step_ns)
+            usable &= tick_step * (1e9 / self.ticks.hz) < max_step_ns
             self._ticked += int(tick_step[usable].sum())
             self._passed += int(time_step[usable].sum())
         self._last[topic] = (int(tick[-1]), int(read_ns[-1]))

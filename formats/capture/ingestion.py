@@ -127,7 +127,7 @@ class SerialIntake:
         halls = () if text is None else hall_sensors.loads_halls(text).names
         self._streams = MessageEncoder(name, halls)
         self._arrivals = ArrivalTimes()
-        self._known: dict[tuple[str, str], Stream] = {}
+        self._streams_by_device: dict[tuple[str, str], Stream] = {}
         self._with_artifacts: set[Stream] = set()
         self._counts = Counts()
         self._remarks: list[str] = []
@@ -139,11 +139,11 @@ class SerialIntake:
         else:
             self._set_device(find_device(device_name))
 
-    def _set_device(self, found: Device) -> None:
-        self.device = found
-        self._decoder = found.create_decoder(self._options)
+    def _set_device(self, device: Device) -> None:
+        self.device = device
+        self._decoder = device.create_decoder(self._options)
         if not self._port.startswith(UNPACED):
-            self._arrivals.byte_ns = 10e9 / (self._baud or found.baud)
+            self._arrivals.byte_ns = 10e9 / (self._baud or device.baud)
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
         """Return the messages of received data: first all raw ones, then the records."""
@@ -203,8 +203,11 @@ class SerialIntake:
         return batches
 
     def restart(self, *, opened: bool = True) -> Iterator[StampedMessage]:
-        """What is half received is dropped; byte offsets go on. Not ``opened`` where only
-        bytes are missing from a recording."""
+        """Return the records that were held back, and discard a partial frame.
+
+        Byte offsets continue. ``opened`` is False if the connection was not lost, and bytes are
+        missing from an incomplete recording instead.
+        """
         self._opened = opened
         yield from self._records(self._restart_decoder)
         self._streams.restart()  # after what was pending back, which is of the time before
@@ -236,15 +239,17 @@ class SerialIntake:
         """
         try:
             batches = decode()
-            made = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
+            stamped = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
         except Exception as error:  # The decoder may be of another package.
             self._stop_decoding(error)
             return []
         for batch in batches:
             if len(batch):
-                self._known[batch.stream.kind, self._streams.device(batch.stream)] = batch.stream
+                self._streams_by_device[batch.stream.kind, self._streams.device(batch.stream)] = (
+                    batch.stream
+                )
                 self.system = self.system or SYSTEMS.get(batch.stream.kind, "")
-        return made
+        return stamped
 
     def _stop_decoding(self, error: Exception) -> None:
         self._remarks.append(
@@ -278,18 +283,18 @@ class SerialIntake:
 
     def clocks(self) -> dict[str, str]:
         """Return offset, drift and jitter (95th percentile of the delay) of each device's clock."""
-        found: dict[str, str] = {}
+        entries: dict[str, str] = {}
         for name, clock in self._streams.clocks().items():
             if clock.jitter_ns is not None and clock.jitter_ns[1] < 0:
                 continue  # Ticks ahead of their arrival belong to no clock in step with the host.
             if clock.offset_ns is not None:
-                found[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
+                entries[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
             if clock.drift_ppm is not None:
-                found[f"tick_drift_ppm:{name}"] = f"{clock.drift_ppm:.3f}"
+                entries[f"tick_drift_ppm:{name}"] = f"{clock.drift_ppm:.3f}"
             if clock.jitter_ns is not None:
-                found[f"tick_jitter_s:{name}"] = f"{clock.jitter_ns[1] / 1e9:.6f}"
-            found[f"tick_restarts:{name}"] = str(clock.restarts)
-        return found
+                entries[f"tick_jitter_s:{name}"] = f"{clock.jitter_ns[1] / 1e9:.6f}"
+            entries[f"tick_restarts:{name}"] = str(clock.restarts)
+        return entries
 
     def rates(self) -> dict[str, float]:
         """Return decoded records per second by topic."""
@@ -299,15 +304,15 @@ class SerialIntake:
         """Return the default artifacts of the device, by its streams."""
         if self.device is None:
             return {}
-        found: dict[str, str] = {}
-        for stream in self._known.values():
+        entries: dict[str, str] = {}
+        for stream in self._streams_by_device.values():
             if stream not in self._with_artifacts:
                 self._with_artifacts.add(stream)
                 try:
-                    found |= self.device.default_artifacts(stream)
+                    entries |= self.device.default_artifacts(stream)
                 except Exception as error:  # The device may be of another package.
                     self._remarks.append(f"no artifacts of {self.device.name}: {error}")
-        return found
+        return entries
 
 
 class CameraIntake:

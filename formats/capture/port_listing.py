@@ -65,15 +65,15 @@ class PortInfo:
 
 def find_ports_with_users() -> list[PortInfo]:
     """Return all ports with the programs that use them, in natural order of their names."""
-    found = find_ports()
-    users = find_port_users(info.device for info in found)
-    return [replace(info, holder=", ".join(map(str, users[info.device])) or None) for info in found]
+    ports = find_ports()
+    users = find_port_users(info.device for info in ports)
+    return [replace(info, holder=", ".join(map(str, users[info.device])) or None) for info in ports]
 
 
 def find_ports() -> list[PortInfo]:
     """Return all ports in natural order of their names."""
-    found = [_info(port) for port in _comports() if _exists(port.device)]
-    return sorted(found, key=lambda info: _natural(info.device))
+    ports = [_info(port) for port in _comports() if _exists(port.device)]
+    return sorted(ports, key=lambda info: _natural(info.device))
 
 
 def _comports() -> list[Any]:

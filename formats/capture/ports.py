@@ -131,14 +131,14 @@ class SerialPort:
         """Return ``port``, ``baud``; once it was open, ``resolved``; of USB ``vid`` and ``pid``
         (hexadecimal), ``serial_number``, ``product``, ``manufacturer``, ``location``.
         """
-        known: dict[str, str | None] = {
+        facts: dict[str, str | None] = {
             "port": self.name,
             "resolved": self._resolved,
             "baud": str(self._baud),
         }
         info = self._info
         if info is not None:
-            known |= {
+            facts |= {
                 "vid": None if info.vid is None else f"{info.vid:04x}",
                 "pid": None if info.pid is None else f"{info.pid:04x}",
                 "serial_number": info.serial_number,
@@ -146,7 +146,7 @@ class SerialPort:
                 "manufacturer": info.manufacturer,
                 "location": info.location,
             }
-        return {key: value for key, value in known.items() if value is not None}
+        return {key: value for key, value in facts.items() if value is not None}
 
     def _present_path(self) -> str:
         """Return its present path: its name, or another one under which the device came back."""

@@ -52,7 +52,7 @@ class Reconnected:
     """The port was opened again, perhaps at another path."""
 
     time_ns: int
-    where: str
+    path: str
 
 
 @dataclass(frozen=True)
@@ -91,14 +91,14 @@ class PortReader:
         self._attempts = 0
         self.received = 0
         """Bytes so far."""
-        self.heard_ns = 0
+        self.last_data_ns = 0
         """When the last of them were read."""
         self._taken = 0
         self._overruns_before = Overruns()  # Of links closed before.
         self._overruns_now = Overruns()
         self._dropped_before = self._dropped = 0
         self.high_water = 0
-        self.held_up = 0
+        self.pauses = 0
         """How often reading stopped because too much was waiting."""
         self._thread = threading.Thread(target=self._run, name="locatk-receiver", daemon=True)
 
@@ -163,11 +163,11 @@ class PortReader:
                 self._events.append(ConnectionLost(self._clock.now(), str(lost)))
                 if not self._reopen():
                     return
-                where = self._port.describe().get("resolved", self._port.name)
-                self._events.append(Reconnected(self._clock.now(), where))
+                path = self._port.describe().get("resolved", self._port.name)
+                self._events.append(Reconnected(self._clock.now(), path))
                 continue
             while self.received - self._taken > self._max_waiting and not self._stop.is_set():
-                self.held_up += 1
+                self.pauses += 1
                 self._stop.wait(0.05)
             if start - counted > COUNTER_INTERVAL_S:
                 counted = start
@@ -175,7 +175,7 @@ class PortReader:
             remaining = start + MIN_READ_INTERVAL_S - time.monotonic()
             if remaining > 0 and self._port.can_reconnect:  # A replayed source has its own pace.
                 time.sleep(remaining)
-        self._read_rest()
+        self._read_remaining()
 
     def _read(self, wait_s: float) -> int:
         assert self._link is not None
@@ -184,13 +184,13 @@ class PortReader:
             return 0
         self._attempts = 0
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
-        self.heard_ns = self._clock.now()
-        self._events.append(ReceivedData(self.heard_ns, data, size))
+        self.last_data_ns = self._clock.now()
+        self._events.append(ReceivedData(self.last_data_ns, data, size))
         self.received += size
         self.high_water = max(self.high_water, self.received - self._taken)
         return size
 
-    def _read_rest(self) -> None:
+    def _read_remaining(self) -> None:
         """Read the bytes that the system still holds, for a limited time."""
         until = time.monotonic() + READ_TIMEOUT_S
         try:

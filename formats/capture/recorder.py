@@ -145,7 +145,7 @@ class Recorder:
             ended, failed = self._write_until_end(stop)
             if not self._receiver.stop():
                 self._report("the driver of the port hangs: bytes in its buffer are not recorded")
-            self._write_rest()
+            self._write_remaining()
         except (
             LocatkError,
             OSError,
@@ -193,8 +193,8 @@ class Recorder:
 
     def _disk_error(self, error: LocatkError | OSError) -> str:
         """Return the error of the disk, and the number of received bytes that are not saved."""
-        left = self._receiver.received - self._count().bytes
-        return f"{error}" + (f"; {left} received bytes are not in the file" if left else "")
+        unsaved = self._receiver.received - self._count().bytes
+        return f"{error}" + (f"; {unsaved} received bytes are not in the file" if unsaved else "")
 
     def _write_until_end(self, stop: threading.Event) -> tuple[str, bool]:
         """Write batches of received data; return why it ended, and whether by an error."""
@@ -233,8 +233,8 @@ class Recorder:
         return ""
 
     def _is_full(self) -> bool:
-        most = self._limits.max_bytes
-        return most is not None and self._parts.bytes_written >= most
+        limit = self._limits.max_bytes
+        return limit is not None and self._parts.bytes_written >= limit
 
     def _elapsed_s(self) -> float:
         return (self._clock.now() - self._start_ns) * 1e-9
@@ -278,9 +278,9 @@ class Recorder:
         self._disconnected_ns = None
         self._last_data_ns = event.time_ns
         self._parts.write(self._intake.restart())
-        self._report(f"reconnected to {event.where} after {away_s:.1f} s", event.time_ns)
+        self._report(f"reconnected to {event.path} after {away_s:.1f} s", event.time_ns)
 
-    def _write_rest(self) -> None:
+    def _write_remaining(self) -> None:
         """Write the data received between the last batch and the end."""
         if not self._is_full():
             self._write(self._receiver.take())
@@ -313,16 +313,16 @@ class Recorder:
         self._check_silence()
         self._check_clock()
         self._check_frames(totals)
-        if self._receiver.held_up > self._pauses:
-            self._pauses = self._receiver.held_up
+        if self._receiver.pauses > self._pauses:
+            self._pauses = self._receiver.pauses
             self._report("the disk is slower than the port: reading is paused")
         return "" if free is None else self._check_disk(free)
 
     def _check_silence(self) -> None:
-        heard_ns = max(
-            self._last_data_ns, self._receiver.heard_ns
+        last_data_ns = max(
+            self._last_data_ns, self._receiver.last_data_ns
         )  # Newer data may wait to be written.
-        silent_s = (self._clock.now() - heard_ns) * 1e-9
+        silent_s = (self._clock.now() - last_data_ns) * 1e-9
         if (
             self._disconnected_ns is None
             and not self._silent
@@ -361,13 +361,13 @@ class Recorder:
             self._step_s = step_s
 
     def _check_disk(self, free: int) -> str:
-        left = free - self._limits.reserve_bytes
-        if left <= 0:
+        available = free - self._limits.reserve_bytes
+        if available <= 0:
             return "the disk is full up to --reserve"
         per_s = self._parts.bytes_written / max(self._elapsed_s(), 1.0)
-        if per_s > 0 and left / per_s < DISK_WARNING_S:
+        if per_s > 0 and available / per_s < DISK_WARNING_S:
             if not self._disk_reported:
-                self._report(f"at this rate the disk will be full in {left / per_s:.0f} s")
+                self._report(f"at this rate the disk will be full in {available / per_s:.0f} s")
             self._disk_reported = True
         else:
             self._disk_reported = False

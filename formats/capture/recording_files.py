@@ -338,13 +338,13 @@ class LiveFile:
     def free(self) -> int | None:
         """Return the free bytes of the disk; None if they are unknown."""
         try:
-            found = os.fstatvfs(self._file.fileno())
+            status = os.fstatvfs(self._file.fileno())
         except (AttributeError, OSError, ValueError):
             try:
                 return shutil.disk_usage(self.path.parent).free
             except OSError:
                 return None
-        return found.f_bavail * found.f_frsize
+        return status.f_bavail * status.f_frsize
 
     def is_there(self) -> bool:
         """Return whether the file has a name; it may have been removed or replaced."""

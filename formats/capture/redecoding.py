@@ -170,14 +170,14 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
         if topic == "/log":
             line = Log.FromString(payload)
             if line.name.startswith("locatk"):  # not of a device: those are decoded is_reconnect
-                yield from _turn(intakes, waiting)
+                yield from _decode_waiting(intakes, waiting)
                 yield StampedMessage("/log", line, time_ns, time_ns)
             continue
         chunk = SerialChunk.FromString(payload)
         hole = chunk.byte_offset != expected[topic]
         is_reconnect = chunk.byte_offset != 0 and (chunk.opened or hole)
         if is_reconnect or time_ns - start_ns >= BATCH_NS:
-            yield from _turn(intakes, waiting)
+            yield from _decode_waiting(intakes, waiting)
             start_ns = time_ns
         if hole:
             intakes[topic].skip_to(chunk.byte_offset)
@@ -185,12 +185,12 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
             yield from intakes[topic].restart(opened=chunk.opened)
         expected[topic] = chunk.byte_offset + len(chunk.data)
         waiting[topic].append(ReceivedData(time_ns, chunk.data, len(chunk.data)))
-    yield from _turn(intakes, waiting)
+    yield from _decode_waiting(intakes, waiting)
     for intake in intakes.values():
         yield from intake.finish()
 
 
-def _turn(
+def _decode_waiting(
     intakes: Mapping[str, SerialIntake], waiting: dict[str, list[ReceivedData]]
 ) -> Iterator[StampedMessage]:
     for topic, received in waiting.items():

@@ -71,14 +71,14 @@ class ReplayPort:
         """Return ``port``, ``resolved`` (the file), ``speed``; once it was open, ``topic``, and
         ``damage`` of a damaged file.
         """
-        known = {
+        facts = {
             "port": self.name,
             "resolved": os.path.realpath(self._file),
             "speed": f"{self._speed:g}",
             "topic": self._topic,
             "damage": self._damage,
         }
-        return {key: value for key, value in known.items() if value}
+        return {key: value for key, value in facts.items() if value}
 
     def _choose_topic(self, session: Session) -> str:
         topics = session.topics("", SCHEMA)
@@ -88,8 +88,8 @@ class ReplayPort:
             return topics[0]
         if topics:
             each = " or ".join(f"{PREFIX}{self._file}#{topic}" for topic in topics)
-            what = f"no port {self._topic}" if self._topic else f"{len(topics)} ports"
-            raise SourceError(what, file=self._file, hint=f"Give {each}")
+            problem = f"no port {self._topic}" if self._topic else f"{len(topics)} ports"
+            raise SourceError(problem, file=self._file, hint=f"Give {each}")
         contents = ", ".join(channel.topic for channel in session.channels) or "nothing"
         raise SourceError(
             "no raw bytes",

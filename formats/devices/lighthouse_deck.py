@@ -49,7 +49,7 @@ Index = NDArray[np.int64]
 _Frames = tuple[Bytes, Index]
 
 FRAME_BYTES = 12
-SENSORS = 4
+SENSOR_COUNT = 4
 TICKS_PER_COUNT = 4
 SYNC_FRAME = b"\xff" * FRAME_BYTES
 SYNC_INTERVAL_NS = 500_000_000
@@ -324,7 +324,7 @@ def _counts(pulses: NDArray[np.void], uses_words: bool) -> tuple[NDArray[Any], N
     group = np.repeat(np.arange(len(starts)), stops - starts)
     smallest = np.minimum.reduceat(np.where(is_identified, own, 99), starts)
     has_one_polynomial = smallest == np.maximum.reduceat(own, starts)
-    group_sensor = group * SENSORS + pulses["sensor"]
+    group_sensor = group * SENSOR_COUNT + pulses["sensor"]
     is_single = np.bincount(group_sensor)[group_sensor] == 1
     is_unambiguous = is_identified | (has_one_polynomial[group] & is_single)
     is_wordless = np.ones(n, bool)
@@ -368,7 +368,7 @@ def encode(recording: Recording) -> Iterator[tuple[int, bytes]]:
     """
     sweeps, usable = recording.sweeps, np.zeros(0, bool)
     if sweeps is not None:
-        usable = (sweeps.device == 0) & np.isin(sweeps.sensor, range(SENSORS))
+        usable = (sweeps.device == 0) & np.isin(sweeps.sensor, range(SENSOR_COUNT))
         usable &= np.isin(sweeps.channel, CHANNELS)
         usable &= (sweeps.count >= 0.5) & (sweeps.count <= lfsr.SEQUENCE_LENGTH - 1)
     if sweeps is None or not np.any(usable):

@@ -43,8 +43,8 @@ def repeat_packets(packets: Callable[[], Packets], times: int = 1) -> Iterator[t
     between packets. Times that decrease are replaced by the previous ones.
     """
     start = 0
-    for turn in count():
-        if times and turn == times:
+    for repetition in count():
+        if times and repetition == times:
             return
         first: int | None = None
         last, number = start, 0
@@ -211,8 +211,8 @@ class LineFaults:
         flipped = self._flips.failures(bit_count)
         if not len(lost) and not len(flipped):
             return data
-        left = np.delete(np.frombuffer(data, np.uint8), lost)
-        np.bitwise_xor.at(left, flipped // 8, (1 << (flipped % 8)).astype(np.uint8))
+        remaining = np.delete(np.frombuffer(data, np.uint8), lost)
+        np.bitwise_xor.at(remaining, flipped // 8, (1 << (flipped % 8)).astype(np.uint8))
         self.dropped += len(lost)
         self.flipped += len(flipped)
-        return left.tobytes()
+        return remaining.tobytes()

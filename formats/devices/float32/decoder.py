@@ -262,16 +262,18 @@ class FloatArrayDecoder:
             is_doubtful[rows] = ~keeps_sensor_order(model, frames[rows], before[rows], cost[rows])
         is_doubtful |= damaged.any(axis=1)
         is_doubtful[0] = False
-        good = int(np.argmax(is_doubtful)) if is_doubtful.any() else n
-        new_start = self._start_by_pauses(model, good)
+        valid_count = int(np.argmax(is_doubtful)) if is_doubtful.any() else n
+        new_start = self._start_by_pauses(model, valid_count)
         if new_start is not None:
-            good = (new_start - self._base - self._position) // size
-        left_out = impossible[: good - 1] | find_isolated_jumps(model, deviations[:good])
-        model = self._release(model, good - 1, left_out)
+            valid_count = (new_start - self._base - self._position) // size
+        left_out = impossible[: valid_count - 1] | find_isolated_jumps(
+            model, deviations[:valid_count]
+        )
+        model = self._release(model, valid_count - 1, left_out)
         if new_start is not None:
             self._correct_start(model, new_start)
             return True
-        if good < n:
+        if valid_count < n:
             self._stride = MIN_STRIDE_FRAMES
             return self._resynchronize(model, final)
         self._stride = min(2 * self._stride, MAX_STRIDE_FRAMES)
@@ -364,13 +366,13 @@ class FloatArrayDecoder:
             self._remark("shifted", self._base + start)
         return True
 
-    def _start_by_pauses(self, model: FrameModel, good: int) -> int | None:
+    def _start_by_pauses(self, model: FrameModel, valid_count: int) -> int | None:
         """Return a pause within the next frames if most pauses show another start of a frame."""
         size = model.layout.size
         held = self._base + self._position
         step = 4 * model.shift_step
         for pause in self._pauses:
-            if model.is_unambiguous or not size <= pause - held < good * size:
+            if model.is_unambiguous or not size <= pause - held < valid_count * size:
                 continue
             phase = (pause - held) % size
             self._votes.append(-1 if phase % step else phase)

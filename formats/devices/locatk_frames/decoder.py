@@ -155,9 +155,9 @@ class FrameDecoder:
 
     def _records(self, contents: Contents) -> list[Batch]:
         heads = contents.rows(np.arange(len(contents)), 0, HEADER.itemsize).view(HEADER)[:, 0]
-        right = np.ones(len(contents), bool)
+        valid = np.ones(len(contents), bool)
         restarted = self._count_lost(heads)
-        lines, sources = self._read_lines(contents, heads, restarted, right)
+        lines, sources = self._read_lines(contents, heads, restarted, valid)
         pieces = _split(*_log_block(lines, heads), sources, contents, heads)
         known = np.isin(heads["type"], (Type.HELLO, Type.TEXT))
         for type, read in READERS.items():
@@ -166,12 +166,12 @@ class FrameDecoder:
             for group in _layouts(contents, frames, type):
                 payload = contents.rows(group, HEADER.itemsize, int(contents.size[group[0]]))
                 block = read(payload, heads["tick"][group].astype(np.int64))
-                right[group] = False if block is None else block.right
+                valid[group] = False if block is None else block.valid
                 if block is not None:
                     pieces += _split(block, group, sources, contents, heads)
-        self.counts.frames += int(right.sum())
-        self.counts.bad += int((~right).sum())
-        self.counts.skipped += int(contents.wire[~right].sum())
+        self.counts.frames += int(valid.sum())
+        self.counts.bad += int((~valid).sum())
+        self.counts.skipped += int(contents.wire[~valid].sum())
         self.counts.unknown += int((~known).sum())
         streams: dict[Stream, list[Batch]] = {}
         for piece in pieces:
@@ -199,11 +199,11 @@ class FrameDecoder:
         contents: Contents,
         heads: NDArray[np.void],
         restarted: NDArray[np.bool_],
-        right: NDArray[np.bool_],
+        valid: NDArray[np.bool_],
     ) -> tuple[list[_LogLine], _FrameSources]:
         """Return the log messages of HELLO and TEXT frames, and the node and clock of each frame.
 
-        ``right`` becomes False for invalid ones.
+        ``valid`` becomes False for invalid ones.
         """
         lines = []
         sources = _FrameSources([], np.zeros(len(heads), np.int64))
@@ -211,12 +211,12 @@ class FrameDecoder:
             sources.add(number, self._nodes[number].ticks, heads["node"] == number)
         for frame in np.flatnonzero(heads["type"] == Type.TEXT).tolist():
             line = read_text(_payload(contents, frame))
-            right[frame] = line is not None
+            valid[frame] = line is not None
             lines += [_LogLine(frame, *line)] if line else []
         records = np.isin(heads["type"], list(READERS))
         for frame in np.flatnonzero(heads["type"] == Type.HELLO).tolist():
             hello = read_hello(_payload(contents, frame))
-            right[frame] = hello is not None
+            valid[frame] = hello is not None
             if hello is not None:
                 number = int(heads["node"][frame])
                 later = (heads["node"] == number) & (np.arange(len(heads)) >= frame)
@@ -288,9 +288,9 @@ def _log_block(lines: list[_LogLine], heads: NDArray[np.void]) -> tuple[Block, I
     frames = np.array([line.frame for line in lines], np.int64)
     text = np.array([line.text for line in lines], object)[:, None]
     level = np.array([line.level for line in lines], np.int64)[:, None]
-    right = np.ones(len(lines), bool)
+    valid = np.ones(len(lines), bool)
     tick = heads["tick"][frames].astype(np.int64)[:, None]
-    return Block("log", 0, right, tick, {"level": level, "text": text}), frames
+    return Block("log", 0, valid, tick, {"level": level, "text": text}), frames
 
 
 def _split(
@@ -298,9 +298,9 @@ def _split(
 ) -> list[Batch]:
     """Return the records of the valid frames of a block, by node and clock."""
     batches = []
-    for place in np.unique(sources.of[frames[block.right]]).tolist():
-        number, ticks = sources.known[place]
-        which = np.flatnonzero(block.right & (sources.of[frames] == place))
+    for index in np.unique(sources.of[frames[block.valid]]).tolist():
+        number, ticks = sources.known[index]
+        which = np.flatnonzero(block.valid & (sources.of[frames] == index))
         each = block.tick.shape[1]
         batches.append(
             Batch(
@@ -454,8 +454,11 @@ def _check_sweep_ranges(sweeps: Sweeps) -> None:
 
 def _nodes(sampled: Sequence[str], sweeps: Sweeps | None) -> dict[str, int]:
     """Return the node number of each device."""
-    seen = () if sweeps is None else np.unique(sweeps.device).tolist()
-    devices = [*sampled, *(sweeps.devices[number] for number in seen if sweeps is not None)]
+    device_numbers = () if sweeps is None else np.unique(sweeps.device).tolist()
+    devices = [
+        *sampled,
+        *(sweeps.devices[number] for number in device_numbers if sweeps is not None),
+    ]
     nodes = {device: number for number, device in enumerate(dict.fromkeys(devices))}
     if len(nodes) > 256:
         raise InputError(f"{len(nodes)} devices, but a port has at most 256")
@@ -483,23 +486,23 @@ def _series(
 ) -> Iterator[_UnnumberedFrame]:
     """Yield frames of samples with constant steps."""
     ticks = ((time_ns - start_ns) // TICK_NS).tolist()
-    most = max(1, min(MAX_FRAME_SAMPLES, (MAX_CONTENT_BYTES - 16) // (4 * values[:1].size)))
+    max_samples = max(1, min(MAX_FRAME_SAMPLES, (MAX_CONTENT_BYTES - 16) // (4 * values[:1].size)))
     start = 0
     while start < len(ticks):
-        stop, step = _end_of_even_steps(ticks, start, most)
+        stop, step = _end_of_even_steps(ticks, start, max_samples)
         payload = payloads.series(values[start:stop], step)
         yield _UnnumberedFrame(int(time_ns[stop - 1]), node, type, ticks[start], payload)
         start = stop
 
 
-def _end_of_even_steps(ticks: list[int], start: int, most: int) -> tuple[int, int]:
+def _end_of_even_steps(ticks: list[int], start: int, max_samples: int) -> tuple[int, int]:
     """Return the end of the samples from ``start`` on that fit into one frame, and their step."""
     first, stop = ticks[start], start + 1
-    if stop == len(ticks) or most == 1 or not 0 < ticks[stop] - first <= MAX_FRAME_TICKS:
+    if stop == len(ticks) or max_samples == 1 or not 0 < ticks[stop] - first <= MAX_FRAME_TICKS:
         return stop, 0
     step = ticks[stop] - first
     while (
-        stop < min(len(ticks), start + most)
+        stop < min(len(ticks), start + max_samples)
         and ticks[stop] - first <= MAX_FRAME_TICKS
         and abs(first + (stop - start) * step - ticks[stop]) <= 1
     ):

@@ -55,10 +55,10 @@ def cobs_encode(data: bytes) -> bytes:
     return bytes(out + _blocks(last, COBS_BLOCK_BYTES + 1))
 
 
-def _blocks(piece: bytes, room: int) -> bytes:
+def _blocks(piece: bytes, max_bytes: int) -> bytes:
     """Return the blocks of the bytes before a 0; a full block does not imply a 0."""
     out = b""
-    while len(piece) >= room:
+    while len(piece) >= max_bytes:
         out += b"\xff" + piece[:COBS_BLOCK_BYTES]
         piece = piece[COBS_BLOCK_BYTES:]
     return out + bytes([len(piece) + 1]) + piece
@@ -117,8 +117,8 @@ class Contents:
         width = stop - start
         if not width or not len(which):
             return np.zeros((len(which), width), np.uint8)
-        places = len(self.data) - width + 1
-        windows = np.ndarray((places,), f"V{width}", self.data, strides=(1,))
+        positions = len(self.data) - width + 1
+        windows = np.ndarray((positions,), f"V{width}", self.data, strides=(1,))
         found: Bytes = windows[self.start[which] + start].view(np.uint8)
         return found.reshape(len(which), width)
 
@@ -156,13 +156,13 @@ class Deframer:
         wire = end - start + 1
         whole = np.flatnonzero((wire > MIN_CONTENT_BYTES + 3) & (wire <= MAX_WIRE_BYTES + 1))
         body, at, size, kept = _decode_cobs(raw, start[whole], end[whole])
-        size, right = _check_crcs(body, at, size)
-        good = whole[kept[right]]
+        size, valid = _check_crcs(body, at, size)
+        good = whole[kept[valid]]
         wire[0] += self._dropped
         self._count(wire, good)
         self._tail, self._dropped = b"", 0
         self._keep(data[last:])
-        return Contents(body, at[right], size[right], before + end[good] + 1, wire[good])
+        return Contents(body, at[valid], size[valid], before + end[good] + 1, wire[good])
 
     def drop(self) -> None:
         """Discard a partial frame.
@@ -210,7 +210,7 @@ def _decode_cobs(raw: bytes, start: Index, end: Index) -> tuple[Bytes, Index, In
     codes = np.frombuffer(raw, np.uint8)
     undone = bytearray(raw)
     body = np.frombuffer(undone, np.uint8)
-    right = np.ones(len(start), bool)
+    valid = np.ones(len(start), bool)
     taken: list[Index] = []
     number, at, stop = np.arange(len(start)), start, end
     while len(at) > MAX_LOOP_FRAMES:
@@ -218,22 +218,22 @@ def _decode_cobs(raw: bytes, start: Index, end: Index) -> tuple[Bytes, Index, In
         at = at + code
         going = at < stop
         if not going.all():
-            right[number[at > stop]] = False
+            valid[number[at > stop]] = False
             number, at, stop, code = number[going], at[going], stop[going], code[going]
         body[at] = 0
         full = code > COBS_BLOCK_BYTES
         if full.any():
             taken.append(at[full])
     after: list[int] = []
-    for n, place, limit in zip(number.tolist(), at.tolist(), stop.tolist(), strict=True):
-        while (following := place + raw[place]) < limit:
+    for n, position, limit in zip(number.tolist(), at.tolist(), stop.tolist(), strict=True):
+        while (following := position + raw[position]) < limit:
             undone[following] = 0
-            if raw[place] > COBS_BLOCK_BYTES:
+            if raw[position] > COBS_BLOCK_BYTES:
                 after.append(following)
-            place = following
-        right[n] = following == limit
+            position = following
+        valid[n] = following == limit
     out = np.sort(np.concatenate([*taken, np.array(after, np.int64)]))
-    kept = np.flatnonzero(right)
+    kept = np.flatnonzero(valid)
     first, last = start[kept] + 1, end[kept]
     if len(out):
         body = np.delete(body, out)
@@ -245,19 +245,19 @@ def _check_crcs(body: Bytes, start: Index, size: Index) -> tuple[Index, Index]:
     """Return the sizes of the contents, and the indices of those with a valid CRC."""
     short = size <= MAX_CRC16_BYTES + 2
     content = size - np.where(short, 2, 4)
-    right = (content >= MIN_CONTENT_BYTES) & (short | (content > MAX_CRC16_BYTES))
-    many = np.flatnonzero(right & short)
+    valid = (content >= MIN_CONTENT_BYTES) & (short | (content > MAX_CRC16_BYTES))
+    many = np.flatnonzero(valid & short)
     if len(many) <= MAX_LOOP_FRAMES:
         many = many[:0]
-    single = right.copy()
+    single = valid.copy()
     single[many] = False
     raw = body.data
     for n in np.flatnonzero(single).tolist():
         first, middle, last = int(start[n]), int(start[n] + content[n]), int(start[n] + size[n])
-        right[n] = checksum(raw[first:middle]) == raw[middle:last]
+        valid[n] = checksum(raw[first:middle]) == raw[middle:last]
     if len(many):
-        right[many] = _is_crc16_valid(body, start[many], content[many])
-    return content, np.flatnonzero(right)
+        valid[many] = _is_crc16_valid(body, start[many], content[many])
+    return content, np.flatnonzero(valid)
 
 
 def _is_crc16_valid(body: Bytes, start: Index, size: Index) -> NDArray[np.bool_]:
@@ -272,19 +272,19 @@ def _is_crc16_valid(body: Bytes, start: Index, size: Index) -> NDArray[np.bool_]
     pairs <<= 8
     pairs |= body
     order = np.argsort(-size, kind="stable")
-    at, left = start[order], size[order]
-    odd = (left & 1).astype(bool)
+    at, remaining = start[order], size[order]
+    odd = (remaining & 1).astype(bool)
     crc = np.full(len(at), 0xFFFF, np.uint16)
     crc[odd] = 0x00FF ^ table[(0xFF ^ body[at[odd]]).astype(np.uint16) << 8]
     at += odd
-    steps = left >> 1
+    steps = remaining >> 1
     going = np.searchsorted(-steps, -np.arange(steps[0]))
     for m in going.tolist():
         crc[:m] = table.take(crc[:m] ^ pairs.take(at[:m]))
         at[:m] += 2
-    right = np.empty(len(at), bool)
-    right[order] = crc.byteswap() == pairs.take(at)
-    return right
+    valid = np.empty(len(at), bool)
+    valid[order] = crc.byteswap() == pairs.take(at)
+    return valid
 
 
 @cache

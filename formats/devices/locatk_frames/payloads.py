@@ -225,7 +225,7 @@ class Block:
     ----------
     kind, sensors
         As in :class:`.decoder.Stream`.
-    right : (n,) bool ndarray
+    valid : (n,) bool ndarray
         Frames whose values are all valid.
     tick : (n, k) int64 ndarray
     columns : dict of str to (n, k, ...) ndarray
@@ -234,7 +234,7 @@ class Block:
 
     kind: str
     sensors: int
-    right: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     tick: NDArray[np.int64]
     columns: dict[str, NDArray[Any]]
 
@@ -243,7 +243,7 @@ class Block:
 class _Series:
     """Values of a series of samples, before they are assigned to columns."""
 
-    right: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     tick: NDArray[np.int64]
     values: NDArray[np.float64]
     temperature: NDArray[np.float64] | None
@@ -263,19 +263,19 @@ def _read_series(payloads: Bytes, tick: NDArray[np.int64], axes: int, flags: int
     if payloads.shape[1] != middle + (4 * samples if has_temperature else 0):
         return None
     step = payloads[:, 4:8].view("<u4").astype(np.int64)
-    right = np.ones(len(payloads), bool)
+    valid = np.ones(len(payloads), bool)
     if samples > 1:
-        right = ((step > 0) & (step * (samples - 1) < MAX_SERIES_TICKS))[:, 0]
+        valid = ((step > 0) & (step * (samples - 1) < MAX_SERIES_TICKS))[:, 0]
     if has_counts:
         scale = payloads[:, start - 4 : start].view("<f4").astype(float)
-        right &= (np.isfinite(scale) & (scale > 0))[:, 0]
+        valid &= (np.isfinite(scale) & (scale > 0))[:, 0]
         counts = payloads[:, start:middle].view("<i2")
         values = np.where(counts == MISSING_COUNT, np.nan, counts * scale)
     else:
         values = payloads[:, start:middle].view("<f4").astype(float)
-        right &= ~np.isinf(values).any(1)
+        valid &= ~np.isinf(values).any(1)
     return _Series(
-        right,
+        valid,
         (tick[:, None] + step * np.arange(samples)) & 0xFFFFFFFF,
         values.reshape(len(payloads), samples, sensors * axes),
         payloads[:, middle:].view("<f4").astype(float) if has_temperature else None,
@@ -287,12 +287,12 @@ def _read_magnetometers(payloads: Bytes, tick: NDArray[np.int64]) -> Block | Non
     if series_data is None:
         return None
     columns: dict[str, NDArray[Any]] = {"b_tesla": series_data.values * 1e-6}
-    right = series_data.right
+    valid = series_data.valid
     if series_data.temperature is not None:
         columns["temperature_celsius"] = series_data.temperature
-        right = right & ~np.isinf(series_data.temperature).any(1)
+        valid = valid & ~np.isinf(series_data.temperature).any(1)
     return Block(
-        "magnetometers", series_data.values.shape[2] // 3, right, series_data.tick, columns
+        "magnetometers", series_data.values.shape[2] // 3, valid, series_data.tick, columns
     )
 
 
@@ -301,17 +301,17 @@ def _read_halls(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     if series_data is None:
         return None
     columns = {"b_tesla": series_data.values * 1e-6}
-    return Block("halls", series_data.values.shape[2], series_data.right, series_data.tick, columns)
+    return Block("halls", series_data.values.shape[2], series_data.valid, series_data.tick, columns)
 
 
 def _read_odometry(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     series_data = _read_series(payloads, tick, 3, 0)
     if series_data is None or series_data.values.shape[2] != 3:
         return None
-    right = series_data.right & np.isfinite(series_data.values).all((1, 2))
+    valid = series_data.valid & np.isfinite(series_data.values).all((1, 2))
     names = ("x_m", "y_m", "heading_rad")
     columns = {name: series_data.values[..., axis] for axis, name in enumerate(names)}
-    return Block("odometry", 0, right, series_data.tick, columns)
+    return Block("odometry", 0, valid, series_data.tick, columns)
 
 
 def _read_records(payloads: Bytes, dtype: np.dtype[np.void]) -> NDArray[np.void] | None:
@@ -326,12 +326,12 @@ def _read_captures(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     records = _read_records(payloads, _CAPTURE)
     if records is None:
         return None
-    right = _in_range(records["polynomial"], -1, 31) & (records["zero"] == 0)
+    valid = _in_range(records["polynomial"], -1, 31) & (records["zero"] == 0)
     columns = {name: records[name] for name in ("sensor", "bits", "polynomial", "bit_offset")}
     return Block(
         "captures",
         0,
-        np.logical_and.reduce(right, axis=1),
+        np.logical_and.reduce(valid, axis=1),
         records["tick"].astype(np.int64),
         columns,
     )
@@ -341,17 +341,17 @@ def _read_sweeps(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     records = _read_records(payloads, _SWEEP)
     if records is None:
         return None
-    right = _in_range(records["channel"], 1, 16)
-    right &= _in_range(records["polynomial"], -1, 31)
-    right &= _in_range(records["sweep"], -1, 1)
-    right &= records["count"] < COUNT_LIMIT
+    valid = _in_range(records["channel"], 1, 16)
+    valid &= _in_range(records["polynomial"], -1, 31)
+    valid &= _in_range(records["sweep"], -1, 1)
+    valid &= records["count"] < COUNT_LIMIT
     names = ("sensor", "channel", "polynomial", "sweep")
     columns: dict[str, NDArray[Any]] = {name: records[name] for name in names}
     columns["count"] = records["count"] / COUNT_STEPS
     return Block(
         "lighthouse",
         0,
-        np.logical_and.reduce(right, axis=1),
+        np.logical_and.reduce(valid, axis=1),
         records["tick"].astype(np.int64),
         columns,
     )

@@ -82,7 +82,7 @@ def test_bytes_and_records(capture: Any, tmp_path: Path, raw_bytes: Any) -> None
     lines = result.stdout.splitlines()
     assert lines[0].startswith(f"{path}: 0:00, {capture_text.size(len(TEXT))} received from lines")
     assert "0 bad, 0 missing" in lines[1]
-    assert lines[0].endswith("end of the source")
+    assert lines[1].endswith("end of the source")
     assert any(line.split()[:2] == ["/readings/robot", "60"] for line in lines)
     assert result.stderr.startswith("Recording replay:")
     assert "Ctrl-C ends it" in result.stderr

@@ -168,7 +168,7 @@ def test_the_name_of_the_place_is_that_of_now(
     port.settle()
     back = all_events(receiver)[1]
     assert isinstance(back, Reconnected)
-    assert "/dev/ttyACM7" in back.where
+    assert "/dev/ttyACM7" in back.path
 
 
 def test_the_end_while_the_device_is_away(port: Any, receive: Callable[..., PortReader]) -> None:
@@ -269,7 +269,7 @@ def test_when_nobody_takes_reading_waits(port: Any, receive: Callable[..., PortR
     receiver = receive(max_waiting_bytes=1000)
     port.send(*[bytes(100)] * 50)
     held = threading.Event()
-    while not receiver.held_up:
+    while not receiver.pauses:
         held.wait(0.001)
     first = receiver.take()
     assert sum(event.size for event in first if isinstance(event, ReceivedData)) == 1100
@@ -283,7 +283,7 @@ def test_when_nobody_takes_reading_waits(port: Any, receive: Callable[..., PortR
 def test_it_can_be_stopped_while_it_waits(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive(max_waiting_bytes=10)
     port.send(*[bytes(100)] * 5)
-    while not receiver.held_up:
+    while not receiver.pauses:
         threading.Event().wait(0.001)
     events = all_events(receiver)
     assert sum(event.size for event in events if isinstance(event, ReceivedData)) == 500
