@@ -448,6 +448,7 @@ def test_tags_are_found_in_what_was_captured(captured: Path, locatk: Any) -> Non
     assert found["heading_rad"] == pytest.approx(expected["heading_rad"], abs=0.02)
 
 
+@pytest.mark.slow
 def test_landmarks_are_found_in_what_was_captured(captured: Path, locatk: Any) -> None:
     want, _ = solved(locatk, captured / "landmarks.mcap")
     got, _ = solved(locatk, captured / "landmarks-captured.mcap")
@@ -465,6 +466,7 @@ def test_landmarks_are_found_in_what_was_captured(captured: Path, locatk: Any) -
     assert np.ptp(offset[len(offset) // 4 :]) < 0.1e9
 
 
+@pytest.mark.slow
 def test_lighthouse_is_solved_of_what_was_captured(captured: Path, locatk: Any) -> None:
     _, reference = solved(locatk, captured / "lighthouse.mcap")
     scene = captured / "scene.toml"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.formats.capture.statistics import CaptureStatistics
@@ -22,6 +22,7 @@ def totals(draw: st.DrawFn) -> CaptureStatistics:
     return CaptureStatistics(**values)
 
 
+@settings(max_examples=30, deadline=None)
 @given(before=totals(), more=totals())
 def test_what_was_counted_since(before: CaptureStatistics, more: CaptureStatistics) -> None:
     now = CaptureStatistics(

@@ -132,6 +132,7 @@ def test_the_header_says_what_the_decoder_reads(
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_there_is_room_for_what_was_asked(firmware: Path, tmp_path: Path) -> None:
     source = tmp_path / "room.c"
     source.write_text("""
@@ -183,6 +184,7 @@ def run_sketch(firmware: Path, host: Path, tmp_path: Path, name: str, seconds: i
     return found, log
 
 
+@pytest.mark.slow
 def test_the_sketch_of_magnetometers(firmware: Path, host: Path, tmp_path: Path) -> None:
     found, log = run_sketch(firmware, host, tmp_path, "locatk_magnetometers", 4)
     bar = found[Stream("magnetometers", sensors=9, ticks=Ticks(1_000_000, 32))]
@@ -199,6 +201,7 @@ def test_the_sketch_of_magnetometers(firmware: Path, host: Path, tmp_path: Path)
     np.testing.assert_allclose(bar["b_tesla"], expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_sketch_of_hall_sensors(firmware: Path, host: Path, tmp_path: Path) -> None:
     found, _ = run_sketch(firmware, host, tmp_path, "locatk_halls", 4)
     halls = found[Stream("halls", sensors=4, ticks=Ticks(1_000_000, 32))]

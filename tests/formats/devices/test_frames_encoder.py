@@ -154,11 +154,11 @@ def test_samples_that_come_unevenly() -> None:
 
 
 def test_ticks_of_a_long_recording_start_again() -> None:
-    time_ns = START_NS + np.arange(100) * 100_000_000_000
-    field = np.ones((100, 2, 3))
+    time_ns = START_NS + np.arange(10) * 500_000_000_000
+    field = np.ones((10, 2, 3))
     found, _ = decoded(Recording([Samples("bar", SensorArray(bar(2, 0.02)), time_ns, field)]))
     assert found["magnetometers", ""]["tick"].tolist() == [
-        n * 100_000_000 % 2**32 for n in range(100)
+        n * 500_000_000 % 2**32 for n in range(10)
     ]
 
 

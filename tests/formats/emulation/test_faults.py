@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
@@ -68,6 +68,7 @@ def test_all_lost_and_all_turned() -> None:
     assert LineFaults(flip=1.0).apply(b"\x00\x0f\xff") == b"\xff\xf0\x00"
 
 
+@settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.integers(0, 400), max_size=30),
     st.sampled_from([0.0, 0.003, 0.1, 0.9]),
