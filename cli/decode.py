@@ -1,4 +1,4 @@
-"""``locatk decode``: raw bytes of a recording into records, again."""
+"""``locatk decode``: decode the raw bytes of a recording again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.capture.options import names_option
+from locatk.cli.capture.options import columns_option
 
 
 @click.command(short_help="Decode the raw bytes of a recording again.")
@@ -16,18 +16,18 @@ from locatk.cli.capture.options import names_option
 @click.option(
     "--device",
     metavar="NAME",
-    help="What sent the bytes, as of `locatk capture`; `auto` finds out.  [default: what the "
-    "recording says]",
+    help="Device that sent the bytes, as in `locatk capture`; auto identifies it.  [default: that "
+    "of the recording]",
 )
 @options.output("Session to write (.mcap).")
 @options.input_option(
     "--artifact",
     many=True,
     metavar="FILE",
-    help="Artifact (.toml), or a session that holds some (.mcap), to attach, in the place of "
-    "what is there. Repeatable.",
+    help="Artifact (.toml), or session that contains some (.mcap), to attach; replaces attached "
+    "ones. Repeatable.",
 )
-@names_option
+@columns_option
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -40,20 +40,20 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Make a session of the raw bytes in RECORDING and of what is decoded from them now.
+    """Write a session with the raw bytes of RECORDING, decoded again.
 
-    For a recording whose device was named wrong, whose decoder has become better, or to which
-    an artifact shall be added. Times stay as they were recorded.
+    Use it if the recording was made with the wrong --device, if the decoder has improved,
+    or to attach an artifact. Times stay as recorded.
 
-    The exit status is 3 where frames were bad or missing.
+    The exit status is 3 if frames are bad or missing.
 
     \b
     Examples:
       locatk decode run.mcap -o again.mcap
-      locatk decode run.mcap --device lines --columns t_ms,x_m,y_m,heading_deg -o again.mcap
+      locatk decode run.mcap --device lines --columns t_ms,x_m,y_m -o again.mcap
       locatk decode run.mcap --artifact array.toml --artifact tag.toml -o again.mcap
     """
-    from locatk.formats.capture import attachments as artifacts
+    from locatk.formats.capture.attachments import attachments
     from locatk.formats.capture.redecoding import decode, losses
     from locatk.formats.devices.decoder import Options
 
@@ -64,7 +64,7 @@ def command(
             output,
             device=device,
             options=Options(columns=columns),
-            artifacts=artifacts.attachments(artifact),
+            artifacts=attachments(artifact),
             overwrite=overwrite,
         )
     for remark in decoded.remarks:
@@ -82,7 +82,7 @@ def command(
                 "output": output,
                 "system": decoded.system or None,
                 "devices": [
-                    {"name": name, "device": decoded.devices[name], **_counted(totals)}
+                    {"name": name, "device": decoded.devices[name], **_decoder_counts(totals)}
                     for name, totals in decoded.totals.items()
                 ],
                 "remarks": decoded.remarks,
@@ -92,8 +92,8 @@ def command(
         raise failures.Incomplete("; ".join(lost))
 
 
-def _counted(totals: Any) -> dict[str, Any]:
-    """What the decoder counts; the rest is of the port."""
-    from locatk.formats.capture.redecoding import LINE
+def _decoder_counts(totals: Any) -> dict[str, Any]:
+    """Return the counts of the decoder, without those of the port."""
+    from locatk.formats.capture.redecoding import LINE_STATISTICS
 
-    return {key: value for key, value in vars(totals).items() if key not in LINE}
+    return {key: value for key, value in vars(totals).items() if key not in LINE_STATISTICS}

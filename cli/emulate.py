@@ -1,94 +1,98 @@
-"""``locatk emulate``: a device that is not there, on a pseudo-terminal."""
+"""``locatk emulate``: emulate a serial device on a pseudo-terminal."""
 
 from __future__ import annotations
 
 import shlex
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command, section
 from locatk.cli.signals import asked_to_stop
 from locatk.core.errors import InputError, LocatkError, MissingDataError
 
-if TYPE_CHECKING:
-    from locatk.formats.emulation.emulator import Totals
-    from locatk.formats.emulation.source import Source
-    from locatk.formats.sessions.reader import Session
-
 SYSTEMS = ("polaris", "landmarks", "lighthouse", "dots")
 
-SHARE = click.FloatRange(0, 1)
-ABOVE_0 = click.FloatRange(0, min_open=True)
+FRACTION = click.FloatRange(0, 1)
+POSITIVE = click.FloatRange(0, min_open=True)
 
 
-@click.command(short_help="Be a device on a pseudo-terminal, without hardware.")
+@click.command(cls=Command, short_help="Be a device on a pseudo-terminal, without hardware.")
 @click.argument("source", metavar="SESSION|SYSTEM")
-@click.option(
-    "--device",
-    metavar="NAME",
-    help="Which device it is, as of `locatk capture`.  [default: the one that recorded the "
-    "session, or polaris-array, locatk, dotbot-gateway by what it holds]",
+@section(
+    "Basic",
+    click.option(
+        "--device",
+        metavar="NAME",
+        help="Device to emulate, as in `locatk capture`.  [default: the one that recorded the "
+        "session, or polaris-array, locatk, dotbot-gateway by its content]",
+    ),
+    click.option(
+        "--link", type=options.PATH, metavar="PATH", help="Path of the port.  [default: a new path]"
+    ),
+    click.option(
+        "--save",
+        type=options.PATH,
+        metavar="FILE",
+        help="Of a SYSTEM: write the simulated session to this file (.mcap), with artifacts and "
+        "truth.",
+    ),
+    options.overwrite,
+    options.number(
+        "--seed", default=0, type=click.IntRange(0), help="Seed of faults and simulation."
+    ),
 )
-@click.option(
-    "--link",
-    type=options.PATH,
-    metavar="PATH",
-    help="Where the port shall be.  [default: a new path]",
+@section(
+    "Pace",
+    options.number(
+        "--speed",
+        default=1.0,
+        type=click.FloatRange(0),
+        metavar="N",
+        help="Factor on the recorded speed; 0 waits for the reader and loses nothing.",
+    ),
+    click.option(
+        "--rate",
+        type=POSITIVE,
+        metavar="BYTES/S",
+        help="Constant rate instead of the recorded pace.",
+    ),
+    options.number(
+        "--loop",
+        default=1,
+        type=click.IntRange(0),
+        metavar="N",
+        help="Number of repetitions; 0 endlessly. Times continue; counters and ticks in the "
+        "bytes restart.",
+    ),
+    click.option("--no-wait", is_flag=True, help="Start before the port is opened."),
 )
-@click.option(
-    "--save",
-    type=options.PATH,
-    metavar="FILE",
-    help="Of a SYSTEM: write the simulated session here (.mcap), with artifacts and truth.",
+@section(
+    "Faults",
+    options.number(
+        "--drop", default=0.0, type=FRACTION, metavar="P", help="Probability that a byte is lost."
+    ),
+    options.number(
+        "--flip", default=0.0, type=FRACTION, metavar="P", help="Probability that a bit flips."
+    ),
+    click.option(
+        "--unplug-every",
+        "unplug_every_s",
+        type=POSITIVE,
+        metavar="SECONDS",
+        help="Unplug the device repeatedly, each time after this time.",
+    ),
+    click.option(
+        "--away",
+        "away_s",
+        type=POSITIVE,
+        metavar="SECONDS",
+        help="Time for which it is unplugged.  [default: 1]",
+    ),
 )
-@options.overwrite
-@options.number(
-    "--speed",
-    default=1.0,
-    type=click.FloatRange(0),
-    metavar="N",
-    help="So many times as fast as recorded; 0 for as fast as the reader takes it, which "
-    "waits for it and loses nothing.",
-)
-@click.option(
-    "--rate",
-    type=ABOVE_0,
-    metavar="BYTES/S",
-    help="A constant rate instead of the recorded pace.",
-)
-@options.number(
-    "--loop",
-    default=1,
-    type=click.IntRange(0),
-    metavar="N",
-    help="Send it so many times; 0 for ever. Times run on, counters and ticks in the bytes "
-    "start again.",
-)
-@click.option("--no-wait", is_flag=True, help="Start before the port is opened.")
-@options.number(
-    "--drop", default=0.0, type=SHARE, metavar="P", help="Probability of a byte to be lost."
-)
-@options.number(
-    "--flip", default=0.0, type=SHARE, metavar="P", help="Probability of a bit to turn over."
-)
-@click.option(
-    "--unplug-every",
-    "unplug_every_s",
-    type=ABOVE_0,
-    metavar="SECONDS",
-    help="Unplug it after so long, again and again.",
-)
-@click.option(
-    "--away",
-    "away_s",
-    type=ABOVE_0,
-    metavar="SECONDS",
-    help="For how long it is gone then.  [default: 1]",
-)
-@options.number("--seed", default=0, type=click.IntRange(0), help="Of faults and simulation.")
 @options.json_flag("Two lines of JSON")
 @options.verbosity
 def command(
@@ -98,24 +102,25 @@ def command(
     save: Path | None,
     overwrite: bool,
     as_json: bool,
-    **given: Any,
+    **settings: Any,
 ) -> None:
-    """Send on a new port what a device would send of SESSION, or of a simulated session of
-    SYSTEM: polaris, landmarks or lighthouse.
+    """Send the bytes of a device on a new port.
 
-    Prints the path of the port, and starts when something opens it. Like a real device it
-    does not wait: what is due while nobody listens is lost, and so is what a reader does not
-    take for a second. What was sent and lost is said at the end.
+    The bytes are those of SESSION, or of a simulated session of SYSTEM: polaris,
+    landmarks or lighthouse. The path of the port is printed; sending starts when a
+    program opens it. A real device does not wait: bytes that are due while the port is
+    closed are lost, and so are bytes that a reader does not take for a second. A summary
+    of bytes sent and lost follows at the end.
 
     \b
     --json prints two lines:
       {"version": 1, "port", "device", "source", "recorded"}
-      {"version": 1, "port", "device", "made", "sent", "dropped", "unheard", "overrun",
-       "flipped", "unplugs"}
+      {"version": 1, "port", "device", "made", "sent", "dropped", "unheard",
+       "overrun", "flipped", "unplugs"}
 
-    recorded: whether the bytes are those of the session. made: bytes that the device had to
-    send, the sum of sent, dropped (by --drop), unheard (nobody listened) and overrun (not
-    read in time). flipped counts bits.
+    recorded: the bytes are those of the session. made: bytes that the device had to send,
+    the sum of sent, dropped (by --drop), unheard (port closed) and overrun (not read in
+    time). flipped counts bits.
 
     \b
     Examples:
@@ -125,43 +130,46 @@ def command(
       locatk emulate run.mcap --rate 3e6 --loop 0 --json
     """
     from locatk.formats.emulation.emulator import Emulator
-    from locatk.formats.emulation.pseudo_port import PseudoPort
+    from locatk.formats.emulation.pseudo_terminal import PseudoPort
 
-    _refuse_contradictions(source, save, given)
+    _refuse_contradictions(source, save, settings)
     with ExitStack() as stack:
-        found, session = _source(source, device, save, overwrite, given["seed"], stack)
-        parts = _parts(found, given)
-        if parts[0].next_s is None:
-            raise InputError("nothing to send", file=source)
+        byte_source, session = _source(source, device, save, overwrite, settings["seed"], stack)
+        pace, faults, plan = _parts(byte_source, settings)
+        if pace.next_s is None:
+            raise InputError("no bytes to send", file=source)
         port = PseudoPort(link)
         stack.callback(port.close)
-        known = {"version": 1, "port": port.path, "device": found.device}
+        facts = {"version": 1, "port": port.path, "device": byte_source.device}
         if as_json:
-            console.emit_json({**known, "source": source, "recorded": found.recorded})
+            origin = {"source": source, "recorded": byte_source.recorded}
+            console.emit_json({**facts, **origin})
         console.result(port.path)
-        console.say(f"{_what(source, found)}{_how_long(session, given)}; Ctrl-C ends it")
-        if not given["no_wait"]:
-            kept = None if source in SYSTEMS and save is None else session
-            console.say(f"Waiting for a reader, as: {_reader(port.path, found, kept)}")
-        emulator = Emulator(port, *parts)
+        content = _describe(source, byte_source) + _describe_duration(session, settings)
+        console.say(f"{content}; press Ctrl-C to stop")
+        if not settings["no_wait"]:
+            saved = None if source in SYSTEMS and save is None else session
+            example = _capture_command(port.path, byte_source, saved)
+            console.say(f"Waiting for a reader, for example: {example}")
+        emulator = Emulator(port, pace, faults, plan)
         try:
             with asked_to_stop(emulator.stop):
                 emulator.run()
         finally:
             if as_json:
-                console.emit_json({**known, **emulator.totals.as_dict()})
+                console.emit_json({**facts, **emulator.totals.as_dict()})
             console.say(_summary(emulator.totals))
 
 
-def _refuse_contradictions(source: str, save: Path | None, given: dict[str, Any]) -> None:
+def _refuse_contradictions(source: str, save: Path | None, settings: dict[str, Any]) -> None:
     if save is not None and source not in SYSTEMS:
-        raise click.UsageError(f"--save is of a SYSTEM: {', '.join(SYSTEMS[:-1])}.")
-    if given["rate"] is not None and given["speed"] != 1:
+        raise click.UsageError(f"--save applies to a SYSTEM: {', '.join(SYSTEMS[:-1])}.")
+    if settings["rate"] is not None and settings["speed"] != 1:
         raise click.UsageError("Give --speed or --rate, not both.")
-    if given["no_wait"] and given["speed"] == 0:
+    if settings["no_wait"] and settings["speed"] == 0:
         raise click.UsageError("--speed 0 waits for the reader, --no-wait does not.")
-    if given["away_s"] is not None and given["unplug_every_s"] is None:
-        raise click.UsageError("--away is of --unplug-every.")
+    if settings["away_s"] is not None and settings["unplug_every_s"] is None:
+        raise click.UsageError("--away needs --unplug-every.")
 
 
 def _source(
@@ -171,13 +179,14 @@ def _source(
     overwrite: bool,
     seed: int,
     stack: ExitStack,
-) -> tuple[Source, Session]:
-    """What is to be sent, and of which session; one that is not saved lives as long as
-    ``stack``."""
+) -> tuple[Any, Any]:
+    """Return the bytes to send, and their session.
+
+    A simulated session that is not saved is removed with ``stack``.
+    """
     import tempfile
 
-    from locatk.formats.emulation.default_sessions import simulate_session
-    from locatk.formats.emulation.source import source_of
+    from locatk.formats.emulation.sources import select_source, write_simulated_session
     from locatk.formats.sessions.reader import Session
 
     path = Path(source)
@@ -186,7 +195,7 @@ def _source(
         path = save or Path(folder, f"{source}.mcap")
         options.guard_output(path, overwrite=overwrite)
         with console.working("Simulating"):
-            simulate_session(source, path, seed=seed, overwrite=overwrite)
+            write_simulated_session(source, path, seed=seed, overwrite=overwrite)
     elif not path.exists():
         raise MissingDataError(
             "no such session",
@@ -194,67 +203,72 @@ def _source(
             hint=f"Give a file, or a system: {', '.join(SYSTEMS[:-1])}",
         )
     session = Session.open(path)
-    return source_of(session, device), session
+    return select_source(session, device), session
 
 
-def _parts(found: Source, given: dict[str, Any]) -> tuple[Any, Any, Any]:
-    """Pace, faults and plan, of what was said on the command line."""
+def _parts(byte_source: Any, settings: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """Return pace, faults and plan, from the options."""
     from math import inf
 
-    from locatk.formats.emulation.emulator import Plan
-    from locatk.formats.emulation.faults import Faults
-    from locatk.formats.emulation.pacing import Constant, Pace, Recorded, repeated
-
-    packets = repeated(found.packets, given["loop"])
-    pace: Pace
-    if given["rate"] is not None:
-        pace = Constant(packets, given["rate"])
-    else:
-        pace = Recorded(packets, given["speed"] or inf)
-    plan = Plan(
-        wait=not given["no_wait"],
-        lossless=given["speed"] == 0,
-        unplug_every_s=given["unplug_every_s"],
-        away_s=1.0 if given["away_s"] is None else given["away_s"],
+    from locatk.formats.emulation.byte_stream import (
+        ConstantRate,
+        LineFaults,
+        Pace,
+        RecordedPace,
+        repeat_packets,
     )
-    return pace, Faults(given["drop"], given["flip"], given["seed"]), plan
+    from locatk.formats.emulation.emulator import EmulationPlan
+
+    packets = repeat_packets(byte_source.packets, settings["loop"])
+    pace: Pace
+    if settings["rate"] is not None:
+        pace = ConstantRate(packets, settings["rate"])
+    else:
+        pace = RecordedPace(packets, settings["speed"] or inf)
+    plan = EmulationPlan(
+        wait=not settings["no_wait"],
+        lossless=settings["speed"] == 0,
+        unplug_every_s=settings["unplug_every_s"],
+        away_s=1.0 if settings["away_s"] is None else settings["away_s"],
+    )
+    return pace, LineFaults(settings["drop"], settings["flip"], settings["seed"]), plan
 
 
-def _what(source: str, found: Source) -> str:
-    how = "bytes as recorded" if found.recorded else "bytes made"
-    return f"{found.device}, {how} of {source}"
+def _describe(source: str, byte_source: Any) -> str:
+    origin = "recorded bytes" if byte_source.recorded else "encoded data"
+    return f"{byte_source.device}, {origin} of {source}"
 
 
-def _how_long(session: Session, given: dict[str, Any]) -> str:
-    """For how long it sends, where that is known before."""
-    if given["loop"] == 0:
-        return ", for ever"
-    if given["rate"] is not None or given["speed"] == 0:
+def _describe_duration(session: Any, settings: dict[str, Any]) -> str:
+    """Return the duration of the bytes, if it is known."""
+    if settings["loop"] == 0:
+        return ", endlessly"
+    if settings["rate"] is not None or settings["speed"] == 0:
         return ""
     if session.start_ns is None or session.end_ns is None:
         return ""
-    seconds = given["loop"] * (session.end_ns - session.start_ns) * 1e-9 / given["speed"]
+    seconds = settings["loop"] * (session.end_ns - session.start_ns) * 1e-9 / settings["speed"]
     return f", {seconds:.1f} s, then it is unplugged"
 
 
-def _reader(port: str, found: Source, session: Session | None) -> str:
-    """What to type in another terminal; with what the session knows beside the bytes."""
-    from locatk.formats.capture import attachments as artifacts
+def _capture_command(port: str, byte_source: Any, session: Any) -> str:
+    """Return the command that records the port, with the artifacts of the session."""
+    from locatk.formats.capture.attachments import attachments
 
-    words = ["locatk", "capture", port, "--device", found.device]
+    words = ["locatk", "capture", port, "--device", byte_source.device]
     if session is not None:
-        with suppress(LocatkError):  # it holds none
-            if artifacts.attachments([Path(session.path)]):
+        with suppress(LocatkError):  # A session without artifacts.
+            if attachments([Path(session.path)]):
                 words += ["--artifact", session.path]
     return shlex.join([*words, "-o", "capture.mcap"])
 
 
-def _summary(totals: Totals) -> str:
+def _summary(totals: Any) -> str:
     parts = [f"sent {totals.sent} of {totals.made} bytes"]
     for count, text in (
         (totals.dropped, "dropped"),
-        (totals.unheard, "lost while nobody listened"),
-        (totals.overrun, "lost as they were not read in time"),
+        (totals.unheard, "lost while the port was closed"),
+        (totals.overrun, "lost because they were not read in time"),
         (totals.flipped, "bits flipped"),
     ):
         if count:

@@ -1,9 +1,9 @@
-"""``locatk recover``: what is left of a damaged recording, as a whole one."""
+"""``locatk recover``: salvage a damaged recording."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -11,12 +11,8 @@ from locatk.cli import console, failures, options
 from locatk.cli.info.capture import size
 from locatk.cli.info.text import when
 
-if TYPE_CHECKING:
-    from locatk.formats.sessions.recovery.recover import Recovered
-    from locatk.formats.sessions.recovery.salvage import Loss
-
-MOST_LOSSES = 20
-"""So many losses are listed for people; ``--json`` holds them all."""
+MAX_LISTED_LOSSES = 20
+"""Losses listed in the text output; ``--json`` contains all of them."""
 
 
 @click.command(short_help="Salvage a damaged recording.")
@@ -26,15 +22,15 @@ MOST_LOSSES = 20
 @options.as_json
 @options.verbosity
 def command(file: Path, output: Path, overwrite: bool, as_json: bool) -> None:
-    """Write what is left of FILE to OUTPUT, as a whole recording.
+    """Write the intact parts of FILE to OUTPUT, as a complete recording.
 
-    FILE (.mcap, of any tool) may be cut short, as by a program that was killed, zeroed, as by
-    a power cut, overwritten in places or have flipped bits. Every whole chunk of messages is
-    saved, wherever it lies, with the attachments and metadata that are left. Nothing is
-    believed that has a wrong checksum. FILE itself is not touched.
+    FILE (.mcap, of any tool) may be truncated (killed program), zeroed (power failure),
+    overwritten in parts or have flipped bits. Every intact chunk of messages is saved, with
+    the attachments and metadata that are left. Data with a wrong checksum are never used.
+    FILE itself is not changed.
 
-    The exit status is 3 where something was lost, or may have been: a recording without an end
-    says nothing of what came last. It is 0 where only an index was damaged.
+    The exit status is 3 if data were lost, or may have been: a recording without an end does
+    not show what came last. It is 0 if only an index was damaged.
 
     \b
     Examples:
@@ -45,31 +41,31 @@ def command(file: Path, output: Path, overwrite: bool, as_json: bool) -> None:
 
     options.guard_output(output, overwrite=overwrite, inputs=[file])
     with console.working(f"Recovering {file}"):
-        found = recover(file, output, overwrite=overwrite)
+        recovered = recover(file, output, overwrite=overwrite)
     if as_json:
-        console.emit_json(_facts(found, output.stat().st_size))
+        console.emit_json(_facts(recovered, output.stat().st_size))
     else:
-        console.result(_text(found))
-    if not found.complete:
-        raise failures.Incomplete(f"lost {_lost(found)} in {file}")
-    if found.damaged:
-        console.say(f"The index of {file} was damaged and is made anew; nothing was lost.")
+        console.result(_text(recovered))
+    if not recovered.complete:
+        raise failures.Incomplete(f"lost {_lost(recovered)} in {file}")
+    if recovered.damaged:
+        console.say(f"The index of {file} was damaged and rebuilt; no data were lost.")
 
 
-def _facts(found: Recovered, written: int) -> dict[str, Any]:
-    """What ``--json`` says."""
+def _facts(recovered: Any, written: int) -> dict[str, Any]:
+    """Return the object of ``--json``."""
     return {
         "version": 1,
-        "source": found.source,
-        "output": found.output,
+        "source": recovered.source,
+        "output": recovered.output,
         "bytes": written,
-        "complete": found.complete,
-        "damaged": found.damaged,
-        "ended": found.ended,
-        "messages": found.messages,
-        "chunks": found.chunks,
-        "attachments": found.attachments,
-        "metadata": found.metadata,
+        "complete": recovered.complete,
+        "damaged": recovered.damaged,
+        "ended": recovered.ended,
+        "messages": recovered.messages,
+        "chunks": recovered.chunks,
+        "attachments": recovered.attachments,
+        "metadata": recovered.metadata,
         "topics": [
             {
                 "topic": each.topic,
@@ -78,16 +74,16 @@ def _facts(found: Recovered, written: int) -> dict[str, Any]:
                 "lost": each.lost,
                 "missing_bytes": each.missing_bytes,
             }
-            for each in found.topics
+            for each in recovered.topics
         ],
-        "lost_messages": found.lost_messages,
-        "lost_attachments": found.lost_attachments,
-        "lost_metadata": found.lost_metadata,
-        "lost_bytes": found.lost_bytes,
-        "tail_bytes": found.tail,
-        "damaged_chunks": found.damaged_chunks,
-        "orphans": found.orphans,
-        "nameless": found.nameless,
+        "lost_messages": recovered.lost_messages,
+        "lost_attachments": recovered.lost_attachments,
+        "lost_metadata": recovered.lost_metadata,
+        "lost_bytes": recovered.lost_bytes,
+        "tail_bytes": recovered.tail,
+        "damaged_chunks": recovered.damaged_chunks,
+        "orphans": recovered.orphans,
+        "nameless": recovered.nameless,
         "losses": [
             {
                 "start": each.start,
@@ -97,59 +93,59 @@ def _facts(found: Recovered, written: int) -> dict[str, Any]:
                 "start_ns": each.start_ns,
                 "end_ns": each.end_ns,
             }
-            for each in found.losses
+            for each in recovered.losses
         ],
     }
 
 
-def _text(found: Recovered) -> str:
+def _text(recovered: Any) -> str:
     lines = [
-        f"Wrote {found.output}: {_count(found.messages, 'message')} of "
-        f"{_count(found.chunks, 'chunk')}, {_count(found.attachments, 'attachment')}, "
-        f"{_count(found.metadata, 'metadata record')}"
+        f"Wrote {recovered.output}: {_count(recovered.messages, 'message')} of "
+        f"{_count(recovered.chunks, 'chunk')}, {_count(recovered.attachments, 'attachment')}, "
+        f"{_count(recovered.metadata, 'metadata record')}"
     ]
-    rows = [(t.topic, t.schema, t.saved, _number(t.lost)) for t in found.topics]
+    rows = [(t.topic, t.schema, t.saved, _number(t.lost)) for t in recovered.topics]
     if rows:
         lines += ["", console.table(("topic", "schema", "saved", "lost"), rows)]
     losses = [
         (loss.start, loss.end, f"{loss.what} {loss.name}".rstrip(), _times(loss))
-        for loss in found.losses[:MOST_LOSSES]
+        for loss in recovered.losses[:MAX_LISTED_LOSSES]
     ]
     if losses:
         lines += ["", console.table(("from byte", "to", "unreadable", "recorded"), losses)]
-    if len(found.losses) > MOST_LOSSES:
-        lines.append(f"... and {len(found.losses) - MOST_LOSSES} more: see --json")
+    if len(recovered.losses) > MAX_LISTED_LOSSES:
+        lines.append(f"... and {len(recovered.losses) - MAX_LISTED_LOSSES} more: see --json")
     return "\n".join(lines)
 
 
-def _lost(found: Recovered) -> str:
-    """What was lost, and how much, in one sentence."""
-    inner = len(found.losses) - bool(found.tail)
-    places = found.lost_bytes - found.tail
+def _lost(recovered: Any) -> str:
+    """Return the losses in one sentence."""
+    holes = len(recovered.losses) - bool(recovered.tail)
+    hole_bytes = recovered.lost_bytes - recovered.tail
     words = [
         words
         for count, words in (
-            (found.lost_messages, _count(found.lost_messages or 0, "message")),
-            (found.orphans, f"{_count(found.orphans, 'message')} that nothing names"),
-            (found.lost_attachments, _count(found.lost_attachments or 0, "attachment")),
-            (found.lost_metadata, _count(found.lost_metadata or 0, "metadata record")),
-            (inner, f"{size(places)} at {_count(inner, 'place')}"),
-            (len(found.nameless), f"the schema of {', '.join(found.nameless)}"),
+            (recovered.lost_messages, _count(recovered.lost_messages or 0, "message")),
+            (recovered.orphans, f"{_count(recovered.orphans, 'message')} without a channel"),
+            (recovered.lost_attachments, _count(recovered.lost_attachments or 0, "attachment")),
+            (recovered.lost_metadata, _count(recovered.lost_metadata or 0, "metadata record")),
+            (holes, f"{size(hole_bytes)} at {_count(holes, 'place')}"),
+            (len(recovered.nameless), f"the schema of {', '.join(recovered.nameless)}"),
         )
         if count
     ]
     words += [
         f"{size(topic.missing_bytes)} received on {topic.topic}"
-        for topic in found.topics
+        for topic in recovered.topics
         if topic.missing_bytes
     ]
-    if not found.ended:
-        tail = f" ({size(found.tail)} are left of it)" if found.tail else ""
-        words.append(f"the end{tail} and whatever came last")
+    if not recovered.ended:
+        tail = f" ({size(recovered.tail)} of it remain)" if recovered.tail else ""
+        words.append(f"the end{tail} and the data after it")
     return ", ".join(words)
 
 
-def _times(loss: Loss) -> str:
+def _times(loss: Any) -> str:
     if loss.start_ns is None or loss.end_ns is None:
         return "-"
     return f"{when(loss.start_ns)} to {when(loss.end_ns)}"

@@ -1,20 +1,28 @@
-"""``locatk capture``: from a port into a session."""
+"""``locatk capture``: from a port or camera to a session."""
 
 from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.capture import text as capture_text
-from locatk.cli.capture.options import DURATION, PACE, SIZE, names_option
+from locatk.cli.capture.options import DURATION, ROTATION, SIZE, columns_option
+from locatk.cli.command import Command, section
 from locatk.cli.signals import asked_to_stop
 
-if TYPE_CHECKING:
-    from locatk.formats.capture.statistics import Recorded
+DEVICES_WITHOUT_COLUMNS = (
+    "locatk",
+    "polaris-array",
+    "magx-array",
+    "lighthouse-deck",
+    "dotbot-gateway",
+    "raw",
+)
+"""Devices to which ``--columns`` does not apply."""
 
 
 def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> dict[str, str]:
@@ -27,84 +35,103 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
     return pairs
 
 
-@click.command(short_help="Record a device from a port, or a camera, into a session.")
+@click.command(cls=Command, short_help="Record a device from a port, or a camera, into a session.")
 @click.argument("port", required=False)
-@click.option(
-    "--list", "listing", is_flag=True, help="Show the serial ports of this machine and exit."
+@section(
+    "Basic",
+    click.option(
+        "--list", "listing", is_flag=True, help="List the serial ports of this computer and exit."
+    ),
+    click.option(
+        "--device",
+        metavar="NAME",
+        default="auto",
+        show_default=True,
+        help="Device at the port: locatk, polaris-array, magx-array, lighthouse-deck, "
+        "dotbot-gateway, lines, raw; auto identifies it from the first seconds.",
+    ),
+    options.output("Session to write (.mcap).", required=False),
+    options.overwrite,
+    click.option("--baud", type=click.IntRange(min=1), help="[default: that of the device]"),
+    columns_option,
+    click.option(
+        "--name",
+        metavar="NAME",
+        help="Name of the device in the session.  [default: robot; of a camera: camera]",
+    ),
 )
-@click.option(
-    "--device",
-    metavar="NAME",
-    default="auto",
-    show_default=True,
-    help="What is at the port: locatk, polaris-array, magx-array, lighthouse-deck, "
-    "dotbot-gateway, lines, raw; auto finds out from the first seconds.",
+@section(
+    "Content of the session",
+    options.input_option(
+        "--artifact",
+        many=True,
+        metavar="FILE",
+        help="Artifact to attach: tag, array, map, hall sensors, scene, manifest, camera "
+        "(.toml), or a session that contains some (.mcap). Repeatable.",
+    ),
+    click.option("--note", help="Description of this recording."),
+    click.option(
+        "--meta",
+        multiple=True,
+        metavar="KEY=VALUE",
+        callback=_pairs,
+        help="Entry of the metadata. Repeatable.",
+    ),
 )
-@options.output("Session to write (.mcap).", required=False)
-@options.input_option(
-    "--artifact",
-    many=True,
-    metavar="FILE",
-    help="What the recording is of, to go into the session: tag, array, map, hall sensors, "
-    "scene, manifest, camera (.toml), or a session that holds them (.mcap). Repeatable.",
+@section(
+    "Start, end and size",
+    click.option(
+        "--wait",
+        "wait_s",
+        type=DURATION,
+        default=0.0,
+        metavar="TIME",
+        help="Longest wait for the port to become available.",
+    ),
+    click.option(
+        "--duration", type=DURATION, metavar="TIME", help="End after this time: 90s, 5min, 2h."
+    ),
+    click.option(
+        "--max-size",
+        type=SIZE,
+        metavar="SIZE",
+        help="End at this total size (up to 0.5 MB more): 500MB, 2GB.",
+    ),
+    click.option(
+        "--rotate",
+        type=ROTATION,
+        metavar="TIME|SIZE",
+        help="Start a new file at this interval: OUTPUT-001.mcap, OUTPUT-002.mcap, each a "
+        "complete session.",
+    ),
+    options.number(
+        "--silence",
+        default="5s",
+        type=DURATION,
+        metavar="TIME",
+        help="Warn after this time without data.",
+    ),
+    options.number(
+        "--reserve",
+        default="64MiB",
+        type=SIZE,
+        metavar="SIZE",
+        help="Stop when less than this much disk space is free.",
+    ),
 )
-@click.option("--note", help="What to know of this recording, for people.")
-@click.option(
-    "--meta", multiple=True, metavar="KEY=VALUE", callback=_pairs, help="A fact. Repeatable."
+@section(
+    "Replay and camera",
+    click.option(
+        "--speed",
+        type=click.FloatRange(min=0),
+        help="Factor on the speed of replay: and camera:FILE; 0 as fast as possible.",
+    ),
+    click.option(
+        "--image",
+        type=click.Choice(("jpeg", "png")),
+        help="Format of camera frames; png is lossless.  [default: jpeg]",
+    ),
 )
-@click.option(
-    "--name",
-    metavar="NAME",
-    help="Of the device in the session.  [default: robot; of a camera: camera]",
-)
-@click.option("--baud", type=click.IntRange(min=1), help="[default: the device's own]")
-@names_option
-@click.option(
-    "--wait",
-    "wait_s",
-    type=DURATION,
-    default=0.0,
-    metavar="TIME",
-    help="Wait so long for the port to be there.",
-)
-@click.option("--duration", type=DURATION, metavar="TIME", help="End after so long: 90s, 5min, 2h.")
-@click.option(
-    "--max-size",
-    type=SIZE,
-    metavar="SIZE",
-    help="End when the files have so many bytes (half a MB more at most): 500MB, 2GB.",
-)
-@click.option(
-    "--rotate",
-    type=PACE,
-    metavar="TIME|SIZE",
-    help="Begin a new file so often: OUTPUT-001.mcap, OUTPUT-002.mcap, each whole in itself.",
-)
-@options.number(
-    "--silence",
-    default="5s",
-    type=DURATION,
-    metavar="TIME",
-    help="Warn after so long without data.",
-)
-@options.number(
-    "--reserve",
-    default="64MiB",
-    type=SIZE,
-    metavar="SIZE",
-    help="End before the disk has less room than this.",
-)
-@click.option(
-    "--speed",
-    type=click.FloatRange(min=0),
-    help="replay:, camera:FILE: so many times as fast as recorded; 0 as fast as possible.",
-)
-@click.option(
-    "--image",
-    type=click.Choice(("jpeg", "png")),
-    help="camera: how frames are packed; png loses nothing.  [default: jpeg]",
-)
-@options.overwrite
 @options.as_json
 @options.verbosity
 def command(
@@ -124,23 +151,23 @@ def command(
     as_json: bool,
     **rest: Any,
 ) -> None:
-    """Record what comes from PORT into OUTPUT, until Ctrl-C.
+    """Record PORT into OUTPUT until Ctrl-C.
 
     \b
     PORT is one of
       /dev/ttyACM0, COM3      a serial port (--list shows them)
-      socket://HOST:PORT, rfc2217://HOST:PORT
-                              a serial port in the network
+      socket://HOST:PORT      raw bytes over TCP
+      rfc2217://HOST:PORT     a serial port of another computer
       replay:FILE.mcap        the raw bytes of a session, as they came
       camera:0, camera:URL, camera:FILE
-                              a camera, by number or stream, or a video
+                              a camera by its number, a stream, a video
 
-    Every byte goes into the session as it came, and beside it what is decoded; `locatk
-    solve` takes it as it is. A port that is unplugged is opened again when it is back.
-    What is killed loses half a second at most: `locatk recover` makes the file whole.
+    Every byte is stored as received, together with the decoded records; `locatk solve`
+    reads the session directly. A port that was unplugged is opened again when it is
+    back. If the program is killed, at most half a second is lost: `locatk recover`
+    completes the file.
 
-    The exit status is 3 where something was lost on the way; the file is whole all the
-    same.
+    The exit status is 3 if data were lost; the file is complete in that case too.
 
     \b
     Examples:
@@ -157,10 +184,10 @@ def command(
         return
     if port is None or output is None:
         raise click.UsageError("Missing PORT." if port is None else "Missing option '-o'.")
-    from locatk.formats.capture import setup as session
+    from locatk.formats.capture import setup
     from locatk.formats.capture.recorder import Limits
 
-    _refuse_idle(port, device, rest)
+    _refuse_unused_options(port, device, rest)
     kind, amount = rotate or ("", 0.0)
     limits = Limits(
         duration_s=duration,
@@ -170,7 +197,7 @@ def command(
         silence_s=silence,
         reserve_bytes=int(reserve),
     )
-    wanted = session.Wanted(
+    request = setup.CaptureRequest(
         port=port,
         device=device,
         output=output,
@@ -183,8 +210,8 @@ def command(
     )
     stop = threading.Event()
     with capture_text.live() as live, asked_to_stop(stop.set):
-        recorded = session.record(
-            wanted,
+        recorded = setup.record(
+            request,
             stop,
             tell=live.tell,
             show=live.show,
@@ -194,51 +221,41 @@ def command(
     _report(recorded, device, as_json)
 
 
-def _refuse_idle(port: str, device: str, given: dict[str, Any]) -> None:
-    """Refuse options that would do nothing."""
-    camera, played = port.startswith("camera:"), port.startswith("replay:")
+def _refuse_unused_options(port: str, device: str, given: dict[str, Any]) -> None:
+    """Refuse options that do not apply to the port or device."""
+    camera, replay = port.startswith("camera:"), port.startswith("replay:")
     network = port.startswith(("socket:", "loop:"))
-    for name, idle, what in (
+    for name, is_unused, what in (
         ("columns", camera, f"the port {port}"),
         ("columns", device in DEVICES_WITHOUT_COLUMNS, f"the device {device}"),
-        ("baud", camera or played or network, f"the port {port}"),
-        ("speed", not (camera or played), f"the port {port}"),
+        ("baud", camera or replay or network, f"the port {port}"),
+        ("speed", not (camera or replay), f"the port {port}"),
         ("image", not camera, f"the port {port}"),
     ):
-        if given[name] not in (None, ()) and idle:
-            raise click.UsageError(f"--{name} means nothing to {what}.")
-
-
-DEVICES_WITHOUT_COLUMNS = (
-    "locatk",
-    "polaris-array",
-    "magx-array",
-    "lighthouse-deck",
-    "dotbot-gateway",
-    "raw",
-)
+        if given[name] not in (None, ()) and is_unused:
+            raise click.UsageError(f"--{name} does not apply to {what}.")
 
 
 def _list(as_json: bool) -> None:
-    from locatk.formats.capture import port_listing as listing
+    from locatk.formats.capture.port_listing import find_ports_with_users
 
-    found = listing.ports()
+    ports = find_ports_with_users()
     if as_json:
-        console.emit_json({"version": 1, "ports": [vars(port) for port in found]})
-    elif found:
-        console.result(capture_text.ports(found))
+        console.emit_json({"version": 1, "ports": [vars(port) for port in ports]})
+    elif ports:
+        console.result(capture_text.ports(ports))
     else:
-        console.say("No serial port found. `locatk emulate polaris` makes one to try.")
+        console.say("No serial port found. `locatk emulate polaris` creates one for tests.")
 
 
-def _report(recorded: Recorded, device: str, as_json: bool) -> None:
+def _report(recorded: Any, device: str, as_json: bool) -> None:
     console.result(capture_text.summary(recorded))
     if as_json:
         console.emit_json(capture_text.as_json(recorded))
-    found = "" if device == "auto" and recorded.device == "raw" else recorded.device
-    doubts = recorded.totals.doubts(found)
+    known_device = "" if device == "auto" and recorded.device == "raw" else recorded.device
+    doubts = recorded.totals.doubts(known_device)
     if doubts and recorded.totals.bytes:
-        doubts.append("is it this device (--device auto), is its baud right?")
+        doubts.append("check --device (or use auto) and --baud")
     losses = recorded.totals.losses() + doubts
     if recorded.failed:
         losses.insert(0, recorded.ended)

@@ -1,4 +1,4 @@
-"""Times and sizes as people write them, for the options of ``locatk capture``."""
+"""Times, sizes and column names as values of options of ``locatk capture``."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ _BYTES = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _BYTES |= {"kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}
 _NUMBER = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-zA-Z]*)")
 
+MAX_QUANTITY = 1e18
+"""Limit of a time in seconds, or a size in bytes."""
 
-LARGEST = 1e18
-
-SHORTEST_S, SMALLEST = 1.0, 100_000
-"""Of a part of a recording."""
+MIN_PART_S, MIN_PART_BYTES = 1.0, 100_000
+"""Smallest part of a recording."""
 
 
 class _Quantity(click.ParamType[float]):
-    """A positive number and its unit."""
+    """Positive number with a unit."""
 
     def __init__(self, name: str, units: dict[str, Any], example: str) -> None:
         self.name, self._units, self._example = name, units, example
@@ -30,23 +30,23 @@ class _Quantity(click.ParamType[float]):
     ) -> float:
         if isinstance(value, int | float):
             return value
-        found = _NUMBER.fullmatch(value.strip())
-        factor = self._units.get(found[2].lower()) if found else None
-        if found is None or factor is None or not 0 < float(found[1]) * factor < LARGEST:
-            self.fail(f"{value!r} is no {self.name}; write it as {self._example}", param, ctx)
-        number: float = float(found[1]) * factor
+        match = _NUMBER.fullmatch(value.strip())
+        factor = self._units.get(match[2].lower()) if match else None
+        if match is None or factor is None or not 0 < float(match[1]) * factor < MAX_QUANTITY:
+            self.fail(f"{value!r} is not a {self.name}; examples: {self._example}", param, ctx)
+        number: float = float(match[1]) * factor
         return number
 
 
 DURATION = _Quantity("time", _SECONDS, "90, 90s, 5min or 2h")
-"""Seconds as a float."""
+"""Converts to seconds as a float."""
 
 SIZE = _Quantity("size", _BYTES, "500MB, 2GB or 64MiB")
-"""Bytes as a float."""
+"""Converts to bytes as a float."""
 
 
-class Pace(click.ParamType[tuple[str, float]]):
-    """A time or a size: ("time", seconds) or ("size", bytes)."""
+class RotationType(click.ParamType[tuple[str, float]]):
+    """Time or size."""
 
     name = "time or size"
 
@@ -56,28 +56,29 @@ class Pace(click.ParamType[tuple[str, float]]):
         if isinstance(value, tuple):
             return value
         unit = re.sub(r"[\d.\s]", "", value).lower()
-        kind, quantity, least = (
-            ("size", SIZE, SMALLEST) if unit in _BYTES else ("time", DURATION, SHORTEST_S)
+        kind, quantity, minimum = (
+            ("size", SIZE, MIN_PART_BYTES) if unit in _BYTES else ("time", DURATION, MIN_PART_S)
         )
         number = quantity.convert(value, param, ctx)
-        if number < least:
-            self.fail(f"{value!r} is too little; at least 1s or 100kB", param, ctx)
+        if number < minimum:
+            self.fail(f"{value!r} is too small; the minimum is 1s or 100kB", param, ctx)
         return kind, number
 
 
-PACE = Pace()
+ROTATION = RotationType()
+"""Converts to ("time", seconds) or ("size", bytes)."""
 
 
 def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
     names = tuple(name.strip() for name in value.split(",")) if value else ()
     if not all(names) or len(set(names)) < len(names):
-        raise click.BadParameter("expected names with commas between, each once.")
+        raise click.BadParameter("expected distinct names, separated by commas.")
     return names
 
 
-names_option = click.option(
+columns_option = click.option(
     "--columns",
     metavar="A,B,...",
     callback=_names,
-    help="lines: names of the values of a line, in their order.",
+    help="Names of the values of a line, in their order; of --device lines.",
 )

@@ -1,4 +1,4 @@
-"""What ``locatk capture`` says: the live line, its end, and the list of ports."""
+"""Text output of ``locatk capture``: status line, summary, and list of ports."""
 
 from __future__ import annotations
 
@@ -6,27 +6,30 @@ import contextlib
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from locatk.cli import console
-
-if TYPE_CHECKING:
-    from locatk.formats.capture.statistics import Recorded, Status
-
 
 ENDS = {
     "duration": "ended after --duration",
     "max-size": "ended at --max-size",
     "stopped": "stopped",
 }
-"""Why a recording has ended, for people."""
+"""Reasons for the end of a recording, as text."""
+
+
+MIN_BACKLOG_BYTES = 1_000_000
+"""Smallest backlog that the status line shows: 0.3 s of 3 MB/s."""
 
 
 class Live:
-    """Talk while recording: on a terminal one line that changes each second, with what
-    happened above it; elsewhere a line a second."""
+    """Messages during a recording.
+
+    On a terminal, one status line changes each second, with the events above it; otherwise
+    a line is written each second.
+    """
 
     def __init__(self) -> None:
         self._shown = console.talks()
@@ -34,27 +37,27 @@ class Live:
         self._width = 0
 
     def ready(self, port: str) -> None:
-        """The port is open."""
+        """Report that the port is open."""
         console.say(f"Recording {port}; Ctrl-C ends it.")
 
     def waiting(self, why: str) -> None:
-        """The port is not there yet, as the user expected, or cannot be opened."""
+        """Report a port that is not available yet."""
         missing = "no such port "
-        told = f" for {why.removeprefix(missing)}" if why.startswith(missing) else f": {why}"
-        console.say(f"Waiting{told}; Ctrl-C ends it.")
+        detail = f" for {why.removeprefix(missing)}" if why.startswith(missing) else f": {why}"
+        console.say(f"Waiting{detail}; Ctrl-C ends it.")
 
     def tell(self, text: str) -> None:
-        """Something happened."""
-        with self._unheard():
+        """Report an event."""
+        with self._without_reader():
             self.wipe()
             console.warn(text)
 
-    def show(self, status: Status) -> None:
-        """How it goes."""
+    def show(self, status: Any) -> None:
+        """Show the status."""
         if not self._shown:
             return
         text = status_line(status)
-        with self._unheard():
+        with self._without_reader():
             if self._terminal:
                 text = text[: shutil.get_terminal_size().columns - 1]
                 click.echo("\r" + text.ljust(self._width), err=True, nl=False)
@@ -63,8 +66,8 @@ class Live:
                 click.echo(text, err=True)
 
     @contextlib.contextmanager
-    def _unheard(self) -> Iterator[None]:
-        """Whoever listened is gone: that must not end a recording."""
+    def _without_reader(self) -> Iterator[None]:
+        """Continue the recording if stderr is closed."""
         try:
             yield
         except OSError:
@@ -72,7 +75,7 @@ class Live:
             self._shown, self._width = False, 0
 
     def wipe(self) -> None:
-        """Take the line away."""
+        """Remove the status line."""
         if self._width:
             click.echo("\r" + " " * self._width + "\r", err=True, nl=False)
             self._width = 0
@@ -80,16 +83,16 @@ class Live:
 
 @contextlib.contextmanager
 def live() -> Iterator[Live]:
-    """Talk while recording, and no half line left of it."""
-    made = Live()
+    """Yield the messages of a recording, and remove the status line at the end."""
+    messages = Live()
     try:
-        yield made
+        yield messages
     finally:
-        made.wipe()
+        messages.wipe()
 
 
-def status_line(status: Status) -> str:
-    """One line: what comes, what is lost, how full things are."""
+def status_line(status: Any) -> str:
+    """Return the status in one line: rates, losses, sizes; counts of zero are left out."""
     totals = status.totals
     away = status.away_s
     words = [
@@ -98,24 +101,28 @@ def status_line(status: Status) -> str:
         f"{status.frames_per_s:.0f} frames/s",
         f"{totals.bad} bad",
         f"{totals.lost} missing",
-        f"{totals.overruns} overrun",
+        *([f"{totals.overruns} overrun"] if totals.overruns else []),
         *([f"{totals.gaps} gap{'' if totals.gaps == 1 else 's'}"] if totals.gaps else []),
-        f"buffer {size(totals.high_water_bytes)}",
+        *([f"backlog {size(totals.high_water_bytes)}"] if _has_backlog(totals) else []),
         f"file {size(status.file_bytes)}",
-        *([f"disk {size(status.free_bytes)} left"] if status.free_bytes is not None else []),
+        *([f"disk {size(status.free_bytes)}"] if status.free_bytes is not None else []),
     ]
     return "  ".join(words)
 
 
+def _has_backlog(totals: Any) -> bool:
+    return bool(totals.high_water_bytes >= MIN_BACKLOG_BYTES)
+
+
 def clock(seconds: float) -> str:
-    """Time since the start, ``m:ss`` or ``h:mm:ss``."""
-    minutes, rest = divmod(int(seconds), 60)
+    """Return a duration as ``m:ss`` or ``h:mm:ss``."""
+    minutes, remainder = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return f"{hours}:{minutes:02d}:{remainder:02d}" if hours else f"{minutes}:{remainder:02d}"
 
 
 def size(count: float) -> str:
-    """Bytes with three digits and a unit."""
+    """Return a number of bytes with three digits and a unit."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
             return f"{number(count / factor)} {unit}"
@@ -123,22 +130,22 @@ def size(count: float) -> str:
 
 
 def number(value: float) -> str:
-    """Three digits, or all before the point."""
+    """Return a number with three digits, or as an integer."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def summary(recorded: Recorded) -> str:
-    """What came of a recording, for people."""
+def summary(recorded: Any) -> str:
+    """Return the summary of a finished recording."""
     totals = recorded.totals
     seconds = (recorded.ended_ns - recorded.started_ns) * 1e-9
     files = ", ".join(map(str, recorded.paths[:3]))
     if len(recorded.paths) > 3:
         files += f" and {len(recorded.paths) - 3} more"
+    source = f" from {recorded.device}" if recorded.device else ""
+    ended = ENDS.get(recorded.ended, recorded.ended)
     lines = [
-        f"{files}: {clock(seconds)}, {size(totals.bytes)} received"
-        + (f" from {recorded.device}" if recorded.device else "")
-        + f", {totals.frames} frames, {totals.bad} bad, {totals.lost} missing; "
-        + ENDS.get(recorded.ended, recorded.ended),
+        f"{files}: {clock(seconds)}, {size(totals.bytes)} received{source}",
+        f"{totals.frames} frames, {totals.bad} bad, {totals.lost} missing; {ended}",
     ]
     if totals.samples:
         rows = [
@@ -146,27 +153,27 @@ def summary(recorded: Recorded) -> str:
             for topic, count in sorted(totals.samples.items())
         ]
         lines += [console.table(("stream", "records", "Hz"), rows)]
-    lines += [_clock(recorded.clocks, device) for device in _ticking(recorded.clocks)]
+    lines += [_clock(recorded.clocks, device) for device in _devices_with_clock(recorded.clocks)]
     if recorded.artifacts:
         lines.append(f"artifacts: {', '.join(recorded.artifacts)}")
     return "\n".join(lines)
 
 
-def _ticking(clocks: dict[str, str]) -> list[str]:
-    """Devices whose clock is known."""
+def _devices_with_clock(clocks: dict[str, str]) -> list[str]:
+    """Return the devices with a clock model."""
     drift = "tick_drift_ppm:"
     return [key.removeprefix(drift) for key in clocks if key.startswith(drift)]
 
 
 def _clock(clocks: dict[str, str], device: str) -> str:
     drift = float(clocks[f"tick_drift_ppm:{device}"])
-    words = f"clock of {device}: {drift:+.1f} ppm to the host's"
-    late = clocks.get(f"tick_jitter_s:{device}")
-    return words if late is None else f"{words}; 95 % arrive within {1e3 * float(late):.1f} ms"
+    text = f"clock of {device}: {drift:+.1f} ppm relative to the host"
+    delay = clocks.get(f"tick_jitter_s:{device}")
+    return text if delay is None else f"{text}; 95 % within {1e3 * float(delay):.1f} ms"
 
 
-def as_json(recorded: Recorded) -> dict[str, Any]:
-    """The same for programs; docs/commands.md."""
+def as_json(recorded: Any) -> dict[str, Any]:
+    """Return the summary for ``--json``; see docs/commands.md."""
     return {
         "version": 1,
         "outputs": recorded.paths,
@@ -183,8 +190,8 @@ def as_json(recorded: Recorded) -> dict[str, Any]:
     }
 
 
-def ports(found: Sequence[Any]) -> str:
-    """The ports of this machine, one a line."""
+def ports(infos: Sequence[Any]) -> str:
+    """Return a table of serial ports."""
     rows = [
         (
             port.device,
@@ -193,6 +200,6 @@ def ports(found: Sequence[Any]) -> str:
             port.description or "-",
             port.holder or "-",
         )
-        for port in found
+        for port in infos
     ]
     return console.table(("port", "VID:PID", "serial number", "description", "held by"), rows)

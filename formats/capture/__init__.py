@@ -1,1 +1,1 @@
-"""Recording from a port: bytes in, a session out that survives what happens in a lab."""
+"""Recording of serial ports and cameras into sessions."""

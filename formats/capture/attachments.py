@@ -1,4 +1,4 @@
-"""Artifacts that go into a recording: checked now, so that nobody finds out at solving."""
+"""Artifacts attached to a recording, validated before it starts."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ KINDS: dict[str, tuple[str, Callable[..., Any]]] = {
     maps.MAP_FORMAT: (maps.MAP_FILE, maps.loads_map),
     hall_sensors.HALLS_FORMAT: (maps.HALLS_FILE, maps.loads_halls),
 }
-"""Format of an artifact to the name of its attachment and what reads it."""
+"""Format of an artifact to the name of its attachment and the function that parses it."""
 
 ATTACHED = dict(KINDS.values())
-"""Name of an attachment to what reads it."""
+"""Name of an attachment to the function that parses it."""
 
 BY_DEVICE = ("array", "halls", "receiver")
-"""Kinds of which each device may have its own: ``array-<device>.toml``."""
+"""Kinds that each device may have: ``array-<device>.toml``."""
 
 
 def attachments(paths: Iterable[Path]) -> dict[str, str]:
-    """Name of the attachment to its text, of artifacts (.toml) and of those that sessions hold.
+    """Return attachments (name to text) of artifacts (.toml) and of sessions that contain some.
 
     Raises
     ------
     MissingDataError, FormatError, ArtifactError
-        A file is not there or is no valid artifact.
+        A file does not exist or is no valid artifact.
     InputError
-        Two of one kind, or a session without any.
+        Two artifacts of one kind, or a session without any.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for path in paths:
         for name, text in _of(path).items():
-            if found.get(name, text) != text:
+            if texts.get(name, text) != text:
                 raise InputError(f"a second {name}", file=path, hint="Give one of each kind")
-            found[name] = text
-    return found
+            texts[name] = text
+    return texts
 
 
 def _of(path: Path) -> dict[str, str]:
@@ -63,7 +63,7 @@ def _of(path: Path) -> dict[str, str]:
 
 def _of_session(path: Path) -> dict[str, str]:
     session = Session.open(path)
-    found = {}
+    texts = {}
     for info in session.attachments():
         stem, dash, _ = info.name.partition("-")
         loads = ATTACHED.get(f"{stem}.toml" if dash and stem in BY_DEVICE else info.name)
@@ -71,9 +71,9 @@ def _of_session(path: Path) -> dict[str, str]:
         if loads is not None and data is not None:
             text = data.decode("utf-8", "replace")
             loads(text, file=f"{path}:{info.name}")
-            found[info.name] = text
-    if not found:
+            texts[info.name] = text
+    if not texts:
         raise InputError(
-            "no artifact is attached", file=path, hint="Give the artifacts themselves (.toml)"
+            "the session contains no artifact", file=path, hint="Give the artifacts (.toml)"
         )
-    return found
+    return texts

@@ -1,9 +1,9 @@
 """Cameras, network streams and video files as sources of frames, through OpenCV.
 
-A thread takes each frame as soon as the driver has it and gives it the time of that moment;
-packing it as an image file is left to the thread that reads. A video file is shown at its
-own pace, its frames at the times at which they are due; ``locatk import video`` is faster
-and keeps the times of the file.
+A thread takes each frame as soon as the driver provides it, and stamps it with that time; the
+reading thread encodes it as an image file. A video file is played in real time, its frames at
+the times at which they are due; ``locatk import video`` is faster and keeps the times of the
+file.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from locatk.core.errors import LocatkError
-from locatk.formats.capture.port_holders import busy, forbidden, holders
-from locatk.formats.capture.source import LinkEnded, LinkLost, Overruns, SourceError
+from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
+from locatk.formats.capture.port_listing import busy_error, find_port_users, permission_error
 from locatk.formats.importers.video import Video, is_cut
 
 FORMATS = ("jpeg", "png")
 
 JPEG_QUALITY = 95
 
-PATIENCE_S = 1.0
-"""A camera that gives no frame for so long is lost; single frames do fail."""
+MAX_FRAME_GAP_S = 1.0
+"""Time without frames after which a camera is considered lost; single frames may fail."""
 
 TIMEOUT_MS = 5_000
-"""After which a network stream that says nothing is given up; V4L2 has 10 s of its own."""
+"""Time after which a silent network stream is closed; V4L2 has a timeout of 10 s of its own."""
 
-MOST_BYTES = 64 << 20
-"""Pixels that may wait to be read."""
+MAX_WAITING_BYTES = 64 << 20
+"""Limit of the pixels that wait to be read."""
 
-AT_ONCE = 8
-"""Frames of one read, which takes long enough to pack them."""
+MAX_READ_FRAMES = 8
+"""Frames per read, because their encoding takes time."""
 
 
 class Frame(NamedTuple):
-    """A frame: when it came, in ns of the clock that was given, and its image file."""
+    """Frame: its time in ns of the given clock, and its image file."""
 
     time_ns: int
     image: bytes
@@ -50,28 +50,28 @@ class Frame(NamedTuple):
 
 
 class CameraPort:
-    """A camera, stream or video file; see :func:`port_of`."""
+    """Camera, stream or video file; see :func:`port_of`."""
 
     def __init__(
         self, place: str, *, clock: Callable[[], int], speed: float, format: str, grey: bool
     ) -> None:
         self.name = f"camera:{place}"
-        self._place = place
+        self._address = place
         self._clock = clock
         self._speed = speed
         self._format = format
         self._grey = grey
-        self._found: dict[str, str] = {}
-        self.comes_again = not self._is_file()
+        self._properties: dict[str, str] = {}
+        self.can_reconnect = not self._is_file()
 
     def _is_file(self) -> bool:
-        """Whether it has an end: not a number, an address, or a device such as /dev/video0."""
-        if self._place.isdecimal() or "://" in self._place:
+        """Return whether it has an end: it is no number, address, or device such as /dev/video0."""
+        if self._address.isdecimal() or "://" in self._address:
             return False
         try:
-            return not stat.S_ISCHR(os.stat(self._place).st_mode)
+            return not stat.S_ISCHR(os.stat(self._address).st_mode)
         except OSError:
-            return not self._place.startswith("/dev/")
+            return not self._address.startswith("/dev/")
 
     def open(self) -> CameraLink:
         """Open it and wait for its first frame.
@@ -79,23 +79,25 @@ class CameraPort:
         Raises
         ------
         SourceError
-            It cannot be opened, or gives no frame.
+            It cannot be opened, or provides no frame.
         """
         is_file = self._is_file()
         if is_file:
-            _check_file(self._place)
-        capture = _opened(self._place, is_file)
+            _check_file(self._address)
+        capture = _opened(self._address, is_file)
         if capture is None:
-            raise self._explained(is_file)
+            raise self._explain_error(is_file)
         first = _grab(capture, self._clock)
         if first is None:
             capture.release()
             raise SourceError(
-                f"{self.name} gives no frame",
-                hint="Is the video cut short?" if is_file else "Is another program using it?",
+                f"{self.name} provides no frame",
+                hint="The video may be truncated"
+                if is_file
+                else "Check that no other program uses it",
             )
         height, width = first[1].shape[:2]
-        self._found = {
+        self._properties = {
             "width": str(width),
             "height": str(height),
             "fps": f"{_rate(capture):g}",
@@ -105,33 +107,36 @@ class CameraPort:
             capture,
             first,
             clock=self._clock,
-            file=self._place if is_file else None,
+            file=self._address if is_file else None,
             speed=self._speed,
             format=self._format,
             grey=self._grey,
         )
 
     def describe(self) -> dict[str, str]:
-        """``port``, ``format``, ``grey``; once it was open, ``width``, ``height``, ``fps`` (0
-        where the driver does not tell) and ``backend``, that of OpenCV."""
-        grey = {"grey": "true"} if self._grey else {}
-        return {"port": self.name, "format": self._format, **grey, **self._found}
+        """Return ``port``, ``format``, ``grey``; once it was open, also facts of the video.
 
-    def _explained(self, is_file: bool) -> SourceError:
-        if is_file or "://" in self._place:
+        These are ``width``, ``height``, ``fps`` (0 if unknown) and ``backend``, that of OpenCV.
+        """
+        grey = {"grey": "true"} if self._grey else {}
+        return {"port": self.name, "format": self._format, **grey, **self._properties}
+
+    def _explain_error(self, is_file: bool) -> SourceError:
+        if is_file or "://" in self._address:
             return SourceError(
-                f"no video from {self._place}", hint="Is the address right, and the camera on?"
+                f"no video from {self._address}",
+                hint="Check the address, and that the camera is on",
             )
-        path = f"/dev/video{self._place}" if self._place.isdecimal() else self._place
+        path = f"/dev/video{self._address}" if self._address.isdecimal() else self._address
         if os.path.exists(path):
             if not os.access(path, os.R_OK | os.W_OK):
-                return forbidden(self.name, path)
-            if holders([path])[path]:
-                return busy(self.name, path)
-        there = sorted(str(each) for each in Path("/dev").glob("video*"))
+                return permission_error(self.name, path)
+            if find_port_users([path])[path]:
+                return busy_error(self.name, path)
+        devices = sorted(str(each) for each in Path("/dev").glob("video*"))
         return SourceError(
-            f"no camera {self._place}",
-            hint=f"There are {', '.join(there)}" if there else "Is it plugged in?",
+            f"no camera {self._address}",
+            hint=f"Available: {', '.join(devices)}" if devices else "Check that it is plugged in",
         )
 
 
@@ -143,43 +148,44 @@ def port_of(
     format: str = "jpeg",
     grey: bool = False,
 ) -> CameraPort:
-    """The camera at a place, not yet opened.
+    """Return the camera at an address, not yet opened.
 
     Parameters
     ----------
     place : str
-        Number of a camera, an address (``rtsp://...``, ``http://...``), a device or a
-        video file.
+        Number of a camera, URL (``rtsp://...``, ``http://...``), device or video file.
     clock : callable
-        Gives the time of a frame in ns; called by several threads.
+        Returns the time in ns; called by several threads.
     speed : float
-        Of a video file, times its own; 0 is as fast as it is read.
+        Factor on the speed of a video file; 0 is as fast as it is read.
     format : str
-        ``"jpeg"`` (quality 95) or ``"png"``, which loses nothing.
+        ``"jpeg"`` (quality 95) or ``"png"``, which is lossless.
     grey : bool
-        Keep luminance alone.
+        Keep only the luminance.
 
     Raises
     ------
     SourceError
-        It is none of them, or ``speed`` is no speed.
+        The address or ``speed`` is invalid.
     """
     if not place:
-        raise SourceError("a camera without a name", hint="As in camera:0 or camera:video.mp4")
+        raise SourceError(
+            "the name of the camera is empty", hint="Example: camera:0, camera:video.mp4"
+        )
     if not (math.isfinite(speed) and speed >= 0):
-        raise SourceError(f"{speed} is no speed", hint="Give 1, 10, or 0 for the fastest")
+        raise SourceError(f"{speed} is not a valid speed", hint="Give 1, 10, or 0 for the fastest")
     if format not in FORMATS:
         raise ValueError(f"format {format!r} is none of {FORMATS}")
     return CameraPort(place, clock=clock, speed=speed, format=format, grey=grey)
 
 
 class CameraLink:
-    """Frames of an opened camera.
+    """Frames of an open camera.
 
     Attributes
     ----------
     dropped : int
-        Frames for which there was no room, as nobody read; none of a file.
+        Frames of a camera dropped because the queue was full; no frames of a file are dropped.
     """
 
     def __init__(
@@ -209,13 +215,14 @@ class CameraLink:
         self._thread.start()
 
     def read(self, wait_s: float) -> list[Frame]:
-        """The frames that have come, some of them if they are many; waits for the first one,
-        at most ``wait_s``.
+        """Return the frames that have arrived, at most MAX_READ_FRAMES.
+
+        Wait for the first one, at most ``wait_s``.
 
         Raises
         ------
         LinkLost
-            A camera gives no more frames, or a file is cut short.
+            A camera provides no more frames, or a file is truncated.
         LinkEnded
             The file is at its end.
         """
@@ -223,12 +230,14 @@ class CameraLink:
             self._changed.wait_for(lambda: self._waiting or self._end, max(0.0, wait_s))
             if not self._waiting and self._end is not None:
                 raise self._end
-            taken = [self._waiting.popleft() for _ in range(min(AT_ONCE, len(self._waiting)))]
+            taken = [
+                self._waiting.popleft() for _ in range(min(MAX_READ_FRAMES, len(self._waiting)))
+            ]
             self._bytes -= sum(pixels.nbytes for _, pixels in taken)
             self._changed.notify_all()
-        return [self._packed(time_ns, pixels) for time_ns, pixels in taken]
+        return [self._encode(time_ns, pixels) for time_ns, pixels in taken]
 
-    def _packed(self, time_ns: int, pixels: Any) -> Frame:
+    def _encode(self, time_ns: int, pixels: Any) -> Frame:
         import cv2
 
         if self._grey and pixels.ndim == 3:
@@ -237,15 +246,15 @@ class CameraLink:
         suffix = ".jpg" if self._format == "jpeg" else ".png"
         done, data = cv2.imencode(suffix, pixels, options)
         if not done:
-            raise LinkLost(f"a frame cannot be packed as {self._format}")
+            raise LinkLost(f"a frame cannot be encoded as {self._format}")
         return Frame(time_ns, data.tobytes(), pixels.shape[1], pixels.shape[0])
 
     def overruns(self) -> Overruns | None:
-        """Nobody counts bytes; see :attr:`dropped`."""
+        """Return None, because bytes are not counted; see :attr:`dropped`."""
         return None
 
     def close(self) -> None:
-        """See :class:`.source.Link`. A driver that hangs keeps the camera until it returns."""
+        """Close the camera. If a driver hangs, the camera stays open until it returns."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -253,8 +262,8 @@ class CameraLink:
 
     def _run(self) -> None:
         try:
-            end = self._show() if self._file is not None else self._watch()
-        except Exception as error:  # whatever a driver raises must not end in silence
+            end = self._play_file() if self._file is not None else self._take_camera_frames()
+        except Exception as error:  # Any error of a driver must be reported.
             end = LinkLost(f"{type(error).__name__}: {error}")
         finally:
             self._capture.release()
@@ -262,57 +271,57 @@ class CameraLink:
             self._end = end
             self._changed.notify_all()
 
-    def _watch(self) -> LinkEnded | LinkLost:
+    def _take_camera_frames(self) -> LinkEnded | LinkLost:
         """Take the frames of a camera until there are no more."""
         last = time.monotonic()
         while not self._closing:
-            shot = _grab(self._capture, self._clock)
-            if shot is not None:
+            grabbed = _grab(self._capture, self._clock)
+            if grabbed is not None:
                 last = time.monotonic()
                 with self._changed:
-                    if self._waiting and self._bytes + shot[1].nbytes > MOST_BYTES:
+                    if self._waiting and self._bytes + grabbed[1].nbytes > MAX_WAITING_BYTES:
                         self.dropped += 1
                     else:
-                        self._put(shot)
-            elif time.monotonic() - last > PATIENCE_S:
-                return LinkLost("no more frames: unplugged, or the stream has ended")
+                        self._put(grabbed)
+            elif time.monotonic() - last > MAX_FRAME_GAP_S:
+                return LinkLost("no more frames: unplugged, or end of the stream")
             else:
                 time.sleep(0.01)
         return LinkEnded("closed")
 
-    def _show(self) -> LinkEnded | LinkLost:
+    def _play_file(self) -> LinkEnded | LinkLost:
         """Take the frames of a file, each when it is due."""
         begun, count, position_s = time.monotonic(), 1, 0.0
         origin_s = _position_s(self._capture)
         step_s = 1 / (_rate(self._capture) or 30.0)
         while True:
-            shot = _grab(self._capture, self._clock)
-            if shot is None:
+            grabbed = _grab(self._capture, self._clock)
+            if grabbed is None:
                 break
-            # Some files tell no times, or wrong ones.
-            told_s = _position_s(self._capture) - origin_s
-            position_s = told_s if told_s > position_s else position_s + step_s
+            # Some files have no timestamps, or wrong ones.
+            stated_s = _position_s(self._capture) - origin_s
+            position_s = stated_s if stated_s > position_s else position_s + step_s
             due = begun + position_s / self._speed if self._speed else begun
             with self._changed:
                 self._changed.wait_for(lambda: self._closing, max(0.0, due - time.monotonic()))
-                self._changed.wait_for(lambda: self._closing or self._bytes < MOST_BYTES)
+                self._changed.wait_for(lambda: self._closing or self._bytes < MAX_WAITING_BYTES)
                 if self._closing:
                     return LinkEnded("closed")
-                self._put((self._clock(), shot[1]))
+                self._put((self._clock(), grabbed[1]))
             count += 1
         if is_cut(Path(self._file or "")):
-            return LinkLost(f"the video is cut short after {count} frames")
+            return LinkLost(f"the video is truncated after {count} frames")
         return LinkEnded("the end of the video")
 
-    def _put(self, shot: tuple[int, Any]) -> None:
-        self._waiting.append(shot)
-        self._bytes += shot[1].nbytes
+    def _put(self, grabbed: tuple[int, Any]) -> None:
+        self._waiting.append(grabbed)
+        self._bytes += grabbed[1].nbytes
         self._changed.notify_all()
 
 
 def _check_file(path: str) -> None:
     if not os.path.exists(path):
-        raise SourceError("no such video", file=path, hint="A camera is camera:0, camera:1, ...")
+        raise SourceError("no such video", file=path, hint="Cameras are camera:0, camera:1, ...")
     try:
         Video(Path(path))
     except LocatkError as error:
@@ -320,38 +329,38 @@ def _check_file(path: str) -> None:
 
 
 def _opened(place: str, is_file: bool) -> Any:
-    """An opened ``cv2.VideoCapture``, or None; OpenCV says nothing on its own from now on."""
-    # Read by the library when it opens its first video; -8 is silence.
+    """Return an open ``cv2.VideoCapture``, or None; messages of OpenCV are switched off."""
+    # Read by the library when it opens its first video; -8 disables all messages.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     import cv2
 
-    # Where this is moved from OpenCV 4 to 5.
+    # This function moved between OpenCV 4 and 5.
     (cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging).setLogLevel(0)
     capture = cv2.VideoCapture()
     if is_file:
-        # As an absolute path no file name is taken for an address on the network.
-        there = capture.open(os.path.abspath(place), cv2.CAP_FFMPEG)
-        # Pixels stay where the sensor had them.
+        # An absolute path cannot be mistaken for a network address.
+        is_ok = capture.open(os.path.abspath(place), cv2.CAP_FFMPEG)
+        # Keep the orientation of the sensor.
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     elif "://" in place:
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC]
         options = [value for limit in limits for value in (limit, TIMEOUT_MS)]
-        there = capture.open(place, cv2.CAP_FFMPEG, options)
+        is_ok = capture.open(place, cv2.CAP_FFMPEG, options)
     elif place.isdecimal():
-        there = capture.open(int(place), cv2.CAP_ANY)
+        is_ok = capture.open(int(place), cv2.CAP_ANY)
     else:
-        # Others would read from any device, and wait for it.
-        there = capture.open(place, cv2.CAP_V4L2)
-    return capture if there else None
+        # Other backends would read from any device, and block.
+        is_ok = capture.open(place, cv2.CAP_V4L2)
+    return capture if is_ok else None
 
 
 def _grab(capture: Any, clock: Callable[[], int]) -> tuple[int, Any] | None:
-    """(time in ns, pixels) of the next frame; None where there is none."""
-    there = capture.grab()
+    """Return (time in ns, pixels) of the next frame; None if is_ok is none."""
+    is_ok = capture.grab()
     time_ns = clock()
-    if there:
-        there, pixels = capture.retrieve()
-    return (time_ns, pixels) if there else None
+    if is_ok:
+        is_ok, pixels = capture.retrieve()
+    return (time_ns, pixels) if is_ok else None
 
 
 def _rate(capture: Any) -> float:

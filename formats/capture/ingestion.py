@@ -1,77 +1,81 @@
-"""What was read becomes messages: raw bytes as they are, and what a decoder makes of them."""
+"""Conversion of received data to messages of a session: raw bytes, and records of a decoder."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, Protocol
 
+import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
+from numpy.typing import NDArray
 
+from locatk.core.clock_sync import TickClock
 from locatk.formats.artifacts import hall_sensors
-from locatk.formats.capture.arrival_times import Arrivals
-from locatk.formats.capture.device_messages import SYSTEMS, Stamped, Streams
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.statistics import Totals
-from locatk.formats.devices import Device, device
+from locatk.formats.capture.clocks import ArrivalTimes, DeviceClock
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.statistics import CaptureStatistics
+from locatk.formats.devices import Device, find_device
 from locatk.formats.devices.decoder import Batch, Counts, Decoder, Options, Stream
+from locatk.formats.devices.identification import MAX_IDENTIFICATION_S, Identifier, Verdict
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import frames, messages
-
-if TYPE_CHECKING:
-    from locatk.formats.devices.identification import Identifier, Verdict
+from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, Layout
 
 PAUSE_NS = 3_000_000
-"""A line that is silent for longer is between two frames: within a frame bytes follow each
-other, or wait for the next millisecond of USB."""
+"""Silence of the line that separates two frames: within a frame, bytes follow each other, or wait
+for the next millisecond of USB."""
 
 AUTO = "auto"
 
 UNPACED = ("replay:", "socket:", "rfc2217:", "loop:")
-"""Ports whose bytes do not come one after the other at a baud."""
+"""Ports whose bytes are not spaced by a baud rate."""
 
 
 class Intake(Protocol):
-    """What becomes of what was read.
+    """Converts received data to messages.
 
     Attributes
     ----------
     declared : sequence of (str, type)
-        Topics that are sure to come, with their messages.
+        Topics that are certain to occur, with their messages.
     system : str
-        Whose session it is, ``""`` while that is not known.
+        System of the session, ``""`` while it is unknown.
     """
 
     declared: Sequence[tuple[str, type[Message]]]
     system: str
 
-    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
-        """Messages of what was read."""
+    def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
+        """Return the messages of received data."""
 
-    def turn(self, now_ns: int) -> Iterator[Stamped]:
-        """Time has gone on, whether or not something was read."""
+    def turn(self, now_ns: int) -> Iterator[StampedMessage]:
+        """Return the messages that are due at ``now_ns``, whether or not data were received."""
 
-    def restart(self) -> Iterator[Stamped]:
-        """The line was lost and is there again."""
+    def restart(self) -> Iterator[StampedMessage]:
+        """Return the messages that were pending back, after a reconnect."""
 
-    def finish(self) -> Iterator[Stamped]:
-        """Nothing more comes."""
+    def finish(self) -> Iterator[StampedMessage]:
+        """Return the messages that were pending back, at the end."""
 
-    def count(self, totals: Totals) -> None:
-        """Put what was counted into ``totals``."""
+    def count(self, totals: CaptureStatistics) -> None:
+        """Write the counts into ``totals``."""
 
     def remarks(self) -> list[str]:
-        """What must be known to use the records, and was not said yet."""
+        """Return new facts that a user of the records must know."""
 
     def clocks(self) -> dict[str, str]:
-        """What is known of the devices' clocks, as entries of the metadata record."""
+        """Return the parameters of the devices' clocks, as entries of the metadata record."""
 
     def rates(self) -> dict[str, float]:
-        """Records a second by topic, from the first to the last."""
+        """Return records per second by topic, between the first and the last."""
 
     def artifacts(self) -> dict[str, str]:
-        """Artifacts that are known without being told, name to text."""
+        """Return artifacts that follow from the device, name to text."""
 
 
 class SerialIntake:
@@ -80,17 +84,17 @@ class SerialIntake:
     Parameters
     ----------
     name : str
-        Of the device, in topics.
+        Name of the device in topics.
     port : str
-        As the user named it.
+        Port as given by the user.
     device_name : str
-        Of :data:`locatk.formats.devices.DEVICES` or an entry point, or ``"auto"``.
+        Name in :data:`locatk.formats.devices.DEVICES`, of an entry point, or ``"auto"``.
     options : Options
-        For the decoder.
+        Options of the decoder.
     baud : int, optional
-        Of the port; the device's own where it is left out.
+        Baud rate of the port; that of the device by default.
     artifacts : mapping of str to str
-        What is attached to the session: name to text.
+        Attachments of the session: name to text.
 
     Raises
     ------
@@ -120,30 +124,28 @@ class SerialIntake:
         self._first_ns: int | None = None
         text = (artifacts or {}).get(hall_sensors.HALLS_FILE)
         halls = () if text is None else hall_sensors.loads_halls(text).names
-        self._streams = Streams(name, halls)
-        self._arrivals = Arrivals()
-        self._known: dict[tuple[str, str], Stream] = {}
-        self._asked: set[Stream] = set()
+        self._streams = MessageEncoder(name, halls)
+        self._arrivals = ArrivalTimes()
+        self._streams_by_device: dict[tuple[str, str], Stream] = {}
+        self._with_artifacts: set[Stream] = set()
         self._counts = Counts()
-        self._said: list[str] = []
+        self._remarks: list[str] = []
         self._decoder: Decoder | None = None
         self._identifier: Identifier | None = None
-        self._held: list[tuple[bytes, bool] | None] = []  # None: opened again
+        self._pending: list[tuple[bytes, bool] | None] = []  # None: opened again
         if device_name == AUTO:
-            from locatk.formats.devices.identification import Identifier
-
             self._identifier = Identifier(self._options)
         else:
-            self._decide(device(device_name))
+            self._set_device(find_device(device_name))
 
-    def _decide(self, found: Device) -> None:
-        self.device = found
-        self._decoder = found.decode(self._options)
+    def _set_device(self, device: Device) -> None:
+        self.device = device
+        self._decoder = device.create_decoder(self._options)
         if not self._port.startswith(UNPACED):
-            self._arrivals.byte_ns = 10e9 / (self._baud or found.baud)
+            self._arrivals.byte_ns = 10e9 / (self._baud or device.baud)
 
-    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
-        """Messages of what was read: all raw ones, then the records."""
+    def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
+        """Return the messages of received data: first all raw ones, then the records."""
         pieces: list[tuple[bool, list[bytes]]] = []
         for each in arrived:
             chunk = SerialChunk(
@@ -163,7 +165,7 @@ class SerialIntake:
             if pause or not pieces:
                 pieces.append((pause, []))
             pieces[-1][1].append(each.data)
-            yield Stamped(self.topic, chunk, each.time_ns, each.time_ns)
+            yield StampedMessage(self.topic, chunk, each.time_ns, each.time_ns)
         for pause, data in pieces:
             yield from self._records(partial(self._feed, b"".join(data), pause))
 
@@ -172,17 +174,16 @@ class SerialIntake:
             return self._decoder.feed(data, pause=pause)
         if self._identifier is None:
             return []
-        self._held.append((data, pause))
+        self._pending.append((data, pause))
         self._identifier.feed(data, pause=pause)
         return self._identified(self._identifier.verdict())
 
-    def turn(self, now_ns: int) -> Iterator[Stamped]:
-        """Settle what the device is, when it was listened to for long enough."""
-        if self._identifier is not None and self._first_ns is not None:
-            from locatk.formats.devices.identification import LISTEN_S
-
-            if now_ns - self._first_ns > LISTEN_S * 1e9:
-                yield from self._records(self._settle)
+    def turn(self, now_ns: int) -> Iterator[StampedMessage]:
+        """End the identification of the device after MAX_IDENTIFICATION_S."""
+        if self._identifier is None or self._first_ns is None:
+            return
+        if now_ns - self._first_ns > MAX_IDENTIFICATION_S * 1e9:
+            yield from self._records(self._settle)
 
     def _settle(self) -> list[Batch]:
         return [] if self._identifier is None else self._identified(self._identifier.settle())
@@ -191,68 +192,77 @@ class SerialIntake:
         if verdict is None:
             return []
         if self._fed:
-            self._said.append(f"the device is taken for {verdict.device}: {verdict.why}")
+            self._remarks.append(f"identified device: {verdict.device} ({verdict.why})")
         self._identifier = None
-        self._decide(device(verdict.device))
-        held, self._held = self._held, []
+        self._set_device(find_device(verdict.device))
+        pending, self._pending = self._pending, []
         batches = []
-        for piece in held:
-            batches += self._again() if piece is None else self._feed(*piece)
+        for piece in pending:
+            batches += self._restart_decoder() if piece is None else self._feed(*piece)
         return batches
 
-    def restart(self, *, opened: bool = True) -> Iterator[Stamped]:
-        """What is half received is dropped; byte offsets go on. Not ``opened`` where only
-        bytes are missing from a recording."""
-        self._opened = opened
-        yield from self._records(self._again)
-        self._streams.restart()  # after what was held back, which is of the time before
+    def restart(self, *, opened: bool = True) -> Iterator[StampedMessage]:
+        """Return the records that were held back, and discard a partial frame.
 
-    def _again(self) -> list[Batch]:
+        Byte offsets continue. ``opened`` is False if the connection was not lost, and bytes are
+        missing from an incomplete recording instead.
+        """
+        self._opened = opened
+        yield from self._records(self._restart_decoder)
+        self._streams.restart()  # after what was pending back, which is of the time before
+
+    def _restart_decoder(self) -> list[Batch]:
         if self._decoder is not None:
             return self._decoder.restart()
-        self._held += [None] * (self._identifier is not None)
+        self._pending += [None] * (self._identifier is not None)
         return []
 
     def skip_to(self, offset: int) -> None:
-        """Of a recording that is not whole: the next byte is number ``offset``."""
+        """Continue at byte ``offset`` after a hole in an incomplete recording."""
         if offset > self._offset > 0:
-            self._said.append(f"{offset - self._offset} bytes are missing at byte {self._offset}")
+            self._remarks.append(
+                f"{offset - self._offset} bytes are missing at byte {self._offset}"
+            )
         self._offset = offset
 
-    def finish(self) -> Iterator[Stamped]:
-        """What the decoder held back."""
+    def finish(self) -> Iterator[StampedMessage]:
+        """Return the records that the decoder pending back."""
         yield from self._records(self._settle)
         if self._decoder is not None:
             yield from self._records(self._decoder.finish)
 
-    def _records(self, decode: Callable[[], list[Batch]]) -> list[Stamped]:
-        """Messages of what ``decode`` gives. Whatever it raises ends the decoding, and not
-        the recording: the bytes go on."""
+    def _records(self, decode: Callable[[], list[Batch]]) -> list[StampedMessage]:
+        """Return the messages of the batches of ``decode``.
+
+        An exception ends the decoding, but not the recording of the bytes.
+        """
         try:
             batches = decode()
-            made = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
-        except Exception as error:  # of a decoder that may be somebody else's
-            self._give_up(error)
+            stamped = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
+        except Exception as error:  # The decoder may be of another package.
+            self._stop_decoding(error)
             return []
         for batch in batches:
             if len(batch):
-                self._known[batch.stream.kind, self._streams.device(batch.stream)] = batch.stream
+                self._streams_by_device[batch.stream.kind, self._streams.device(batch.stream)] = (
+                    batch.stream
+                )
                 self.system = self.system or SYSTEMS.get(batch.stream.kind, "")
-        return made
+        return stamped
 
-    def _give_up(self, error: Exception) -> None:
-        self._said.append(
-            f"the decoder failed ({type(error).__name__}: {error}): from here on there are only "
-            "raw bytes. Please report it"
+    def _stop_decoding(self, error: Exception) -> None:
+        self._remarks.append(
+            f"the decoder failed ({type(error).__name__}: {error}); only raw bytes are recorded "
+            "from now on. Please report this error"
         )
         if self._decoder is not None:
             self._counts = self._decoder.counts
-            self._said += self._decoder.remarks
+            self._remarks += self._decoder.remarks
         self._decoder = self._identifier = None
-        self._held = []
+        self._pending = []
 
-    def count(self, totals: Totals) -> None:
-        """What the decoder counted, and how many records there are of each topic."""
+    def count(self, totals: CaptureStatistics) -> None:
+        """Write the counts of the decoder, and the records per topic, into ``totals``."""
         totals.bytes = self._fed
         if self._decoder is not None:
             self._counts = self._decoder.counts
@@ -262,56 +272,55 @@ class SerialIntake:
         totals.samples = dict(self._streams.samples)
 
     def remarks(self) -> list[str]:
-        """Of the decoder and of the identification."""
-        said, self._said = self._said + self._streams.remarks, []
+        """Return new remarks of the decoder and the identification."""
+        remarks, self._remarks = self._remarks + self._streams.remarks, []
         self._streams.remarks = []
         if self._decoder is not None:
-            said += self._decoder.remarks
+            remarks += self._decoder.remarks
             self._decoder.remarks.clear()
-        return said
+        return remarks
 
     def clocks(self) -> dict[str, str]:
-        """Of each device's clock against the host's: offset, drift, and how late the latest
-        twentieth of what it sends arrives."""
-        found: dict[str, str] = {}
+        """Return offset, drift and jitter (95th percentile of the delay) of each device's clock."""
+        entries: dict[str, str] = {}
         for name, clock in self._streams.clocks().items():
             if clock.jitter_ns is not None and clock.jitter_ns[1] < 0:
-                continue  # ticks ahead of their arrival are of no clock that runs with ours
+                continue  # Ticks ahead of their arrival belong to no clock in step with the host.
             if clock.offset_ns is not None:
-                found[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
+                entries[f"tick_offset_s:{name}"] = f"{clock.offset_ns / 1e9:.6f}"
             if clock.drift_ppm is not None:
-                found[f"tick_drift_ppm:{name}"] = f"{clock.drift_ppm:.3f}"
+                entries[f"tick_drift_ppm:{name}"] = f"{clock.drift_ppm:.3f}"
             if clock.jitter_ns is not None:
-                found[f"tick_jitter_s:{name}"] = f"{clock.jitter_ns[1] / 1e9:.6f}"
-            found[f"tick_restarts:{name}"] = str(clock.restarts)
-        return found
+                entries[f"tick_jitter_s:{name}"] = f"{clock.jitter_ns[1] / 1e9:.6f}"
+            entries[f"tick_restarts:{name}"] = str(clock.restarts)
+        return entries
 
     def rates(self) -> dict[str, float]:
-        """Of what was decoded."""
+        """Return decoded records per second by topic."""
         return self._streams.rates()
 
     def artifacts(self) -> dict[str, str]:
-        """Sensors of devices that are what they are."""
+        """Return the default artifacts of the device, by its streams."""
         if self.device is None:
             return {}
-        found: dict[str, str] = {}
-        for stream in self._known.values():
-            if stream not in self._asked:
-                self._asked.add(stream)
+        entries: dict[str, str] = {}
+        for stream in self._streams_by_device.values():
+            if stream not in self._with_artifacts:
+                self._with_artifacts.add(stream)
                 try:
-                    found |= self.device.attached(stream)
-                except Exception as error:  # of a device that may be somebody else's
-                    self._said.append(f"no artifacts of {self.device.name}: {error}")
-        return found
+                    entries |= self.device.default_artifacts(stream)
+                except Exception as error:  # The device may be of another package.
+                    self._remarks.append(f"no artifacts of {self.device.name}: {error}")
+        return entries
 
 
 class CameraIntake:
-    """Frames of a camera, already packed as image files.
+    """Frames of a camera, encoded as image files.
 
     Parameters
     ----------
     name : str
-        Of the camera, in topics.
+        Name of the camera in topics.
     format : str
         ``"png"`` or ``"jpeg"``.
     """
@@ -323,8 +332,8 @@ class CameraIntake:
         self._name, self._format = name, format
         self._frames = self._bytes = self._first_ns = self._last_ns = 0
 
-    def take(self, arrived: Sequence[Arrived]) -> Iterator[Stamped]:
-        """One message a frame."""
+    def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
+        """Return one message per frame."""
         for each in arrived:
             for time_ns, image, *_ in each.data:
                 self._first_ns = self._first_ns or time_ns
@@ -337,38 +346,218 @@ class CameraIntake:
                     data=image,
                     format=self._format,
                 )
-                yield Stamped(self.topic, message, time_ns, time_ns)
+                yield StampedMessage(self.topic, message, time_ns, time_ns)
 
-    def turn(self, now_ns: int) -> Iterator[Stamped]:
-        """Nothing."""
+    def turn(self, now_ns: int) -> Iterator[StampedMessage]:
+        """Return nothing."""
         return iter(())
 
-    def restart(self) -> Iterator[Stamped]:
-        """Nothing: each frame stands alone."""
+    def restart(self) -> Iterator[StampedMessage]:
+        """Return nothing, because frames are independent."""
         return iter(())
 
-    def finish(self) -> Iterator[Stamped]:
-        """Nothing."""
+    def finish(self) -> Iterator[StampedMessage]:
+        """Return nothing."""
         return iter(())
 
-    def count(self, totals: Totals) -> None:
-        """Frames and their bytes."""
+    def count(self, totals: CaptureStatistics) -> None:
+        """Write the number of frames and their bytes into ``totals``."""
         totals.bytes, totals.frames = self._bytes, self._frames
         totals.samples = {self.topic: self._frames}
 
     def remarks(self) -> list[str]:
-        """None."""
+        """Return nothing."""
         return []
 
     def clocks(self) -> dict[str, str]:
-        """None: a frame has the time at which it was taken from the driver."""
+        """Return nothing: a frame has the time at which it was taken from the driver."""
         return {}
 
     def rates(self) -> dict[str, float]:
-        """Of the frames."""
+        """Return frames per second."""
         span_s = (self._last_ns - self._first_ns) * 1e-9
         return {self.topic: (self._frames - 1) / span_s} if span_s > 0 else {}
 
     def artifacts(self) -> dict[str, str]:
-        """None."""
+        """Return nothing."""
         return {}
+
+
+SYSTEMS = {
+    "magnetometers": "polaris",
+    "halls": "landmarks",
+    "lighthouse": "lighthouse",
+    "captures": "lighthouse",
+}
+"""System that solves a kind of records."""
+
+MIN_RATE_SPAN_S = 0.01
+"""Shortest time from which a rate is computed."""
+
+LEVELS = (Log.UNKNOWN, Log.DEBUG, Log.INFO, Log.WARNING, Log.ERROR, Log.FATAL)
+
+
+@dataclass(frozen=True)
+class StampedMessage:
+    """Message of a session, with the times of its completion and of its measurement."""
+
+    topic: str
+    message: Message
+    time_ns: int
+    publish_ns: int
+
+
+class MessageEncoder:
+    """Converts batches of a decoder to messages with times of the host's clock.
+
+    Parameters
+    ----------
+    name : str
+        Name of the device; if there are several behind the port, they are ``<name>-<node>``.
+    halls : sequence of str
+        Names of the hall sensors in the order of ``halls.toml``; empty if unknown.
+
+    Attributes
+    ----------
+    samples : Counter
+        Records by topic.
+    remarks : list of str
+        Facts that a user of the records must know.
+    """
+
+    def __init__(self, name: str, halls: Sequence[str] = ()) -> None:
+        self._name = name
+        self._halls = tuple(halls)
+        self._reported_names: set[tuple[str, ...]] = set()
+        self.remarks: list[str] = []
+        self._first: dict[str, int] = {}
+        self._last: dict[str, int] = {}
+        self._times_of: dict[str, DeviceClock] = {}
+        self.samples: Counter[str] = Counter()
+
+    def device(self, stream: Stream) -> str:
+        """Return the name of the device of a stream."""
+        return f"{self._name}-{stream.node}" if stream.node else self._name
+
+    def rates(self) -> dict[str, float]:
+        """Return records per second by topic, between the first and the last."""
+        spans = {topic: (self._last[topic] - first) * 1e-9 for topic, first in self._first.items()}
+        return {
+            topic: (self.samples[topic] - 1) / span
+            for topic, span in spans.items()
+            if span > MIN_RATE_SPAN_S
+        }
+
+    def clocks(self) -> dict[str, TickClock]:
+        """Return the clock model of each device that sends plausible ticks."""
+        return {name: clock.model for name, clock in self._times_of.items() if clock.rate is None}
+
+    def restart(self) -> None:
+        """Restart the clock models after a reconnect."""
+        for clock in self._times_of.values():
+            clock.restart()
+
+    def messages(
+        self, batches: Sequence[Batch], arrivals: ArrivalTimes, now_ns: int
+    ) -> Iterator[StampedMessage]:
+        """Yield the messages of ``batches``, which were all complete at ``now_ns``.
+
+        Times of measurements are those of the device's ticks, if it sends any, or else the arrival
+        times of their last bytes.
+        """
+        for batch in batches:
+            if len(batch) == 0:
+                continue
+            if batch.stream.kind == "log":
+                yield from self._log(batch, arrivals.read_ns(batch.end), now_ns)
+            else:
+                yield from self._records(batch, self._times(batch, arrivals), now_ns)
+
+    def _records(
+        self, batch: Batch, time_ns: NDArray[np.int64], now_ns: int
+    ) -> Iterator[StampedMessage]:
+        stream, device = batch.stream, self.device(batch.stream)
+        topic, layout, once = _stream_layout(stream, device)
+        time_ns = self._ascending(topic, time_ns)
+        self._first.setdefault(topic, int(time_ns[0]))
+        self.samples[topic] += len(batch)
+        columns: dict[str, NDArray[Any]] = {"time_ns": time_ns, **batch.columns}
+        if stream.kind == "halls":
+            columns["b_tesla"] = self._in_order(stream.names, columns["b_tesla"])
+        if batch.tick is not None:
+            columns["device_ticks"] = batch.tick
+        if batch.sequence is not None:
+            columns["sequence"] = batch.sequence
+        for start in range(0, len(batch), MAX_BATCH_SAMPLES):
+            part = slice(start, start + MAX_BATCH_SAMPLES)
+            message = layout.pack(once, {key: column[part] for key, column in columns.items()})
+            yield StampedMessage(topic, message, now_ns, int(time_ns[start]))
+
+    def _in_order(self, names: tuple[str, ...], field: NDArray[Any]) -> NDArray[Any]:
+        """Return fields (n, N) in the order of ``halls.toml``, by the names that a device sends."""
+        if not names or not self._halls or names == self._halls:
+            return field
+        if sorted(names) == sorted(self._halls):
+            return field[:, [names.index(name) for name in self._halls]]
+        if names not in self._reported_names:
+            self._reported_names.add(names)
+            self.remarks.append(
+                f"the device names its hall sensors {', '.join(names)}, halls.toml names them "
+                f"{', '.join(self._halls)}: they are assigned in order"
+            )
+        return field
+
+    def _times(self, batch: Batch, arrivals: ArrivalTimes) -> NDArray[np.int64]:
+        ticks = batch.stream.ticks
+        if batch.tick is None or ticks is None:
+            return arrivals.wire_ns(batch.end)
+        device = self.device(batch.stream)
+        clock = self._times_of.get(device)
+        if clock is None or clock.ticks != ticks:
+            clock = self._times_of[device] = DeviceClock(ticks)
+        believed = clock.rate is None
+        times = clock.times(batch.stream.kind, batch.tick, arrivals.read_ns(batch.end))
+        if believed and clock.rate is not None:
+            self.remarks.append(
+                f"the clock of {device} runs {clock.rate:.2g} times as fast as stated: samples "
+                "have the times of their arrival"
+            )
+        return arrivals.wire_ns(batch.end) if times is None else times
+
+    def _ascending(self, topic: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return times that increase by at least a nanosecond, also across batches."""
+        steps = np.arange(len(time_ns))
+        last = self._last.get(topic, -1)
+        rising = np.maximum.accumulate(np.maximum(time_ns - steps, last + 1)) + steps
+        self._last[topic] = int(rising[-1])
+        return rising
+
+    def _log(
+        self, batch: Batch, read_ns: NDArray[np.int64], now_ns: int
+    ) -> Iterator[StampedMessage]:
+        name = self.device(batch.stream)
+        rows = zip(batch.columns["level"], batch.columns["text"], read_ns.tolist(), strict=True)
+        for level, text, time_ns in rows:
+            stamp = messages.timestamp(time_ns)
+            line = Log(timestamp=stamp, level=LEVELS[int(level)], message=str(text), name=name)
+            yield StampedMessage("/log", line, now_ns, time_ns)
+
+
+def _stream_layout(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
+    """Return topic, layout and constant fields of a stream of a device."""
+    field: dict[str, Any] = {"device": device, "frame_id": device, "sensors": stream.sensors}
+    if stream.kind == "magnetometers":
+        return f"/magnetometers/{device}", messages.magnetometers(stream.sensors), field
+    if stream.kind == "halls":
+        return f"/halls/{device}", messages.halls(stream.sensors), field
+    if stream.kind == "lighthouse":
+        return f"/lighthouse/{device}", messages.SWEEPS, {"device": device}
+    if stream.kind == "captures":
+        return f"/captures/{device}", messages.CAPTURES, {"device": device}
+    if stream.kind == "odometry":
+        once: dict[str, Any] = {"device": device, "frame_id": "odometry"}
+        return f"/odometry/{device}", messages.ODOMETRY, once
+    if stream.kind == "readings":
+        once = {"device": device, "names": stream.names}
+        return f"/readings/{device}", messages.readings(len(stream.names)), once
+    raise ValueError(f"unknown kind of records: {stream.kind}")

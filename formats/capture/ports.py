@@ -1,19 +1,19 @@
-"""Ports, as the user names them: serial devices, and URLs of what behaves like one.
+"""Ports: serial devices, and URLs of sources that behave like one.
 
 ============================  ==============================================================
 ``/dev/ttyACM0``, ``COM3``    a serial port, or a link to one (``/dev/serial/by-id/...``)
 ``socket://HOST:PORT``        raw bytes over TCP
 ``rfc2217://HOST:PORT``       a serial port of another computer
 ``replay:FILE.mcap``          the raw bytes of a session, see :mod:`.replay`
-``loop://``                   a port without a device: silence
+``loop://``                   a port without a device, which is silent
 ``spy://``, ``alt://``,       of pyserial, see its documentation
 ``hwgrep://``, ``cp2110://``
 ============================  ==============================================================
 
-A serial port is locked (``flock``) and, on Linux, closed to programs that take no lock too
-(``TIOCEXCL``). DTR and RTS are set as pyserial does: many boards start anew when their port
-is opened. What came before the port was set up is thrown away by pyserial, as it may have
-been read at another speed; after that, nothing is.
+A serial port is locked (``flock``) and, on Linux, closed to programs that take no lock
+(``TIOCEXCL``). DTR and RTS are set as pyserial does: many boards restart when their port is
+opened. pyserial discards bytes that arrived before the port was set up, because they may have
+been read at another baud rate; no bytes are discarded after that.
 """
 
 from __future__ import annotations
@@ -29,61 +29,73 @@ from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-from locatk.formats.capture.connections import DescriptorLink, PolledLink, RemoteLink, SerialLink
-from locatk.formats.capture.port_holders import busy, forbidden, is_pty
-from locatk.formats.capture.port_listing import PortInfo, attached
+from locatk.formats.capture.links import (
+    DescriptorLink,
+    Link,
+    PolledLink,
+    Port,
+    RemoteLink,
+    SerialLink,
+    SourceError,
+)
+from locatk.formats.capture.port_listing import (
+    PortInfo,
+    busy_error,
+    find_ports,
+    is_pty,
+    permission_error,
+)
 from locatk.formats.capture.replay import ReplayPort
-from locatk.formats.capture.source import Link, Port, SourceError
 
 URLS = ("socket", "rfc2217", "replay", "loop", "spy", "alt", "hwgrep", "cp2110")
 
-CONNECT_S = 5.0
+CONNECT_TIMEOUT_S = 5.0
 
-LARGEST_BAUD_ERROR = 0.05
-"""Beyond it a UART takes the last bit of a byte for its neighbour."""
+MAX_BAUD_ERROR_FRACTION = 0.05
+"""Relative error of the baud rate with which a UART still samples the last bit of a byte."""
 
-LIST = "See `locatk capture --list`"
+LIST_HINT = "See `locatk capture --list`"
 
 _TERMIOS2 = struct.Struct("4I20B2I")
 _TCGETS2 = 0x802C542A
-"""Asks for the speed that the driver set (Linux, include/uapi/asm-generic/ioctls.h)."""
+"""Queries the baud rate set by the driver (Linux, include/uapi/asm-generic/ioctls.h)."""
 
 _KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
-"""After 25 s of silence a peer that is gone without a word is noticed."""
+"""Options by which a peer that has vanished is noticed after 25 s of silence."""
 
 
 def port_of(name: str, *, baud: int, speed: float = 1.0) -> Port:
-    """The port of this name, not yet opened.
+    """Return the port of this name, not yet opened.
 
     Parameters
     ----------
     name : str
-        As in the table above.
+        Name as in the table above.
     baud : int
-        Of a serial port, here or behind ``rfc2217://``.
+        Baud rate of a serial port, local or behind ``rfc2217://``.
     speed : float
-        Of ``replay:``, times that of the recording; 0 is as fast as possible.
+        Factor on the speed of ``replay:``; 0 is as fast as possible.
 
     Raises
     ------
     SourceError
-        It is none, or the speed is.
+        The name or the speed is invalid.
     """
     if baud <= 0:
-        raise SourceError(f"{baud} is no baud rate")
+        raise SourceError(f"{baud} is not a baud rate")
     kind, colon, rest = name.partition(":")
     kind = kind.lower()
     if kind == "replay" and colon:
         return ReplayPort(name, speed=speed)
     if kind == "camera" and colon:
-        raise SourceError(f"{name} is a camera, which sends no bytes")
+        raise SourceError(f"{name} is a camera, not a serial port")
     if not rest.startswith("//"):
         if not name:
-            raise SourceError("a port without a name", hint=LIST)
+            raise SourceError("the name of the port is empty", hint=LIST_HINT)
         return SerialPort(name, baud=baud)
     if kind not in URLS:
         known = ", ".join(f"{url}://" for url in URLS)
-        raise SourceError(f"no such kind of port: {kind}://", hint=f"Known are {known}")
+        raise SourceError(f"unknown kind of port: {kind}://", hint=f"Known kinds: {known}")
     if kind in ("socket", "rfc2217"):
         host, number = _address(name)
         if kind == "socket":
@@ -92,40 +104,41 @@ def port_of(name: str, *, baud: int, speed: float = 1.0) -> Port:
 
 
 class SerialPort:
-    """A serial device, or a URL that pyserial opens.
+    """Serial device, or URL that pyserial opens.
 
-    A USB device is known again by vendor, product and serial number when it comes back
-    under another name. A symbolic link is taken at its word: whatever it points to.
+    A USB device that comes back under another name is recognized by vendor, product and serial
+    number. A symbolic link is always followed.
     """
 
     def __init__(self, name: str, *, baud: int) -> None:
         self.name = name
-        self.comes_again = not name.lower().startswith("loop:")
+        self.can_reconnect = not name.lower().startswith("loop:")
         self._baud = baud
         self._resolved: str | None = None
         self._info: PortInfo | None = None
-        self._twins: set[str | None] = set()
+        self._other_locations: set[str | None] = set()
 
     def open(self) -> Link:
-        """See :class:`.source.Port`."""
-        link, path = open_serial(self._place(), self._baud)
+        """Open the port; see :class:`.links.Port`."""
+        link, path = open_serial(self._present_path(), self._baud)
         self._resolved = path if "://" in path else os.path.realpath(path)
-        now = attached()
-        self._info = _info_of(self._resolved, now) or self._info
-        self._twins = {info.location for info in self._like(now)}
+        now = find_ports()
+        self._info = _find_info(self._resolved, now) or self._info
+        self._other_locations = {info.location for info in self._similar_ports(now)}
         return link
 
     def describe(self) -> dict[str, str]:
-        """``port``, ``baud``; once it was open, ``resolved``; of USB ``vid`` and ``pid``
-        (hexadecimal), ``serial_number``, ``product``, ``manufacturer``, ``location``."""
-        known: dict[str, str | None] = {
+        """Return ``port``, ``baud``; once it was open, ``resolved``; of USB ``vid`` and ``pid``
+        (hexadecimal), ``serial_number``, ``product``, ``manufacturer``, ``location``.
+        """
+        facts: dict[str, str | None] = {
             "port": self.name,
             "resolved": self._resolved,
             "baud": str(self._baud),
         }
         info = self._info
         if info is not None:
-            known |= {
+            facts |= {
                 "vid": None if info.vid is None else f"{info.vid:04x}",
                 "pid": None if info.pid is None else f"{info.pid:04x}",
                 "serial_number": info.serial_number,
@@ -133,36 +146,36 @@ class SerialPort:
                 "manufacturer": info.manufacturer,
                 "location": info.location,
             }
-        return {key: value for key, value in known.items() if value is not None}
+        return {key: value for key, value in facts.items() if value is not None}
 
-    def _place(self) -> str:
-        """Where it is now: its name, or another one under which it came back."""
+    def _present_path(self) -> str:
+        """Return its present path: its name, or another one under which the device came back."""
         before = self._info
         if before is None or before.identity is None or "://" in self.name:
             return self.name
         if os.path.islink(self.name) and os.path.exists(self.name):
             return self.name
-        now = attached()
-        # Cheap adapters have no serial number, or all the same; then the socket tells.
-        like = self._like(now)
-        same = [info for info in like if info.location == before.location]
-        same = same or [info for info in like if info.location not in self._twins]
+        now = find_ports()
+        # Cheap adapters have no serial number, or all the same one; the socket identifies them.
+        similar = self._similar_ports(now)
+        same = [info for info in similar if info.location == before.location]
+        same = same or [info for info in similar if info.location not in self._other_locations]
         if len(same) == 1:
             return same[0].device
-        if like:
+        if similar:
             raise SourceError(
-                f"{self.name} is gone; like it there is {', '.join(each.device for each in like)}",
-                hint=f"Plug it in where it was: USB {before.location}",
+                f"{self.name} is gone; similar ports: {', '.join(each.device for each in similar)}",
+                hint=f"Plug it into its former socket: USB {before.location}",
             )
-        other = _info_of(os.path.realpath(self.name), now)
+        other = _find_info(os.path.realpath(self.name), now)
         if other is not None and other.identity is not None:
             raise SourceError(
-                f"another device is at {self.name} now ({other.description or other.device})",
+                f"{self.name} is another device now ({other.description or other.device})",
                 hint=f"Plug in {before.description or 'the first one'} again",
             )
         return self.name
 
-    def _like(self, infos: list[PortInfo]) -> list[PortInfo]:
+    def _similar_ports(self, infos: list[PortInfo]) -> list[PortInfo]:
         known = self._info and self._info.identity
         return [info for info in infos if known and info.identity == known]
 
@@ -170,10 +183,10 @@ class SerialPort:
 class SocketPort:
     """Raw bytes over TCP, as from ``ser2net`` or ``socat``.
 
-    Not pyserial's, which throws away what the other side says first.
+    pyserial's own ``socket://`` discards the first bytes of the other side.
     """
 
-    comes_again = True
+    can_reconnect = True
 
     def __init__(self, name: str, host: str, number: int) -> None:
         self.name = name
@@ -182,11 +195,11 @@ class SocketPort:
         self._peer: str | None = None
 
     def open(self) -> Link:
-        """See :class:`.source.Port`."""
+        """Open the connection; see :class:`.links.Port`."""
         try:
-            connection = socket.create_connection((self._host, self._number), CONNECT_S)
+            connection = socket.create_connection((self._host, self._number), CONNECT_TIMEOUT_S)
         except (OSError, UnicodeError) as error:
-            raise _unreachable(error, self.name) from error
+            raise _network_error(error, self.name) from error
         connection.setblocking(False)
         with contextlib.suppress(OSError):
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -198,12 +211,12 @@ class SocketPort:
         return DescriptorLink(connection.fileno(), connection.recv, connection.close)
 
     def describe(self) -> dict[str, str]:
-        """``port``; once it was open, ``resolved``: address and port of the other side."""
+        """Return ``port``; once it was open, ``resolved``: address and port of the other side."""
         return {"port": self.name} | ({"resolved": self._peer} if self._peer else {})
 
 
 def open_serial(url: str, baud: int) -> tuple[Link, str]:
-    """A link to a device or a URL of pyserial, and the path that was opened in the end.
+    """Return a link to a device or a URL of pyserial, and the path that was opened.
 
     Raises
     ------
@@ -212,90 +225,94 @@ def open_serial(url: str, baud: int) -> tuple[Link, str]:
     """
     import serial
 
-    outside = sys.exception()
+    earlier = sys.exception()
     port: Any = None
     try:
         port = serial.serial_for_url(
             url, baudrate=baud, timeout=0, exclusive=True, do_not_open=True
         )
         port.open()
-    # Its handlers let all kinds through: termios.error, re.error, OverflowError, KeyError.
+    # pyserial passes on many kinds of errors: termios.error, re.error, OverflowError, KeyError.
     except Exception as error:
         path = url if port is None or port.port is None else str(port.port)
-        raise _explained(list(_causes(error, outside)), url, path, baud) from error
+        raise _explain_error(list(_causes(error, earlier)), url, path, baud) from error
     path = str(port.port)
     if url.lower().startswith("rfc2217:"):
         return RemoteLink(port), path
-    # One that overrides `read`, as spy:// does, must see the bytes.
+    # A class that overrides `read`, such as spy://, must receive the bytes.
     if os.name != "posix" or type(port).read is not serial.Serial.read:
         return PolledLink(port), path
-    with contextlib.suppress(ValueError, NotImplementedError):  # drivers without such a mode
+    with contextlib.suppress(ValueError, NotImplementedError):  # Some drivers have no such mode.
         port.set_low_latency_mode(True)
     actual = _actual_baud(port.fileno())
-    if actual and abs(actual - baud) > LARGEST_BAUD_ERROR * baud:
+    if actual and abs(actual - baud) > MAX_BAUD_ERROR_FRACTION * baud:
         port.close()
-        raise _wrong_baud(url, baud, actual)
-    # A pseudo-terminal would stay closed to others even after its holder was killed.
+        raise _baud_error(url, baud, actual)
+    # The lock of a pseudo-terminal would outlive a killed program.
     return SerialLink(port, exclusive=sys.platform == "linux" and not is_pty(path)), path
 
 
-def _explained(errors: list[BaseException], name: str, path: str, baud: int) -> SourceError:
-    """What went wrong when ``path`` was opened, from the error and those that led to it."""
+def _explain_error(errors: list[BaseException], name: str, path: str, baud: int) -> SourceError:
+    """Return the error for the exceptions that were raised when ``path`` was opened."""
     if name.lower().startswith("rfc2217:"):
         if len(errors) > 1:
-            return _unreachable(errors[-1], name)
-        place = "{0.hostname}:{0.port}".format(urlsplit(name))
-        hint = f"Does it speak RFC 2217? If it sends the bytes alone: socket://{place}"
+            return _network_error(errors[-1], name)
+        address = "{0.hostname}:{0.port}".format(urlsplit(name))
+        hint = f"If it does not support RFC 2217 and only sends bytes, use socket://{address}"
         return _not_opened(errors, name, hint)
     is_baud = isinstance(errors[0], ValueError) and "baud" in str(errors[0])
     if is_baud or isinstance(errors[0], OverflowError):
-        return _wrong_baud(name, baud)
+        return _baud_error(name, baud)
     number = next((number for number in map(_number, errors) if number), None)
     if number in (errno.ENOENT, errno.ENOTDIR):
-        known = {os.path.basename(info.device): info.device for info in attached()}
-        near = difflib.get_close_matches(os.path.basename(path), known, 3, 0.7)
-        meant = " or ".join(known[each] for each in near)
-        hint = f"{LIST}; did you mean {meant}?" if meant else LIST
+        known = {os.path.basename(info.device): info.device for info in find_ports()}
+        matches = difflib.get_close_matches(os.path.basename(path), known, 3, 0.7)
+        suggestion = " or ".join(known[each] for each in matches)
+        hint = f"{LIST_HINT}; did you mean {suggestion}?" if suggestion else LIST_HINT
         return SourceError(f"no such port {path}", hint=hint)
     if number in (errno.EBUSY, errno.EAGAIN):
-        return busy(name, path)
+        return busy_error(name, path)
     if number in (errno.EACCES, errno.EPERM):
-        return forbidden(name, path)
+        return permission_error(name, path)
     if number in (errno.ENOTTY, errno.EISDIR):
-        kind = "a folder" if os.path.isdir(path) else "no serial port"
-        return SourceError(f"{name} is {kind}", hint=f"{LIST}; replay:FILE.mcap plays a session")
+        kind = "a folder" if os.path.isdir(path) else "not a serial port"
+        return SourceError(
+            f"{name} is {kind}", hint=f"{LIST_HINT}; replay:FILE.mcap replays a session"
+        )
     if number in (errno.ENXIO, errno.ENODEV, errno.EIO):
-        return SourceError(f"no device behind {name}", hint=f"Is it plugged in? {LIST}")
+        return SourceError(
+            f"no device behind {name}", hint=f"Check that it is plugged in. {LIST_HINT}"
+        )
     if number == errno.EINVAL:
-        return _wrong_baud(name, baud)
+        return _baud_error(name, baud)
     return _not_opened(errors, name)
 
 
-def _not_opened(errors: list[BaseException], name: str, hint: str = LIST) -> SourceError:
-    # Of the first line, without the insides that pyserial lists.
+def _not_opened(errors: list[BaseException], name: str, hint: str = LIST_HINT) -> SourceError:
+    # Keep the first line, without the internals that pyserial appends.
     text = str(errors[0]).partition("\n")[0].partition(" [")[0].rstrip(": ")
     return SourceError(f"{name} cannot be opened ({text or type(errors[0]).__name__})", hint=hint)
 
 
-def _wrong_baud(name: str, baud: int, actual: int | None = None) -> SourceError:
-    instead = f", only {actual}" if actual else ""
-    return SourceError(f"{name} cannot do {baud} baud{instead}", hint="Give another --baud")
+def _baud_error(name: str, baud: int, actual: int | None = None) -> SourceError:
+    instead = f"; it uses {actual}" if actual else ""
+    return SourceError(f"{name} does not support {baud} baud{instead}", hint="Give another --baud")
 
 
-def _unreachable(error: BaseException, name: str) -> SourceError:
+def _network_error(error: BaseException, name: str) -> SourceError:
     parts = urlsplit(name)
-    place = f"{parts.hostname}:{parts.port}"
+    address = f"{parts.hostname}:{parts.port}"
     if isinstance(error, socket.gaierror | UnicodeError):
-        return SourceError(f"unknown host {parts.hostname} of {name}", hint="Is it spelt right?")
+        return SourceError(f"unknown host {parts.hostname} of {name}", hint="Check its spelling")
     if isinstance(error, ConnectionRefusedError):
-        hint = "Is its server running, and the number of the port right?"
-        return SourceError(f"nobody listens at {place}", hint=hint)
+        hint = "Check that its server is running, and the port number"
+        return SourceError(f"no server at {address}", hint=hint)
     if isinstance(error, TimeoutError):
-        hint = "Is it switched on, and in this network?"
-        return SourceError(f"{place} does not answer", hint=hint)
+        hint = "Check that it is switched on and in this network"
+        return SourceError(f"{address} does not answer", hint=hint)
     return SourceError(
-        f"{place} cannot be reached ({getattr(error, 'strerror', None) or error})",
-        hint="Is the network there?",
+        f"{address} cannot be reached ({getattr(error, 'strerror', None) or error})",
+        hint="Check the network connection",
     )
 
 
@@ -307,21 +324,26 @@ def _address(name: str) -> tuple[str, int]:
         host = number = None
     if not host or not number:
         kind = name.partition(":")[0]
-        raise SourceError(f"{name} names no host and port", hint=f"As in {kind}://192.168.1.7:4000")
+        raise SourceError(
+            f"{name} has no host and port", hint=f"Example: {kind}://192.168.1.7:4000"
+        )
     return host, number
 
 
-def _causes(error: BaseException, outside: BaseException | None) -> Iterator[BaseException]:
-    """An error and those that led to it, not those that were handled before."""
+def _causes(error: BaseException, earlier: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and its causes, without those that were handled before."""
     each: BaseException | None = error
-    while each is not None and each is not outside:
+    while each is not None and each is not earlier:
         yield each
         each = each.__cause__ or each.__context__
 
 
 def _number(error: BaseException) -> int | None:
-    """``errno`` of an error, also of ``termios.error``, which is no OSError, and of Windows,
-    where pyserial tells it in words."""
+    """Return the ``errno`` of an error.
+
+    It is also found in ``termios.error``, which is no OSError, and in the text of pyserial's errors
+    on Windows.
+    """
     if error.args and isinstance(error.args[0], int):
         return error.args[0]
     if "FileNotFoundError" in str(error):
@@ -330,7 +352,7 @@ def _number(error: BaseException) -> int | None:
 
 
 def _actual_baud(number: int) -> int | None:
-    """The speed that the driver set; None where nobody tells."""
+    """Return the baud rate set by the driver; None if it is unknown."""
     if sys.platform != "linux":
         return None
     import fcntl
@@ -341,5 +363,5 @@ def _actual_baud(number: int) -> int | None:
         return None
 
 
-def _info_of(path: str, infos: list[PortInfo]) -> PortInfo | None:
+def _find_info(path: str, infos: list[PortInfo]) -> PortInfo | None:
     return next((info for info in infos if os.path.realpath(info.device) == path), None)

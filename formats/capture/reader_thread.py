@@ -1,5 +1,4 @@
-"""The thread that reads the port, and nothing else: bytes and what happens to the line, in
-the order in which they came."""
+"""Thread that only reads the port: received data and events of the line, in their order."""
 
 from __future__ import annotations
 
@@ -10,30 +9,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from locatk.formats.capture.host_clock import HostClock
-from locatk.formats.capture.source import Link, LinkEnded, LinkLost, Overruns, Port
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.links import Link, LinkEnded, LinkLost, Overruns, Port
 
-WAIT_S = 0.1
-"""Longest wait for a byte: so long it takes to notice that the recording is over."""
+READ_TIMEOUT_S = 0.1
+"""Longest wait for a byte, and so the delay until the end of the recording is noticed."""
 
-LEAST_S = 0.001
-"""Shortest time between reads. A stamp is late by no more, and a fast line is read in pieces
-of some kilobytes instead of byte by byte; the smallest buffers of a kernel (4096 bytes) take
-20 ms to overflow at 2 Mbaud."""
+MIN_READ_INTERVAL_S = 0.001
+"""Shortest time between reads. Timestamps are late by at most this, and a fast line is read in
+pieces of some kilobytes instead of single bytes; the smallest buffers of a kernel (4096 bytes)
+take 20 ms to overflow at 2 Mbaud."""
 
 BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
-"""Between attempts to open a port again; the last one is repeated."""
+"""Delays between attempts to reconnect; the last one is repeated."""
 
-HANGING_S = 3.0
+MAX_STOP_WAIT_S = 3.0
 """Longest wait for the thread at the end."""
 
-COUNT_S = 0.5
-"""Between looks at the kernel's counters."""
+COUNTER_INTERVAL_S = 0.5
+"""Interval between reads of the kernel's error counters."""
 
 
 @dataclass(frozen=True)
-class Arrived:
-    """What one read gave: bytes of a serial line, or frames of a camera."""
+class ReceivedData:
+    """Result of one read: bytes of a serial line, or frames of a camera."""
 
     time_ns: int
     data: Any
@@ -41,90 +40,92 @@ class Arrived:
 
 
 @dataclass(frozen=True)
-class Lost:
-    """The connection broke."""
+class ConnectionLost:
+    """The connection was lost."""
 
     time_ns: int
     why: str
 
 
 @dataclass(frozen=True)
-class Back:
-    """It is there again, perhaps elsewhere."""
+class Reconnected:
+    """The port was opened again, perhaps at another path."""
 
     time_ns: int
-    where: str
+    path: str
 
 
 @dataclass(frozen=True)
-class Ended:
-    """Nothing more will come; ``error`` where that is not as it should be."""
+class SourceEnded:
+    """No more data will come; ``error`` is set if that is unexpected."""
 
     time_ns: int
     error: str | None = None
 
 
-Event = Arrived | Lost | Back | Ended
+Event = ReceivedData | ConnectionLost | Reconnected | SourceEnded
 
 
-class Receiver:
-    """Reads a port in a thread of its own and opens it again when it was lost.
+class PortReader:
+    """Reads a port in a thread of its own, and reconnects when the connection is lost.
 
     Parameters
     ----------
     port : Port
     link : Link
-        The port, opened.
+        The open port.
     clock : HostClock
-    most_bytes : int
-        When so many wait to be written, reading stops until there is room: the system's own
-        buffers then fill, and count what they lose.
+    max_waiting_bytes : int
+        When so many bytes wait to be written, reading stops until there is space: then the buffers
+        of the system fill up, and count their losses.
     """
 
     def __init__(
-        self, port: Port, link: Link, clock: HostClock, *, most_bytes: int = 64 << 20
+        self, port: Port, link: Link, clock: HostClock, *, max_waiting_bytes: int = 64 << 20
     ) -> None:
         self._port, self._clock = port, clock
         self._link: Link | None = link
-        self._most = most_bytes
+        self._max_waiting = max_waiting_bytes
         self._events: deque[Event] = deque()
         self._stop = threading.Event()
         self._attempts = 0
         self.received = 0
         """Bytes so far."""
-        self.heard_ns = 0
+        self.last_data_ns = 0
         """When the last of them were read."""
         self._taken = 0
-        self._before = Overruns()  # of links that are closed
-        self._now = Overruns()
+        self._overruns_before = Overruns()  # Of links closed before.
+        self._overruns_now = Overruns()
         self._dropped_before = self._dropped = 0
         self.high_water = 0
-        self.held_up = 0
+        self.pauses = 0
         """How often reading stopped because too much was waiting."""
         self._thread = threading.Thread(target=self._run, name="locatk-receiver", daemon=True)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> bool:
-        """Read what has arrived by now, close the port and end the thread; returns whether it
-        ended: one that hangs in a driver is left behind."""
+        """Read the bytes that have arrived, close the port and end the thread.
+
+        Return False if the thread hangs in a driver; it is remaining behind then.
+        """
         if not self._stop.is_set():
             self._stop.set()
-            self._thread.join(HANGING_S)
+            self._thread.join(MAX_STOP_WAIT_S)
         return not self._thread.is_alive()
 
     def take(self) -> Sequence[Event]:
-        """All that has happened since the last call."""
+        """Return all events since the last call."""
         events = [self._events.popleft() for _ in range(len(self._events))]
-        self._taken += sum(event.size for event in events if isinstance(event, Arrived))
+        self._taken += sum(event.size for event in events if isinstance(event, ReceivedData))
         return events
 
     @property
     def overruns(self) -> Overruns:
-        """What the kernel counted, of all links."""
-        before, now = self._before, self._now
+        """Error counters of the kernel, summed over all links."""
+        before, now = self._overruns_before, self._overruns_now
         return Overruns(
             before.overrun + now.overrun,
             before.buffer + now.buffer,
@@ -134,47 +135,47 @@ class Receiver:
 
     @property
     def dropped(self) -> int:
-        """Frames of a camera that came faster than they were taken."""
+        """Frames of a camera that arrived faster than they were taken."""
         return self._dropped_before + self._dropped
 
     def _run(self) -> None:
         try:
             self._receive()
-        except Exception as error:  # whatever a driver raises must not end in silence
-            self._events.append(Ended(self._clock.now(), f"{type(error).__name__}: {error}"))
+        except Exception as error:  # Any error of a driver must be reported.
+            self._events.append(SourceEnded(self._clock.now(), f"{type(error).__name__}: {error}"))
         finally:
             self._close()
 
     def _receive(self) -> None:
         counted = 0.0
         while not self._stop.is_set():
-            begun = time.monotonic()
+            start = time.monotonic()
             try:
-                self._read(WAIT_S)
+                self._read(READ_TIMEOUT_S)
             except LinkEnded:
-                self._events.append(Ended(self._clock.now()))
+                self._events.append(SourceEnded(self._clock.now()))
                 return
             except LinkLost as lost:
                 self._close()
-                if not self._port.comes_again:
-                    self._events.append(Ended(self._clock.now(), str(lost)))
+                if not self._port.can_reconnect:
+                    self._events.append(SourceEnded(self._clock.now(), str(lost)))
                     return
-                self._events.append(Lost(self._clock.now(), str(lost)))
+                self._events.append(ConnectionLost(self._clock.now(), str(lost)))
                 if not self._reopen():
                     return
-                where = self._port.describe().get("resolved", self._port.name)
-                self._events.append(Back(self._clock.now(), where))
+                path = self._port.describe().get("resolved", self._port.name)
+                self._events.append(Reconnected(self._clock.now(), path))
                 continue
-            while self.received - self._taken > self._most and not self._stop.is_set():
-                self.held_up += 1
+            while self.received - self._taken > self._max_waiting and not self._stop.is_set():
+                self.pauses += 1
                 self._stop.wait(0.05)
-            if begun - counted > COUNT_S:
-                counted = begun
+            if start - counted > COUNTER_INTERVAL_S:
+                counted = start
                 self._count()
-            left = begun + LEAST_S - time.monotonic()
-            if left > 0 and self._port.comes_again:  # what is played has its own pace
-                time.sleep(left)
-        self._read_rest()
+            remaining = start + MIN_READ_INTERVAL_S - time.monotonic()
+            if remaining > 0 and self._port.can_reconnect:  # A replayed source has its own pace.
+                time.sleep(remaining)
+        self._read_remaining()
 
     def _read(self, wait_s: float) -> int:
         assert self._link is not None
@@ -183,15 +184,15 @@ class Receiver:
             return 0
         self._attempts = 0
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
-        self.heard_ns = self._clock.now()
-        self._events.append(Arrived(self.heard_ns, data, size))
+        self.last_data_ns = self._clock.now()
+        self._events.append(ReceivedData(self.last_data_ns, data, size))
         self.received += size
         self.high_water = max(self.high_water, self.received - self._taken)
         return size
 
-    def _read_rest(self) -> None:
-        """What the system still holds; from a device that never stops, not for long."""
-        until = time.monotonic() + WAIT_S
+    def _read_remaining(self) -> None:
+        """Read the bytes that the system still holds, for a limited time."""
+        until = time.monotonic() + READ_TIMEOUT_S
         try:
             while time.monotonic() < until and self._read(0.0):
                 pass
@@ -199,25 +200,25 @@ class Receiver:
             return
 
     def _reopen(self) -> bool:
-        # Counted on over links that break before they gave anything.
+        # The count continues over links that break before any data arrive.
         while not self._stop.wait(BACKOFF_S[min(self._attempts, len(BACKOFF_S) - 1)]):
             self._attempts += 1
             try:
                 self._link = self._port.open()
                 return True
-            except Exception:  # not there yet, or a driver that is not ready
+            except Exception:  # Not available yet, or its driver is not ready.
                 continue
         return False
 
     def _count(self) -> None:
         if self._link is not None:
-            self._now = self._link.overruns() or self._now
+            self._overruns_now = self._link.overruns() or self._overruns_now
             self._dropped = getattr(self._link, "dropped", 0)
 
     def _close(self) -> None:
         if self._link is not None:
             self._count()
-            self._before, self._now = self.overruns, Overruns()
+            self._overruns_before, self._overruns_now = self.overruns, Overruns()
             self._dropped_before, self._dropped = self.dropped, 0
             self._link.close()
             self._link = None

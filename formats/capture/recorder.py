@@ -1,7 +1,7 @@
-"""The recording itself: from the receiver's events to files, until somebody ends it.
+"""Recorder: writes the events of the reader to files until the recording ends.
 
-Three threads: the receiver reads the port and nothing else; this one decodes and writes;
-a third forces the file to the disk, which may take longer than a port can wait.
+There are three threads: the reader only reads the port; this one decodes and writes; the third
+one forces the file to the disk (fsync), which may take longer than a port can wait.
 """
 
 from __future__ import annotations
@@ -14,44 +14,51 @@ from dataclasses import dataclass
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError
-from locatk.formats.capture.host_clock import HostClock
+from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import Intake
-from locatk.formats.capture.reader_thread import Arrived, Back, Ended, Event, Lost, Receiver
-from locatk.formats.capture.recording_files import CHUNK, Parts
-from locatk.formats.capture.statistics import Recorded, Status, Totals
+from locatk.formats.capture.reader_thread import (
+    ConnectionLost,
+    Event,
+    PortReader,
+    ReceivedData,
+    Reconnected,
+    SourceEnded,
+)
+from locatk.formats.capture.recording_files import CHUNK_BYTES, RecordingFiles
+from locatk.formats.capture.statistics import CaptureStatistics, CaptureStatus, RecordingResult
 
-TURN_S = 0.02
-"""Between looks at what was received: one message of each stream covers about so much."""
+WRITE_INTERVAL_S = 0.02
+"""Interval between batches of received data; a message of a stream covers about so much time."""
 
-SHOW_S = 1.0
-"""Between looks at rates, disk, silence and clock."""
+STATUS_INTERVAL_S = 1.0
+"""Interval between checks of rates, disk, silence and clock."""
 
-DOUBT_S = 5.0
-"""After so long bytes without a frame are told of."""
+FRAME_CHECK_S = 5.0
+"""Time after which bytes without a frame are reported."""
 
-AHEAD_S = 300.0
-"""A disk that will be full sooner than this is told of."""
+DISK_WARNING_S = 300.0
+"""Remaining time until the disk is full at which that is reported."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When what is done; None for never.
+    """Limits of a recording; None for no limit.
 
     Attributes
     ----------
     duration_s, max_bytes
         The recording ends.
     rotate_s, rotate_bytes
-        A new part begins.
+        A new file begins.
     silence_s : float
-        Without a byte for so long there is a warning.
+        Time without data after which a warning is issued.
     reserve_bytes : int
-        So much of the disk stays free.
+        Free space of the disk at which the recording ends.
     flush_s : float
-        So often what was recorded is given to the system: the most that is lost when the
-        program is killed, with :data:`TURN_S`.
+        Interval of flushes to the system: with :data:`WRITE_INTERVAL_S`, the most that is lost when
+        the program is killed.
     sync_s : float
-        So often it is forced to the disk: the most that is lost with the power.
+        Interval of flushes to the disk: the most that is lost in a power failure.
     """
 
     duration_s: float | None = None
@@ -64,15 +71,17 @@ class Limits:
     sync_s: float = 1.0
 
 
-def _pieces(events: Sequence[Event]) -> Iterator[list[Event]]:
-    """The events of a turn, and no more than a chunk of bytes at once: a file is looked at
-    after each. At least one piece, if an empty one."""
+def _split_events(events: Sequence[Event]) -> Iterator[list[Event]]:
+    """Yield events in pieces of at most a chunk, because sizes are checked after each piece.
+
+    There is at least one piece, which may be empty.
+    """
     piece: list[Event] = []
     size = 0
     for event in events:
         piece.append(event)
-        size += event.size if isinstance(event, Arrived) else 0
-        if size >= CHUNK:
+        size += event.size if isinstance(event, ReceivedData) else 0
+        if size >= CHUNK_BYTES:
             yield piece
             piece, size = [], 0
     yield piece
@@ -83,47 +92,47 @@ class Recorder:
 
     Parameters
     ----------
-    receiver : Receiver
+    receiver : PortReader
         Not yet started.
     intake : Intake
-    parts : Parts
+    parts : RecordingFiles
     clock : HostClock
     limits : Limits
     tell : callable
-        Takes lines for people as they come: gaps, silence, a disk that fills.
+        Takes messages for the user: gaps, silence, a disk that fills up.
     show : callable
-        Takes a :class:`Status` once a second.
+        Takes a :class:`CaptureStatus` once per second.
     """
 
     def __init__(
         self,
-        receiver: Receiver,
+        receiver: PortReader,
         intake: Intake,
-        parts: Parts,
+        parts: RecordingFiles,
         clock: HostClock,
         limits: Limits,
         *,
         tell: Callable[[str], None],
-        show: Callable[[Status], None],
+        show: Callable[[CaptureStatus], None],
     ) -> None:
         self._receiver, self._intake, self._parts = receiver, intake, parts
         self._clock, self._limits = clock, limits
         self._tell, self._show = tell, show
-        self._totals = Totals()
-        self._part_began = Totals()
-        self._lost_ns: int | None = None
+        self._totals = CaptureStatistics()
+        self._part_began = CaptureStatistics()
+        self._disconnected_ns: int | None = None
         self._step_s = 0.0
-        self._held_up = 0
-        self._disk_told = False
+        self._pauses = 0
+        self._disk_reported = False
         self._flushed_bytes = 0
-        self._doubted = False
+        self._frames_checked = False
 
-    def run(self, stop: threading.Event) -> Recorded:
-        """Record until ``stop`` is set, a limit is reached, or nothing more can come.
+    def run(self, stop: threading.Event) -> RecordingResult:
+        """Record until ``stop`` is set, a limit is reached, or the source ends.
 
-        The files are finished when this returns, whatever ended it.
+        The files are finished when this returns, in all cases.
         """
-        self._start_ns = self._part_ns = self._heard_ns = self._clock.now()
+        self._start_ns = self._part_ns = self._last_data_ns = self._clock.now()
         self._silent = False
         self._parts.flush()
         self._receiver.start()
@@ -133,20 +142,23 @@ class Recorder:
         )
         syncer.start()
         try:
-            ended, failed = self._turns(stop)
+            ended, failed = self._write_until_end(stop)
             if not self._receiver.stop():
-                self._say("the port's driver hangs: what it still holds is not recorded")
-            self._rest()
-        except (LocatkError, OSError) as error:  # of the disk: all else is of the receiver
+                self._report("the driver of the port hangs: bytes in its buffer are not recorded")
+            self._write_remaining()
+        except (
+            LocatkError,
+            OSError,
+        ) as error:  # Errors of the disk; those of the port are events of the reader.
             self._receiver.stop()
-            ended, failed = self._unsaved(error), True
+            ended, failed = self._disk_error(error), True
         except BaseException as error:
             self._parts.finish(self._facts(f"{type(error).__name__}: {error}"))
             raise
         finally:
             self._receiver.stop()
             syncing.set()
-        recorded = Recorded(
+        recorded = RecordingResult(
             totals=self._count(),
             paths=self._parts.paths,
             device=self._device(),
@@ -161,15 +173,15 @@ class Recorder:
         )
         if self._parts.is_gone():
             recorded.failed = True
-            recorded.ended += f"; somebody has removed or replaced {self._parts.file.path}"
+            recorded.ended += f"; {self._parts.file.path} was removed or replaced"
         try:
             self._parts.finish(self._facts(ended))
         except OSError as error:
             recorded.failed = True
             missing = self._receiver.received - self._flushed_bytes
             recorded.ended = (
-                f"{error}; the end of the file is missing, with up to {missing} bytes that were "
-                "received: `locatk recover` it"
+                f"{error}; the end of the file is missing, with up to {missing} received bytes: "
+                "use `locatk recover`"
             )
         recorded.file_bytes = self._parts.bytes_written
         syncer.join(self._limits.sync_s)
@@ -179,19 +191,19 @@ class Recorder:
         self._parts.flush()
         self._flushed_bytes = self._count().bytes
 
-    def _unsaved(self, error: LocatkError | OSError) -> str:
-        """What went wrong with the disk, and what is not on it."""
-        left = self._receiver.received - self._count().bytes
-        return f"{error}" + (f"; {left} bytes that were received are not in it" if left else "")
+    def _disk_error(self, error: LocatkError | OSError) -> str:
+        """Return the error of the disk, and the number of received bytes that are not saved."""
+        unsaved = self._receiver.received - self._count().bytes
+        return f"{error}" + (f"; {unsaved} received bytes are not in the file" if unsaved else "")
 
-    def _turns(self, stop: threading.Event) -> tuple[str, bool]:
-        """Write what comes, turn after turn; returns why it ended and whether that is bad."""
+    def _write_until_end(self, stop: threading.Event) -> tuple[str, bool]:
+        """Write batches of received data; return why it ended, and whether by an error."""
         flushed = shown = time.monotonic()
-        before = Totals()
+        before = CaptureStatistics()
         while True:
-            over = self._over(stop)
+            over = self._reason_to_stop(stop)
             ended = None
-            for events in _pieces(self._receiver.take()):
+            for events in _split_events(self._receiver.take()):
                 ended = self._write(events) or ended
                 if self._is_full():
                     return "max-size", False
@@ -199,9 +211,9 @@ class Recorder:
             if now - flushed >= self._limits.flush_s:
                 flushed = now
                 self._flush()
-            if now - shown >= SHOW_S:
+            if now - shown >= STATUS_INTERVAL_S:
                 totals = self._count()
-                full = self._second(totals, before, now - shown)
+                full = self._check_status(totals, before, now - shown)
                 before, shown = totals, now
                 if full:
                     return full, True
@@ -209,10 +221,10 @@ class Recorder:
                 return ended.error or "end of the source", ended.error is not None
             if over:
                 return over, False
-            stop.wait(TURN_S)
+            stop.wait(WRITE_INTERVAL_S)
 
-    def _over(self, stop: threading.Event) -> str:
-        """Why it is time to end, ``""`` while it is not."""
+    def _reason_to_stop(self, stop: threading.Event) -> str:
+        """Return why the recording must end; ``""`` if it continues."""
         limits = self._limits
         if stop.is_set():
             return "stopped"
@@ -221,129 +233,144 @@ class Recorder:
         return ""
 
     def _is_full(self) -> bool:
-        most = self._limits.max_bytes
-        return most is not None and self._parts.bytes_written >= most
+        limit = self._limits.max_bytes
+        return limit is not None and self._parts.bytes_written >= limit
 
     def _elapsed_s(self) -> float:
         return (self._clock.now() - self._start_ns) * 1e-9
 
-    def _write(self, events: Sequence[Event]) -> Ended | None:
-        """Write what the receiver tells, in its order; returns its end where there is one."""
-        arrived: list[Arrived] = []
+    def _write(self, events: Sequence[Event]) -> SourceEnded | None:
+        """Write the events of the reader in their order; return its end, if it is among them."""
+        received: list[ReceivedData] = []
         ended = None
         for event in events:
-            if isinstance(event, Arrived):
-                arrived.append(event)
-                self._heard_ns, self._silent = event.time_ns, False
+            if isinstance(event, ReceivedData):
+                received.append(event)
+                self._last_data_ns, self._silent = event.time_ns, False
                 continue
-            self._take(arrived)
-            arrived = []
-            if isinstance(event, Lost):
-                self._lost_ns = event.time_ns
+            self._take(received)
+            received = []
+            if isinstance(event, ConnectionLost):
+                self._disconnected_ns = event.time_ns
                 self._totals.gaps += 1
-                self._say(f"connection lost: {event.why}", event.time_ns)
-            elif isinstance(event, Back):
+                self._report(f"connection lost: {event.why}", event.time_ns)
+            elif isinstance(event, Reconnected):
                 self._close_gap(event)
             else:
                 ended = event
-        self._take(arrived)
+        self._take(received)
         self._parts.write(self._intake.turn(self._clock.now()))
         self._parts.system(self._intake.system)
         self._parts.attach(self._intake.artifacts())
         for remark in self._intake.remarks():
-            self._say(remark)
+            self._report(remark)
         return ended
 
-    def _take(self, arrived: Sequence[Arrived]) -> None:
-        if arrived:
-            self._rotate()  # with the first byte of a part, so that none is empty
-            self._parts.write(self._intake.take(arrived))
+    def _take(self, received: Sequence[ReceivedData]) -> None:
+        if received:
+            self._rotate()  # Before the first byte of a part, so that none is empty.
+            self._parts.write(self._intake.take(received))
 
-    def _close_gap(self, event: Back) -> None:
-        assert self._lost_ns is not None
-        away_s = (event.time_ns - self._lost_ns) * 1e-9
+    def _close_gap(self, event: Reconnected) -> None:
+        assert self._disconnected_ns is not None
+        away_s = (event.time_ns - self._disconnected_ns) * 1e-9
         self._totals.gap_s += away_s
-        self._lost_ns = None
-        self._heard_ns = event.time_ns
+        self._disconnected_ns = None
+        self._last_data_ns = event.time_ns
         self._parts.write(self._intake.restart())
-        self._say(f"connected again to {event.where} after {away_s:.1f} s", event.time_ns)
+        self._report(f"reconnected to {event.path} after {away_s:.1f} s", event.time_ns)
 
-    def _rest(self) -> None:
-        """What was received between the last turn and the end."""
+    def _write_remaining(self) -> None:
+        """Write the data received between the last batch and the end."""
         if not self._is_full():
             self._write(self._receiver.take())
-        if self._lost_ns is not None:
-            self._totals.gap_s += (self._clock.now() - self._lost_ns) * 1e-9
+        if self._disconnected_ns is not None:
+            self._totals.gap_s += (self._clock.now() - self._disconnected_ns) * 1e-9
         self._parts.write(self._intake.finish())
         for remark in self._intake.remarks():
-            self._say(remark)
+            self._report(remark)
 
-    def _second(self, totals: Totals, before: Totals, took_s: float) -> str:
-        """What is looked at once a second; returns why to stop, ``""`` for no reason."""
-        fresh = totals.since(before)
+    def _check_status(
+        self, totals: CaptureStatistics, before: CaptureStatistics, elapsed_s: float
+    ) -> str:
+        """Run the checks of each second; return why to stop, ``""`` for no reason."""
+        new = totals.since(before)
         free = self._parts.file.free()
-        rate = fresh.bytes / took_s
+        rate = new.bytes / elapsed_s
         self._show(
-            Status(
+            CaptureStatus(
                 self._elapsed_s(),
-                None if self._lost_ns is None else (self._clock.now() - self._lost_ns) * 1e-9,
+                None
+                if self._disconnected_ns is None
+                else (self._clock.now() - self._disconnected_ns) * 1e-9,
                 rate,
-                fresh.frames / took_s,
+                new.frames / elapsed_s,
                 totals,
                 self._parts.bytes_written,
                 free,
             )
         )
-        self._look_for_silence()
-        self._look_at_clock()
-        self._look_for_frames(totals)
-        if self._receiver.held_up > self._held_up:
-            self._held_up = self._receiver.held_up
-            self._say("the disk is slower than the port: reading waits")
-        return "" if free is None else self._look_at_disk(free)
+        self._check_silence()
+        self._check_clock()
+        self._check_frames(totals)
+        if self._receiver.pauses > self._pauses:
+            self._pauses = self._receiver.pauses
+            self._report("the disk is slower than the port: reading is paused")
+        return "" if free is None else self._check_disk(free)
 
-    def _look_for_silence(self) -> None:
-        heard_ns = max(self._heard_ns, self._receiver.heard_ns)  # more may wait to be written
-        silent_s = (self._clock.now() - heard_ns) * 1e-9
-        if self._lost_ns is None and not self._silent and silent_s >= self._limits.silence_s:
+    def _check_silence(self) -> None:
+        last_data_ns = max(
+            self._last_data_ns, self._receiver.last_data_ns
+        )  # Newer data may wait to be written.
+        silent_s = (self._clock.now() - last_data_ns) * 1e-9
+        if (
+            self._disconnected_ns is None
+            and not self._silent
+            and silent_s >= self._limits.silence_s
+        ):
             self._silent = True
             self._totals.silences += 1
-            self._say(
-                f"nothing received for {silent_s:.0f} s: is it on, does it send, is the baud right?"
+            self._report(
+                f"no data received for {silent_s:.0f} s: check the power, the wiring and --baud"
             )
 
-    def _look_for_frames(self, totals: Totals) -> None:
-        """Bytes and nothing in them: the most usual fault of all."""
+    def _check_frames(self, totals: CaptureStatistics) -> None:
+        """Report bytes without frames, the most frequent fault of all."""
         device = self._device()
-        if not self._doubted and device and self._elapsed_s() >= DOUBT_S and totals.bytes:
-            self._doubted = True
+        if (
+            not self._frames_checked
+            and device
+            and self._elapsed_s() >= FRAME_CHECK_S
+            and totals.bytes
+        ):
+            self._frames_checked = True
             for doubt in totals.doubts(device):
-                self._say(f"{doubt}: is it this device (--device auto), is its baud right?")
+                self._report(f"{doubt}: check --device (or use auto) and --baud")
 
     def _device(self) -> str:
-        """What is at the port, ``""`` while that is not known, and of a camera."""
+        """Return the name of the device; ``""`` if it is unknown, and of a camera."""
         return getattr(getattr(self._intake, "device", None), "name", "")
 
-    def _look_at_clock(self) -> None:
+    def _check_clock(self) -> None:
         step_s = self._clock.stepped_ns() * 1e-9
         if abs(step_s - self._step_s) > 0.1:
-            self._say(
+            self._report(
                 f"the wall clock was set by {step_s - self._step_s:+.1f} s; times of this "
-                "recording go on as they were"
+                "recording are not affected"
             )
             self._step_s = step_s
 
-    def _look_at_disk(self, free: int) -> str:
-        left = free - self._limits.reserve_bytes
-        if left <= 0:
-            return "the disk is full but for the reserve"
+    def _check_disk(self, free: int) -> str:
+        available = free - self._limits.reserve_bytes
+        if available <= 0:
+            return "the disk is full up to --reserve"
         per_s = self._parts.bytes_written / max(self._elapsed_s(), 1.0)
-        if per_s > 0 and left / per_s < AHEAD_S:
-            if not self._disk_told:
-                self._say(f"the disk is full in {left / per_s:.0f} s at this rate")
-            self._disk_told = True
+        if per_s > 0 and available / per_s < DISK_WARNING_S:
+            if not self._disk_reported:
+                self._report(f"at this rate the disk will be full in {available / per_s:.0f} s")
+            self._disk_reported = True
         else:
-            self._disk_told = False
+            self._disk_reported = False
         return ""
 
     def _rotate(self) -> None:
@@ -354,19 +381,21 @@ class Recorder:
         )
         big = limits.rotate_bytes is not None and self._parts.part_bytes >= limits.rotate_bytes
         if old or big:
-            self._parts.next_part(self._facts("goes on in the next part"))
+            self._parts.next_part(self._facts("continued in the next part"))
             self._part_ns = self._clock.now()
             self._part_began = self._count()
             self._parts.flush()
 
-    def _say(self, text: str, time_ns: int | None = None) -> None:
-        """To people and into the session; without a time at that of what was written last, as
-        bytes that came before now may still wait."""
+    def _report(self, text: str, time_ns: int | None = None) -> None:
+        """Report a message to the user and in the session.
+
+        Without a time it gets that of the last message, because earlier bytes may still wait.
+        """
         self._parts.log(text, time_ns or self._start_ns, level=Log.WARNING)
         self._tell(text)
 
-    def _count(self) -> Totals:
-        """All that is counted, as of now."""
+    def _count(self) -> CaptureStatistics:
+        """Return the present statistics."""
         totals = self._totals
         self._intake.count(totals)
         overruns = self._receiver.overruns
@@ -374,10 +403,10 @@ class Recorder:
         totals.dropped = self._receiver.dropped
         totals.high_water_bytes = self._receiver.high_water
         totals.clock_step_s = self._step_s
-        return Totals(**vars(totals))
+        return CaptureStatistics(**vars(totals))
 
     def _facts(self, ended: str) -> dict[str, str]:
-        """What the part that ends now holds, for its metadata."""
+        """Return the statistics of the file that ends now, for its metadata."""
         device = self._device()
         return {
             **({"device": device} if device else {}),
@@ -388,6 +417,6 @@ class Recorder:
         }
 
     def _sync(self, done: threading.Event) -> None:
-        """Force the file to the disk again and again, away from the thread that writes."""
+        """Force the file to the disk repeatedly, in a thread of its own."""
         while not done.wait(self._limits.sync_s):
             self._parts.file.sync()

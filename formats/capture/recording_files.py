@@ -1,8 +1,19 @@
-"""The files of a recording: one, or one after the other, each whole in itself."""
+"""Files of a recording: one, or several in sequence, each a complete session.
+
+A file can be read up to its last flush while it grows. Unlike the output of
+:func:`locatk.formats.output.atomic_write` it has its final name from the start, because a
+recording must be there when the program is killed.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import errno
+import os
 import re
+import shutil
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,29 +21,28 @@ from pathlib import Path
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
-from locatk.core.errors import OutputExistsError
-from locatk.formats.capture.device_messages import Stamped
-from locatk.formats.capture.live_file import LiveFile, check_idle
+from locatk.core.errors import LocatkError, OutputExistsError
+from locatk.formats.capture.ingestion import StampedMessage
 from locatk.formats.capture.statistics import RECORD
 from locatk.formats.output import check_output
 from locatk.formats.sessions.mcap_file import SESSION_RECORD
 from locatk.formats.sessions.messages import timestamp
 from locatk.formats.sessions.writer import SessionWriter
 
-CHUNK = 1 << 19
-"""A chunk is written when it has so many bytes, if not before. Half of what the MCAP writer
-takes before it writes one unasked."""
+CHUNK_BYTES = 1 << 19
+"""Bytes after which a chunk is written, if not before: half of the limit at which the MCAP writer
+writes one itself."""
 
 LOG_NAME = "locatk capture"
-"""Who says what the recorder writes to ``/log``."""
+"""Sender of the recorder's messages on ``/log``."""
 
-PER_CHUNK = 512
-"""Bytes of the index at the end of a file by chunk, at most."""
+INDEX_BYTES_PER_CHUNK = 512
+"""Upper limit of the index at the end of a file, per chunk."""
 
 
 @dataclass(frozen=True)
-class Content:
-    """What every part begins with.
+class FileContent:
+    """Initial content of each file.
 
     Attributes
     ----------
@@ -41,7 +51,7 @@ class Content:
     artifacts : mapping of str to str
         Attachments: name to text.
     declared : sequence of (str, type)
-        Topics that are sure to come.
+        Topics that are certain to occur.
     """
 
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -50,18 +60,18 @@ class Content:
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Path of a part, numbered from 1: ``run.mcap`` becomes ``run-001.mcap``."""
+    """Return the path of a part, numbered from 1: ``run.mcap`` becomes ``run-001.mcap``."""
     return path.with_name(f"{path.stem}-{number:03d}{path.suffix}")
 
 
-class Parts:
-    """Writes a recording; :meth:`next_part` goes on in a new file.
+class RecordingFiles:
+    """Writes a recording; :meth:`next_part` continues in a new file.
 
     Parameters
     ----------
     path : path
-        The file, or where ``numbered`` the name from which those of the parts are made.
-    content : Content
+        The file; if ``numbered``, the name from which those of the parts are derived.
+    content : FileContent
     numbered : bool
         There may be several parts.
     overwrite : bool
@@ -70,11 +80,11 @@ class Parts:
     Raises
     ------
     OutputExistsError, MissingDataError, LocatkError
-        See :class:`.live_file.LiveFile`.
+        See :class:`LiveFile`.
     """
 
     def __init__(
-        self, path: Path, content: Content, *, numbered: bool = False, overwrite: bool = False
+        self, path: Path, content: FileContent, *, numbered: bool = False, overwrite: bool = False
     ) -> None:
         self._path, self._content = path, content
         self._numbered, self._overwrite = numbered, overwrite
@@ -86,11 +96,13 @@ class Parts:
         self._last_ns = 0
         self.paths: list[Path] = []
         self._is_open = False
-        if numbered and overwrite:  # what stays of an older recording would look like ours
-            olds = parts_of(path)
-            for old in olds:
+        if (
+            numbered and overwrite
+        ):  # Remaining parts of an older recording would look like parts of this one.
+            old_parts = parts_of(path)
+            for old in old_parts:
                 check_idle(old)
-            for old in olds:
+            for old in old_parts:
                 old.unlink(missing_ok=True)
         self._open()
 
@@ -117,47 +129,49 @@ class Parts:
 
     @property
     def artifacts(self) -> Mapping[str, str]:
-        """What is attached, name to text."""
+        """Attachments, name to text."""
         return self._artifacts
 
     @property
     def bytes_written(self) -> int:
-        """By all parts together."""
+        """Size of all parts."""
         return self._finished_bytes + self.part_bytes
 
     @property
     def part_bytes(self) -> int:
-        """By this part."""
+        """Size of this part."""
         return self.file.tell() if self._is_open else 0
 
     def is_gone(self) -> bool:
-        """Whether somebody has removed the file that is being written."""
+        """Return whether the open file was removed."""
         return self._is_open and not self.file.is_there()
 
     def system(self, name: str) -> None:
-        """Say whose session it is, once that is known."""
+        """Set the system of the session, once it is known."""
         if name and name != self._system:
             self._system = name
             self._writer.metadata(SESSION_RECORD, {"system": name})
 
     def attach(self, artifacts: Mapping[str, str]) -> None:
-        """Attach what is not yet there, to this part and all that follow."""
+        """Attach new artifacts to this part and all that follow."""
         for name, text in artifacts.items():
             if name not in self._artifacts:
                 self._artifacts[name] = text
                 self._writer.attach_toml(name, text)
 
-    def write(self, stamped: Iterable[Stamped]) -> None:
-        """Write messages, in the order in which they come."""
+    def write(self, stamped: Iterable[StampedMessage]) -> None:
+        """Write messages in the given order."""
         for each in stamped:
             self._writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
             self._last_ns = max(self._last_ns, each.time_ns)
             self._pending += each.message.ByteSize()
-            if self._pending >= CHUNK:  # before the writer does, who makes no room
+            if (
+                self._pending >= CHUNK_BYTES
+            ):  # Before the MCAP writer does, which allocates no space.
                 self.flush()
 
     def log(self, text: str, time_ns: int, *, level: int = Log.WARNING) -> None:
-        """A line for the log panel, not before what was written last."""
+        """Write a log message, not before the time of the last message."""
         time_ns = max(time_ns, self._last_ns)
         line = Log(timestamp=timestamp(time_ns), level=level, message=text, name=LOG_NAME)  # type: ignore[arg-type]
         self._writer.write("/log", line, time_ns)
@@ -165,26 +179,28 @@ class Parts:
         self._pending += line.ByteSize()
 
     def flush(self) -> None:
-        """Give all that is buffered to the system: what is killed from here on keeps it.
+        """Write all buffered data to the system, so that they survive if the program is killed.
 
         Raises
         ------
         DiskFullError
-            There is no room for it; the file can still be finished.
+            The disk has no space for them; the file can still be finished.
         """
         self._chunks += self._pending > 0
         self._pending = 0
-        self.file.make_room(4 * CHUNK + PER_CHUNK * self._chunks)
+        self.file.make_room(4 * CHUNK_BYTES + INDEX_BYTES_PER_CHUNK * self._chunks)
         self._writer.flush()
 
     def next_part(self, facts: Mapping[str, str]) -> None:
-        """Finish this file with ``facts`` and go on in the next one."""
+        """Finish this file with ``facts`` and continue in the next one."""
         self.finish(facts)
         self._open()
 
     def finish(self, facts: Mapping[str, str]) -> None:
-        """Write the end of the file; ``facts`` are added to the record ``capture``. Nothing
-        where that is done."""
+        """Write the end of the file; ``facts`` are added to the record ``capture``.
+
+        A second call has no effect.
+        """
         if not self._is_open:
             return
         self._is_open = False
@@ -197,7 +213,7 @@ class Parts:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The parts of ``path`` that are there."""
+    """Return the existing parts of ``path``."""
     name = re.compile(re.escape(path.stem) + r"-\d{3,}" + re.escape(path.suffix))
     if not path.parent.is_dir():
         return []
@@ -207,7 +223,7 @@ def parts_of(path: Path) -> list[Path]:
 def check_outputs(
     path: Path, *, numbered: bool, overwrite: bool, inputs: Sequence[Path] = ()
 ) -> None:
-    """Refuse outputs that are there, or are among ``inputs``, before a port is opened.
+    """Refuse outputs that exist, or are among ``inputs``, before a port is opened.
 
     Raises
     ------
@@ -221,3 +237,194 @@ def check_outputs(
                 "the output is one of the inputs", file=each, hint="Choose another -o"
             )
         check_output(each, overwrite=overwrite)
+
+
+RESERVED_BYTES = 4 << 20
+"""Space of the disk that is allocated in advance, so that a recording can still be finished when
+the disk is full."""
+
+FULL_DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of the system if the disk, a quota, or the largest file of a file system is full."""
+
+_KEEP_SIZE = 1
+"""FALLOC_FL_KEEP_SIZE: the size of the file does not change."""
+
+
+class DiskFullError(LocatkError, OSError):
+    """The disk is full; the data written before are complete."""
+
+
+class LiveFile:
+    """Unbuffered binary file that is only appended to.
+
+    Parameters
+    ----------
+    path : path
+        Must not exist, unless ``overwrite``.
+    overwrite : bool
+        Replace it. The old file is removed at once.
+
+    Raises
+    ------
+    OutputExistsError, MissingDataError, LocatkError
+        It exists, its folder does not exist, or the system refuses.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        check_output(path, overwrite=overwrite)
+        # As in atomic_write, the target of a link is replaced, not the link.
+        self.path = Path(os.path.realpath(path) if os.path.islink(path) else path)
+        try:
+            if overwrite:
+                check_idle(self.path)
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(self.path)
+            self._file = open(self.path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
+            _lock(self._file.fileno())
+        except LocatkError:
+            raise
+        except OSError as error:
+            raise LocatkError(f"cannot write: {error.strerror or error}", file=path) from error
+        self._size = 0
+        self._allocated_end = 0
+        self._can_allocate = sys.platform == "linux"
+
+    def write(self, data: bytes | bytearray | memoryview) -> int:
+        """Append all of ``data``, or nothing of it.
+
+        Raises
+        ------
+        DiskFullError
+            The disk is full.
+        OSError
+            Any other error of the disk.
+        """
+        view = memoryview(data)
+        done = 0
+        try:
+            while done < len(view):
+                done += self._file.write(view[done:])
+        except BaseException as error:
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size)
+                self._file.seek(self._size)
+            if isinstance(error, OSError) and error.errno in FULL_DISK_ERRNOS:
+                raise DiskFullError(_describe_errno(error.errno), file=self.path) from error
+            raise
+        self._size += done
+        return done
+
+    def make_room(self, more: int) -> None:
+        """Allocate ``more`` bytes beyond the present end, and :data:`RESERVED_BYTES`.
+
+        On file systems without allocation this has no effect.
+
+        Raises
+        ------
+        DiskFullError
+            The disk is full; space allocated before remains available to finish the file.
+        """
+        wanted = self._size + more
+        if not self._can_allocate or wanted + RESERVED_BYTES // 2 <= self._allocated_end:
+            return
+        number = _fallocate(self._file.fileno(), self._size, more + RESERVED_BYTES)
+        if number in FULL_DISK_ERRNOS:
+            raise DiskFullError(_describe_errno(number), file=self.path)
+        if number == 0:
+            self._allocated_end = wanted + RESERVED_BYTES
+        elif number != errno.EINTR:
+            self._can_allocate = False
+
+    def free(self) -> int | None:
+        """Return the free bytes of the disk; None if they are unknown."""
+        try:
+            status = os.fstatvfs(self._file.fileno())
+        except (AttributeError, OSError, ValueError):
+            try:
+                return shutil.disk_usage(self.path.parent).free
+            except OSError:
+                return None
+        return status.f_bavail * status.f_frsize
+
+    def is_there(self) -> bool:
+        """Return whether the file has a name; it may have been removed or replaced."""
+        try:
+            return os.fstat(self._file.fileno()).st_nlink > 0
+        except (OSError, ValueError):
+            return False
+
+    def tell(self) -> int:
+        """Return the number of bytes written."""
+        return self._size
+
+    def flush(self) -> None:
+        """Do nothing, because the file is unbuffered."""
+
+    def sync(self) -> None:
+        """Force the data to the disk; slow, therefore called from a separate thread."""
+        if not self._file.closed:
+            with contextlib.suppress(OSError, ValueError):  # Closed meanwhile, or not supported.
+                getattr(os, "fdatasync", os.fsync)(self._file.fileno())
+
+    def close(self) -> None:
+        """Release the allocated space, force the data to the disk and close."""
+        if self._file.closed:
+            return
+        with contextlib.suppress(OSError):
+            self._file.truncate(self._size)
+        with contextlib.suppress(OSError):
+            os.fsync(self._file.fileno())
+        self._file.close()
+
+
+def check_idle(path: Path) -> None:
+    """Refuse a file that another capture is writing.
+
+    Raises
+    ------
+    OutputExistsError
+    """
+    try:
+        with open(path, "rb") as stream:
+            busy = not _lock(stream.fileno())
+    except FileNotFoundError:
+        return
+    if busy:
+        raise OutputExistsError(
+            f"output {str(path)!r} is being recorded by another program",
+            hint="End that program, or choose another name",
+        )
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock a file until it is closed; return False if another process has the lock."""
+    try:
+        import fcntl
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True  # The file system has no locks.
+    return True
+
+
+def _describe_errno(number: int | None) -> str:
+    return "the file has the largest size possible" if number == errno.EFBIG else "no space left"
+
+
+def _fallocate(descriptor: int, offset: int, length: int) -> int:
+    """Allocate space on the disk without changing the file's size; return an errno or 0.
+
+    fallocate(2) with FALLOC_FL_KEEP_SIZE, which Python's ``os.posix_fallocate`` does not support.
+    """
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        call = libc.fallocate64 if hasattr(libc, "fallocate64") else libc.fallocate
+    except (OSError, AttributeError):
+        return errno.ENOSYS
+    call.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64]
+    call.restype = ctypes.c_int
+    return ctypes.get_errno() if call(descriptor, _KEEP_SIZE, offset, length) else 0

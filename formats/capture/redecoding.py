@@ -1,4 +1,4 @@
-"""The raw bytes of a recording, decoded again: with another device, or a better decoder."""
+"""Repeated decoding of the raw bytes of a recording, with another device or a newer decoder."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from pathlib import Path
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import FormatError
-from locatk.formats.capture.device_messages import Stamped
-from locatk.formats.capture.ingestion import AUTO, SerialIntake
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.statistics import RECORD, Totals
+from locatk.formats.capture.ingestion import AUTO, SerialIntake, StampedMessage
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.statistics import RECORD, CaptureStatistics
 from locatk.formats.devices.decoder import Options
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.mcap_file import CHANNELS_RECORD, SESSION_RECORD
@@ -22,26 +21,26 @@ from locatk.formats.sessions.writer import SessionWriter
 
 TOPIC = "/serial/"
 
-TURN_NS = 20_000_000
-"""Reads within so much time are decoded at once."""
+BATCH_NS = 20_000_000
+"""Time span of reads that are decoded together."""
 
 
 @dataclass(frozen=True)
-class Decoded:
-    """What came of the raw bytes.
+class RedecodingResult:
+    """Result of the repeated decoding.
 
     Attributes
     ----------
     devices : dict of str to str
-        Name of the device in the session to what it was taken for.
-    totals : dict of str to Totals
-        By name.
+        Device that the decoder assumed, by name of the device in the session.
+    totals : dict of str to CaptureStatistics
+        Statistics by name.
     remarks : list of str
     system : str
     """
 
     devices: dict[str, str]
-    totals: dict[str, Totals]
+    totals: dict[str, CaptureStatistics]
     remarks: list[str]
     system: str
 
@@ -54,32 +53,31 @@ def decode(
     options: Options | None = None,
     artifacts: Mapping[str, str] | None = None,
     overwrite: bool = False,
-) -> Decoded:
-    """Write a session of the raw bytes of ``path`` and of what a decoder makes of them now.
+) -> RedecodingResult:
+    """Write a session with the raw bytes of ``path`` and new records of a decoder.
 
-    Times, attachments and metadata stay; records that were decoded before are left out.
+    Times, attachments and metadata are kept; records that were decoded before are left out.
 
     Parameters
     ----------
     path, output : path
     device : str, optional
-        What sent the bytes; what the recording says where it is left out, else what they
-        look like.
+        Device that sent the bytes; by default that in the metadata, or else identified from them.
     options : Options, optional
-        For the decoder.
+        Options of the decoder.
     artifacts : mapping of str to str, optional
-        Attachments (name to text) to add, or to put in the place of those that are there.
+        Attachments (name to text) to add, or to replace existing ones.
     overwrite : bool
         Replace an existing file.
 
     Raises
     ------
     MissingDataError, FormatError
-        It is no session, is damaged, or holds no raw bytes.
+        The input is no session, is damaged, or contains no raw bytes.
     InputError
         There is no such device.
     OutputExistsError
-        ``output`` is there.
+        ``output`` exists.
     """
     session = Session.open(path)
     topics = session.topics(TOPIC, SerialChunk.DESCRIPTOR.full_name)
@@ -87,18 +85,18 @@ def decode(
         raise FormatError(
             f"no raw bytes (topic {TOPIC}<device>)",
             file=session.path,
-            hint="Give a recording of `locatk capture`; `locatk emulate` sends what others hold",
+            hint="Give a recording of `locatk capture`; `locatk emulate` encodes other sessions",
         )
-    said = session.metadata().get(RECORD, {})
-    name = device or said.get("device") or AUTO
+    recorded = session.metadata().get(RECORD, {})
+    name = device or recorded.get("device") or AUTO
     attached = {**_attached(session), **(artifacts or {})}
     intakes = {
         topic: SerialIntake(
             topic.removeprefix(TOPIC),
-            said.get("port", ""),
+            recorded.get("port", ""),
             name,
             options,
-            baud=int(said["baud"]) if said.get("baud", "").isdigit() else None,
+            baud=int(recorded["baud"]) if recorded.get("baud", "").isdigit() else None,
             artifacts=attached,
         )
         for topic in topics
@@ -119,27 +117,29 @@ def decode(
                 writer.metadata(key, record)
         decoded = _decoded(intakes)
         writer.metadata(SESSION_RECORD, {"system": decoded.system})
-        writer.metadata(RECORD, _facts(said, intakes, decoded, Path(session.path).name))
+        writer.metadata(RECORD, _facts(recorded, intakes, decoded, Path(session.path).name))
     return decoded
 
 
 def _facts(
-    said: Mapping[str, str],
+    recorded: Mapping[str, str],
     intakes: Mapping[str, SerialIntake],
-    decoded: Decoded,
+    decoded: RedecodingResult,
     source: str,
 ) -> dict[str, str]:
-    """Entries of the record ``capture``: what the port has counted as it was, the rest anew."""
-    fresh: dict[str, str] = {}
+    """Return the entries of the record ``capture``: those of the port unchanged, the others new."""
+    new: dict[str, str] = {}
     for totals in decoded.totals.values():
-        fresh |= {key: text for key, text in totals.texts().items() if key not in LINE}
+        new |= {key: text for key, text in totals.texts().items() if key not in LINE_STATISTICS}
     for intake in intakes.values():
-        fresh |= intake.clocks()
-    stays = {key: text for key, text in said.items() if not key.startswith(("samples:", "tick_"))}
-    return {**stays, **fresh, "device": ", ".join(decoded.devices.values()), "decoded_from": source}
+        new |= intake.clocks()
+    kept = {
+        key: text for key, text in recorded.items() if not key.startswith(("samples:", "tick_"))
+    }
+    return {**kept, **new, "device": ", ".join(decoded.devices.values()), "decoded_from": source}
 
 
-LINE = (
+LINE_STATISTICS = (
     "gaps",
     "gap_s",
     "silences",
@@ -149,7 +149,7 @@ LINE = (
     "high_water_bytes",
     "clock_step_s",
 )
-"""Entries of the metadata that the port has counted, not the decoder."""
+"""Entries of the metadata that are counted by the port, not by the decoder."""
 
 
 def _attached(session: Session) -> dict[str, str]:
@@ -161,61 +161,61 @@ def _attached(session: Session) -> dict[str, str]:
     return texts
 
 
-def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator[Stamped]:
-    """Raw bytes, records and the log of the recorder, in the order of the file."""
-    waiting: dict[str, list[Arrived]] = {topic: [] for topic in intakes}
-    begun = 0
+def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator[StampedMessage]:
+    """Yield raw bytes, records and log messages of the recorder, in the order of the file."""
+    waiting: dict[str, list[ReceivedData]] = {topic: [] for topic in intakes}
+    start_ns = 0
     expected = dict.fromkeys(intakes, 0)
     for topic, time_ns, payload in session.messages([*intakes, "/log"]):
         if topic == "/log":
             line = Log.FromString(payload)
-            if line.name.startswith("locatk"):  # not of a device: those are decoded again
-                yield from _turn(intakes, waiting)
-                yield Stamped("/log", line, time_ns, time_ns)
+            if line.name.startswith("locatk"):  # not of a device: those are decoded is_reconnect
+                yield from _decode_waiting(intakes, waiting)
+                yield StampedMessage("/log", line, time_ns, time_ns)
             continue
         chunk = SerialChunk.FromString(payload)
         hole = chunk.byte_offset != expected[topic]
-        again = chunk.byte_offset != 0 and (chunk.opened or hole)
-        if again or time_ns - begun >= TURN_NS:
-            yield from _turn(intakes, waiting)
-            begun = time_ns
+        is_reconnect = chunk.byte_offset != 0 and (chunk.opened or hole)
+        if is_reconnect or time_ns - start_ns >= BATCH_NS:
+            yield from _decode_waiting(intakes, waiting)
+            start_ns = time_ns
         if hole:
             intakes[topic].skip_to(chunk.byte_offset)
-        if again:
+        if is_reconnect:
             yield from intakes[topic].restart(opened=chunk.opened)
         expected[topic] = chunk.byte_offset + len(chunk.data)
-        waiting[topic].append(Arrived(time_ns, chunk.data, len(chunk.data)))
-    yield from _turn(intakes, waiting)
+        waiting[topic].append(ReceivedData(time_ns, chunk.data, len(chunk.data)))
+    yield from _decode_waiting(intakes, waiting)
     for intake in intakes.values():
         yield from intake.finish()
 
 
-def _turn(
-    intakes: Mapping[str, SerialIntake], waiting: dict[str, list[Arrived]]
-) -> Iterator[Stamped]:
-    for topic, arrived in waiting.items():
-        if arrived:
-            yield from intakes[topic].take(arrived)
-            yield from intakes[topic].turn(arrived[-1].time_ns)
+def _decode_waiting(
+    intakes: Mapping[str, SerialIntake], waiting: dict[str, list[ReceivedData]]
+) -> Iterator[StampedMessage]:
+    for topic, received in waiting.items():
+        if received:
+            yield from intakes[topic].take(received)
+            yield from intakes[topic].turn(received[-1].time_ns)
             waiting[topic] = []
 
 
-def _decoded(intakes: Mapping[str, SerialIntake]) -> Decoded:
+def _decoded(intakes: Mapping[str, SerialIntake]) -> RedecodingResult:
     system = next((intake.system for intake in intakes.values() if intake.system), "")
     devices: dict[str, str] = {}
-    totals: dict[str, Totals] = {}
+    totals: dict[str, CaptureStatistics] = {}
     remarks: list[str] = []
     for topic, intake in intakes.items():
         name = topic.removeprefix(TOPIC)
         devices[name] = intake.device.name if intake.device else ""
-        totals[name] = Totals()
+        totals[name] = CaptureStatistics()
         intake.count(totals[name])
         remarks += intake.remarks()
-    return Decoded(devices, totals, remarks, system)
+    return RedecodingResult(devices, totals, remarks, system)
 
 
-def losses(decoded: Decoded) -> list[str]:
-    """What the decoder could not use, one phrase each."""
+def losses(decoded: RedecodingResult) -> list[str]:
+    """Return one phrase for each kind of data that the decoder could not use."""
     return [
         phrase
         for name, totals in decoded.totals.items()

@@ -1,5 +1,4 @@
-"""One recording from what the user wants to the files: checks first, then the port, then the
-first byte on the disk."""
+"""Start of a recording: checks of the request, opening of the port, first byte of the file."""
 
 from __future__ import annotations
 
@@ -16,15 +15,19 @@ from pathlib import Path
 from locatk.core.errors import InputError, LocatkError
 from locatk.formats.capture import attachments as artifacts
 from locatk.formats.capture import ports, replay
-from locatk.formats.capture.host_clock import HostClock
+from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import AUTO, CameraIntake, Intake, SerialIntake
-from locatk.formats.capture.live_file import DiskFullError
-from locatk.formats.capture.reader_thread import BACKOFF_S, Receiver
+from locatk.formats.capture.links import Link, Port, SourceError
+from locatk.formats.capture.reader_thread import BACKOFF_S, PortReader
 from locatk.formats.capture.recorder import Limits, Recorder
-from locatk.formats.capture.recording_files import Content, Parts, check_outputs
-from locatk.formats.capture.source import Link, Port, SourceError
-from locatk.formats.capture.statistics import Recorded, Status
-from locatk.formats.devices import device as device_named
+from locatk.formats.capture.recording_files import (
+    DiskFullError,
+    FileContent,
+    RecordingFiles,
+    check_outputs,
+)
+from locatk.formats.capture.statistics import CaptureStatus, RecordingResult
+from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Options
 
 CAMERA = "camera:"
@@ -32,8 +35,8 @@ NAME, CAMERA_NAME = "robot", "camera"
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What to record, and how; the options of ``locatk capture``."""
+class CaptureRequest:
+    """Options of ``locatk capture``."""
 
     port: str
     device: str
@@ -52,7 +55,7 @@ class Wanted:
 
     @property
     def is_camera(self) -> bool:
-        """Whether frames are recorded, not bytes."""
+        """Return whether frames are recorded instead of bytes."""
         return self.port.startswith(CAMERA)
 
     @property
@@ -62,112 +65,114 @@ class Wanted:
 
     @property
     def numbered(self) -> bool:
-        """Whether there may be several files."""
+        """Return whether there may be several files."""
         return self.limits.rotate_s is not None or self.limits.rotate_bytes is not None
 
 
 def record(
-    wanted: Wanted,
+    request: CaptureRequest,
     stop: threading.Event,
     *,
     tell: Callable[[str], None] = lambda text: None,
-    show: Callable[[Status], None] = lambda status: None,
+    show: Callable[[CaptureStatus], None] = lambda status: None,
     ready: Callable[[str], None] = lambda port: None,
     waiting: Callable[[str], None] = lambda port: None,
-) -> Recorded:
-    """Record until ``stop`` is set, a limit of ``wanted`` is reached or the source is at its
-    end.
+) -> RecordingResult:
+    """Record until ``stop`` is set, a limit is reached or the source ends.
 
     Parameters
     ----------
-    wanted : Wanted
+    request : CaptureRequest
     stop : threading.Event
     tell, show : callable
         See :class:`.recorder.Recorder`.
     ready : callable
         Takes the name of the port once it is open.
     waiting : callable
-        Takes what is wrong with a port that is waited for.
+        Takes the error of a port that is not yet available.
 
     Raises
     ------
     LocatkError
-        Something is wrong with what is wanted, an artifact, the output or the port; nothing
-        was written then.
+        The request, an artifact, the output or the port is invalid; no file was written.
     """
-    _check_name(wanted.device_name)
-    content = _artifacts(wanted)
+    _check_name(request.device_name)
+    content = _artifacts(request)
     check_outputs(
-        wanted.output,
-        numbered=wanted.numbered,
-        overwrite=wanted.overwrite,
-        inputs=[*wanted.artifacts, *_played(wanted.port)],
+        request.output,
+        numbered=request.numbered,
+        overwrite=request.overwrite,
+        inputs=[*request.artifacts, *_replayed_paths(request.port)],
     )
-    _check_disk(wanted.output.parent, wanted.limits.reserve_bytes)
+    _check_disk(request.output.parent, request.limits.reserve_bytes)
     clock = HostClock()
-    intake = _intake(wanted, content)
-    port = _port(wanted, clock)
-    link = _opened(port, wanted.wait_s, stop, waiting)
+    intake = _intake(request, content)
+    port = _port(request, clock)
+    link = _open_port(port, request.wait_s, stop, waiting)
     try:
         ready(port.name)
-        facts = _facts(wanted, port, clock)
-        parts = Parts(
-            wanted.output,
-            Content(facts, content, intake.declared),
-            numbered=wanted.numbered,
-            overwrite=wanted.overwrite,
+        facts = _facts(request, port, clock)
+        parts = RecordingFiles(
+            request.output,
+            FileContent(facts, content, intake.declared),
+            numbered=request.numbered,
+            overwrite=request.overwrite,
         )
     except BaseException:
         link.close()
         raise
-    receiver = Receiver(port, link, clock)
-    recorder = Recorder(receiver, intake, parts, clock, wanted.limits, tell=tell, show=show)
+    receiver = PortReader(port, link, clock)
+    recorder = Recorder(receiver, intake, parts, clock, request.limits, tell=tell, show=show)
     return recorder.run(stop)
 
 
-def _artifacts(wanted: Wanted) -> dict[str, str]:
-    """What goes into the session: of what is played what that holds, and what is given."""
-    played: dict[str, str] = {}
-    for path in _played(wanted.port):
-        with contextlib.suppress(LocatkError):  # none, or no session: the port will say
-            played |= artifacts.attachments([path])
-    return {**played, **artifacts.attachments(wanted.artifacts)}
+def _artifacts(request: CaptureRequest) -> dict[str, str]:
+    """Return the attachments: those of a replayed session, and those given."""
+    replayed: dict[str, str] = {}
+    for path in _replayed_paths(request.port):
+        with contextlib.suppress(
+            LocatkError
+        ):  # Not a session, or without artifacts: opening the port reports it.
+            replayed |= artifacts.attachments([path])
+    return {**replayed, **artifacts.attachments(request.artifacts)}
 
 
-def _opened(
+def _open_port(
     port: Port, wait_s: float, stop: threading.Event, waiting: Callable[[str], None]
 ) -> Link:
-    """Open a port, which may not be there for another ``wait_s``."""
+    """Open a port, and retry for up to ``wait_s``."""
     until = time.monotonic() + wait_s
-    told = False
+    is_reported = False
     while True:
         try:
             return port.open()
         except SourceError as error:
             if time.monotonic() >= until:
                 raise
-            if not told:
+            if not is_reported:
                 waiting(str(error))
-            told = True
+            is_reported = True
             if stop.wait(BACKOFF_S[1]):
                 raise
 
 
-def _played(port: str) -> list[Path]:
-    """The file that is played, whatever topic of it."""
+def _replayed_paths(port: str) -> list[Path]:
+    """Return the possible paths of a replayed file, with and without a topic."""
     if not port.startswith(replay.PREFIX):
         return []
-    place = port.removeprefix(replay.PREFIX).removeprefix("//")
-    return [Path(place), Path(place.rpartition("#")[0] or place)]
+    source = port.removeprefix(replay.PREFIX).removeprefix("//")
+    return [Path(source), Path(source.rpartition("#")[0] or source)]
 
 
 def _check_name(name: str) -> None:
     if not name or any(c.isspace() or c == "/" for c in name):
-        raise InputError(f"the name {name!r} cannot be in a topic", hint="Use letters and digits")
+        raise InputError(
+            f"the name {name!r} cannot be part of a topic", hint="Use letters and digits"
+        )
 
 
 def _check_disk(folder: Path, reserve: int) -> None:
-    """Refuse a folder that cannot be written, or a disk that is full already."""
+    """Refuse a folder that cannot be written, or a full disk."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -180,55 +185,57 @@ def _check_disk(folder: Path, reserve: int) -> None:
     free = shutil.disk_usage(folder).free
     if free <= reserve:
         raise DiskFullError(
-            f"only {free / 1e6:.0f} MB are free on the disk",
+            f"only {free / 1e6:.0f} MB of the disk are free",
             file=folder,
-            hint=f"Free some space, or choose a --reserve below {reserve / 1e6:.0f} MB",
+            hint=f"Free some space, or reduce --reserve below {reserve / 1e6:.0f} MB",
         )
 
 
-def _intake(wanted: Wanted, content: Mapping[str, str]) -> Intake:
-    if wanted.is_camera:
-        if wanted.device != AUTO:
+def _intake(request: CaptureRequest, content: Mapping[str, str]) -> Intake:
+    if request.is_camera:
+        if request.device != AUTO:
             raise InputError(
-                f"a camera is no {wanted.device}", hint="Leave out --device for a camera"
+                f"a camera is not a {request.device}", hint="Omit --device for a camera"
             )
-        return CameraIntake(wanted.device_name, wanted.image)
+        return CameraIntake(request.device_name, request.image)
     return SerialIntake(
-        wanted.device_name,
-        wanted.port,
-        wanted.device,
-        Options(columns=wanted.columns),
-        baud=wanted.baud,
+        request.device_name,
+        request.port,
+        request.device,
+        Options(columns=request.columns),
+        baud=request.baud,
         artifacts=content,
     )
 
 
-def _port(wanted: Wanted, clock: HostClock) -> Port:
-    if wanted.is_camera:
-        from locatk.formats.capture import camera  # OpenCV, which bytes do not need
+def _port(request: CaptureRequest, clock: HostClock) -> Port:
+    if request.is_camera:
+        from locatk.formats.capture import (
+            camera,
+        )  # OpenCV is slow to import, and not needed for bytes.
 
         return camera.port_of(
-            wanted.port.removeprefix(CAMERA),
+            request.port.removeprefix(CAMERA),
             clock=clock.now,
-            speed=wanted.speed,
-            format=wanted.image,
+            speed=request.speed,
+            format=request.image,
         )
-    known = None if wanted.device == AUTO else device_named(wanted.device)
-    baud = wanted.baud or (known.baud if known else 115_200)
-    return ports.port_of(wanted.port, baud=baud, speed=wanted.speed)
+    known = None if request.device == AUTO else find_device(request.device)
+    baud = request.baud or (known.baud if known else 115_200)
+    return ports.port_of(request.port, baud=baud, speed=request.speed)
 
 
-def _facts(wanted: Wanted, port: Port, clock: HostClock) -> dict[str, str]:
-    """What is known at the start, for the metadata record ``capture``."""
-    known = {} if wanted.is_camera or wanted.device == AUTO else {"device": wanted.device}
+def _facts(request: CaptureRequest, port: Port, clock: HostClock) -> dict[str, str]:
+    """Return the entries of the metadata record ``capture`` that are known at the start."""
+    known = {} if request.is_camera or request.device == AUTO else {"device": request.device}
     return {
         **port.describe(),
-        "port": wanted.port,
+        "port": request.port,
         **known,
-        "name": wanted.device_name,
+        "name": request.device_name,
         "started_ns": str(clock.now()),
         "host": platform.node(),
         "clock": "host, steady, set once from the wall clock",
-        **({"note": wanted.note} if wanted.note else {}),
-        **{f"meta:{key}": value for key, value in wanted.meta.items()},
+        **({"note": request.note} if request.note else {}),
+        **{f"meta:{key}": value for key, value in request.meta.items()},
     }

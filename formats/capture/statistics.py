@@ -1,5 +1,4 @@
-"""What a recording got, and what it lost: the numbers of the live line, of the metadata and
-of ``--json``."""
+"""Statistics of a recording, for the status line, the metadata and ``--json``."""
 
 from __future__ import annotations
 
@@ -12,29 +11,30 @@ RECORD = "capture"
 
 
 @dataclass
-class Totals:
-    """Counted since the start.
+class CaptureStatistics:
+    """Counts since the start.
 
     Attributes
     ----------
     bytes, frames, bad, lost, skipped, unknown : int
-        Of the decoder: :class:`locatk.formats.devices.decoder.Counts`; of a camera, ``frames``.
+        Counts of the decoder (:class:`locatk.formats.devices.decoder.Counts`); of a camera, only
+        ``bytes`` and ``frames``.
     gaps : int
-        How often the connection was lost.
+        Number of times the connection was lost.
     gap_s : float
-        For how long in all.
+        Total time without connection.
     silences : int
-        How often nothing came for longer than was allowed.
+        Number of times no data came for longer than allowed.
     overruns : int
-        Bytes that the kernel says a UART lost.
+        Bytes that the UART or the kernel's buffer lost, as counted by the kernel.
     dropped : int
-        Frames of a camera that came faster than they could be packed.
+        Frames of a camera that came faster than they could be encoded.
     line_errors : int
-        Bytes without a stop bit or of wrong parity, by the kernel.
+        Bytes without a stop bit or with wrong parity, as counted by the kernel.
     high_water_bytes : int
-        Most that waited between the port and the file.
+        Largest backlog between the port and the file.
     clock_step_s : float
-        By how much the wall clock was set meanwhile; the times here did not follow.
+        Time by which the wall clock was set meanwhile; the times of the recording did not change.
     samples : dict of str to int
         Records by topic.
     """
@@ -55,9 +55,8 @@ class Totals:
     clock_step_s: float = 0.0
     samples: dict[str, int] = field(default_factory=dict)
 
-    def since(self, before: Totals) -> Totals:
-        """What was counted since ``before``; the high water and the clock's step are not
-        counts and stay."""
+    def since(self, before: CaptureStatistics) -> CaptureStatistics:
+        """Return the counts since ``before``; the largest backlog and the clock step are kept."""
         kept = ("high_water_bytes", "clock_step_s", "samples")
         counted = {
             each.name: getattr(self, each.name) - getattr(before, each.name)
@@ -67,7 +66,7 @@ class Totals:
         samples = {
             topic: count - before.samples.get(topic, 0) for topic, count in self.samples.items()
         }
-        return Totals(
+        return CaptureStatistics(
             **counted,
             high_water_bytes=self.high_water_bytes,
             clock_step_s=self.clock_step_s,
@@ -75,13 +74,17 @@ class Totals:
         )
 
     def losses(self) -> list[str]:
-        """What was lost, one phrase each; empty where nothing was."""
+        """Return one phrase for each kind of loss."""
         counted = (
             (self.overruns, "byte overrun in the UART", "bytes overrun in the UART"),
             (self.dropped, "frame of the camera dropped", "frames of the camera dropped"),
             (self.line_errors, "byte with a line error", "bytes with line errors"),
             (self.bad, "bad frame", "bad frames"),
-            (self.lost, "frame missing by its number", "frames missing by their numbers"),
+            (
+                self.lost,
+                "frame missing by its sequence number",
+                "frames missing by their sequence numbers",
+            ),
         )
         lost = [f"{count} {one if count == 1 else more}" for count, one, more in counted if count]
         if self.gaps:
@@ -89,20 +92,22 @@ class Totals:
         return lost
 
     def doubts(self, device: str) -> list[str]:
-        """Why nothing, or little, could be made of what came from a device of this kind; ``""``
-        for a camera."""
+        """Return why no or few frames of the device were found in the data.
+
+        ``device`` is ``""`` for a camera.
+        """
         if not self.bytes:
-            return ["nothing was received"]
+            return ["no data were received"]
         if device == "raw":
             return []
         if not self.frames:
-            return [f"no frame of {device or 'a device that is known'} in {self.bytes} bytes"]
+            return [f"no frame of {device or 'a known device'} in {self.bytes} bytes"]
         if 2 * self.skipped > self.bytes:
-            return [f"{self.skipped} of {self.bytes} bytes are in no frame of {device}"]
+            return [f"{self.skipped} of {self.bytes} bytes are in no valid frame of {device}"]
         return []
 
     def texts(self) -> dict[str, str]:
-        """As entries of a metadata record."""
+        """Return the entries of a metadata record."""
         plain = asdict(self)
         samples = plain.pop("samples")
         return {
@@ -112,37 +117,36 @@ class Totals:
 
 
 @dataclass(frozen=True)
-class Status:
-    """How it goes, once a second."""
+class CaptureStatus:
+    """State of a recording, reported once per second."""
 
     elapsed_s: float
     away_s: float | None
-    """For how long the connection has been lost; None while it is there."""
+    """Time since the connection was lost; None while it is open."""
     bytes_per_s: float
     frames_per_s: float
-    totals: Totals
+    totals: CaptureStatistics
     file_bytes: int
     free_bytes: int | None
 
 
 @dataclass
-class Recorded:
-    """What came of a recording.
+class RecordingResult:
+    """Result of a recording.
 
     Attributes
     ----------
     paths : list of path
         The files, in their order.
     ended : str
-        Why: ``"stopped"``, ``"duration"``, ``"max-size"``, ``"end of the source"``, or what
-        went wrong.
+        Reason: ``"stopped"``, ``"duration"``, ``"max-size"``, ``"end of the source"``, or an error.
     rates : dict of str to float
-        Records a second by topic, from the first to the last.
+        Records per second by topic, between the first and the last.
     failed : bool
-        Whether it ended for something that went wrong.
+        It was ended by an error.
     """
 
-    totals: Totals
+    totals: CaptureStatistics
     paths: list[Path]
     device: str
     started_ns: int

@@ -1,7 +1,7 @@
-"""Devices: what comes over the wire from each, as records.
+"""Registry of the devices whose bytes locatk decodes, and sends when it emulates them.
 
-One module a device behind the contract of :mod:`.decoder`; open to others through the
-entry-point group ``locatk.devices``, whose entries point to a :class:`Device`.
+Each device is one module behind the contract of :mod:`.decoder`. Other packages add devices
+through the entry-point group ``locatk.devices``, whose entries point to a :class:`Device`.
 """
 
 from __future__ import annotations
@@ -9,71 +9,70 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from importlib.metadata import entry_points
+from typing import Any
 
 from locatk.core.errors import InputError
+from locatk.formats.devices.decoder import Decoder, Options, Recording, Stream
 
-if TYPE_CHECKING:
-    from locatk.formats.devices.decoder import Decoder, Options
-    from locatk.formats.devices.recording import Recording
-
-GROUP = "locatk.devices"
+ENTRY_POINT_GROUP = "locatk.devices"
 
 
 @dataclass(frozen=True)
 class Device:
-    """A kind of device, as the user names it.
+    """Kind of device, with the callables that decode and encode its bytes.
 
     Attributes
     ----------
     name : str
-    short : str
-        What comes over the wire, for the help.
+        Value of ``--device``.
+    summary : str
+        Format of its bytes, in one line.
     baud : int
-        Of its port, unless the user says otherwise.
+        Baud rate of its port, unless the user gives another one.
     decoder : str
-        ``"module:name"`` of a callable that takes :class:`.decoder.Options` and gives a
+        ``"module:name"`` of a callable that takes :class:`.decoder.Options` and returns a
         :class:`.decoder.Decoder`.
     encoder : str
-        ``"module:name"`` of a callable that takes a :class:`.recording.Recording` and
-        yields (time in ns, bytes) as the device would send them; ``""`` for none.
+        ``"module:name"`` of a callable that takes a :class:`.decoder.Recording` and yields
+        (time in ns, bytes) as the device would send them; ``""`` if there is none.
     artifacts : str
-        ``"module:name"`` of a callable that gives the artifacts to attach where the user
-        gives none of the name: a mapping of file name to text, from the sensors of a
-        :class:`.decoder.Stream`; ``""`` for none.
+        ``"module:name"`` of a callable that takes a :class:`.decoder.Stream` and returns
+        artifacts (file name to text) that are attached if the user gives none of that name;
+        ``""`` if there is none.
     """
 
     name: str
-    short: str
+    summary: str
     baud: int
     decoder: str
     encoder: str = ""
     artifacts: str = ""
 
-    def decode(self, options: Options) -> Decoder:
-        """A decoder at the start of a stream of bytes."""
+    def create_decoder(self, options: Options) -> Decoder:
+        """Return a decoder at the start of a byte stream."""
         decoder: Decoder = _load(self.decoder)(options)
         return decoder
 
     def encode(self, recording: Recording) -> Iterator[tuple[int, bytes]]:
-        """(time in ns, bytes) of a recording, as the device would send it.
+        """Return (time in ns, bytes) of a recording, as the device would send it.
 
         Raises
         ------
         InputError
-            Nobody knows how, or the recording holds nothing that this device sends.
+            The device has no encoder, or the recording contains nothing that it sends.
         """
         if not self.encoder:
             raise InputError(f"no encoder of the device {self.name!r}")
         frames: Iterator[tuple[int, bytes]] = _load(self.encoder)(recording)
         return frames
 
-    def attached(self, stream: Any) -> dict[str, str]:
-        """Artifacts of a stream that are known without being told."""
+    def default_artifacts(self, stream: Stream) -> dict[str, str]:
+        """Return the artifacts of a stream that follow from the device: file name to text."""
         if not self.artifacts:
             return {}
-        known: dict[str, str] = _load(self.artifacts)(stream)
-        return known
+        artifacts: dict[str, str] = _load(self.artifacts)(stream)
+        return artifacts
 
 
 DEVICES = {
@@ -81,26 +80,25 @@ DEVICES = {
     for device in (
         Device(
             "locatk",
-            "frames of the firmware in docs/firmware: COBS, CRC, sequence, ticks",
+            "frames of the firmware in docs/firmware: COBS, CRC, sequence number, ticks",
             115_200,
             "locatk.formats.devices.locatk_frames.decoder:FrameDecoder",
             "locatk.formats.devices.locatk_frames.decoder:encode",
         ),
         Device(
             "polaris-array",
-            "published Polaris firmware: 27 or 9 float32 a sample",
+            "published Polaris firmware: 27 or 9 float32 per sample",
             115_200,
-            "locatk.formats.devices.float32.arrays:PolarisDecoder",
-            "locatk.formats.devices.float32.arrays:encode_polaris",
-            "locatk.formats.devices.float32.arrays:polaris_artifacts",
+            "locatk.formats.devices.float32.decoder:PolarisDecoder",
+            "locatk.formats.devices.float32.decoder:encode_polaris",
+            "locatk.formats.devices.float32.decoder:polaris_artifacts",
         ),
         Device(
             "magx-array",
-            "MagX firmware: 25 float32 a sample",
+            "MagX firmware: 25 float32 per sample",
             115_200,
-            "locatk.formats.devices.float32.arrays:MagxDecoder",
-            "locatk.formats.devices.float32.arrays:encode_magx",
-            "locatk.formats.devices.float32.arrays:magx_artifacts",
+            "locatk.formats.devices.float32.decoder:MagxDecoder",
+            "locatk.formats.devices.float32.decoder:encode_magx",
         ),
         Device(
             "lighthouse-deck",
@@ -126,36 +124,34 @@ DEVICES = {
         ),
         Device(
             "raw",
-            "bytes that are kept as they are",
+            "any bytes, stored without decoding",
             115_200,
             "locatk.formats.devices.raw:RawDecoder",
         ),
     )
 }
-"""Name to device. ``auto`` is none of them: see :mod:`.identify`."""
+"""Built-in devices by name. ``auto`` is not a device: see :mod:`.identification`."""
 
 
-def device(name: str) -> Device:
-    """The device of this name, of locatk or of another package.
+def find_device(name: str) -> Device:
+    """Return the device of this name, built in or of another package.
 
     Raises
     ------
     InputError
-        There is none.
+        There is no such device, or it cannot be loaded.
     """
     if name in DEVICES:
         return DEVICES[name]
-    from importlib.metadata import entry_points
-
-    for entry in entry_points(group=GROUP, name=name):
+    for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
         try:
-            found = entry.load()
-        except Exception as error:  # of another package
+            device = entry.load()
+        except Exception as error:  # Code of another package may raise anything.
             raise InputError(f"the device {name!r} cannot be loaded ({error})") from error
-        if not isinstance(found, Device):
-            raise InputError(f"the device {name!r} of {entry.value} is no Device")
-        return found
-    others = sorted(entry.name for entry in entry_points(group=GROUP))
+        if not isinstance(device, Device):
+            raise InputError(f"the device {name!r} of {entry.value} is not a Device")
+        return device
+    others = sorted(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))
     raise InputError(
         f"no device {name!r}", hint=f"Known devices: {', '.join([*DEVICES, *others])}, auto"
     )
@@ -163,5 +159,5 @@ def device(name: str) -> Device:
 
 def _load(target: str) -> Callable[..., Any]:
     module, _, name = target.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return found
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function

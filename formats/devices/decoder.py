@@ -1,25 +1,39 @@
-"""What a device says over a wire: the contract between bytes and records.
+"""Contract of a device: bytes to records (decoder), and recordings to bytes (encoder).
 
-A decoder takes bytes as they come, in pieces of any size, and gives records in batches;
-whatever the pieces, the records are the same. It knows no clock: a record says after
-which byte it was complete, and the session knows when that byte arrived.
+A decoder takes a byte stream in pieces of any size and returns records in batches. The
+records do not depend on how the stream is cut. A decoder has no clock: each record states
+after which byte it was complete, and the capture knows when that byte arrived.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.landmarks.halls import HallSamples
+from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.polaris.array import Samples
+from locatk.core.trajectory import Trajectory
+
 KINDS = ("magnetometers", "halls", "lighthouse", "captures", "odometry", "readings", "log")
-"""Kinds of records; :mod:`locatk.formats.capture.device_messages` says what becomes of each."""
+"""Kinds of records; :mod:`locatk.formats.capture.ingestion` converts each to messages."""
 
 
 @dataclass(frozen=True)
 class Ticks:
-    """A device's clock: how fast it counts, and after how many bits it starts again."""
+    """Tick counter of a device.
+
+    Attributes
+    ----------
+    hz : float
+        Nominal frequency.
+    bits : int
+        Width; the counter wraps after ``2**bits`` ticks.
+    """
 
     hz: float
     bits: int = 64
@@ -27,21 +41,21 @@ class Ticks:
 
 @dataclass(frozen=True)
 class Stream:
-    """Records of one kind, of one of the devices behind a port.
+    """Identity of a stream of records: their kind, and the device behind the port.
 
     Attributes
     ----------
     kind : str
         One of :data:`KINDS`.
     node : str
-        Which of the devices behind the port; ``""`` where there is only one.
+        Name of the device behind the port; ``""`` if there is only one.
     sensors : int
-        Of ``magnetometers`` and ``halls``: how many.
+        Number of sensors, of ``magnetometers`` and ``halls``.
     names : tuple of str
-        Of ``readings``: names of the values; of ``halls``: names of the sensors, where the
-        device tells.
+        Names of the values, of ``readings``; names of the sensors, of ``halls``, if the device
+        sends them.
     ticks : Ticks or None
-        The clock of :attr:`Batch.tick`.
+        Counter of :attr:`Batch.tick`.
     """
 
     kind: str
@@ -53,19 +67,20 @@ class Stream:
 
 @dataclass(frozen=True)
 class Batch:
-    """Records of one stream, in the order in which they came.
+    """Records of one stream, in the order of their arrival.
 
     Attributes
     ----------
     stream : Stream
     end : (n,) int64 ndarray
-        Bytes fed up to and with the last byte of each record's frame; never descending.
+        Number of bytes fed up to and including the last byte of each record's frame; never
+        descending.
     columns : dict of str to ndarray
-        What was measured, (n,) or (n, width), in SI:
+        Values, (n,) or (n, width), in SI units:
 
         ``magnetometers``
-            ``b_tesla`` (n, 3 N): x, y, z of each sensor, in the array's axes.
-            ``temperature_celsius`` (n,), where the device tells.
+            ``b_tesla`` (n, 3 N): x, y, z of each sensor, along the axes of the array.
+            ``temperature_celsius`` (n,), if the device sends it.
         ``halls``
             ``b_tesla`` (n, N), positive upward.
         ``lighthouse``
@@ -82,9 +97,9 @@ class Batch:
             ``level`` (n,) int: 1 debug, 2 info, 3 warning, 4 error, 5 fatal, as in
             ``foxglove.Log``; ``text`` (n,) object array of str.
     tick : (n,) int64 ndarray or None
-        The device's clock as received, when the record was measured.
+        Tick counter of the device at the measurement, as received.
     sequence : (n,) int64 ndarray or None
-        The device's counter of samples or frames, as received.
+        Sequence number of the sample or frame, as received.
     """
 
     stream: Stream
@@ -99,23 +114,23 @@ class Batch:
 
 @dataclass
 class Counts:
-    """What became of the bytes.
+    """Statistics of a decoder.
 
     Attributes
     ----------
     bytes : int
-        Fed so far.
+        Bytes fed.
     frames : int
-        Whole and right.
+        Complete and valid frames.
     bad : int
-        Wrong: checksum, length, or content that cannot be.
+        Invalid frames: wrong checksum, length or content.
     lost : int
-        Missing between two good ones, as their sequence numbers tell.
+        Frames missing between two valid ones, by their sequence numbers.
     skipped : int
-        Bytes that belong to no good frame; those before the first are not counted, as
-        nobody starts to listen at the start of a frame.
+        Bytes outside of valid frames. Bytes before the first valid frame are not counted,
+        because reception rarely begins at the start of a frame.
     unknown : int
-        Of the ``frames``: those of a type that this version does not know.
+        Those of ``frames`` whose type this version does not know.
     """
 
     bytes: int = 0
@@ -127,42 +142,55 @@ class Counts:
 
 
 class Decoder(Protocol):
-    """Bytes in, records out.
+    """Converts a byte stream to records.
 
     Attributes
     ----------
     counts : Counts
     remarks : list of str
-        What must be known to use the records, said once: an assumption, a doubt. Whoever
-        feeds takes them out.
+        Facts that a user of the records must know, such as an assumption; each is added once.
+        The caller removes them.
     """
 
     counts: Counts
     remarks: list[str]
 
     def feed(self, data: bytes, *, pause: bool = False) -> list[Batch]:
-        """Take the next bytes and give the records that they complete.
+        """Return the records that the next bytes complete.
 
-        ``pause`` says that the line was silent before them, for longer than between the
-        bytes of a frame.
+        ``pause`` states that the line was silent before these bytes, for longer than between
+        the bytes of a frame.
         """
 
     def restart(self) -> list[Batch]:
-        """The connection was lost and is there again: what is half received is dropped, and
-        what the device counted while nobody listened is not :attr:`Counts.lost`."""
+        """Discard a partial frame after a reconnect, and return records that were held back.
+
+        Frames that the device sent while it was disconnected do not count as
+        :attr:`Counts.lost`.
+        """
 
     def finish(self) -> list[Batch]:
-        """No more bytes: give what was held back."""
+        """Return the records that were held back, at the end of the byte stream."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user told of a device.
+    """Options of a decoder, as given by the user.
 
     Attributes
     ----------
     columns : tuple of str
-        ``lines``: names of the values of a line, in their order.
+        Names of the values of a line, in their order; of ``lines``.
     """
 
     columns: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Observations of a session, as input of an encoder; empty or None if it has none."""
+
+    samples: Sequence[Samples] = ()
+    halls: Sequence[HallSamples] = ()
+    sweeps: Sweeps | None = None
+    odometry: Sequence[Trajectory] = ()

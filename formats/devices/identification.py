@@ -1,10 +1,11 @@
-"""Which device speaks: all that are known listen to the first bytes.
+"""Identification of an unknown device from its first bytes, with the decoders of all devices.
 
-What a decoder makes of the bytes of another device is little, and much is bad or skipped.
-Frames with a checksum come right by chance once in 65536 times: a few are proof. Others
-must be many and leave out almost nothing, and must be far less where the same bytes are in
-a random order: zeros are zeros in any order, and whatever fits them says nothing. Lines
-must be text. A decoder that has doubts is not sure of its device.
+A decoder makes few records of the bytes of another device, and many of them are bad or skipped.
+Frames with a 16-bit checksum are valid by chance once in 65,536 times, so that a few are proof.
+Frames without a checksum must be many and leave out almost nothing, and there must be far fewer
+of them in a random permutation of the same bytes: zeros are zeros in any order, and frames that
+zeros satisfy prove nothing. Lines must be printable text. A decoder with remarks is not certain
+of its device.
 """
 
 from __future__ import annotations
@@ -15,53 +16,57 @@ from importlib.metadata import entry_points
 
 import numpy as np
 
-from locatk.formats.devices import DEVICES, GROUP, Device
+from locatk.formats.devices import DEVICES, ENTRY_POINT_GROUP, Device
 from locatk.formats.devices.decoder import Batch, Decoder, Options
 
-LISTEN_S = 3.0
-"""Seconds after which whoever listens should :meth:`Identifier.settle`."""
+MAX_IDENTIFICATION_S = 3.0
+"""Time after which the caller should :meth:`Identifier.settle`."""
 
-LARGEST = 1 << 17
-"""Bytes after which it is settled anyway."""
+MAX_BYTES = 1 << 17
+"""Bytes after which the identification ends in any case."""
 
-PIECE = 512
-"""Bytes that are listened to at a time: the first frame is placed so exactly."""
+PIECE_BYTES = 512
+"""Bytes fed at a time, which is the resolution of the position of the first frame."""
 
-PATIENCE = 8192
+MAX_HELD_BACK_BYTES = 8192
 """Bytes that a decoder may hold back, or that one frame may have."""
 
-CHECKED = ("locatk", "dotbot-gateway")
+CHECKSUM_DEVICES = ("locatk", "dotbot-gateway")
 """Devices whose frames have a checksum."""
 
-MARKS = {"lighthouse-deck": b"\xff" * 12}
-"""What must be among the bytes of a device beside its frames."""
+REQUIRED_BYTES = {"lighthouse-deck": b"\xff" * 12}
+"""Byte sequences that a device sends besides its frames."""
 
-VALUES = 8
-"""So many different bytes say something."""
+MIN_DISTINCT_BYTES = 8
+"""Streams of fewer different byte values prove nothing."""
 
-ONE_VALUE = 0.7
-"""A larger share of one byte says nothing, whatever stands between."""
+MAX_BYTE_FRACTION = 0.7
+"""Streams with a larger fraction of one byte value prove nothing."""
 
-TEXT = "lines"
-NOTHING = "raw"
+MIN_PRINTABLE_FRACTION = 0.8
+"""Fraction of printable characters in text."""
 
-_PRINTED = bytes([*b"\t\n\r\x1b", *range(0x20, 0x7F)])
+TEXT_DEVICE = "lines"
+UNKNOWN_DEVICE = "raw"
 
-SURE, LIKELY, NONE = "sure", "likely", "none"
+_PRINTABLE = bytes([*b"\t\n\r\x1b", *range(0x20, 0x7F)])
+
+CERTAIN, LIKELY, UNKNOWN = "sure", "likely", "none"
+"""Values of :attr:`Verdict.confidence`."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a device was taken for.
+    """Result of the identification.
 
     Attributes
     ----------
     device : str
-        Its name; ``"raw"`` where the bytes fit none.
+        Name of the device; ``"raw"`` if the bytes match none.
     confidence : str
-        ``"sure"``, ``"likely"``, or ``"none"`` where they fit none.
+        ``"sure"``, ``"likely"``, or ``"none"`` if the bytes match none.
     why : str
-        For people, as a phrase.
+        Reason, as a phrase for the user.
     """
 
     device: str
@@ -70,43 +75,47 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class _Needed:
-    """What it takes: so many frames, and so much of the bytes from the first on."""
+class _Requirement:
+    """Minimum number of frames, and fraction of the bytes since the first frame."""
 
     frames: int
-    share: float
+    fraction: float
 
 
-_SURE_CHECKED, _LIKELY_CHECKED = _Needed(4, 0.5), _Needed(2, 0.2)
-_SURE, _LIKELY = _Needed(30, 0.9), _Needed(5, 0.6)
-_BY_CHANCE = 0.25
-"""Of what was found, so much may be found in a random order as well."""
+_CERTAIN_CHECKSUM, _LIKELY_CHECKSUM = _Requirement(4, 0.5), _Requirement(2, 0.2)
+_CERTAIN_PLAIN, _LIKELY_PLAIN = _Requirement(30, 0.9), _Requirement(5, 0.6)
+_LIKELY_LINE = _Requirement(1, 0.8)
+
+_MAX_CHANCE_FRACTION = 0.25
+"""Largest fraction of the frames that may also occur in the permuted bytes."""
 
 
-class _Listener:
-    """A device that listens.
+class _Candidate:
+    """Device with its decoder.
 
     Attributes
     ----------
     records : int
-        Other than those of the log.
+        Records received, except those of the log.
     first : int or None
-        Where its first record ended.
-    proven : bool
-        It hears far less in a random order; tried again when there are ``again`` bytes.
+        End of the first record.
+    is_proven : bool
+        There are far fewer frames in the permuted bytes.
+    next_test_bytes : int
+        Number of bytes at which the permutation test is repeated.
     """
 
     def __init__(self, device: Device, options: Options) -> None:
         self.name = device.name
-        self.decoder: Decoder = device.decode(options)
+        self.decoder: Decoder = device.create_decoder(options)
         self.records = self._frames = 0
-        self.proven = False
-        self.again = 0
+        self.is_proven = False
+        self.next_test_bytes = 0
         self.first: int | None = None
-        self._last = self._heard = 0
+        self._last = self._fed = 0
 
     def feed(self, data: bytes, pause: bool) -> None:
-        self._heard += len(data)
+        self._fed += len(data)
         self._take(self.decoder.feed(data, pause=pause))
 
     def finish(self) -> None:
@@ -119,43 +128,43 @@ class _Listener:
             ends += [int(batch.end[0]), int(batch.end[-1])] if len(batch) else []
         if self.frames > self._frames:
             self._frames = self.frames
-            ends.append(self._heard)
+            ends.append(self._fed)
         if ends:
             self.first = min(ends) if self.first is None else self.first
             self._last = max(self._last, *ends)
 
     @property
     def frames(self) -> int:
-        """Right, and of a type that is known."""
+        """Number of valid frames of known types."""
         return self.decoder.counts.frames - self.decoder.counts.unknown
 
     @property
-    def share(self) -> float:
-        """Of the bytes from the first frame on, what is in good ones."""
+    def fraction(self) -> float:
+        """Fraction of the bytes since the first frame that are in valid frames."""
         if self.first is None:
             return 0.0
-        waiting = self._heard - self._last - PATIENCE
+        waiting = self._fed - self._last - MAX_HELD_BACK_BYTES
         missed = max(self.decoder.counts.skipped, waiting)
-        return max(0.0, 1 - missed / max(1, self._heard - self.first))
+        return max(0.0, 1 - missed / max(1, self._fed - self.first))
 
-    def has(self, needed: _Needed) -> bool:
-        """Whether it has heard as much as is needed."""
-        return self.frames >= needed.frames and self.share >= needed.share
+    def meets(self, required: _Requirement) -> bool:
+        """Return whether there are as many frames as required."""
+        return self.frames >= required.frames and self.fraction >= required.fraction
 
 
 class Identifier:
-    """Listens to the first bytes of a device that nobody has named.
+    """Identifies the device that sends a byte stream.
 
-    Feed it what the device says, as it comes, and ask for the :meth:`verdict`; when
-    :data:`LISTEN_S` are over, :meth:`settle`. What was fed is to be fed again to the
-    decoder that it names.
+    Feed it the bytes as they arrive and ask for the :meth:`verdict`; after
+    :data:`MAX_IDENTIFICATION_S`, :meth:`settle`. Then feed the same bytes again to the decoder
+    of the device.
 
     Parameters
     ----------
     options : Options, optional
-        For the decoders.
+        Options of the decoders.
     devices : iterable of Device, optional
-        All that are known to locatk and to other packages, where it is left out.
+        Candidates; by default the devices of locatk and of other packages.
     """
 
     def __init__(
@@ -164,142 +173,153 @@ class Identifier:
         self._options = options or Options()
         self._verdict: Verdict | None = None
         self._data = bytearray()
-        self._failed: list[str] = []
+        self._failures: list[str] = []
         self._devices: dict[str, Device] = {}
-        self._listeners: list[_Listener] = []
+        self._candidates: list[_Candidate] = []
         if devices is None:
-            devices = [*DEVICES.values(), *self._others()]
+            devices = [*DEVICES.values(), *self._load_external_devices()]
         for device in devices:
-            if device.name not in (NOTHING, *self._devices):
+            if device.name not in (UNKNOWN_DEVICE, *self._devices):
                 self._devices[device.name] = device
                 try:
-                    self._listeners.append(_Listener(device, self._options))
-                except Exception as error:  # of another package: the others go on
-                    self._leave(device.name, error)
+                    self._candidates.append(_Candidate(device, self._options))
+                except Exception as error:  # Code of another package; the others continue.
+                    self._remove(device.name, error)
 
-    def _others(self) -> list[Device]:
-        """Devices of other packages."""
-        found = []
-        for entry in entry_points(group=GROUP):
+    def _load_external_devices(self) -> list[Device]:
+        """Return the devices of other packages."""
+        devices = []
+        for entry in entry_points(group=ENTRY_POINT_GROUP):
             try:
                 device = entry.load()
                 if not isinstance(device, Device):
-                    raise TypeError("no Device")
-                found.append(device)
-            except Exception as error:
-                self._leave(entry.name, error)
-        return found
+                    raise TypeError("not a Device")
+                devices.append(device)
+            except Exception as error:  # Code of another package may raise anything.
+                self._remove(entry.name, error)
+        return devices
 
-    def _leave(self, name: str, error: Exception) -> None:
-        self._failed.append(f"{name} could not listen ({type(error).__name__}: {error})")
-        self._listeners = [each for each in self._listeners if each.name != name]
+    def _remove(self, name: str, error: Exception) -> None:
+        self._failures.append(f"the decoder of {name} failed ({type(error).__name__}: {error})")
+        self._candidates = [each for each in self._candidates if each.name != name]
 
     def feed(self, data: bytes, *, pause: bool = False) -> None:
         """Take the next bytes; ``pause`` as in :meth:`.decoder.Decoder.feed`."""
         if self._verdict is not None:
             return
-        data = data[: LARGEST - len(self._data)]
+        data = data[: MAX_BYTES - len(self._data)]
         self._data += data
-        for start in range(0, len(data), PIECE):
-            piece, pause = data[start : start + PIECE], pause and not start
-            for listener in list(self._listeners):
+        for start in range(0, len(data), PIECE_BYTES):
+            piece, pause = data[start : start + PIECE_BYTES], pause and not start
+            for candidate in list(self._candidates):
                 try:
-                    listener.feed(piece, pause)
+                    candidate.feed(piece, pause)
                 except Exception as error:
-                    self._leave(listener.name, error)
+                    self._remove(candidate.name, error)
 
     def verdict(self) -> Verdict | None:
-        """What the device is, as soon as there is no doubt; None before."""
+        """Return the device as soon as it is certain; None before."""
         if self._verdict is None:
-            if len(self._data) >= LARGEST:
+            if len(self._data) >= MAX_BYTES:
                 return self.settle()
-            checked = [each for each in self._listeners if each.name in CHECKED and each.frames]
-            sure = [each for each in checked if each.has(_SURE_CHECKED)]
-            if not checked:
-                fitting = [each for each in self._listeners if self._fits(each, _SURE)]
-                sure = [e for e in fitting if e.name == TEXT or not e.decoder.remarks]
-                sure = [each for each in sure if self._not_by_chance(each)]
-            if len(sure) == 1:
-                self._decide(sure[0], SURE)
+            with_checksum = [
+                each for each in self._candidates if each.name in CHECKSUM_DEVICES and each.frames
+            ]
+            certain = [each for each in with_checksum if each.meets(_CERTAIN_CHECKSUM)]
+            if not with_checksum:
+                certain = [
+                    each
+                    for each in self._candidates
+                    if self._is_match(each, _CERTAIN_PLAIN)
+                    and (each.name == TEXT_DEVICE or not each.decoder.remarks)
+                    and self._is_not_chance(each)
+                ]
+            if len(certain) == 1:
+                self._decide(certain[0], CERTAIN)
         return self._verdict
 
     def settle(self) -> Verdict:
-        """What the device is most likely; nothing more is listened to."""
+        """Return the most likely device and end the identification."""
         if self._verdict is not None:
             return self._verdict
-        for listener in list(self._listeners):
-            listener.again = 0
+        for candidate in list(self._candidates):
+            candidate.next_test_bytes = 0
             try:
-                listener.finish()
+                candidate.finish()
             except Exception as error:
-                self._leave(listener.name, error)
-        checked = [e for e in self._listeners if e.name in CHECKED and e.has(_LIKELY_CHECKED)]
-        others = [each for each in self._listeners if self._fits(each, _LIKELY)]
-        for listener in (*_best(checked), *_best(others)):
-            if listener in checked or self._not_by_chance(listener):
-                return self._decide(listener, LIKELY)
-        text = next((each for each in self._listeners if each.name == TEXT), None)
-        if text is not None and text.has(_Needed(1, 0.8)) and self._is_text():
+                self._remove(candidate.name, error)
+        with_checksum = [
+            each
+            for each in self._candidates
+            if each.name in CHECKSUM_DEVICES and each.meets(_LIKELY_CHECKSUM)
+        ]
+        others = [each for each in self._candidates if self._is_match(each, _LIKELY_PLAIN)]
+        for candidate in (*_best_first(with_checksum), *_best_first(others)):
+            if candidate in with_checksum or self._is_not_chance(candidate):
+                return self._decide(candidate, LIKELY)
+        text = next((each for each in self._candidates if each.name == TEXT_DEVICE), None)
+        if text is not None and text.meets(_LIKELY_LINE) and self._is_text():
             return self._decide(text, LIKELY)
-        self._verdict = Verdict(NOTHING, NONE, "; ".join([self._nothing(), *self._failed]))
+        reason = "; ".join([self._reason_unknown(), *self._failures])
+        self._verdict = Verdict(UNKNOWN_DEVICE, UNKNOWN, reason)
         return self._verdict
 
-    def _fits(self, listener: _Listener, needed: _Needed) -> bool:
-        """Whether a device without checksums has heard enough that is its own."""
-        if listener.name in CHECKED or not listener.has(needed):
+    def _is_match(self, candidate: _Candidate, required: _Requirement) -> bool:
+        """Return whether a device without checksums has as many frames as required."""
+        if candidate.name in CHECKSUM_DEVICES or not candidate.meets(required):
             return False
-        if listener.name == TEXT:  # boot messages come from all devices
-            return listener.records >= needed.frames and self._is_text()
-        return MARKS.get(listener.name, b"") in self._data
+        if candidate.name == TEXT_DEVICE:  # All devices send boot messages.
+            return candidate.records >= required.frames and self._is_text()
+        return REQUIRED_BYTES.get(candidate.name, b"") in self._data
 
     def _is_text(self) -> bool:
-        """Whether most bytes are of characters that people print."""
-        printed = len(self._data) - len(bytes(self._data).translate(None, _PRINTED))
-        return printed >= 0.8 * len(self._data)
+        """Return whether most bytes are printable characters."""
+        printable = len(self._data) - len(bytes(self._data).translate(None, _PRINTABLE))
+        return printable >= MIN_PRINTABLE_FRACTION * len(self._data)
 
-    def _not_by_chance(self, listener: _Listener) -> bool:
-        """Whether it hears far less in the same bytes in a random order."""
-        if listener.name == TEXT or listener.proven:
+    def _is_not_chance(self, candidate: _Candidate) -> bool:
+        """Return whether the decoder finds far fewer frames in the permuted bytes."""
+        if candidate.name == TEXT_DEVICE or candidate.is_proven:
             return True
-        if len(self._data) < listener.again:
+        if len(self._data) < candidate.next_test_bytes:
             return False
-        listener.again = 2 * len(self._data)
-        data = np.frombuffer(bytes(self._data[listener.first :]), np.uint8)
-        share = np.bincount(data, minlength=256) / max(len(data), 1)
-        if np.count_nonzero(share) < VALUES or share.max() > ONE_VALUE:
+        candidate.next_test_bytes = 2 * len(self._data)
+        data = np.frombuffer(bytes(self._data[candidate.first :]), np.uint8)
+        fraction = np.bincount(data, minlength=256) / max(len(data), 1)
+        if np.count_nonzero(fraction) < MIN_DISTINCT_BYTES or fraction.max() > MAX_BYTE_FRACTION:
             return False
-        mixed = np.random.default_rng(0).permutation(data).tobytes()
+        permuted = np.random.default_rng(0).permutation(data).tobytes()
         try:
-            control = _Listener(self._devices[listener.name], self._options)
-            control.feed(mixed, True)
+            control = _Candidate(self._devices[candidate.name], self._options)
+            control.feed(permuted, True)
             control.finish()
         except Exception as error:
-            self._leave(listener.name, error)
+            self._remove(candidate.name, error)
             return False
-        listener.proven = control.frames <= _BY_CHANCE * listener.frames
-        return listener.proven
+        candidate.is_proven = control.frames <= _MAX_CHANCE_FRACTION * candidate.frames
+        return candidate.is_proven
 
-    def _decide(self, listener: _Listener, confidence: str) -> Verdict:
-        size = len(self._data)
-        found = f"{listener.frames} {'lines' if listener.name == TEXT else 'frames'}"
-        if listener.name in CHECKED:
-            found += " of right checksum"
-        share = f"{listener.share:.0%} of what came since the first"
-        self._verdict = Verdict(
-            listener.name, confidence, f"{found} in the first {size} bytes, {share}"
+    def _decide(self, candidate: _Candidate, confidence: str) -> Verdict:
+        units = "lines" if candidate.name == TEXT_DEVICE else "frames"
+        if candidate.name in CHECKSUM_DEVICES:
+            units += " with a valid checksum"
+        reason = (
+            f"{candidate.frames} {units} in the first {len(self._data)} bytes, "
+            f"{candidate.fraction:.0%} of the bytes since the first one"
         )
+        self._verdict = Verdict(candidate.name, confidence, reason)
         return self._verdict
 
-    def _nothing(self) -> str:
-        """Why it is no known device."""
+    def _reason_unknown(self) -> str:
+        """Return why the bytes match no known device."""
         size = len(self._data)
         if not size:
-            return "nothing came"
+            return "no bytes received"
         if len(set(self._data)) == 1:
-            return f"{size} bytes that are all 0x{self._data[0]:02x}: check the wiring and baud"
-        return f"{size} bytes that fit no known device: check the baud"
+            return f"all {size} bytes are 0x{self._data[0]:02x}: check the wiring and --baud"
+        return f"{size} bytes match no known device: check --baud"
 
 
-def _best(listeners: list[_Listener]) -> list[_Listener]:
-    """Those who hear most first."""
-    return sorted(listeners, key=lambda each: (-each.share, each.decoder.counts.bad))
+def _best_first(candidates: list[_Candidate]) -> list[_Candidate]:
+    """Return the candidates, those with the largest fraction of the bytes first."""
+    return sorted(candidates, key=lambda each: (-each.fraction, each.decoder.counts.bad))

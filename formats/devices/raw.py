@@ -1,4 +1,4 @@
-"""The device of which nothing is known: its bytes are kept, and that is all."""
+"""Device of unknown format: its bytes are stored and not decoded."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from locatk.formats.devices.decoder import Batch, Counts, Options
 
 
 class RawDecoder:
-    """Counts bytes and makes no records of them; see :mod:`.decoder`."""
+    """Decoder that counts bytes and returns no records; see :class:`.decoder.Decoder`."""
 
     def __init__(self, options: Options) -> None:
         self.counts = Counts()
         self.remarks: list[str] = []
 
     def feed(self, data: bytes, *, pause: bool = False) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.feed`."""
+        """Count the bytes."""
         self.counts.bytes += len(data)
         return []
 
     def restart(self) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.restart`."""
+        """Return nothing."""
         return []
 
     def finish(self) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.finish`."""
+        """Return nothing."""
         return []

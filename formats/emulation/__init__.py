@@ -1,1 +1,1 @@
-"""Devices that are not there: their bytes on a pseudo-terminal, with faults on demand."""
+"""Emulation of serial devices on pseudo-terminals, with faults of the line."""

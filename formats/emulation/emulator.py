@@ -1,7 +1,7 @@
-"""Sends what a device would send, when it would, to whoever has its port open.
+"""Emulation of a serial device on a pseudo-terminal, in real time.
 
-As a real device it does not wait: what is due while nobody listens, or while the reader does
-not read, is lost. All that is lost is counted.
+A real device does not wait: bytes that are due while the port is closed, or while the reader
+does not read, are lost. All losses are counted.
 """
 
 from __future__ import annotations
@@ -10,35 +10,33 @@ import math
 import time
 from dataclasses import asdict, dataclass
 
-from locatk.formats.emulation.faults import Faults
-from locatk.formats.emulation.pacing import LARGEST, Pace
-from locatk.formats.emulation.pseudo_port import PseudoPort
-from locatk.formats.emulation.pseudo_terminal import Terminal
+from locatk.formats.emulation.byte_stream import MAX_PIECE_BYTES, LineFaults, Pace
+from locatk.formats.emulation.pseudo_terminal import PseudoPort, PseudoTerminal
 
-TICK_S = 0.004
-"""Shortest time between two writes: 12 kB at 3 MB/s, where the kernel holds 20 kB."""
+MIN_WRITE_INTERVAL_S = 0.004
+"""Shortest time between two writes: 12 kB at 3 MB/s; the kernel buffers 20 kB."""
 
-LOOK_S = 0.01
-"""Longest time between two looks whether the reader is there."""
+MAX_POLL_INTERVAL_S = 0.01
+"""Longest time between two checks whether the port is open."""
 
 SETTLE_S = 0.2
-"""A reader counts as listening from so long after it opened the port: until then it sets it
-up, and throws away what has arrived (pyserial does)."""
+"""Time between the opening of the port and the first byte sent; meanwhile the reader sets up the
+port and discards its input (pyserial does)."""
 
-PATIENCE_S = 1.0
-"""For so long a reader may be busy before bytes are lost; then they are, until it has caught
-up. The kernel holds 20 kB; what is more waits here."""
+MAX_BLOCKED_S = 1.0
+"""Time for which a reader may be busy before bytes are lost, until it has caught up. The kernel
+buffers 20 kB; the rest is queued here."""
 
-END_S = 10.0
-"""For so long the last bytes wait for the reader."""
+END_WAIT_S = 10.0
+"""Longest wait for the reader at the end."""
 
-LAST_S = 0.1
-"""For so long they do when it is unplugged or stopped."""
+UNPLUG_WAIT_S = 0.1
+"""Longest wait for the reader before the port is unplugged or stopped."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How it behaves.
+class EmulationPlan:
+    """Behaviour of the emulated device.
 
     Attributes
     ----------
@@ -47,11 +45,11 @@ class Plan:
     lossless : bool
         Wait for the reader whenever it does not read, as no real device does.
     unplug_every_s : float or None
-        For how long it is plugged in at a time; None for ever.
+        Time for which it is plugged in; None for no unplugging.
     away_s : float
-        For how long it is not, each time.
-    settle_s, patience_s, end_s : float
-        :data:`SETTLE_S`, :data:`PATIENCE_S` and :data:`END_S`.
+        Time for which it is unplugged.
+    settle_s, max_blocked_s, end_wait_s : float
+        :data:`SETTLE_S`, :data:`MAX_BLOCKED_S` and :data:`END_WAIT_S`.
     """
 
     wait: bool = True
@@ -59,30 +57,30 @@ class Plan:
     unplug_every_s: float | None = None
     away_s: float = 1.0
     settle_s: float = SETTLE_S
-    patience_s: float = PATIENCE_S
-    end_s: float = END_S
+    max_blocked_s: float = MAX_BLOCKED_S
+    end_wait_s: float = END_WAIT_S
 
 
 @dataclass
-class Totals:
-    """What became of the bytes; those made are the sum of those sent, dropped and lost.
+class EmulationCounts:
+    """Counts of bytes; ``made`` is the sum of ``sent``, ``dropped``, ``unheard`` and ``overrun``.
 
     Attributes
     ----------
     made : int
-        The device had to send.
+        Bytes that the device had to send.
     sent : int
-        The reader got.
+        Bytes received by the reader.
     dropped : int
-        Lost as a fault of the line.
+        Bytes lost as a fault of the line.
     unheard : int
-        Lost while it was unplugged or nobody listened, or not read when that came.
+        Bytes lost while the device was unplugged or the port closed, or unread at that time.
     overrun : int
-        Lost because the reader did not read in time.
+        Bytes lost because the reader did not read in time.
     flipped : int
-        Bits that turned over, in bytes that were lost afterwards too.
+        Flipped bits, including those of bytes that were lost afterwards.
     unplugs : int
-        How often it was unplugged.
+        Number of times it was unplugged.
     """
 
     made: int = 0
@@ -94,7 +92,7 @@ class Totals:
     unplugs: int = 0
 
     def as_dict(self) -> dict[str, int]:
-        """For JSON."""
+        """Return the counts for JSON."""
         return asdict(self)
 
 
@@ -105,50 +103,50 @@ class Emulator:
     ----------
     port : PseudoPort
     pace : Pace
-        What it sends, and when.
-    faults : Faults, optional
+        Bytes and their due times.
+    faults : LineFaults, optional
         None by default.
-    plan : Plan, optional
+    plan : EmulationPlan, optional
     """
 
     def __init__(
         self,
         port: PseudoPort,
         pace: Pace,
-        faults: Faults | None = None,
-        plan: Plan | None = None,
+        faults: LineFaults | None = None,
+        plan: EmulationPlan | None = None,
     ) -> None:
         self._port = port
         self._pace = pace
-        self._faults = faults or Faults()
-        self._plan = plan or Plan()
-        self._totals = Totals()
+        self._faults = faults or LineFaults()
+        self._plan = plan or EmulationPlan()
+        self._totals = EmulationCounts()
         self._pending = bytearray()
-        self._opened_s: float | None = None
-        self._stuck_s: float | None = None
-        self._change_s = self._plan.unplug_every_s or math.inf
+        self._reader_since_s: float | None = None
+        self._blocked_since_s: float | None = None
+        self._plug_change_s = self._plan.unplug_every_s or math.inf
         self._start_s = 0.0
         self._stopped = False
 
     def stop(self) -> None:
-        """Let :meth:`run` end soon, also from a signal handler or another thread."""
+        """End :meth:`run` soon; may be called from a signal handler or another thread."""
         self._stopped = True
 
     @property
-    def totals(self) -> Totals:
-        """What became of the bytes so far."""
+    def totals(self) -> EmulationCounts:
+        """Counts so far."""
         faults, totals = self._faults, self._totals
         totals.dropped, totals.flipped = faults.dropped, faults.flipped
         return totals
 
     def run(self) -> None:
-        """Send everything, wait until it is read, and close the port; however it ends."""
+        """Send all bytes, wait until they are read, and close the port in any case."""
         try:
             self._start_s = time.monotonic()
             if self._plan.wait:
                 self._await_reader()
             self._send_all()
-            self._let_read(math.inf if self._plan.lossless else self._plan.end_s)
+            self._wait_until_read(math.inf if self._plan.lossless else self._plan.end_wait_s)
         finally:
             self._totals.unheard += len(self._pending)
             self._pending.clear()
@@ -159,101 +157,105 @@ class Emulator:
         return time.monotonic() - self._start_s
 
     def _await_reader(self) -> None:
-        while self._listener() is None and not self._stopped:
-            time.sleep(LOOK_S)
-        self._opened_s = -self._plan.settle_s  # of the clock that starts now
+        while self._ready_terminal() is None and not self._stopped:
+            time.sleep(MAX_POLL_INTERVAL_S)
+        self._reader_since_s = -self._plan.settle_s  # of the clock that starts now
         self._start_s = time.monotonic()
 
     def _send_all(self) -> None:
         while not self._stopped and (self._pace.next_s is not None or self._pending):
             now = self._now()
-            listener = self._listener()
-            holds = self._plan.lossless and (listener is None or bool(self._pending))
-            data = b"" if holds else self._pace.due(min(now, self._change_s))
-            self._take_in(data, lost=listener is None)
-            if self._pending and listener:
-                self._write(listener, now)
-            if self._change_s <= now and (holds or not self._late(self._change_s)):
-                self._change_plug()
-            elif self._pending and listener:
-                listener.wait_room(TICK_S)
-            elif len(data) < LARGEST:
-                ahead_s = LOOK_S if holds else (self._pace.next_s or 0.0) - self._now()
-                time.sleep(min(max(ahead_s, TICK_S if data else 0.0), LOOK_S))
+            terminal = self._ready_terminal()
+            holds = self._plan.lossless and (terminal is None or bool(self._pending))
+            data = b"" if holds else self._pace.due(min(now, self._plug_change_s))
+            self._queue(data, lost=terminal is None)
+            if self._pending and terminal:
+                self._write(terminal, now)
+            if self._plug_change_s <= now and (
+                holds or not self._has_due_before(self._plug_change_s)
+            ):
+                self._toggle_plug()
+            elif self._pending and terminal:
+                terminal.wait_room(MIN_WRITE_INTERVAL_S)
+            elif len(data) < MAX_PIECE_BYTES:
+                ahead_s = MAX_POLL_INTERVAL_S if holds else (self._pace.next_s or 0.0) - self._now()
+                time.sleep(
+                    min(max(ahead_s, MIN_WRITE_INTERVAL_S if data else 0.0), MAX_POLL_INTERVAL_S)
+                )
 
-    def _late(self, until_s: float) -> bool:
-        """Whether there is still something that was due by then."""
+    def _has_due_before(self, until_s: float) -> bool:
+        """Return whether bytes that were due by then are left."""
         return self._pace.next_s is not None and self._pace.next_s <= until_s
 
-    def _take_in(self, data: bytes, *, lost: bool) -> None:
+    def _queue(self, data: bytes, *, lost: bool) -> None:
         self._totals.made += len(data)
-        data = self._faults.spoil(data)
+        data = self._faults.apply(data)
         if lost:
             self._totals.unheard += len(data)
         else:
             self._pending += data
 
-    def _write(self, terminal: Terminal, now: float) -> None:
+    def _write(self, terminal: PseudoTerminal, now: float) -> None:
         sent = terminal.write(self._pending)
         del self._pending[:sent]
         self._totals.sent += sent
         if not self._pending or self._plan.lossless:
-            self._stuck_s = None
-        elif self._stuck_s is None:
-            self._stuck_s = now
-        elif now - self._stuck_s > self._plan.patience_s:
+            self._blocked_since_s = None
+        elif self._blocked_since_s is None:
+            self._blocked_since_s = now
+        elif now - self._blocked_since_s > self._plan.max_blocked_s:
             self._totals.overrun += len(self._pending)
             self._pending.clear()
 
-    def _listener(self) -> Terminal | None:
-        """The terminal, if somebody has had it open for long enough."""
+    def _ready_terminal(self) -> PseudoTerminal | None:
+        """Return the terminal if a reader has had it open for long enough."""
         now = self._now()
         terminal = self._port.terminal
         if terminal is None:
             return None
         if not terminal.has_reader():
-            if self._opened_s is not None:
-                self._opened_s = None
+            if self._reader_since_s is not None:
+                self._reader_since_s = None
                 self._drop_pending()
-                self._lost_unread(terminal.reset())
+                self._count_unread(terminal.reset())
             return None
-        if self._opened_s is None:
-            self._opened_s = now
-        return terminal if now - self._opened_s >= self._plan.settle_s else None
+        if self._reader_since_s is None:
+            self._reader_since_s = now
+        return terminal if now - self._reader_since_s >= self._plan.settle_s else None
 
     def _drop_pending(self) -> None:
-        """Nobody is there to whom it could be sent."""
-        self._stuck_s = None
+        """Discard queued bytes, because the port is closed or unplugged."""
+        self._blocked_since_s = None
         if not self._plan.lossless:
             self._totals.unheard += len(self._pending)
             self._pending.clear()
 
-    def _lost_unread(self, count: int) -> None:
+    def _count_unread(self, count: int) -> None:
         self._totals.sent -= count
         self._totals.unheard += count
 
-    def _change_plug(self) -> None:
+    def _toggle_plug(self) -> None:
         if self._port.terminal is None:
             self._port.plug()
-            self._change_s += self._plan.unplug_every_s or math.inf
+            self._plug_change_s += self._plan.unplug_every_s or math.inf
         else:
             self._drop_pending()
             self._unplug()
             self._totals.unplugs += 1
-            self._change_s += self._plan.away_s
+            self._plug_change_s += self._plan.away_s
 
     def _unplug(self) -> None:
         # What is unread is taken back to be counted. A reader at work meanwhile would see a
         # hole there and something after it, so it is let come to the end of what was sent.
-        self._let_read(LAST_S, stoppable=False)
-        self._lost_unread(self._port.unplug())
-        self._opened_s = None
+        self._wait_until_read(UNPLUG_WAIT_S, stoppable=False)
+        self._count_unread(self._port.unplug())
+        self._reader_since_s = None
 
-    def _let_read(self, wait_s: float, *, stoppable: bool = True) -> None:
-        """Wait until the reader has read what was sent: it is gone when the port is."""
+    def _wait_until_read(self, wait_s: float, *, stoppable: bool = True) -> None:
+        """Wait until the reader has read all bytes, because unread ones vanish with the port."""
         until_s = self._now() + wait_s
         terminal = self._port.terminal
         while terminal and terminal.has_reader() and terminal.has_unread():
             if (stoppable and self._stopped) or self._now() > until_s:
                 break
-            time.sleep(0.5 * TICK_S)
+            time.sleep(0.5 * MIN_WRITE_INTERVAL_S)

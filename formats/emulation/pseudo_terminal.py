@@ -1,16 +1,16 @@
-"""A pseudo-terminal as a device sees it: is there a reader, is there room, what was not read.
+"""Pseudo-terminals as serial ports of emulated devices.
 
-What Linux does with pseudo-terminals, and what follows (tried with 6.18):
+Behaviour of pseudo-terminals on Linux (tested with 6.18), and consequences:
 
-* The master is told that nobody has the slave open (POLLHUP); of readers it learns nothing
-  else. But only at the slave is seen what was not read, and a reader may keep others from
-  opening it (TIOCEXCL). So one slave is kept open here, but for the moment of a look whether
-  there is another one.
-* The slave keeps its settings, TIOCEXCL among them, and what was written to it and not read,
-  from one opening to the next. A serial port does not: they are put back when the reader left.
-* What was not read is gone when the master is closed; the reader sees its end at once.
-* FIONREAD and TIOCOUTQ miss what is still on its way to the reader; polling the slave moves
-  that on first, and is exact.
+* The master is notified when the slave is closed by all (POLLHUP), and learns nothing else about
+  readers. Unread bytes can only be determined at the slave, and a reader may prevent others from
+  opening it (TIOCEXCL). So one slave is kept open here, except while it is checked whether there
+  is another one.
+* The slave keeps its settings, including TIOCEXCL, and unread bytes from one opening to the next.
+  A serial port does not: they are reset when the reader has closed it.
+* Unread bytes are discarded when the master is closed; the reader gets end-of-file at once.
+* FIONREAD and TIOCOUTQ miss bytes on their way to the reader; polling the slave moves these on
+  first, and is exact.
 """
 
 from __future__ import annotations
@@ -18,20 +18,24 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import sys
+import tempfile
+from pathlib import Path
 
-from locatk.core.errors import LocatkError
+from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
 
-PIECE = 1 << 16
+READ_BYTES = 1 << 16
+"""Bytes per read."""
 
-MOST_READS = 1000
-"""To empty a buffer that holds 20 kB, 4 kB a read."""
+MAX_READS = 1000
+"""Reads to empty a buffer of 20 kB, with 4 kB per read."""
 
 _TIOCGEXCL = 0x8004_5440
-"""Whether TIOCEXCL is in force (Linux, include/uapi/asm-generic/ioctls.h)."""
+"""Queries TIOCEXCL (Linux, include/uapi/asm-generic/ioctls.h)."""
 
 
-class Terminal:
-    """A new pseudo-terminal that passes bytes on as they are.
+class PseudoTerminal:
+    """Pseudo-terminal in raw mode.
 
     Attributes
     ----------
@@ -41,7 +45,7 @@ class Terminal:
     Raises
     ------
     LocatkError
-        There is none left.
+        No pseudo-terminal is available.
     """
 
     def __init__(self) -> None:
@@ -58,7 +62,7 @@ class Terminal:
             os.set_blocking(each, False)
 
     def has_reader(self) -> bool:
-        """Whether somebody has it open. What they wrote to it is passed over."""
+        """Return whether a reader has it open; discard the bytes that it wrote."""
         exclusive = self._release()
         events = _poll(self._master, select.POLLIN)
         alone = bool(events & select.POLLHUP)
@@ -70,11 +74,11 @@ class Terminal:
                 self._lock(True)
             if events & select.POLLIN:
                 with contextlib.suppress(OSError):
-                    os.read(self._master, PIECE)
+                    os.read(self._master, READ_BYTES)
         return not alone
 
     def _release(self) -> bool:
-        """Close the slave; whether it was locked, which it is no more."""
+        """Close the slave and remove its lock; return whether it was locked."""
         if self._slave is None:
             return False
         import fcntl
@@ -98,22 +102,22 @@ class Terminal:
                 fcntl.ioctl(self._slave, termios.TIOCEXCL if exclusive else termios.TIOCNXCL)
 
     def write(self, data: bytes | bytearray) -> int:
-        """Pass on as much as there is room for; returns how much."""
+        """Write as many bytes as the buffer accepts; return their number."""
         try:
             return os.write(self._master, data)
         except BlockingIOError:
             return 0
 
     def wait_room(self, wait_s: float) -> None:
-        """Wait until there is room for more, at most so long."""
+        """Wait until the buffer accepts bytes, at most ``wait_s``."""
         _poll(self._master, select.POLLOUT, wait_s)
 
     def has_unread(self) -> bool:
-        """Whether something is left for the reader to read; yes where that is not known."""
+        """Return whether bytes are left to read; True if that is unknown."""
         return self._slave is None or bool(_poll(self._slave, select.POLLIN) & select.POLLIN)
 
     def reset(self) -> int:
-        """Settings and buffer as at the start; returns how many bytes were not read."""
+        """Reset settings and buffer; return the number of unread bytes."""
         import termios
         import tty
 
@@ -121,16 +125,16 @@ class Terminal:
             return 0
         tty.setraw(self._slave, termios.TCSANOW)
         taken = 0
-        for _ in range(MOST_READS):
+        for _ in range(MAX_READS):
             if not self.has_unread():
                 break
             # Another one may be reading at this very moment, and keeps it for as long.
             with contextlib.suppress(BlockingIOError):
-                taken += len(os.read(self._slave, PIECE))
+                taken += len(os.read(self._slave, READ_BYTES))
         return taken
 
     def close(self) -> int:
-        """Hang up; returns how many bytes were not read."""
+        """Hang up; return the number of unread bytes."""
         unread = self.reset()
         self._release()
         os.close(self._master)
@@ -141,3 +145,103 @@ def _poll(descriptor: int, events: int, wait_s: float = 0.0) -> int:
     poll = select.poll()
     poll.register(descriptor, events)
     return sum(event for _, event in poll.poll(1e3 * wait_s))
+
+
+class PseudoPort:
+    """Symbolic link to a pseudo-terminal, which is a new one after each unplugging.
+
+    Parameters
+    ----------
+    link : path, optional
+        Path of the link; in a new private folder by default. A link left behind by a killed
+        emulator is replaced; any other file is kept.
+
+    Attributes
+    ----------
+    path : str
+        Path of the link.
+
+    Raises
+    ------
+    OutputExistsError
+        The path exists.
+    MissingDataError
+        Its folder does not exist.
+    LocatkError
+        The system has no pseudo-terminals, or none is available.
+    """
+
+    def __init__(self, link: str | os.PathLike[str] | None = None) -> None:
+        if sys.platform == "win32":
+            raise LocatkError("Windows has no pseudo-terminals", hint="Use WSL or another computer")
+        self._terminal: PseudoTerminal | None = None
+        self._folder: str | None = None
+        if link is None:
+            self._folder = tempfile.mkdtemp(prefix="locatk-")
+            link = Path(self._folder, "port")
+        self.path = os.path.abspath(link)
+        try:
+            _remove_stale(self.path)
+            self.plug()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def terminal(self) -> PseudoTerminal | None:
+        """Terminal that is plugged in; None while unplugged."""
+        return self._terminal
+
+    def plug(self) -> None:
+        """Create a terminal and its link.
+
+        Raises
+        ------
+        OutputExistsError, MissingDataError, LocatkError
+            As for the constructor.
+        """
+        terminal = PseudoTerminal()
+        try:
+            os.symlink(terminal.name, self.path)
+        except OSError as error:
+            terminal.close()
+            raise _refused(error, self.path) from error
+        self._terminal = terminal
+
+    def unplug(self) -> int:
+        """Remove link and terminal; return the number of unread bytes."""
+        if self._terminal is None:
+            return 0
+        terminal, self._terminal = self._terminal, None
+        # The terminal's number may soon be another one's, so the link goes first.
+        with contextlib.suppress(OSError):
+            if os.readlink(self.path) == terminal.name:
+                os.unlink(self.path)
+        return terminal.close()
+
+    def close(self) -> int:
+        """Remove everything that was created; return the number of unread bytes."""
+        unread = self.unplug()
+        if self._folder is not None:
+            with contextlib.suppress(OSError):
+                os.rmdir(self._folder)
+        return unread
+
+
+def _remove_stale(path: str) -> None:
+    """Remove a link to a terminal that no longer exists, as a killed emulator leaves it behind."""
+    dangling = os.path.islink(path) and not os.path.exists(path)
+    if dangling and os.readlink(path).startswith("/dev/pts/"):
+        os.unlink(path)
+
+
+def _refused(error: OSError, path: str) -> LocatkError:
+    if isinstance(error, FileExistsError):
+        return OutputExistsError(
+            "the path of the port is taken",
+            file=path,
+            hint="Choose another --link, or remove it if no emulator runs there",
+        )
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        return MissingDataError("no folder for the port", file=path, hint="Create it first")
+    return LocatkError(f"no link to the port: {error.strerror}", file=path)

@@ -8,7 +8,7 @@ from collections.abc import Collection
 from dataclasses import fields
 from typing import Any
 
-from locatk.formats.capture.statistics import RECORD, Totals
+from locatk.formats.capture.statistics import RECORD, CaptureStatistics
 from locatk.formats.sessions.mcap_file import Segment
 from locatk.formats.sessions.reader import Session
 
@@ -19,7 +19,7 @@ MAX_DESCRIBED_CHUNKS = 1000
 """Number of chunks whose indexes are read in order to find the messages of a topic."""
 
 _NUMBERS = {"started_ns", "ended_ns", "part", "parts", "baud", "unplugged"} | {
-    each.name for each in fields(Totals)
+    each.name for each in fields(CaptureStatistics)
 }
 _NUMBER_PREFIXES = ("samples:", "tick_")
 """Entries of the record ``capture`` that are numbers."""

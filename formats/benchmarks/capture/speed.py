@@ -18,8 +18,7 @@ from locatk.formats.benchmarks import Figure
 from locatk.formats.benchmarks.capture.serial_line import SEQUENCES, block
 from locatk.formats.benchmarks.timing import SEED, cpu_seconds
 from locatk.formats.devices import DEVICES
-from locatk.formats.devices.decoder import Options
-from locatk.formats.devices.recording import Recording
+from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -78,7 +77,7 @@ def _decoding(name: str, data: bytes) -> Callable[[], None]:
 
 
 def _decode(name: str, data: bytes) -> None:
-    decoder = DEVICES[name].decode(Options())
+    decoder = DEVICES[name].create_decoder(Options())
     for start in range(0, len(data), PIECE):
         decoder.feed(data[start : start + PIECE])
     decoder.finish()

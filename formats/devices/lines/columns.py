@@ -34,8 +34,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import NAMES
-from locatk.formats.devices.decoder import Batch, Stream, Ticks
-from locatk.formats.devices.recording import Recording
+from locatk.formats.devices.decoder import Batch, Recording, Stream, Ticks
 from locatk.formats.tables.columns import TIMES, UNITS
 
 Array = NDArray[np.float64]

@@ -1,7 +1,7 @@
-"""What frames of the locatk protocol say: headers and payloads, to bytes and back.
+"""Headers and payloads of the locatk protocol: encoding of one frame, parsing of many.
 
-One frame is made at a time, as a firmware does it; frames of one layout are read together,
-a row each. docs/firmware/README.md has the tables; all numbers are little-endian.
+Frames are encoded one at a time, as a firmware does; frames of one layout are parsed together,
+one row each. docs/firmware/README.md has the tables; all numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from locatk.formats.devices.locatk_frames.framing import Bytes, seal
+from locatk.formats.devices.locatk_frames.framing import Bytes, encode_frame
 
-VERSION = 1
-"""Of the protocol, as HELLO tells it."""
+PROTOCOL_VERSION = 1
+"""Version of the protocol, as sent in HELLO."""
 
 HEADER = np.dtype([("type", "u1"), ("node", "u1"), ("sequence", "<u2"), ("tick", "<u4")])
-"""Of each content."""
+"""Header of each content."""
 
-COUNTS, TEMPERATURE = 1, 2
-"""Flags of a series: int16 counts in place of float32; a temperature a sample."""
+HAS_COUNTS, HAS_TEMPERATURE = 1, 2
+"""Flags of a series: int16 counts instead of float32; a temperature per sample."""
 
-MISSING = -(1 << 15)
-"""The count that says that a sensor gave nothing."""
+MISSING_COUNT = -(1 << 15)
+"""Count of a sensor without a value."""
 
-LONGEST_TICKS = 1 << 31
-"""What a series lasts is less: half of what a tick can tell."""
+MAX_SERIES_TICKS = 1 << 31
+"""Limit of the duration of a series: half of the range of a tick."""
 
 COUNT_STEPS = 256
-"""Parts of a step of the 6 MHz bit clock."""
+"""Fractions of a step of the 6 MHz bit clock."""
 
-COUNT_END = (1 << 17) * COUNT_STEPS
-"""Counts of sweeps are below: the sequence has 2^17 - 1 states."""
+COUNT_LIMIT = (1 << 17) * COUNT_STEPS
+"""Limit of the counts of sweeps: the sequence has 2^17 - 1 states."""
 
 _HEADER = struct.Struct("<BBHI")
 _SERIES = struct.Struct("<BBBBI")
@@ -64,7 +64,7 @@ _SWEEP = np.dtype(
 
 
 class Type(IntEnum):
-    """First byte of a header."""
+    """Type of a frame, the first byte of its header."""
 
     HELLO = 1
     TEXT = 2
@@ -76,7 +76,7 @@ class Type(IntEnum):
 
 
 class FrameWriter:
-    """Frames of one node, numbered: what ``locatk_frame.h`` does on a device.
+    """Writes numbered frames of one node, as ``locatk_frame.h`` does on a device.
 
     Parameters
     ----------
@@ -89,26 +89,26 @@ class FrameWriter:
         self.sequence = 0
 
     def frame(self, type: int, tick: int, payload: bytes) -> bytes:
-        """The next frame; ``tick`` is taken modulo 2^32.
+        """Return the next frame; ``tick`` is taken modulo 2^32.
 
         Raises
         ------
         ValueError
-            The payload is longer than a frame can be.
+            The payload is too long for a frame.
         """
         header = _HEADER.pack(type, self.node, self.sequence, tick & 0xFFFFFFFF)
         self.sequence = (self.sequence + 1) & 0xFFFF
-        return seal(header + payload)
+        return encode_frame(header + payload)
 
 
 def hello(tick_hz: int, name: str) -> bytes:
-    """Who sends, and how fast its clock counts."""
-    return _HELLO.pack(VERSION, tick_hz) + name.encode()
+    """Return the payload of HELLO: version, tick rate and name of the device."""
+    return _HELLO.pack(PROTOCOL_VERSION, tick_hz) + name.encode()
 
 
-def text(level: int, words: str) -> bytes:
-    """A line for people; ``level`` as in :class:`.decoder.Batch`."""
-    return bytes([level]) + words.encode()
+def text(level: int, message: str) -> bytes:
+    """Return the payload of a log message; ``level`` as in :class:`.decoder.Batch`."""
+    return bytes([level]) + message.encode()
 
 
 def series(
@@ -118,21 +118,23 @@ def series(
     scale: float | None = None,
     temperature: ArrayLike | None = None,
 ) -> bytes:
-    """Samples of magnetometers (k, N, 3) or hall sensors (k, N).
+    """Return the payload of samples of magnetometers (k, N, 3) or hall sensors (k, N).
 
     Parameters
     ----------
     values : array_like
-        Microtesla, or counts where ``scale`` is given.
+        Microtesla, or counts if ``scale`` is given.
     step : int
-        Ticks from one sample to the next; 0 where there is only one.
+        Ticks from one sample to the next; 0 for a single sample.
     scale : float, optional
-        Microtesla of a count.
+        Microtesla per count.
     temperature : (k,) array_like, optional
         Degrees Celsius.
     """
     data = np.asarray(values)
-    flags = (COUNTS if scale is not None else 0) | (TEMPERATURE if temperature is not None else 0)
+    flags = (HAS_COUNTS if scale is not None else 0) | (
+        HAS_TEMPERATURE if temperature is not None else 0
+    )
     parts = [_SERIES.pack(data.shape[1], data.shape[0], flags, 0, step)]
     if scale is not None:
         parts.append(struct.pack("<f", scale))
@@ -143,7 +145,7 @@ def series(
 
 
 def odometry(poses: ArrayLike, step: int) -> bytes:
-    """Poses (k, 3): x and y in metres, heading in radians."""
+    """Return the payload of poses (k, 3): x and y in metres, heading in radians."""
     return series(np.asarray(poses)[:, None], step)
 
 
@@ -154,7 +156,7 @@ def captures(
     bit_offset: ArrayLike,
     bits: ArrayLike,
 ) -> bytes:
-    """Bits of Lighthouse sweeps, (k,) each, as in ``locatk.LighthouseCapture``."""
+    """Return the payload of bits of sweeps, (k,) each, as in ``locatk.LighthouseCapture``."""
     return _records(
         _CAPTURE, tick=tick, sensor=sensor, polynomial=polynomial, bit_offset=bit_offset, bits=bits
     )
@@ -168,7 +170,7 @@ def sweeps(
     sweep: ArrayLike,
     count: ArrayLike,
 ) -> bytes:
-    """Lighthouse sweeps, (k,) each, as in :class:`locatk.core.lighthouse.recording.Sweeps`."""
+    """Return the payload of sweeps, (k,) each, as in ``locatk.LighthouseSweep``."""
     parts = np.rint(np.asarray(count, float) * COUNT_STEPS)
     return _records(
         _SWEEP,
@@ -190,7 +192,7 @@ def _records(dtype: np.dtype[np.void], **columns: ArrayLike) -> bytes:
 
 @dataclass(frozen=True)
 class Hello:
-    """What HELLO says."""
+    """Content of a HELLO."""
 
     version: int
     tick_hz: int
@@ -198,18 +200,18 @@ class Hello:
 
 
 def read_hello(payload: bytes) -> Hello | None:
-    """None where it cannot be."""
+    """Return the content of a HELLO; None if it is invalid."""
     if len(payload) < _HELLO.size:
         return None
     version, tick_hz = _HELLO.unpack_from(payload)
-    reserved = any(payload[1:4]) and version == VERSION
+    reserved = any(payload[1:4]) and version == PROTOCOL_VERSION
     if not version or not tick_hz or reserved:
         return None
     return Hello(version, tick_hz, payload[_HELLO.size :].decode(errors="backslashreplace"))
 
 
 def read_text(payload: bytes) -> tuple[int, str] | None:
-    """Level and words; None where they cannot be."""
+    """Return level and text of a log message; None if it is invalid."""
     if not payload or not 1 <= payload[0] <= 5:
         return None
     return payload[0], payload[1:].decode(errors="backslashreplace")
@@ -223,8 +225,8 @@ class Block:
     ----------
     kind, sensors
         As in :class:`.decoder.Stream`.
-    right : (n,) bool ndarray
-        Frames that hold no value that cannot be.
+    valid : (n,) bool ndarray
+        Frames whose values are all valid.
     tick : (n, k) int64 ndarray
     columns : dict of str to (n, k, ...) ndarray
         As in :class:`.decoder.Batch`.
@@ -232,86 +234,88 @@ class Block:
 
     kind: str
     sensors: int
-    right: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     tick: NDArray[np.int64]
     columns: dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class _Series:
-    """Values of a series of samples, before they have names."""
+    """Values of a series of samples, before they are assigned to columns."""
 
-    right: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     tick: NDArray[np.int64]
     values: NDArray[np.float64]
     temperature: NDArray[np.float64] | None
 
 
-@np.errstate(invalid="ignore")  # of a signalling NaN that becomes a quiet one
+@np.errstate(invalid="ignore")  # A signalling NaN becomes a quiet one.
 def _read_series(payloads: Bytes, tick: NDArray[np.int64], axes: int, flags: int) -> _Series | None:
-    """Values (n, k, N axes) of payloads that may have these flags."""
+    """Return values (n, k, N axes) of payloads with some of ``flags``; None for another layout."""
     if payloads.shape[1] < _SERIES.size:
         return None
-    sensors, samples, told, zero = payloads[0, :SHAPE].tolist()
-    if not sensors or not samples or told & ~flags or zero:
+    sensors, samples, present, zero = payloads[0, :SHAPE_BYTES].tolist()
+    if not sensors or not samples or present & ~flags or zero:
         return None
-    scaled, warm = told & COUNTS, told & TEMPERATURE
-    start = _SERIES.size + (4 if scaled else 0)
-    middle = start + samples * sensors * axes * (2 if scaled else 4)
-    if payloads.shape[1] != middle + (4 * samples if warm else 0):
+    has_counts, has_temperature = present & HAS_COUNTS, present & HAS_TEMPERATURE
+    start = _SERIES.size + (4 if has_counts else 0)
+    middle = start + samples * sensors * axes * (2 if has_counts else 4)
+    if payloads.shape[1] != middle + (4 * samples if has_temperature else 0):
         return None
     step = payloads[:, 4:8].view("<u4").astype(np.int64)
-    right = np.ones(len(payloads), bool)
+    valid = np.ones(len(payloads), bool)
     if samples > 1:
-        right = ((step > 0) & (step * (samples - 1) < LONGEST_TICKS))[:, 0]
-    if scaled:
+        valid = ((step > 0) & (step * (samples - 1) < MAX_SERIES_TICKS))[:, 0]
+    if has_counts:
         scale = payloads[:, start - 4 : start].view("<f4").astype(float)
-        right &= (np.isfinite(scale) & (scale > 0))[:, 0]
+        valid &= (np.isfinite(scale) & (scale > 0))[:, 0]
         counts = payloads[:, start:middle].view("<i2")
-        values = np.where(counts == MISSING, np.nan, counts * scale)
+        values = np.where(counts == MISSING_COUNT, np.nan, counts * scale)
     else:
         values = payloads[:, start:middle].view("<f4").astype(float)
-        right &= ~np.isinf(values).any(1)
+        valid &= ~np.isinf(values).any(1)
     return _Series(
-        right,
+        valid,
         (tick[:, None] + step * np.arange(samples)) & 0xFFFFFFFF,
         values.reshape(len(payloads), samples, sensors * axes),
-        payloads[:, middle:].view("<f4").astype(float) if warm else None,
+        payloads[:, middle:].view("<f4").astype(float) if has_temperature else None,
     )
 
 
 def _read_magnetometers(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
-    found = _read_series(payloads, tick, 3, COUNTS | TEMPERATURE)
-    if found is None:
+    series_data = _read_series(payloads, tick, 3, HAS_COUNTS | HAS_TEMPERATURE)
+    if series_data is None:
         return None
-    columns: dict[str, NDArray[Any]] = {"b_tesla": found.values * 1e-6}
-    right = found.right
-    if found.temperature is not None:
-        columns["temperature_celsius"] = found.temperature
-        right = right & ~np.isinf(found.temperature).any(1)
-    return Block("magnetometers", found.values.shape[2] // 3, right, found.tick, columns)
+    columns: dict[str, NDArray[Any]] = {"b_tesla": series_data.values * 1e-6}
+    valid = series_data.valid
+    if series_data.temperature is not None:
+        columns["temperature_celsius"] = series_data.temperature
+        valid = valid & ~np.isinf(series_data.temperature).any(1)
+    return Block(
+        "magnetometers", series_data.values.shape[2] // 3, valid, series_data.tick, columns
+    )
 
 
 def _read_halls(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
-    found = _read_series(payloads, tick, 1, COUNTS)
-    if found is None:
+    series_data = _read_series(payloads, tick, 1, HAS_COUNTS)
+    if series_data is None:
         return None
-    columns = {"b_tesla": found.values * 1e-6}
-    return Block("halls", found.values.shape[2], found.right, found.tick, columns)
+    columns = {"b_tesla": series_data.values * 1e-6}
+    return Block("halls", series_data.values.shape[2], series_data.valid, series_data.tick, columns)
 
 
 def _read_odometry(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
-    found = _read_series(payloads, tick, 3, 0)
-    if found is None or found.values.shape[2] != 3:
+    series_data = _read_series(payloads, tick, 3, 0)
+    if series_data is None or series_data.values.shape[2] != 3:
         return None
-    right = found.right & np.isfinite(found.values).all((1, 2))
+    valid = series_data.valid & np.isfinite(series_data.values).all((1, 2))
     names = ("x_m", "y_m", "heading_rad")
-    columns = {name: found.values[..., axis] for axis, name in enumerate(names)}
-    return Block("odometry", 0, right, found.tick, columns)
+    columns = {name: series_data.values[..., axis] for axis, name in enumerate(names)}
+    return Block("odometry", 0, valid, series_data.tick, columns)
 
 
 def _read_records(payloads: Bytes, dtype: np.dtype[np.void]) -> NDArray[np.void] | None:
-    """Records (n, k); None where the length is of no number of them."""
+    """Return records (n, k); None if the size is not a multiple of the record size."""
     if not payloads.shape[1] or payloads.shape[1] % dtype.itemsize:
         return None
     records: NDArray[np.void] = payloads.view(dtype)
@@ -322,12 +326,12 @@ def _read_captures(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     records = _read_records(payloads, _CAPTURE)
     if records is None:
         return None
-    right = _between(records["polynomial"], -1, 31) & (records["zero"] == 0)
+    valid = _in_range(records["polynomial"], -1, 31) & (records["zero"] == 0)
     columns = {name: records[name] for name in ("sensor", "bits", "polynomial", "bit_offset")}
     return Block(
         "captures",
         0,
-        np.logical_and.reduce(right, axis=1),
+        np.logical_and.reduce(valid, axis=1),
         records["tick"].astype(np.int64),
         columns,
     )
@@ -337,32 +341,32 @@ def _read_sweeps(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     records = _read_records(payloads, _SWEEP)
     if records is None:
         return None
-    right = _between(records["channel"], 1, 16)
-    right &= _between(records["polynomial"], -1, 31)
-    right &= _between(records["sweep"], -1, 1)
-    right &= records["count"] < COUNT_END
+    valid = _in_range(records["channel"], 1, 16)
+    valid &= _in_range(records["polynomial"], -1, 31)
+    valid &= _in_range(records["sweep"], -1, 1)
+    valid &= records["count"] < COUNT_LIMIT
     names = ("sensor", "channel", "polynomial", "sweep")
     columns: dict[str, NDArray[Any]] = {name: records[name] for name in names}
     columns["count"] = records["count"] / COUNT_STEPS
     return Block(
         "lighthouse",
         0,
-        np.logical_and.reduce(right, axis=1),
+        np.logical_and.reduce(valid, axis=1),
         records["tick"].astype(np.int64),
         columns,
     )
 
 
-def _between(values: NDArray[Any], low: int, high: int) -> NDArray[np.bool_]:
+def _in_range(values: NDArray[Any], low: int, high: int) -> NDArray[np.bool_]:
     inside: NDArray[np.bool_] = (values >= low) & (values <= high)
     return inside
 
 
 SERIES = (Type.MAGNETOMETERS, Type.HALLS, Type.ODOMETRY)
-"""Types of which the length and the first :data:`SHAPE` bytes tell the layout; that of the
-others the length alone."""
+"""Types whose layout follows from the size and the first :data:`SHAPE_BYTES` bytes; that of the
+others follows from the size."""
 
-SHAPE = 4
+SHAPE_BYTES = 4
 
 READERS: dict[Type, Callable[[Bytes, NDArray[np.int64]], Block | None]] = {
     Type.MAGNETOMETERS: _read_magnetometers,
@@ -371,6 +375,5 @@ READERS: dict[Type, Callable[[Bytes, NDArray[np.int64]], Block | None]] = {
     Type.LIGHTHOUSE_CAPTURE: _read_captures,
     Type.LIGHTHOUSE_SWEEP: _read_sweeps,
 }
-"""How payloads (n, size) of one layout become a block, with the ticks (n,) of their headers;
-None where there is no such layout. Of the types that hold records; the others are read one
-by one."""
+"""Functions that convert payloads (n, size) of one layout and the ticks (n,) of their headers to a
+block, or None if there is no such layout. Types without records are parsed one by one."""

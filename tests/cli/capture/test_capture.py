@@ -19,17 +19,17 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.cli.capture import text as capture_text
-from locatk.cli.capture.options import DURATION, PACE, SIZE
+from locatk.cli.capture.options import DURATION, ROTATION, SIZE
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import tags
 from locatk.formats.capture import port_listing as listing
 from locatk.formats.capture import ports
-from locatk.formats.capture.live_file import LiveFile
+from locatk.formats.capture.links import Overruns
 from locatk.formats.capture.port_listing import PortInfo
-from locatk.formats.capture.recorder import Status
-from locatk.formats.capture.source import Overruns
-from locatk.formats.capture.statistics import Totals
+from locatk.formats.capture.recorder import CaptureStatus
+from locatk.formats.capture.recording_files import LiveFile
+from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
@@ -81,8 +81,8 @@ def test_bytes_and_records(capture: Any, tmp_path: Path, raw_bytes: Any) -> None
     assert raw_bytes(path) == TEXT
     lines = result.stdout.splitlines()
     assert lines[0].startswith(f"{path}: 0:00, {capture_text.size(len(TEXT))} received from lines")
-    assert "0 bad, 0 missing" in lines[0]
-    assert lines[0].endswith("end of the source")
+    assert "0 bad, 0 missing" in lines[1]
+    assert lines[1].endswith("end of the source")
     assert any(line.split()[:2] == ["/readings/robot", "60"] for line in lines)
     assert result.stderr.startswith("Recording replay:")
     assert "Ctrl-C ends it" in result.stderr
@@ -172,11 +172,11 @@ def test_auto_finds_out(locatk: Any, old: Path, tmp_path: Path, raw_bytes: Any) 
     report = json.loads(result.stdout)
     assert report["device"] == "lines"
     assert report["samples"] == {"/readings/robot": 60}
-    assert "Warning: the device is taken for lines" in result.stderr
+    assert "Warning: identified device: lines" in result.stderr
     assert raw_bytes(path) == TEXT
     assert facts(path)["device"] == "lines"
     (_, said), *_ = Session.open(path).decoded("/log", Log)
-    assert said.message.startswith("the device is taken for lines")
+    assert said.message.startswith("identified device: lines")
 
 
 def test_auto_of_noise_is_raw(locatk: Any, tmp_path: Path, raw_bytes: Any) -> None:
@@ -186,7 +186,7 @@ def test_auto_of_noise_is_raw(locatk: Any, tmp_path: Path, raw_bytes: Any) -> No
     result = locatk("capture", f"replay:{source}", "--speed", 0, "-o", path, "--json")
     assert json.loads(result.stdout)["device"] == "raw"
     assert result.exit_code == 3
-    assert "no frame of a device that is known in 3000 bytes" in result.stderr
+    assert "no frame of a known device in 3000 bytes" in result.stderr
     assert raw_bytes(path) == noise
 
 
@@ -196,10 +196,10 @@ def test_a_port_that_is_silent(locatk: Any, tmp_path: Path, raw_bytes: Any) -> N
     given = ("--device", "raw", "-o", path, "--duration", "1.3s", "--silence", "200ms", "--json")
     result = locatk("capture", "loop://", *given)
     assert result.exit_code == 3
-    assert "Incomplete: nothing was received" in result.stderr
+    assert "Incomplete: no data were received" in result.stderr
     report = json.loads(result.stdout)
     assert (report["ended"], report["silences"], report["bytes"]) == ("duration", 1, 0)
-    assert "Warning: nothing received for 1 s" in result.stderr
+    assert "Warning: no data received for 1 s" in result.stderr
     assert raw_bytes(path) == b""
     live = [line for line in result.stderr.splitlines() if line.startswith("0:01  ")]
     assert len(live) == 1
@@ -293,7 +293,7 @@ def unopened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             asked.append(name)
             raise AssertionError("the port was opened")
 
-        return SimpleNamespace(name=name, comes_again=False, open=fail, describe=dict)
+        return SimpleNamespace(name=name, can_reconnect=False, open=fail, describe=dict)
 
     monkeypatch.setattr(ports, "port_of", port_of)
     return asked
@@ -306,17 +306,17 @@ def unopened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         (["/dev/x"], "Missing option '-o'"),
         (["/dev/x", "-o", "OUT", "--meta", "robot"], "'robot' is not of the form KEY=VALUE"),
         (["/dev/x", "-o", "OUT", "--meta", "=7"], "is not of the form KEY=VALUE"),
-        (["/dev/x", "-o", "OUT", "--duration", "5 parsecs"], "is no time"),
-        (["/dev/x", "-o", "OUT", "--duration", "0"], "is no time"),
+        (["/dev/x", "-o", "OUT", "--duration", "5 parsecs"], "is not a time"),
+        (["/dev/x", "-o", "OUT", "--duration", "0"], "is not a time"),
         (["/dev/x", "-o", "OUT", "--duration", "-1s"], ""),
-        (["/dev/x", "-o", "OUT", "--max-size", "much"], "is no size"),
-        (["/dev/x", "-o", "OUT", "--max-size", "9" * 400], "is no size"),
+        (["/dev/x", "-o", "OUT", "--max-size", "much"], "is not a size"),
+        (["/dev/x", "-o", "OUT", "--max-size", "9" * 400], "is not a size"),
         (["/dev/x", "-o", "OUT", "--rotate", "sometimes"], "is no"),
         (["/dev/x", "-o", "OUT", "--rotate", "1us"], ""),
-        (["/dev/x", "-o", "OUT", "--rotate", "1B"], "too little"),
-        (["/dev/x", "-o", "OUT", "--silence", "0"], "is no time"),
-        (["/dev/x", "-o", "OUT", "--columns", "a,,b"], "names with commas"),
-        (["/dev/x", "-o", "OUT", "--columns", "a,a"], "each once"),
+        (["/dev/x", "-o", "OUT", "--rotate", "1B"], "too small"),
+        (["/dev/x", "-o", "OUT", "--silence", "0"], "is not a time"),
+        (["/dev/x", "-o", "OUT", "--columns", "a,,b"], "distinct names"),
+        (["/dev/x", "-o", "OUT", "--columns", "a,a"], "distinct names"),
         (["/dev/x", "-o", "OUT", "--baud", "0"], ""),
         (["/dev/x", "-o", "OUT", "--speed", "-1"], ""),
     ],
@@ -338,17 +338,17 @@ def test_wrong_usage(
     ("given", "words"),
     [
         (["--device", "nonsense"], "no device 'nonsense'"),
-        (["--name", "a/b"], "the name 'a/b' cannot be in a topic"),
-        (["--name", "a b"], "cannot be in a topic"),
+        (["--name", "a/b"], "the name 'a/b' cannot be part of a topic"),
+        (["--name", "a b"], "cannot be part of a topic"),
         (["--artifact", "WRONG"], "wrong.toml"),
         (["--artifact", "TAG", "--artifact", "OTHER"], "a second tag.toml"),
-        (["--artifact", "OLD"], "no artifact is attached"),
-        (["--artifact", "GONE"], "No such file"),
+        (["--artifact", "OLD"], "the session contains no artifact"),
+        (["--artifact", "UNPLUGGED"], "No such file"),
         (["-o", "THERE"], "exists"),
         (["-o", "NOFOLDER"], "no folder"),
         (["-o", "FOLDER", "--overwrite"], "not a regular file"),
         (["--rotate", "10min", "-o", "PARTED"], "parted-002.mcap"),
-        (["--reserve", "100000TB"], "are free on the disk"),
+        (["--reserve", "100000TB"], "of the disk are free"),
     ],
 )
 def test_refused(
@@ -363,7 +363,7 @@ def test_refused(
         "WRONG": "wrong.toml",
         "TAG": "tag.toml",
         "OTHER": "other.toml",
-        "GONE": "gone.toml",
+        "UNPLUGGED": "gone.toml",
         "OLD": "old.mcap",
         "THERE": "there.mcap",
         "NOFOLDER": "no/run.mcap",
@@ -413,7 +413,7 @@ def test_what_is_played_is_not_overwritten(locatk: Any, old: Path) -> None:
 def test_a_camera_is_no_serial_device(locatk: Any, tmp_path: Path) -> None:
     result = locatk("capture", "camera:0", "--device", "lines", "-o", tmp_path / "run.mcap")
     assert result.exit_code == 1
-    assert "a camera is no lines" in result.stderr
+    assert "a camera is not a lines" in result.stderr
 
 
 def test_the_end_of_a_damaged_source_is_told(
@@ -439,7 +439,7 @@ def test_the_end_of_a_damaged_source_is_told(
 def test_times(text: str, seconds: float) -> None:
     assert DURATION.convert(text, None, None) == pytest.approx(seconds)
     if seconds >= 1:
-        assert PACE.convert(text, None, None) == ("time", pytest.approx(seconds))
+        assert ROTATION.convert(text, None, None) == ("time", pytest.approx(seconds))
 
 
 @pytest.mark.parametrize(
@@ -447,12 +447,12 @@ def test_times(text: str, seconds: float) -> None:
 )
 def test_sizes(text: str, count: float) -> None:
     assert SIZE.convert(text, None, None) == count
-    assert PACE.convert(text, None, None) == ("size", count)
+    assert ROTATION.convert(text, None, None) == ("size", count)
 
 
 @pytest.mark.parametrize("text", ["", "s", "1e3", "5 GiBs", "1,5s", "--", "1m2s", "nan", "inf"])
 def test_what_is_neither(text: str) -> None:
-    for kind in (DURATION, SIZE, PACE):
+    for kind in (DURATION, SIZE, ROTATION):
         with pytest.raises(click.BadParameter):
             kind.convert(text, None, None)  # type: ignore[attr-defined]
 
@@ -461,9 +461,9 @@ def test_what_is_neither(text: str) -> None:
 
 
 def test_the_live_line() -> None:
-    totals = Totals(bad=2, lost=3, overruns=4, gaps=1, high_water_bytes=5_000)
+    totals = CaptureStatistics(bad=2, lost=3, overruns=4, gaps=1, high_water_bytes=5_000_000)
     line = capture_text.status_line(
-        Status(3723.4, None, 2.5e6, 812.4, totals, 7_000_000, 80_000_000_000)
+        CaptureStatus(3723.4, None, 2.5e6, 812.4, totals, 7_000_000, 80_000_000_000)
     )
     assert line.split("  ") == [
         "1:02:03",
@@ -473,15 +473,20 @@ def test_the_live_line() -> None:
         "3 missing",
         "4 overrun",
         "1 gap",
-        "buffer 5 kB",
+        "backlog 5 MB",
         "file 7 MB",
-        "disk 80 GB left",
+        "disk 80 GB",
     ]
-    quiet = capture_text.status_line(Status(5.0, None, 0.0, 0.0, Totals(), 0, None))
+    quiet = capture_text.status_line(
+        CaptureStatus(5.0, None, 0.0, 0.0, CaptureStatistics(), 0, None)
+    )
     assert quiet.startswith("0:05  0 B/s")
     assert "gap" not in quiet
     assert "disk" not in quiet
-    away = capture_text.status_line(Status(9.0, 3.2, 0.0, 0.0, Totals(gaps=2), 0, None))
+    assert "backlog" not in quiet
+    away = capture_text.status_line(
+        CaptureStatus(9.0, 3.2, 0.0, 0.0, CaptureStatistics(gaps=2), 0, None)
+    )
     assert away.startswith("0:09  away for 3 s  ")
     assert "2 gaps" in away
 
@@ -499,7 +504,7 @@ def test_on_a_terminal_the_line_stays_one(
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "50")
-    status = Status(5.0, None, 1e6, 10.0, Totals(), 10**6, 10**9)
+    status = CaptureStatus(5.0, None, 1e6, 10.0, CaptureStatistics(), 10**6, 10**9)
     with capture_text.live() as live:
         live.show(status)
         live.show(status)
@@ -523,7 +528,7 @@ def test_who_listens_may_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(click, "echo", broken)
     live = capture_text.Live()
     live.tell("one")
-    live.show(Status(5.0, None, 1e6, 10.0, Totals(), 10**6, 10**9))
+    live.show(CaptureStatus(5.0, None, 1e6, 10.0, CaptureStatistics(), 10**6, 10**9))
     live.tell("two")
     live.wipe()
     assert len(heard) == 1
@@ -537,7 +542,7 @@ def test_losses_of_the_line_are_in_the_json(
     read, write = os.pipe()
 
     class Port:
-        name, comes_again = "uart", True
+        name, can_reconnect = "uart", True
 
         def open(self) -> Any:
             return self
@@ -588,7 +593,7 @@ PORT = PortInfo(
 
 
 def test_the_list_of_ports(locatk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listing, "ports", lambda: [PORT])
+    monkeypatch.setattr(listing, "find_ports_with_users", lambda: [PORT])
     result = locatk("capture", "--list")
     assert result.exit_code == 0
     assert result.stderr == ""
@@ -603,7 +608,7 @@ def test_the_list_of_ports(locatk: Any, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_no_ports(locatk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listing, "ports", list)
+    monkeypatch.setattr(listing, "find_ports_with_users", list)
     result = locatk("capture", "--list")
     assert (result.exit_code, result.stdout) == (0, "")
     assert "No serial port found" in result.stderr
@@ -630,9 +635,9 @@ def test_a_full_disk_is_one_line(
     monkeypatch.setattr(LiveFile, "free", lambda self: 1)
     from locatk.formats.capture import recorder
 
-    monkeypatch.setattr(recorder, "SHOW_S", 0.0)
+    monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.0)
     result = capture("--json")
     assert result.exit_code == 3
-    assert "Incomplete: the disk is full but for the reserve" in result.stderr
+    assert "Incomplete: the disk is full up to --reserve" in result.stderr
     assert TEXT.startswith(raw_bytes(tmp_path / "run.mcap"))
     assert "the disk is full" in json.loads(result.stdout)["ended"]

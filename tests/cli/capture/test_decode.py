@@ -72,8 +72,8 @@ def test_found_out(locatk: Any, old: Path, tmp_path: Path) -> None:
     report = json.loads(result.stdout)
     assert report["devices"][0]["device"] == "lines"
     assert report["devices"][0]["samples"] == {"/readings/robot": 50}
-    assert report["remarks"][0].startswith("the device is taken for lines")
-    assert "Warning: the device is taken for lines" in result.stderr
+    assert report["remarks"][0].startswith("identified device: lines")
+    assert "Warning: identified device: lines" in result.stderr
 
 
 def test_columns(locatk: Any, old: Path, tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_what_the_port_had_lost_is_not_told_again_by_the_status(locatk: Any, old
         (["EMPTY", "-o", "NEW"], "no raw bytes"),
         (["CUT", "-o", "NEW"], "cut.mcap"),
         (["GONE", "-o", "NEW"], "No such file"),
-        (["OLD", "-o", "NEW", "--artifact", "EMPTY"], "no artifact is attached"),
+        (["OLD", "-o", "NEW", "--artifact", "EMPTY"], "the session contains no artifact"),
     ],
 )
 def test_refused(locatk: Any, old: Path, tmp_path: Path, given: list[str], words: str) -> None:

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from locatk.cli.emulate import SYSTEMS
-from locatk.formats.emulation import default_sessions as simulated
-from locatk.formats.emulation.faults import Faults
+from locatk.formats.emulation import sources as simulated
+from locatk.formats.emulation.byte_stream import LineFaults
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
@@ -75,8 +75,8 @@ def test_the_path_is_all_that_is_printed(locatk: Callable, run: Path, tmp_path: 
         result = locatk("emulate", run, "--link", link)
     assert result.exit_code == 0, result.stderr
     assert result.stdout == f"{link}\n"
-    assert f"locatk, bytes as recorded of {run}, " in result.stderr
-    assert f"as: locatk capture {link} --device locatk " in result.stderr
+    assert f"locatk, recorded bytes of {run}, " in result.stderr
+    assert f"for example: locatk capture {link} --device locatk " in result.stderr
     assert result.stderr.endswith("Sent 5000 of 5000 bytes\n")
     assert b"".join(got) == DATA
     assert not os.path.lexists(link)
@@ -98,8 +98,8 @@ def test_json_tells_the_port_and_then_what_became_of_the_bytes(
     counted = {name: last.pop(name) for name in ("sent", "dropped", "flipped")}
     assert last == {**known, "made": 10_000, **lost}
     assert counted["sent"] == len(b"".join(got)) == 10_000 - counted["dropped"]
-    expected = Faults(0.05, 0.01, seed=3)
-    assert b"".join(got) == expected.spoil(2 * DATA)
+    expected = LineFaults(0.05, 0.01, seed=3)
+    assert b"".join(got) == expected.apply(2 * DATA)
     assert counted["dropped"] == expected.dropped > 0
     assert counted["flipped"] == expected.flipped > 0
 
@@ -114,7 +114,7 @@ def test_unplugging_is_counted(locatk: Callable, run: Path, tmp_path: Path) -> N
     assert told["unplugs"] == 1
     assert told["sent"] == len(b"".join(got)) > 0
     assert told["unheard"] == 5000 - told["sent"] > 0
-    assert "lost while nobody listened, unplugged 1 time\n" in result.stderr
+    assert "lost while the port was closed, unplugged 1 time\n" in result.stderr
 
 
 def test_as_fast_as_possible(locatk: Callable, run: Path, tmp_path: Path) -> None:
@@ -167,17 +167,17 @@ def test_all_systems_are_offered() -> None:
         (["absent.mcap"], 1, "Error: no such session in absent.mcap. Hint: Give a file, or a sys"),
         (["dots"], 1, "Hint: Record its camera with `locatk capture camera:VIDEO`"),
         (["RUN", "--device", "nonsense"], 1, "Error: no device 'nonsense'. Hint: Known devices"),
-        (["RUN", "--device", "lines"], 1, "Error: nothing that comes over a serial port in RUN"),
+        (["RUN", "--device", "lines"], 1, "Error: no data that a serial device sends in RUN"),
         (["RUN", "--link", "RUN"], 1, "Error: the path of the port is taken in RUN. Hint: Cho"),
         (["RUN", "--link", "absent/port"], 1, "Error: no folder for the port"),
-        (["EMPTY"], 1, "Error: nothing to send in EMPTY."),
+        (["EMPTY"], 1, "Error: no bytes to send in EMPTY."),
         (["TEXT"], 1, "Error: not an MCAP file"),
         (["RUN", "--drop", "2"], 2, "--drop"),
         (["RUN", "--speed", "-1"], 2, "--speed"),
         (["RUN", "--speed", "2", "--rate", "9"], 2, "--speed or --rate, not both"),
         (["RUN", "--speed", "0", "--no-wait"], 2, "--no-wait"),
-        (["RUN", "--away", "2"], 2, "--away is of --unplug-every"),
-        (["RUN", "--save", "x.mcap"], 2, "--save is of a SYSTEM"),
+        (["RUN", "--away", "2"], 2, "--away needs --unplug-every"),
+        (["RUN", "--save", "x.mcap"], 2, "--save applies to a SYSTEM"),
         ([], 2, "SESSION|SYSTEM"),
     ],
 )

@@ -103,7 +103,7 @@ def test_a_recording_without_an_end(locatk, chunked: Path, tmp_path: Path) -> No
     out = tmp_path / "out.mcap"
     result = locatk("recover", chunked, "-o", out)
     assert result.exit_code == 3
-    assert "the end (50 bytes are left of it) and whatever came last" in result.stderr
+    assert "the end (50 bytes of it remain) and the data after it" in result.stderr
     assert "?" in result.stdout  # how much is not known
     assert locatk("info", out).exit_code == 0
     again = locatk("recover", out, "-o", tmp_path / "again.mcap")
@@ -116,7 +116,7 @@ def test_a_damaged_index_is_no_loss(locatk, chunked: Path, tmp_path: Path) -> No
     chunked.write_bytes(data)
     result = locatk("recover", chunked, "-o", tmp_path / "out.mcap")
     assert result.exit_code == 0
-    assert "made anew" in result.stderr
+    assert "rebuilt" in result.stderr
     quiet = locatk("recover", chunked, "-o", tmp_path / "out2.mcap", "-q")
     assert (quiet.exit_code, quiet.stderr) == (0, "")
 

@@ -16,12 +16,12 @@ import pytest
 
 from locatk.formats.capture import ports, recorder
 from locatk.formats.capture import setup as session
-from locatk.formats.capture.recorder import Limits, Recorded, Status
-from locatk.formats.capture.source import LinkEnded, LinkLost, Overruns
+from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns
+from locatk.formats.capture.recorder import CaptureStatus, Limits, RecordingResult
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 
-WAIT_S = 20.0
+READ_TIMEOUT_S = 20.0
 """Longer than anything here takes; a test that waits for it has failed."""
 
 
@@ -31,7 +31,7 @@ class ScriptedPort:
     name = "scripted"
 
     def __init__(self) -> None:
-        self.comes_again = True
+        self.can_reconnect = True
         self.refusals: list[Exception] = []
         """What the next attempts to open it raise."""
         self.asked = 0
@@ -70,7 +70,7 @@ class ScriptedPort:
         """Wait until all that was sent has been read."""
         with self._coming.all_tasks_done:
             done = self._coming.all_tasks_done.wait_for(
-                lambda: not self._coming.unfinished_tasks, WAIT_S
+                lambda: not self._coming.unfinished_tasks, READ_TIMEOUT_S
             )
         assert done, "what was sent was not read"
 
@@ -110,18 +110,18 @@ class Running:
     ----------
     said : list of str
         What was told.
-    shown : list of Status
+    shown : list of CaptureStatus
     """
 
-    def __init__(self, wanted: session.Wanted) -> None:
+    def __init__(self, wanted: session.CaptureRequest) -> None:
         self.wanted = wanted
         self.stop = threading.Event()
         self.opened = threading.Event()
         self.said: list[str] = []
-        self.shown: list[Status] = []
+        self.shown: list[CaptureStatus] = []
         self.when_shown: Callable[[], None] = lambda: None
         self._news = threading.Condition()
-        self._recorded: Recorded | None = None
+        self._recorded: RecordingResult | None = None
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="test-recording")
         self._thread.start()
@@ -153,7 +153,7 @@ class Running:
         """Wait until it holds; looked at whenever something is told or shown."""
         with self._news:
             held = self._news.wait_for(
-                lambda: condition() or not self._thread.is_alive() or self._error, WAIT_S
+                lambda: condition() or not self._thread.is_alive() or self._error, READ_TIMEOUT_S
             )
         assert held, f"did not come about; told: {self.said}"
         assert condition(), f"did not come about; told: {self.said}, {self._error!r}"
@@ -162,16 +162,16 @@ class Running:
         """Wait until somebody is told this."""
         self.until(lambda: any(words in text for text in self.said))
 
-    def result(self) -> Recorded:
+    def result(self) -> RecordingResult:
         """Wait for the end and give what came of it, or raise what it raised."""
-        self._thread.join(WAIT_S)
+        self._thread.join(READ_TIMEOUT_S)
         assert not self._thread.is_alive(), "the recording does not end"
         if self._error is not None:
             raise self._error
         assert self._recorded is not None
         return self._recorded
 
-    def end(self) -> Recorded:
+    def end(self) -> RecordingResult:
         """Stop it, then :meth:`result`."""
         self.stop.set()
         return self.result()
@@ -190,16 +190,16 @@ def start(
     """``start("raw", duration_s=1, name="red")`` records the port to ``run.mcap``; the names of
     limits are theirs, all others those of what is wanted. Nothing may be left afterwards."""
     monkeypatch.setattr(ports, "port_of", lambda *args, **more: port)
-    monkeypatch.setattr(recorder, "SHOW_S", 0.05)  # instead of a second
+    monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.05)  # instead of a second
     before = _left()
     running: list[Running] = []
 
     def begin(device: str = "raw", **given: Any) -> Running:
         limits = {key: given.pop(key) for key in list(given) if key in Limits.__annotations__}
         given.setdefault("output", tmp_path / "run.mcap")
-        wanted = session.Wanted("scripted", device, limits=Limits(**limits), **given)
+        wanted = session.CaptureRequest("scripted", device, limits=Limits(**limits), **given)
         running.append(Running(wanted))
-        assert running[-1].opened.wait(WAIT_S)
+        assert running[-1].opened.wait(READ_TIMEOUT_S)
         return running[-1]
 
     yield begin

@@ -7,7 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.formats.capture.arrival_times import KEPT, Arrivals
+from locatk.formats.capture import clocks
+from locatk.formats.capture.clocks import ArrivalTimes
+
+KEPT_READS = 1 << 10
+"""Instead of MIN_KEPT_READS, so that the test is fast."""
 
 reads = st.lists(
     st.tuples(st.integers(1, 50), st.integers(0, 10_000)), min_size=1, max_size=30
@@ -15,14 +19,14 @@ reads = st.lists(
 """(ends, times) of reads, times not always later."""
 
 
-def filled(table: np.ndarray, byte_ns: float = 0.0) -> Arrivals:
-    arrivals = Arrivals(byte_ns)
+def filled(table: np.ndarray, byte_ns: float = 0.0) -> ArrivalTimes:
+    arrivals = ArrivalTimes(byte_ns)
     for end, time_ns in table.tolist():
         arrivals.add(end, time_ns)
     return arrivals
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(table=reads, byte_ns=st.floats(0, 500))
 def test_every_byte_has_the_time_of_its_read(table: np.ndarray, byte_ns: float) -> None:
     arrivals = filled(table, byte_ns)
@@ -56,13 +60,18 @@ def test_what_is_not_there_yet_has_the_last_time() -> None:
     assert filled(np.array([(10, 7), (20, 9)])).read_ns(np.array([21])).tolist() == [9]
 
 
-@pytest.mark.parametrize("n", [2 * KEPT, 2 * KEPT + 1, 3 * KEPT + 17, 4 * KEPT + 1])
-def test_a_long_recording_takes_no_more_room_and_forgets_only_what_is_old(n: int) -> None:
-    arrivals = Arrivals()
+@pytest.mark.parametrize(
+    "n", [2 * KEPT_READS, 2 * KEPT_READS + 1, 3 * KEPT_READS + 17, 4 * KEPT_READS + 1]
+)
+def test_a_long_recording_takes_no_more_memory_and_forgets_only_old_reads(
+    monkeypatch: pytest.MonkeyPatch, n: int
+) -> None:
+    monkeypatch.setattr(clocks, "MIN_KEPT_READS", KEPT_READS)
+    arrivals = ArrivalTimes()
     room = sum(each.nbytes for each in vars(arrivals).values() if isinstance(each, np.ndarray))
     for k in range(n):
         arrivals.add(3 * (k + 1), 1_000 * (k + 1))
-    ends = np.arange(3 * (n - KEPT) + 1, 3 * n + 1)
+    ends = np.arange(3 * (n - KEPT_READS) + 1, 3 * n + 1)
     assert arrivals.read_ns(ends).tolist() == (1_000 * -(-ends // 3)).tolist()
     after = sum(each.nbytes for each in vars(arrivals).values() if isinstance(each, np.ndarray))
     assert after == room

@@ -127,7 +127,7 @@ def test_a_session_and_a_file(tmp_path: Path) -> None:
 
 def test_a_session_without_any(tmp_path: Path) -> None:
     path = session(tmp_path / "old.mcap", notes="x = 1\n")
-    with pytest.raises(InputError, match=r"no artifact is attached in .*old\.mcap"):
+    with pytest.raises(InputError, match=r"the session contains no artifact in .*old\.mcap"):
         attachments([path])
 
 

@@ -20,7 +20,7 @@ import pytest
 from locatk.formats import images
 from locatk.formats.capture import camera
 from locatk.formats.capture.camera import CameraLink, Frame, port_of
-from locatk.formats.capture.source import LinkEnded, LinkLost, SourceError
+from locatk.formats.capture.links import LinkEnded, LinkLost, SourceError
 
 SIZE = (64, 48)
 GREYS = list(range(20, 220, 20))
@@ -71,7 +71,7 @@ def test_frames_of_a_video(video: Path, format: str, grey: bool) -> None:
     assert levels == pytest.approx(GREYS, abs=3)
     times = [frame.time_ns for frame in frames]
     assert times == sorted(set(times))
-    assert not port.comes_again
+    assert not port.can_reconnect
 
 
 def test_png_loses_nothing(video: Path) -> None:
@@ -118,7 +118,7 @@ def test_silence_until_a_frame_is_due(video: Path) -> None:
 
 
 def test_a_file_waits_for_who_reads_slowly(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera, "MOST_BYTES", 3 * SIZE[0] * SIZE[1] * 2)
+    monkeypatch.setattr(camera, "MAX_WAITING_BYTES", 3 * SIZE[0] * SIZE[1] * 2)
     link = port_of(str(video), clock=ticks(), speed=0).open()
     time.sleep(0.05)
     assert len(link._waiting) <= 3
@@ -134,7 +134,7 @@ def test_a_video_that_is_cut_short(video: Path) -> None:
     frames, end = shown(port_of(str(video), clock=ticks(), speed=0).open())
     assert 0 < len(frames) < len(GREYS)
     assert isinstance(end, LinkLost)
-    assert "cut short" in str(end)
+    assert "truncated" in str(end)
 
 
 def refused(place: str) -> SourceError:
@@ -177,7 +177,7 @@ def test_the_libraries_say_nothing(tmp_path: Path) -> None:
     code = """
 import sys
 from locatk.formats.capture.camera import port_of
-from locatk.formats.capture.source import SourceError
+from locatk.formats.capture.links import SourceError
 for place in sys.argv[1:]:
     try:
         port_of(place, clock=lambda: 0).open()
@@ -244,9 +244,9 @@ def stream() -> Iterator[str]:
 
 
 def test_a_network_camera(stream: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(camera, "MAX_FRAME_GAP_S", 0.1)
     port = port_of(stream, clock=ticks())
-    assert port.comes_again
+    assert port.can_reconnect
     for _ in range(2):
         frames, end = shown(port.open())
         assert len(frames) >= 10  # the last one may be taken for half a frame
@@ -281,7 +281,7 @@ class Capture:
 @pytest.fixture
 def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[bool]], Capture]:
     """Puts a camera of one's own behind ``camera:0``."""
-    monkeypatch.setattr(camera, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(camera, "MAX_FRAME_GAP_S", 0.05)
 
     def plug(answers: list[bool]) -> Capture:
         capture = Capture(answers)
@@ -297,21 +297,21 @@ def test_a_camera_is_unplugged(driver: Callable[[list[bool]], Capture]) -> None:
     frames, end = shown(port.open())
     assert len(frames) == 3
     assert isinstance(end, LinkLost)
-    assert port.comes_again
+    assert port.can_reconnect
     assert capture.released
     assert port.describe()["fps"] == "0"
 
 
 def test_a_camera_that_gives_nothing(driver: Callable[[list[bool]], Capture]) -> None:
     capture = driver([])
-    assert str(refused("0")) == "camera:0 gives no frame"
+    assert str(refused("0")) == "camera:0 provides no frame"
     assert capture.released
 
 
 def test_frames_that_nobody_reads_are_counted(
     driver: Callable[[list[bool]], Capture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(camera, "MOST_BYTES", 4 * SIZE[0] * SIZE[1] * 3)
+    monkeypatch.setattr(camera, "MAX_WAITING_BYTES", 4 * SIZE[0] * SIZE[1] * 3)
     capture = driver([True] * 10)
     link = port_of("0", clock=ticks()).open()
     while not capture.released:

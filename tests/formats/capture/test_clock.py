@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from locatk.formats.capture.host_clock import HostClock, steady_ns
+from locatk.formats.capture.clocks import HostClock, steady_ns
 
 
 class Clocks:

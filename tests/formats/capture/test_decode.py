@@ -14,13 +14,12 @@ from locatk.core.errors import FormatError, InputError, MissingDataError, Output
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.formats.capture.ingestion import SerialIntake
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.recording_files import LOG_NAME, Content, Parts
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.recording_files import LOG_NAME, FileContent, RecordingFiles
 from locatk.formats.capture.redecoding import decode, losses
 from locatk.formats.capture.statistics import RECORD
-from locatk.formats.devices import device
-from locatk.formats.devices.decoder import Options
-from locatk.formats.devices.recording import Recording
+from locatk.formats.devices import find_device
+from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
 from locatk.formats.sessions import messages
 from locatk.formats.sessions.reader import Session
@@ -46,9 +45,9 @@ def record(
     """A recording as the recorder makes it, with stamps of the test's own."""
     intake = SerialIntake(topic_name, "/dev/x", name, options)
     said = {"device": name, "port": "/dev/x", "note": "of a test", **(facts or {})}
-    made = Parts(path, Content(said, {}, intake.declared))
+    made = RecordingFiles(path, FileContent(said, {}, intake.declared))
     for start in range(0, len(reads), 3):
-        arrived: list[Arrived] = []
+        arrived: list[ReceivedData] = []
         for each in reads[start : start + 3]:
             if each is None:
                 made.write(intake.take(arrived))
@@ -57,7 +56,7 @@ def record(
                 made.write(intake.restart())
                 made.log("connected again", START_NS)
             else:
-                arrived.append(Arrived(START_NS + each[0] * MS, each[1], len(each[1])))
+                arrived.append(ReceivedData(START_NS + each[0] * MS, each[1], len(each[1])))
         made.write(intake.take(arrived))
         made.flush()
     made.write(intake.finish())
@@ -131,7 +130,9 @@ def some_halls(n: int = 400) -> HallSamples:
 def test_binary_devices_alike(
     tmp_path: Path, name: str, recording: Recording, topic: str, layout: Any
 ) -> None:
-    sent = [((time_ns - START_NS) // MS, data) for time_ns, data in device(name).encode(recording)]
+    sent = [
+        ((time_ns - START_NS) // MS, data) for time_ns, data in find_device(name).encode(recording)
+    ]
     live = record(tmp_path / "live.mcap", name, sent)
     decode(live, tmp_path / "again.mcap")
 

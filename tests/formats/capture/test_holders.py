@@ -13,8 +13,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from locatk.formats.capture import port_holders as holding
-from locatk.formats.capture.port_holders import Holder, busy, forbidden, holders, is_pty
+from locatk.formats.capture import port_listing as holding
+from locatk.formats.capture.port_listing import (
+    PortUser,
+    busy_error,
+    find_port_users,
+    is_pty,
+    permission_error,
+)
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has /proc")
 
@@ -41,8 +47,8 @@ def another(path: str) -> Iterator[int]:
 
 @linux
 def test_nobody(path: str) -> None:
-    assert holders([path]) == {path: ()}
-    assert holders(["/no/such/port"]) == {"/no/such/port": ()}
+    assert find_port_users([path]) == {path: ()}
+    assert find_port_users(["/no/such/port"]) == {"/no/such/port": ()}
 
 
 @linux
@@ -50,17 +56,17 @@ def test_this_program(path: str, tmp_path: Path) -> None:
     link = tmp_path / "robot"
     link.symlink_to(path)
     number = os.open(path, os.O_RDWR | os.O_NOCTTY)
-    found = holders([str(link), path, "/dev/null"])
+    found = find_port_users([str(link), path, "/dev/null"])
     os.close(number)
     assert [holder.pid for holder in found[path]] == [os.getpid()]
     assert found[str(link)] == found[path]
-    assert holders([path]) == {path: ()}
+    assert find_port_users([path]) == {path: ()}
 
 
 @linux
 def test_another_program(path: str, another: int) -> None:
-    assert holders([path]) == {path: (Holder(another, "sleep"),)}
-    assert str(busy("robot", path)) == f"robot is in use by sleep (pid {another})"
+    assert find_port_users([path]) == {path: (PortUser(another, "sleep"),)}
+    assert str(busy_error("robot", path)) == f"robot is in use by sleep (pid {another})"
 
 
 @linux
@@ -79,33 +85,33 @@ def test_locks_are_told_of_all_users(
     (tmp_path / "locks").write_text(f"{lines[0]}\n{other}4: FLOCK ADVISORY WRITE x y 0 EOF\n")
     (tmp_path / str(os.getpid())).mkdir()
     (tmp_path / str(os.getpid()) / "comm").write_text("capture\n")
-    monkeypatch.setattr(holding, "PROC", tmp_path)
-    assert holders([path]) == {path: (Holder(os.getpid(), "capture"),)}
+    monkeypatch.setattr(holding, "PROC_DIR", tmp_path)
+    assert find_port_users([path]) == {path: (PortUser(os.getpid(), "capture"),)}
 
 
 def test_where_nobody_can_be_seen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(holding, "PROC", tmp_path / "none")
-    error = busy("/dev/ttyACM0", "/dev/ttyACM0")
+    monkeypatch.setattr(holding, "PROC_DIR", tmp_path / "none")
+    error = busy_error("/dev/ttyACM0", "/dev/ttyACM0")
     assert str(error) == "/dev/ttyACM0 is in use by another program"
     assert error.hint is not None
     assert "ModemManager" in error.hint
     assert "lsof /dev/ttyACM0" in error.hint
 
 
-def seen(monkeypatch: pytest.MonkeyPatch, *found: Holder) -> None:
-    monkeypatch.setattr(holding, "holders", lambda paths: dict.fromkeys(paths, found))
+def seen(monkeypatch: pytest.MonkeyPatch, *found: PortUser) -> None:
+    monkeypatch.setattr(holding, "find_port_users", lambda paths: dict.fromkeys(paths, found))
 
 
 def test_the_hint_knows_the_modem_manager(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen(monkeypatch, Holder(9, "ModemManager"))
-    error = busy("robot", "/dev/ttyACM0")
+    seen(monkeypatch, PortUser(9, "ModemManager"))
+    error = busy_error("robot", "/dev/ttyACM0")
     assert str(error) == "robot is in use by ModemManager (pid 9)"
     assert "systemctl disable --now ModemManager" in str(error.hint)
 
 
 def test_all_holders_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen(monkeypatch, Holder(os.getpid(), "python"), Holder(8, "screen"))
-    assert "by this program itself and screen (pid 8)" in str(busy("robot", "/dev/x"))
+    seen(monkeypatch, PortUser(os.getpid(), "python"), PortUser(8, "screen"))
+    assert "by this program itself and screen (pid 8)" in str(busy_error("robot", "/dev/x"))
 
 
 def node(monkeypatch: pytest.MonkeyPatch, mode: int, gid: int) -> None:
@@ -117,7 +123,7 @@ def node(monkeypatch: pytest.MonkeyPatch, mode: int, gid: int) -> None:
 def test_the_group_of_the_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     node(monkeypatch, 0o660, 987)
     monkeypatch.setattr(grp, "getgrgid", lambda gid: SimpleNamespace(gr_name="uucp", gr_mem=[]))
-    error = forbidden("robot", "/dev/ttyACM0")
+    error = permission_error("robot", "/dev/ttyACM0")
     assert str(error) == "no permission to open robot"
     assert "sudo usermod -aG uucp $USER" in str(error.hint)
     assert "log in again" in str(error.hint)
@@ -128,18 +134,18 @@ def test_a_member_must_log_in_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pwd.getpwuid", lambda uid: SimpleNamespace(pw_name="ada"))
     group = SimpleNamespace(gr_name="dialout", gr_mem=["ada"])
     monkeypatch.setattr(grp, "getgrgid", lambda gid: group)
-    assert "since you logged in: log in again" in str(forbidden("robot", "/dev/x").hint)
+    assert "after your login: log in again" in str(permission_error("robot", "/dev/x").hint)
 
 
 @pytest.mark.parametrize(("mode", "gid"), [(0o600, 987), (0o660, 0), (0o640, 987)])
 def test_no_group_may(monkeypatch: pytest.MonkeyPatch, mode: int, gid: int) -> None:
     node(monkeypatch, mode, gid)
-    assert "udev" in str(forbidden("robot", "/dev/x").hint)
+    assert "udev" in str(permission_error("robot", "/dev/x").hint)
 
 
 def test_a_group_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     node(monkeypatch, 0o660, 2**31 - 7)
-    assert "2147483641" in str(forbidden("robot", "/dev/x").hint)
+    assert "2147483641" in str(permission_error("robot", "/dev/x").hint)
 
 
 @linux

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import types
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,10 +14,10 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
 from locatk.formats import devices as wire
-from locatk.formats.capture.device_messages import Stamped
-from locatk.formats.capture.ingestion import PAUSE_NS, CameraIntake, SerialIntake
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.statistics import Totals
+from locatk.formats.capture import ingestion
+from locatk.formats.capture.ingestion import PAUSE_NS, CameraIntake, SerialIntake, StampedMessage
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 
@@ -120,11 +118,11 @@ def devices(monkeypatch: pytest.MonkeyPatch) -> None:
         )
 
 
-def reads(*data: bytes, step_ns: int = 4 * MS, start_ns: int = START_NS) -> list[Arrived]:
-    return [Arrived(start_ns + k * step_ns, each, len(each)) for k, each in enumerate(data)]
+def reads(*data: bytes, step_ns: int = 4 * MS, start_ns: int = START_NS) -> list[ReceivedData]:
+    return [ReceivedData(start_ns + k * step_ns, each, len(each)) for k, each in enumerate(data)]
 
 
-def raw(made: Sequence[Stamped]) -> bytes:
+def raw(made: Sequence[StampedMessage]) -> bytes:
     content = bytearray()
     for each in made:
         if isinstance(each.message, SerialChunk):
@@ -134,7 +132,7 @@ def raw(made: Sequence[Stamped]) -> bytes:
     return bytes(content)
 
 
-def values(made: Sequence[Stamped]) -> list[float]:
+def values(made: Sequence[StampedMessage]) -> list[float]:
     return [
         value
         for each in made
@@ -143,7 +141,7 @@ def values(made: Sequence[Stamped]) -> list[float]:
     ]
 
 
-def times_of(made: Sequence[Stamped]) -> list[int]:
+def times_of(made: Sequence[StampedMessage]) -> list[int]:
     return [
         time_ns
         for each in made
@@ -152,8 +150,8 @@ def times_of(made: Sequence[Stamped]) -> list[int]:
     ]
 
 
-def counted(intake: Any) -> Totals:
-    totals = Totals()
+def counted(intake: Any) -> CaptureStatistics:
+    totals = CaptureStatistics()
     intake.count(totals)
     return totals
 
@@ -184,7 +182,7 @@ def test_how_it_was_read_changes_no_record(data: bytes, cut: st.DataObject) -> N
     pieces = [data[a:b] for a, b in zip([0, *places], [*places, len(data)], strict=True)]
     pieces = [piece for piece in pieces if piece]
     intake = SerialIntake("red", "", "quads")
-    made: list[Stamped] = []
+    made: list[StampedMessage] = []
     turns = sorted(cut.draw(st.sets(st.integers(0, len(pieces)), max_size=4)))
     arrived = reads(*pieces)
     for a, b in zip([0, *turns], [*turns, len(pieces)], strict=True):
@@ -295,7 +293,7 @@ FAULTS = {
 @pytest.mark.parametrize("where", FAULTS)
 def test_a_decoder_that_fails_costs_no_byte(where: str) -> None:
     intake = SerialIntake("red", "", "quads")
-    made: list[Stamped] = []
+    made: list[StampedMessage] = []
     sent = b""
     for number, piece in enumerate(FAULTS[where]):
         if piece is None:
@@ -381,11 +379,8 @@ class Identifier:
 
 @pytest.fixture
 def auto(monkeypatch: pytest.MonkeyPatch) -> type[Identifier]:
-    module: Any = types.ModuleType("identify")
     kind = type("Identifier", (Identifier,), {})
-    module.Identifier, module.Verdict, module.LISTEN_S = kind, Verdict, 3.0
-    monkeypatch.setitem(sys.modules, "locatk.formats.devices.identification", module)
-    monkeypatch.setattr(wire, "identify", module, raising=False)
+    monkeypatch.setattr(ingestion, "Identifier", kind)
     return kind
 
 
@@ -405,7 +400,7 @@ def test_auto_loses_nothing_while_it_listens(auto: Any) -> None:
     expected = [0.0, 50 * MS - 4 * byte_ns, 50 * MS]
     np.testing.assert_allclose(np.array(times_of(made)) - START_NS, expected, atol=2)
     (remark,) = intake.remarks()
-    assert remark == "the device is taken for quads: four bytes each"
+    assert remark == "identified device: quads (four bytes each)"
     list(intake.take(reads(b"mnop", start_ns=START_NS + 60 * MS)))
     assert counted(intake).frames == 4
 
@@ -459,7 +454,7 @@ def test_auto_that_fails_costs_no_byte(auto: Any) -> None:
 def test_auto_that_hears_nothing(auto: Any) -> None:
     intake = SerialIntake("red", "", "auto")
     assert list(intake.finish()) == []
-    assert counted(intake) == Totals()
+    assert counted(intake) == CaptureStatistics()
 
 
 # ---- cameras
@@ -468,7 +463,7 @@ def test_auto_that_hears_nothing(auto: Any) -> None:
 def test_frames_of_a_camera() -> None:
     intake = CameraIntake("camera", "png")
     frames = [(START_NS, b"one"), (START_NS + 5, b"three")]
-    made = list(intake.take([Arrived(START_NS + 9, frames, 8)]))
+    made = list(intake.take([ReceivedData(START_NS + 9, frames, 8)]))
     images: list[Any] = [each.message for each in made]
     assert [(each.topic, each.time_ns) for each in made] == [
         (intake.topic, START_NS),

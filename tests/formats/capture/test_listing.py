@@ -13,8 +13,12 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from locatk.formats.capture import port_listing as listing
-from locatk.formats.capture.port_holders import Holder
-from locatk.formats.capture.port_listing import PortInfo, attached, ports
+from locatk.formats.capture.port_listing import (
+    PortInfo,
+    PortUser,
+    find_ports,
+    find_ports_with_users,
+)
 
 
 def usb(device: str, **known: object) -> ListPortInfo:
@@ -44,12 +48,16 @@ def arduino(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("arduino")
 def test_ports_in_natural_order() -> None:
-    assert [info.device for info in ports()] == ["/dev/ttyACM9", "/dev/ttyACM10", "/dev/ttyS4"]
+    assert [info.device for info in find_ports_with_users()] == [
+        "/dev/ttyACM9",
+        "/dev/ttyACM10",
+        "/dev/ttyS4",
+    ]
 
 
 @pytest.mark.usefixtures("arduino")
 def test_all_that_is_known() -> None:
-    bare, known, _ = ports()
+    bare, known, _ = find_ports_with_users()
     assert known == PortInfo(
         device="/dev/ttyACM10",
         vid=0x2341,
@@ -66,7 +74,7 @@ def test_all_that_is_known() -> None:
 
 def test_this_machine() -> None:
     # Whatever it has: names that exist, once each.
-    names = [info.device for info in attached()]
+    names = [info.device for info in find_ports()]
     assert len(set(names)) == len(names)
     if sys.platform == "linux":
         assert all(os.path.exists(name) for name in names)
@@ -74,9 +82,15 @@ def test_this_machine() -> None:
 
 @pytest.mark.usefixtures("arduino")
 def test_holders_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    held = {"/dev/ttyACM10": (Holder(7, "screen"), Holder(8, "cat"))}
-    monkeypatch.setattr(listing, "holders", lambda paths: {p: held.get(p, ()) for p in paths})
-    assert [info.holder for info in ports()] == [None, "screen (pid 7), cat (pid 8)", None]
+    held = {"/dev/ttyACM10": (PortUser(7, "screen"), PortUser(8, "cat"))}
+    monkeypatch.setattr(
+        listing, "find_port_users", lambda paths: {p: held.get(p, ()) for p in paths}
+    )
+    assert [info.holder for info in find_ports_with_users()] == [
+        None,
+        "screen (pid 7), cat (pid 8)",
+        None,
+    ]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has names without ports")
@@ -84,10 +98,10 @@ def test_names_without_a_port_are_left_out(tmp_path: Path, monkeypatch: pytest.M
     for name, kind in (("ttyS0", "4"), ("ttyS1", "0")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(f"{kind}\n")
-    monkeypatch.setattr(listing, "TTYS", tmp_path)
+    monkeypatch.setattr(listing, "TTY_CLASS_DIR", tmp_path)
     names = ["/dev/ttyS0", "/dev/ttyS1", "/dev/ttyS2", "/dev/ttyUSB0"]
     monkeypatch.setattr(list_ports, "comports", lambda: [usb(name) for name in names])
-    assert [info.device for info in attached()] == ["/dev/ttyS0", "/dev/ttyS2", "/dev/ttyUSB0"]
+    assert [info.device for info in find_ports()] == ["/dev/ttyS0", "/dev/ttyS2", "/dev/ttyUSB0"]
 
 
 def test_a_port_that_goes_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,7 +114,7 @@ def test_a_port_that_goes_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
         return [usb("/dev/ttyACM0")]
 
     monkeypatch.setattr(list_ports, "comports", comports)
-    assert attached() == [PortInfo("/dev/ttyACM0")]
+    assert find_ports() == [PortInfo("/dev/ttyACM0")]
 
 
 def test_ports_that_cannot_be_listed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +122,7 @@ def test_ports_that_cannot_be_listed(monkeypatch: pytest.MonkeyPatch) -> None:
         raise OSError("no /sys here")
 
     monkeypatch.setattr(list_ports, "comports", comports)
-    assert attached() == ports() == []
+    assert find_ports() == find_ports_with_users() == []
 
 
 def test_identity() -> None:

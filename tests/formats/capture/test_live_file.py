@@ -12,8 +12,8 @@ from typing import IO, Any
 import pytest
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
-from locatk.formats.capture import live_file
-from locatk.formats.capture.live_file import AHEAD, DiskFullError, LiveFile
+from locatk.formats.capture import recording_files as live_file
+from locatk.formats.capture.recording_files import RESERVED_BYTES, DiskFullError, LiveFile
 
 
 class Disk:
@@ -242,7 +242,7 @@ def test_where_room_cannot_be_taken_nobody_asks_again(
     taken.answers = [number]
     file = LiveFile(tmp_path / "run.mcap")
     for _ in range(3):
-        file.make_room(10 * AHEAD)
+        file.make_room(10 * RESERVED_BYTES)
         file.write(b"x")
     assert len(taken.ends) == 1
     file.close()
@@ -267,10 +267,10 @@ def test_room_is_taken_without_a_longer_file_and_given_back(tmp_path: Path) -> N
         pytest.skip(f"this file system takes no room ahead ({os.strerror(number)})")
     file.make_room(1000)
     assert path.stat().st_size == 1
-    assert path.stat().st_blocks * 512 >= AHEAD
+    assert path.stat().st_blocks * 512 >= RESERVED_BYTES
     file.close()
     assert path.stat().st_size == 1
-    assert path.stat().st_blocks * 512 < AHEAD
+    assert path.stat().st_blocks * 512 < RESERVED_BYTES
 
 
 def test_on_a_disk_that_fills_what_was_promised_can_be_written(small_disk: Path) -> None:

@@ -11,14 +11,14 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
-from locatk.formats.capture import live_file
+from locatk.formats.capture import recording_files as live_file
 from locatk.formats.capture import recording_files as parts
-from locatk.formats.capture.device_messages import Stamped
-from locatk.formats.capture.live_file import DiskFullError
+from locatk.formats.capture.ingestion import StampedMessage
 from locatk.formats.capture.recording_files import (
     LOG_NAME,
-    Content,
-    Parts,
+    DiskFullError,
+    FileContent,
+    RecordingFiles,
     check_outputs,
     part_path,
 )
@@ -28,16 +28,16 @@ from locatk.formats.sessions.reader import Session
 
 START_NS = 1_700_000_000_000_000_000
 TOPIC = "/serial/robot"
-CONTENT = Content(
+CONTENT = FileContent(
     facts={"port": "/dev/ttyACM0", "meta:robot": "7"},
     artifacts={"tag.toml": "a = 1\n"},
     declared=[(TOPIC, SerialChunk)],
 )
 
 
-def chunk(data: bytes, offset: int = 0, time_ns: int = START_NS) -> Stamped:
+def chunk(data: bytes, offset: int = 0, time_ns: int = START_NS) -> StampedMessage:
     message = SerialChunk(timestamp=timestamp(time_ns), byte_offset=offset, data=data)
-    return Stamped(TOPIC, message, time_ns, time_ns)
+    return StampedMessage(TOPIC, message, time_ns, time_ns)
 
 
 def contents(path: Path) -> bytes:
@@ -53,7 +53,7 @@ def test_names_of_parts() -> None:
 
 def test_one_file_with_all_that_was_said(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    made = Parts(path, CONTENT)
+    made = RecordingFiles(path, CONTENT)
     made.write([chunk(b"first")])
     made.system("polaris")
     made.system("")
@@ -77,7 +77,7 @@ def test_one_file_with_all_that_was_said(tmp_path: Path) -> None:
 
 
 def test_streams_without_a_message_are_known_too(tmp_path: Path) -> None:
-    made = Parts(tmp_path / "run.mcap", CONTENT)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT)
     made.finish({})
     session = Session.open(tmp_path / "run.mcap")
     assert {each.topic: each.schema for each in session.channels} == {
@@ -87,7 +87,7 @@ def test_streams_without_a_message_are_known_too(tmp_path: Path) -> None:
 
 
 def test_what_was_flushed_is_there_when_the_program_is_killed(tmp_path: Path) -> None:
-    made = Parts(tmp_path / "run.mcap", CONTENT)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT)
     made.flush()
     made.write([chunk(b"kept")])
     made.flush()
@@ -103,10 +103,10 @@ def test_what_was_flushed_is_there_when_the_program_is_killed(tmp_path: Path) ->
 
 
 def test_a_new_topic_is_there_when_the_program_is_killed(tmp_path: Path) -> None:
-    made = Parts(tmp_path / "run.mcap", CONTENT)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT)
     made.write([chunk(b"x")])
     made.flush()
-    made.write([Stamped("/readings/robot", Readings(device="robot"), START_NS, START_NS)])
+    made.write([StampedMessage("/readings/robot", Readings(device="robot"), START_NS, START_NS)])
     made.flush()
     killed = shutil.copy(tmp_path / "run.mcap", tmp_path / "killed.mcap")
     made.finish({})
@@ -132,7 +132,7 @@ def test_no_chunk_is_larger_than_what_room_was_made_for(
         assert not room or self.tell() <= room
         return count
 
-    made = Parts(tmp_path / "run.mcap", CONTENT)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT)
     monkeypatch.setattr(live_file.LiveFile, "make_room", make_room)
     monkeypatch.setattr(live_file.LiveFile, "write", write)
     made.flush()
@@ -152,7 +152,7 @@ def test_room_is_taken_for_chunks_that_are_there(
     """A silent line, flushed five times a second for a day, needs no more of the disk."""
     asked: list[int] = []
     monkeypatch.setattr(live_file.LiveFile, "make_room", lambda self, more: asked.append(more))
-    made = Parts(tmp_path / "run.mcap", CONTENT)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT)
     for _ in range(2000):
         made.flush()
     made.finish({})
@@ -163,7 +163,7 @@ def test_room_is_taken_for_chunks_that_are_there(
 
 
 def test_parts_are_whole_in_themselves(tmp_path: Path) -> None:
-    made = Parts(tmp_path / "run.mcap", CONTENT, numbered=True)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT, numbered=True)
     made.write([chunk(b"one")])
     made.system("landmarks")
     made.attach({"halls.toml": "h = 1\n"})
@@ -189,7 +189,7 @@ def test_parts_are_whole_in_themselves(tmp_path: Path) -> None:
 
 
 def test_the_size_of_a_part_is_its_own(tmp_path: Path) -> None:
-    made = Parts(tmp_path / "run.mcap", CONTENT, numbered=True)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT, numbered=True)
     made.write([chunk(os.urandom(300_000))])
     made.flush()
     assert made.part_bytes == made.bytes_written > 300_000
@@ -221,7 +221,7 @@ def test_parts_of_an_older_recording_do_not_stay_among_the_new(tmp_path: Path) -
     for number in (1, 2, 3, 4):
         part_path(tmp_path / "run.mcap", number).write_bytes(b"old")
     (tmp_path / "run-x.mcap").write_bytes(b"another")
-    made = Parts(tmp_path / "run.mcap", CONTENT, numbered=True, overwrite=True)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT, numbered=True, overwrite=True)
     made.next_part({})
     made.finish({})
     names = sorted(path.name for path in tmp_path.iterdir())
@@ -230,18 +230,18 @@ def test_parts_of_an_older_recording_do_not_stay_among_the_new(tmp_path: Path) -
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no flock")
 def test_parts_that_are_being_written_are_not_replaced(tmp_path: Path) -> None:
-    made = Parts(tmp_path / "run.mcap", CONTENT, numbered=True)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT, numbered=True)
     made.write([chunk(b"one")])
     made.next_part({})
     made.write([chunk(b"two", 3)])
     with pytest.raises(OutputExistsError, match="being recorded"):
-        Parts(tmp_path / "run.mcap", CONTENT, numbered=True, overwrite=True)
+        RecordingFiles(tmp_path / "run.mcap", CONTENT, numbered=True, overwrite=True)
     made.finish({})
     assert [contents(path) for path in made.paths] == [b"one", b"two"]
 
 
 def test_a_part_that_cannot_be_begun_leaves_the_one_before_whole(tmp_path: Path) -> None:
-    made = Parts(tmp_path / "run.mcap", CONTENT, numbered=True)
+    made = RecordingFiles(tmp_path / "run.mcap", CONTENT, numbered=True)
     made.write([chunk(b"one")])
     part_path(tmp_path / "run.mcap", 2).mkdir()
     with pytest.raises(LocatkError):
@@ -254,7 +254,7 @@ def test_a_part_that_cannot_be_begun_leaves_the_one_before_whole(tmp_path: Path)
 # ---- a full disk
 
 
-def fill(made: Parts, size: int, pieces: list[bytes]) -> None:
+def fill(made: RecordingFiles, size: int, pieces: list[bytes]) -> None:
     """Write for ever, and note what."""
     while True:
         pieces.append(os.urandom(size))
@@ -263,7 +263,7 @@ def fill(made: Parts, size: int, pieces: list[bytes]) -> None:
 
 def test_a_full_disk_leaves_a_whole_file(small_disk: Path) -> None:
     path = small_disk / "run.mcap"
-    made = Parts(path, CONTENT)
+    made = RecordingFiles(path, CONTENT)
     pieces: list[bytes] = []
     with pytest.raises(DiskFullError):
         fill(made, 50_000, pieces)
@@ -278,7 +278,7 @@ def test_a_full_disk_leaves_a_whole_file(small_disk: Path) -> None:
 def test_a_full_disk_leaves_a_whole_file_of_large_messages(small_disk: Path, size: int) -> None:
     """Pictures of a camera are larger than a chunk."""
     path = small_disk / "run.mcap"
-    made = Parts(path, CONTENT)
+    made = RecordingFiles(path, CONTENT)
     pieces: list[bytes] = []
     with pytest.raises(DiskFullError):
         fill(made, size, pieces)
@@ -292,7 +292,7 @@ def test_a_full_disk_leaves_a_whole_file_of_large_messages(small_disk: Path, siz
 
 def test_a_message_that_the_disk_has_no_room_for_is_left_out(small_disk: Path) -> None:
     path = small_disk / "run.mcap"
-    made = Parts(path, CONTENT)
+    made = RecordingFiles(path, CONTENT)
     made.flush()
     made.write([chunk(os.urandom(3_000_000))])
     with pytest.raises(DiskFullError):
@@ -308,4 +308,4 @@ def test_half_of_what_the_library_writes_unasked() -> None:
 
     from mcap.writer import Writer
 
-    assert inspect.signature(Writer).parameters["chunk_size"].default >= 2 * parts.CHUNK
+    assert inspect.signature(Writer).parameters["chunk_size"].default >= 2 * parts.CHUNK_BYTES

@@ -23,11 +23,11 @@ import serial
 from serial.rfc2217 import PortManager
 from serial.tools import list_ports
 
-from locatk.formats.capture import port_holders as holders
+from locatk.formats.capture import port_listing as holders
 from locatk.formats.capture import ports
+from locatk.formats.capture.links import Link, LinkLost, SourceError
 from locatk.formats.capture.port_listing import PortInfo
 from locatk.formats.capture.ports import SerialPort, port_of
-from locatk.formats.capture.source import Link, LinkLost, SourceError
 
 BAUD = 115_200
 EVERY_BYTE = bytes(range(256)) * 12
@@ -125,7 +125,7 @@ def test_bytes_of_a_terminal(terminal: Terminal, opened: Opened) -> None:
     assert gathered(link, len(EVERY_BYTE)) == EVERY_BYTE
     assert link.read(0.001) == b""
     assert link.overruns() is None
-    assert port.comes_again
+    assert port.can_reconnect
     assert port.describe() == {
         "port": terminal.path,
         "resolved": terminal.path,
@@ -271,7 +271,7 @@ def test_no_permission(terminal: Terminal) -> None:
     assert advice in told
 
 
-@pytest.mark.parametrize("kind", ["a folder", "no serial port"])
+@pytest.mark.parametrize("kind", ["a folder", "not a serial port"])
 def test_not_a_port(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "run.mcap"
     if kind == "a folder":
@@ -284,14 +284,14 @@ def test_not_a_port(tmp_path: Path, kind: str) -> None:
 
 
 def test_a_device_that_is_no_terminal() -> None:
-    assert str(refused("/dev/null")) == "/dev/null is no serial port"
+    assert str(refused("/dev/null")) == "/dev/null is not a serial port"
 
 
 @pytest.fixture
 def plugged(monkeypatch: pytest.MonkeyPatch) -> list[PortInfo]:
     """The ports of this computer, for the test to change."""
     now: list[PortInfo] = []
-    monkeypatch.setattr(ports, "attached", lambda: list(now))
+    monkeypatch.setattr(ports, "find_ports", lambda: list(now))
     return now
 
 
@@ -310,7 +310,7 @@ def test_no_such_port_at_all(plugged: list[PortInfo]) -> None:
 def test_the_driver_sets_another_speed(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_actual_baud", lambda number: 9600)
     error = refused(terminal.path)
-    assert str(error) == f"{terminal.path} cannot do 115200 baud, only 9600"
+    assert str(error) == f"{terminal.path} does not support 115200 baud; it uses 9600"
     assert "--baud" in str(error.hint)
     monkeypatch.setattr(ports, "_actual_baud", lambda number: 117_000)
     port_of(terminal.path, baud=BAUD).open().close()
@@ -326,7 +326,7 @@ def test_the_speed_is_as_set(terminal: Terminal) -> None:
 
 @pytest.mark.parametrize("baud", [2**31, 2**40])
 def test_a_speed_that_no_driver_takes(terminal: Terminal, baud: int) -> None:
-    assert f"cannot do {baud} baud" in str(refused(terminal.path, baud=baud))
+    assert f"does not support {baud} baud" in str(refused(terminal.path, baud=baud))
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def test_a_speed_that_no_driver_takes(terminal: Terminal, baud: int) -> None:
         (OSError(errno.EIO, "I/O error"), "no device behind"),
         (OSError(errno.ENXIO, "none"), "no device behind"),
         (OSError(errno.EBUSY, "busy"), "is in use by"),
-        (OSError(errno.EINVAL, "invalid"), "cannot do 115200 baud"),
+        (OSError(errno.EINVAL, "invalid"), "does not support 115200 baud"),
         (OSError(errno.ENOMEM, "no memory"), "cannot be opened ("),
         (PermissionError(errno.EACCES, "no"), "no permission"),
         (RuntimeError(), "cannot be opened (RuntimeError)"),
@@ -421,7 +421,7 @@ def test_another_device_is_not_taken_for_it(
     opened(port).close()
     plugged[:] = [device(terminal.path, pid=0x8036, description="Leonardo bootloader")]
     error = refused(port)
-    assert str(error) == f"another device is at {terminal.path} now (Leonardo bootloader)"
+    assert str(error) == f"{terminal.path} is another device now (Leonardo bootloader)"
     assert error.hint == "Plug in Uno again"
     plugged[:] = [device(terminal.path)]
     opened(port)
@@ -472,8 +472,8 @@ def test_twins_are_told_apart_by_their_sockets(
     # It is unplugged: its twin is not it.
     plugged[:] = [twin]
     error = refused(port)
-    assert str(error) == f"{terminal.path} is gone; like it there is /dev/none"
-    assert error.hint == "Plug it in where it was: USB 1-2"
+    assert str(error) == f"{terminal.path} is gone; similar ports: /dev/none"
+    assert error.hint == "Plug it into its former socket: USB 1-2"
     # It comes back, and the two have changed their names.
     plugged[:] = [adapter(terminal.path, "1-3"), adapter(another.path, "1-2")]
     opened(port).close()
@@ -508,7 +508,7 @@ def served(
 def test_a_socket(opened: Opened) -> None:
     number, thread = served(lambda connection: connection.sendall(b"hello" + EVERY_BYTE), 2)
     port = port_of(f"socket://127.0.0.1:{number}", baud=BAUD)
-    assert port.comes_again
+    assert port.can_reconnect
     for _ in range(2):
         link = opened(port)
         # What the server said before anybody read is not thrown away.
@@ -518,7 +518,7 @@ def test_a_socket(opened: Opened) -> None:
         link.close()
     assert port.describe() == {"port": port.name, "resolved": f"127.0.0.1:{number}"}
     thread.join()
-    assert str(refused(port)) == f"nobody listens at 127.0.0.1:{number}"
+    assert str(refused(port)) == f"no server at 127.0.0.1:{number}"
 
 
 def wait_after(connection: socket.socket, data: bytes, over: threading.Event) -> None:
@@ -597,7 +597,7 @@ def test_a_remote_port(opened: Opened) -> None:
     remote = Remote(EVERY_BYTE)
     number, thread = served(remote, 2)
     port = port_of(f"rfc2217://127.0.0.1:{number}", baud=57_600)
-    assert port.comes_again
+    assert port.can_reconnect
     for _ in range(2):
         link = opened(port)
         assert remote.port.baudrate == 57_600
@@ -607,7 +607,7 @@ def test_a_remote_port(opened: Opened) -> None:
         assert lost(link) == "closed by the other side"
         link.close()
     thread.join()
-    assert str(refused(port)) == f"nobody listens at 127.0.0.1:{number}"
+    assert str(refused(port)) == f"no server at 127.0.0.1:{number}"
     assert port.describe() == {"port": port.name, "resolved": port.name, "baud": "57600"}
 
 
@@ -625,7 +625,7 @@ def test_loop(opened: Opened) -> None:
     port = port_of("loop://", baud=BAUD)
     link = opened(port)
     assert link.read(0.001) == b""
-    assert not port.comes_again
+    assert not port.can_reconnect
     assert port.describe() == {"port": "loop://", "resolved": "loop://", "baud": str(BAUD)}
 
 
@@ -688,7 +688,7 @@ def test_names_of_nothing(name: str) -> None:
 
 @pytest.mark.parametrize("baud", [0, -9600])
 def test_no_speed(baud: int) -> None:
-    assert str(refused("loop://", baud=baud)) == f"{baud} is no baud rate"
+    assert str(refused("loop://", baud=baud)) == f"{baud} is not a baud rate"
 
 
 # What is installed to make links of pseudo-terminals
@@ -707,7 +707,7 @@ def test_socat_ends_and_starts_again(tmp_path: Path, opened: Opened) -> None:
             with open(names[0], "wb", buffering=0) as stream:
                 stream.write(EVERY_BYTE)
                 assert gathered(link, len(EVERY_BYTE)) == EVERY_BYTE
-            found = holders.holders([str(names[1])])[str(names[1])]
+            found = holders.find_port_users([str(names[1])])[str(names[1])]
             assert os.getpid() in {holder.pid for holder in found}
             socat.terminate()
         assert "unplugged" in lost(link)

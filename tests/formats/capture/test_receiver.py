@@ -10,18 +10,25 @@ from typing import Any
 import pytest
 
 from locatk.formats.capture import reader_thread as receiver_module
-from locatk.formats.capture.host_clock import HostClock
-from locatk.formats.capture.reader_thread import Arrived, Back, Ended, Event, Lost, Receiver
-from locatk.formats.capture.source import Overruns, SourceError
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.links import Overruns, SourceError
+from locatk.formats.capture.reader_thread import (
+    ConnectionLost,
+    Event,
+    PortReader,
+    ReceivedData,
+    Reconnected,
+    SourceEnded,
+)
 
 
 @pytest.fixture
-def receive(port: Any) -> Iterator[Callable[..., Receiver]]:
+def receive(port: Any) -> Iterator[Callable[..., PortReader]]:
     """``receive()`` starts to read the port; it is stopped in the end."""
-    made: list[Receiver] = []
+    made: list[PortReader] = []
 
-    def begin(**more: Any) -> Receiver:
-        made.append(Receiver(port, port.open(), HostClock(), **more))
+    def begin(**more: Any) -> PortReader:
+        made.append(PortReader(port, port.open(), HostClock(), **more))
         made[-1].start()
         return made[-1]
 
@@ -31,7 +38,7 @@ def receive(port: Any) -> Iterator[Callable[..., Receiver]]:
     assert not [each for each in threading.enumerate() if each.name == "locatk-receiver"]
 
 
-def all_events(receiver: Receiver) -> list[Event]:
+def all_events(receiver: PortReader) -> list[Event]:
     receiver.stop()
     return list(receiver.take())
 
@@ -40,20 +47,22 @@ def kinds(events: list[Event]) -> list[str]:
     return [type(event).__name__ for event in events]
 
 
-def test_every_read_in_its_order(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_every_read_in_its_order(port: Any, receive: Callable[..., PortReader]) -> None:
     pieces = [bytes([k % 251]) * (k % 7 + 1) for k in range(200)]
     receiver = receive()
     port.send(*pieces)
     events = all_events(receiver)
-    assert [event.data for event in events if isinstance(event, Arrived)] == pieces
-    assert [event.size for event in events if isinstance(event, Arrived)] == list(map(len, pieces))
+    assert [event.data for event in events if isinstance(event, ReceivedData)] == pieces
+    assert [event.size for event in events if isinstance(event, ReceivedData)] == list(
+        map(len, pieces)
+    )
     times = [event.time_ns for event in events]
     assert times == sorted(times)
     assert port.links[0].closed
 
 
 def test_what_the_system_holds_at_the_end_is_read(
-    port: Any, receive: Callable[..., Receiver]
+    port: Any, receive: Callable[..., PortReader]
 ) -> None:
     receiver = receive()
     waiting, go_on = threading.Event(), threading.Event()
@@ -73,7 +82,7 @@ def test_what_the_system_holds_at_the_end_is_read(
     assert [event.data for event in receiver.take()] == [b"held", b"rest", b"and more"]
 
 
-def test_a_device_that_never_stops_is_left(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_a_device_that_never_stops_is_left(port: Any, receive: Callable[..., PortReader]) -> None:
     sending = True
 
     def again() -> bytes:
@@ -91,7 +100,7 @@ def test_a_device_that_never_stops_is_left(port: Any, receive: Callable[..., Rec
 
 def test_whoever_takes_may_be_there_at_once(port: Any) -> None:
     """Between the moment at which an event is there and the next step of the thread."""
-    receiver = Receiver(port, port.open(), HostClock())
+    receiver = PortReader(port, port.open(), HostClock())
     taken: list[Event] = []
 
     class Eager(deque[Event]):
@@ -106,10 +115,16 @@ def test_whoever_takes_may_be_there_at_once(port: Any) -> None:
     port.send(b"three")
     port.settle()
     receiver.stop()
-    assert kinds(taken) == ["Arrived", "Arrived", "Lost", "Back", "Arrived"]
+    assert kinds(taken) == [
+        "ReceivedData",
+        "ReceivedData",
+        "ConnectionLost",
+        "Reconnected",
+        "ReceivedData",
+    ]
 
 
-def test_lost_and_back(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_lost_and_back(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive()
     port.send(b"before")
     port.lose("pulled out")
@@ -117,10 +132,10 @@ def test_lost_and_back(port: Any, receive: Callable[..., Receiver]) -> None:
     port.send(b"after")
     port.settle()
     events = all_events(receiver)
-    assert kinds(events) == ["Arrived", "Lost", "Back", "Arrived"]
-    assert isinstance(events[1], Lost)
+    assert kinds(events) == ["ReceivedData", "ConnectionLost", "Reconnected", "ReceivedData"]
+    assert isinstance(events[1], ConnectionLost)
     assert events[1].why == "pulled out"
-    assert isinstance(events[2], Back)
+    assert isinstance(events[2], Reconnected)
     assert len(port.links) == 2
     assert [link.closed for link in port.links] == [1, 1]
     times = [event.time_ns for event in events]
@@ -128,7 +143,7 @@ def test_lost_and_back(port: Any, receive: Callable[..., Receiver]) -> None:
 
 
 def test_it_tries_again_until_the_device_is_there(
-    port: Any, receive: Callable[..., Receiver], monkeypatch: pytest.MonkeyPatch
+    port: Any, receive: Callable[..., PortReader], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(receiver_module, "BACKOFF_S", (0.001, 0.002))
     receiver = receive()
@@ -137,11 +152,13 @@ def test_it_tries_again_until_the_device_is_there(
     port.settle()
     port.send(b"back")
     port.settle()
-    assert kinds(all_events(receiver)) == ["Lost", "Back", "Arrived"]
+    assert kinds(all_events(receiver)) == ["ConnectionLost", "Reconnected", "ReceivedData"]
     assert port.asked == 9
 
 
-def test_the_name_of_the_place_is_that_of_now(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_the_name_of_the_place_is_that_of_now(
+    port: Any, receive: Callable[..., PortReader]
+) -> None:
     """A device that comes back under another name is said to be there."""
     receiver = receive()
     port.known = {"resolved": "/dev/ttyACM7"}
@@ -150,21 +167,21 @@ def test_the_name_of_the_place_is_that_of_now(port: Any, receive: Callable[..., 
     port.send(b"x")
     port.settle()
     back = all_events(receiver)[1]
-    assert isinstance(back, Back)
-    assert "/dev/ttyACM7" in back.where
+    assert isinstance(back, Reconnected)
+    assert "/dev/ttyACM7" in back.path
 
 
-def test_the_end_while_the_device_is_away(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_the_end_while_the_device_is_away(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive()
     port.refusals = [SourceError("not there") for _ in range(10_000)]
     port.lose()
     port.settle()
-    assert kinds(all_events(receiver)) == ["Lost"]
+    assert kinds(all_events(receiver)) == ["ConnectionLost"]
     assert port.links[0].closed
 
 
 def test_a_link_that_breaks_whenever_it_is_opened_is_not_tried_for_ever_at_once(
-    port: Any, receive: Callable[..., Receiver], monkeypatch: pytest.MonkeyPatch
+    port: Any, receive: Callable[..., PortReader], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The wait between attempts begins anew only after something was received."""
     waits: list[float] = []
@@ -190,33 +207,33 @@ def test_a_link_that_breaks_whenever_it_is_opened_is_not_tried_for_ever_at_once(
 
 
 def test_what_does_not_come_again_is_at_its_end(
-    port: Any, receive: Callable[..., Receiver]
+    port: Any, receive: Callable[..., PortReader]
 ) -> None:
-    port.comes_again = False
+    port.can_reconnect = False
     receiver = receive()
     port.send(b"x")
     port.lose("cut short")
     port.settle()
     events = all_events(receiver)
-    assert kinds(events) == ["Arrived", "Ended"]
-    assert isinstance(events[1], Ended)
+    assert kinds(events) == ["ReceivedData", "SourceEnded"]
+    assert isinstance(events[1], SourceEnded)
     assert events[1].error == "cut short"
     assert port.asked == 1
 
 
-def test_the_end_of_the_source(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_the_end_of_the_source(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive()
     port.send(b"x")
     port.end()
     port.settle()
     events = all_events(receiver)
-    assert kinds(events) == ["Arrived", "Ended"]
-    assert isinstance(events[1], Ended)
+    assert kinds(events) == ["ReceivedData", "SourceEnded"]
+    assert isinstance(events[1], SourceEnded)
     assert events[1].error is None
     assert port.links[0].closed
 
 
-def test_whatever_a_driver_raises_is_told(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_whatever_a_driver_raises_is_told(port: Any, receive: Callable[..., PortReader]) -> None:
     def fail() -> bytes:
         raise RuntimeError("driver gone mad")
 
@@ -225,14 +242,14 @@ def test_whatever_a_driver_raises_is_told(port: Any, receive: Callable[..., Rece
     port.then(fail)
     port.settle()
     events = all_events(receiver)
-    assert kinds(events) == ["Arrived", "Ended"]
-    assert isinstance(events[1], Ended)
+    assert kinds(events) == ["ReceivedData", "SourceEnded"]
+    assert isinstance(events[1], SourceEnded)
     assert events[1].error == "RuntimeError: driver gone mad"
     assert port.links[0].closed
 
 
 def test_a_port_that_cannot_be_opened_again_for_an_unforeseen_reason(
-    port: Any, receive: Callable[..., Receiver], monkeypatch: pytest.MonkeyPatch
+    port: Any, receive: Callable[..., PortReader], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may be another the next time: a recording does not end for it."""
     monkeypatch.setattr(receiver_module, "BACKOFF_S", (0.001,))
@@ -242,51 +259,51 @@ def test_a_port_that_cannot_be_opened_again_for_an_unforeseen_reason(
     port.settle()
     port.send(b"x")
     port.settle()
-    assert kinds(all_events(receiver)) == ["Lost", "Back", "Arrived"]
+    assert kinds(all_events(receiver)) == ["ConnectionLost", "Reconnected", "ReceivedData"]
 
 
 # ---- too much
 
 
-def test_when_nobody_takes_reading_waits(port: Any, receive: Callable[..., Receiver]) -> None:
-    receiver = receive(most_bytes=1000)
+def test_when_nobody_takes_reading_waits(port: Any, receive: Callable[..., PortReader]) -> None:
+    receiver = receive(max_waiting_bytes=1000)
     port.send(*[bytes(100)] * 50)
     held = threading.Event()
-    while not receiver.held_up:
+    while not receiver.pauses:
         held.wait(0.001)
     first = receiver.take()
-    assert sum(event.size for event in first if isinstance(event, Arrived)) == 1100
+    assert sum(event.size for event in first if isinstance(event, ReceivedData)) == 1100
     taken = 1100
     while taken < 5000:
-        taken += sum(event.size for event in receiver.take() if isinstance(event, Arrived))
+        taken += sum(event.size for event in receiver.take() if isinstance(event, ReceivedData))
     assert taken == 5000
     assert receiver.high_water == 1100
 
 
-def test_it_can_be_stopped_while_it_waits(port: Any, receive: Callable[..., Receiver]) -> None:
-    receiver = receive(most_bytes=10)
+def test_it_can_be_stopped_while_it_waits(port: Any, receive: Callable[..., PortReader]) -> None:
+    receiver = receive(max_waiting_bytes=10)
     port.send(*[bytes(100)] * 5)
-    while not receiver.held_up:
+    while not receiver.pauses:
         threading.Event().wait(0.001)
     events = all_events(receiver)
-    assert sum(event.size for event in events if isinstance(event, Arrived)) == 500
+    assert sum(event.size for event in events if isinstance(event, ReceivedData)) == 500
 
 
 def test_frames_of_a_camera_count_by_their_pictures(
-    port: Any, receive: Callable[..., Receiver]
+    port: Any, receive: Callable[..., PortReader]
 ) -> None:
     receiver = receive()
     port.then(lambda: [(1, b"abc"), (2, b"defgh")])
     port.settle()
     (event,) = all_events(receiver)
-    assert isinstance(event, Arrived)
+    assert isinstance(event, ReceivedData)
     assert event.size == 8
 
 
 # ---- what the kernel counts
 
 
-def test_overruns_of_all_links(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_overruns_of_all_links(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive()
     port.links[0].counted = Overruns(overrun=2, buffer=3, frame=5, parity=7)
     port.lose()
@@ -300,7 +317,7 @@ def test_overruns_of_all_links(port: Any, receive: Callable[..., Receiver]) -> N
 
 
 def test_overruns_are_counted_once_though_the_device_is_away(
-    port: Any, receive: Callable[..., Receiver]
+    port: Any, receive: Callable[..., PortReader]
 ) -> None:
     receiver = receive()
     port.links[0].counted = Overruns(overrun=7)
@@ -311,7 +328,7 @@ def test_overruns_are_counted_once_though_the_device_is_away(
     assert receiver.overruns == Overruns(overrun=7)
 
 
-def test_nobody_counts(port: Any, receive: Callable[..., Receiver]) -> None:
+def test_nobody_counts(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive()
     port.send(b"x")
     receiver.stop()

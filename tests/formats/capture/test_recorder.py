@@ -15,14 +15,15 @@ from typing import Any
 import pytest
 
 from locatk.core.errors import LocatkError, OutputExistsError
-from locatk.formats.capture import live_file, recorder
 from locatk.formats.capture import reader_thread as receiver
+from locatk.formats.capture import recorder
+from locatk.formats.capture import recording_files as live_file
 from locatk.formats.capture import recording_files as parts
 from locatk.formats.capture import setup as session
-from locatk.formats.capture.host_clock import HostClock
-from locatk.formats.capture.live_file import DiskFullError, LiveFile
-from locatk.formats.capture.reader_thread import Receiver
-from locatk.formats.capture.source import Overruns, SourceError
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.links import Overruns, SourceError
+from locatk.formats.capture.reader_thread import PortReader
+from locatk.formats.capture.recording_files import DiskFullError, LiveFile
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 
@@ -138,7 +139,9 @@ def test_a_disk_that_is_slow_costs_no_byte(
         return real(self, data)
 
     monkeypatch.setattr(LiveFile, "write", slow)
-    monkeypatch.setattr(session, "Receiver", lambda *args: Receiver(*args, most_bytes=50_000))
+    monkeypatch.setattr(
+        session, "PortReader", lambda *args: PortReader(*args, max_waiting_bytes=50_000)
+    )
     sent = pieces(200, size=1000)
     running = start(flush_s=0.02)
     port.send(*sent)
@@ -214,7 +217,9 @@ def test_whatever_comes_together(
     monkeypatch.setattr(LiveFile, "write", sometimes_slow)
     monkeypatch.setattr(receiver, "BACKOFF_S", (0.001, 0.01))
     most = chance.choice([2_000, 1 << 20])
-    monkeypatch.setattr(session, "Receiver", lambda *args: Receiver(*args, most_bytes=most))
+    monkeypatch.setattr(
+        session, "PortReader", lambda *args: PortReader(*args, max_waiting_bytes=most)
+    )
     rotation = chance.choice([{}, {"rotate_s": 0.05}, {"rotate_bytes": 20_000}])
     running = start(flush_s=chance.choice([0.0, 0.02]), **rotation)
     sent = bytearray()
@@ -274,7 +279,7 @@ def test_unplugged_and_plugged_in_again(
     assert not recorded.failed
     lines = log_lines(path)
     assert lines[0] == "connection lost: pulled out"
-    assert lines[1].startswith("connected again to scripted after ")
+    assert lines[1].startswith("reconnected to scripted after ")
     assert running.said == lines
     facts = Session.open(path).metadata()["capture"]
     assert facts["gaps"] == "1"
@@ -310,7 +315,7 @@ def test_a_silence_while_it_is_away_is_no_second_warning(port: Any, start: Any) 
 
 
 def test_it_breaks_for_good(port: Any, start: Any, raw_bytes: Any) -> None:
-    port.comes_again = False
+    port.can_reconnect = False
     running = start()
     port.send(b"half")
     port.lose("cut short")
@@ -344,7 +349,7 @@ def test_a_driver_that_fails(port: Any, start: Any, raw_bytes: Any) -> None:
 def test_a_driver_that_hangs_does_not_hold_the_file(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(receiver, "HANGING_S", 0.2)
+    monkeypatch.setattr(receiver, "MAX_STOP_WAIT_S", 0.2)
     hanging, go_on = threading.Event(), threading.Event()
 
     def hang() -> bytes:
@@ -368,7 +373,7 @@ def test_a_driver_that_hangs_does_not_hold_the_file(
 @pytest.mark.slow
 def test_silence_is_told_once_until_something_comes(port: Any, start: Any, log_lines: Any) -> None:
     running = start(silence_s=0.2)
-    running.until_said("nothing received for 0 s")
+    running.until_said("no data received for 0 s")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 8)
     assert len(running.said) == 1
@@ -395,7 +400,7 @@ def test_a_disk_that_was_slow_is_no_silence(
         return real(self, data)
 
     running = start(silence_s=0.3, flush_s=0.01)
-    monkeypatch.setattr(recorder, "SHOW_S", 0.0)  # looked at in the very turn
+    monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.0)  # looked at in the very turn
     monkeypatch.setattr(LiveFile, "write", stall)
     port.send(os.urandom(5000))
     assert stalled.wait(10)
@@ -416,7 +421,7 @@ def test_bytes_in_which_no_frame_is_found_are_told_of_once(
     port: Any, start: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The wrong device, or the wrong baud."""
-    monkeypatch.setattr(recorder, "DOUBT_S", 0.1)
+    monkeypatch.setattr(recorder, "FRAME_CHECK_S", 0.1)
     running = start("locatk")
     port.send(b"\x80" * 500)
     running.until_said("no frame of locatk in 500 bytes")
@@ -506,7 +511,7 @@ def test_sizes_hold_for_what_comes_at_once(
     port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch, limits: Any
 ) -> None:
     """3 MB a turn, and the line goes on: no hole, and not much more than was asked for."""
-    monkeypatch.setattr(recorder, "TURN_S", 0.3)
+    monkeypatch.setattr(recorder, "WRITE_INTERVAL_S", 0.3)
     given = bytearray()
 
     def again() -> bytes:
@@ -563,7 +568,7 @@ def test_parts_hold_every_byte_once(
     assert recorded.file_bytes == sum(path.stat().st_size for path in recorded.paths)
     ended = [Session.open(path).metadata()["capture"]["ended"] for path in recorded.paths]
     assert ended[-1] == "stopped"
-    assert set(ended[:-1]) == {"goes on in the next part"}
+    assert set(ended[:-1]) == {"continued in the next part"}
 
 
 @pytest.mark.slow
@@ -614,7 +619,7 @@ def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
     running = start(reserve_bytes=5_000_000)
     sent = pieces(60, size=1000)
     port.send(*sent)
-    running.until_said("the disk is full in")
+    running.until_said("the disk will be full in")
     free = 4_000_000
     last = pieces(30, size=1000)
     running.when_shown = lambda: port.send(*last)
@@ -625,7 +630,7 @@ def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
     assert b"".join(sent + last).startswith(kept)
     assert len(kept) >= 60_000
     assert recorded.totals.bytes == len(kept)
-    assert any("the disk is full in" in line for line in log_lines(*recorded.paths))
+    assert any("the disk will be full in" in line for line in log_lines(*recorded.paths))
 
 
 def test_a_disk_that_nobody_can_ask_is_no_matter(
@@ -693,7 +698,7 @@ def test_a_disk_that_fails_ends_it_in_words(
     recorded = running.result()
     assert recorded.failed
     assert os.strerror(errno.EIO) in recorded.ended
-    assert "4 bytes" in recorded.ended  # that were received are not in it
+    assert "4 received bytes" in recorded.ended  # that were received are not in it
     left = Session.open(path, damaged_ok=True).decoded(RAW, SerialChunk)
     assert b"".join(chunk.data for _, chunk in left) == b"kept"
 
@@ -776,14 +781,14 @@ def test_a_read_only_disk(port: Any, start: Any, small_disk: Path) -> None:
 
 
 def test_a_disk_that_is_full_already(port: Any, start: Any, small_disk: Path) -> None:
-    refused(start, DiskFullError, "only 9 MB are free", output=small_disk / "run.mcap")
+    refused(start, DiskFullError, "only 9 MB of the disk are free", output=small_disk / "run.mcap")
     assert port.asked == 0
     assert not list(small_disk.iterdir())
 
 
 @pytest.mark.parametrize("name", ["a/b", "a b", "a\nb"])
 def test_names_that_are_no_topics(port: Any, start: Any, name: str) -> None:
-    refused(start, LocatkError, "cannot be in a topic", name=name)
+    refused(start, LocatkError, "cannot be part of a topic", name=name)
     assert port.asked == 0
 
 
@@ -829,7 +834,7 @@ def test_the_output_is_what_is_played(start: Any, tmp_path: Path, port: Any) -> 
     (path,) = running.end().paths
     before = path.read_bytes()
     for name in (f"replay:{path}", f"replay:{path}#{RAW}", f"replay://{path}"):
-        wanted = session.Wanted(name, "raw", path, overwrite=True)
+        wanted = session.CaptureRequest(name, "raw", path, overwrite=True)
         with pytest.raises(OutputExistsError):
             session.record(wanted, threading.Event())
     assert path.read_bytes() == before
@@ -844,7 +849,7 @@ def recorded_alone(port: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(session.ports, "port_of", lambda *args, **more: port)
 
     def run(**talk: Callable[[Any], None]) -> Any:
-        wanted = session.Wanted("scripted", "raw", tmp_path / "alone.mcap")
+        wanted = session.CaptureRequest("scripted", "raw", tmp_path / "alone.mcap")
         return session.record(wanted, threading.Event(), **talk)
 
     return run

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from locatk.formats.capture import replay
+from locatk.formats.capture.links import LinkEnded, LinkLost, SourceError
 from locatk.formats.capture.ports import port_of
 from locatk.formats.capture.replay import ReplayLink, ReplayPort
-from locatk.formats.capture.source import LinkEnded, LinkLost, SourceError
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import read_index
 from locatk.formats.sessions.writer import SessionWriter
@@ -66,7 +66,7 @@ def test_the_same_pieces(session: Path) -> None:
             link.read(0.0)
         assert link.overruns() is None
         link.close()
-    assert not port.comes_again
+    assert not port.can_reconnect
     assert port.describe() == {
         "port": f"replay:{session}",
         "resolved": str(session),
@@ -149,7 +149,7 @@ def test_names_with_a_number_sign(tmp_path: Path) -> None:
 def test_no_raw_bytes(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no raw bytes") as error:
         ReplayPort(f"replay:{write(tmp_path / 'run.mcap', topics=())}").open()
-    assert "It holds /log" in str(error.value.hint)
+    assert "It contains /log" in str(error.value.hint)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no session at all"])
@@ -164,13 +164,13 @@ def test_no_session(tmp_path: Path, content: bytes | None) -> None:
 
 @pytest.mark.parametrize("name", ["replay:", "replay://"])
 def test_no_file(name: str) -> None:
-    with pytest.raises(SourceError, match="names no file"):
+    with pytest.raises(SourceError, match="has no file name"):
         port_of(name, baud=9600).open()
 
 
 @pytest.mark.parametrize("speed", [-1.0, float("nan"), float("inf")])
 def test_no_speed(session: Path, speed: float) -> None:
-    with pytest.raises(SourceError, match="is no speed"):
+    with pytest.raises(SourceError, match="is not a valid speed"):
         port_of(f"replay:{session}", baud=9600, speed=speed)
 
 

@@ -19,15 +19,16 @@ from typing import Any
 import pytest
 import serial
 
-from locatk.formats.capture import connections as serial_link
-from locatk.formats.capture.connections import (
-    MOST,
+from locatk.formats.capture import links as serial_link
+from locatk.formats.capture.links import (
+    MAX_READ_BYTES,
     DescriptorLink,
+    LinkLost,
+    Overruns,
     PolledLink,
     RemoteLink,
     SerialLink,
 )
-from locatk.formats.capture.source import LinkLost, Overruns
 
 
 @pytest.fixture
@@ -143,7 +144,7 @@ def test_what_was_read_before_an_error_is_given_first() -> None:
 
 def test_a_read_ends_though_there_are_more() -> None:
     link = Cleared(*itertools.repeat(b"a" * 65_536, 100)).link()
-    assert len(link.read(1.0)) == MOST
+    assert len(link.read(1.0)) == MAX_READ_BYTES
 
 
 def test_ready_for_nothing_is_silence() -> None:
@@ -273,7 +274,7 @@ def test_a_silent_remote_port() -> None:
 
 
 def test_a_remote_read_ends_though_there_are_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_link, "MOST", 3)
+    monkeypatch.setattr(serial_link, "MAX_READ_BYTES", 3)
     link = remote(*(bytes([each]) for each in range(7)))
     assert [link.read(1.0) for _ in range(3)] == [b"\0\1\2", b"\3\4\5", b"\6"]
     assert link.read(0.0) == b""

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.formats.artifacts import tags
-from locatk.formats.capture.arrival_times import Arrivals
-from locatk.formats.capture.device_messages import Stamped, Streams
+from locatk.formats.capture.clocks import ArrivalTimes
+from locatk.formats.capture.ingestion import MessageEncoder, StampedMessage
 from locatk.formats.devices.decoder import KINDS, Batch, Stream, Ticks
 from locatk.formats.sessions import field_samples, messages, observations
 from locatk.formats.sessions import trajectories as tracks
@@ -27,8 +27,8 @@ START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
 
 
-def arrivals_of(ends: Sequence[int], step_ns: int = 20 * MS) -> Arrivals:
-    arrivals = Arrivals()
+def arrivals_of(ends: Sequence[int], step_ns: int = 20 * MS) -> ArrivalTimes:
+    arrivals = ArrivalTimes()
     for number, end in enumerate(ends):
         arrivals.add(int(end), START_NS + number * step_ns)
     return arrivals
@@ -67,7 +67,7 @@ STREAMS = {
 }
 
 
-def unpacked(made: Sequence[Stamped], layout: Layout) -> messages.Batches:
+def unpacked(made: Sequence[StampedMessage], layout: Layout) -> messages.Batches:
     return layout.unpack([each.message.SerializeToString() for each in made])
 
 
@@ -84,7 +84,7 @@ def test_every_value_comes_through(kind: str, node: str) -> None:
     columns = values(kind, 7)
     tick, sequence = np.arange(7) * 1000 + 5, np.arange(7) + 65_530
     made = list(
-        Streams("red").messages(
+        MessageEncoder("red").messages(
             [Batch(stream, ends, columns, tick=tick, sequence=sequence)],
             arrivals_of(ends),
             START_NS + 999 * MS,
@@ -117,7 +117,7 @@ def test_long_batches_are_several_messages() -> None:
     ends = np.arange(1, n + 1)
     stream, layout = STREAMS["halls"]
     columns = values("halls", n)
-    streams = Streams("red")
+    streams = MessageEncoder("red")
     made = list(streams.messages([Batch(stream, ends, columns)], arrivals_of(ends), START_NS))
     batches = unpacked(made, layout)
     assert batches.counts.tolist() == [MAX_BATCH_SAMPLES, MAX_BATCH_SAMPLES, 1]
@@ -131,7 +131,7 @@ def test_long_batches_are_several_messages() -> None:
 def test_empty_batches_are_nothing() -> None:
     stream, _ = STREAMS["halls"]
     batch = Batch(stream, np.zeros(0, np.int64), values("halls", 0))
-    streams = Streams("red")
+    streams = MessageEncoder("red")
     assert list(streams.messages([batch], arrivals_of([1]), START_NS)) == []
     assert not streams.samples
 
@@ -146,7 +146,7 @@ def test_empty_batches_are_nothing() -> None:
 )
 def test_times_of_a_topic_ascend_strictly(steps: list[list[int]]) -> None:
     """Readers refuse two samples of one time, and many records may end in one read."""
-    arrivals, streams = Arrivals(), Streams("red")
+    arrivals, streams = ArrivalTimes(), MessageEncoder("red")
     stream, layout = STREAMS["halls"]
     end, time_ns, made, truth = 0, START_NS, [], []
     for lengths in steps:
@@ -164,7 +164,7 @@ def test_times_of_a_topic_ascend_strictly(steps: list[list[int]]) -> None:
 
 
 def test_topics_do_not_push_each_other() -> None:
-    streams, arrivals = Streams("red"), arrivals_of([10])
+    streams, arrivals = MessageEncoder("red"), arrivals_of([10])
     for kind in ("halls", "odometry"):
         stream, layout = STREAMS[kind]
         batch = Batch(stream, np.array([10]), values(kind, 1))
@@ -176,7 +176,12 @@ def test_topics_do_not_push_each_other() -> None:
 
 
 def ticked(
-    streams: Streams, arrivals: Arrivals, ends: Any, tick: Any, ticks: Ticks, node: str = ""
+    streams: MessageEncoder,
+    arrivals: ArrivalTimes,
+    ends: Any,
+    tick: Any,
+    ticks: Ticks,
+    node: str = "",
 ) -> Any:
     stream = Stream("halls", node=node, sensors=4, ticks=ticks)
     batch = Batch(stream, ends, values("halls", len(ends)), tick=tick)
@@ -188,10 +193,10 @@ def test_samples_have_the_times_of_the_device() -> None:
     """Samples every 10 ms, read in bursts of 100 ms: their ticks tell them apart."""
     n = 300
     ends = np.arange(1, n + 1)
-    arrivals = Arrivals()
+    arrivals = ArrivalTimes()
     for burst in range(n // 10):
         arrivals.add(10 * (burst + 1), START_NS + (burst + 1) * 100 * MS)
-    streams = Streams("red")
+    streams = MessageEncoder("red")
     tick = (np.arange(n) + 1) * 10_000 + 123_456
     times = ticked(streams, arrivals, ends, tick, Ticks(1e6))["time_ns"]
     np.testing.assert_allclose(np.diff(times)[20:] / MS, 10, atol=0.2)
@@ -201,7 +206,7 @@ def test_samples_have_the_times_of_the_device() -> None:
 
 
 def test_each_device_has_its_clock() -> None:
-    streams = Streams("red")
+    streams = MessageEncoder("red")
     ends = np.arange(1, 6)
     for node in ("a", "b"):
         ticked(streams, arrivals_of(ends), ends, ends * 1000, Ticks(1e6, 32), node)
@@ -209,7 +214,7 @@ def test_each_device_has_its_clock() -> None:
 
 
 def test_streams_of_one_device_share_its_clock() -> None:
-    streams = Streams("red")
+    streams = MessageEncoder("red")
     ends = np.arange(1, 6)
     ticked(streams, arrivals_of(ends), ends, ends * 1000, Ticks(1e6, 32))
     first = streams.clocks()["red"]
@@ -222,7 +227,7 @@ def test_streams_of_one_device_share_its_clock() -> None:
 
 def test_after_a_restart_the_ticks_may_be_others() -> None:
     """Unplugged for a second, the device counts from 0 again: no time is bent for it."""
-    streams = Streams("red")
+    streams = MessageEncoder("red")
     ends = np.arange(1, 101)
     arrivals = arrivals_of(ends)
     ticked(streams, arrivals, ends, ends * 20_000 + 9_000_000, Ticks(1e6))
@@ -243,7 +248,7 @@ def test_what_the_device_says_goes_to_the_log() -> None:
         np.array([10, 20]),
         {"level": np.array([2, 4]), "text": np.array(["started", "hot"], object)},
     )
-    made = list(Streams("red").messages([batch], arrivals_of([10, 20]), START_NS + 50 * MS))
+    made = list(MessageEncoder("red").messages([batch], arrivals_of([10, 20]), START_NS + 50 * MS))
     lines: list[Any] = [each.message for each in made]
     assert [each.topic for each in made] == ["/log", "/log"]
     assert [line.message for line in lines] == ["started", "hot"]
@@ -256,7 +261,7 @@ def test_what_the_device_says_goes_to_the_log() -> None:
 def test_a_kind_that_nobody_knows() -> None:
     batch = Batch(Stream("smell"), np.array([1]), {})
     with pytest.raises(ValueError, match="smell"):
-        list(Streams("red").messages([batch], arrivals_of([1]), START_NS))
+        list(MessageEncoder("red").messages([batch], arrivals_of([1]), START_NS))
 
 
 # ---- solvers can read them
@@ -264,7 +269,7 @@ def test_a_kind_that_nobody_knows() -> None:
 
 def test_what_was_recorded_reads_like_what_was_written(tmp_path: Path) -> None:
     ends = np.arange(1, 51) * 10
-    arrivals, streams = arrivals_of(ends), Streams("red")
+    arrivals, streams = arrivals_of(ends), MessageEncoder("red")
     columns = {kind: values(kind, 50) for kind in STREAMS}
     columns["magnetometers"].pop("temperature_celsius")
     with SessionWriter(tmp_path / "run.mcap", system="polaris") as writer:

@@ -132,6 +132,7 @@ def test_the_header_says_what_the_decoder_reads(
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_there_is_room_for_what_was_asked(firmware: Path, tmp_path: Path) -> None:
     source = tmp_path / "room.c"
     source.write_text("""
@@ -178,11 +179,12 @@ def run_sketch(firmware: Path, host: Path, tmp_path: Path, name: str, seconds: i
     # HELLO: number 0 first, then each second.
     assert done.stdout.count(name.encode()) == seconds + 1
     (log,) = (columns for stream, columns in found.items() if stream.kind == "log")
-    assert log["text"][0] == f"hello from {name} 1.0, 1000000 ticks a second"
+    assert log["text"][0] == f"hello from {name} 1.0, 1000000 ticks/s"
     assert log["sequence"][0] == 0
     return found, log
 
 
+@pytest.mark.slow
 def test_the_sketch_of_magnetometers(firmware: Path, host: Path, tmp_path: Path) -> None:
     found, log = run_sketch(firmware, host, tmp_path, "locatk_magnetometers", 4)
     bar = found[Stream("magnetometers", sensors=9, ticks=Ticks(1_000_000, 32))]
@@ -199,6 +201,7 @@ def test_the_sketch_of_magnetometers(firmware: Path, host: Path, tmp_path: Path)
     np.testing.assert_allclose(bar["b_tesla"], expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_sketch_of_hall_sensors(firmware: Path, host: Path, tmp_path: Path) -> None:
     found, _ = run_sketch(firmware, host, tmp_path, "locatk_halls", 4)
     halls = found[Stream("halls", sensors=4, ticks=Ticks(1_000_000, 32))]
@@ -236,5 +239,8 @@ def test_page_and_header_name_the_same_types(firmware: Path) -> None:
     assert on_page == types
     defined = {name: int(n) for name, n in re.findall(r"#define LOCATK_([A-Z_]+) (\d+)", header)}
     assert types.items() <= defined.items()
-    assert defined["VERSION"] == payloads.VERSION
-    assert (defined["COUNTS"], defined["TEMPERATURE"]) == (payloads.COUNTS, payloads.TEMPERATURE)
+    assert defined["VERSION"] == payloads.PROTOCOL_VERSION
+    assert (defined["COUNTS"], defined["TEMPERATURE"]) == (
+        payloads.HAS_COUNTS,
+        payloads.HAS_TEMPERATURE,
+    )

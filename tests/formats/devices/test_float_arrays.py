@@ -16,16 +16,15 @@ from locatk.core.errors import InputError
 from locatk.core.polaris import mlx90393
 from locatk.core.polaris.array import Samples
 from locatk.formats.artifacts.tags import loads_array
-from locatk.formats.devices.decoder import Batch, Decoder, Options, Stream
-from locatk.formats.devices.float32.arrays import (
+from locatk.formats.devices import find_device
+from locatk.formats.devices.decoder import Batch, Decoder, Options, Recording, Stream
+from locatk.formats.devices.float32.decoder import (
     MagxDecoder,
     PolarisDecoder,
     encode_magx,
     encode_polaris,
-    magx_artifacts,
     polaris_artifacts,
 )
-from locatk.formats.devices.recording import Recording
 from locatk.formats.importers.polaris_csv import read_polaris
 
 COUNT_UT = np.array([0.150, 0.150, 0.242])
@@ -147,7 +146,7 @@ def test_published_recordings_come_back_as_they_were_imported(runs: list[Samples
             0,
         )
         (remark,) = decoder.remarks
-        assert "taken from the first byte" in remark
+        assert "assumed from the first received byte" in remark
 
 
 def test_axes_are_the_arrays() -> None:
@@ -218,7 +217,7 @@ def test_pauses_that_come_later_correct_the_first_byte() -> None:
     decoder, batches = decode(data, pauses)
     found = order(fields(batches), tesla(values))
     assert found[-95:] == list(range(105, 200))
-    assert "taken from the first byte" in decoder.remarks[0]
+    assert "assumed from the first received byte" in decoder.remarks[0]
     assert "in a wrong order" in decoder.remarks[1]
 
 
@@ -234,7 +233,7 @@ def test_false_pauses_are_outvoted(seed: int) -> None:
     # Alone, they name no place.
     decoder, batches = decode(data, stalls)
     np.testing.assert_array_equal(fields(batches), tesla(values))
-    assert "taken from the first byte" in decoder.remarks[0]
+    assert "assumed from the first received byte" in decoder.remarks[0]
 
 
 def test_pauses_in_each_frame_at_the_border_of_usb_packets() -> None:
@@ -251,7 +250,7 @@ def test_sensors_that_measure_alike_are_told_by_pauses_only() -> None:
     data, true = to_bytes(values), tesla(values)
     decoder, batches = decode(data)
     np.testing.assert_array_equal(fields(batches), true)
-    assert "so alike" in decoder.remarks[0]
+    assert "such similar values" in decoder.remarks[0]
     decoder, batches = decode(data[50:], starts(len(data), 108, 50))
     np.testing.assert_array_equal(fields(batches), true[1:])
     assert decoder.remarks == []
@@ -407,7 +406,7 @@ def test_damage_in_the_first_frames() -> None:
         assert found.count(-1) <= 1
         assert len(found) >= 116
         assert found[-110:] == list(range(10, 120))
-        assert "taken from the first byte" in decoder.remarks[0]
+        assert "assumed from the first received byte" in decoder.remarks[0]
 
 
 # ---- odd sensors
@@ -505,11 +504,11 @@ def test_what_the_firmware_says_of_its_sensors() -> None:
     text = b"No sensor 3 found ... check your wiring?\r\n"
     decoder, batches = decode(7 * text + to_bytes(values))
     np.testing.assert_array_equal(fields(batches), tesla(values))
-    assert decoder.remarks[0] == "the device says: No sensor 3 found ... check your wiring?"
-    assert "taken from the first byte" in decoder.remarks[1]
+    assert decoder.remarks[0] == "message of the device: No sensor 3 found ... check your wiring?"
+    assert "assumed from the first received byte" in decoder.remarks[1]
     decoder, batches = decode(500 * text)
     assert batches == []
-    assert decoder.remarks == ["the device says: No sensor 3 found ... check your wiring?"]
+    assert decoder.remarks == ["message of the device: No sensor 3 found ... check your wiring?"]
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 9])
@@ -641,7 +640,7 @@ def test_no_number_is_sent_as_no_number() -> None:
 def test_other_numbers_of_sensors_cannot_be_sent(sensors: int, encode: Callable) -> None:
     array = mlx90393.published_bar(sensors, 0.02)
     samples = Samples("bar", array, np.arange(2), np.zeros((2, sensors, 3)))
-    with pytest.raises(InputError, match=f"{sensors} sensors, where"):
+    with pytest.raises(InputError, match=f"{sensors} sensors, but"):
         encode(Recording([samples]))
 
 
@@ -662,4 +661,4 @@ def test_the_published_bars_are_known(sensors: int, spacing_m: float, rate_hz: f
 
 
 def test_the_place_of_magx_sensors_is_not_known() -> None:
-    assert magx_artifacts(Stream("magnetometers", sensors=8)) == {}
+    assert find_device("magx-array").default_artifacts(Stream("magnetometers", sensors=8)) == {}

@@ -10,31 +10,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.polaris.mlx90393 import HALLCONF_SCALE, QUANTUM_UT
-from locatk.formats.devices.float32.detection import (
-    LOOK,
-    Layout,
-    Lock,
-    choose,
-    in_order,
-    leaps,
-    phases,
-    plausible,
+from locatk.formats.devices.float32.frame_matching import (
+    LOOKAHEAD_FRAMES,
+    FrameLayout,
+    FrameModel,
+    choose_phase,
+    evaluate_phases,
+    find_isolated_jumps,
+    is_plausible,
+    keeps_sensor_order,
 )
 from locatk.formats.devices.float32.synchronization import (
-    HOLD,
-    LEAST,
-    Found,
+    DECISION_FRAMES,
+    MIN_RUN_FRAMES,
+    Acquisition,
     acquire,
     find_run,
-    majority,
+    majority_position,
 )
 
-NINE, THREE, MAGX = Layout(9), Layout(3), Layout(8, spare=1)
+NINE, THREE, MAGX = FrameLayout(9), FrameLayout(3), FrameLayout(8, spare=1)
 PUBLISHED_UT = (0.150, 0.242)
 
 
 def frames(
-    n: int, layout: Layout = NINE, counts_ut: tuple[float, float] = PUBLISHED_UT, seed: int = 0
+    n: int, layout: FrameLayout = NINE, counts_ut: tuple[float, float] = PUBLISHED_UT, seed: int = 0
 ) -> np.ndarray:
     """(n, P) float32 of an array that stands still, in counts."""
     rng = np.random.default_rng(seed)
@@ -51,20 +51,22 @@ def frames(
 def found(
     data: bytes,
     pauses: tuple[int, ...] = (),
-    layouts: tuple[Layout, ...] = (NINE, THREE),
+    layouts: tuple[FrameLayout, ...] = (NINE, THREE),
     first: int | None = 0,
-    hint: Lock | None = None,
+    hint: FrameModel | None = None,
     decide: bool = False,
-) -> Found | None:
-    return acquire(data, pauses, layouts, first=first, hint=hint, least=LEAST, decide=decide)
+) -> Acquisition | None:
+    return acquire(
+        data, pauses, layouts, first=first, hint=hint, least=MIN_RUN_FRAMES, decide=decide
+    )
 
 
-def lock(values: np.ndarray) -> Lock:
+def lock(values: np.ndarray) -> FrameModel:
     """A lock on frames that are known to start where they do."""
     settled = found(values.tobytes(), decide=True)
     assert settled is not None
     assert settled.start % NINE.size == 0
-    return settled.lock
+    return settled.model
 
 
 # ---- floats
@@ -85,12 +87,12 @@ def lock(values: np.ndarray) -> Lock:
     ],
 )
 def test_fields_are_plausible(value: float, fine: bool) -> None:
-    assert plausible(np.array([value], np.float32)).tolist() == [fine]
+    assert is_plausible(np.array([value], np.float32)).tolist() == [fine]
 
 
 def test_not_all_bits_that_are_no_number_are_plausible() -> None:
     bits = np.array([0x7FC00000, 0xFFC00000, 0xFFFFFFFF, 0x7F800001], np.uint32)
-    assert plausible(bits.view(np.float32)).tolist() == [True, True, False, False]
+    assert is_plausible(bits.view(np.float32)).tolist() == [True, True, False, False]
 
 
 @settings(max_examples=40, deadline=None)
@@ -103,16 +105,16 @@ def test_not_all_bits_that_are_no_number_are_plausible() -> None:
 def test_counts_are_learnt(gain: int, resolution: int, scale: float, seed: int) -> None:
     """Of all settings of the part, to the rounding of float32."""
     xy, z = (value * scale * 2**resolution for value in QUANTUM_UT[gain])
-    settled = found(frames(HOLD + 2, counts_ut=(xy, z), seed=seed).tobytes())
+    settled = found(frames(DECISION_FRAMES + 2, counts_ut=(xy, z), seed=seed).tobytes())
     assert settled is not None
-    np.testing.assert_allclose(settled.lock.quantum, np.tile([xy, xy, z], 9), rtol=1e-6)
+    np.testing.assert_allclose(settled.model.quantum, np.tile([xy, xy, z], 9), rtol=1e-6)
 
 
 def test_values_that_are_no_counts_teach_none() -> None:
-    noise = np.random.default_rng(1).normal(size=(HOLD + 2, 27)).astype("f4")
-    settled = found((frames(HOLD + 2) + noise).astype("<f4").tobytes())
+    noise = np.random.default_rng(1).normal(size=(DECISION_FRAMES + 2, 27)).astype("f4")
+    settled = found((frames(DECISION_FRAMES + 2) + noise).astype("<f4").tobytes())
     assert settled is not None
-    assert not settled.lock.quantum.any()
+    assert not settled.model.quantum.any()
 
 
 def test_counts_are_learnt_in_spite_of_damage() -> None:
@@ -120,8 +122,8 @@ def test_counts_are_learnt_in_spite_of_damage() -> None:
     values[4, [3, 10, 20]] = [17.0801, -3.3333, 8e4]
     settled = found(values.tobytes(), pauses=(108, 216, 324, 432))
     assert settled is not None
-    np.testing.assert_allclose(settled.lock.quantum[:3], [0.15, 0.15, 0.242], rtol=1e-6)
-    wild = settled.lock.wild(values)
+    np.testing.assert_allclose(settled.model.quantum[:3], [0.15, 0.15, 0.242], rtol=1e-6)
+    wild = settled.model.is_impossible(values)
     assert np.argwhere(wild).tolist() == [[4, 3], [4, 10], [4, 20]]
 
 
@@ -132,7 +134,7 @@ def test_counts_are_learnt_in_spite_of_damage() -> None:
 def test_a_run_is_found_within_garbage(shift: int) -> None:
     rng = np.random.default_rng(shift)
     values = frames(10)
-    run = find_run(rng.bytes(300 + shift) + values.tobytes() + rng.bytes(333), 27, LEAST)
+    run = find_run(rng.bytes(300 + shift) + values.tobytes() + rng.bytes(333), 27, MIN_RUN_FRAMES)
     assert run is not None
     begin, floats = run
     assert (begin - 300 - shift) % 4 == 0
@@ -143,37 +145,37 @@ def test_a_run_is_found_within_garbage(shift: int) -> None:
 
 def test_garbage_has_no_run() -> None:
     rng = np.random.default_rng(0)
-    assert find_run(rng.bytes(100_000), 27, LEAST) is None
-    assert find_run(b"", 27, LEAST) is None
-    assert find_run(frames(LEAST - 1).tobytes(), 27, LEAST) is None
+    assert find_run(rng.bytes(100_000), 27, MIN_RUN_FRAMES) is None
+    assert find_run(b"", 27, MIN_RUN_FRAMES) is None
+    assert find_run(frames(MIN_RUN_FRAMES - 1).tobytes(), 27, MIN_RUN_FRAMES) is None
 
 
 def test_without_pauses_it_takes_some_frames_to_be_settled() -> None:
-    data = frames(HOLD + 2).tobytes()
-    assert found(data[: HOLD * 108]) is None
+    data = frames(DECISION_FRAMES + 2).tobytes()
+    assert found(data[: DECISION_FRAMES * 108]) is None
     settled = found(data)
     assert settled is not None
-    assert (settled.start % 108, settled.assumed) == (0, "first")
+    assert (settled.start % 108, settled.assumption) == (0, "first")
     early = found(data[: 8 * 108], pauses=(216, 324, 432))
     assert early is not None
-    assert (early.start % 108, early.assumed) == (0, "")
+    assert (early.start % 108, early.assumption) == (0, "")
 
 
 def test_a_wrong_start_is_no_start_of_a_sensor() -> None:
     """Z has other counts: of 27 places, 9 are left, and the nearest of them is a guess."""
-    data = frames(HOLD + 3).tobytes()
+    data = frames(DECISION_FRAMES + 3).tobytes()
     settled = found(data[20:])
     assert settled is not None
-    assert settled.assumed == "guess"
+    assert settled.assumption == "guess"
     assert (settled.start + 20) % 12 == 0
-    np.testing.assert_allclose(settled.lock.quantum[:3], [0.15, 0.15, 0.242], rtol=1e-6)
+    np.testing.assert_allclose(settled.model.quantum[:3], [0.15, 0.15, 0.242], rtol=1e-6)
 
 
 def test_three_sensors_are_three_times_nine_floats() -> None:
     settled = found(frames(100, THREE).tobytes())
     assert settled is not None
-    assert settled.lock.layout == THREE
-    assert not settled.lock.sure
+    assert settled.model.layout == THREE
+    assert not settled.model.is_unambiguous
 
 
 def test_magx_tells_its_start_by_values_alone() -> None:
@@ -181,15 +183,15 @@ def test_magx_tells_its_start_by_values_alone() -> None:
     settled = found(data[30:], layouts=(MAGX,))
     assert settled is not None
     assert (settled.start + 30) % 100 == 0
-    assert settled.lock.sure
-    assert settled.lock.blind.tolist() == 24 * [False] + [True]
+    assert settled.model.is_unambiguous
+    assert settled.model.ignored.tolist() == 24 * [False] + [True]
 
 
 def test_the_hint_tells_the_start() -> None:
     values = frames(40)
     settled = found(values[20:].tobytes()[40:], hint=lock(values[:20]))
     assert settled is not None
-    assert ((settled.start + 40) % 108, settled.assumed) == (0, "")
+    assert ((settled.start + 40) % 108, settled.assumption) == (0, "")
     # Another array is none of the hint's.
     other = found(frames(20, seed=9).tobytes()[40:], hint=lock(values[:20]))
     assert other is None
@@ -214,7 +216,7 @@ def test_equal_floats_are_no_frames() -> None:
     ],
 )
 def test_majority(places: list[int], winner: int | None) -> None:
-    assert majority(places) == winner
+    assert majority_position(places) == winner
 
 
 # ---- the next frame
@@ -224,24 +226,24 @@ def test_majority(places: list[int], winner: int | None) -> None:
 def test_the_phase_after_a_loss(lost: int) -> None:
     values = frames(20)
     known = lock(values[:10])
-    piece = values[10:].tobytes()[lost : lost + (LOOK + 1) * 108]
+    piece = values[10:].tobytes()[lost : lost + (LOOKAHEAD_FRAMES + 1) * 108]
     offset = np.arange(108)
-    among = phases(known, piece, offset)
+    among = evaluate_phases(known, piece, offset)
     gone = (-offset) % 108
-    choice = choose(among, NINE, gone, np.zeros(108, np.int64))
+    choice = choose_phase(among, NINE, gone, np.zeros(108, np.int64))
     assert offset[choice.best] == -lost % 108
-    assert choice.leads
-    assert choice.fits
-    assert choice.clear
-    assert choice.stays == (lost == 0)
+    assert choice.has_clear_lead
+    assert choice.is_accepted
+    assert choice.is_unambiguous
+    assert choice.is_unshifted == (lost == 0)
 
 
 def test_garbage_fits_no_phase() -> None:
     known = lock(frames(10))
     offset = np.arange(108)
-    among = phases(known, np.random.default_rng(0).bytes(540), offset)
-    choice = choose(among, NINE, offset[::-1].copy(), np.zeros(108, np.int64))
-    assert not choice.fits
+    among = evaluate_phases(known, np.random.default_rng(0).bytes(540), offset)
+    choice = choose_phase(among, NINE, offset[::-1].copy(), np.zeros(108, np.int64))
+    assert not choice.is_accepted
 
 
 def test_a_magnet_leaves_the_sensors_in_order() -> None:
@@ -252,8 +254,8 @@ def test_a_magnet_leaves_the_sensors_in_order() -> None:
     none = np.zeros((1, 27), bool)
 
     def ordered(frame: np.ndarray) -> bool:
-        cost = known.cost(known.apart(frame, before), none).sum(axis=1)
-        return bool(in_order(known, frame, before, cost)[0])
+        cost = known.cost(known.deviations(frame, before), none).sum(axis=1)
+        return bool(keeps_sensor_order(known, frame, before, cost)[0])
 
     assert ordered(after)
     assert not ordered(np.roll(after, 3, axis=1))
@@ -261,24 +263,24 @@ def test_a_magnet_leaves_the_sensors_in_order() -> None:
 
 def test_only_a_lonely_value_leaps() -> None:
     values = frames(12).astype(float)
-    known = replace(lock(frames(12)), width=np.ones(27))
+    known = replace(lock(frames(12)), sigma=np.ones(27))
     values[:] = values[0]
     values[4, 7] += 60  # alone
     values[6, [9, 12]] += 60  # with a neighbour
     values[8:, 15] += 60  # for good
     values[9, 20] += 15  # noise
-    apart = known.apart(values[1:], values[:-1])
-    assert np.argwhere(leaps(known, apart)).tolist() == [[3, 7]]
+    apart = known.deviations(values[1:], values[:-1])
+    assert np.argwhere(find_isolated_jumps(known, apart)).tolist() == [[3, 7]]
 
 
 def test_a_lock_turns_with_its_sensors() -> None:
     values = frames(10)
     known = lock(values)
-    turned = known.turned(6)
+    turned = known.shifted(6)
     np.testing.assert_array_equal(turned.last, np.roll(known.last, -6))
-    cost = turned.cost(turned.apart(np.roll(values[9], -6)), np.zeros(27, bool))
+    cost = turned.cost(turned.deviations(np.roll(values[9], -6)), np.zeros(27, bool))
     assert cost.mean() < 1.6
-    assert known.cost(known.apart(np.roll(values[9], -6)), np.zeros(27, bool)).mean() > 1.6
+    assert known.cost(known.deviations(np.roll(values[9], -6)), np.zeros(27, bool)).mean() > 1.6
 
 
 def test_frames_of_zeros_are_wild() -> None:
@@ -286,4 +288,4 @@ def test_frames_of_zeros_are_wild() -> None:
     values = frames(3)
     values[1] = 0
     values[2, 3:6] = 0
-    assert known.wild(values).any(axis=1).tolist() == [False, True, False]
+    assert known.is_impossible(values).any(axis=1).tolist() == [False, True, False]

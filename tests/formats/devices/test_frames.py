@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.formats.devices import device
+from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Batch, Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames import payloads
-from locatk.formats.devices.locatk_frames.decoder import PIECE, FrameDecoder
-from locatk.formats.devices.locatk_frames.framing import LARGEST_WIRE
+from locatk.formats.devices.locatk_frames.decoder import PIECE_BYTES, FrameDecoder
+from locatk.formats.devices.locatk_frames.framing import MAX_WIRE_BYTES
 from locatk.formats.devices.locatk_frames.payloads import FrameWriter, Type
 
 MHZ = Ticks(1_000_000, 32)
@@ -65,7 +65,7 @@ def one(type: int, payload: bytes, tick: int = 7) -> tuple[Batch, FrameDecoder]:
 
 
 def test_the_device_is_known() -> None:
-    assert isinstance(device("locatk").decode(Options()), FrameDecoder)
+    assert isinstance(find_device("locatk").create_decoder(Options()), FrameDecoder)
 
 
 def test_magnetometers() -> None:
@@ -290,7 +290,7 @@ def numbered(*sequences: int, type: Type = Type.HALLS, node: int = 0) -> bytes:
         (numbered(5, 5, 6), 0),  # twice the same
         (numbered(5, 6, 5, 6, 7), 0),
         (numbered(40_000, 0, 1), 25_535),  # could be
-        (numbered(30_000, 0, 1), 0),  # started anew, without a HELLO
+        (numbered(30_000, 0, 1), 0),  # restarted, without a HELLO
         (numbered(40_000) + numbered(0, type=Type.HELLO) + numbered(1, 2), 0),
         (numbered(40_000) + numbered(3, type=Type.HELLO), 25_538),
         (numbered(1, 2) + numbered(9, node=1) + numbered(3) + numbered(11, node=1), 1),
@@ -334,7 +334,7 @@ def test_a_changed_rate_holds_from_its_hello_on() -> None:
     pieces, _ = decoded(wire, list(range(0, len(wire), 3)))
     assert listed(pieces) == listed(whole)
     assert decoder.remarks == [
-        "node 3 did not say how fast it counts: ticks were taken for 1000000 a second"
+        "node 3 did not send its tick rate, which is assumed to be 1000000 Hz"
     ]
 
 
@@ -346,7 +346,8 @@ def test_records_before_the_first_hello_are_remarked(cuts: list[int]) -> None:
     wire += writer.frame(Type.HELLO, 0, payloads.hello(32_768, "slow"))
     _, decoder = decoded(wire, cuts)
     assert decoder.remarks == [
-        "the device counts 32768 ticks a second: before it said so they were taken for 1000000"
+        "the tick rate of the device is 32768 Hz; 1000000 Hz was assumed for the records before "
+        "its HELLO"
     ]
     hello = FrameWriter().frame(Type.HELLO, 0, payloads.hello(32_768, "slow"))
     assert decoded(hello + wire, cuts)[1].remarks == []
@@ -364,8 +365,8 @@ def test_hello_is_logged_where_it_tells_anything() -> None:
             for line in zip(each.columns["level"].tolist(), each.columns["text"], strict=True)
         ]
         assert lines == [
-            (2, "hello from it, 1000000 ticks a second"),
-            (3, "started anew: it, 1000000 ticks a second"),
+            (2, "hello from it, 1000000 ticks/s"),
+            (3, "restarted: it, 1000000 ticks/s"),
         ]
         assert (decoder.counts.lost, decoder.remarks) == (0, [])
 
@@ -376,7 +377,7 @@ def test_a_newer_version_is_remarked_once() -> None:
     wire = b"".join(writer.frame(Type.HELLO, n, hello) for n in range(3))
     _, decoder = decoded(wire)
     assert decoder.remarks == [
-        "the device speaks version 2 of the protocol, of which this locatk knows 1"
+        "the device uses version 2 of the protocol; this locatk supports version 1"
     ]
 
 
@@ -457,7 +458,7 @@ def test_any_split_gives_the_same(seed: int, cuts: list[int]) -> None:
 def test_more_than_is_decoded_at_once() -> None:
     frames = some_frames(3000, 11)
     wire = b"".join(frames)
-    assert len(wire) > PIECE
+    assert len(wire) > PIECE_BYTES
     whole, decoder = decoded(wire)
     pieces, other = decoded(wire, list(range(0, len(wire), 1013)))
     assert listed(pieces) == listed(whole)
@@ -510,7 +511,7 @@ def test_garbage_needs_no_memory() -> None:
     for size in (1_000_000, 300, 70_000):
         noise = random.integers(1, 256, size).astype(np.uint8).tobytes()
         assert decoder.feed(noise) == []
-        assert len(decoder._deframer._tail) <= LARGEST_WIRE + 1
+        assert len(decoder._deframer._tail) <= MAX_WIRE_BYTES + 1
     batches = decoder.feed(b"\0" + numbered(2))
     assert [batch.end.tolist() for batch in batches] == [[decoder.counts.bytes]]
     assert (decoder.counts.bad, decoder.counts.skipped) == (1, 1_070_301)

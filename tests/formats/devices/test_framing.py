@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from locatk.formats.devices.decoder import Counts
 from locatk.formats.devices.locatk_frames import framing
 from locatk.formats.devices.locatk_frames.framing import (
-    LARGEST_CONTENT,
-    LARGEST_WIRE,
+    MAX_CONTENT_BYTES,
+    MAX_WIRE_BYTES,
     Contents,
     Deframer,
     checksum,
     cobs_encode,
-    seal,
+    encode_frame,
 )
 
 LENGTHS = [0, 1, 2, 253, 254, 255, 256, 507, 508, 509, 762, 1000]
@@ -35,7 +35,7 @@ pieces = st.lists(
 ).map(b"".join)
 """Bytes with long runs, of zeros and of others."""
 
-contents = pieces.map(lambda data: (data + bytes(8))[: max(8, min(len(data), LARGEST_CONTENT))])
+contents = pieces.map(lambda data: (data + bytes(8))[: max(8, min(len(data), MAX_CONTENT_BYTES))])
 
 
 def cobs_decode(data: bytes) -> bytes | None:
@@ -64,10 +64,10 @@ def one_by_one(wire: bytes) -> tuple[Found, Counts]:
     end = 0
     for piece in wire.split(b"\0")[:-1]:
         end += len(piece) + 1
-        body = (cobs_decode(piece) if len(piece) <= LARGEST_WIRE else None) or b""
+        body = (cobs_decode(piece) if len(piece) <= MAX_WIRE_BYTES else None) or b""
         size = 2 if len(body) <= 258 else 4
         content = body[:-size]
-        fits = len(content) >= 8 and (size == 2 or 256 < len(content) <= LARGEST_CONTENT)
+        fits = len(content) >= 8 and (size == 2 or 256 < len(content) <= MAX_CONTENT_BYTES)
         if fits and body == content + checksum(content):
             found.append((content, end))
         elif found:
@@ -137,32 +137,32 @@ def test_checksums_of_known_bytes() -> None:
     assert checksum(long) == (reference ^ 0xFFFFFFFF).to_bytes(4, "little")
 
 
-@pytest.mark.parametrize("size", [0, 7, LARGEST_CONTENT + 1])
+@pytest.mark.parametrize("size", [0, 7, MAX_CONTENT_BYTES + 1])
 def test_no_frame_of_another_size(size: int) -> None:
     with pytest.raises(ValueError, match=f"{size} bytes"):
-        seal(bytes(size))
+        encode_frame(bytes(size))
 
 
 def test_the_longest_frame() -> None:
-    content = bytes([7]) * LARGEST_CONTENT
-    wire = seal(content)
-    assert len(wire) == LARGEST_WIRE + 1
+    content = bytes([7]) * MAX_CONTENT_BYTES
+    wire = encode_frame(content)
+    assert len(wire) == MAX_WIRE_BYTES + 1
     assert fed(wire, []) == ([(content, len(wire))], Counts(bytes=len(wire)))
 
 
 @given(st.lists(contents, min_size=1, max_size=6), st.lists(st.integers(0, 9999), max_size=5))
 def test_what_was_sealed_is_found(sent: list[bytes], cuts: list[int]) -> None:
-    wire = b"".join(map(seal, sent))
+    wire = b"".join(map(encode_frame, sent))
     found, counts = fed(wire, cuts)
     assert [content for content, _ in found] == sent
     assert (found, counts) == one_by_one(wire)
     assert (counts.bad, counts.skipped) == (0, 0)
 
 
-@pytest.mark.parametrize("few", [0, framing.FEW])
+@pytest.mark.parametrize("few", [0, framing.MAX_LOOP_FRAMES])
 def test_many_at_once_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -> None:
     # Arrays for all from the first, and for those that are many; lengths about all limits.
-    monkeypatch.setattr(framing, "FEW", few)
+    monkeypatch.setattr(framing, "MAX_LOOP_FRAMES", few)
     random = np.random.default_rng(6)
     sent = []
     for n in range(1500):
@@ -172,7 +172,7 @@ def test_many_at_once_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -
         if n % 5 == 0:
             content[content == 0] = 1
         sent.append(content.tobytes())
-    wire = b"".join(map(seal, sent))
+    wire = b"".join(map(encode_frame, sent))
     found, counts = fed(wire, [100_000, 100_001, 200_000])
     assert [content for content, _ in found] == sent
     assert (found, counts) == one_by_one(wire)
@@ -180,14 +180,14 @@ def test_many_at_once_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("few", [0, framing.FEW])
+@pytest.mark.parametrize("few", [0, framing.MAX_LOOP_FRAMES])
 def test_damage_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -> None:
-    monkeypatch.setattr(framing, "FEW", few)
+    monkeypatch.setattr(framing, "MAX_LOOP_FRAMES", few)
     random = np.random.default_rng(7)
     for _ in range(60):
         sizes = random.integers(8, 400, 40)
         sent = [random.integers(0, 256, n).astype(np.uint8).tobytes() for n in sizes]
-        wire = bytearray(b"".join(map(seal, sent)))
+        wire = bytearray(b"".join(map(encode_frame, sent)))
         faults = int(random.integers(1, 8))
         for _ in range(faults):
             place = int(random.integers(0, len(wire)))
@@ -207,13 +207,13 @@ def test_damage_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -> None
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=4))
 def test_garbage_before_the_first_frame_is_no_fault(data: bytes, cuts: list[int]) -> None:
-    found, counts = fed(data + b"\0" + seal(b"whatever it is"), cuts)
+    found, counts = fed(data + b"\0" + encode_frame(b"whatever it is"), cuts)
     assert [content for content, _ in found] == [b"whatever it is"]
     assert (counts.bad, counts.skipped) == (0, 0)
 
 
 def test_every_byte_after_the_first_frame_is_counted() -> None:
-    one, two = seal(b"the first frame"), seal(b"the second frame")
+    one, two = encode_frame(b"the first frame"), encode_frame(b"the second frame")
     garbage = b"abc\0\0defghijklmnopqrstuvwxyz\0"
     found, counts = fed(b"\x05junk\0" + one + garbage + two, [])
     assert len(found) == 2
@@ -233,11 +233,11 @@ def test_a_short_content_has_no_long_checksum(longest: int) -> None:
 def test_memory_is_bounded() -> None:
     counts = Counts()
     deframer = Deframer(counts)
-    first = seal(b"a frame to begin")
+    first = encode_frame(b"a frame to begin")
     deframer.feed(first)
     for _ in range(100):
         deframer.feed(b"U" * 100_000)
-        assert len(deframer._tail) <= LARGEST_WIRE + 1
+        assert len(deframer._tail) <= MAX_WIRE_BYTES + 1
     found = deframer.feed(b"U\0" + first)
     assert len(found) == 1
     assert found.end[0] == counts.bytes == 10_000_002 + 2 * len(first)
@@ -247,12 +247,12 @@ def test_memory_is_bounded() -> None:
 def test_what_is_half_received_is_dropped() -> None:
     counts = Counts()
     deframer = Deframer(counts)
-    one = seal(b"a frame to begin")
+    one = encode_frame(b"a frame to begin")
     deframer.feed(one + one[:5])
     deframer.restart()
     assert len(deframer.feed(one[5:])) == 0  # the rest of a frame nobody saw the start of
     assert len(deframer.feed(one)) == 1
     assert (counts.bad, counts.skipped) == (0, 0)
-    deframer.feed(b"U" * (LARGEST_WIRE + 9))
+    deframer.feed(b"U" * (MAX_WIRE_BYTES + 9))
     deframer.drop()
-    assert (counts.bad, counts.skipped) == (1, LARGEST_WIRE + 9)
+    assert (counts.bad, counts.skipped) == (1, MAX_WIRE_BYTES + 9)

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.formats.devices.decoder import Counts
-from locatk.formats.devices.hdlc import ESCAPE, FLAG, LARGEST, HdlcDecoder, packed, unpacked
+from locatk.formats.devices.dotbot_gateway import (
+    ESCAPE,
+    FLAG,
+    MAX_FRAME_BYTES,
+    HdlcDecoder,
+    decode_hdlc,
+    encode_hdlc,
+)
 
 VECTORS = [
     (b"test", b"~test\x88\x07~"),
@@ -39,27 +46,27 @@ def slow_fcs(payload: bytes) -> int:
 
 @pytest.mark.parametrize(("payload", "frame"), VECTORS)
 def test_published_frames(payload: bytes, frame: bytes) -> None:
-    assert packed(payload) == frame
+    assert encode_hdlc(payload) == frame
     assert decode(frame)[0] == [(len(frame), payload)]
 
 
 def test_check_value_of_the_catalogue() -> None:
     assert slow_fcs(b"123456789") == 0x906E
-    assert packed(b"123456789")[-3:-1] == b"\x6e\x90"
+    assert encode_hdlc(b"123456789")[-3:-1] == b"\x6e\x90"
 
 
 @given(st.binary(max_size=300))
 def test_there_and_back(payload: bytes) -> None:
-    frame = packed(payload)
+    frame = encode_hdlc(payload)
     assert frame.count(FLAG) == 2
-    assert unpacked(frame[1:-1]) == payload
+    assert decode_hdlc(frame[1:-1]) == payload
     fcs = slow_fcs(payload).to_bytes(2, "little")
     assert frame[1:-1].replace(b"}^", b"~").replace(b"}]", b"}") == payload + fcs
 
 
 @given(payloads, st.booleans(), st.lists(st.integers(0, 500)))
 def test_pieces_do_not_matter(sent: list[bytes], shared: bool, cuts: list[int]) -> None:
-    frames = [packed(payload) for payload in sent]
+    frames = [encode_hdlc(payload) for payload in sent]
     stream = b"\x01}" + b"".join(frames)
     if shared:
         stream = stream.replace(FLAG * 2, FLAG)
@@ -68,13 +75,17 @@ def test_pieces_do_not_matter(sent: list[bytes], shared: bool, cuts: list[int]) 
     assert [payload for _, payload in found] == sent
     assert (counts.frames, counts.bad, counts.skipped) == (len(sent), 0, 0)
     for end, payload in found:
-        assert stream[:end].endswith(packed(payload)[1:])
+        assert stream[:end].endswith(encode_hdlc(payload)[1:])
 
 
 @pytest.mark.slow
 @given(payloads, st.binary(max_size=40), st.data())
 def test_faults_make_no_wrong_frame(sent: list[bytes], noise: bytes, draw: st.DataObject) -> None:
-    good = [packed(b"first")] + [packed(payload) for payload in sent] + [packed(b"last")]
+    good = (
+        [encode_hdlc(b"first")]
+        + [encode_hdlc(payload) for payload in sent]
+        + [encode_hdlc(b"last")]
+    )
     which = draw.draw(st.integers(1, len(good) - 1))
     frame = bytearray(good[which])
     fault = draw.draw(st.sampled_from(["flip", "drop", "add"]))
@@ -86,7 +97,7 @@ def test_faults_make_no_wrong_frame(sent: list[bytes], noise: bytes, draw: st.Da
     else:
         frame[place:place] = noise
     good[which] = bytes(frame)
-    found, _ = decode(*good, packed(b"end"))
+    found, _ = decode(*good, encode_hdlc(b"end"))
     payloads = [payload for _, payload in found]
     expected = [b"first", *sent, b"last", b"end"]
     # An FCS sees every single flip; of others it lets through one in 65536.
@@ -98,7 +109,7 @@ def test_faults_make_no_wrong_frame(sent: list[bytes], noise: bytes, draw: st.Da
 
 
 def test_what_is_wrong_is_counted() -> None:
-    good = packed(b"good")
+    good = encode_hdlc(b"good")
     found, counts = decode(b"~nothing heard yet~", good, b"~bad frame~", good, good[:-1] + b"x~")
     assert len(found) == 2
     assert (counts.frames, counts.bad) == (2, 2)
@@ -107,25 +118,27 @@ def test_what_is_wrong_is_counted() -> None:
 
 @pytest.mark.parametrize("body", [b"", b"a", b"}", b"}}^\x00", b"a}", b"}A\x00\x00"])
 def test_what_is_no_frame(body: bytes) -> None:
-    assert unpacked(body) is None
+    assert decode_hdlc(body) is None
 
 
 def test_escape_before_the_flag_gives_up_the_frame() -> None:
-    found, counts = decode(packed(b"one"), packed(b"two")[:-1] + ESCAPE + FLAG, packed(b"three"))
+    found, counts = decode(
+        encode_hdlc(b"one"), encode_hdlc(b"two")[:-1] + ESCAPE + FLAG, encode_hdlc(b"three")
+    )
     assert [payload for _, payload in found] == [b"one", b"three"]
     assert counts.bad == 1
 
 
-@pytest.mark.parametrize("size", [LARGEST - 2, LARGEST - 1, 5 * LARGEST])
-@pytest.mark.parametrize("step", [7, LARGEST, 10**6])
+@pytest.mark.parametrize("size", [MAX_FRAME_BYTES - 2, MAX_FRAME_BYTES - 1, 5 * MAX_FRAME_BYTES])
+@pytest.mark.parametrize("step", [7, MAX_FRAME_BYTES, 10**6])
 def test_longest_frame(size: int, step: int) -> None:
-    stream = packed(b"one") + packed(bytes(size)) + packed(b"two")
+    stream = encode_hdlc(b"one") + encode_hdlc(bytes(size)) + encode_hdlc(b"two")
     decoder = HdlcDecoder(counts := Counts())
     found = []
     for k in range(0, len(stream), step):
         found += decoder.feed(stream[k : k + step])
-        assert len(decoder._rest) <= LARGEST
-    fits = size + 2 <= LARGEST
+        assert len(decoder._rest) <= MAX_FRAME_BYTES
+    fits = size + 2 <= MAX_FRAME_BYTES
     assert [len(payload) for _, payload in found] == [3, *[size] * fits, 3]
     assert found[-1][0] == len(stream)
     assert (counts.frames, counts.bad) == (2 + fits, 1 - fits)
@@ -134,9 +147,9 @@ def test_longest_frame(size: int, step: int) -> None:
 
 def test_connection_lost_and_there_again() -> None:
     decoder = HdlcDecoder(counts := Counts())
-    one = packed(b"one")
+    one = encode_hdlc(b"one")
     assert decoder.feed(one + b"half a fr") == [(len(one), b"one")]
     decoder.restart()
-    found = decoder.feed(b"ame~" + packed(b"two"))
-    assert found == [(len(one) + 9 + 4 + len(packed(b"two")), b"two")]
+    found = decoder.feed(b"ame~" + encode_hdlc(b"two"))
+    assert found == [(len(one) + 9 + 4 + len(encode_hdlc(b"two")), b"two")]
     assert (counts.frames, counts.bad, counts.skipped) == (2, 0, 0)

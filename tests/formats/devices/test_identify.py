@@ -17,9 +17,15 @@ from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats.devices import DEVICES, Device
 from locatk.formats.devices import identification as identify
-from locatk.formats.devices.decoder import Batch, Counts, Options, Stream
-from locatk.formats.devices.identification import LARGEST, LIKELY, NONE, SURE, Identifier, Verdict
-from locatk.formats.devices.recording import Recording
+from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream
+from locatk.formats.devices.identification import (
+    CERTAIN,
+    LIKELY,
+    MAX_BYTES,
+    UNKNOWN,
+    Identifier,
+    Verdict,
+)
 
 START_NS = 1_760_000_000_000_000_000
 
@@ -152,7 +158,7 @@ def test_clean_frames_are_sure_soon(name: str) -> None:
             heard += 1
         verdict = identifier.verdict()
         assert verdict is not None
-        assert verdict.confidence == SURE, what
+        assert verdict.confidence == CERTAIN, what
         assert heard <= 50
         assert verdict.device == name
 
@@ -204,8 +210,8 @@ def noise(kind: str) -> bytes:
 )
 def test_what_fits_no_device_stays_raw(kind: str, boot: bytes) -> None:
     verdict = listen(cut([boot + noise(kind)], 300))
-    assert (verdict.device, verdict.confidence) == ("raw", NONE)
-    assert "check the" in verdict.why
+    assert (verdict.device, verdict.confidence) == ("raw", UNKNOWN)
+    assert verdict.why.endswith("--baud")
 
 
 @pytest.mark.parametrize(
@@ -233,18 +239,18 @@ def test_words_are_lines_when_nothing_else_comes(text: bytes) -> None:
 
 
 def test_reasons_for_raw() -> None:
-    assert Identifier().settle() == Verdict("raw", NONE, "nothing came")
-    assert "all 0x00: check the wiring" in listen([bytes(50)]).why
-    assert "50 bytes that fit no known device" in listen([np.random.default_rng(0).bytes(50)]).why
+    assert Identifier().settle() == Verdict("raw", UNKNOWN, "no bytes received")
+    assert "all 50 bytes are 0x00: check the wiring" in listen([bytes(50)]).why
+    assert "50 bytes match no known device" in listen([np.random.default_rng(0).bytes(50)]).why
 
 
 def test_so_many_bytes_are_enough() -> None:
     identifier = Identifier()
-    identifier.feed(np.random.default_rng(1).bytes(LARGEST + 50_000))
+    identifier.feed(np.random.default_rng(1).bytes(MAX_BYTES + 50_000))
     verdict = identifier.verdict()
     assert verdict is not None
     assert verdict.device == "raw"
-    assert len(identifier._data) == LARGEST
+    assert len(identifier._data) == MAX_BYTES
 
 
 # ---- devices of other packages
@@ -297,7 +303,7 @@ class Other(Device):
 
     fake: tuple[Any, ...] = ()
 
-    def decode(self, options: Options) -> Fake:
+    def create_decoder(self, options: Options) -> Fake:
         if self.fake[2:3] == ("decode",):
             raise ValueError("no")
         return Fake(*self.fake)
@@ -315,7 +321,7 @@ def framed(frames: int) -> list[bytes]:
 def test_devices_of_other_packages() -> None:
     devices = [*DEVICES.values(), other("theirs", b"\xaa\x55", 20)]
     assert listen(framed(100), devices=devices).device == "theirs"
-    assert listen(framed(100), devices=devices).confidence == SURE
+    assert listen(framed(100), devices=devices).confidence == CERTAIN
     assert listen(framed(8), devices=devices).confidence == LIKELY
     assert listen(framed(3), devices=devices).device == "raw"
 
@@ -341,7 +347,7 @@ def test_a_decoder_that_fails_does_no_harm(where: str) -> None:
         assert all(listen(p, devices=devices).device == name for _, p in sent(name))
     verdict = listen([bytes(100)], devices=devices)
     assert verdict.device == "raw"
-    assert verdict.why.endswith("theirs could not listen (ValueError: no)")
+    assert verdict.why.endswith("the decoder of theirs failed (ValueError: no)")
 
 
 def test_entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -360,7 +366,7 @@ def test_entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(identify, "entry_points", lambda group: entries)
     assert listen(framed(100)).device == "theirs"
     assert listen([b"Hello\n"]).device == "lines"
-    assert "broken could not listen (ImportError: gone)" in listen([bytes(9)]).why
+    assert "the decoder of broken failed (ImportError: gone)" in listen([bytes(9)]).why
 
 
 def test_options_reach_the_decoders() -> None:
@@ -368,5 +374,5 @@ def test_options_reach_the_decoders() -> None:
     identifier = Identifier(Options(columns))
     identifier.feed(b"\n" + b"1,2\n" * 40)
     assert identifier.verdict() == Verdict(
-        "lines", SURE, "40 lines in the first 161 bytes, 100% of what came since the first"
+        "lines", CERTAIN, "40 lines in the first 161 bytes, 100% of the bytes since the first one"
     )

@@ -18,12 +18,11 @@ from locatk.core.geometry import quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
-from locatk.formats.devices import device
-from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks
+from locatk.formats.devices import find_device
+from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream, Ticks
 from locatk.formats.devices.lines import decoder as lines
 from locatk.formats.devices.lines.columns import meaning, split_unit
 from locatk.formats.devices.lines.decoder import LONGEST, LineDecoder
-from locatk.formats.devices.recording import Recording
 
 Pieces = Sequence[bytes]
 
@@ -717,7 +716,7 @@ def recording() -> Recording:
 
 def test_a_recording_comes_back() -> None:
     said = recording()
-    frames = list(device("lines").encode(said))
+    frames = list(find_device("lines").encode(said))
     times = [time_ns for time_ns, _ in frames]
     assert times == sorted(times)
     decoder, batches = decode(*(line for _, line in frames))
@@ -750,4 +749,4 @@ def refused() -> Iterator[tuple[Recording, str]]:
 @pytest.mark.parametrize(("said", "words"), list(refused()))
 def test_what_lines_do_not_tell(said: Recording, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        device("lines").encode(said)
+        find_device("lines").encode(said)

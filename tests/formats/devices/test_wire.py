@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 from typing import Any
 
 import pytest
@@ -10,11 +9,10 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.formats import devices as wire
 from locatk.formats.capture.ingestion import SerialIntake
-from locatk.formats.capture.reader_thread import Arrived
-from locatk.formats.capture.statistics import Totals
-from locatk.formats.devices.decoder import Options
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.capture.statistics import CaptureStatistics
+from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.devices.lines.decoder import LineDecoder
-from locatk.formats.devices.recording import Recording
 
 MINE = wire.Device("mine", "lines of another package", 9600, f"{__name__}:made")
 
@@ -41,15 +39,15 @@ def packages(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         assert group == "locatk.devices"
         return [Entry(each) for each in held if name in (None, each)]
 
-    monkeypatch.setattr(metadata, "entry_points", entry_points)
+    monkeypatch.setattr(wire, "entry_points", entry_points)
     return held
 
 
 @pytest.mark.parametrize("name", list(wire.DEVICES))
 def test_each_device_decodes(name: str) -> None:
-    device = wire.device(name)
+    device = wire.find_device(name)
     assert device is wire.DEVICES[name]
-    decoder = device.decode(Options())
+    decoder = device.create_decoder(Options())
     assert decoder.feed(b"") == []
     assert decoder.counts.bytes == 0
 
@@ -61,9 +59,9 @@ def test_a_device_of_another_package(
     monkeypatch.setattr(wire, "_load", lambda target: made)
     intake = SerialIntake("red", "", "mine")
     data = b"1,2\n3,4\n5,6\n"
-    topics = [each.topic for each in intake.take([Arrived(10**18, data, len(data))])]
+    topics = [each.topic for each in intake.take([ReceivedData(10**18, data, len(data))])]
     assert "/readings/red" in topics
-    totals = Totals()
+    totals = CaptureStatistics()
     intake.count(totals)
     assert totals.samples["/readings/red"] >= 2
 
@@ -71,7 +69,7 @@ def test_a_device_of_another_package(
 def test_an_unknown_device_is_refused_with_all_that_are_known(packages: dict[str, Any]) -> None:
     packages["mine"] = MINE
     with pytest.raises(InputError, match="no device 'nonsense'") as caught:
-        wire.device("nonsense")
+        wire.find_device("nonsense")
     assert caught.value.hint is not None
     assert "polaris-array" in caught.value.hint
     assert "mine" in caught.value.hint
@@ -82,7 +80,7 @@ def test_an_unknown_device_is_refused_with_all_that_are_known(packages: dict[str
 def test_a_broken_package_is_named(packages: dict[str, Any], held: object) -> None:
     packages["mine"] = held
     with pytest.raises(InputError, match="the device 'mine'"):
-        wire.device("mine")
+        wire.find_device("mine")
 
 
 def test_a_device_without_an_encoder_says_so() -> None:

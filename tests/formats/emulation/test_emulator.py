@@ -13,16 +13,20 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import InputError, OutputExistsError
-from locatk.formats.emulation.emulator import Emulator, Plan, Totals
-from locatk.formats.emulation.faults import Faults
-from locatk.formats.emulation.pacing import Constant, Recorded, repeated
-from locatk.formats.emulation.pseudo_port import PseudoPort
+from locatk.formats.emulation.byte_stream import (
+    ConstantRate,
+    LineFaults,
+    RecordedPace,
+    repeat_packets,
+)
+from locatk.formats.emulation.emulator import EmulationCounts, EmulationPlan, Emulator
+from locatk.formats.emulation.pseudo_terminal import PseudoPort
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pseudo-terminals of Linux")
 
 SETTLE_S = 0.03
 QUICK = {"settle_s": SETTLE_S}
-IMPATIENT = {**QUICK, "patience_s": 0.1, "end_s": 0.2}
+IMPATIENT = {**QUICK, "max_blocked_s": 0.1, "end_wait_s": 0.2}
 
 
 def numbered(count: int, step_ms: float = 1.0, size: int = 8) -> list[tuple[int, bytes]]:
@@ -34,7 +38,7 @@ def joined(packets: list[tuple[int, bytes]]) -> bytes:
     return b"".join(data for _, data in packets)
 
 
-def balanced(totals: Totals) -> bool:
+def balanced(totals: EmulationCounts) -> bool:
     lost = totals.dropped + totals.unheard + totals.overrun
     return totals.made == totals.sent + lost
 
@@ -112,7 +116,7 @@ def port(tmp_path: Path) -> Iterator[PseudoPort]:
     assert list(tmp_path.iterdir()) == []
 
 
-def emulate(emulator: Emulator, *readers: Reader) -> Totals:
+def emulate(emulator: Emulator, *readers: Reader) -> EmulationCounts:
     """Run to the end with readers at work."""
     for reader in readers:
         reader.start()
@@ -127,16 +131,16 @@ def test_every_byte_arrives_in_order(port: PseudoPort) -> None:
     packets = numbered(2000, step_ms=0.1, size=64)
     reader = Reader(port.path)
     start = time.monotonic()
-    totals = emulate(Emulator(port, Recorded(packets), plan=Plan(**QUICK)), reader)
+    totals = emulate(Emulator(port, RecordedPace(packets), plan=EmulationPlan(**QUICK)), reader)
     assert reader.data == joined(packets)
-    assert totals == Totals(made=len(reader.data), sent=len(reader.data))
+    assert totals == EmulationCounts(made=len(reader.data), sent=len(reader.data))
     assert time.monotonic() - start > 0.2, "not before it is due"
 
 
 def test_more_than_a_terminal_holds_at_once(port: PseudoPort) -> None:
     data = np.random.default_rng(3).bytes(300_000)
     reader = Reader(port.path)
-    emulate(Emulator(port, Recorded([(0, data)]), plan=Plan(**QUICK)), reader)
+    emulate(Emulator(port, RecordedPace([(0, data)]), plan=EmulationPlan(**QUICK)), reader)
     assert reader.data == data
 
 
@@ -144,7 +148,7 @@ def test_a_constant_rate(port: PseudoPort) -> None:
     data = np.random.default_rng(3).bytes(200_000)
     reader = Reader(port.path)
     start = time.monotonic()
-    emulate(Emulator(port, Constant([(0, data)], 1e6), plan=Plan(**QUICK)), reader)
+    emulate(Emulator(port, ConstantRate([(0, data)], 1e6), plan=EmulationPlan(**QUICK)), reader)
     assert reader.data == data
     assert time.monotonic() - start > 0.2
 
@@ -152,7 +156,7 @@ def test_a_constant_rate(port: PseudoPort) -> None:
 def test_a_late_reader_misses_nothing(port: PseudoPort) -> None:
     packets = numbered(100, step_ms=0.2)
     reader = Reader(port.path, delay_s=0.15)
-    emulate(Emulator(port, Recorded(packets), plan=Plan(**QUICK)), reader)
+    emulate(Emulator(port, RecordedPace(packets), plan=EmulationPlan(**QUICK)), reader)
     assert reader.data == joined(packets)
 
 
@@ -166,14 +170,16 @@ def test_the_first_reader_may_throw_away_what_is_there_when_it_opens(port: Pseud
 
     packets = numbered(100, step_ms=0.2)
     reader = Reader(port.path, first=flush)
-    emulate(Emulator(port, Recorded(packets), plan=Plan(settle_s=6 * SETTLE_S)), reader)
+    emulate(
+        Emulator(port, RecordedPace(packets), plan=EmulationPlan(settle_s=6 * SETTLE_S)), reader
+    )
     assert reader.data == joined(packets)
 
 
 def test_a_passer_by_does_not_start_it(port: PseudoPort) -> None:
     """As ``stty -F PORT`` before the reader."""
     packets = numbered(50)
-    emulator = Emulator(port, Recorded(packets), plan=Plan(settle_s=0.1))
+    emulator = Emulator(port, RecordedPace(packets), plan=EmulationPlan(settle_s=0.1))
     run = threading.Thread(target=emulator.run)
     run.start()
     os.close(os.open(port.path, os.O_RDWR | os.O_NOCTTY))
@@ -189,22 +195,26 @@ def test_a_passer_by_does_not_start_it(port: PseudoPort) -> None:
 def test_without_waiting_the_start_is_lost(port: PseudoPort) -> None:
     packets = numbered(250)
     reader = Reader(port.path, delay_s=0.1)
-    totals = emulate(Emulator(port, Recorded(packets), plan=Plan(wait=False, **QUICK)), reader)
+    totals = emulate(
+        Emulator(port, RecordedPace(packets), plan=EmulationPlan(wait=False, **QUICK)), reader
+    )
     assert joined(packets).endswith(reader.data)
     assert totals.sent == len(reader.data) > 0
     assert totals.unheard == totals.made - totals.sent > 0
 
 
 def test_without_any_reader_all_is_lost(port: PseudoPort) -> None:
-    totals = emulate(Emulator(port, Recorded(numbered(50)), plan=Plan(wait=False, **QUICK)))
-    assert totals == Totals(made=400, unheard=400)
+    totals = emulate(
+        Emulator(port, RecordedPace(numbered(50)), plan=EmulationPlan(wait=False, **QUICK))
+    )
+    assert totals == EmulationCounts(made=400, unheard=400)
 
 
 def test_while_the_reader_is_away_bytes_are_lost_and_counted(port: PseudoPort) -> None:
     """Among them what it left unread: the next reader does not get to see it."""
     packets = numbered(350)
     reader = Reader(port.path, leaves_after=400)
-    totals = emulate(Emulator(port, Recorded(packets), plan=Plan(**QUICK)), reader)
+    totals = emulate(Emulator(port, RecordedPace(packets), plan=EmulationPlan(**QUICK)), reader)
     before, after = reader.parts
     assert joined(packets).startswith(before)
     assert joined(packets).endswith(after)
@@ -216,7 +226,7 @@ def test_while_the_reader_is_away_bytes_are_lost_and_counted(port: PseudoPort) -
 def test_a_reader_that_does_not_read_loses_bytes_in_the_middle(port: PseudoPort) -> None:
     packets = numbered(500, size=200)  # 100 kB, where a terminal holds 20 kB
     reader = Reader(port.path, first=lambda descriptor: time.sleep(0.3))
-    totals = emulate(Emulator(port, Recorded(packets), plan=Plan(**IMPATIENT)), reader)
+    totals = emulate(Emulator(port, RecordedPace(packets), plan=EmulationPlan(**IMPATIENT)), reader)
     assert totals.sent == len(reader.data)
     assert totals.overrun == totals.made - totals.sent > 10_000
     whole = joined(packets)
@@ -231,7 +241,7 @@ def test_a_reader_that_does_not_read_loses_bytes_in_the_middle(port: PseudoPort)
 def test_a_busy_reader_loses_nothing(port: PseudoPort) -> None:
     packets = numbered(250, size=200)
     reader = Reader(port.path, first=lambda descriptor: time.sleep(0.2))
-    emulate(Emulator(port, Recorded(packets), plan=Plan(**QUICK)), reader)
+    emulate(Emulator(port, RecordedPace(packets), plan=EmulationPlan(**QUICK)), reader)
     assert reader.data == joined(packets)
 
 
@@ -240,8 +250,8 @@ def test_as_fast_as_the_reader_takes_it_nothing_is_lost(port: PseudoPort) -> Non
     """Neither while it is busy nor while it is away, but for what it left unread."""
     packets = numbered(6000, step_ms=1000, size=200)
     busy = Reader(port.path, first=lambda descriptor: time.sleep(0.3), leaves_after=60_000)
-    pace = Recorded(packets, float("inf"))
-    totals = emulate(Emulator(port, pace, plan=Plan(lossless=True, **QUICK)), busy)
+    pace = RecordedPace(packets, float("inf"))
+    totals = emulate(Emulator(port, pace, plan=EmulationPlan(lossless=True, **QUICK)), busy)
     before, after = busy.parts
     assert joined(packets).startswith(before)
     assert joined(packets).endswith(after)
@@ -255,8 +265,8 @@ def test_as_fast_as_the_reader_takes_it_nothing_is_lost(port: PseudoPort) -> Non
 def test_unplugging(port: PseudoPort) -> None:
     packets = numbered(580)
     reader = Reader(port.path)
-    plan = Plan(unplug_every_s=0.15, away_s=0.1, **QUICK)
-    totals = emulate(Emulator(port, Recorded(packets), plan=plan), reader)
+    plan = EmulationPlan(unplug_every_s=0.15, away_s=0.1, **QUICK)
+    totals = emulate(Emulator(port, RecordedPace(packets), plan=plan), reader)
     assert totals.unplugs == 2
     assert len(reader.parts) == 3
     assert totals.sent == len(reader.data)
@@ -278,18 +288,18 @@ def test_a_reader_that_is_cut_off_knows_what_it_missed(port: PseudoPort) -> None
     """What it had not read when the port went is counted to the byte."""
     packets = numbered(250)
     reader = Reader(port.path, first=lambda descriptor: reader.over.wait(9))
-    plan = Plan(unplug_every_s=0.15, away_s=9, **QUICK)
-    totals = emulate(Emulator(port, Recorded(packets), plan=plan), reader)
+    plan = EmulationPlan(unplug_every_s=0.15, away_s=9, **QUICK)
+    totals = emulate(Emulator(port, RecordedPace(packets), plan=plan), reader)
     assert reader.data == b""
-    assert totals == Totals(made=2000, unheard=2000, unplugs=1)
+    assert totals == EmulationCounts(made=2000, unheard=2000, unplugs=1)
 
 
 def test_a_port_that_cannot_come_back(port: PseudoPort) -> None:
-    plan = Plan(wait=False, unplug_every_s=0.05, away_s=0.1, **QUICK)
+    plan = EmulationPlan(wait=False, unplug_every_s=0.05, away_s=0.1, **QUICK)
     taken = Path(port.path)
     threading.Timer(0.1, taken.write_text, ["precious"]).start()
     with pytest.raises(OutputExistsError):
-        Emulator(port, Recorded(numbered(1000)), plan=plan).run()
+        Emulator(port, RecordedPace(numbered(1000)), plan=plan).run()
     assert taken.read_text() == "precious"
     taken.unlink()
 
@@ -306,25 +316,28 @@ def test_the_last_bytes_are_waited_for(port: PseudoPort) -> None:
 
     packets = numbered(1000, step_ms=0.01)
     reader = Reader(port.path, first=slowly)
-    emulate(Emulator(port, Recorded(packets), plan=Plan(**QUICK)), reader)
+    emulate(Emulator(port, RecordedPace(packets), plan=EmulationPlan(**QUICK)), reader)
     assert reader.data == joined(packets)
 
 
 def test_the_last_bytes_are_not_waited_for_for_ever(port: PseudoPort) -> None:
     reader = Reader(port.path, first=lambda descriptor: reader.over.wait(9))
     totals = emulate(
-        Emulator(port, Recorded(numbered(100, step_ms=0.1)), plan=Plan(**IMPATIENT)), reader
+        Emulator(port, RecordedPace(numbered(100, step_ms=0.1)), plan=EmulationPlan(**IMPATIENT)),
+        reader,
     )
-    assert totals == Totals(made=800, unheard=800)
+    assert totals == EmulationCounts(made=800, unheard=800)
 
 
 def test_faults_are_counted_as_they_arrive(port: PseudoPort) -> None:
     packets = numbered(4000, step_ms=0.02, size=50)
     reader = Reader(port.path)
-    emulator = Emulator(port, Recorded(packets), Faults(0.01, 0.002, seed=5), Plan(**QUICK))
+    emulator = Emulator(
+        port, RecordedPace(packets), LineFaults(0.01, 0.002, seed=5), EmulationPlan(**QUICK)
+    )
     totals = emulate(emulator, reader)
-    expected = Faults(0.01, 0.002, seed=5)
-    assert reader.data == expected.spoil(joined(packets))
+    expected = LineFaults(0.01, 0.002, seed=5)
+    assert reader.data == expected.apply(joined(packets))
     assert (totals.dropped, totals.flipped) == (expected.dropped, expected.flipped)
     assert totals.dropped > 0
     assert totals.sent == len(reader.data)
@@ -333,7 +346,12 @@ def test_faults_are_counted_as_they_arrive(port: PseudoPort) -> None:
 def test_again_and_again(port: PseudoPort) -> None:
     packets = numbered(100, step_ms=0.2)
     reader = Reader(port.path)
-    emulate(Emulator(port, Recorded(repeated(lambda: packets, 3)), plan=Plan(**QUICK)), reader)
+    emulate(
+        Emulator(
+            port, RecordedPace(repeat_packets(lambda: packets, 3)), plan=EmulationPlan(**QUICK)
+        ),
+        reader,
+    )
     assert reader.data == 3 * joined(packets)
 
 
@@ -346,7 +364,7 @@ def test_a_failing_source_leaves_nothing_behind(port: PseudoPort) -> None:
 
     reader = Reader(port.path)
     reader.start()
-    emulator = Emulator(port, Recorded(packets()), plan=Plan(**QUICK))
+    emulator = Emulator(port, RecordedPace(packets()), plan=EmulationPlan(**QUICK))
     with pytest.raises(InputError):
         emulator.run()
     reader.finish()
@@ -359,8 +377,8 @@ def test_a_failing_source_leaves_nothing_behind(port: PseudoPort) -> None:
 def test_it_can_be_stopped_while_it_sends(port: PseudoPort, speed: float) -> None:
     packets = [(1_000_000 * k, bytes([k % 256]) * 100) for k in range(100_000)]
     reader = Reader(port.path)
-    plan = Plan(lossless=speed > 1, **QUICK)
-    emulator = Emulator(port, Recorded(packets, speed), plan=plan)
+    plan = EmulationPlan(lossless=speed > 1, **QUICK)
+    emulator = Emulator(port, RecordedPace(packets, speed), plan=plan)
     threading.Timer(0.15, emulator.stop).start()
     totals = emulate(emulator, reader)
     assert joined(packets).startswith(reader.data)
@@ -370,15 +388,17 @@ def test_it_can_be_stopped_while_it_sends(port: PseudoPort, speed: float) -> Non
 
 def test_it_can_be_stopped_while_it_waits(port: PseudoPort) -> None:
     """For the first reader, and for the last one to read."""
-    emulator = Emulator(port, Recorded(numbered(10)), plan=Plan(**QUICK))
+    emulator = Emulator(port, RecordedPace(numbered(10)), plan=EmulationPlan(**QUICK))
     threading.Timer(0.05, emulator.stop).start()
-    assert emulate(emulator) == Totals()
+    assert emulate(emulator) == EmulationCounts()
 
     port.plug()
     reader = Reader(port.path, first=lambda descriptor: reader.over.wait(9))
-    emulator = Emulator(port, Recorded(numbered(10)), plan=Plan(lossless=True, **QUICK))
+    emulator = Emulator(
+        port, RecordedPace(numbered(10)), plan=EmulationPlan(lossless=True, **QUICK)
+    )
     threading.Timer(0.2, emulator.stop).start()
-    assert emulate(emulator, reader) == Totals(made=80, unheard=80)
+    assert emulate(emulator, reader) == EmulationCounts(made=80, unheard=80)
 
 
 def test_a_standing_device_costs_little(port: PseudoPort) -> None:
@@ -386,6 +406,6 @@ def test_a_standing_device_costs_little(port: PseudoPort) -> None:
     reader = Reader(port.path)
     packets = [(0, b"start"), (250_000_000, b"end")]
     before = time.process_time()
-    emulate(Emulator(port, Recorded(packets), plan=Plan(**QUICK)), reader)
+    emulate(Emulator(port, RecordedPace(packets), plan=EmulationPlan(**QUICK)), reader)
     assert time.process_time() - before < 0.2
     assert reader.data == b"startend"

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
-from locatk.formats.emulation.pseudo_port import PseudoPort
-from locatk.formats.emulation.pseudo_terminal import Terminal
+from locatk.formats.emulation.pseudo_terminal import PseudoPort, PseudoTerminal
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pseudo-terminals of Linux")
 
@@ -27,13 +26,13 @@ def opened(path: str) -> int:
 
 
 @pytest.fixture
-def terminal() -> Iterator[Terminal]:
-    made = Terminal()
+def terminal() -> Iterator[PseudoTerminal]:
+    made = PseudoTerminal()
     yield made
     made.close()
 
 
-def test_a_reader_is_seen(terminal: Terminal) -> None:
+def test_a_reader_is_seen(terminal: PseudoTerminal) -> None:
     for _ in range(3):
         assert not terminal.has_reader()
         reader, other = opened(terminal.name), opened(terminal.name)
@@ -45,7 +44,7 @@ def test_a_reader_is_seen(terminal: Terminal) -> None:
         assert not terminal.has_reader()
 
 
-def test_bytes_pass_as_they_are(terminal: Terminal) -> None:
+def test_bytes_pass_as_they_are(terminal: PseudoTerminal) -> None:
     reader = opened(terminal.name)
     data = bytes(range(256)) * 4
     assert terminal.write(data) == len(data)
@@ -55,7 +54,7 @@ def test_bytes_pass_as_they_are(terminal: Terminal) -> None:
     os.close(reader)
 
 
-def test_what_was_not_read_is_counted_to_the_byte(terminal: Terminal) -> None:
+def test_what_was_not_read_is_counted_to_the_byte(terminal: PseudoTerminal) -> None:
     reader = opened(terminal.name)
     sent = 0
     while more := terminal.write(bytes(4096)):
@@ -71,7 +70,7 @@ def test_what_was_not_read_is_counted_to_the_byte(terminal: Terminal) -> None:
     assert terminal.reset() == 4
 
 
-def test_room_is_waited_for(terminal: Terminal) -> None:
+def test_room_is_waited_for(terminal: PseudoTerminal) -> None:
     reader = opened(terminal.name)
     while terminal.write(bytes(4096)):
         time.sleep(0.01)  # some of it is on its way to the reader's side
@@ -87,7 +86,7 @@ def test_room_is_waited_for(terminal: Terminal) -> None:
     os.close(reader)
 
 
-def test_settings_of_a_reader_go_with_it(terminal: Terminal) -> None:
+def test_settings_of_a_reader_go_with_it(terminal: PseudoTerminal) -> None:
     """Else the next one would meet lines, echo, or a port that is closed to it."""
     reader = opened(terminal.name)
     usual = termios.tcgetattr(reader)
@@ -107,7 +106,7 @@ def test_settings_of_a_reader_go_with_it(terminal: Terminal) -> None:
     os.close(reader)
 
 
-def test_what_a_reader_writes_is_passed_over(terminal: Terminal) -> None:
+def test_what_a_reader_writes_is_passed_over(terminal: PseudoTerminal) -> None:
     reader = opened(terminal.name)
     for _ in range(50):  # a terminal holds less
         assert os.write(reader, bytes(2000)) == 2000
@@ -161,7 +160,7 @@ def touched(path: Path) -> tuple[int, ...]:
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link", "dangling", "terminal"])
 def test_what_belongs_to_others_is_not_touched(tmp_path: Path, kind: str) -> None:
-    path, terminal = tmp_path / "port", Terminal()
+    path, terminal = tmp_path / "port", PseudoTerminal()
     match kind:
         case "file":
             path.write_text("precious")

@@ -16,9 +16,8 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats import devices as wire
-from locatk.formats.devices.recording import Recording
-from locatk.formats.emulation.default_sessions import SYSTEMS, simulate_session
-from locatk.formats.emulation.source import source_of
+from locatk.formats.devices.decoder import Recording
+from locatk.formats.emulation.sources import SYSTEMS, select_source, write_simulated_session
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import field_samples, observations
 from locatk.formats.sessions.reader import Session
@@ -85,7 +84,7 @@ def of_bytes(
 
 
 def test_recorded_bytes_are_sent_as_they_are(tmp_path: Path) -> None:
-    source = source_of(of_bytes(tmp_path / "run.mcap"))
+    source = select_source(of_bytes(tmp_path / "run.mcap"))
     assert (source.device, source.recorded) == ("locatk", True)
     expected = [(START_NS + 1000 * k, bytes([k, 0, 255])) for k in range(10)]
     assert list(source.packets()) == expected
@@ -105,32 +104,32 @@ def test_recorded_bytes_are_sent_as_they_are(tmp_path: Path) -> None:
 def test_whose_bytes_they_are(
     tmp_path: Path, by: str | None, name: str | None, device: str
 ) -> None:
-    source = source_of(of_bytes(tmp_path / "run.mcap", by), name)
+    source = select_source(of_bytes(tmp_path / "run.mcap", by), name)
     assert (source.device, source.recorded) == (device, True)
     assert len(list(source.packets())) == 10
 
 
 def test_bytes_of_another_device_are_not_sent(tmp_path: Path, recordings: list[Recording]) -> None:
-    with pytest.raises(InputError, match="nothing that comes over a serial port"):
-        source_of(of_bytes(tmp_path / "run.mcap", "locatk"), "fake")
+    with pytest.raises(InputError, match="no data that a serial device sends"):
+        select_source(of_bytes(tmp_path / "run.mcap", "locatk"), "fake")
 
 
 def test_bytes_of_two_ports_are_refused(tmp_path: Path) -> None:
     session = of_bytes(tmp_path / "run.mcap", None, ("/serial/one", "/serial/two"))
     with pytest.raises(InputError, match="raw bytes of 2 ports"):
-        source_of(session)
+        select_source(session)
 
 
 def test_a_damaged_chunk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     session = of_bytes(tmp_path / "run.mcap")
-    source = source_of(session)
+    source = select_source(session)
     monkeypatch.setattr(session, "messages", lambda topics: [("/serial/bar", 0, b"\xff")])
     with pytest.raises(FormatError, match=r"damaged in .*run.mcap:/serial/bar"):
         list(source.packets())
 
 
 def test_streams_are_encoded(tmp_path: Path, recordings: list[Recording]) -> None:
-    source = source_of(of_samples(tmp_path / "run.mcap"), "fake")
+    source = select_source(of_samples(tmp_path / "run.mcap"), "fake")
     assert (source.device, source.recorded) == ("fake", False)
     assert list(source.packets()) == [(START_NS, b"\x05")]
     assert list(source.packets()) == [(START_NS, b"\x05")], "and again"
@@ -144,7 +143,7 @@ def test_streams_are_encoded(tmp_path: Path, recordings: list[Recording]) -> Non
 
 def test_all_streams_reach_the_device(tmp_path: Path, recordings: list[Recording]) -> None:
     for make, name in ((of_halls, "halls"), (of_sweeps, "sweeps")):
-        source = source_of(make(tmp_path / f"{name}.mcap"), "fake")
+        source = select_source(make(tmp_path / f"{name}.mcap"), "fake")
         with pytest.raises(InputError, match=rf"no samples of magnetometers in .*{name}.mcap"):
             list(source.packets())
         assert len(getattr(recordings[-1], name)) in (1, 5)
@@ -155,17 +154,17 @@ def test_all_streams_reach_the_device(tmp_path: Path, recordings: list[Recording
     [(of_samples, "polaris-array"), (of_halls, "locatk"), (of_sweeps, "dotbot-gateway")],
 )
 def test_the_usual_device(tmp_path: Path, make, device: str) -> None:
-    assert source_of(make(tmp_path / "run.mcap")).device == device
+    assert select_source(make(tmp_path / "run.mcap")).device == device
 
 
 def test_a_device_that_does_not_exist(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no device 'nonsense'"):
-        source_of(of_samples(tmp_path / "run.mcap"), "nonsense")
+        select_source(of_samples(tmp_path / "run.mcap"), "nonsense")
 
 
 def test_raw_is_what_was_recorded_or_nothing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nothing that the device 'raw' sends"):
-        source_of(of_samples(tmp_path / "run.mcap"), "raw")
+    with pytest.raises(InputError, match="no data that the device 'raw' sends"):
+        select_source(of_samples(tmp_path / "run.mcap"), "raw")
 
 
 def test_images_come_over_no_serial_port(tmp_path: Path, recordings: list[Recording]) -> None:
@@ -174,8 +173,8 @@ def test_images_come_over_no_serial_port(tmp_path: Path, recordings: list[Record
     path = tmp_path / "run.mcap"
     with SessionWriter(path, system="dots") as writer:
         writer.write("/camera/image", CompressedImage(format="png", data=b"x"), START_NS)
-    with pytest.raises(InputError, match="serial port") as caught:
-        source_of(Session.open(path), "fake")
+    with pytest.raises(InputError, match="serial device") as caught:
+        select_source(Session.open(path), "fake")
     assert caught.value.hint is not None
     assert "camera:" in caught.value.hint
 
@@ -185,7 +184,7 @@ def test_images_come_over_no_serial_port(tmp_path: Path, recordings: list[Record
 def test_simulated_sessions(system: str, tmp_path: Path) -> None:
     """They hold observations that a device can send, artifacts and truth."""
     path = tmp_path / "run.mcap"
-    simulate_session(system, path, seed=3)
+    write_simulated_session(system, path, seed=3)
     session = Session.open(path)
     assert session.facts["system"] == system
     names = {entry.name for entry in session.attachments()}
@@ -195,12 +194,12 @@ def test_simulated_sessions(system: str, tmp_path: Path) -> None:
     assert session.start_ns is not None
     assert session.end_ns is not None
     assert 10e9 < session.end_ns - session.start_ns < 60e9, "worth a look, and no long wait"
-    source = source_of(session, "locatk")
+    source = select_source(session, "locatk")
     assert sum(len(data) for _, data in source.packets()) > 10_000
 
 
 def test_a_camera_is_no_serial_device(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no serial port") as caught:
-        simulate_session("dots", tmp_path / "run.mcap")
+        write_simulated_session("dots", tmp_path / "run.mcap")
     assert caught.value.hint is not None
     assert "camera:VIDEO" in caught.value.hint

@@ -118,8 +118,7 @@ def test_windows_are_read_as_those_of_gateway_frames(read) -> None:
 def test_the_gateway_and_its_log_tell_the_same_counts(read) -> None:
     """The same windows through the reader of gateway frames: one convention."""
     from locatk.formats.devices.decoder import Options
-    from locatk.formats.devices.dotbot_gateway import GatewayDecoder
-    from locatk.formats.devices.hdlc import packed
+    from locatk.formats.devices.dotbot_gateway import GatewayDecoder, encode_hdlc
 
     rng = np.random.default_rng(1)
     raw = [(int(p), int(o), int(b)) for p, o, b in zip(
@@ -130,7 +129,7 @@ def test_the_gateway_and_its_log_tell_the_same_counts(read) -> None:
     for first, second in zip(raw[::2], raw[1::2], strict=True):
         body = np.array([(b, p, o) for p, o, b in (first, second)], record).tobytes()
         header = bytes(8) + int(SOURCE, 16).to_bytes(8, "little") + bytes(3) + b"\x08" + bytes(4)
-        frames += packed(header + b"\x02" + body)
+        frames += encode_hdlc(header + b"\x02" + body)
     batches = GatewayDecoder(Options()).feed(frames)
     expected = next(b for b in batches if b.stream.kind == "lighthouse").columns["count"]
     text = "".join(windows("8.1", *pair) for pair in zip(raw[::2], raw[1::2], strict=True))
