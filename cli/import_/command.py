@@ -27,7 +27,7 @@ class Format:
 
 FORMATS = {
     "dotbot-lh2": Format(
-        "locatk.formats.importers.dotbot.csv_recording:read_dotbot", "lighthouse", lighthouse.DOTBOT
+        "locatk.formats.importers.dotbot.recording:read_dotbot", "lighthouse", lighthouse.DOTBOT
     ),
     "saleae": Format(
         "locatk.formats.importers.saleae.session:read_saleae", "lighthouse", lighthouse.SALEAE

@@ -201,10 +201,10 @@ def _volts(per_tesla: tuple[float, ...] | None, zero: Any) -> Any:
 def _start(text: str | None) -> int | None:
     if text is None:
         return None
-    from locatk.formats.tables.csv_table import parse_time_ns
+    from locatk.formats.tables.timestamps import parse_iso_time
 
     try:
-        return parse_time_ns(text)
+        return parse_iso_time(text)
     except ValueError:
         raise click.UsageError(
             f"--start {text!r} is not a time in UTC, as in 2026-01-31T12:00:00Z."

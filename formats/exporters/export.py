@@ -10,9 +10,12 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters.kitti import write_kitti
+from locatk.formats.exporters.trajectory_csv import write_csv
+from locatk.formats.exporters.tum import write_tum
 from locatk.formats.output import atomic_write
 from locatk.formats.sessions.reader import Session
+from locatk.formats.tables.timestamps import format_epoch_seconds
 
 FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
 
@@ -109,11 +112,11 @@ def write(
     """
     match format_name:
         case "csv":
-            trajectories.write_csv(part.path, part.trajectories, overwrite=overwrite)
+            write_csv(part.path, part.trajectories, overwrite=overwrite)
         case "tum":
-            trajectories.write_tum(part.path, part.trajectories[0], overwrite=overwrite)
+            write_tum(part.path, part.trajectories[0], overwrite=overwrite)
         case "kitti":
-            trajectories.write_kitti(part.path, part.trajectories[0], overwrite=overwrite)
+            write_kitti(part.path, part.trajectories[0], overwrite=overwrite)
             assert part.times is not None
             write_times(part.times, part.trajectories[0], overwrite=overwrite)
         case "parquet":
@@ -140,7 +143,7 @@ def write_times(path: Path, trajectory: Trajectory, *, overwrite: bool = False) 
     What KITTI's ``times.txt`` is to its poses, but that it counts from the first one.
     """
     with atomic_write(path, overwrite=overwrite, mode="w") as stream:
-        times = map(trajectories.format_time, trajectory.time_ns.tolist())
+        times = map(format_epoch_seconds, trajectory.time_ns.tolist())
         stream.writelines(f"{time}\n" for time in times)
 
 

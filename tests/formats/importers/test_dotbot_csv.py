@@ -18,7 +18,7 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
 from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.dotbot.csv_recording import read_dotbot
+from locatk.formats.importers.dotbot.recording import read_dotbot
 from locatk.formats.importers.lighthouse import ImportedSession
 
 CORNERS = ("tl", "tr", "br", "bl")
@@ -519,7 +519,7 @@ def test_no_markers_from_a_plane_that_is_not_of_these_counts(write: Write) -> No
     write(json.dumps({"v": SQUARE}), "calibration.json")
     session = read_dotbot([write(synthetic(1e-3)[0])])
     assert session.scene is None
-    assert "no homography of the counts" in session.warnings[0]
+    assert "not a homography of the counts" in session.warnings[0]
     still = "timestamp,x,y,c0,c1\n" + "".join(
         f"2023-07-24 17:11:{i:02d},0.5,0.5,38000,79000\n" for i in range(10)
     )
