@@ -30,7 +30,7 @@ FORMATS = {
         "locatk.formats.importers.dotbot.recording:read_dotbot", "lighthouse", lighthouse.DOTBOT
     ),
     "saleae": Format(
-        "locatk.formats.importers.saleae.session:read_saleae", "lighthouse", lighthouse.SALEAE
+        "locatk.formats.importers.saleae.recording:read_saleae", "lighthouse", lighthouse.SALEAE
     ),
     "libsurvive": Format(
         "locatk.formats.importers.libsurvive.recording:read_libsurvive",

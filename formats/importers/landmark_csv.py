@@ -199,7 +199,7 @@ def read_landmarks(
         find_absent_readings(by_axis),
         table.file,
         [column.name for column in readings],
-        [table.lines[row] for row in rows],
+        [table.lines[row] for row in rows.tolist()],
     )
     if excluded == field_t.size:
         raise InputError("no usable reading", file=path, hint=warnings[0].split(": ", 1)[1])

@@ -13,6 +13,7 @@ import pytest
 
 from locatk.cli import export
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.exporters import export as exports
 from locatk.formats.importers.tum import read_tum

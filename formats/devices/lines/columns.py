@@ -67,9 +67,9 @@ POSE_KEYS = ("x", "y", "heading")
 
 
 class SiColumn(NamedTuple):
-    """Index of a column in the line, and its factor to SI (clock: to nanoseconds)."""
+    """Number of a column in the line, from 0, and its factor to SI (clock: to nanoseconds)."""
 
-    index: int
+    number: int
     factor: float
 
 
@@ -86,7 +86,7 @@ class Part:
 
     def values(self, lines: Array) -> Array:
         """Return the values (n, width) of lines (n, columns), in SI; ``nan`` if unknown."""
-        index = [column.index for column in self.columns]
+        index = [column.number for column in self.columns]
         values = lines[:, index] * np.array([column.factor for column in self.columns])
         if self.stream.kind != "readings":
             values[np.isinf(values)] = np.nan
@@ -131,11 +131,11 @@ class ColumnLayout:
         """Return the clock (n,) of lines (n, columns) in microseconds; None without a clock."""
         if self.clock is None:
             return None
-        return lines[:, self.clock.index] * (self.clock.factor / NANOSECONDS_PER_TICK)
+        return lines[:, self.clock.number] * (self.clock.factor / NANOSECONDS_PER_TICK)
 
     def sequences(self, lines: Array) -> Array | None:
         """Return the counter (n,) of lines (n, columns); None without a counter."""
-        return None if self.sequence is None else lines[:, self.sequence.index]
+        return None if self.sequence is None else lines[:, self.sequence.number]
 
     def is_damaged(self, lines: Array) -> NDArray[np.bool_]:
         """Return the lines (n,) with an impossible clock or counter."""
@@ -205,7 +205,7 @@ class ColumnLayout:
             return []
         fields = part.fields(values[has_record])
         if part.stream.kind == "magnetometers" and self.temperature is not None:
-            fields["temperature_celsius"] = lines[rows, self.temperature.index]
+            fields["temperature_celsius"] = lines[rows, self.temperature.number]
         stream = Stream(part.stream.kind, "", part.stream.sensors, part.stream.names, clock)
         return [
             Batch(
@@ -221,7 +221,7 @@ class ColumnLayout:
 def interpret_columns(names: Sequence[str]) -> ColumnLayout:
     """Interpret the names of columns; see the module. If a quantity repeats, its first is used."""
     by_kind: dict[str, dict[tuple[str, ...], SiColumn]] = {kind.field: {} for kind in COLUMN_KINDS}
-    remarks = []
+    remarks: list[str] = []
     for index, name in enumerate(names):
         match = match_column(name, COLUMN_KINDS)
         if match is None:
@@ -243,8 +243,8 @@ def interpret_columns(names: Sequence[str]) -> ColumnLayout:
     has_magnetometers = any(part.stream.kind == "magnetometers" for part in parts)
     clock, sequence = (by_kind[kind].get(()) for kind in ("clock", "sequence"))
     temperature = by_kind["temperature"].get(()) if has_magnetometers else None
-    used = {column.index for part in parts for column in part.columns}
-    used |= {column.index for column in (clock, sequence, temperature) if column is not None}
+    used = {column.number for part in parts for column in part.columns}
+    used |= {column.number for column in (clock, sequence, temperature) if column is not None}
     readings = [index for index in range(len(names)) if index not in used]
     if readings:
         stream = Stream("readings", names=tuple(names[index] for index in readings))

@@ -53,8 +53,8 @@ class CountColumn(NamedTuple):
     ``channel`` is assumed if that column is missing; if it is None, the column is required.
     """
 
-    count: str
-    polynomial: str
+    count_name: str
+    polynomial_name: str
     channel: int | None
 
 
@@ -132,8 +132,8 @@ def detect_layout(table: Table) -> str:
     present = set(table.columns)
     nearest, missing = "", list(present)
     for name, columns in LAYOUTS.items():
-        required = {TIME_COLUMN, *(column.count for column in columns)}
-        required |= {column.polynomial for column in columns if column.channel is None}
+        required = {TIME_COLUMN, *(column.count_name for column in columns)}
+        required |= {column.polynomial_name for column in columns if column.channel is None}
         absent = sorted(required - present)
         if not absent:
             return name
@@ -172,9 +172,9 @@ def read_rows(table: Table, layout: str) -> CountRows:
     index = {name: i for i, name in enumerate(devices)}
     count, channel, polynomial = [], [], []
     for column in LAYOUTS[layout]:
-        count.append(table.floats(column.count, low=0))
-        if column.polynomial in table.columns:
-            polynomial.append(table.integers(column.polynomial, 0, POLYNOMIAL_COUNT - 1))
+        count.append(table.floats(column.count_name, low=0))
+        if column.polynomial_name in table.columns:
+            polynomial.append(table.integers(column.polynomial_name, 0, POLYNOMIAL_COUNT - 1))
             channel.append(channel_of(polynomial[-1]))
         else:
             polynomial.append(np.full(n, UNKNOWN))
