@@ -601,15 +601,17 @@ GUARDED = """
 import resource, sys
 from pathlib import Path
 from locatk.core.errors import LocatkError
-from locatk.formats import artifacts, crazyflie, receivers
+from locatk.formats.artifacts.receiver import read_receiver
+from locatk.formats.artifacts.scene import read_scene
+from locatk.formats.exporters.crazyflie import read_config
 from locatk.formats.importers.dotbot.log import read_dotbot_log
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.saleae.recording import read_saleae
 readers = {
     "sal": lambda path: read_saleae([path]), "csv": lambda path: read_saleae([path]),
     "bin": lambda path: read_saleae([path]), "gz": lambda path: read_libsurvive([path]),
-    "log": lambda path: read_dotbot_log([path]), "yaml": crazyflie.read_config,
-    "scene": artifacts.read_scene, "receiver": receivers.read_receiver,
+    "log": lambda path: read_dotbot_log([path]), "yaml": read_config,
+    "scene": read_scene, "receiver": read_receiver,
 }
 pages = int(Path("/proc/self/statm").read_text().split()[0])
 limit = pages * resource.getpagesize() + int(sys.argv[2])
