@@ -55,8 +55,8 @@ def exclude_readings(
         for sensor in np.flatnonzero(mask.any(axis=(0, 2))).tolist():
             rows = np.flatnonzero(mask[:, sensor].any(axis=1))
             warnings.append(
-                f"{file}:{lines[rows[0]]}: {names[sensor]} has {reason} in {len(rows)} rows; "
-                "excluded"
+                f"{file}:{lines[rows[0]]}: {names[sensor]} has {reason} in {len(rows)} "
+                f"row{'s' * (len(rows) > 1)}; excluded"
             )
     field_t[excluded] = np.nan
     return int(np.count_nonzero(excluded)), warnings

@@ -196,7 +196,7 @@ class Table:
 
     def _fail_cell(self, row: int, name: str, expected: str) -> NoReturn:
         cells = self.numbers[name] if name in self.numbers else self.columns[name]
-        cell = str(cells[row])[:MAX_QUOTED_CHARACTERS]
+        cell = str(cells[row]).strip()[:MAX_QUOTED_CHARACTERS]
         self.fail(row, f"{cell} in column {name!r} should be {expected}", CORRECT_ROW_HINT)
 
 

@@ -261,9 +261,7 @@ class LineBlocks:
                 taken, given = taken + len(raw) - len(rest), given + len(piece)
                 if given > max(MIN_COMPRESSION_CHECK_BYTES, MAX_COMPRESSION_RATIO * taken):
                     ratio = given // taken
-                    self.cut = (
-                        f"compressed {ratio} : 1 after {given >> 20} MB, unlike a recording"
-                    )
+                    self.cut = f"compressed {ratio} : 1 after {given >> 20} MB, unlike a recording"
                     return
                 raw = rest
         if not decompressor.eof:

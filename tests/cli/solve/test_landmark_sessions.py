@@ -165,7 +165,7 @@ def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
     assert result.exit_code == 3
     assert json.loads(result.stdout)["left_out"] == 2
     assert f"{run}:5: h4 has no number in 2 rows; excluded" in result.stderr
-    assert "Incomplete: 2 of 160 readings are left out." in result.stderr
+    assert "Incomplete: 2 of 160 readings are excluded." in result.stderr
     assert len(Session.open(out).topics("/log")) == 1
 
 

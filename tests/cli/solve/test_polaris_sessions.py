@@ -106,8 +106,8 @@ def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
     assert answer["left_out"] == 5
     assert "at most 61 samples per second" in answer["warnings"][0]
     assert f"{run}:7: sensor 2 has no number in 2 rows" in result.stderr
-    assert f"{run}:22: sensor 2 has more than an MLX90393" in result.stderr
-    assert "Incomplete: 5 of 1620 values are left out." in result.stderr
+    assert f"{run}:22: sensor 2 has a field beyond the range of an MLX90393" in result.stderr
+    assert "Incomplete: 5 of 1620 values are excluded." in result.stderr
     session = Session.open(out)
     (samples,) = observations.read_samples(session)
     assert np.count_nonzero(np.isnan(samples.field_t)) == 5

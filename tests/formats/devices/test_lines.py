@@ -24,7 +24,6 @@ from locatk.formats.devices.lines import decoder as lines
 from locatk.formats.devices.lines.columns import interpret_columns
 from locatk.formats.devices.lines.decoder import MAX_LINE_BYTES, LineDecoder
 from locatk.formats.devices.recording import Recording
-from locatk.formats.tables.quantities import split_unit
 
 Pieces = Sequence[bytes]
 
@@ -499,23 +498,6 @@ def test_teleplot_pictures_and_damage() -> None:
 
 
 # ---- what names mean
-
-
-@pytest.mark.parametrize(
-    ("name", "bare", "unit"),
-    [
-        ("b0x_ut", "b0x", "ut"),
-        ("B0X (uT)", "b0x", "ut"),
-        ("b0x[\u00b5T]", "b0x", "ut"),
-        ("heading [deg]", "heading", "deg"),
-        ("hall_left", "hall_left", ""),
-        ("x", "x", ""),
-        ("battery_v", "battery", "v"),
-        ("_m", "_m", ""),
-    ],
-)
-def test_units_in_names(name: str, bare: str, unit: str) -> None:
-    assert split_unit(name) == (bare, unit)
 
 
 @pytest.mark.parametrize(

@@ -156,7 +156,7 @@ def test_cells_without_numbers_are_left_out_and_named(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     assert imported.warnings == [
         f"{path}:6: sensor 2 has no number in 2 rows; excluded",
-        f"{path}:9: sensor 3 has no number in 1 rows; excluded",
+        f"{path}:9: sensor 3 has no number in 1 row; excluded",
     ]
 
 

@@ -19,7 +19,6 @@ from locatk.formats.importers.kitti import read_kitti
 from locatk.formats.importers.trajectory_csv import read_csv
 from locatk.formats.importers.tum import read_tum
 from locatk.formats.tables import delimited, timestamps
-from locatk.formats.tables.timestamps import format_epoch_seconds, parse_decimal_time
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
@@ -43,35 +42,6 @@ def poses(draw: st.DrawFn, names: st.SearchStrategy[str] = NAMES) -> Trajectory:
     return Trajectory(
         draw(names), "floor", np.array(stamps, np.int64), position, quaternion, covariance
     )
-
-
-@given(st.integers(-(2**63), 2**63 - 1))
-def test_stamps_lose_no_nanosecond(time_ns: int) -> None:
-    assert parse_decimal_time(format_epoch_seconds(time_ns)) == time_ns
-
-
-@pytest.mark.parametrize(
-    ("text", "time_ns"),
-    [
-        ("1690218696.0748", 1690218696074800000),
-        ("1.690218696074800000e+09", 1690218696074800000),
-        ("1", 10**9),
-        ("-0.5", -(10**9) // 2),
-        ("0.00000000051", 1),
-        (" 2 ", 2 * 10**9),
-    ],
-)
-def test_stamps_of_other_programs(text: str, time_ns: int) -> None:
-    assert parse_decimal_time(text) == time_ns
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "now", "nan", "inf", "1e400", "1e10", "9223372037", "1,5", "0x10", "1.2.3", "1e999999"],
-)
-def test_no_stamps(text: str) -> None:
-    with pytest.raises(ValueError, match="time"):
-        parse_decimal_time(text)
 
 
 @pytest.mark.slow
@@ -155,20 +125,6 @@ def _outcome(file: Path) -> object:
     except LocatkError as error:
         return type(error), str(error), error.hint
     return read.time_ns.tolist(), read.position.tolist(), read.quaternion.tolist()
-
-
-@given(
-    st.lists(st.integers(0, 2**63 - 1), min_size=1, max_size=5), st.integers(0, 12), st.booleans()
-)
-def test_stamps_at_once_are_those_one_by_one(stamps: list[int], places: int, cut: bool) -> None:
-    words = [
-        format_epoch_seconds(each)[: len(format_epoch_seconds(each)) - 9 + places]
-        for each in stamps
-    ]
-    words = [word.rstrip("0") for word in words] if cut else words
-
-    expected = [parse_decimal_time(word) for word in words]
-    assert timestamps.parse_decimal_times(words).tolist() == expected
 
 
 def test_stamps_beyond_the_range_are_no_stamps(tmp_path: Path) -> None:
