@@ -607,6 +607,7 @@ TEXT = st.lists(
 ).map(lambda lines: b"".join(line + end for line, end in lines))
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(
     data=TEXT,

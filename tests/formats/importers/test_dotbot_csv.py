@@ -334,6 +334,7 @@ def test_missing_files_and_mixed_layouts(write: Write, tmp_path: Path) -> None:
         read_dotbot([write(TWO + ROW), other])
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=300))
 def test_any_bytes_are_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, content: bytes
@@ -344,6 +345,7 @@ def test_any_bytes_are_refused_in_one_line(
         read_dotbot([file])
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(st.integers(0, 10**6), st.sampled_from("RGB"), st.integers(0, 131071)),

@@ -56,6 +56,7 @@ def test_any_numbers_come_in_order(numbers: list[int]) -> None:
     assert [int(path.stem[1:]) for path in paths] == sorted(numbers)
 
 
+@pytest.mark.slow
 @given(st.lists(st.text(st.characters(exclude_characters="/\0"), min_size=1), min_size=2))
 def test_any_names_can_be_ordered(names: list[str]) -> None:
     from locatk.formats.importers.images import _natural
@@ -293,6 +294,7 @@ def test_a_video_that_is_cut_short(tmp_path: Path) -> None:
     assert source.lost == f"{path}: truncated after {len(shots)} frames"
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=300))
 def test_no_bytes_upset_the_look_for_the_end(tmp_path_factory, data: bytes) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path_factory.getbasetemp() / "any"

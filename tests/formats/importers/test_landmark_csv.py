@@ -86,6 +86,7 @@ def test_units_in_brackets_and_columns_beside_them(tmp_path: Path) -> None:
     check(read(path, units=("gauss",)), drive())
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     time=st.sampled_from(list(UNITS["time"])),
@@ -305,6 +306,7 @@ def test_files_that_are_no_table(tmp_path: Path) -> None:
             read(tmp_path / "run.csv")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=120), st.integers(0, 400))
 def test_noise_in_a_file_is_an_error_or_data(

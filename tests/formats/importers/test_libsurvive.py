@@ -501,6 +501,7 @@ def test_archives_of_several_members_and_damaged_ones(tmp_path: Path, room: Room
     assert str(read_libsurvive([file]).lost).startswith("the archive is damaged")
 
 
+@pytest.mark.slow
 def test_bombs_are_read_to_a_limit(
     tmp_path: Path, room: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -662,6 +663,7 @@ def test_damage_of_any_kind_is_an_error_or_a_warning(tmp_path: Path, data: st.Da
     assert np.all(np.diff(sweeps.time_ns) >= 0)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     st.lists(

@@ -53,6 +53,7 @@ def read(path: Path, rate: float = 40.0) -> ImportedSamples:
     return read_polaris(path, rate_hz=rate, spacing_m=0.02)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.lists(st.floats(-4000, 4000), min_size=6, max_size=6), min_size=1, max_size=9).map(
@@ -222,6 +223,7 @@ def test_a_cell_that_is_no_vector_is_named(tmp_path: Path, cell: str) -> None:
     assert "'sensor 2'" in caught.value.message
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.text("0123456789.+-eEnaifNA(), |\t", max_size=24))
 def test_a_cell_is_a_vector_exactly_where_python_says_so(

@@ -394,6 +394,7 @@ def test_a_bomb_takes_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     fails(path, "more than 1,048,576")
 
 
+@pytest.mark.slow
 def test_a_clock_that_never_ends_is_passed_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -469,6 +470,7 @@ def test_a_channel_outside_its_archive(tmp_path: Path) -> None:
     assert (read.names, read.format) == (("'Channel 4'",), "saleae-binary")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.integers(1, 10**7), max_size=40), st.integers(0, 1), st.integers(-(10**12), 10**12)

@@ -102,6 +102,7 @@ LINES = st.lists(WORDS, min_size=8, max_size=8).map(" ".join)
 STAMPS = st.one_of(st.integers(0, 9999999999).map(str), st.decimals(0, 3, places=9).map(str), WORDS)
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(STAMPS, st.one_of(st.just("0 0 0 0 0 0 1"), LINES)), max_size=4),
     st.sampled_from(["\n", "\r\n", "\n\n", " \n", "\n# c\n"]),
