@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from locatk.formats.devices.decoder import Batch, Counts
 from locatk.formats.devices.lines.columns import ColumnLayout
-from locatk.formats.devices.lines.text import BLANK, parse_numbers, split_cells
+from locatk.formats.devices.lines.text import BLANK, parse_number_row, split_cells
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -154,7 +154,7 @@ class LineBlock:
             values = np.array([float(cell or b"nan") for cell in cells]).reshape(-1, width)
         except ValueError:
             rows = [
-                parse_numbers(split_cells(self.line(k).decode(), shape.separator)) for k in lines
+                parse_number_row(split_cells(self.line(k).decode(), shape.separator)) for k in lines
             ]
             damaged = [int(k) for k, row in zip(lines, rows, strict=True) if row is None]
             lines = np.array([k for k, row in zip(lines, rows, strict=True) if row], np.int64)

@@ -39,7 +39,7 @@ from locatk.formats.devices.lines.text import (
     is_damaged_row,
     is_garbage,
     parse_header,
-    parse_numbers,
+    parse_number_row,
     parse_pairs,
     parse_telemetry,
     split_cells,
@@ -263,7 +263,7 @@ class LineDecoder:
         text = line.text
         pairs = parse_pairs(text) if ":" in text else None
         row = None if pairs else split_cells(text, detect_separator(text))
-        values = None if row is None else parse_numbers(row)
+        values = None if row is None else parse_number_row(row)
         if (values or pairs) and self._is_half:
             return
         if values:
@@ -354,7 +354,7 @@ class LineDecoder:
         self._row = None
         for line in lines:
             cells = split_cells(line.text, detect_separator(line.text))
-            self._decode_numbers(line, parse_numbers(cells) or [])
+            self._decode_numbers(line, parse_number_row(cells) or [])
 
     def _table_of_pairs(self, names: tuple[str, ...]) -> LineTable:
         table = self._pair_tables.get(names)

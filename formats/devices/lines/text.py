@@ -78,7 +78,7 @@ def parse_number(cell: str) -> float:
     return math.inf if cell.endswith("ovf") else float(cell or "nan")
 
 
-def parse_numbers(row: Sequence[str]) -> list[float] | None:
+def parse_number_row(row: Sequence[str]) -> list[float] | None:
     """Return the numbers of a row; None if any cell is neither empty nor a number."""
     if not all(map(_IS_NUMBER.fullmatch, row)):
         return None
@@ -236,7 +236,7 @@ def parse_telemetry(text: str) -> Telemetry | None:
     names = tuple(f"{name}.{axis}{unit}" for axis in axes) or (name + unit,)
     points = []
     for point in filter(None, (each.strip() for each in values.split(";"))):
-        numbers = parse_numbers([cell.strip() for cell in point.split(":")])
+        numbers = parse_number_row([cell.strip() for cell in point.split(":")])
         if numbers is None or not len(names) <= len(numbers) <= len(names) + 1:
             if numbers is not None or _LIKE_A_NUMBER.match(point):
                 return None

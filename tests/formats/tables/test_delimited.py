@@ -77,7 +77,19 @@ def test_ordinary_numbers_are_parsed_at_once(
 
 
 @pytest.mark.parametrize(
-    "text", ["1,2\n3\n", "1,2,3\n", "1,2\n\n3,4\n", "1,,2\n", "1,2\n3,x\n", "nan,1\n", "1, 2\n", ""]
+    "text",
+    [
+        "1,2\n3\n",
+        "1,2,3\n",
+        "1,2,3,4\n",
+        "1\n2\n",
+        "1,2\n\n3,4\n",
+        "1,,2\n",
+        "1,2\n3,x\n",
+        "nan,1\n",
+        "1, 2\n",
+        "",
+    ],
 )
 def test_irregular_blocks_are_refused(text: str) -> None:
     assert parse_numbers(text.encode(), 2, ",") is None
@@ -95,6 +107,14 @@ def test_rows_of_numbers(tmp_path: Path, text: str) -> None:
     for read in (lambda: table.floats("x", high=2), lambda: table.integers("x", 3, 9)):
         with pytest.raises(InputError, match="in column 'x' should be"):
             read()
+
+
+def test_a_number_that_overflows_is_quoted_as_written(tmp_path: Path) -> None:
+    path = tmp_path / "rows.txt"
+    path.write_text("1.5 2\n2.5 1e400\n")
+    table = read_number_rows(path, ("t", "x"), hint="t x", time_column="t")
+    with pytest.raises(InputError, match=r"1e400 in column 'x' should be a finite .*rows\.txt:2"):
+        table.floats("x")
 
 
 def test_missing_cells(tmp_path: Path) -> None:

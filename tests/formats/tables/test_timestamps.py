@@ -38,6 +38,8 @@ def test_decimal_times(text: str, unit: str, time_ns: int) -> None:
 def test_text_that_is_not_a_time(text: str) -> None:
     with pytest.raises(ValueError, match="time"):
         ts.parse_decimal_time(text)
+    with pytest.raises(ValueError, match="time"):
+        ts.parse_decimal_times(["1.5", text])
 
 
 @settings(max_examples=50)
