@@ -1,1 +1,1 @@
-"""``locatk import``."""
+"""``locatk import``: the command, and the options and results of each system."""

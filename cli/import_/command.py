@@ -1,7 +1,8 @@
-"""``locatk import``: recordings of other tools become sessions."""
+"""``locatk import``: recordings of other tools as sessions."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,84 +10,86 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.import_ import lighthouse
-from locatk.cli.import_.landmarks import OPTIONS, import_samples, landmark_options
+from locatk.cli.command import Command
+from locatk.cli.import_ import dots, landmarks, lighthouse, polaris
 
-MOST_WARNINGS = 10
-"""So many are said on stderr; ``--json`` and the log of a camera session hold them all."""
+MAX_PRINTED_WARNINGS = 10
+"""Most warnings on stderr; ``--json`` and the log of a camera session contain all of them."""
+
+Results = tuple[dict[str, Any], str | None]
+"""Results for ``--json``, and a summary of the losses, if any."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A foreign format: who reads it, and the options that mean something to it."""
+    """Foreign format.
+
+    Attributes
+    ----------
+    reader : str
+        Module and name of the function that reads it.
+    run : callable
+        Imports with that reader: ``run(reader, paths, output, given, overwrite)``, in which
+        ``given`` are the options that were given, by the names of their arguments.
+    options : tuple of str
+        Options that the format has.
+    takes_one_path : bool
+    """
 
     reader: str
-    system: str
-    options: tuple[str, ...]
+    run: Callable[[Any, tuple[Path, ...], Path, dict[str, Any], bool], Results]
+    options: tuple[str, ...] = ()
+    takes_one_path: bool = False
 
+
+IMPORTERS = "locatk.formats.importers."
 
 FORMATS = {
     "dotbot-lh2": Format(
-        "locatk.formats.importers.dotbot.csv_recording:read_dotbot", "lighthouse", lighthouse.DOTBOT
+        IMPORTERS + "dotbot.recording:read_dotbot", lighthouse.import_sweeps, lighthouse.DOTBOT
     ),
     "saleae": Format(
-        "locatk.formats.importers.saleae.session:read_saleae", "lighthouse", lighthouse.SALEAE
+        IMPORTERS + "saleae.recording:read_saleae",
+        lighthouse.import_sweeps,
+        lighthouse.SALEAE,
+        takes_one_path=True,
     ),
     "libsurvive": Format(
-        "locatk.formats.importers.libsurvive.recording:read_libsurvive",
-        "lighthouse",
+        IMPORTERS + "libsurvive.recording:read_libsurvive",
+        lighthouse.import_sweeps,
         lighthouse.LIBSURVIVE,
     ),
-    "dotbot-log": Format("locatk.formats.importers.dotbot.log:read_dotbot_log", "lighthouse", ()),
-    "crazyflie-config": Format("locatk.formats.exporters.crazyflie:read_config", "scene", ()),
-    "images": Format(
-        "locatk.formats.importers.images:ImageFiles", "dots", ("sheet", "camera", "rate")
+    "dotbot-log": Format(IMPORTERS + "dotbot.log:read_dotbot_log", lighthouse.import_sweeps),
+    "crazyflie-config": Format(
+        "locatk.formats.exporters.crazyflie:read_config",
+        lighthouse.import_scene,
+        takes_one_path=True,
     ),
-    "video": Format("locatk.formats.importers.video:Video", "dots", ("sheet", "camera")),
+    "images": Format(IMPORTERS + "images:ImageFiles", dots.import_images, dots.IMAGES),
+    "video": Format(IMPORTERS + "video:Video", dots.import_video, dots.VIDEO, takes_one_path=True),
     "polaris-csv": Format(
-        "locatk.formats.importers.polaris_csv:read_polaris", "polaris", ("rate", "spacing", "tag")
+        IMPORTERS + "polaris_csv:read_polaris",
+        polaris.import_samples,
+        polaris.OPTIONS,
+        takes_one_path=True,
     ),
     "landmark-csv": Format(
-        "locatk.formats.importers.landmark_csv:read_landmarks", "landmarks", OPTIONS
+        IMPORTERS + "landmark_csv:read_landmarks",
+        landmarks.import_samples,
+        landmarks.OPTIONS,
+        takes_one_path=True,
     ),
 }
-"""Name of a foreign format to what is known of it."""
-
-ONE_PATH = ("saleae", "crazyflie-config", "video", "polaris-csv", "landmark-csv")
 
 
-@click.command("import", short_help="Turn recordings of other tools into a session.")
+@click.command("import", cls=Command, short_help="Turn recordings of other tools into a session.")
 @click.argument("format_name", metavar="FORMAT", type=click.Choice(list(FORMATS)))
 @click.argument("paths", type=options.PATH, nargs=-1, required=True)
-@options.output("Session to write (.mcap); of crazyflie-config the scene (.toml).")
+@options.output("Session to write (.mcap), or for crazyflie-config the scene (.toml).")
 @lighthouse.lighthouse_options
-@options.input_option(
-    "--sheet",
-    metavar="MANIFEST",
-    help="images, video: manifest of the sheet in the frames (sheet.toml).",
-)
-@options.input_option(
-    "--camera", metavar="FILE", help="images, video: the camera that took them (camera.toml)."
-)
-@click.option(
-    "--rate",
-    type=click.FloatRange(min=1e-3, max=1e6),
-    metavar="HZ",
-    help="images: frames a second. [default: 30]  polaris-csv: samples a second, which its "
-    "stamps do not tell; required (published runs: 40).",
-)
-@click.option(
-    "--spacing",
-    type=click.FloatRange(min=0, min_open=True, max=1000),
-    metavar="MM",
-    help="polaris-csv: between neighbouring sensors; required (published runs: 20).",
-)
-@options.input_option(
-    "--tag",
-    metavar="FILE",
-    help="polaris-csv: the tags that were passed (tag.toml). [default: the published design]",
-)
-@landmark_options
+@dots.dots_options
+@polaris.polaris_options
+@landmarks.landmark_options
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -94,42 +97,37 @@ def command(
     format_name: str,
     paths: tuple[Path, ...],
     output: Path,
-    sheet: Path | None,
-    camera: Path | None,
-    rate: float | None,
-    spacing: float | None,
-    tag: Path | None,
     overwrite: bool,
     as_json: bool,
-    **more: Any,
+    **format_options: Any,
 ) -> None:
-    """Read PATHS, recorded by another tool in FORMAT, into one session.
+    """Import PATHS, recorded by another tool in FORMAT, as one session.
 
     \b
     FORMAT is one of
       dotbot-lh2    LFSR counts of Lighthouse V2 as published by DotBots (CSV)
-      dotbot-log    the same, and raw bits, from log lines of a DotBot gateway
-      saleae        the infrared light itself: data lines of photodiodes on a logic
-                    analyser, as a capture of Logic 2 (.sal) or exported edges
-                    (.csv, .bin); finds sweeps, rotor periods and calibrations
+      dotbot-log    the same, and raw bits, from logs of a DotBot gateway
+      saleae        infrared light: data lines of photodiodes on a logic analyser,
+                    as a capture of Logic 2 (.sal) or exported edges (.csv, .bin);
+                    decodes sweeps, rotor periods and calibrations
       libsurvive    recordings of libsurvive (.rec, .rec.gz), Lighthouse V2
       crazyflie-config
                     stations of a Crazyflie (YAML): poses and calibrations; the
-                    output is no session but a scene (scene.toml)
+                    output is a scene (scene.toml) instead of a session
       images        camera frames of a dot sheet: files, folders or patterns, in
                     the order of the file names (frame2 before frame10)
-      video         the same from one video file, whose times are kept
+      video         frames of one video file, with its times
       polaris-csv   samples of a bar of magnetometers over magnetic tags, as
                     published with Polaris: one row a sample, a column
                     "Sensor 1" (the rightmost) and so on, with cells "(x, y, z)"
-                    in microtesla; row over --rate is the time
+                    in microtesla; the time is the row divided by --rate
       landmark-csv  hall sensors and odometry of a robot over landmarks: one row
                     a sample, with columns t, x, y, heading, front, left, rear,
-                    right; units are in their names (x_mm) or said with --units
+                    right; units are part of the names (x_mm) or given by --units
 
-    Files that are no image or are damaged, and samples that are no number or saturated, are
-    left out and named; the exit status is 3 then, and the rest is written all the same. So it
-    is with the end of a recording that is cut off, and with stations that cannot be told apart.
+    Files that are damaged or not images, and samples that are missing or saturated, are excluded
+    and reported. The rest is written, and the exit status is 3. The same applies to a truncated
+    recording, and to stations that cannot be distinguished.
 
     \b
     Examples:
@@ -151,134 +149,29 @@ def command(
           --volts-per-tesla 13 --zero-volts median
     """
     chosen = FORMATS[format_name]
-    given = {
-        "sheet": sheet,
-        "camera": camera,
-        "rate": rate,
-        "spacing": spacing,
-        "tag": tag,
-        **more,
-    }
-    given = {name: value for name, value in given.items() if value not in (None, ())}
+    given = {name: value for name, value in format_options.items() if value not in (None, ())}
     for name in given:
         if name not in chosen.options:
             raise click.UsageError(
                 f"--{name.replace('_', '-')} means nothing to the format {format_name}."
             )
-    if format_name in ONE_PATH and len(paths) > 1:
+    if chosen.takes_one_path and len(paths) > 1:
         raise click.UsageError(f"The format {format_name} takes one PATH.")
-    if format_name != "images":  # whose patterns are not there by that name
+    if format_name != "images":  # patterns such as run/*.png are not names of files
         options.must_exist(paths)
-    named = [value for value in given.values() if isinstance(value, Path)]
-    aside = [*given.get("truth", ()), *named]
-    options.guard_output(output, overwrite=overwrite, inputs=[*paths, *aside])
-    read = options.load(chosen.reader)
-    if chosen.system == "dots":
-        answer, lost = _frames(format_name, read, paths, output, sheet, camera, rate, overwrite)
-    elif chosen.system == "polaris":
-        answer, lost = _samples(read, paths[0], output, rate, spacing, tag, overwrite)
-    elif chosen.system == "landmarks":
-        answer, lost = import_samples(read, paths[0], output, more, overwrite)
-    elif chosen.system == "scene":
-        answer, lost = lighthouse.import_scene(read, paths[0], output, overwrite)
-    else:
-        answer, lost = lighthouse.import_sweeps(read, paths, output, given, overwrite)
-    for warning in answer["warnings"][:MOST_WARNINGS]:
+    input_files = [value for value in given.values() if isinstance(value, Path)]
+    options.guard_output(
+        output, overwrite=overwrite, inputs=[*paths, *given.get("truth", ()), *input_files]
+    )
+    results, lost = chosen.run(options.load(chosen.reader), paths, output, given, overwrite)
+    warnings = results["warnings"]
+    for warning in warnings[:MAX_PRINTED_WARNINGS]:
         console.warn(warning)
-    if len(answer["warnings"]) > MOST_WARNINGS:
-        console.warn(f"... and {len(answer['warnings']) - MOST_WARNINGS} more")
+    if len(warnings) > MAX_PRINTED_WARNINGS:
+        console.warn(f"... and {len(warnings) - MAX_PRINTED_WARNINGS} more")
     if as_json:
-        console.emit_json({"version": 1, "output": output, "format": format_name, **answer})
+        console.emit_json({"version": 1, "output": output, "format": format_name, **results})
     else:
         console.result(f"Wrote {output}")
     if lost is not None:
         raise failures.Incomplete(lost)
-
-
-def _frames(
-    format_name: str,
-    read: Any,
-    paths: tuple[Path, ...],
-    output: Path,
-    sheet: Path | None,
-    camera: Path | None,
-    rate: float | None,
-    overwrite: bool,
-) -> tuple[dict[str, Any], str | None]:
-    """Import camera frames; returns what ``--json`` says of them, and what was lost."""
-    from locatk.formats.artifacts import sheets
-    from locatk.formats.importers.images import DEVICE, find_images
-    from locatk.formats.sessions import frames
-
-    manifest = None if sheet is None else sheets.read_manifest(sheet)
-    lens = None if camera is None else sheets.read_camera(camera)
-    more = {} if rate is None else {"rate_hz": rate}
-    if format_name == "images":
-        found = find_images(paths)
-        options.guard_output(output, overwrite=overwrite, inputs=found)
-        source = read(found, camera=lens, **more)
-    else:
-        source = read(paths[0], camera=lens)
-    with console.progress(source, "Importing") as bar:
-        counts = frames.write_shots(
-            output,
-            {DEVICE: bar},
-            manifest=manifest,
-            camera=lens,
-            facts=source.facts,
-            warnings=source.warnings,
-            overwrite=overwrite,
-        )
-    count = counts[DEVICE]
-    console.say(f"{count} frames of {DEVICE}")
-    if manifest is None:
-        console.say("No --sheet: `locatk solve` will need its manifest as --artifact")
-    answer = {
-        "frames": count,
-        "devices": [DEVICE],
-        "left_out": source.left_out,
-        "warnings": source.warnings,
-    }
-    return answer, source.lost
-
-
-def _samples(
-    read: Any,
-    path: Path,
-    output: Path,
-    rate: float | None,
-    spacing: float | None,
-    tag: Path | None,
-    overwrite: bool,
-) -> tuple[dict[str, Any], str | None]:
-    """Import samples of an array; returns what ``--json`` says of them, and what was lost."""
-    from locatk.formats.artifacts import tags
-    from locatk.formats.importers.polaris_csv import PUBLISHED_TAGS
-    from locatk.formats.sessions import field_samples
-
-    if rate is None or spacing is None:
-        name = "--rate" if rate is None else "--spacing"
-        raise click.UsageError(f"The format polaris-csv needs {name}.")
-    known = PUBLISHED_TAGS if tag is None else tags.read_tags(tag)
-    with console.working("Reading"):
-        imported = read(path, rate_hz=rate, spacing_m=spacing / 1000)
-        field_samples.write_magnetometers(
-            output,
-            [imported.samples],
-            tags=known,
-            facts=imported.facts,
-            warnings=imported.warnings,
-            overwrite=overwrite,
-        )
-    samples = imported.samples
-    console.say(f"{len(samples)} samples of {len(samples.array)} sensors")
-    if tag is None:
-        console.say("No --tag: the session holds the design of the published tags")
-    answer = {
-        "samples": len(samples),
-        "sensors": len(samples.array),
-        "devices": [samples.device],
-        "left_out": imported.left_out,
-        "warnings": imported.warnings,
-    }
-    return answer, imported.lost

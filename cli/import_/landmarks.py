@@ -1,20 +1,14 @@
-"""What `locatk import landmark-csv` is told on the command line, and what it does."""
+"""Import of hall sensors and odometry of a robot over landmarks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import click
 
 from locatk.cli import console, options
-
-if TYPE_CHECKING:
-    from locatk.core.landmarks.halls import HallSensors
-    from locatk.core.landmarks.map.floor import FloorMap
-
-F = TypeVar("F", bound=Callable[..., Any])
+from locatk.cli.command import section
 
 OPTIONS = (
     "columns",
@@ -27,35 +21,39 @@ OPTIONS = (
     "downward",
     "start",
 )
-"""By the names of their arguments."""
+"""Options of landmark-csv, by the names of their arguments."""
 
 MEDIAN = "median"
 
 
-def _named(ctx: click.Context, param: click.Parameter, value: str | None) -> dict[str, str] | None:
-    """Callback: ``t=time,x=odom_x`` as a dictionary."""
+def _parse_columns(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> dict[str, str] | None:
+    """Return ``t=time,x=odom_x`` as a dictionary; a click callback."""
     if value is None:
         return None
-    named: dict[str, str] = {}
+    headers: dict[str, str] = {}
     for pair in value.split(","):
         key, equals, name = (part.strip() for part in pair.partition("="))
         if not (key and equals and name):
             raise click.BadParameter(f"{pair!r} is not KEY=NAME.")
-        if key in named:
-            raise click.BadParameter(f"{key} is there twice.")
-        named[key] = name
-    return named
+        if key in headers:
+            raise click.BadParameter(f"{key} occurs twice.")
+        headers[key] = name
+    return headers
 
 
-def _words(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...] | None:
-    """Callback: ``s,mm,deg`` as a tuple."""
+def _parse_words(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[str, ...] | None:
+    """Return ``s,mm,deg`` as a tuple; a click callback."""
     return value if value is None else tuple(word.strip().lower() for word in value.split(","))
 
 
-def _numbers(
+def _parse_numbers(
     ctx: click.Context, param: click.Parameter, value: str | None
 ) -> tuple[float, ...] | None:
-    """Callback: numbers between commas."""
+    """Return numbers separated by commas; a click callback."""
     if value is None:
         return None
     try:
@@ -64,100 +62,88 @@ def _numbers(
         raise click.BadParameter(f"{value!r} is not numbers, as in 2.5 or 2.5,2.49.") from None
 
 
-def _zeros(
+def _parse_numbers_or_median(
     ctx: click.Context, param: click.Parameter, value: str | None
 ) -> tuple[float, ...] | str | None:
-    """Callback: the same, or ``median``."""
-    return value if value == MEDIAN else _numbers(ctx, param, value)
+    """Return numbers separated by commas, or ``median``; a click callback."""
+    return value if value == MEDIAN else _parse_numbers(ctx, param, value)
 
 
-def landmark_options(command: F) -> F:
-    """The options of the format ``landmark-csv``."""
-    for option in reversed(
-        (
-            click.option(
-                "--columns",
-                metavar="KEY=NAME,...",
-                callback=_named,
-                help="landmark-csv: headers of t, x, y, heading and of the sensors front, left, "
-                "rear, right (or those of --halls), where these are not their names.",
-            ),
-            click.option(
-                "--units",
-                metavar="UNIT,...",
-                callback=_words,
-                help="landmark-csv: of the columns whose names tell none: one of s, ms, us, ns; "
-                "of m, cm, mm; of rad, deg; of t, mt, ut, gauss, v, mv.",
-            ),
-            click.option(
-                "--circle",
-                type=click.FloatRange(min=0, min_open=True, max=1000),
-                metavar="MM",
-                help="landmark-csv: radius of the circle of sensors. [default: that of --map]",
-            ),
-            options.input_option(
-                "--halls",
-                metavar="FILE",
-                help="landmark-csv: the sensors' names and places (halls.toml), where they are "
-                "not four on a circle.",
-            ),
-            options.input_option(
-                "--map", metavar="FILE", help="landmark-csv: the floor's map (map.toml)."
-            ),
-            click.option(
-                "--volts-per-tesla",
-                metavar="V",
-                callback=_numbers,
-                help="landmark-csv: of the sensors, or of each, with commas between; negative "
-                "where a field that points up lowers the voltage (10 mV/mT: 10).",
-            ),
-            click.option(
-                "--zero-volts",
-                metavar="V",
-                callback=_zeros,
-                help="landmark-csv: without a field, of the sensors or of each; `median` takes "
-                "the median of each sensor.",
-            ),
-            click.option(
-                "--downward",
-                is_flag=True,
-                default=None,
-                help="landmark-csv: readings are positive where the field points down.",
-            ),
-            click.option(
-                "--start",
-                metavar="TIME",
-                help="landmark-csv: of the first row, in UTC (2026-01-31T12:00:00Z). [default: "
-                "as the rows say]",
-            ),
-        )
-    ):
-        command = option(command)
-    return command
+landmark_options = section(
+    "For landmark-csv",
+    click.option(
+        "--columns",
+        metavar="KEY=NAME,...",
+        callback=_parse_columns,
+        help="Headers of t, x, y, heading and of the sensors front, left, rear, right (or those of "
+        "--halls), if they differ from these names.",
+    ),
+    click.option(
+        "--units",
+        metavar="UNIT,...",
+        callback=_parse_words,
+        help="Units of columns without a unit in their names: one of s, ms, us, ns; of m, cm, mm; "
+        "of rad, deg; of t, mt, ut, nt, gauss, v, mv.",
+    ),
+    click.option(
+        "--circle",
+        type=click.FloatRange(min=0, min_open=True, max=1000),
+        metavar="MM",
+        help="Radius of the circle of sensors.  [default: that of --map]",
+    ),
+    options.input_option(
+        "--halls",
+        metavar="FILE",
+        help="Names and positions of the sensors (halls.toml), if they are not four on a circle.",
+    ),
+    options.input_option("--map", metavar="FILE", help="Map of the floor (map.toml)."),
+    click.option(
+        "--volts-per-tesla",
+        metavar="V",
+        callback=_parse_numbers,
+        help="Sensitivity of all sensors, or of each separated by commas; negative if a field that "
+        "points up lowers the voltage (10 mV/mT: 10).",
+    ),
+    click.option(
+        "--zero-volts",
+        metavar="V",
+        callback=_parse_numbers_or_median,
+        help="Voltage without a field, of all sensors or of each; `median` takes the median of "
+        "each sensor.",
+    ),
+    click.option(
+        "--downward",
+        is_flag=True,
+        default=None,
+        help="Readings are positive if the field points down.",
+    ),
+    click.option(
+        "--start",
+        metavar="TIME",
+        help="Time of the first row, in UTC (2026-01-31T12:00:00Z).  [default: as in the rows]",
+    ),
+)
 
 
 def import_samples(
-    read: Any, path: Path, output: Path, given: dict[str, Any], overwrite: bool
+    reader: Any, paths: tuple[Path, ...], output: Path, given: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, Any], str | None]:
-    """Import samples of hall sensors; returns what ``--json`` says of them, and what was lost.
-
-    ``given`` holds :data:`OPTIONS`.
-    """
+    """Import samples; returns the results for ``--json`` and a summary of the losses."""
     from locatk.formats.artifacts import maps
     from locatk.formats.sessions import field_samples
 
-    volts = _volts(given["volts_per_tesla"], given["zero_volts"])
-    start_ns = _start(given["start"])
-    floor = None if given["map"] is None else maps.read_map(given["map"])
-    sensors = _sensors(given["circle"], given["halls"], floor)
+    volts = _volts(given.get("volts_per_tesla"), given.get("zero_volts"))
+    start_ns = _start_ns(given.get("start"))
+    floor = maps.read_map(given["map"]) if "map" in given else None
+    sensors = _sensors(given.get("circle"), given.get("halls"), floor)
     with console.working("Reading"):
-        imported = read(
-            path,
+        imported = reader(
+            paths[0],
             sensors=sensors,
-            columns=given["columns"],
-            units=given["units"] or (),
+            columns=given.get("columns"),
+            units=given.get("units", ()),
             volts=volts,
-            downward=bool(given["downward"]),
+            downward="downward" in given,
             start_ns=start_ns,
         )
         field_samples.write_halls(
@@ -176,7 +162,7 @@ def import_samples(
     )
     if floor is None:
         console.say("No --map: `locatk solve` will need it as --artifact")
-    answer = {
+    results = {
         "samples": len(samples),
         "sensors": len(samples.sensors),
         "devices": [samples.device],
@@ -184,10 +170,11 @@ def import_samples(
         "left_out": imported.left_out,
         "warnings": imported.warnings,
     }
-    return answer, imported.lost
+    return results, imported.lost
 
 
-def _volts(per_tesla: tuple[float, ...] | None, zero: Any) -> Any:
+def _volts(per_tesla: tuple[float, ...] | None, zero: tuple[float, ...] | str | None) -> Any:
+    """Return the conversion of voltages; None if readings are fields."""
     if per_tesla is None and zero is None:
         return None
     if per_tesla is None or zero is None:
@@ -195,34 +182,33 @@ def _volts(per_tesla: tuple[float, ...] | None, zero: Any) -> Any:
         raise click.UsageError(f"Voltages need {missing} too.")
     from locatk.formats.importers.landmark_csv import Volts
 
-    return Volts(per_tesla, None if zero == MEDIAN else zero)
+    return Volts(per_tesla, None if isinstance(zero, str) else zero)
 
 
-def _start(text: str | None) -> int | None:
+def _start_ns(text: str | None) -> int | None:
     if text is None:
         return None
-    from locatk.formats.tables.csv_table import parse_time_ns
+    from locatk.formats.tables.timestamps import parse_iso_time
 
     try:
-        return parse_time_ns(text)
+        return parse_iso_time(text)
     except ValueError:
         raise click.UsageError(
             f"--start {text!r} is not a time in UTC, as in 2026-01-31T12:00:00Z."
         ) from None
 
 
-def _sensors(circle: float | None, file: Path | None, floor: FloorMap | None) -> HallSensors:
-    """Where the sensors sit, by what was said of them."""
-    from locatk.core.landmarks.halls import HallSensors
-    from locatk.core.landmarks.halls import circle as on_circle
+def _sensors(circle_mm: float | None, file: Path | None, floor: Any) -> Any:
+    """Return the positions of the sensors as given by --circle, --halls or --map."""
+    from locatk.core.landmarks.halls import HallSensors, circle
     from locatk.formats.artifacts import maps
 
-    if circle is not None and file is not None:
+    if circle_mm is not None and file is not None:
         raise click.UsageError("Give --circle or --halls, not both.")
     if file is not None:
         return maps.read_halls(file)
-    if circle is not None:
-        return HallSensors(position_m=on_circle(circle / 1000))
+    if circle_mm is not None:
+        return HallSensors(position_m=circle(circle_mm / 1000))
     if floor is not None:
-        return HallSensors(position_m=on_circle(floor.geometry.circle_m))
+        return HallSensors(position_m=circle(floor.geometry.circle_m))
     raise click.UsageError("The format landmark-csv needs --circle, --halls or --map.")

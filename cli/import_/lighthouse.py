@@ -1,100 +1,103 @@
-"""What `locatk import` is told of Lighthouse on the command line, and what it does."""
+"""Import of Lighthouse recordings as sessions, and of configurations as scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from locatk.cli import console, options
-from locatk.cli.command import combine
+from locatk.cli.command import combine, section
 from locatk.cli.info import lighthouse as info_lighthouse
-
-if TYPE_CHECKING:
-    from locatk.core.lighthouse.recording import StationReport
-    from locatk.formats.importers.lighthouse import ImportedSession
 
 DOTBOT = ("truth", "calibration")
 SALEAE = ("channel", "method", "device")
 LIBSURVIVE = ("stations",)
 """Options of the formats, by the names of their arguments."""
 
-NAMES = {"channel": "channels"}
-"""Options that readers call by another name."""
+READER_ARGUMENTS = {"channel": "channels"}
+"""Arguments of the readers whose names differ from those of the options."""
 
 SCENE_KEYS = ("channel", "id", "period_ticks", "calibration", "position_m")
 
-LONGEST_NAME = 64
+MAX_NAME_CHARACTERS = 64
+
+MAX_LISTED_DEVICES = 8
 
 
-def _device_name(ctx: click.Context, option: click.Parameter, name: str | None) -> str | None:
-    """A name that a topic can have and a terminal can show."""
-    if name is not None and not (0 < len(name.strip()) <= LONGEST_NAME and name.isprintable()):
-        raise click.BadParameter(f"expected a name of 1 to {LONGEST_NAME} printable characters")
+def _check_device_name(ctx: click.Context, option: click.Parameter, name: str | None) -> str | None:
+    """Refuse a name that is not suitable for a topic and a terminal; a click callback."""
+    if name is not None and not (
+        0 < len(name.strip()) <= MAX_NAME_CHARACTERS and name.isprintable()
+    ):
+        raise click.BadParameter(
+            f"expected a name of 1 to {MAX_NAME_CHARACTERS} printable characters"
+        )
     return name
 
 
 lighthouse_options = combine(
-    options.input_option(
-        "--truth",
-        many=True,
-        metavar="PATH",
-        help="dotbot-lh2: reference to store beside the data: pixel tracks from Blender. "
-        "Repeatable. Grid columns in the data itself are taken unasked.",
+    section(
+        "For dotbot-lh2",
+        options.input_option(
+            "--truth",
+            many=True,
+            metavar="PATH",
+            help="Reference to store with the data: pixel tracks from Blender. Repeatable. Grid "
+            "columns of the data itself are always imported.",
+        ),
+        options.input_option(
+            "--calibration",
+            metavar="PATH",
+            help="Camera or marker calibration (calibration.json).  [default: the one in the "
+            "folder of the truth or of the data]",
+        ),
     ),
-    options.input_option(
-        "--calibration",
-        metavar="PATH",
-        help="dotbot-lh2: camera or marker calibration (calibration.json), where it is not beside "
-        "the truth.",
+    section(
+        "For saleae",
+        click.option(
+            "--channel",
+            type=click.IntRange(0, 255),
+            multiple=True,
+            metavar="N",
+            help="Channel of the analyser, from 0, with the data line of a photodiode. Repeatable, "
+            "sensor 0 first.  [default: those with light]",
+        ),
+        click.option(
+            "--method",
+            type=click.Choice(("soft", "paper")),
+            help="Decoding of bits: `soft` uses soft decisions on the whole burst, `paper` is the "
+            "published method.  [default: soft]",
+        ),
+        click.option(
+            "--device",
+            metavar="NAME",
+            callback=_check_device_name,
+            help="Name of the device in the session.  [default: photodiode]",
+        ),
     ),
-    click.option(
-        "--channel",
-        type=click.IntRange(0, 255),
-        multiple=True,
-        metavar="N",
-        help="saleae: channel of the analyser, from 0, that holds a photodiode's data line. "
-        "Repeatable, sensor 0 first. [default: those with light]",
-    ),
-    click.option(
-        "--method",
-        type=click.Choice(("soft", "paper")),
-        help="saleae: how bits are read: `soft` weighs the whole burst, `paper` is the published "
-        "way as written. [default: soft]",
-    ),
-    click.option(
-        "--device",
-        metavar="NAME",
-        callback=_device_name,
-        help="saleae: of the device in the session. [default: photodiode]",
-    ),
-    click.option(
-        "--stations",
-        is_flag=True,
-        default=None,
-        help="libsurvive: take the poses of the stations from the recording, too; else "
-        "`locatk solve` finds its own.",
+    section(
+        "For libsurvive",
+        click.option(
+            "--stations",
+            is_flag=True,
+            default=None,
+            help="Import the poses of the stations, too. Otherwise `locatk solve` estimates them.",
+        ),
     ),
 )
 
 
 def import_sweeps(
-    read: Any,
-    paths: tuple[Path, ...],
-    output: Path,
-    given: dict[str, Any],
-    overwrite: bool,
+    reader: Any, paths: tuple[Path, ...], output: Path, given: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, Any], str | None]:
-    """Import sweeps; returns what ``--json`` says of them, and what was lost.
-
-    ``given`` holds the options that were given, by the names of their arguments.
-    """
+    """Import sweeps; returns the results for ``--json`` and a summary of the losses."""
     from locatk.formats.sessions import observations
 
     with console.working("Reading"):
-        imported: ImportedSession = read(list(paths), **_arguments(paths, given))
+        imported = reader(list(paths), **_reader_arguments(paths, given))
         observations.write_session(
             output,
             system="lighthouse",
@@ -106,69 +109,64 @@ def import_sweeps(
             receivers=imported.receivers,
             overwrite=overwrite,
         )
-    sweeps, stations = imported.sweeps, _stations(imported.stations)
+    sweeps = imported.sweeps
+    stations = [info_lighthouse.told(station, station.channel) for station in imported.stations]
     truth_poses = sum(map(len, imported.truth))
-    console.say(
-        f"{len(sweeps)} sweeps of {_some(sweeps.devices)}"
-        + (f", {truth_poses} truth poses" if truth_poses else "")
-    )
+    truth = f", {truth_poses} truth poses" if truth_poses else ""
+    console.say(f"{len(sweeps)} sweeps of {_device_list(sweeps.devices)}{truth}")
     if stations:
         console.say(console.table(*info_lighthouse.station_table(stations)))
-    answer = {
+    results = {
         "sweeps": len(sweeps),
         "devices": list(sweeps.devices),
         "truth_poses": truth_poses,
         "stations": [{**each, "id": info_lighthouse.hexadecimal(each["id"])} for each in stations],
         "warnings": imported.warnings,
     }
-    return answer, imported.lost
+    return results, imported.lost
 
 
 def import_scene(
-    read: Any, path: Path, output: Path, overwrite: bool
+    reader: Any, paths: tuple[Path, ...], output: Path, given: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, Any], str | None]:
-    """Import the stations of another tool's configuration as ``scene.toml``; returns as
-    :func:`import_sweeps`."""
+    """Import the stations of a configuration as ``scene.toml``; returns as `import_sweeps`."""
     from locatk.formats.artifacts import scene as artifacts
 
     if output.suffix.lower() != ".toml":
         raise click.UsageError(
-            f"-o {output}: what comes out is a scene, whose name ends in .toml (scene.toml)."
+            f"-o {output}: the output is a scene, whose name ends in .toml (scene.toml)."
         )
-    scene = read(path)
+    scene = reader(paths[0])
     artifacts.write_scene(output, scene, overwrite=overwrite)
-    found = info_lighthouse.scene(scene)
-    stations = [{key: each[key] for key in SCENE_KEYS} for each in found["stations"]]
+    description = info_lighthouse.scene(scene)
+    stations = [{key: each[key] for key in SCENE_KEYS} for each in description["stations"]]
     warnings = list(scene.notes)
     if stations:
-        table = info_lighthouse.station_table(found["stations"], found["scale"])
+        table = info_lighthouse.station_table(description["stations"], description["scale"])
         console.say(console.table(*table))
     else:
-        warnings.append(f"{path} holds no station")
-    answer = {
+        warnings.append(f"{paths[0]} has no station")
+    results = {
         "stations": [{**each, "id": info_lighthouse.hexadecimal(each["id"])} for each in stations],
-        "scale": found["scale"],
+        "scale": description["scale"],
         "warnings": warnings,
     }
-    return answer, None
+    return results, None
 
 
-def _arguments(paths: tuple[Path, ...], given: dict[str, Any]) -> dict[str, Any]:
-    """Keywords of a reader; what is not given is left to it."""
-    named = {NAMES.get(name, name): value for name, value in given.items()}
-    if "truth" in named:
-        # A recording named as its own reference means its own columns, which are read anyway.
-        named["truth"] = [
-            path for path in named["truth"] if not any(path.samefile(other) for other in paths)
+def _reader_arguments(paths: tuple[Path, ...], given: dict[str, Any]) -> dict[str, Any]:
+    """Return the given options as arguments of a reader, which has its own defaults."""
+    arguments = {READER_ARGUMENTS.get(name, name): value for name, value in given.items()}
+    if "truth" in arguments:
+        # A recording given as its own reference means its own columns, which are always read.
+        arguments["truth"] = [
+            path for path in given["truth"] if not any(path.samefile(other) for other in paths)
         ]
-    return named
+    return arguments
 
 
-def _some(devices: Sequence[str], most: int = 8) -> str:
-    """Devices for people: how many, and the names of some."""
-    names = ", ".join([*devices[:most], "..."] if len(devices) > most else devices)
+def _device_list(devices: Sequence[str]) -> str:
+    """Return the number of devices and the names of the first."""
+    more = ["..."] if len(devices) > MAX_LISTED_DEVICES else []
+    names = ", ".join([*devices[:MAX_LISTED_DEVICES], *more])
     return f"{len(devices)} device{'s' * (len(devices) != 1)} ({names})"
-
-
-def _stations(heard: Sequence[StationReport]) -> list[dict[str, Any]]:
-    return [info_lighthouse.told(station, station.channel) for station in heard]

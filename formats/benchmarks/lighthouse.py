@@ -29,7 +29,7 @@ from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks import Figure
-from locatk.formats.importers.dotbot.csv_recording import read_dotbot
+from locatk.formats.importers.dotbot.recording import read_dotbot
 from locatk.formats.importers.lighthouse import ImportedSession
 
 Array = NDArray[np.float64]

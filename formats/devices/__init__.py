@@ -120,7 +120,7 @@ DEVICES = {
             "lines of text: CSV, name:value",
             115_200,
             "locatk.formats.devices.lines.decoder:LineDecoder",
-            "locatk.formats.devices.lines.decoder:encode",
+            "locatk.formats.devices.lines.encoder:encode",
         ),
         Device(
             "raw",

@@ -10,9 +10,12 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text
+from locatk.formats.exporters.kitti import write_kitti
+from locatk.formats.exporters.trajectory_csv import write_csv
+from locatk.formats.exporters.tum import write_tum
 from locatk.formats.output import atomic_write
 from locatk.formats.sessions.reader import Session
+from locatk.formats.tables.timestamps import format_epoch_seconds
 
 FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
 
@@ -111,11 +114,11 @@ def write(
     """
     match format_name:
         case "csv":
-            trajectory_text.write_csv(file.path, file.trajectories, overwrite=overwrite)
+            write_csv(file.path, file.trajectories, overwrite=overwrite)
         case "tum":
-            trajectory_text.write_tum(file.path, file.trajectories[0], overwrite=overwrite)
+            write_tum(file.path, file.trajectories[0], overwrite=overwrite)
         case "kitti":
-            trajectory_text.write_kitti(file.path, file.trajectories[0], overwrite=overwrite)
+            write_kitti(file.path, file.trajectories[0], overwrite=overwrite)
             assert file.times is not None
             write_times(file.times, file.trajectories[0], overwrite=overwrite)
         case "parquet":
@@ -142,7 +145,7 @@ def write_times(path: Path, trajectory: Trajectory, *, overwrite: bool = False) 
     The ``times.txt`` of KITTI is similar, but counts from the first pose.
     """
     with atomic_write(path, overwrite=overwrite, mode="w") as stream:
-        times = map(trajectory_text.format_time, trajectory.time_ns.tolist())
+        times = map(format_epoch_seconds, trajectory.time_ns.tolist())
         stream.writelines(f"{time}\n" for time in times)
 
 

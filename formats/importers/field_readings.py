@@ -1,4 +1,4 @@
-"""Readings of field sensors in recordings of others: what of them cannot be used."""
+"""Exclusion of unusable readings of field sensors from imported recordings."""
 
 from __future__ import annotations
 
@@ -8,51 +8,55 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-SILENT_ROWS = 10
-"""A sensor that says the same in all rows, and at least so many, is dead: others have noise,
-or see something."""
+MIN_CONSTANT_ROWS = 10
+"""Rows from which on a sensor with constant readings is dead: any other has noise."""
 
-DEAD = "the same in all rows, as of a sensor that is dead"
-
-Bad = tuple[NDArray[np.bool_], str]
-"""Which readings cannot be used, and why, in words that follow "has"."""
+UnusableReadings = tuple[NDArray[np.bool_], str]
+"""Mask (n, N, axes) of readings, and the reason as a phrase that follows "has"."""
 
 
-def no_reading(field_t: NDArray[np.float64]) -> list[Bad]:
-    """What is no reading of a field (n, N, axes): no number, or of a sensor that is dead."""
-    dead = np.zeros(field_t.shape, bool)
-    if len(field_t) >= SILENT_ROWS:
-        dead[:] = (field_t == field_t[0]).all(axis=(0, 2))[:, None]
-    return [(np.isnan(field_t), "no number"), (dead, DEAD)]
+def find_absent_readings(field_t: NDArray[np.float64]) -> list[UnusableReadings]:
+    """Find the readings (n, N, axes) that are not a number or come from a dead sensor."""
+    is_dead = np.zeros(field_t.shape, bool)
+    if len(field_t) >= MIN_CONSTANT_ROWS:
+        is_dead[:] = (field_t == field_t[0]).all(axis=(0, 2))[:, None]
+    return [
+        (np.isnan(field_t), "no number"),
+        (is_dead, "a constant value (dead sensor)"),
+    ]
 
 
-def leave_out(
+def exclude_readings(
     field_t: NDArray[np.float64],
-    reasons: Iterable[Bad],
+    unusable: Iterable[UnusableReadings],
     file: Path,
     names: Sequence[str],
     lines: Sequence[int],
 ) -> tuple[int, list[str]]:
-    """Make ``nan`` of what cannot be used; how much it is, and a warning a sensor.
+    """Replace unusable readings by ``nan``.
 
     Parameters
     ----------
     field_t : (n, N, axes) ndarray
-        Changed.
-    reasons : iterable of (bad, words)
+        Changed in place.
+    unusable : iterable of UnusableReadings
     file : path
-    names : sequence of str
-        Of the sensors.
-    lines : sequence of int
-        Of the rows in the file.
+        For the warnings, like ``names`` of the N sensors and ``lines`` of the n rows in it.
+
+    Returns
+    -------
+    (int, list of str)
+        The number of excluded readings, and a warning a sensor and reason.
     """
     warnings = []
-    every = np.zeros(field_t.shape, bool)
-    for bad, words in reasons:
-        every |= bad
-        for sensor in np.flatnonzero(bad.any(axis=(0, 2))).tolist():
-            mine = bad[:, sensor].any(axis=1)
-            rows, line = int(np.count_nonzero(mine)), lines[int(np.argmax(mine))]
-            warnings.append(f"{file}:{line}: {names[sensor]} has {words} in {rows} rows: left out")
-    field_t[every] = np.nan
-    return int(np.count_nonzero(every)), warnings
+    excluded = np.zeros(field_t.shape, bool)
+    for mask, reason in unusable:
+        excluded |= mask
+        for sensor in np.flatnonzero(mask.any(axis=(0, 2))).tolist():
+            rows = np.flatnonzero(mask[:, sensor].any(axis=1))
+            warnings.append(
+                f"{file}:{lines[rows[0]]}: {names[sensor]} has {reason} in {len(rows)} "
+                f"row{'s' * (len(rows) > 1)}; excluded"
+            )
+    field_t[excluded] = np.nan
+    return int(np.count_nonzero(excluded)), warnings

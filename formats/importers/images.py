@@ -1,8 +1,8 @@
-"""Image files of one camera, read as the frames of a session.
+"""Image files of one camera, imported as the frames of a session.
 
 Files come in the natural order of their names (``frame2`` before ``frame10``), folder after
-folder. Nothing in them says when they were taken, so that a rate does: the first frame is at
-:data:`START_NS`, and a file that cannot be read keeps its place in time.
+folder. They contain no times, which therefore follow from a rate: the first frame is at
+:data:`~locatk.formats.tables.timestamps.UNDATED_START_NS`, and an unreadable file is a gap.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.formats import images
 from locatk.formats.sessions.frames import Shot
+from locatk.formats.tables.timestamps import UNDATED_START_NS
 
 DEVICE = "camera"
-"""Name of the camera; image files and videos do not tell one."""
+"""Name of the camera, which image files and videos do not contain."""
 
-START_NS = 1_000_000_000
-"""Time of the first frame where no clock is known: a second after 1970, for no one to take
-it for a date; zero is what some viewers take for no time."""
+DEFAULT_RATE_HZ = 30.0
 
-RATE_HZ = 30.0
+MAGIC_BYTES = 12
+"""Bytes at the beginning of a file that identify a compressed image."""
 
 _NUMBER = re.compile("([0-9]+)")
 
@@ -38,26 +38,30 @@ class ImageFiles:
     Parameters
     ----------
     files : sequence of path
-        In the order of time; see :func:`find_images`.
+        In order of time; see :func:`find_images`.
     rate_hz : float
-        Frames a second.
+        Frames per second.
     camera : Camera, optional
         Frames must have its size.
 
     Attributes
     ----------
     warnings : list of str
-        What was left out and why, one line a file; grows while iterating.
+        Excluded files and the reasons, one line a file; grows while iterating.
     left_out : int
-        How many files that is.
+        Number of excluded files.
     lost : str or None
-        The same in a line, if there are any.
+        Summary of the excluded files, if there are any.
     facts : dict of str to str
         For the session's metadata.
     """
 
     def __init__(
-        self, files: Sequence[Path], *, rate_hz: float = RATE_HZ, camera: Camera | None = None
+        self,
+        files: Sequence[Path],
+        *,
+        rate_hz: float = DEFAULT_RATE_HZ,
+        camera: Camera | None = None,
     ) -> None:
         self._files = files
         self._rate_hz = rate_hz
@@ -71,7 +75,7 @@ class ImageFiles:
         }
 
     def __len__(self) -> int:
-        """Number of files, whether they can be read or not."""
+        """Number of files, including unreadable ones."""
         return len(self._files)
 
     @property
@@ -82,20 +86,20 @@ class ImageFiles:
     def lost(self) -> str | None:
         if not self.warnings:
             return None
-        return f"{self.left_out} of {len(self)} files are left out"
+        return f"{self.left_out} of {len(self)} files are excluded"
 
     def __iter__(self) -> Iterator[Shot]:
-        """The frames, in the order of time.
+        """Yield the frames in order of time.
 
         Raises
         ------
         InputError
-            None of the files is an image that can be used.
+            None of the files is a usable image.
         """
         names = frame_names(self._files)
-        # One topic holds one kind of message: beside files that are kept as they are, the
-        # others become PNG.
-        compressed = any(images.is_compressed(_head(file)) for file in self._files)
+        # A topic has one kind of message: if some files are stored as they are, the others
+        # are stored as PNG.
+        has_compressed = any(images.is_compressed(_head(file)) for file in self._files)
         count = 0
         for number, (file, name) in enumerate(zip(self._files, names, strict=True)):
             try:
@@ -109,82 +113,82 @@ class ImageFiles:
                 self.warnings.append(f"{file}: cannot be read ({error.strerror})")
                 continue
             count += 1
-            time_ns = START_NS + round(number * 1e9 / self._rate_hz)
+            time_ns = UNDATED_START_NS + round(number * 1e9 / self._rate_hz)
             if picture.format:
                 yield Shot(time_ns, name, data, picture.format)
-            elif compressed:
+            elif has_compressed:
                 yield Shot(time_ns, name, images.encode_png(picture.pixels), "png")
             else:
                 yield Shot(time_ns, name, picture.pixels)
         if count == 0:
-            first = self.warnings[0] if self.warnings else "there are none"
+            reason = self.warnings[0] if self.warnings else "there are none"
             raise FormatError(
-                f"none of {len(self._files)} files can be used: {first}",
+                f"none of {len(self._files)} files is usable: {reason}",
                 hint="Compare the --camera with the frames" if self._camera is not None else None,
             )
 
 
 def find_images(paths: Sequence[Path]) -> list[Path]:
-    """Image files that ``paths`` name, each once, in natural order.
+    """Find the image files that ``paths`` name, each once, in natural order.
 
     Parameters
     ----------
     paths : sequence of path
-        Files, which are taken whatever they are called; folders, of which files with an
-        image's extension are taken, without sub-folders; or patterns such as
-        ``run/*.png``, of which likewise.
+        Files with any name; folders, in which the files with an extension of images are taken,
+        without sub-folders; or patterns such as ``run/*.png``, likewise.
 
     Raises
     ------
     MissingDataError
-        A path is not there, or a pattern fits nothing.
+        A path is missing, or no file matches a pattern.
     FormatError
-        A folder or the files of a pattern hold no image.
+        A folder or pattern has no image.
     """
-    found: dict[Path, Path] = {}
+    by_path: dict[Path, Path] = {}
     for path in paths:
-        for file in _expanded(path):
-            found.setdefault(file.resolve(), file)
-    return sorted(found.values(), key=_natural)
+        for file in _expand(path):
+            by_path.setdefault(file.resolve(), file)
+    return sorted(by_path.values(), key=_natural)
 
 
-def _expanded(path: Path) -> list[Path]:
+def _expand(path: Path) -> list[Path]:
+    """Return the files that a path names: itself, those of a folder, or those of a pattern."""
     if path.is_dir():
-        inside = [file for file in path.iterdir() if file.is_file()]
-        what = "folder"
+        files = [file for file in path.iterdir() if file.is_file()]
+        kind = "folder"
     elif path.exists():
         return [path]
     elif glob.has_magic(str(path)):
-        inside = [Path(name) for name in glob.glob(str(path), recursive=True)]
-        inside = [file for file in inside if file.is_file()]
-        what = "pattern"
-        if not inside:
+        files = [Path(name) for name in glob.glob(str(path), recursive=True)]
+        files = [file for file in files if file.is_file()]
+        kind = "pattern"
+        if not files:
             raise MissingDataError(
-                "no file fits the pattern", file=path, hint="Check the folder and the extension"
+                "no file matches the pattern", file=path, hint="Check the folder and the extension"
             )
     else:
         raise MissingDataError(
             "No such file or folder", file=path, hint="Check the spelling of the path"
         )
-    kept = [file for file in inside if file.suffix.lower() in images.EXTENSIONS]
-    if not kept:
+    image_files = [file for file in files if file.suffix.lower() in images.EXTENSIONS]
+    if not image_files:
         raise FormatError(
-            f"no image files ({len(inside)} files of other kinds)",
+            f"no image files ({len(files)} files of other kinds)",
             file=path,
-            hint=f"Give a {what} with {', '.join(sorted(images.EXTENSIONS))}; a pattern such as "
+            hint=f"Give a {kind} with {', '.join(sorted(images.EXTENSIONS))}; a pattern such as "
             "'run/**/*.png' searches sub-folders",
         )
-    return kept
+    return image_files
 
 
 def frame_names(files: Sequence[Path]) -> list[str]:
-    """Names of the frames: those of the files, with folders where they would not differ."""
+    """Return the names of the frames: those of the files, with folders if names repeat."""
     names = [file.name for file in files]
     return names if len(set(names)) == len(names) else [file.as_posix() for file in files]
 
 
 def check_size(pixels: NDArray[Any], camera: Camera | None) -> None:
-    """Refuse a frame of another size than the camera's.
+    """Refuse a frame whose size differs from that of the camera.
 
     Raises
     ------
@@ -194,12 +198,12 @@ def check_size(pixels: NDArray[Any], camera: Camera | None) -> None:
         return
     height, width = pixels.shape[:2]
     raise InputError(
-        f"{width} x {height} px, where the camera has {camera.size[0]} x {camera.size[1]} px"
+        f"{width} x {height} px, but the camera has {camera.size[0]} x {camera.size[1]} px"
     )
 
 
 def _natural(path: Path) -> tuple[list[str | int], ...]:
-    """Sort key in which numbers count as numbers; unlike ones of equal value differ too."""
+    """Return a sort key that compares numbers by value, and equal ones by their digits."""
     parts = (path.parent.as_posix(), path.name)
     split = [
         [int(piece) if odd % 2 else piece for odd, piece in enumerate(_NUMBER.split(part))]
@@ -211,6 +215,6 @@ def _natural(path: Path) -> tuple[list[str | int], ...]:
 def _head(file: Path) -> bytes:
     try:
         with open(file, "rb") as stream:
-            return stream.read(12)
+            return stream.read(MAGIC_BYTES)
     except OSError:
         return b""

@@ -1,8 +1,8 @@
 """Recordings of hall sensors and odometry in one table (CSV), as robots log them.
 
-One row a sample: the time, where the robot's odometry has it (x, y, heading), and a reading
-of each hall sensor. No such recording is published: columns and units are what the user or
-the header says (:mod:`.columns`).
+One row a sample: the time, the pose of the robot's odometry (x, y, heading), which may be empty,
+and a reading of each hall sensor. No such recording is published: columns and units are stated by
+the user or by the header (:mod:`locatk.formats.tables.quantities`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -20,47 +19,64 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.field_readings import leave_out, no_reading
-from locatk.formats.tables.columns import UNITS, Column, by_quantity, find
-from locatk.formats.tables.csv_table import Table, read_table
+from locatk.formats.importers.field_readings import exclude_readings, find_absent_readings
+from locatk.formats.tables.delimited import Table, read_table
+from locatk.formats.tables.quantities import (
+    UNITS,
+    Column,
+    find_columns,
+    units_by_quantity,
+)
+from locatk.formats.tables.timestamps import UNDATED_START_NS, parse_decimal_time
 
 Array = NDArray[np.float64]
 
 DEVICE = "robot"
 FRAME = "odometry"
 
-START_NS = 1_000_000_000
-"""Time of the first row where no clock is known."""
+MIN_EPOCH_NS = 946_684_800_000_000_000
+"""Times from the year 2000 on belong to a clock that counts from 1970."""
 
-EPOCH_NS = 946_684_800_000_000_000
-"""Times from here on (the year 2000) are of a clock that counts from 1970."""
+MAX_TIME_NS = 2**62
+"""Largest time; differences of two of them fit into int64."""
 
-LATEST_NS = 2**62
+TIME_KEY = "t"
 
-POSE = ("x", "y", "heading")
-"""What the columns of odometry are called."""
+POSE_KEYS = ("x", "y", "heading")
+"""Keys of the columns of odometry."""
 
-VOLTS = ("v", "mv")
+MIN_DISTINCT_POSES = 10
+"""Fewer distinct poses do not show how often odometry is updated."""
 
-FEWEST_UPDATES = 10
-"""With fewer poses that differ nothing is said of how often odometry is new."""
+MIN_ROWS_PER_UPDATE = 2
+"""Median number of rows with the same pose from which on odometry is slower than the log."""
 
-_STRIDE_M = 0.02
-_ALONG = 0.5
-_FASTEST_MPS = 10.0
+STRIDE_M = 0.02
+"""Path length over which the direction of motion is compared with the heading."""
+
+MAX_STRIDES = 5000
+
+MIN_STRIDES = 4
+"""Fewer strides do not show whether the robot moves along its heading."""
+
+MIN_MEAN_ALIGNMENT = 0.5
+"""Smallest plausible mean of cos(2 angle) between the direction of motion and the heading."""
+
+MAX_SPEED_M_S = 10.0
+"""Largest plausible mean speed of a robot."""
 
 
 @dataclass(frozen=True)
 class Volts:
-    """How a voltage becomes a field: one value for all sensors, or one each, in their order.
+    """Conversion of voltages to fields: one value for all sensors, or one each in their order.
 
     Attributes
     ----------
     per_tesla : tuple of float
-        Negative where a field that points up lowers the voltage.
+        Negative if a field that points up lowers the voltage.
     zero : tuple of float or None
-        Volts without a field; None for the median of each sensor, which is right where a
-        robot is off the landmarks most of the time.
+        Voltage without a field; None for the median of each sensor, which suits a robot that is
+        off the landmarks most of the time.
     """
 
     per_tesla: tuple[float, ...]
@@ -69,18 +85,18 @@ class Volts:
 
 @dataclass
 class ImportedHalls:
-    """A recording of others.
+    """Imported recording of hall sensors and odometry.
 
     Attributes
     ----------
     samples : HallSamples
     odometry : Trajectory
     facts : dict of str to str
-        What was read and assumed, for people.
+        Source and assumptions, as text.
     warnings : list of str
-        What was lost or is doubtful, one line each.
+        Losses and doubts, one line each.
     left_out : int
-        Readings that are not there or could not be used.
+        Readings that are missing or unusable.
     """
 
     samples: HallSamples
@@ -91,10 +107,10 @@ class ImportedHalls:
 
     @property
     def lost(self) -> str | None:
-        """What was lost, None where nothing was."""
+        """Summary of the losses; None without any."""
         if not self.left_out:
             return None
-        return f"{self.left_out} of {self.samples.field_t.size} readings are left out"
+        return f"{self.left_out} of {self.samples.field_t.size} readings are excluded"
 
 
 def read_landmarks(
@@ -113,230 +129,245 @@ def read_landmarks(
     ----------
     path : path
     sensors : HallSensors
-        Where the hall sensors sit; their names are those of their columns.
-    columns : mapping, optional
-        Of ``t``, ``x``, ``y``, ``heading`` and the names of sensors to headers; those that
-        are left out have a column of their own name, with or without a unit behind it.
+        Positions and names of the hall sensors; the names are the keys of their columns.
+    columns : mapping of str to str, optional
+        Headers of the keys ``t``, ``x``, ``y``, ``heading`` and of the sensors. Any other key has
+        a column of its own name, with or without a unit.
     units : sequence of str
-        At most one of each quantity in :data:`.columns.UNITS`, for columns whose names tell none.
+        At most one unit of each quantity, for columns without a unit in their names.
     volts : Volts, optional
-        Where readings are voltages.
+        Required if readings are voltages.
     downward : bool
-        Readings are positive where the field points down.
+        Readings are positive if the field points down.
     start_ns : int, optional
-        Time of the first row since the epoch. Where it is left out, times from the year
-        2000 on are taken as they are, others begin at :data:`START_NS`.
+        Time of the first row since the epoch. [default: times from the year 2000 on are kept,
+        others start at :data:`~locatk.formats.tables.timestamps.UNDATED_START_NS`]
 
     Raises
     ------
     MissingDataError, FormatError
-        See :func:`locatk.formats.tables.csv_table.read_table`; also where a column is
-        missing, or two could be meant.
+        See :func:`~locatk.formats.tables.delimited.read_table` and
+        :func:`~locatk.formats.tables.quantities.find_columns`.
     InputError
-        A unit is not known, a cell is no number, times do not ascend, or nothing is left.
+        A unit is unknown, a cell is not a number, times do not ascend, or nothing is usable.
     """
-    given = by_quantity(units)
-    twice = [name for name in sensors.names if name in POSE or name == "t"]
-    if twice:
-        raise InputError(f"a sensor called {twice[0]!r}", hint="That is another column's name")
-    table = read_table(path)
-    quantities = {"t": "time", "x": "length", "y": "length", "heading": "angle"}
-    quantities |= dict.fromkeys(sensors.names, "field")
-    found = find(table, quantities, columns or {}, given)
-    time_ns, clock = _times(found["t"], start_ns)
-    odometry = _odometry(table, found, time_ns)
-    readings = [found[name] for name in sensors.names]
-    field_t = _fields(readings, volts)
-    # Rows that have a pose alone are no samples.
-    there = ~np.isnan(field_t).all(axis=1)
-    if not there.any():
-        raise InputError("no reading of any sensor", file=path, hint="Check the columns")
-    field_t = -field_t[there] if downward else field_t[there]
-    imported = ImportedHalls(
-        HallSamples(DEVICE, sensors, time_ns[there], field_t),
-        odometry,
-        {
-            "format": "landmark-csv",
-            "file": Path(path).name,
-            "rows": str(len(table)),
-            "columns": ", ".join(
-                f"{key}={column.name}" + (f" [{column.unit}]" if column.unit else "")
-                for key, column in found.items()
-            ),
-            "clock": clock,
-        },
-    )
-    if volts is not None:
-        imported.facts["volts_per_tesla"] = ", ".join(f"{v:g}" for v in volts.per_tesla)
-        zero = volts.zero
-        imported.facts["zero_volts"] = ", ".join(f"{v:g}" for v in zero) if zero else "median"
-    if downward:
-        imported.facts["positive"] = "downward in the file, upward here"
-    poses = np.count_nonzero(~np.isnan(found["x"].numbers()))
-    if len(odometry) < poses:
-        imported.facts["odometry"] = f"{poses - len(odometry)} repeated poses are passed over"
-    lines = [table.lines[row] for row in np.flatnonzero(there)]
-    by_axis = imported.samples.field_t[:, :, None]
-    names = [column.name for column in readings]
-    imported.left_out, imported.warnings = leave_out(
-        by_axis, no_reading(by_axis), table.file, names, lines
-    )
-    imported.warnings += _doubts(odometry)
-    if imported.left_out == field_t.size:
+    given_units = units_by_quantity(units)
+    reserved = [name for name in sensors.names if name in (TIME_KEY, *POSE_KEYS)]
+    if reserved:
         raise InputError(
-            "no reading that can be used", file=path, hint=imported.warnings[0].split(": ", 1)[1]
+            f"a sensor is called {reserved[0]!r}", hint="Rename it: another column has this key"
         )
-    return imported
+    table = read_table(path)
+    quantities = {
+        TIME_KEY: ("time",),
+        "x": ("length",),
+        "y": ("length",),
+        "heading": ("angle",),
+        **dict.fromkeys(sensors.names, ("field", "voltage")),
+    }
+    by_key = find_columns(table, quantities, columns or {}, given_units)
+    time_ns, clock = _times(by_key[TIME_KEY], start_ns)
+    odometry, repeated_poses = _odometry(table, by_key, time_ns)
+    readings = [by_key[name] for name in sensors.names]
+    field_t = _fields(readings, volts)
+    # Rows with a pose and no reading are not samples.
+    rows = np.flatnonzero(~np.isnan(field_t).all(axis=1))
+    if not len(rows):
+        raise InputError("no reading of any sensor", file=path, hint="Check the columns")
+    field_t = -field_t[rows] if downward else field_t[rows]
+    facts = {
+        "format": "landmark-csv",
+        "file": Path(path).name,
+        "rows": str(len(table)),
+        "columns": ", ".join(
+            f"{key}={column.name}" + (f" [{column.unit}]" if column.unit else "")
+            for key, column in by_key.items()
+        ),
+        "clock": clock,
+    }
+    if volts is not None:
+        facts["volts_per_tesla"] = ", ".join(f"{v:g}" for v in volts.per_tesla)
+        facts["zero_volts"] = ", ".join(f"{v:g}" for v in volts.zero) if volts.zero else "median"
+    if downward:
+        facts["positive"] = "downward in the file, upward in the session"
+    if repeated_poses:
+        facts["odometry"] = f"{repeated_poses} repeated poses are skipped"
+    samples = HallSamples(DEVICE, sensors, time_ns[rows], field_t)
+    by_axis = samples.field_t[:, :, None]
+    excluded, warnings = exclude_readings(
+        by_axis,
+        find_absent_readings(by_axis),
+        table.file,
+        [column.name for column in readings],
+        [table.lines[row] for row in rows.tolist()],
+    )
+    if excluded == field_t.size:
+        raise InputError("no usable reading", file=path, hint=warnings[0].split(": ", 1)[1])
+    warnings += _odometry_warnings(odometry)
+    return ImportedHalls(samples, odometry, facts, warnings, excluded)
 
 
 def _times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str]:
-    """Times of the rows in ns since the epoch, and which clock they are of."""
+    """Return the times of the rows in nanoseconds since the epoch, and a text on their clock."""
     table, unit = column.table, column.unit
     if not unit:
-        at, clock = table.times_ns(column.name), "dates and times of the file"
+        time_ns, clock = table.iso_times_ns(column.name), "dates and times of the file"
     else:
-        ns = UNITS["time"][unit]
-        table.floats(column.name, -LATEST_NS / ns, LATEST_NS / ns)
+        limit = MAX_TIME_NS / UNITS["time"][unit]
+        table.floats(column.name, -limit, limit)
+        cells = table.columns[column.name]
         # Nanoseconds since 1970 have more digits than a float.
-        cells = map(Decimal, map(str.strip, table.columns[column.name]))
-        at = np.array([int((cell * int(ns)).to_integral_value()) for cell in cells], np.int64)
-        if at[0] >= EPOCH_NS:
+        time_ns = np.array([parse_decimal_time(cell, unit) for cell in cells], np.int64)
+        if time_ns[0] >= MIN_EPOCH_NS:
             clock = f"{unit} since 1970"
         else:
-            at, clock = at - at[0] + START_NS, "the first row is at 1 s: no clock is known"
+            time_ns = time_ns - time_ns[0] + UNDATED_START_NS
+            clock = "unknown: the first row is at 1 s"
     if start_ns is not None:
-        at, clock = at - at[0] + start_ns, "the first row is at the time that was given"
-    steps = np.diff(at)
-    if (steps <= 0).any():
-        row = int(np.argmax(steps <= 0)) + 1
+        time_ns, clock = time_ns - time_ns[0] + start_ns, "the first row is at the given time"
+    steps_ns = np.diff(time_ns)
+    if (steps_ns <= 0).any():
+        row = int(np.argmax(steps_ns <= 0)) + 1
         table.fail(
             row,
-            "the time goes backwards" if steps[row - 1] < 0 else "the time of the row before",
-            "Put the rows into their order, and write times with all of their digits",
+            "the time goes backwards" if steps_ns[row - 1] < 0 else "the time of the previous row",
+            "Sort the rows by time, and write times with all of their digits",
         )
-    return at, clock
+    return time_ns, clock
 
 
 def _fields(columns: Sequence[Column], volts: Volts | None) -> Array:
-    """Readings (n, N) in tesla."""
-    table = columns[0].table
-    in_volts = [column.unit in VOLTS for column in columns]
-    if any(in_volts) != all(in_volts):
-        one, other = columns[in_volts.index(True)], columns[in_volts.index(False)]
+    """Return the readings (n, N) in tesla."""
+    table, first = columns[0].table, columns[0]
+    is_voltage = [column.unit in UNITS["voltage"] for column in columns]
+    other = next((c for c, v in zip(columns, is_voltage, strict=True) if v != is_voltage[0]), None)
+    if other is not None:
         raise FormatError(
-            f"column {one.name!r} is in {one.unit}, {other.name!r} in {other.unit}",
+            f"column {first.name!r} is in {first.unit}, but {other.name!r} in {other.unit}",
             file=table.file,
             where=1,
             hint="Write all sensors as voltages, or none",
         )
-    if all(in_volts) and volts is None:
+    if is_voltage[0] and volts is None:
         raise InputError(
-            "voltages, and nothing tells the field from them",
+            "voltages without a conversion to fields",
             file=table.file,
-            where=columns[0].name,
+            where=first.name,
             hint="Give --volts-per-tesla and --zero-volts, from the sensor's data sheet",
         )
-    if volts is not None and not all(in_volts):
+    if volts is not None and not is_voltage[0]:
         raise InputError(
-            f"volts per tesla, where the readings are in {columns[0].unit}",
+            f"volts per tesla for readings in {first.unit}",
             file=table.file,
-            where=columns[0].name,
-            hint="Say --units v, or leave out --volts-per-tesla and --zero-volts",
+            where=first.name,
+            hint="Give --units v, or remove --volts-per-tesla and --zero-volts",
         )
-    values = np.column_stack([column.numbers() for column in columns])
+    values = np.column_stack([column.in_si() for column in columns])
     if volts is None:
         return values
-    sensors = len(columns)
-    gains = _each("volts per tesla", volts.per_tesla, sensors)
+    gains = _per_sensor("volts per tesla", volts.per_tesla, len(columns))
     if not gains.all():
         raise InputError("0 volts per tesla", hint="Give it from the sensor's data sheet")
     if volts.zero is not None:
-        zero = _each("zero volts", volts.zero, sensors)
+        zero = _per_sensor("zero volts", volts.zero, len(columns))
     else:
-        there = ~np.isnan(values).all(axis=0)
-        zero = np.zeros(sensors)
-        zero[there] = np.nanmedian(values[:, there], axis=0)
+        has_readings = ~np.isnan(values).all(axis=0)
+        zero = np.zeros(len(columns))
+        zero[has_readings] = np.nanmedian(values[:, has_readings], axis=0)
     return (values - zero) / gains
 
 
-def _each(what: str, values: tuple[float, ...], sensors: int) -> Array:
+def _per_sensor(name: str, values: tuple[float, ...], sensors: int) -> Array:
+    """Return one finite value for each sensor."""
     if len(values) not in (1, sensors) or not all(map(math.isfinite, values)):
         raise InputError(
-            f"{len(values)} numbers of {what} for {sensors} sensors",
+            f"{len(values)} numbers of {name} for {sensors} sensors",
             hint="Give one for all, or one each in the order of the sensors",
         )
     return np.broadcast_to(np.array(values, float), (sensors,)).copy()
 
 
-def _odometry(table: Table, found: Mapping[str, Column], time_ns: NDArray[np.int64]) -> Trajectory:
-    """Poses of the rows that have one: odometry may be slower than the sensors."""
-    values = np.column_stack([found[key].numbers() for key in POSE])
-    gone = np.isnan(values)
-    some = gone.any(axis=1) & ~gone.all(axis=1)
-    if some.any():
-        row = int(np.argmax(some))
-        key = POSE[int(np.argmax(gone[row]))]
+def _odometry(
+    table: Table, columns: Mapping[str, Column], time_ns: NDArray[np.int64]
+) -> tuple[Trajectory, int]:
+    """Return the poses of odometry, which may be slower than the sensors.
+
+    Returns
+    -------
+    (Trajectory, int)
+        The poses, and the number of rows that repeat the pose of an earlier row.
+    """
+    values = np.column_stack([columns[key].in_si() for key in POSE_KEYS])
+    is_empty = np.isnan(values)
+    is_partial = is_empty.any(axis=1) & ~is_empty.all(axis=1)
+    if is_partial.any():
+        row = int(np.argmax(is_partial))
+        key = POSE_KEYS[int(np.argmax(is_empty[row]))]
         table.fail(
             row,
-            f"no {key} ({found[key].name!r}) where the rest of the pose is there",
+            f"{key} ({columns[key].name!r}) is empty, but the rest of the pose is not",
             "Write all of x, y and heading, or leave all three empty",
         )
-    there = ~gone.all(axis=1)
-    if np.count_nonzero(there) < 2:
+    rows = np.flatnonzero(~is_empty.all(axis=1))
+    if len(rows) < 2:
         raise InputError(
             "no odometry: the columns x, y and heading are empty",
             file=table.file,
-            hint="Record the wheels too: four sensors alone do not tell the way",
+            hint="Record the wheels too: four sensors alone do not determine the path",
         )
-    fresh = np.flatnonzero(there)[_updates(values[there])]
-    x, y, heading = values[fresh].T
-    n = len(x)
-    return Trajectory(
+    updates = rows[_find_updates(values[rows])]
+    x, y, heading = values[updates].T
+    odometry = Trajectory(
         DEVICE,
         FRAME,
-        time_ns[fresh],
-        np.column_stack([x, y, np.zeros(n)]),
+        time_ns[updates],
+        np.column_stack([x, y, np.zeros(len(x))]),
         quaternion_from_heading(heading),
-        np.full((n, 6, 6), np.nan),
+        np.full((len(x), 6, 6), np.nan),
     )
+    return odometry, len(rows) - len(updates)
 
 
-def _updates(poses: Array) -> NDArray[np.int64]:
-    """Rows in which odometry is new, where most rows repeat the pose of the one before.
+def _find_updates(poses: Array) -> NDArray[np.int64]:
+    """Find the rows with a new pose if most rows repeat the previous one, otherwise all rows.
 
-    A logger that is faster than the odometry writes a staircase, which no robot drives.
-    Where the robot stands for long, the last of the equal rows counts as well.
+    A logger that is faster than odometry writes a staircase, which no robot drives. If the robot
+    stands still for long, the last of the equal rows is also taken.
     """
     n = len(poses)
     first = np.concatenate([[0], np.flatnonzero((np.diff(poses, axis=0) != 0).any(axis=1)) + 1])
     last = np.concatenate([first[1:] - 1, [n - 1]])
-    held = float(np.median(last - first + 1))
-    if len(first) < FEWEST_UPDATES or held < 2:
+    rows_per_update = float(np.median(last - first + 1))
+    if len(first) < MIN_DISTINCT_POSES or rows_per_update < MIN_ROWS_PER_UPDATE:
         return np.arange(n)
-    stands = last[last - first + 1 > 2 * held]
-    return np.unique(np.concatenate([first, stands, [n - 1]]))
+    standstill_ends = last[last - first + 1 > 2 * rows_per_update]
+    return np.unique(np.concatenate([first, standstill_ends, [n - 1]]))
 
 
-def _doubts(odometry: Trajectory) -> list[str]:
-    """What a robot on wheels cannot have driven: units or axes are other ones then."""
-    place, heading = odometry.position[:, :2], heading_from_quaternion(odometry.quaternion)
-    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
-    doubts = []
-    seconds = float(odometry.time_ns[-1] - odometry.time_ns[0]) * 1e-9
-    if way[-1] > _FASTEST_MPS * seconds:
-        doubts.append(
-            f"odometry says {way[-1] / seconds:.3g} m/s on average: check the units of x and y"
+def _odometry_warnings(odometry: Trajectory) -> list[str]:
+    """Warn of motion that a robot on wheels cannot perform: units or axes are mistaken."""
+    position = odometry.position[:, :2]
+    heading = heading_from_quaternion(odometry.quaternion)
+    steps_m = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    distance_m = np.concatenate([[0], np.cumsum(steps_m)])
+    length_m = float(distance_m[-1])
+    warnings = []
+    duration_s = float(odometry.time_ns[-1] - odometry.time_ns[0]) * 1e-9
+    if length_m > MAX_SPEED_M_S * duration_s:
+        warnings.append(
+            f"the mean speed of odometry is {length_m / duration_s:.3g} m/s: check the units of x "
+            "and y"
         )
-    strides = np.arange(0.0, way[-1], max(_STRIDE_M, way[-1] / 5000))
-    stops = np.unique(np.searchsorted(way, strides))
-    if len(stops) >= 5:
-        step = np.diff(place[stops], axis=0)
-        middle = heading[(stops[:-1] + stops[1:]) // 2]
-        # Twice the angle: wheels roll backwards as well.
-        turned = 2 * (np.arctan2(step[:, 1], step[:, 0]) - middle)
-        if float(np.mean(np.cos(turned))) < _ALONG:
-            doubts.append(
-                "the robot does not drive where its heading points: check the unit of heading, "
-                "that it grows counter-clockwise, and which column is x and which y"
+    strides_m = np.arange(0.0, length_m, max(STRIDE_M, length_m / MAX_STRIDES))
+    stops = np.unique(np.searchsorted(distance_m, strides_m))
+    if len(stops) > MIN_STRIDES:
+        step = np.diff(position[stops], axis=0)
+        middle_heading = heading[(stops[:-1] + stops[1:]) // 2]
+        # Twice the angle, because wheels roll backwards as well.
+        angle = 2 * (np.arctan2(step[:, 1], step[:, 0]) - middle_heading)
+        if float(np.mean(np.cos(angle))) < MIN_MEAN_ALIGNMENT:
+            warnings.append(
+                "the robot does not move along its heading: check the unit of heading, that it "
+                "grows counter-clockwise, and which column is x and which y"
             )
-    return doubts
+    return warnings

@@ -1,4 +1,4 @@
-"""What an importer of Lighthouse recordings answers."""
+"""Result of the importers of Lighthouse recordings."""
 
 from __future__ import annotations
 
@@ -13,27 +13,26 @@ from locatk.core.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class ImportedSession:
-    """A recording of others.
+    """Imported Lighthouse recording.
 
     Attributes
     ----------
     sweeps : Sweeps
         Ascending in time.
     scene : Scene or None
-        What the recording tells of the place: markers with their sightings, calibrations,
-        stations; None where it tells nothing.
+        Markers with their visits, calibrations and stations in the recording; None without any.
     truth : list of Trajectory
         One a device, under the names of the sweeps' devices.
     facts : dict of str to str
-        What was read and assumed, for people.
+        Source and assumptions, as text.
     warnings : list of str
-        What was lost or is doubtful, one line each.
+        Losses and doubts, one line each.
     stations : tuple of StationReport
-        What was measured of each station, ascending in channel.
+        Measurements of each station, ascending in channel.
     receivers : dict of str to Receiver
-        By device, where its photodiodes sit.
+        Layout of the photodiodes of each device.
     lost : str or None
-        What was left out of the recording, in one line: the exit status is 3 then.
+        Summary of the losses in one line. If there are any, the exit status is 3.
     """
 
     sweeps: Sweeps

@@ -1,15 +1,15 @@
-"""Recordings of magnetometer arrays as Polaris and MagX publish them (CSV).
+"""Recordings of magnetometer arrays as published with Polaris and MagX (CSV).
 
-github.com/wjk5117/Polaris, dychen24/magx (MIT). The header is ``,Time Stamp,Sensor 1,...,
-Sensor N``; a cell of a sensor is a tuple in text, ``"(x, y, z)"`` in microtesla. Other
-columns are passed over.
+Format of github.com/wjk5117/Polaris and dychen24/magx (MIT): the header is
+``,Time Stamp,Sensor 1,...,Sensor N``; a cell of a sensor is a tuple in text, ``"(x, y, z)"`` in
+microtesla. Other columns are ignored.
 
-The part's X looks to the right, Y back and Z down, and sensor 1 is the rightmost: in the
-array's frame B = (-Y, -X, -Z).
+The sensor's X points right, Y back and Z down, and sensor 1 is the rightmost: in the frame of the
+array, B = (-Y, -X, -Z).
 
-A sample's time is its row over the rate, which has to be told: the stamps that were
-published with the paper are not times, but rows over 100. Where stamps are dates and
-times, the first is when the recording began.
+The time of a sample is its row divided by the rate, which the user states: the stamps published
+with the paper are not times, but rows divided by 100. If stamps are dates and times, the first
+one is the start of the recording.
 """
 
 from __future__ import annotations
@@ -26,44 +26,51 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.polaris import mlx90393
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.tag import Tags
-from locatk.formats.importers.field_readings import Bad, leave_out, no_reading
-from locatk.formats.tables.csv_table import TIME, Table, read_table
+from locatk.formats.importers.field_readings import (
+    UnusableReadings,
+    exclude_readings,
+    find_absent_readings,
+)
+from locatk.formats.tables.delimited import Table, read_table
+from locatk.formats.tables.timestamps import UNDATED_START_NS, is_iso_time
 
 Array = NDArray[np.float64]
 
 DEVICE = "bar"
 
-START_NS = 1_000_000_000
-"""Time of the first sample where no clock is known."""
+TIME_COLUMN = "time stamp"
 
 PUBLISHED_TAGS = Tags(
     codec="polaris-released",
     notes=("assumed on import: the design of the published tags, and all of their ids",),
 )
-"""The paper's default tag: 3 x 3 cells of 40 mm, five magnets of 2 x 0.5 mm at 10 mm."""
+"""Default tag of the paper: 3 x 3 cells of 40 mm, five magnets of 2 x 0.5 mm at 10 mm."""
 
-RATES_AGREE = 0.05
-"""Relative difference up to which stamps and rate are the same."""
+MAX_RATE_DIFFERENCE_FRACTION = 0.05
+"""Largest relative difference of the rate by the stamps from the stated one without a warning."""
 
-_SENSOR = re.compile(r"sensor ?([1-9]\d{0,3})", re.ASCII)
-_NOTHING = "(nan, nan, nan)"
-_OF_NUMBERS = b"0123456789.+-eEnNaA \t"
+SATURATION_QUANTA = 1.5
+"""Readings within this distance of the end of the scale may be saturated."""
+
+_SENSOR_NAME = re.compile(r"sensor ?([1-9]\d{0,3})", re.ASCII)
+_EMPTY_VECTOR = "(nan, nan, nan)"
+_NUMBER_CHARACTERS = b"0123456789.+-eEnNaA \t"
 _TO_COMMAS = bytes.maketrans(b"()|", b"  ,")
 
 
 @dataclass
 class ImportedSamples:
-    """A recording of others.
+    """Imported recording of a magnetometer array.
 
     Attributes
     ----------
     samples : Samples
     facts : dict of str to str
-        What was read and assumed, for people.
+        Source and assumptions, as text.
     warnings : list of str
-        What was lost or is doubtful, one line each.
+        Losses and doubts, one line each.
     left_out : int
-        Values by axis, sensor and sample that are not there or could not be used.
+        Values (by axis, sensor and sample) that are missing or unusable.
     """
 
     samples: Samples
@@ -73,10 +80,10 @@ class ImportedSamples:
 
     @property
     def lost(self) -> str | None:
-        """What was lost, None where nothing was."""
+        """Summary of the losses; None without any."""
         if not self.left_out:
             return None
-        return f"{self.left_out} of {self.samples.field_t.size} values are left out"
+        return f"{self.left_out} of {self.samples.field_t.size} values are excluded"
 
 
 def read_polaris(path: Path, *, rate_hz: float, spacing_m: float) -> ImportedSamples:
@@ -86,108 +93,104 @@ def read_polaris(path: Path, *, rate_hz: float, spacing_m: float) -> ImportedSam
     ----------
     path : path
     rate_hz : float
-        Samples a second.
+        Samples per second.
     spacing_m : float
-        Between neighbouring sensors.
+        Distance between neighbouring sensors.
 
     Raises
     ------
     MissingDataError, FormatError
-        See :func:`locatk.formats.tables.csv_table.read_table`; also where the columns of the
-        sensors are missing or have gaps.
+        See :func:`locatk.formats.tables.delimited.read_table`; also if columns of sensors are
+        missing.
     InputError
-        A cell is no tuple of three numbers, stamps go backwards, no MLX90393 gives this
-        rate, or nothing is left.
+        A cell is not a tuple of three numbers, stamps go backwards, no MLX90393 has this rate,
+        or no value is usable.
     """
     warnings: list[str] = []
-    part = _settings(rate_hz, warnings)
+    settings = _sensor_settings(rate_hz, warnings)
     table = read_table(path)
-    sensors = _sensors(table)
-    array = mlx90393.published_bar(len(sensors), spacing_m, part)
-    values = np.stack([_vectors(table, name) for name in sensors], axis=1)
+    names = _sensor_columns(table)
+    array = mlx90393.published_bar(len(names), spacing_m, settings)
+    values = np.stack([_vectors(table, name) for name in names], axis=1)
     field_t = -values[:, :, [1, 0, 2]] * 1e-6
-    imported = ImportedSamples(
-        Samples(DEVICE, array, _times(table, rate_hz, warnings), field_t),
-        {
-            "format": "polaris-csv",
-            "file": Path(path).name,
-            "rows": str(len(table)),
-            "rate_hz": repr(float(rate_hz)),
-            "clock": "time is the row over the rate; stamps are not used, but for the start",
-        },
-        warnings,
+    samples = Samples(DEVICE, array, _times(table, rate_hz, warnings), field_t)
+    facts = {
+        "format": "polaris-csv",
+        "file": Path(path).name,
+        "rows": str(len(table)),
+        "rate_hz": repr(float(rate_hz)),
+        "clock": "time is the row divided by the rate; of the stamps only the start is used",
+    }
+    absent, dead = find_absent_readings(field_t)
+    excluded, losses = exclude_readings(
+        samples.field_t, (absent, _saturated(samples), dead), table.file, names, table.lines
     )
-    missing, dead = no_reading(field_t)
-    reasons = (missing, _beyond(imported.samples), dead)
-    imported.left_out, lost = leave_out(
-        imported.samples.field_t, reasons, table.file, sensors, table.lines
-    )
-    warnings += lost
-    if imported.left_out == field_t.size:
-        raise InputError("no value that can be used", file=path, hint=warnings[-1])
-    return imported
+    warnings += losses
+    if excluded == field_t.size:
+        raise InputError("no usable value", file=path, hint=warnings[-1])
+    return ImportedSamples(samples, facts, warnings, excluded)
 
 
-def _settings(rate_hz: float, warnings: list[str]) -> mlx90393.Settings:
-    """How the sensors must be set for the rate: as published where that is possible."""
+def _sensor_settings(rate_hz: float, warnings: list[str]) -> mlx90393.Settings:
+    """Return settings of the sensors with this rate: the published ones if possible."""
     if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise InputError(f"a rate of {rate_hz:g} Hz", hint="give samples a second, above 0")
+        raise InputError(f"a rate of {rate_hz:g} Hz", hint="Give samples per second, above 0")
     published = mlx90393.Settings()
     if rate_hz <= published.max_rate_hz:
         return published
-    part = mlx90393.settings_for_rate(rate_hz, published)
-    if part is None:
+    settings = mlx90393.settings_for_rate(rate_hz, published)
+    if settings is None:
         raise InputError(
-            f"no MLX90393 gives {rate_hz:g} samples a second",
-            hint="the published recordings have 40: give the rate of the rows with --rate",
+            f"no MLX90393 gives {rate_hz:g} samples per second",
+            hint="The published recordings have 40: give the rate of the rows with --rate",
         )
     warnings.append(
-        f"the published sensors give at most {published.max_rate_hz:.0f} samples a second: for "
-        f"{rate_hz:g} they are taken to be set to {part}"
+        f"the published sensors give at most {published.max_rate_hz:.0f} samples per second; for "
+        f"{rate_hz:g}, these settings are assumed: {settings}"
     )
-    return part
+    return settings
 
 
-def _sensors(table: Table) -> list[str]:
-    """Names of the columns of sensor 1, 2, ..."""
-    found = {int(match[1]): name for name in table.columns if (match := _SENSOR.fullmatch(name))}
-    if not found:
+def _sensor_columns(table: Table) -> list[str]:
+    """Return the names of the columns of sensor 1, 2, ..."""
+    columns = {int(m[1]): name for name in table.columns if (m := _SENSOR_NAME.fullmatch(name))}
+    if not columns:
         raise FormatError(
-            "no column of a sensor",
+            "columns of sensors are missing",
             file=table.file,
             where=1,
-            hint="the header should be: ,Time Stamp,Sensor 1,Sensor 2,...",
+            hint="The header should be: ,Time Stamp,Sensor 1,Sensor 2,...",
         )
-    missing = [number for number in range(1, max(found) + 1) if number not in found]
+    missing = [number for number in range(1, max(columns) + 1) if number not in columns]
     if missing:
         raise FormatError(
-            f"missing column 'Sensor {missing[0]}'",
+            f"column 'Sensor {missing[0]}' is missing",
             file=table.file,
             where=1,
-            hint="export the table with all of its columns, or name them from 1",
+            hint="Export the table with all of its columns, or number them from 1",
         )
-    return [found[number] for number in sorted(found)]
+    return [columns[number] for number in sorted(columns)]
 
 
 def _vectors(table: Table, name: str) -> Array:
-    """One sensor's column as (n, 3) numbers; ``nan`` where a cell is empty."""
-    cells = [cell or _NOTHING for cell in table.columns[name]]
-    vectors = _parsed(cells)
+    """Return the column of a sensor as (n, 3) numbers; ``nan`` for empty cells."""
+    cells = [cell or _EMPTY_VECTOR for cell in table.columns[name]]
+    vectors = _parse_vectors(cells)
     if vectors is None:
-        row = next(row for row, cell in enumerate(cells) if _parsed([cell]) is None)
+        row = next(row for row, cell in enumerate(cells) if _parse_vectors([cell]) is None)
         table.fail(
             row,
-            f"{cells[row][:40]!r} in column {name!r} is no tuple of three numbers",
-            'write it as "(1.5, -20.25, 3)", in microtesla, or leave it empty',
+            f"{cells[row][:40]!r} in column {name!r} is not a tuple of three numbers",
+            'Write it as "(1.5, -20.25, 3)", in microtesla, or leave it empty',
         )
     return vectors
 
 
-def _parsed(cells: list[str]) -> Array | None:
-    """Cells as (n, 3) numbers; None where one is no tuple of three."""
+def _parse_vectors(cells: list[str]) -> Array | None:
+    """Parse all cells at once into (n, 3) numbers; None if a cell is not a tuple of three."""
     joined = "|".join(cells).encode("ascii", "replace")
-    # Without the letters of numbers, tuples of three are all alike.
-    if joined.translate(None, _OF_NUMBERS) != b"|".join([b"(,,)"] * len(cells)):
+    # Without the characters of numbers, all tuples of three are alike.
+    if joined.translate(None, _NUMBER_CHARACTERS) != b"|".join([b"(,,)"] * len(cells)):
         return None
     try:
         numbers = map(float, joined.translate(_TO_COMMAS).split(b","))
@@ -198,30 +201,32 @@ def _parsed(cells: list[str]) -> Array | None:
 
 
 def _times(table: Table, rate_hz: float, warnings: list[str]) -> NDArray[np.int64]:
-    """Times of the rows, in ns since the epoch."""
-    n, start = len(table), START_NS
-    stamps = table.columns.get("time stamp")
-    if stamps is not None:
-        if TIME.fullmatch(stamps[0].strip()):
-            at = table.times_ns("time stamp")
-            start = int(at[0])
-            span = (int(at[-1]) - start) * 1e-9
-            if n > 1 and abs(span * rate_hz / (n - 1) - 1) > RATES_AGREE:
-                told = f"{(n - 1) / span:.4g} samples a second" if span > 0 else "one moment"
+    """Return the times of the rows, in nanoseconds since the epoch."""
+    n, start_ns = len(table), UNDATED_START_NS
+    if TIME_COLUMN in table.columns:
+        if is_iso_time(table.columns[TIME_COLUMN][0]):
+            stamps_ns = table.iso_times_ns(TIME_COLUMN)
+            start_ns = int(stamps_ns[0])
+            duration_s = (int(stamps_ns[-1]) - start_ns) * 1e-9
+            expected_s = (n - 1) / rate_hz
+            if n > 1 and abs(duration_s / expected_s - 1) > MAX_RATE_DIFFERENCE_FRACTION:
+                stamped = "a single time"
+                if duration_s > 0:
+                    stamped = f"{(n - 1) / duration_s:.4g} samples per second"
                 warnings.append(
-                    f"the stamps tell {told}, not {rate_hz:g}: the rate that was given is used"
+                    f"the stamps show {stamped}, not {rate_hz:g}: the stated rate is used"
                 )
-            steps: NDArray[np.float64] = np.diff(at).astype(float)
+            steps: Array = np.diff(stamps_ns).astype(float)
         else:
-            steps = np.diff(table.floats("time stamp"))
+            steps = np.diff(table.floats(TIME_COLUMN))
         if (steps < 0).any():
             row = int(np.argmax(steps < 0)) + 1
-            table.fail(row, "the time stamp goes backwards", "put the rows into their order")
-    return start + np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
+            table.fail(row, "the time stamp goes backwards", "Sort the rows by time")
+    return start_ns + np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
 
 
-def _beyond(samples: Samples) -> Bad:
-    """What a sensor cannot tell: the last count of a scale is where all above it ends up."""
+def _saturated(samples: Samples) -> UnusableReadings:
+    """Find readings at the end of the scale, to which all larger fields are clipped."""
     array = samples.array
-    saturated = np.abs(samples.field_t) > array.range_t - 1.5 * array.quantum_t
-    return saturated, f"more than an {array.sensor} can tell"
+    limit_t = array.range_t - SATURATION_QUANTA * array.quantum_t
+    return np.abs(samples.field_t) > limit_t, f"a field beyond the range of an {array.sensor}"

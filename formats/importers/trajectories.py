@@ -1,36 +1,38 @@
-"""Trajectories from any file that holds some: a session, a solution, TUM, KITTI or CSV."""
+"""Trajectories from any file that contains some: a session, a solution, TUM, KITTI or CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters.trajectory_csv import COLUMNS
 from locatk.formats.files import read_bytes
+from locatk.formats.importers.kitti import KITTI_COLUMNS, read_kitti
+from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.importers.tum import TUM_COLUMNS, read_tum
 
 Kind = Literal["solution", "session", "tum", "kitti", "csv"]
 Role = Literal["estimate", "truth"]
 
 EVO_KINDS = ("tum", "kitti")
-"""What evo reads too; with two of these, poses are matched as evo does."""
+"""Formats that evo reads too; poses of two such files are associated as in evo."""
 
 MCAP_MAGIC = b"\x89MCAP"
 
 GZIP_MAGIC = b"\x1f\x8b"
 
-HEAD = 1 << 16
-"""Bytes in which the first row of a text must be."""
+HEAD_BYTES = 1 << 16
+"""Beginning of a text file that has to contain the first row."""
 
-HINT = "Give a session or solution (.mcap), or a TUM, KITTI or CSV file"
+KIND_HINT = "Give a session or solution (.mcap), or a TUM, KITTI or CSV file"
 
 
 @dataclass(frozen=True)
 class TrajectoryFile:
-    """What a file holds.
+    """Trajectories of a file.
 
     Attributes
     ----------
@@ -40,7 +42,7 @@ class TrajectoryFile:
     trajectories : list of Trajectory
         One a device.
     solved : bool
-        Whether they are poses that somebody found; False for the truth of a session.
+        False if they are the truth of a session.
     """
 
     path: Path
@@ -50,47 +52,47 @@ class TrajectoryFile:
 
 
 def read(path: Path, *, role: Role = "estimate") -> list[Trajectory]:
-    """Trajectories of a file, one a device; see :func:`open_file`."""
+    """Read the trajectories of a file, one a device; see :func:`open_file`."""
     return open_file(path, role=role).trajectories
 
 
 def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
-    """Trajectories of a file, found by what it holds.
+    """Read the trajectories of a file, whose kind is detected from its content.
 
     Parameters
     ----------
     path : path
-        A session (its truth), a solution (its poses), or text: CSV with a header as
-        :func:`locatk.formats.exporters.trajectory_text.write_csv` writes it, TUM (eight numbers
-        a line) or KITTI (twelve).
+        A session (its truth), a solution (its poses), or text: CSV with a header
+        (:func:`~locatk.formats.importers.trajectory_csv.read_csv`), TUM (eight numbers a line)
+        or KITTI (twelve).
     role : str
-        An ``"estimate"`` is the solved poses of a file that holds solved poses and truth, a
-        ``"truth"`` its truth.
+        For a file with solved poses and truth: ``"estimate"`` reads the poses, ``"truth"`` the
+        truth.
 
     Raises
     ------
     MissingDataError
-        There is no such file.
+        The file is missing.
     FormatError, InputError
-        It is none of these, holds no poses, or is damaged.
+        The file is of another kind, has no poses, or is damaged.
     """
     path = Path(path)
     if path.is_dir():
-        raise InputError("a folder where a file is expected", file=path, hint=HINT)
-    head = read_bytes(path, HEAD)
+        raise InputError("a folder instead of a file", file=path, hint=KIND_HINT)
+    head = read_bytes(path, HEAD_BYTES)
     if head.startswith(MCAP_MAGIC):
-        return _mcap(path, role)
+        return _read_mcap(path, role)
     kind = _kind_of_text(path, head)
     if kind == "csv":
-        return TrajectoryFile(path, kind, trajectories.read_csv(path), True)
-    one = trajectories.read_tum if kind == "tum" else trajectories.read_kitti
-    return TrajectoryFile(path, kind, [one(path)], True)
+        return TrajectoryFile(path, kind, read_csv(path), True)
+    trajectory = read_tum(path) if kind == "tum" else read_kitti(path)
+    return TrajectoryFile(path, kind, [trajectory], True)
 
 
 def _kind_of_text(path: Path, head: bytes) -> Literal["tum", "kitti", "csv"]:
-    """By the first row that is no comment."""
+    """Detect the kind from the first row that is not a comment."""
     if not head.strip():
-        raise FormatError("an empty file", file=path, hint=HINT)
+        raise FormatError("an empty file", file=path, hint=KIND_HINT)
     if head.startswith(GZIP_MAGIC):
         raise FormatError("a compressed file", file=path, hint="Unpack it: `gunzip`")
     lines = head.decode("utf-8-sig", "replace").splitlines()
@@ -99,75 +101,65 @@ def _kind_of_text(path: Path, head: bytes) -> Literal["tum", "kitti", "csv"]:
         if not words or words[0].startswith("#"):
             continue
         if "," in line:
-            if "time_s" in line.lower():
+            if COLUMNS[0] in line.lower():
                 return "csv"
             raise FormatError(
-                "a table without the column 'time_s'",
+                f"column {COLUMNS[0]!r} is missing",
                 file=path,
                 where=number,
-                hint=f"The header is {','.join(trajectories.COLUMNS[:9])},...",
+                hint=f"The header is {','.join(COLUMNS[:9])},...",
             )
-        if len(words) == 8:
+        if len(words) == len(TUM_COLUMNS):
             return "tum"
-        if len(words) == 12:
+        if len(words) == len(KITTI_COLUMNS):
             return "kitti"
         break
     else:
-        raise FormatError("no poses", file=path, hint=HINT)
+        raise FormatError("no poses", file=path, hint=KIND_HINT)
     raise FormatError(
-        "neither a session nor poses: the first row has "
-        + (f"{len(words)} words" if len(words) > 1 else "one word"),
+        f"neither a session nor poses: the first row has {len(words)} word{'s' * (len(words) > 1)}",
         file=path,
         where=number,
         hint="TUM has 8 numbers a row, KITTI 12, and CSV a header with time_s",
     )
 
 
-def _mcap(path: Path, role: Role) -> TrajectoryFile:
+def _read_mcap(path: Path, role: Role) -> TrajectoryFile:
+    # The MCAP reader is slow to import, and text files do not need it.
     from locatk.formats.sessions.reader import Session
     from locatk.formats.sessions.solutions import read_trajectories
 
-    kind: Kind = "solution" if Session.open(path).facts.get("kind") == "solution" else "session"
-    solved = kind == "solution" or (role == "estimate" and _holds_poses(path))
-    found = read_trajectories(path, "solution" if solved else "truth")
-    return TrajectoryFile(path, kind, found, solved)
-
-
-def _holds_poses(path: Path) -> bool:
-    """Whether a file that no solver of locatk wrote holds solved poses."""
-    from locatk.formats.sessions.reader import Session
-
     session = Session.open(path)
-    return bool(
-        session.topics("/solution/", "locatk.PoseTrack")
-        or session.topics("/pose/", "foxglove.PoseInFrame")
+    kind: Kind = "solution" if session.facts.get("kind") == "solution" else "session"
+    # Other solvers write poses into files that are not marked as solutions.
+    has_poses = session.topics("/solution/", "locatk.PoseTrack") or session.topics(
+        "/pose/", "foxglove.PoseInFrame"
     )
+    solved = kind == "solution" or (role == "estimate" and bool(has_poses))
+    trajectories = read_trajectories(path, "solution" if solved else "truth")
+    return TrajectoryFile(path, kind, trajectories, solved)
 
 
 def check_kinds(estimate: TrajectoryFile, truth: TrajectoryFile) -> None:
-    """Refuse to compare a file without times (KITTI) with one that has times.
+    """Refuse to compare a file without times (KITTI) with a file with times.
 
     Raises
     ------
     InputError
-        Only one is KITTI, or they have not as many rows.
+        Only one of them is KITTI, or both are and differ in their number of rows.
     """
     if (estimate.kind == "kitti") != (truth.kind == "kitti"):
         timeless, other = (estimate, truth) if estimate.kind == "kitti" else (truth, estimate)
         raise InputError(
-            f"KITTI tells no times, and {other.path.name} is no KITTI file",
+            f"KITTI has no times, and {other.path.name} is not a KITTI file",
             file=timeless.path,
-            hint="Give two KITTI files of the same rows, or write this one as TUM",
+            hint="Give two KITTI files with the same rows, or write this one as TUM",
         )
     if estimate.kind == "kitti":
-        mine, true = (_rows(each.trajectories) for each in (estimate, truth))
-        if mine != true:
+        rows, true_rows = (sum(map(len, each.trajectories)) for each in (estimate, truth))
+        if rows != true_rows:
             raise InputError(
-                f"{mine} rows, where {truth.path.name} has {true}",
+                f"{rows} rows, but {truth.path.name} has {true_rows}",
                 file=estimate.path,
-                hint="Rows of KITTI files belong to each other one by one: give as many of both",
+                hint="KITTI files are compared row by row: give as many rows in both",
             )
-
-
-def _rows(found: Sequence[Trajectory]) -> int:
-    return sum(len(each) for each in found)

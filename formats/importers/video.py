@@ -1,7 +1,7 @@
-"""A video file, read as the frames of a session.
+"""Video files, imported as the frames of a session.
 
-The times are those of the video: its frames keep their distances, also where the rate
-varies. Its beginning is at :data:`START_NS`.
+The times are those of the video, also if its rate varies. It begins at
+:data:`~locatk.formats.tables.timestamps.UNDATED_START_NS`.
 """
 
 from __future__ import annotations
@@ -14,14 +14,23 @@ from typing import Any
 
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError
-from locatk.formats.importers.images import START_NS, check_size
+from locatk.formats.importers.images import check_size
 from locatk.formats.sessions.frames import Shot
+from locatk.formats.tables.timestamps import UNDATED_START_NS
 
-_EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
-"""With which a Matroska file and the segment in it begin."""
+EBML_MAGIC, SEGMENT_MAGIC = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
+"""First bytes of a Matroska file and of its segment."""
 
-LOST_S = 0.5
-"""A video whose frames end so long before the duration it claims is called cut short."""
+MAX_MISSING_S = 0.5
+"""Longest time between the last frame and the claimed end of a video that is complete."""
+
+DEFAULT_STEP_NS = 33_333_333
+"""Time between frames of a video without a rate, at 30 Hz."""
+
+HEAD_BYTES = 256
+"""Beginning of a file with the sizes that its container claims."""
+
+TEXT_CHECK_BYTES = 4096
 
 
 class Video:
@@ -36,18 +45,18 @@ class Video:
     Attributes
     ----------
     warnings : list of str
-        What is lost or doubtful, one line each; grows while iterating.
+        Losses and doubts, one line each; grows while iterating.
     left_out : int
-        0: how many frames a damaged video has lost is not known.
+        0, because the number of frames that a damaged video lost is unknown.
     lost : str or None
-        Whether the end is missing, in a line; known after iterating.
+        Text on a missing end, if it is; known after iterating.
     facts : dict of str to str
         For the session's metadata.
 
     Raises
     ------
     FormatError
-        It is no video that OpenCV can read.
+        The file is not a video that OpenCV can read.
     """
 
     def __init__(self, path: Path, *, camera: Camera | None = None) -> None:
@@ -62,28 +71,28 @@ class Video:
         self.facts = {"importer": "video", "source": path.name}
 
     def __len__(self) -> int:
-        """Number of frames as the file claims, which is a guess in some formats."""
+        """Number of frames that the file claims, which some formats only estimate."""
         return self._claimed
 
     def __iter__(self) -> Iterator[Shot]:
-        """The frames, in the order of time.
+        """Yield the frames in order of time.
 
         Raises
         ------
         FormatError
-            There is none that can be read.
+            No frame is readable.
         InputError
-            They have another size than the camera.
+            Their size differs from that of the camera.
         """
         import numpy as np
 
         count = guessed = 0
         last_ns = longest_ns = 0
-        step_ns = round(1e9 / self._rate_hz) if self._rate_hz > 0 else 33_333_333
+        step_ns = round(1e9 / self._rate_hz) if self._rate_hz > 0 else DEFAULT_STEP_NS
         with _capture(self._path) as (capture, cv2):
             while True:
-                there, picture = capture.read()
-                if not there:
+                has_frame, picture = capture.read()
+                if not has_frame:
                     break
                 time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                 if count and time_ns <= last_ns:
@@ -102,39 +111,39 @@ class Video:
                     raise InputError(
                         error.message, file=self._path, hint="Compare the --camera with the video"
                     ) from None
-                yield Shot(START_NS + max(0, time_ns), str(count), pixels)
+                yield Shot(UNDATED_START_NS + max(0, time_ns), str(count), pixels)
                 count += 1
         if count == 0:
             raise FormatError(
-                "no frame of the video can be read", file=self._path, hint="Is it cut short?"
+                "no frame of the video is readable", file=self._path, hint="Is it cut short?"
             )
         if guessed:
             self.warnings.append(
-                f"{self._path}: {guessed} frames without a time of their own, placed by the rate"
+                f"{self._path}: {guessed} frames without a time; their times follow from the rate"
             )
         missing_s = self._claimed / self._rate_hz - last_ns / 1e9 if self._rate_hz > 0 else 0.0
         if is_cut(self._path):
-            self.lost = f"{self._path}: cut short after {count} frames"
-        # The duration of a Matroska file counts from 0, wherever its first frame is.
-        elif missing_s > max(LOST_S, 2e-9 * longest_ns) and not _is_matroska(self._path):
-            self.lost = f"{self._path}: the frames end {missing_s:.1f} s before the video should"
+            self.lost = f"{self._path}: truncated after {count} frames"
+        # The duration of a Matroska file counts from 0, even if its first frame is later.
+        elif missing_s > max(MAX_MISSING_S, 2e-9 * longest_ns) and not _is_matroska(self._path):
+            self.lost = f"{self._path}: the frames end {missing_s:.1f} s before the claimed end"
         if self.lost is not None:
             self.warnings.append(self.lost)
 
 
 def is_cut(path: Path) -> bool:
-    """Whether a video file ends before what its container says.
+    """Return whether a video file is shorter than its container claims.
 
-    Told by MP4 and MOV (boxes), MKV and WebM (segment) and AVI (RIFF); False for others,
-    and where a live recording has left the size open.
+    MP4 and MOV (boxes), MKV and WebM (segment) and AVI (RIFF) contain their size. False for
+    others, and if a live recording left the size open.
     """
     size = path.stat().st_size
     with open(path, "rb") as stream:
-        head = stream.read(256)
+        head = stream.read(HEAD_BYTES)
         if head[:4] == b"RIFF":
             claimed = int.from_bytes(head[4:8], "little")
             return claimed not in (0, 0xFFFFFFFF) and 8 + claimed > size
-        if head[:4] == _EBML:
+        if head[:4] == EBML_MAGIC:
             return _segment_end(head) > size
         if head[4:8] != b"ftyp":
             return False
@@ -153,21 +162,21 @@ def is_cut(path: Path) -> bool:
 
 def _is_matroska(path: Path) -> bool:
     with open(path, "rb") as stream:
-        return stream.read(len(_EBML)) == _EBML
+        return stream.read(len(EBML_MAGIC)) == EBML_MAGIC
 
 
 def _segment_end(head: bytes) -> int:
-    """Where the segment of a Matroska file ends, 0 where it does not say."""
-    segment = _element_end(head, len(_EBML))
-    if segment is None or head[segment : segment + 4] != _SEGMENT:
+    """Return the end of the segment of a Matroska file, 0 if unknown."""
+    segment = _element_end(head, len(EBML_MAGIC))
+    if segment is None or head[segment : segment + 4] != SEGMENT_MAGIC:
         return 0
     return _element_end(head, segment + 4) or 0
 
 
 def _element_end(head: bytes, position: int) -> int | None:
-    """Where the Matroska element ends whose size stands at ``position``, if it says so.
+    """Return the end of the Matroska element whose size is at ``position``; None if unknown.
 
-    RFC 8794, 4: the leading zero bits of a size tell how many bytes it has.
+    The number of leading zero bits of a size is its length in bytes minus one (RFC 8794, 4).
     """
     first = head[position] if position < len(head) else 0
     length = 9 - first.bit_length()
@@ -177,10 +186,10 @@ def _element_end(head: bytes, position: int) -> int | None:
 
 
 def _is_text(path: Path) -> bool:
-    """Whether a file is plain text, of which FFmpeg would make a video of a terminal."""
+    """Return whether a file is plain text, which FFmpeg would render as a video of a terminal."""
     try:
         with open(path, "rb") as stream:
-            head = stream.read(4096)
+            head = stream.read(TEXT_CHECK_BYTES)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", file=path) from None
     return all(byte > 31 or byte in b"\t\n\v\f\r\x1b" for byte in head)
@@ -188,25 +197,25 @@ def _is_text(path: Path) -> bool:
 
 @contextmanager
 def _capture(path: Path) -> Iterator[tuple[Any, Any]]:
-    """The opened video and OpenCV, which says nothing on its own meanwhile."""
-    # Read by the library when it opens its first video; -8 is silence.
+    """Open a video and OpenCV, which prints nothing meanwhile."""
+    # The library reads this when it opens its first video; -8 means quiet.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     import cv2
 
-    # Where these two are moved from OpenCV 4 to 5.
+    # OpenCV 5 moved these two functions.
     logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
     level = logging.getLogLevel()
     logging.setLogLevel(0)  # silent
     capture = cv2.VideoCapture()
     try:
-        # As an absolute path no file name is taken for an address on the network.
+        # An absolute path is never mistaken for a network address.
         opened = not _is_text(path) and capture.open(os.path.abspath(path), cv2.CAP_FFMPEG)
         if opened:
-            # Pixels stay where the sensor had them, as in image files.
+            # Pixels stay at their positions on the sensor, as in image files.
             capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         else:
             raise FormatError(
-                "not a video that can be read",
+                "not a readable video",
                 file=path,
                 hint="Give MP4, MKV, AVI or WebM; `locatk import images` takes image files",
             )

@@ -1,1 +1,8 @@
-"""Tables of columns: CSV and similar text."""
+"""Tables of columns in text files, read strictly.
+
+=================  ===============================================================================
+``delimited``      text to cells and numbers; errors name file, line and column
+``quantities``     names of columns to quantities and SI units: ``x_mm``, ``heading [deg]``
+``timestamps``     epoch seconds and ISO 8601 times to nanoseconds, exactly
+=================  ===============================================================================
+"""

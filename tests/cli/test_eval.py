@@ -15,7 +15,9 @@ import pytest
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters.kitti import write_kitti
+from locatk.formats.exporters.trajectory_csv import write_csv
+from locatk.formats.exporters.tum import write_tum
 from locatk.formats.sessions.solutions import write_solution
 from locatk.formats.sessions.trajectories import truth_messages, write_streams
 from locatk.formats.sessions.writer import SessionWriter
@@ -172,9 +174,9 @@ def test_devices_of_other_names(locatk, tmp_path: Path) -> None:
 
 
 def test_any_file_on_either_side(locatk, run: Path, found: Path, tmp_path: Path) -> None:
-    trajectories.write_tum(tmp_path / "solved.txt", solved())
-    trajectories.write_csv(tmp_path / "solved.csv", [solved()])
-    trajectories.write_tum(tmp_path / "truth.txt", drive())
+    write_tum(tmp_path / "solved.txt", solved())
+    write_csv(tmp_path / "solved.csv", [solved()])
+    write_tum(tmp_path / "truth.txt", drive())
     expected = answer(locatk, found, "--truth", run)["rmse_m"]
     for mine in ("solved.mcap", "solved.csv", "solved.txt"):
         for true in ("run.mcap", "truth.txt"):
@@ -188,8 +190,8 @@ def test_any_file_on_either_side(locatk, run: Path, found: Path, tmp_path: Path)
 
 
 def test_kitti_is_compared_row_by_row(locatk, tmp_path: Path) -> None:
-    trajectories.write_kitti(tmp_path / "a.txt", solved())
-    trajectories.write_kitti(tmp_path / "b.txt", drive())
+    write_kitti(tmp_path / "a.txt", solved())
+    write_kitti(tmp_path / "b.txt", drive())
     said = answer(locatk, tmp_path / "a.txt", "--truth", tmp_path / "b.txt")
     assert (said["n"], said["match"], said["coverage"]["share"]) == (N, "nearest", 1.0)
     assert said["rmse_m"] == pytest.approx(1.4e-3, rel=0.1)
@@ -300,7 +302,7 @@ def test_the_longest_gap_is_chosen(locatk, found: Path, tmp_path: Path) -> None:
     slow = tmp_path / "slow.csv"
     part = unknown(drive())
     rows = np.arange(0, N, 20)
-    trajectories.write_csv(slow, [part.select(np.isin(np.arange(N), rows))])
+    write_csv(slow, [part.select(np.isin(np.arange(N), rows))])
     assert answer(locatk, found, "--truth", slow)["n"] == len(rows)
     bridged = answer(locatk, found, "--truth", slow, "--max-gap", 1)
     assert bridged["n"] == rows[-1] + 1
@@ -311,8 +313,8 @@ def test_a_single_pose_and_what_comes_late_are_said_in_words(
     locatk, run: Path, tmp_path: Path
 ) -> None:
     one, late = tmp_path / "one.csv", tmp_path / "late.csv"
-    trajectories.write_csv(one, [solved().select(np.arange(N) == 5)])
+    write_csv(one, [solved().select(np.arange(N) == 5)])
     assert "The one pose with truth lies" in locatk("eval", one, "--truth", run).stdout
-    trajectories.write_csv(late, [solved(late_ns=-5_000_000_000_000)])
+    write_csv(late, [solved(late_ns=-5_000_000_000_000)])
     said = locatk("eval", late, "--truth", run).stderr
     assert "starts 5000.000 s before the truth" in said

@@ -13,11 +13,13 @@ import pytest
 
 from locatk.cli import export
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.exporters import export as exports
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.importers.tum import read_tum
 from locatk.formats.sessions.solutions import read_solution, write_solution
 from locatk.formats.sessions.writer import SessionWriter
+from locatk.formats.tables.timestamps import parse_decimal_time
 
 POSES = 20
 
@@ -79,14 +81,14 @@ def test_kitti_keeps_the_times_beside_the_matrices(locatk, solved: Path, tmp_pat
     matrices = np.loadtxt(out).reshape(-1, 3, 4)
     assert np.array_equal(matrices[:, :, 3], wanted.position)
     times = (tmp_path / "poses.times.txt").read_text().splitlines()
-    assert [trajectories.parse_time(time) for time in times] == wanted.time_ns.tolist()
+    assert [parse_decimal_time(time) for time in times] == wanted.time_ns.tolist()
     # The times are guarded like the poses.
     out.unlink()
     assert locatk("export", solved, "--format", "kitti", "-o", out).exit_code == 1
     assert not out.exists()
 
 
-def exports_of(path: Path) -> list[trajectories.Trajectory]:
+def exports_of(path: Path) -> list[Trajectory]:
     from locatk.formats.sessions.solutions import read_trajectories
 
     return read_trajectories(path)
@@ -131,7 +133,7 @@ def test_a_session_gives_its_reference_poses(locatk, session: Path, tmp_path: Pa
     out = tmp_path / "truth.tum"
     assert locatk("export", session, "--format", "tum", "-o", out).exit_code == 0
     [truth] = exports_of(session)
-    assert np.array_equal(trajectories.read_tum(out).position, truth.position)
+    assert np.array_equal(read_tum(out).position, truth.position)
 
 
 def test_stdout_gets_the_same_text_as_a_file(locatk, two: Path, tmp_path: Path) -> None:

@@ -275,7 +275,7 @@ def test_a_crazyflie_config_becomes_a_scene(locatk, tmp_path: Path) -> None:
     empty.write_text(CONFIG[: CONFIG.index("geos")])
     result = locatk("import", "crazyflie-config", empty, "-o", tmp_path / "empty.toml")
     assert result.exit_code == 0
-    assert "holds no station" in result.stderr
+    assert "has no station" in result.stderr
     damaged = tmp_path / "damaged.yaml"
     damaged.write_text(CONFIG[:120])
     result = locatk("import", "crazyflie-config", damaged, "-o", out, "--overwrite")

@@ -12,7 +12,7 @@ from locatk.core.lighthouse import solve
 from locatk.core.solution import Solution
 from locatk.formats.benchmarks import Figure
 from locatk.formats.benchmarks.timing import cpu_seconds
-from locatk.formats.importers.libsurvive.device import read_stored
+from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.lighthouse import ImportedSession
 
@@ -42,7 +42,7 @@ def figures(data: Path) -> list[Figure]:
 
 
 def _calibrations(session: ImportedSession, path: Path) -> Figure:
-    stored = read_stored(path.with_name(path.name + ".json"))
+    stored = read_stored_calibrations(path.with_name(path.name + ".json"))
     differ = 0
     for station in session.stations:
         known = None if station.id is None else stored.get(station.id)

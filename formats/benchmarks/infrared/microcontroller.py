@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.recording import Edges
 from locatk.formats.benchmarks import Figure
-from locatk.formats.importers.saleae.capture import read_light
+from locatk.formats.importers.saleae.recording import read_light
 
 Array = NDArray[np.float64]
 

@@ -45,7 +45,7 @@ from locatk.formats.benchmarks.infrared.libsurvive import figures as survive_fig
 from locatk.formats.benchmarks.infrared.microcontroller import STAGES
 from locatk.formats.benchmarks.infrared.microcontroller import figures as microcontroller_figures
 from locatk.formats.benchmarks.timing import alone, cpu_seconds
-from locatk.formats.importers.saleae.capture import read_light
+from locatk.formats.importers.saleae.recording import read_light
 
 DOTBOT = "DotBot C, its best window"
 RUN_LENGTH = "plain run lengths"

@@ -27,7 +27,8 @@ from locatk.core.geometry import (
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks import Figure
 from locatk.formats.benchmarks.timing import SEED, cpu_seconds
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters.tum import write_tum
+from locatk.formats.importers.tum import read_tum
 
 POSES = 100_000
 COMPARED = 5_000
@@ -129,13 +130,13 @@ def write(folder: Path, n: int) -> None:
         quaternion_from_matrix(away @ noise @ matrix_from_quaternion(quaternion)),
         unknown,
     )
-    trajectories.write_tum(folder / "truth.tum", truth, overwrite=True)
-    trajectories.write_tum(folder / "estimate.tum", estimate, overwrite=True)
+    write_tum(folder / "truth.tum", truth, overwrite=True)
+    write_tum(folder / "estimate.tum", estimate, overwrite=True)
 
 
 def _own(folder: Path) -> float:
-    truth = trajectories.read_tum(folder / "truth.tum")
-    estimate = trajectories.read_tum(folder / "estimate.tum")
+    truth = read_tum(folder / "truth.tum")
+    estimate = read_tum(folder / "estimate.tum")
     options = EvaluationOptions(align="se3", match="nearest")
     return cpu_seconds(lambda: evaluate([(estimate, truth)], options))
 
@@ -149,7 +150,7 @@ def _difference(evo: Evo, folder: Path) -> Figure:
     largest, count = 0.0, 0
     for align, options in ALIGNMENTS.items():
         said = evaluate(
-            [(trajectories.read_tum(estimate), trajectories.read_tum(truth))],
+            [(read_tum(estimate), read_tum(truth))],
             EvaluationOptions(align=align, match="nearest"),
         ).as_dict()
         for metric, program in (("ape", evo.ape), ("rpe", evo.rpe)):

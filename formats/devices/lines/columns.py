@@ -1,380 +1,289 @@
-"""What the columns of a line of text mean, by their names; and a recording as such lines.
+"""Quantities in the columns of a line of text, by their names.
 
-One spelling for the project: a quantity, then its unit as in :mod:`..importers.columns`
-(``x_mm``, ``x [mm]``, ``x(mm)``), in capitals or not.
+A name is a quantity with its unit (:mod:`locatk.formats.tables.quantities`): ``x_mm``, ``x [mm]``,
+``x(mm)``, in capitals or not.
 
 =================================  =======================================================
 ``t``, ``time``, ``timestamp``     with s, ms, us or ns: the device's clock (a tick, in
                                    microseconds). Also ``millis`` and ``micros``
-``seq``, ``sequence``              its counter of samples: tells what was lost
+``seq``, ``sequence``              its counter of samples, which shows losses
 ``b<k>x``, ``b<k>y``, ``b<k>z``    with t, mt, ut, nt or gauss: magnetometer k, from 0 or 1
-                                   on; all three axes of all. ``bx``, ``by``, ``bz`` where
+                                   on; all three axes of each. ``bx``, ``by``, ``bz`` if
                                    there is only one
 ``temperature``, ``temp``          with c: of the magnetometers
 ``hall_<name>``                    with t, mt, ut, nt or gauss: a hall sensor, positive
-                                   upward. Front, left, rear and right in this order, others
-                                   as they come
+                                   upward. Front, left, rear and right are sorted, other
+                                   names keep their order
 ``x``, ``y``, ``heading``          with m, cm, mm and rad, deg: odometry; all three
 =================================  =======================================================
 
-Every other column is a reading, with the number as it is. So is what has no unit: what a
-name does not tell is not guessed.
+Every other column is a reading, with the number unchanged. So is a column without a unit, because
+a unit is never guessed.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import InputError
-from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import NAMES
-from locatk.formats.devices.decoder import Batch, Recording, Stream, Ticks
-from locatk.formats.tables.columns import TIMES, UNITS
+from locatk.formats.devices.decoder import Batch, Stream, Ticks
+from locatk.formats.tables.quantities import TIME_NAMES, UNITS, ColumnKind, match_column
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 TICK_HZ = 1e6
+"""Rate of the ticks of all records: the device's clock is converted to microseconds."""
 
-INFO = 2
-"""Level of what a device prints, in the log."""
+NANOSECONDS_PER_TICK = 1e3
 
-FIELD = {unit: factor for unit, factor in UNITS["field"].items() if unit not in ("v", "mv")}
-FIELD["nt"] = 1e-9
+MAX_TICK = 2.0**62
+"""Larger clocks are damaged."""
 
-_UNIT = re.compile(r"(.+?)(?:_([a-z]+)| ?\[([a-z]+)\]| ?\(([a-z]+)\))")
-_AXIS = re.compile(r"b(\d{0,3})_?([xyz])", re.ASCII)
-_TIMERS = {"millis": 1e3, "micros": 1.0}
-_NO_TIME = 2.0**62
+COLUMN_KINDS = (
+    ColumnKind("sequence", re.compile("seq|sequence")),
+    ColumnKind("clock", re.compile("millis"), factor=UNITS["time"]["ms"]),
+    ColumnKind("clock", re.compile("micros"), factor=UNITS["time"]["us"]),
+    ColumnKind("clock", re.compile("|".join(TIME_NAMES)), ("time",)),
+    ColumnKind("magnetometers", re.compile(r"b(\d{0,3})_?([xyz])", re.ASCII), ("field",)),
+    ColumnKind("halls", re.compile("hall_(.*)"), ("field",)),
+    ColumnKind("odometry", re.compile("(x|y)"), ("length",)),
+    ColumnKind("odometry", re.compile("(heading)"), ("angle",)),
+    ColumnKind("temperature", re.compile("temperature|temp"), ("temperature",)),
+)
+"""Columns with a meaning, in the order in which they are tried."""
+
+WITH_UNIT_REMARK = ("magnetometers", "halls")
+"""Kinds whose names are so special that a missing unit is remarked."""
+
+POSE_KEYS = ("x", "y", "heading")
+
+
+class SiColumn(NamedTuple):
+    """Number of a column in the line, from 0, and its factor to SI (clock: to nanoseconds)."""
+
+    number: int
+    factor: float
+
+
+Columns = Mapping[tuple[str, ...], SiColumn]
+"""Columns of one kind by key, in the order of the line."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Records of one kind: from which columns of a line, and what they are in SI."""
+    """Records of one stream: the columns of a line that they are taken from."""
 
     stream: Stream
-    columns: tuple[int, ...]
-    factors: tuple[float, ...]
+    columns: tuple[SiColumn, ...]
+
+    def values(self, lines: Array) -> Array:
+        """Return the values (n, width) of lines (n, columns), in SI; ``nan`` if unknown."""
+        index = [column.number for column in self.columns]
+        values = lines[:, index] * np.array([column.factor for column in self.columns])
+        if self.stream.kind != "readings":
+            values[np.isinf(values)] = np.nan
+        return values
+
+    def fields(self, values: Array) -> dict[str, NDArray[Any]]:
+        """Return values (n, width) as columns of a :class:`Batch`."""
+        if self.stream.kind == "odometry":
+            return {"x_m": values[:, 0], "y_m": values[:, 1], "heading_rad": values[:, 2]}
+        return {"value" if self.stream.kind == "readings" else "b_tesla": values}
 
 
 @dataclass(frozen=True)
-class Meaning:
-    """What the columns of a line are.
+class ColumnLayout:
+    """Interpretation of the columns of a line.
 
     Attributes
     ----------
     names : tuple of str
     parts : tuple of Part
-    tick : (int, float) or None
-        Column of the device's clock, and its unit in microseconds.
-    sequence : int or None
-        Column of its counter.
-    temperature : int or None
-        Column of the temperature of the magnetometers.
-    doubts : tuple of str
-        Columns that look like more than the readings that they are kept as.
+    clock, sequence, temperature : SiColumn or None
+        Columns of the device's clock, of its counter, and of the temperature of the
+        magnetometers.
+    remarks : tuple of str
+        Columns whose names suggest more than the readings that they are kept as.
     """
 
     names: tuple[str, ...]
     parts: tuple[Part, ...]
-    tick: tuple[int, float] | None
-    sequence: int | None
-    temperature: int | None
-    doubts: tuple[str, ...]
+    clock: SiColumn | None
+    sequence: SiColumn | None
+    temperature: SiColumn | None
+    remarks: tuple[str, ...]
 
     @property
-    def told(self) -> bool:
-        """Whether a name says more than that there is a reading."""
-        readings = all(part.stream.kind == "readings" for part in self.parts)
-        return not readings or self.tick is not None or self.sequence is not None
+    def has_meaning(self) -> bool:
+        """True if any column is more than a reading."""
+        only_readings = all(part.stream.kind == "readings" for part in self.parts)
+        return not only_readings or self.clock is not None or self.sequence is not None
 
-    def records(self, values: Array, end: Ints, wide: bool) -> tuple[list[Batch], bool]:
-        """Batches of lines (n, columns) that end at ``end`` (n,), and ``wide`` as it is then.
+    def ticks(self, lines: Array) -> Array | None:
+        """Return the clock (n,) of lines (n, columns) in microseconds; None without a clock."""
+        if self.clock is None:
+            return None
+        return lines[:, self.clock.number] * (self.clock.factor / NANOSECONDS_PER_TICK)
 
-        ``wide`` says that the clock has counted beyond 32 bits: microseconds do so after 71
-        minutes, and many devices start again at 0 there.
+    def sequences(self, lines: Array) -> Array | None:
+        """Return the counter (n,) of lines (n, columns); None without a counter."""
+        return None if self.sequence is None else lines[:, self.sequence.number]
+
+    def is_damaged(self, lines: Array) -> NDArray[np.bool_]:
+        """Return the lines (n,) with an impossible clock or counter."""
+        damaged = np.zeros(len(lines), bool)
+        tick, sequence = self.ticks(lines), self.sequences(lines)
+        if tick is not None:
+            damaged |= ~((tick >= 0) & (tick < MAX_TICK))
+        if sequence is not None:
+            is_counter = (sequence >= 0) & (sequence < 1 << 32) & (np.rint(sequence) == sequence)
+            damaged |= ~is_counter
+        return damaged
+
+    def batches(self, lines: Array, end: Ints, is_wide: bool) -> tuple[list[Batch], bool]:
+        """Return the records of lines.
+
+        Parameters
+        ----------
+        lines : (n, columns) ndarray
+        end : (n,) int64 ndarray
+            Bytes up to the end of each line.
+        is_wide : bool
+            True once the clock has exceeded 32 bits. A clock in microseconds does so after 71
+            minutes, and many devices restart at 0 then.
+
+        Returns
+        -------
+        (list of Batch, bool)
+            The second is ``is_wide`` after these lines.
         """
-        tick = None if self.tick is None else _whole(values[:, self.tick[0]] * self.tick[1])
-        sequence = None if self.sequence is None else _whole(values[:, self.sequence])
-        narrow = len(end)
-        if tick is not None and self.tick is not None:
-            beyond = tick >= 1 << 32
-            if wide or self.tick[1] != 1:
+        n = len(end)
+        tick, sequence = (
+            None if values is None else np.rint(values).astype(np.int64)
+            for values in (self.ticks(lines), self.sequences(lines))
+        )
+        narrow = n
+        if tick is not None and self.clock is not None:
+            is_beyond = tick >= 1 << 32
+            if is_wide or self.clock.factor != NANOSECONDS_PER_TICK:
                 narrow = 0
-            elif beyond.any():
-                narrow = int(np.argmax(beyond))
-            wide |= narrow < len(end)
+            elif is_beyond.any():
+                narrow = int(np.argmax(is_beyond))
+            is_wide |= narrow < n
         batches = []
-        for rows, bits in ((slice(0, narrow), 32), (slice(narrow, None), 64)):
-            if len(end[rows]):
-                ticks = None if tick is None else Ticks(TICK_HZ, bits)
-                for part in self.parts:
-                    batch = self._batch(part, ticks, values[rows], end[rows], tick, sequence, rows)
-                    batches += [batch] if len(batch) else []
-        return batches, wide
-
-    def wrong(self, values: Array) -> NDArray[np.bool_]:
-        """(n,) lines whose clock or counter cannot be."""
-        wrong = np.zeros(len(values), bool)
-        if self.tick is not None:
-            tick = values[:, self.tick[0]] * self.tick[1]
-            wrong |= ~((tick >= 0) & (tick < _NO_TIME))
-        if self.sequence is not None:
-            sequence = values[:, self.sequence]
-            wrong |= ~((sequence >= 0) & (sequence < 1 << 32) & (np.rint(sequence) == sequence))
-        return wrong
+        for rows, bits in ((np.arange(narrow), 32), (np.arange(narrow, n), 64)):
+            clock = None if tick is None else Ticks(TICK_HZ, bits)
+            for part in self.parts if len(rows) else ():
+                batches += self._batch(part, clock, lines, end, tick, sequence, rows)
+        return batches, is_wide
 
     def _batch(
         self,
         part: Part,
-        ticks: Ticks | None,
-        values: Array,
+        clock: Ticks | None,
+        lines: Array,
         end: Ints,
         tick: Ints | None,
         sequence: Ints | None,
-        rows: slice,
-    ) -> Batch:
-        """Lines in which there is something of this kind."""
-        stream = part.stream
-        ours = values[:, part.columns] * np.array(part.factors)
-        if stream.kind != "readings":
-            ours[np.isinf(ours)] = np.nan
-        gone = np.isnan(ours)
-        kept = ~(gone.any(axis=1) if stream.kind == "odometry" else gone.all(axis=1))
-        ours = ours[kept]
-        columns: dict[str, NDArray[Any]]
-        if stream.kind == "odometry":
-            columns = {"x_m": ours[:, 0], "y_m": ours[:, 1], "heading_rad": ours[:, 2]}
-        elif stream.kind == "readings":
-            columns = {"value": ours}
-        else:
-            columns = {"b_tesla": ours}
-        if stream.kind == "magnetometers" and self.temperature is not None:
-            columns["temperature_celsius"] = values[kept, self.temperature]
-        return Batch(
-            Stream(stream.kind, "", stream.sensors, stream.names, ticks),
-            end[kept],
-            columns,
-            None if tick is None else tick[rows][kept],
-            None if sequence is None else sequence[rows][kept],
-        )
-
-
-def _whole(values: Array) -> Ints:
-    return np.rint(values).astype(np.int64)
-
-
-def split_unit(name: str) -> tuple[str, str]:
-    """A column's name without its unit, and the unit, ``""`` where it has none; small letters.
-
-    Examples
-    --------
-    >>> split_unit("B0X_uT"), split_unit("heading [deg]"), split_unit("hall_left")
-    (('b0x', 'ut'), ('heading', 'deg'), ('hall_left', ''))
-    """
-    plain = name.strip().lower().replace("\u00b5", "u").replace("\u03bc", "u")
-    match = _UNIT.fullmatch(plain)
-    unit = "" if match is None else match[2] or match[3] or match[4]
-    known = unit in FIELD or unit in ("c", "celsius") or any(unit in of for of in UNITS.values())
-    return (match[1], unit) if match and known else (plain, "")
-
-
-def meaning(names: Sequence[str]) -> Meaning:
-    """What columns of these names are; see the module."""
-    tick: tuple[int, float] | None = None
-    sequence: int | None = None
-    temperature: int | None = None
-    axes: dict[tuple[int, str], tuple[int, float]] = {}
-    halls: dict[str, tuple[int, float]] = {}
-    pose: dict[str, tuple[int, float]] = {}
-    no_unit = []
-    for place, name in enumerate(names):
-        bare, unit = split_unit(name)
-        axis = _AXIS.fullmatch(bare)
-        if bare in ("seq", "sequence") and not unit and sequence is None:
-            sequence = place
-        elif bare in _TIMERS and not unit and tick is None:
-            tick = place, _TIMERS[bare]
-        elif bare in TIMES and unit in UNITS["time"] and tick is None:
-            tick = place, UNITS["time"][unit] / 1e3
-        elif axis and unit in FIELD:
-            axes.setdefault((int(axis[1] or 0), axis[2]), (place, FIELD[unit]))
-        elif bare.startswith("hall_") and unit in FIELD:
-            halls.setdefault(bare[5:], (place, FIELD[unit]))
-        elif bare in ("x", "y") and unit in UNITS["length"]:
-            pose.setdefault(bare, (place, UNITS["length"][unit]))
-        elif bare == "heading" and unit in UNITS["angle"]:
-            pose.setdefault(bare, (place, UNITS["angle"][unit]))
-        elif bare in ("temperature", "temp") and unit in ("c", "celsius"):
-            temperature = place if temperature is None else temperature
-        elif not unit and (axis or bare.startswith("hall_")):
-            no_unit.append(name)
-    doubts = []
-    if no_unit:
-        doubts.append(f"no unit in the name of column {no_unit[0]!r}: name it {no_unit[0]}_ut")
-    parts = []
-    numbers = sorted({number for number, _ in axes})
-    if (
-        axes
-        and len(axes) == 3 * len(numbers)
-        and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-        and numbers[0] <= 1
-    ):
-        found = [axes[number, axis] for number in numbers for axis in "xyz"]
-        parts.append(_part(Stream("magnetometers", sensors=len(numbers)), found))
-    elif axes:
-        temperature = None
-        doubts.append(
-            "columns of magnetometers that are not x, y and z of each, from 0 or 1 on without a gap"
-        )
-    else:
-        temperature = None
-    if halls:
-        known = set(halls) <= set(NAMES)
-        order = [name for name in NAMES if name in halls] if known else list(halls)
-        stream = Stream("halls", sensors=len(order), names=tuple(order))
-        parts.append(_part(stream, [halls[name] for name in order]))
-    if len(pose) == 3:
-        parts.append(_part(Stream("odometry"), [pose[key] for key in ("x", "y", "heading")]))
-    elif pose:
-        doubts.append("columns of odometry that are not x, y and heading, each with its unit")
-    used = {sequence, temperature, None if tick is None else tick[0]}
-    used |= {column for part in parts for column in part.columns}
-    rest = [place for place in range(len(names)) if place not in used]
-    if rest:
-        stream = Stream("readings", names=tuple(names[place] for place in rest))
-        parts.append(_part(stream, [(place, 1.0) for place in rest]))
-    return Meaning(tuple(names), tuple(parts), tick, sequence, temperature, tuple(doubts))
-
-
-def _part(stream: Stream, found: Sequence[tuple[int, float]]) -> Part:
-    return Part(stream, tuple(place for place, _ in found), tuple(factor for _, factor in found))
-
-
-def points(stream: Stream, found: Sequence[tuple[int, int, list[float]]]) -> Batch:
-    """Readings of which each came alone: end, tick and values."""
-    end, tick, values = (np.array(part) for part in zip(*found, strict=True))
-    return Batch(stream, end, {"value": values}, None if stream.ticks is None else tick)
-
-
-def log(found: Sequence[tuple[int, str]]) -> Batch:
-    """Lines of the log: end and text."""
-    text = np.empty(len(found), object)
-    text[:] = [line for _, line in found]
-    columns: dict[str, NDArray[Any]] = {"level": np.full(len(found), INFO), "text": text}
-    return Batch(Stream("log"), np.array([end for end, _ in found], np.int64), columns)
-
-
-def merged(batches: Sequence[Batch]) -> list[Batch]:
-    """The same records with those of a stream together, in the order of their lines; in
-    several batches where only some tell a temperature or a count."""
-    streams: dict[Stream, list[Batch]] = {}
-    for batch in batches:
-        streams.setdefault(batch.stream, []).append(batch)
-    return [batch for several in streams.values() for batch in _joined(several)]
-
-
-def _joined(several: list[Batch]) -> list[Batch]:
-    if len(several) == 1:
-        return several
-    said = [_fields(batch) for batch in several]
-    forms = [tuple(fields) for fields in said]
-    form = np.repeat([forms.index(each) for each in forms], [len(batch) for batch in several])
-    every = {
-        name: np.concatenate([f.get(name, np.zeros(len(f["end"]), np.int64)) for f in said])
-        for name in {name for names in forms for name in names}
-    }
-    order = np.argsort(every["end"], kind="stable")
-    batches = []
-    for run in np.split(order, np.flatnonzero(np.diff(form[order])) + 1):
-        fields = {name: every[name][run] for name in forms[form[run[0]]]}
-        own = {name: fields.pop(name, None) for name in ("tick", "sequence")}
-        batches.append(Batch(several[0].stream, fields.pop("end"), fields, **own))
-    return batches
-
-
-def _fields(batch: Batch) -> dict[str, NDArray[Any]]:
-    fields = {"end": batch.end, "tick": batch.tick, "sequence": batch.sequence, **batch.columns}
-    return {name: array for name, array in fields.items() if array is not None}
-
-
-def encode(recording: Recording) -> Iterator[tuple[int, bytes]]:
-    """A recording as CSV, its columns named as above: a header, then one line a time at
-    which anything was measured, with empty cells for what was not.
-
-    The clock, ``time_us``, counts from the first line. Fields are in microtesla.
-
-    Returns
-    -------
-    iterator of (int, bytes)
-        When what a line says was measured, in ns, and the line.
-
-    Raises
-    ------
-    InputError
-        The recording has neither samples of a field nor odometry, or several devices of a
-        kind: a line tells of one.
-    """
-    columns: list[tuple[str, Ints, Array, str]] = []
-    for kind, several in _kinds(recording).items():
-        if len(several) > 1:
-            raise InputError(
-                f"{kind} of {len(several)} devices, where a line tells of one",
-                hint="Emulate the device locatk, whose frames have a node each",
+        rows: Ints,
+    ) -> list[Batch]:
+        """Return the records of one part in some rows: of odometry complete ones only."""
+        values = part.values(lines[rows])
+        is_empty = np.isnan(values)
+        is_odometry = part.stream.kind == "odometry"
+        has_record = ~(is_empty.any(axis=1) if is_odometry else is_empty.all(axis=1))
+        rows = rows[has_record]
+        if not len(rows):
+            return []
+        fields = part.fields(values[has_record])
+        if part.stream.kind == "magnetometers" and self.temperature is not None:
+            fields["temperature_celsius"] = lines[rows, self.temperature.number]
+        stream = Stream(part.stream.kind, "", part.stream.sensors, part.stream.names, clock)
+        return [
+            Batch(
+                stream,
+                end[rows],
+                fields,
+                None if tick is None else tick[rows],
+                None if sequence is None else sequence[rows],
             )
-        columns += several[0] if several else []
-    columns = [column for column in columns if len(column[1])]
+        ]
+
+
+def interpret_columns(names: Sequence[str]) -> ColumnLayout:
+    """Interpret the names of columns; see the module. If a quantity repeats, its first is used."""
+    by_kind: dict[str, dict[tuple[str, ...], SiColumn]] = {kind.field: {} for kind in COLUMN_KINDS}
+    remarks: list[str] = []
+    for index, name in enumerate(names):
+        match = match_column(name, COLUMN_KINDS)
+        if match is None:
+            continue
+        kind = match.kind.field
+        if not math.isnan(match.factor):
+            by_kind[kind].setdefault(match.key, SiColumn(index, match.factor))
+        elif kind in WITH_UNIT_REMARK and not remarks:
+            remarks.append(f"the unit of column {name!r} is missing: name it {name}_ut")
+    parts = []
+    for kind, interpret in (
+        ("magnetometers", _magnetometers),
+        ("halls", _halls),
+        ("odometry", _odometry),
+    ):
+        part, remark = interpret(by_kind[kind])
+        parts += [part] if part else []
+        remarks += [remark] if remark else []
+    has_magnetometers = any(part.stream.kind == "magnetometers" for part in parts)
+    clock, sequence = (by_kind[kind].get(()) for kind in ("clock", "sequence"))
+    temperature = by_kind["temperature"].get(()) if has_magnetometers else None
+    used = {column.number for part in parts for column in part.columns}
+    used |= {column.number for column in (clock, sequence, temperature) if column is not None}
+    readings = [index for index in range(len(names)) if index not in used]
+    if readings:
+        stream = Stream("readings", names=tuple(names[index] for index in readings))
+        parts.append(Part(stream, tuple(SiColumn(index, 1.0) for index in readings)))
+    return ColumnLayout(tuple(names), tuple(parts), clock, sequence, temperature, tuple(remarks))
+
+
+def _magnetometers(columns: Columns) -> tuple[Part | None, str]:
+    """Return the magnetometers if all axes of each are there, and otherwise a remark."""
+    by_axis: dict[tuple[int, str], SiColumn] = {}
+    for (number, axis), column in columns.items():
+        by_axis.setdefault((int(number or 0), axis), column)
+    if not by_axis:
+        return None, ""
+    numbers = sorted({number for number, _ in by_axis})
+    is_contiguous = numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    if numbers[0] > 1 or not is_contiguous or len(by_axis) != 3 * len(numbers):
+        return None, (
+            "columns of magnetometers are not x, y and z of each, numbered from 0 or 1 on"
+        )
+    ordered = tuple(by_axis[number, axis] for number in numbers for axis in "xyz")
+    return Part(Stream("magnetometers", sensors=len(numbers)), ordered), ""
+
+
+def _halls(columns: Columns) -> tuple[Part | None, str]:
+    """Return the hall sensors, those of a robot in the order of :data:`NAMES`."""
     if not columns:
-        raise InputError("no magnetometers, hall sensors or odometry in the recording")
-    times = np.unique(np.concatenate([time_ns for _, time_ns, _, _ in columns]))
-    return _lines(columns, times)
+        return None, ""
+    names = [name for (name,) in columns]
+    if set(names) <= set(NAMES):
+        names.sort(key=NAMES.index)
+    stream = Stream("halls", sensors=len(names), names=tuple(names))
+    return Part(stream, tuple(columns[name,] for name in names)), ""
 
 
-def _kinds(recording: Recording) -> Mapping[str, list[list[tuple[str, Ints, Array, str]]]]:
-    """Kind to devices to columns: name, times, values and how they are written."""
-    samples = [
-        [
-            (f"b{k}{axis}_ut", each.time_ns, each.field_t[:, k, a] * 1e6, "%.4f")
-            for k in range(each.field_t.shape[1])
-            for a, axis in enumerate("xyz")
-        ]
-        for each in recording.samples
-    ]
-    halls = [
-        [
-            (f"hall_{name}_ut", each.time_ns, each.field_t[:, k] * 1e6, "%.4f")
-            for k, name in enumerate(each.sensors.names)
-        ]
-        for each in recording.halls
-    ]
-    odometry = [
-        [
-            ("x_m", each.time_ns, each.position[:, 0], "%.6f"),
-            ("y_m", each.time_ns, each.position[:, 1], "%.6f"),
-            ("heading_rad", each.time_ns, heading_from_quaternion(each.quaternion), "%.6f"),
-        ]
-        for each in recording.odometry
-    ]
-    return {"samples": samples, "hall sensors": halls, "odometry": odometry}
-
-
-def _lines(
-    columns: Sequence[tuple[str, Ints, Array, str]], times: Ints
-) -> Iterator[tuple[int, bytes]]:
-    start_ns = int(times[0])
-    names = [name for name, *_ in columns]
-    yield start_ns, (",".join(["time_us", *names]) + "\n").encode()
-    cells = []
-    for _, time_ns, values, form in columns:
-        column = np.full(len(times), np.nan)
-        column[np.searchsorted(times, time_ns)] = values
-        cells.append([form % value if value == value else "" for value in column.tolist()])
-    for time_ns, *row in zip(times.tolist(), *cells, strict=True):
-        tick = (time_ns - start_ns) // 1000
-        yield time_ns, (",".join([str(tick), *row]) + "\n").encode()
+def _odometry(columns: Columns) -> tuple[Part | None, str]:
+    """Return odometry if x, y and heading are there, and otherwise a remark."""
+    if not columns:
+        return None, ""
+    if len(columns) < len(POSE_KEYS):
+        return None, "columns of odometry are not x, y and heading, each with its unit"
+    return Part(Stream("odometry"), tuple(columns[key,] for key in POSE_KEYS)), ""

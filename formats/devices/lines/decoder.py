@@ -1,65 +1,87 @@
-"""Lines of text: what sketches print.
+"""Decoder of lines of text, as sketches print them.
 
 ``\\n``, ``\\r\\n`` or ``\\r`` ends a line. It is one of
 
 * numbers, separated by commas, semicolons, tabs or blanks, all lines alike. Names come from
-  a header, which may come again, or from the user; without either they are ``c0``, ``c1``,
+  a header, which may be repeated, or from the user; without either they are ``c0``, ``c1``,
   ... An empty cell or ``nan`` is no value;
 * ``name:value``, several separated in the same ways (Arduino's serial plotter);
 * ``>name:value`` and ``>name:milliseconds:value;...``, with ``§unit`` and ``|flags``
-  (Teleplot, github.com/nesnes/teleplot: on serial lines what has no ``>`` is a log);
-* else text, which is logged: boot messages. Text with characters that nobody prints, or
-  that is numbers for the most part, is wrong.
+  (Teleplot, github.com/nesnes/teleplot; on serial lines, text without ``>`` is a log);
+* other text, which is logged: boot messages. Text with control characters, or that consists
+  of numbers for the most part, is damaged.
 
-What a name means: :mod:`.line_columns`. Those of Teleplot are readings, ``name[unit]``.
+:mod:`.columns` lists the meaning of names. Values of Teleplot are readings, ``name[unit]``.
 
-Nobody starts to listen at the start of a line: numbers in the first are left out. Numbers
-without names define how many there are when two lines in a row agree.
+A connection rarely begins at the start of a line: numbers in the first one are ignored. Numbers
+without names define the number of columns when two consecutive lines agree.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks
-from locatk.formats.devices.lines import text as line_text
-from locatk.formats.devices.lines.blocks import Lines, Range, Shape, Table
-from locatk.formats.devices.lines.columns import TICK_HZ, log, meaning, merged, points
-from locatk.formats.devices.lines.columns import encode as encode
+from locatk.formats.devices.lines.blocks import LineBlock, LineRange, LineShape, LineTable
+from locatk.formats.devices.lines.columns import TICK_HZ, interpret_columns
 from locatk.formats.devices.lines.text import (
     BLANK,
-    LATEST_MS,
-    Alike,
-    cells,
-    columns,
-    numbers,
-    separator,
+    MAX_TIME_MS,
+    PairLineCache,
+    count_columns,
+    detect_separator,
+    is_damaged_row,
+    is_garbage,
+    parse_header,
+    parse_number_row,
+    parse_pairs,
+    parse_telemetry,
+    split_cells,
 )
 
-LONGEST = 1 << 16
-"""Bytes of a line; longer ones are wrong."""
+MAX_LINE_BYTES = 1 << 16
+"""Longer lines are damaged."""
 
-PIECE = 1 << 16
-"""Bytes that are looked at together."""
+PIECE_BYTES = 1 << 16
+"""Bytes that are decoded together."""
 
-KNOWN = 256
-"""So many sets of names of ``name:value`` are remembered."""
+MAX_TABLES = 256
+"""Sets of names of ``name:value``, and different remarks, that are remembered."""
 
-SOON = 256
-"""Lines that are looked at first, where the columns have changed."""
+FIRST_SPAN_LINES = 256
+"""Lines whose form is compared at first after a change of the columns."""
 
-_ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+INFO_LEVEL = 2
+"""Level of printed text in the log (``foxglove.Log``)."""
+
+_ANSI_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
-class _Line(NamedTuple):
-    """Something that waits for the line after it: text, its end and its length in bytes."""
+class TextLine(NamedTuple):
+    """Line that waits for its successor: text, bytes up to its end, and its size in bytes."""
 
     text: str
     end: int
     size: int
+
+
+class PendingHeader(NamedTuple):
+    """Names that become a header if numbers follow, otherwise words."""
+
+    names: tuple[str, ...]
+    line: TextLine
+    has_mismatch: bool
+    """One line of another number of cells followed, which may be damaged."""
+
+
+Point = tuple[int, int, list[float]]
+"""Readings that came alone: bytes up to their end, tick and values."""
 
 
 class LineDecoder:
@@ -68,12 +90,12 @@ class LineDecoder:
     Parameters
     ----------
     options : Options
-        ``columns`` names the numbers of a line; headers are then passed over.
+        ``columns`` names the numbers of a line; headers are then ignored.
 
     Attributes
     ----------
     counts : Counts
-        ``frames`` are lines that were understood, headers and text among them.
+        ``frames`` are lines that were understood, including headers and text.
     remarks : list of str
 
     Raises
@@ -84,53 +106,58 @@ class LineDecoder:
 
     def __init__(self, options: Options | None = None) -> None:
         names = () if options is None else options.columns
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise InputError(f"two columns are called {twice!r}")
+        repeated = next((name for name in names if names.count(name) > 1), None)
+        if repeated is not None:
+            raise InputError(f"two columns are called {repeated!r}")
         self.counts = Counts()
         self.remarks: list[str] = []
-        self._fixed = bool(names)
-        self._said: set[str] = set()
-        self._table: Table | None = None
-        self._pairs: dict[tuple[str, ...], Table] = {}
-        self._alike: Alike[Table | Stream] = Alike()
-        self._header: tuple[tuple[str, ...], _Line, bool] | None = None
-        self._row: _Line | None = None
+        self._made_remarks: set[str] = set()
+        # Tables of the lines: the current one, and those of names with values.
+        self._has_fixed_names = bool(names)
+        self._table: LineTable | None = None
+        self._pair_tables: dict[tuple[str, ...], LineTable] = {}
+        self._pair_lines: PairLineCache[LineTable | Stream] = PairLineCache()
+        # Lines whose meaning depends on the next one.
+        self._header: PendingHeader | None = None
+        self._row: TextLine | None = None
+        # Bytes of an incomplete line, and the number of those dropped from an overlong one.
         self._tail = bytearray()
-        self._dropped = 0
-        self._whole = self._half = self._heard = False
-        self._touched: dict[int, Table] = {}
+        self._dropped_bytes = 0
+        # The next line is whole; the current line is half; any line was understood.
+        self._next_is_whole = self._is_half = self._has_understood = False
+        # Records since the last batches.
+        self._touched: dict[int, LineTable] = {}
         self._log: list[tuple[int, str]] = []
-        self._points: dict[Stream, list[tuple[int, int, list[float]]]] = {}
+        self._points: dict[Stream, list[Point]] = {}
         if names:
-            self._table = self._new_table(names, named=True)
+            self._table = self._new_table(names, is_named=True)
 
-    # ---- the contract
+    # ---- interface of Decoder
 
     def feed(self, data: bytes, *, pause: bool = False) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.feed`; a pause says nothing here."""
-        for start in range(0, len(data), PIECE):
-            self._feed(data[start : start + PIECE])
-        return self._batches()
+        """See :meth:`.decoder.Decoder.feed`; a pause has no meaning in text."""
+        for start in range(0, len(data), PIECE_BYTES):
+            self._feed(data[start : start + PIECE_BYTES])
+        return self._take_batches()
 
     def restart(self) -> list[Batch]:
         """See :meth:`.decoder.Decoder.restart`; the columns stay known."""
         batches = self.finish()
-        self._whole = False
-        for table in (self._table, *self._pairs.values()):
+        self._next_is_whole = False
+        for table in (self._table, *self._pair_tables.values()):
             if table is not None:
                 table.counter.restart()
         return batches
 
     def finish(self) -> list[Batch]:
-        """See :meth:`.decoder.Decoder.finish`. A line without an end is half received."""
+        """See :meth:`.decoder.Decoder.finish`. A line without an end is incomplete."""
         self._tail.clear()
-        self._dropped = 0
-        self._settle()
+        self._dropped_bytes = 0
+        self._settle_header()
         if self._row is not None and self._table is None:
-            self._begin(self._row)
-        self._drop_row()
-        return self._batches()
+            self._begin_table([self._row])
+        self._reject_row()
+        return self._take_batches()
 
     # ---- bytes to lines
 
@@ -141,255 +168,318 @@ class LineDecoder:
         if cut:
             block = bytes(self._tail) + data[:cut]
             self._tail[:] = data[cut:]
-            if self._dropped:
-                base, block = self._overlong(base, block)
+            if self._dropped_bytes:
+                base, block = self._skip_overlong_line(base, block)
             if block:
-                self._block(block, base)
+                self._decode_block(block, base)
         else:
             self._tail += data
-        if len(self._tail) > LONGEST:
-            self._dropped += len(self._tail)
+        if len(self._tail) > MAX_LINE_BYTES:
+            self._dropped_bytes += len(self._tail)
             self._tail.clear()
 
-    def _overlong(self, base: int, block: bytes) -> tuple[int, bytes]:
-        """Pass over the end of a line that was too long."""
+    def _skip_overlong_line(self, base: int, block: bytes) -> tuple[int, bytes]:
+        """Return a block without the end of a line that was too long."""
         end = len(block.replace(b"\r", b"\n").partition(b"\n")[0]) + 1
-        self._half, self._whole = not self._whole, True
-        self._bad(self._dropped + end)
-        self._dropped = 0
+        self._begin_line()
+        self._count_bad(self._dropped_bytes + end)
+        self._dropped_bytes = 0
         return base + end, block[end:]
 
-    def _block(self, block: bytes, base: int) -> None:
-        """Take whole lines: those that are rows of the table at once, others one by one."""
-        lines = Lines(block, base)
-        self._whole |= lines.first_is_empty
-        ranges: list[Range] = []
-        odd: list[int] = []
-        now = self._now()
-        at = known = place = 0
-        span = SOON
-        while at < len(lines):
-            if at == known:
-                known, span = min(len(lines), at + span), 4 * span
-                odd, place = lines.odd(at, known, now[1], LONGEST), 0
-            while place < len(odd) and odd[place] < at:
-                place += 1
-            fitting = odd[place] if place < len(odd) else known
-            if at < fitting and self._whole and self._header is None and self._row is None:
-                ranges.append((at, fitting))
-                self._heard, self._half = True, False
-                at = fitting
+    def _decode_block(self, block: bytes, base: int) -> None:
+        """Decode whole lines: rows of the current table many at a time, others one by one."""
+        lines = LineBlock(block, base)
+        self._next_is_whole |= lines.first_is_empty
+        ranges: list[LineRange] = []
+        others: list[int] = []
+        table = self._current_table()
+        line = compared = next_other = 0
+        span = FIRST_SPAN_LINES
+        while line < len(lines):
+            if line == compared:
+                compared, span = min(len(lines), line + span), 4 * span
+                others = lines.find_other_lines(line, compared, table[1], MAX_LINE_BYTES)
+                next_other = 0
+            while next_other < len(others) and others[next_other] < line:
+                next_other += 1
+            fitting_until = others[next_other] if next_other < len(others) else compared
+            has_pending_line = self._header is not None or self._row is not None
+            if line < fitting_until and self._next_is_whole and not has_pending_line:
+                ranges.append((line, fitting_until))
+                self._has_understood, self._is_half = True, False
+                line = fitting_until
                 continue
-            self._line(lines.line(at), lines.end(at))
-            at += 1
-            if now != self._now():
-                self._take(lines, ranges, *now)
-                now = self._now()
-                ranges, known, span = [], at, SOON
-        self._take(lines, ranges, *now)
+            self._decode_line(lines.line(line), lines.end(line))
+            line += 1
+            if table != self._current_table():
+                self._add_rows(lines, ranges, *table)
+                table = self._current_table()
+                ranges, compared, span = [], line, FIRST_SPAN_LINES
+        self._add_rows(lines, ranges, *table)
 
-    def _now(self) -> tuple[Table | None, Shape | None]:
+    def _current_table(self) -> tuple[LineTable | None, LineShape | None]:
         return self._table, None if self._table is None else self._table.shape
 
-    def _take(
-        self, lines: Lines, ranges: Sequence[Range], table: Table | None, shape: Shape | None
+    def _add_rows(
+        self,
+        lines: LineBlock,
+        ranges: Sequence[LineRange],
+        table: LineTable | None,
+        shape: LineShape | None,
     ) -> None:
-        """Rows of a table, many at a time."""
+        """Add many rows to a table."""
         if ranges and table is not None and shape is not None:
-            rows, wrong = lines.rows(ranges, shape)
-            self._add(table).add(rows)
-            for number in wrong:
-                self._bad(len(lines.line(number)) + 1)
+            rows, damaged = lines.parse(ranges, shape)
+            self._touch(table).add_block(rows)
+            for number in damaged:
+                self._count_bad(len(lines.line(number)) + 1)
 
     # ---- one line
 
-    def _line(self, raw: bytes, end: int) -> None:
-        self._half, self._whole = not self._whole, True
+    def _begin_line(self) -> None:
+        self._is_half, self._next_is_whole = not self._next_is_whole, True
+
+    def _decode_line(self, raw: bytes, end: int) -> None:
+        self._begin_line()
         size = len(raw) + 1
-        if size - 1 > LONGEST:
-            self._bad(size)
+        if size - 1 > MAX_LINE_BYTES:
+            self._count_bad(size)
             return
-        if not self._half and self._header is None and self._again(raw, end, size):
+        if not self._is_half and self._header is None and self._decode_known_pairs(raw, end, size):
             return
-        text = _ANSI.sub("", raw.decode("utf-8", "replace")).strip("\ufeff \t")
+        text = _ANSI_COLOUR.sub("", raw.decode("utf-8", "replace")).strip("\ufeff \t")
         if not text:
             return
-        if line_text.garbage(text):
-            self._bad(size)
+        if is_garbage(text):
+            self._count_bad(size)
         elif text[0] == ">":
-            self._settle()
-            self._telemetry(_Line(text, end, size), raw)
+            self._settle_header()
+            self._decode_telemetry(TextLine(text, end, size), raw)
         else:
-            self._cells(_Line(text, end, size), raw)
+            self._decode_cells(TextLine(text, end, size), raw)
 
-    def _cells(self, line: _Line, raw: bytes) -> None:
-        """Numbers, names and values, names, or words."""
+    def _decode_cells(self, line: TextLine, raw: bytes) -> None:
+        """Decode a line of numbers, of names with values, of names, or of words."""
         text = line.text
-        named = line_text.pairs(text) if ":" in text else None
-        row = None if named else cells(text, separator(text))
-        values = None if row is None else numbers(row)
-        if (values or named) and self._half:
+        pairs = parse_pairs(text) if ":" in text else None
+        row = None if pairs else split_cells(text, detect_separator(text))
+        values = None if row is None else parse_number_row(row)
+        if (values or pairs) and self._is_half:
             return
         if values:
-            self._numbers(line, values)
+            self._decode_numbers(line, values)
             return
-        names = None if self._fixed or named else line_text.header(text, self._names)
-        expected = self._names if self._header is None else self._header[0]
-        if not (named or names) and line_text.damaged(row or [], len(expected)):
-            self._bad(line.size)
-            self._say("lines with cells that are no numbers are left out")
+        names = None if self._has_fixed_names or pairs else parse_header(text, self._known_names)
+        expected = self._known_names if self._header is None else self._header.names
+        if not (pairs or names) and is_damaged_row(row or [], len(expected)):
+            self._count_bad(line.size)
+            self._remark("lines with cells that are not numbers are skipped")
             return
-        self._settle()
-        if named:
-            table = self._of_pairs(named[0])
-            self._heard = True
-            self._add(table).add_one(line.end, line.size, named[1])
-            self._alike.learn(raw, named[1], table)
+        self._settle_header()
+        if pairs:
+            table = self._table_of_pairs(pairs[0])
+            self._has_understood = True
+            self._touch(table).add_line(line.end, line.size, pairs[1])
+            self._pair_lines.learn(raw, pairs[1], table)
         elif names:
-            self._heard = True
-            self._header = names, line, False
-        elif row and self._fixed and tuple(row) == self._names:
-            self._heard = True
+            self._has_understood = True
+            self._header = PendingHeader(names, line, False)
+        elif row and self._has_fixed_names and tuple(row) == self._known_names:
+            self._has_understood = True
             self.counts.frames += 1
         else:
-            self._tell(line)
+            self._add_to_log(line)
 
-    def _again(self, raw: bytes, end: int, size: int) -> bool:
-        """Take a line that is like one before, but for its numbers."""
-        found = self._alike.read(raw)
-        if found is None:
+    def _decode_known_pairs(self, raw: bytes, end: int, size: int) -> bool:
+        """Decode a line that differs from an earlier one in its numbers only."""
+        known = self._pair_lines.read(raw)
+        if known is None:
             return False
-        target, values = found
-        if isinstance(target, Table):
-            self._add(target).add_one(end, size, values)
+        target, values = known
+        if isinstance(target, LineTable):
+            self._touch(target).add_line(end, size, values)
             return True
         *time_ms, value = values
-        if time_ms and not 0 <= time_ms[0] < LATEST_MS:
+        if time_ms and not 0 <= time_ms[0] < MAX_TIME_MS:
             return False
         self.counts.frames += 1
-        self._point(target, end, time_ms[0] if time_ms else None, [value])
+        self._add_point(target, end, time_ms[0] if time_ms else None, [value])
         return True
 
-    def _point(self, stream: Stream, end: int, time_ms: float | None, values: list[float]) -> None:
-        point = end, round(1e3 * (time_ms or 0.0)), values
-        self._points.setdefault(stream, []).append(point)
+    def _add_point(
+        self, stream: Stream, end: int, time_ms: float | None, values: list[float]
+    ) -> None:
+        tick = round(1e3 * (time_ms or 0.0))
+        self._points.setdefault(stream, []).append((end, tick, values))
 
     @property
-    def _names(self) -> tuple[str, ...]:
-        """Of the columns, where somebody has named them."""
-        named = self._table is not None and self._table.named
-        return self._table.meaning.names if named and self._table is not None else ()
+    def _known_names(self) -> tuple[str, ...]:
+        """Names of the current columns; empty if they are numbered."""
+        return self._table.layout.names if self._table is not None and self._table.is_named else ()
 
-    def _numbers(self, line: _Line, values: list[float]) -> None:
-        """A row of the table, or of another table."""
-        separated = separator(line.text)
-        trailing = separated != BLANK and line.text.endswith(separated)
+    def _decode_numbers(self, line: TextLine, values: list[float]) -> None:
+        """Add a row to the current table, or begin another one."""
+        separator = detect_separator(line.text)
+        has_trailing = separator != BLANK and line.text.endswith(separator)
         table = self._table
         if self._header is not None:
-            names, said, tried = self._header
-            if len(values) - trailing <= len(names) <= len(values):
+            names = self._header.names
+            if len(values) - has_trailing <= len(names) <= len(values):
                 self._header = None
                 self.counts.frames += 1
-                if table is None or names != table.meaning.names:
-                    table = self._table = self._new_table(names, named=True)
-            elif tried:
-                self._settle()
-            else:  # this line may be damaged
-                self._header = names, said, True
-        if table is not None and table.takes(len(values), separated, trailing):
-            self._heard = True
-            self._add(table).add_one(line.end, line.size, values[: table.shape.columns])
-            self._drop_row()
-        elif table is not None and table.named:
-            self._bad(line.size)
-            named = f"{table.shape.columns} columns are named"
-            self._say(f"lines of more or less numbers are left out, where {named}")
-        elif self._row is not None and columns(self._row.text, line.text):
-            self._begin(self._row, line)
+                if table is None or names != table.layout.names:
+                    table = self._table = self._new_table(names, is_named=True)
+            elif self._header.has_mismatch:
+                self._settle_header()
+            else:
+                self._header = self._header._replace(has_mismatch=True)
+        if table is not None and table.accepts(len(values), separator, has_trailing):
+            self._has_understood = True
+            self._touch(table).add_line(line.end, line.size, values[: table.shape.columns])
+            self._reject_row()
+        elif table is not None and table.is_named:
+            self._count_bad(line.size)
+            columns = table.shape.columns
+            self._remark(f"lines of another length are skipped: {columns} columns have names")
+        elif self._row is not None and count_columns(self._row.text, line.text):
+            self._begin_table([self._row, line])
         else:
-            self._drop_row()
+            self._reject_row()
             self._row = line
 
-    def _begin(self, one: _Line, other: _Line | None = None) -> None:
-        """A table of columns without names."""
-        count = columns(one.text, other.text if other else one.text) or 0
-        self._table = self._new_table([f"c{i}" for i in range(count)], named=False)
+    def _begin_table(self, lines: Sequence[TextLine]) -> None:
+        """Begin a table of columns without names from its first lines."""
+        count = count_columns(lines[0].text, lines[-1].text) or 0
+        self._table = self._new_table([f"c{i}" for i in range(count)], is_named=False)
         self._row = None
-        for line in (one, other) if other else (one,):
-            self._numbers(line, numbers(cells(line.text, separator(line.text))) or [])
+        for line in lines:
+            cells = split_cells(line.text, detect_separator(line.text))
+            self._decode_numbers(line, parse_number_row(cells) or [])
 
-    def _of_pairs(self, names: tuple[str, ...]) -> Table:
-        table = self._pairs.get(names)
+    def _table_of_pairs(self, names: tuple[str, ...]) -> LineTable:
+        table = self._pair_tables.get(names)
         if table is None:
-            if len(self._pairs) >= KNOWN:
-                self._pairs.clear()
-                self._alike.forget()
-            table = self._pairs[names] = self._new_table(names, named=True)
+            if len(self._pair_tables) >= MAX_TABLES:
+                self._pair_tables.clear()
+                self._pair_lines.clear()
+            table = self._pair_tables[names] = self._new_table(names, is_named=True)
         return table
 
-    def _telemetry(self, line: _Line, raw: bytes) -> None:
-        """A line of Teleplot."""
-        said = line_text.telemetry(line.text[1:])
-        if said is None:
-            self._bad(line.size)
+    def _decode_telemetry(self, line: TextLine, raw: bytes) -> None:
+        """Decode a line of Teleplot."""
+        telemetry = parse_telemetry(line.text[1:])
+        if telemetry is None:
+            self._count_bad(line.size)
             return
-        self._heard = True
-        if said.text:
-            self._tell(_Line(said.text, line.end, line.size))
+        self._has_understood = True
+        if telemetry.text:
+            self._add_to_log(TextLine(telemetry.text, line.end, line.size))
             return
         self.counts.frames += 1
-        self.counts.unknown += said.drawing
-        for time_ms, values in said.points:
+        self.counts.unknown += telemetry.is_drawing
+        for time_ms, values in telemetry.points:
             ticks = None if time_ms is None else Ticks(TICK_HZ)
-            stream = Stream("readings", names=said.names, ticks=ticks)
-            self._point(stream, line.end, time_ms, values)
-            if len(said.points) == len(said.names) == 1:
-                self._alike.learn(raw, [*([] if time_ms is None else [time_ms]), *values], stream)
+            stream = Stream("readings", names=telemetry.names, ticks=ticks)
+            self._add_point(stream, line.end, time_ms, values)
+            if len(telemetry.points) == len(telemetry.names) == 1:
+                time = [] if time_ms is None else [time_ms]
+                self._pair_lines.learn(raw, [*time, *values], stream)
 
-    # ---- what becomes of lines
+    # ---- results of lines
 
-    def _settle(self) -> None:
-        """Names that no numbers follow are words."""
+    def _settle_header(self) -> None:
+        """Log names that no numbers follow: they are words."""
         if self._header is not None:
-            said, self._header = self._header[1], None
-            self._tell(said)
+            line, self._header = self._header.line, None
+            self._add_to_log(line)
 
-    def _drop_row(self) -> None:
-        """Numbers that no others follow which agree are wrong."""
+    def _reject_row(self) -> None:
+        """Count a row of numbers as damaged if no row of the same length follows."""
         if self._row is not None:
-            self._bad(self._row.size)
+            self._count_bad(self._row.size)
             self._row = None
 
-    def _tell(self, line: _Line) -> None:
-        self._heard = True
+    def _add_to_log(self, line: TextLine) -> None:
+        self._has_understood = True
         self.counts.frames += 1
         self._log.append((line.end, line.text))
 
-    def _bad(self, size: int) -> None:
-        if self._heard and not self._half:
+    def _count_bad(self, size: int) -> None:
+        if self._has_understood and not self._is_half:
             self.counts.bad += 1
             self.counts.skipped += size
 
-    def _new_table(self, names: Sequence[str], *, named: bool) -> Table:
-        said = meaning(names)
-        for doubt in said.doubts:
-            self._say(doubt)
-        return Table(said, Shape("," if len(names) > 1 else BLANK, len(names)), named=named)
+    def _new_table(self, names: Sequence[str], *, is_named: bool) -> LineTable:
+        layout = interpret_columns(names)
+        for remark in layout.remarks:
+            self._remark(remark)
+        shape = LineShape("," if len(names) > 1 else BLANK, len(names))
+        return LineTable(layout, shape, is_named=is_named)
 
-    def _say(self, remark: str) -> None:
-        if remark not in self._said and len(self._said) < KNOWN:
-            self._said.add(remark)
-            self.remarks.append(remark)
+    def _remark(self, text: str) -> None:
+        if text not in self._made_remarks and len(self._made_remarks) < MAX_TABLES:
+            self._made_remarks.add(text)
+            self.remarks.append(text)
 
-    def _add(self, table: Table) -> Table:
+    def _touch(self, table: LineTable) -> LineTable:
         self._touched[id(table)] = table
         return table
 
-    def _batches(self) -> list[Batch]:
-        """Records of the lines since the last time, a batch a stream, in their order."""
-        batches = [batch for each in self._touched.values() for batch in each.records(self.counts)]
+    def _take_batches(self) -> list[Batch]:
+        """Return the records since the last call, a batch a stream, in the order of their lines."""
+        batches = [b for table in self._touched.values() for b in table.take_records(self.counts)]
         self._touched.clear()
-        batches += [points(*each) for each in self._points.items()]
-        batches += [log(self._log)] if self._log else []
+        batches += [_point_batch(stream, points) for stream, points in self._points.items()]
+        batches += [_log_batch(self._log)] if self._log else []
         self._points, self._log = {}, []
-        return merged(batches)
+        return _merge_streams(batches)
+
+
+# ---- batches
+
+
+def _point_batch(stream: Stream, points: Sequence[Point]) -> Batch:
+    end, tick, values = (np.array(part) for part in zip(*points, strict=True))
+    return Batch(stream, end, {"value": values}, None if stream.ticks is None else tick)
+
+
+def _log_batch(lines: Sequence[tuple[int, str]]) -> Batch:
+    text = np.empty(len(lines), object)
+    text[:] = [line for _, line in lines]
+    columns: dict[str, NDArray[Any]] = {"level": np.full(len(lines), INFO_LEVEL), "text": text}
+    return Batch(Stream("log"), np.array([end for end, _ in lines], np.int64), columns)
+
+
+def _merge_streams(batches: Sequence[Batch]) -> list[Batch]:
+    """Merge the batches of each stream, in the order of their lines.
+
+    A stream has several batches if only some have a temperature or a count.
+    """
+    streams: dict[Stream, list[Batch]] = {}
+    for batch in batches:
+        streams.setdefault(batch.stream, []).append(batch)
+    return [batch for parts in streams.values() for batch in _merge(parts)]
+
+
+def _merge(parts: list[Batch]) -> list[Batch]:
+    if len(parts) == 1:
+        return parts
+    fields = [_fields(batch) for batch in parts]
+    forms = [tuple(part) for part in fields]
+    form = np.repeat([forms.index(each) for each in forms], [len(batch) for batch in parts])
+    merged = {
+        name: np.concatenate([f.get(name, np.zeros(len(f["end"]), np.int64)) for f in fields])
+        for name in {name for names in forms for name in names}
+    }
+    order = np.argsort(merged["end"], kind="stable")
+    batches = []
+    for run in np.split(order, np.flatnonzero(np.diff(form[order])) + 1):
+        columns = {name: merged[name][run] for name in forms[form[run[0]]]}
+        optional = {name: columns.pop(name, None) for name in ("tick", "sequence")}
+        batches.append(Batch(parts[0].stream, columns.pop("end"), columns, **optional))
+    return batches
+
+
+def _fields(batch: Batch) -> dict[str, NDArray[Any]]:
+    fields = {"end": batch.end, "tick": batch.tick, "sequence": batch.sequence, **batch.columns}
+    return {name: array for name, array in fields.items() if array is not None}

@@ -1,4 +1,4 @@
-"""What one line of text is: numbers, names and values, names alone, telemetry, or words."""
+"""Classification of one line of text: numbers, names with values, names, telemetry, or words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
-from locatk.formats.devices.lines.columns import meaning
+from locatk.formats.devices.lines.columns import interpret_columns
 
 T = TypeVar("T")
 
@@ -22,200 +22,209 @@ _PAIR_OF_WORDS = re.compile(rf"([^\W\d][^\s:,;]*)[ \t]*:[ \t]*({_NUMBER})(?:[ \t
 _IS_WORD = re.compile(r"\$?[^\W\d](?!.*:.*[0-9])")
 _LIKE_A_NUMBER = re.compile(r"[-+.]?[0-9]")
 _LIKE_A_NAME = re.compile(r"[_\[]")
-_MAY_TELL = re.compile(r"[_\[(]|(?i:seq|millis|micros)")
+_MAY_HAVE_MEANING = re.compile(r"[_\[(]|(?i:seq|millis|micros)")
 _VALUE = re.compile(rf":[ \t]*([+-]?{_DIGITS})".encode())
 _CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
 BLANK = " "
+"""Separator of cells that any number of blanks and tabs separate."""
 
-LATEST_MS = 2.0**52
-"""Times are below; in microseconds they still are whole numbers."""
+MAX_TIME_MS = 2.0**52
+"""Larger times are damaged; these are still whole numbers in microseconds."""
 
-_ALIKE = 256
+MAX_CACHED_LINES = 256
 
-_FEWEST_WORDS = 4
-"""Words in a row that may be names though none of them looks like one."""
+MAX_REPLACED_FRACTION = 1 / 8
+"""Largest fraction of characters of a text that may be damaged UTF-8."""
 
-
-def separator(text: str) -> str:
-    """What separates the cells of a line; blanks where nothing else does."""
-    return next((one for one in (";", ",", "\t") if one in text), BLANK)
+MIN_HEADER_WORDS = 4
+"""Words in a row that may be a header even if none of them looks like a name."""
 
 
-def cells(text: str, separated: str) -> list[str]:
-    """Cells of a line, without the blanks around them."""
-    if separated == BLANK:
+def detect_separator(text: str) -> str:
+    """Return the separator of the cells of a line: semicolon, comma, tab, otherwise blanks."""
+    return next((character for character in (";", ",", "\t") if character in text), BLANK)
+
+
+def split_cells(text: str, separator: str) -> list[str]:
+    """Split a line into cells, without the blanks around them."""
+    if separator == BLANK:
         return text.split()
-    return [cell.strip() for cell in text.split(separated)]
+    return [cell.strip() for cell in text.split(separator)]
 
 
-def columns(one: str, other: str) -> int | None:
-    """How many columns two lines of numbers have, None where they disagree. A separator at the
-    end is one too many, unless cells before it are empty as well."""
+def count_columns(text: str, other_text: str) -> int | None:
+    """Return the number of columns of two lines of numbers; None if they disagree.
+
+    A separator at the end adds no column, unless the cells before it are empty as well.
+    """
     counts, trailing = [], []
-    for text in (one, other):
-        separated = separator(text)
-        row = cells(text, separated)
+    for line in (text, other_text):
+        separator = detect_separator(line)
+        row = split_cells(line, separator)
         counts.append(len(row))
-        trailing.append(separated != BLANK and not row[-1] and bool(row[-2]))
+        trailing.append(separator != BLANK and not row[-1] and bool(row[-2]))
     if counts[0] == counts[1]:
         return counts[0] - all(trailing)
-    few, many = sorted(range(2), key=lambda i: counts[i])
-    return counts[few] if counts[many] - trailing[many] == counts[few] else None
+    fewer, more = sorted(range(2), key=lambda i: counts[i])
+    return counts[fewer] if counts[more] - trailing[more] == counts[fewer] else None
 
 
-def number(cell: str) -> float:
-    """A cell that is a number, as a number; ``nan`` where it is empty.
+def parse_number(cell: str) -> float:
+    """Return the number in a cell; ``nan`` if it is empty.
 
-    Arduino prints ``ovf`` for what it cannot print.
+    Arduino prints ``ovf`` for numbers that it cannot print.
     """
     return math.inf if cell.endswith("ovf") else float(cell or "nan")
 
 
-def numbers(row: Sequence[str]) -> list[float] | None:
-    """Numbers of a line, None where it is none of numbers."""
+def parse_number_row(row: Sequence[str]) -> list[float] | None:
+    """Return the numbers of a row; None if any cell is neither empty nor a number."""
     if not all(map(_IS_NUMBER.fullmatch, row)):
         return None
-    return [number(cell) for cell in row]
+    return [parse_number(cell) for cell in row]
 
 
-def pairs(text: str) -> tuple[tuple[str, ...], list[float]] | None:
-    """Names and values of a line of ``name:value``, None where it is none."""
-    separated = separator(text)
-    if separated == BLANK:
-        found = _words(text)
+def parse_pairs(text: str) -> tuple[tuple[str, ...], list[float]] | None:
+    """Return the names and values of a line of ``name:value``; None if it is not one."""
+    separator = detect_separator(text)
+    if separator == BLANK:
+        pairs = _pairs_of_words(text)
     else:
-        row = text.split(separated)
+        row = text.split(separator)
         matches = [_PAIR.fullmatch(cell) for cell in (row if row[-1].strip() else row[:-1])]
-        found = [(match[1], match[2]) for match in matches if match]
-        if len(found) < len(matches):
-            found = []
-    names = tuple(name for name, _ in found)
+        pairs = [(match[1], match[2]) for match in matches if match]
+        if len(pairs) < len(matches):
+            pairs = []
+    names = tuple(name for name, _ in pairs)
     if not names or len(set(names)) < len(names):
         return None
-    return names, [number(value) for _, value in found]
+    return names, [parse_number(value) for _, value in pairs]
 
 
-def _words(text: str) -> list[tuple[str, str]]:
-    """Names and values that only blanks separate: none, or the whole line is of them."""
-    found, at = [], 0
-    while at < len(text):
-        match = _PAIR_OF_WORDS.match(text, at)
+def _pairs_of_words(text: str) -> list[tuple[str, str]]:
+    """Return the names and values of a line of pairs that only blanks separate; else none."""
+    pairs, position = [], 0
+    while position < len(text):
+        match = _PAIR_OF_WORDS.match(text, position)
         if match is None:
-            whole = _PAIR.fullmatch(text)
-            return [(whole[1], whole[2])] if whole else []
-        found.append((match[1], match[2]))
-        at = match.end()
-    return found
+            single = _PAIR.fullmatch(text)
+            return [(single[1], single[2])] if single else []
+        pairs.append((match[1], match[2]))
+        position = match.end()
+    return pairs
 
 
-def header(text: str, known: tuple[str, ...] = ()) -> tuple[str, ...] | None:
-    """Names of columns, None where a line is none of names.
+def parse_header(text: str, known: tuple[str, ...] = ()) -> tuple[str, ...] | None:
+    """Return the names of columns; None if a line is not a header.
 
-    Words in a row may as well be a message: they are names if they look like some. Where
-    there are names already (``known``), others for as many columns must look so, too.
+    Words in a row may also be a message: they are a header if they look like names. If columns
+    have names already (``known``), names of as many other columns have to look so, too.
     """
     text = text.lstrip("#% ")
-    separated = separator(text)
-    row = [cell.strip("\"' ") for cell in cells(text, separated)]
+    separator = detect_separator(text)
+    row = [cell.strip("\"' ") for cell in split_cells(text, separator)]
     if row and not row[-1]:
         row = row[:-1]
-    labels = len(row) > 1 and all(cell.endswith(":") for cell in row)
-    names = tuple(cell.rstrip(": ") for cell in row) if labels else tuple(row)
+    are_labels = len(row) > 1 and all(cell.endswith(":") for cell in row)
+    names = tuple(cell.rstrip(": ") for cell in row) if are_labels else tuple(row)
     if not names or len(set(names)) < len(names) or not all(map(_IS_NAME.fullmatch, names)):
         return None
-    if names == known or labels:
+    if names == known or are_labels:
         return names
-    few = len(names) < (_FEWEST_WORDS if separated == BLANK else 2)
-    if few or len(names) == len(known):
-        looks = all(map(_LIKE_A_NAME.search, names))
-        if not looks and not (_MAY_TELL.search(text) and meaning(names).told):
+    is_short = len(names) < (MIN_HEADER_WORDS if separator == BLANK else 2)
+    if is_short or len(names) == len(known):
+        look_like_names = all(map(_LIKE_A_NAME.search, names))
+        has_meaning = _MAY_HAVE_MEANING.search(text) and interpret_columns(names).has_meaning
+        if not look_like_names and not has_meaning:
             return None
     if any(name.count(" ") > 1 or name[-1] in ".!?" for name in names):
         return None
     return names
 
 
-def garbage(text: str) -> bool:
-    """Whether there are characters that nobody prints, or many bytes that are no UTF-8."""
-    return _CONTROL.search(text) is not None or 8 * text.count("\ufffd") > len(text)
+def is_garbage(text: str) -> bool:
+    """Return whether a line has control characters, or many bytes that are not UTF-8."""
+    replaced = text.count("\ufffd")
+    return _CONTROL.search(text) is not None or replaced > MAX_REPLACED_FRACTION * len(text)
 
 
-def damaged(row: Sequence[str], columns: int) -> bool:
-    """Whether cells that are not all numbers, or names and numbers, were: most are and none of
-    the others is a word, or half are of as many as there are ``columns``."""
+def is_damaged_row(row: Sequence[str], columns: int) -> bool:
+    """Return whether a row of which not all cells are numbers was one of numbers.
+
+    It was if most cells are numbers, or names with numbers, and none of the others is a word; or
+    if half of them are and there are as many as ``columns``.
+    """
     odd = [cell for cell in row if not (_IS_NUMBER.fullmatch(cell) or _PAIR.fullmatch(cell))]
-    right = sum(map(bool, row)) - len(odd)
-    if len(row) == columns and 2 * right >= columns:
-        return right > 0
-    return 2 * right > len(row) and not any(map(_IS_WORD.match, odd))
+    intact = sum(map(bool, row)) - len(odd)
+    if len(row) == columns and 2 * intact >= columns:
+        return intact > 0
+    return 2 * intact > len(row) and not any(map(_IS_WORD.match, odd))
 
 
-class Alike(Generic[T]):
-    """Lines of names and values that were read before, so that one which differs in its
-    numbers alone is read at once."""
+class PairLineCache(Generic[T]):
+    """Patterns of lines of ``name:value``, so that a line with other numbers is read at once."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[bytes, int], tuple[re.Pattern[bytes], T]] = {}
 
-    def forget(self) -> None:
-        """Forget them all."""
+    def clear(self) -> None:
+        """Forget all lines."""
         self._known.clear()
 
-    def learn(self, raw: bytes, values: Sequence[float], what: T) -> None:
-        """Lines like ``raw``, in which colons lead to these ``values``, are ``what``."""
+    def learn(self, raw: bytes, values: Sequence[float], target: T) -> None:
+        """Remember that lines like ``raw``, in which colons precede ``values``, are ``target``."""
         parts = _VALUE.split(raw)
         if list(map(float, parts[1::2])) == list(values):
-            if len(self._known) >= _ALIKE:
+            if len(self._known) >= MAX_CACHED_LINES:
                 self._known.clear()
             pattern = _VALUE.pattern.join(map(re.escape, parts[::2]))
-            self._known[_label(raw)] = re.compile(pattern), what
+            self._known[_label(raw)] = re.compile(pattern), target
 
     def read(self, raw: bytes) -> tuple[T, list[float]] | None:
-        """What a line is, and its values; None where it is like none."""
-        found = self._known.get(_label(raw))
-        match = None if found is None else found[0].fullmatch(raw)
-        return (found[1], list(map(float, match.groups()))) if found and match else None
+        """Return the target and the values of a line; None if it is like none before."""
+        known = self._known.get(_label(raw))
+        match = None if known is None else known[0].fullmatch(raw)
+        return (known[1], list(map(float, match.groups()))) if known and match else None
 
 
 def _label(raw: bytes) -> tuple[bytes, int]:
-    """What tells lines of names and values apart, for the most part."""
+    """Return the first name of a line and the number of its colons, which usually identify it."""
     return raw[: raw.find(b":")], raw.count(b":")
 
 
 class Telemetry(NamedTuple):
-    """What a line of Teleplot says.
+    """Line of Teleplot.
 
     Attributes
     ----------
     names : tuple of str
-        Of the values of one point.
+        Names of the values of one point.
     points : list of (float or None, list of float)
-        Milliseconds, where they are told, and values.
+        Milliseconds, if given, and values.
     text : str
         Words instead of points.
-    drawing : bool
-        A picture or a shape, of which nothing is taken.
+    is_drawing : bool
+        True for a picture or a shape, which is ignored.
     """
 
     names: tuple[str, ...]
     points: list[tuple[float | None, list[float]]]
     text: str = ""
-    drawing: bool = False
+    is_drawing: bool = False
 
 
 _DRAWINGS = ("3D|", "JPG|", "PNG|")
-_WIDTHS = {"xy": "xy", "xyz": "xyz"}
 
 
-def telemetry(text: str) -> Telemetry | None:
-    """What a line says that began with ``>``, which is taken off; None where it is damaged."""
+def parse_telemetry(text: str) -> Telemetry | None:
+    """Parse a line of Teleplot without its leading ``>``; None if it is damaged."""
     if text.startswith(_DRAWINGS):
-        return Telemetry((), [], drawing=True)
-    said, _, flag = text.rpartition("|") if "|" in text else (text, "", "")
+        return Telemetry((), [], is_drawing=True)
+    content, _, flag = text.rpartition("|") if "|" in text else (text, "", "")
     flags = flag.split(",")
-    said, _, unit = said.partition("§")
-    name, colon, values = said.partition(":")
+    content, _, unit = content.partition("§")
+    name, colon, values = content.partition(":")
     name = name.partition(",")[0].strip()
     if not colon or not name:
         return Telemetry((), [], text=values.strip() if colon else text.strip())
@@ -227,13 +236,14 @@ def telemetry(text: str) -> Telemetry | None:
     names = tuple(f"{name}.{axis}{unit}" for axis in axes) or (name + unit,)
     points = []
     for point in filter(None, (each.strip() for each in values.split(";"))):
-        found = numbers([cell.strip() for cell in point.split(":")])
-        if found is None or not len(names) <= len(found) <= len(names) + 1:
-            if found is not None or _LIKE_A_NUMBER.match(point):
+        numbers = parse_number_row([cell.strip() for cell in point.split(":")])
+        if numbers is None or not len(names) <= len(numbers) <= len(names) + 1:
+            if numbers is not None or _LIKE_A_NUMBER.match(point):
                 return None
             return Telemetry((), [], text=f"{name}: {values.strip()}")
-        time = found.pop(-1 if axes else 0) if len(found) > len(names) else None
-        if time is not None and not 0 <= time < LATEST_MS:
+        # The time is the first number of a point, but the last one of a point with axes.
+        time_ms = numbers.pop(-1 if axes else 0) if len(numbers) > len(names) else None
+        if time_ms is not None and not 0 <= time_ms < MAX_TIME_MS:
             return None
-        points.append((time, found))
+        points.append((time_ms, numbers))
     return Telemetry(names, points) if points else None

@@ -1,26 +1,26 @@
-"""Logs of PyDotBot, the controller of DotBots, read into sweeps.
+"""Logs of PyDotBot, the controller of DotBots, imported as sweeps.
 
 PyDotBot logs with structlog: as logfmt into its file, with colours to the terminal; others
-let it write JSON. Records are told by their keys, whatever the event is called:
+configure it to write JSON. Records are recognised by their keys, not by the name of the event:
 
 ====================================  ==================================================
-keys                                  what it is
+keys                                  record
 ====================================  ==================================================
 poly, lfsr_index, [db_time]           a sweep that the robot decoded, 2024; db_time is the
                                       robot's clock in us when it received the light
-sweep_0_poly, _off, _bits, sweep_1_   windows of 64 bits, 2023: the count is the place of the
-                                      17 bits after the first ``off``, less ``off``
-c0, c1                                two counts of one station, 2023; which one is not told:
+sweep_0_poly, _off, _bits, sweep_1_   windows of 64 bits, 2023: the count is the LFSR index of
+                                      the 17 bits after the first ``off``, less ``off``
+c0, c1                                two counts of one station, 2023, without its polynomial:
                                       channel 1, as its authors assume
 ====================================  ==================================================
 
 ``source`` (or ``address``) names the device. A polynomial above 31, an index beyond the
-sequence and bits of nothing but zeros are a robot's marks of an error: no sweep, and nothing
+sequence and bits that are all zero mark an error of the robot: there is no sweep, and nothing
 is lost. ``sweep`` numbers a robot's memory, not the planes of the rotor: it is not used.
-Lines of other events are passed over.
+Lines of other events are skipped.
 
-Log lines are late by tens of milliseconds, more than lies between two sweeps. Where robots
-tell db_time, it dates the sweeps (:mod:`locatk.core.clock_sync`).
+Log lines are late by tens of milliseconds, longer than the time between two sweeps. If records
+contain db_time, it dates the sweeps (:mod:`locatk.core.clock_sync`).
 
 Source: PyDotBot ``controller.py``, ``logger.py``; ``parse_logfile.py`` of alvarado23lighthouse,
 alvarado24lh-distortion and alvarado24automatic.
@@ -43,21 +43,29 @@ from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
-from locatk.formats.artifacts.scene import parse_time
 from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.tables.timestamps import parse_iso_time
 
-DEVICE = "robot"
+DEFAULT_DEVICE = "robot"
 """Name of the device in records without a source."""
 
 ASSUMED_CHANNEL = 1
-"""Of records that name no polynomial."""
+"""Channel of records without a polynomial."""
 
-LONGEST_LINE = 16384
-LONGEST_NAME = 64
-MOST_WINDOWS = 16
-PACKED = 1 << 16
-NAMED_FAULTS = 5
-"""Damaged records that are named one by one."""
+MAX_LINE_BYTES = 16384
+"""Longer lines are not records: one with 16 windows has about 1,500 bytes."""
+
+MAX_NAME_CHARACTERS = 64
+
+MAX_WINDOWS_PER_RECORD = 16
+
+ROWS_PER_BLOCK = 1 << 16
+"""Sweeps after which the list of tuples is packed into an array, to save memory."""
+
+MAX_NAMED_FAULTS = 5
+"""Damaged records that get a warning each."""
+
+MAX_TIME_NS = 1 << 62
 
 ROBOT_HZ, ROBOT_BITS = 1e6, 32
 WINDOW_BITS = 64
@@ -66,29 +74,42 @@ Rows = NDArray[np.void]
 _Fields = Mapping[bytes, bytes]
 
 _FIELD = re.compile(
-    rb'\b([A-Za-z_]\w*+)=("(?:[^"\\]|\\.)*+(?:"|$)'  # logfmt quotes so ...
-    rb"|'(?:[^'\\]|\\.)*+(?:'|$)"  # ... and the terminal so
+    rb'\b([A-Za-z_]\w*+)=("(?:[^"\\]|\\.)*+(?:"|$)'  # quotes of logfmt
+    rb"|'(?:[^'\\]|\\.)*+(?:'|$)"  # quotes of the terminal
     rb'|[^\s"]*)'
 )
 _COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
 _TIME = re.compile(
     r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?(Z|[+-]\d\d:\d\d)?", re.ASCII
 )
-_HINT = "give the file that PyDotBot wrote (pydotbot.log), at log level info"
+LOG_HINT = "Give the file that PyDotBot wrote (pydotbot.log), at log level info"
 
-_ROW = np.dtype(
+SWEEP_DTYPE = np.dtype(
     {
         "names": ["time_ns", "device", "polynomial", "count", "tick", "bits", "offset"],
         "formats": ["i8", "i4", "i4", "i8", "i8", "u8", "i8"],
     }
 )
-"""A sweep; ``tick`` is -1 where the robot told no time, ``offset`` -1 where it told the
-count and no bits."""
+"""Sweep of a log; ``tick`` is -1 without a time of the robot, ``offset`` -1 without bits."""
 
 
 @dataclass
 class _Log:
-    """What was read so far. Devices are numbered by their names, and by those names' bytes."""
+    """Records read so far.
+
+    Attributes
+    ----------
+    devices : dict of str to int
+        Device numbers by name.
+    known : dict of bytes to int
+        The same by the bytes of the field, which repeat from line to line.
+    rows : list of tuple
+        Sweeps in the order of :data:`SWEEP_DTYPE`; ``packed`` are earlier ones.
+    lines, records, marks, damaged : int
+        Lines, records of light, records without a sweep, and unreadable records.
+    faults : list of str
+        Warnings on the first damaged records.
+    """
 
     devices: dict[str, int] = field(default_factory=dict)
     known: dict[bytes, int] = field(default_factory=dict)
@@ -101,19 +122,19 @@ class _Log:
     faults: list[str] = field(default_factory=list)
 
     def add(self, *row: int) -> None:
-        """Add a sweep, its values in the order of :data:`_ROW`."""
+        """Add a sweep, its values in the order of :data:`SWEEP_DTYPE`."""
         self.rows.append(row)
-        if len(self.rows) == PACKED:
+        if len(self.rows) == ROWS_PER_BLOCK:
             self.pack()
 
     def pack(self) -> None:
-        """Keep what was added in less memory."""
-        self.packed.append(np.array(self.rows, _ROW))
+        """Convert the added sweeps to an array, which takes less memory."""
+        self.packed.append(np.array(self.rows, SWEEP_DTYPE))
         self.rows = []
 
 
 class _Damaged(Exception):
-    """What is wrong with a record."""
+    """Problem of a record that cannot be read."""
 
 
 def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
@@ -127,11 +148,11 @@ def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
     Raises
     ------
     MissingDataError
-        No file is given, or one is not there.
+        No file is given, or one is missing.
     InputError
-        A file cannot be read.
+        A file is not readable.
     FormatError
-        No line of the logs is a record of light.
+        The logs contain no record of light.
     """
     if not paths:
         raise MissingDataError("no log to import")
@@ -143,11 +164,11 @@ def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
             warnings.append(f"no record of light in {path}")
     rows = _rows(log, warnings)
     if not len(rows):
-        told = f" ({log.records} records of light, {log.damaged} of them damaged)"
-        told = told if log.records else ": none of its lines tells of light"
-        raise FormatError(f"no sweep in the log{told}", file=paths[0], hint=_HINT)
+        detail = f" ({log.records} records of light, {log.damaged} of them damaged)"
+        detail = detail if log.records else ": no line is a record of light"
+        raise FormatError(f"no sweep in the log{detail}", file=paths[0], hint=LOG_HINT)
     warnings += log.faults
-    rows = _once(_named_first(rows, warnings), warnings)
+    rows = _without_repeats(_without_unnamed(rows, warnings), warnings)
     clock = _date(rows, log.devices, warnings)
     sweeps = _sweeps(rows[np.argsort(rows["time_ns"], kind="stable")], tuple(log.devices))
     channels, sizes = np.unique(sweeps.channel, return_counts=True)
@@ -156,9 +177,9 @@ def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
     facts = {
         "format": "dotbot-log",
         "files": ", ".join(Path(path).name for path in paths),
-        "lines": f"{log.lines}, of which {log.records} tell of light",
+        "lines": f"{log.lines}, of which {log.records} are records of light",
         "sweeps": str(len(sweeps)),
-        "without a sweep": f"{log.marks} marks of robots that decoded nothing",
+        "without a sweep": f"{log.marks} records of robots that decoded nothing",
         "devices": ", ".join(
             f"{name} ({n} sweeps)" for name, n in zip(log.devices, per_device, strict=True)
         ),
@@ -197,20 +218,20 @@ def _read(path: Path, log: _Log) -> None:
             _KINDS[kind](log, fields, _line_time(plain, fields))
         except _Damaged as error:
             log.damaged += 1
-            if len(log.faults) < NAMED_FAULTS:
-                log.faults.append(f"{path}:{number}: {error}: left out")
+            if len(log.faults) < MAX_NAMED_FAULTS:
+                log.faults.append(f"{path}:{number}: {error}: skipped")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Lines with their numbers and ends; of one that is longer than any record, nothing."""
+    """Yield lines with their numbers and ends; lines longer than any record are empty."""
     try:
         with open(path, "rb") as stream:
             number = 0
-            while line := stream.readline(LONGEST_LINE):
+            while line := stream.readline(MAX_LINE_BYTES):
                 number += 1
-                if len(line) == LONGEST_LINE and not line.endswith(b"\n"):
+                if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
                     while line and not line.endswith(b"\n"):
-                        line = stream.readline(LONGEST_LINE)
+                        line = stream.readline(MAX_LINE_BYTES)
                     line = b"\n"
                 yield number, line
     except (FileNotFoundError, NotADirectoryError):
@@ -220,34 +241,38 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _fields(line: bytes) -> _Fields:
-    """Keys and values of a line of logfmt or JSON, as bytes."""
+    """Return the keys and values of a line of logfmt or JSON, as bytes."""
     if line.startswith(b"{"):
         try:
-            found = json.loads(line)
-            return {key.encode(): str(value).encode() for key, value in found.items()}
+            record = json.loads(line)
+            return {key.encode(): str(value).encode() for key, value in record.items()}
         except (ValueError, RecursionError):
             return {}
     return dict(_FIELD.findall(line))
 
 
 def _line_time(line: bytes, fields: _Fields) -> int:
-    """Nanoseconds since the epoch at which a line was logged; UTC where no zone is told."""
-    told = fields.get(b"timestamp")
-    text = (line[:40] if told is None else told.strip(b'"')).decode("latin-1")
-    match = _TIME.match(text) if told is None else _TIME.fullmatch(text)
+    """Return the time of a line in nanoseconds since the epoch; UTC if it has no zone."""
+    stamp = fields.get(b"timestamp")
+    text = (line[:40] if stamp is None else stamp.strip(b'"')).decode("latin-1")
+    match = _TIME.match(text) if stamp is None else _TIME.fullmatch(text)
     second = _second_ns(match[1], match[2], match[4] or "Z") if match else None
-    if match is None or second is None or not 0 <= second < 1 << 62:
+    if match is None or second is None or not 0 <= second < MAX_TIME_NS:
         raise _Damaged("no time")
     return second + int((match[3] or "0").ljust(9, "0"))
 
 
 @lru_cache(maxsize=1024)
 def _second_ns(day: str, clock: str, zone: str) -> int | None:
-    return parse_time(f"{day}T{clock}{zone}")
+    """Return the time of a whole second; cached, because many lines share one."""
+    try:
+        return parse_iso_time(f"{day}T{clock}{zone}", utc_only=False)
+    except ValueError:
+        return None
 
 
 def _number(fields: _Fields, key: bytes) -> int:
-    """A whole number; one of a robot's marks of an error may be negative."""
+    """Return a whole number, which may be negative if it marks an error of the robot."""
     text = fields.get(key, b"")
     if not (text.isdigit() or text.removeprefix(b"-").isdigit()) or len(text) > 20:
         shown = text[:20].decode("ascii", "backslashreplace")
@@ -256,21 +281,21 @@ def _number(fields: _Fields, key: bytes) -> int:
 
 
 def _device(log: _Log, fields: _Fields) -> int:
-    told = fields.get(b"source") or fields.get(b"address") or DEVICE.encode()
-    number = log.known.get(told)
+    source = fields.get(b"source") or fields.get(b"address") or DEFAULT_DEVICE.encode()
+    number = log.known.get(source)
     if number is None:
         try:
-            name = told.strip(b"\"'").decode()
+            name = source.strip(b"\"'").decode()
         except UnicodeDecodeError:
             name = ""
-        if not (0 < len(name) <= LONGEST_NAME and name.isprintable()):
-            raise _Damaged("a source that is no name")
-        number = log.known[told] = log.devices.setdefault(name, len(log.devices))
+        if not (0 < len(name) <= MAX_NAME_CHARACTERS and name.isprintable()):
+            raise _Damaged("the source is not a name")
+        number = log.known[source] = log.devices.setdefault(name, len(log.devices))
     return number
 
 
 def _add_processed(log: _Log, fields: _Fields, time_ns: int) -> None:
-    """A sweep that the robot decoded."""
+    """Add a sweep that the robot decoded."""
     polynomial, count = _number(fields, b"poly"), _number(fields, b"lfsr_index")
     tick = _number(fields, b"db_time") if b"db_time" in fields else UNKNOWN
     if b"db_time" in fields and not 0 <= tick < 1 << ROBOT_BITS:
@@ -283,7 +308,7 @@ def _add_processed(log: _Log, fields: _Fields, time_ns: int) -> None:
 
 
 def _add_counts(log: _Log, fields: _Fields, time_ns: int) -> None:
-    """Two counts of a station that is not told."""
+    """Add two counts of an unknown station."""
     counts = [_number(fields, b"c0"), _number(fields, b"c1")]
     device = _device(log, fields)
     for count in counts:
@@ -294,9 +319,9 @@ def _add_counts(log: _Log, fields: _Fields, time_ns: int) -> None:
 
 
 def _add_windows(log: _Log, fields: _Fields, time_ns: int) -> None:
-    """Windows of bits, from which the indices are to be found."""
+    """Add windows of bits, whose LFSR indices are searched later."""
     windows = []
-    for k in range(MOST_WINDOWS):
+    for k in range(MAX_WINDOWS_PER_RECORD):
         keys = [b"sweep_%d_%s" % (k, part) for part in (b"poly", b"off", b"bits")]
         if not any(key in fields for key in keys):
             break
@@ -304,9 +329,9 @@ def _add_windows(log: _Log, fields: _Fields, time_ns: int) -> None:
     device = _device(log, fields)
     for polynomial, offset, bits in windows:
         if not 0 <= bits < 1 << WINDOW_BITS:
-            raise _Damaged("bits that are no 64-bit number")
-        room = WINDOW_BITS - lfsr.REGISTER_BITS
-        if 0 <= polynomial < POLYNOMIAL_COUNT and 0 <= offset <= room:
+            raise _Damaged("the bits are not a 64-bit number")
+        max_offset = WINDOW_BITS - lfsr.REGISTER_BITS
+        if 0 <= polynomial < POLYNOMIAL_COUNT and 0 <= offset <= max_offset:
             log.add(time_ns, device, polynomial, 0, UNKNOWN, bits, offset)
         else:
             log.marks += 1
@@ -317,69 +342,73 @@ _KINDS = {
     b"sweep_0_bits": _add_windows,
     b"c0": _add_counts,
 }
-"""What adds a record, by the key that tells it."""
+"""Function that adds a record, by the key that identifies its kind."""
 
 
 def _rows(log: _Log, warnings: list[str]) -> Rows:
-    """All sweeps in order of the log's time, windows searched for their indices."""
+    """Return all sweeps in order of the log's time, with the LFSR indices of their windows."""
     log.pack()
     rows = np.concatenate(log.packed)
     windows = rows["offset"] >= 0
-    known = rows[windows]
-    index = lfsr.window_index(known["bits"], known["offset"], known["polynomial"])
+    with_bits = rows[windows]
+    index = lfsr.window_index(with_bits["bits"], with_bits["offset"], with_bits["polynomial"])
     rows["count"][windows] = index
-    dark = np.flatnonzero(windows)[index == lfsr.NO_INDEX]
-    log.marks += len(dark)
-    rows = np.delete(rows, dark)
+    without_index = np.flatnonzero(windows)[index == lfsr.NO_INDEX]
+    log.marks += len(without_index)
+    rows = np.delete(rows, without_index)
     backwards = int(np.count_nonzero(np.diff(rows["time_ns"]) < 0))
     if backwards:
         warnings.append(f"times of the log went backwards {backwards} times: records were sorted")
     return rows[np.argsort(rows["time_ns"], kind="stable")]
 
 
-def _named_first(rows: Rows, warnings: list[str]) -> Rows:
-    """Without counts of unknown stations where others tell theirs: they are the same light."""
-    named = rows["polynomial"] >= 0
-    if not np.any(named) or np.all(named):
+def _without_unnamed(rows: Rows, warnings: list[str]) -> Rows:
+    """Remove counts of unknown stations if other records contain the station of the same light."""
+    is_named = rows["polynomial"] >= 0
+    if not np.any(is_named) or np.all(is_named):
         return rows
     warnings.append(
-        f"{int(np.count_nonzero(~named))} counts that name no station were passed over: other "
-        "records tell the same light with its polynomial"
+        f"{np.count_nonzero(~is_named)} counts without a polynomial were dropped: other records "
+        "contain the same light with its polynomial"
     )
-    return rows[named]
+    return rows[is_named]
 
 
-def _once(rows: Rows, warnings: list[str]) -> Rows:
-    """Without sweeps that are in the logs twice, as where logs overlap."""
-    # The log's time, of which there are few equal ones, is the first key.
+def _without_repeats(rows: Rows, warnings: list[str]) -> Rows:
+    """Remove sweeps that occur twice, because logs overlap."""
+    # Few times of the log are equal, so that it sorts fastest as the first key.
     order = np.lexsort(
         [rows[name] for name in ("tick", "count", "polynomial", "device", "time_ns")]
     )
     ranked = rows[order]
-    same = np.ones(max(len(rows) - 1, 0), bool)
+    is_repeat = np.ones(max(len(rows) - 1, 0), bool)
     for name in ("time_ns", "device", "polynomial", "count", "tick"):
-        same &= np.diff(ranked[name]) == 0
-    if np.any(same):
-        warnings.append(f"{int(np.count_nonzero(same))} sweeps repeat another exactly: dropped")
-    return np.delete(rows, order[1:][same])
+        is_repeat &= np.diff(ranked[name]) == 0
+    if np.any(is_repeat):
+        warnings.append(
+            f"{int(np.count_nonzero(is_repeat))} sweeps repeat another exactly: dropped"
+        )
+    return np.delete(rows, order[1:][is_repeat])
 
 
 def _date(rows: Rows, devices: Mapping[str, int], warnings: list[str]) -> str:
-    """Set the times of sweeps by the robots' clocks; how times are known."""
-    dated = rows["tick"] >= 0
-    if not np.any(dated):
+    """Set the times of sweeps by the clocks of the robots; return a text on the clock."""
+    is_dated = rows["tick"] >= 0
+    if not np.any(is_dated):
         return "times of log lines, taken as UTC; all counts of a line share one"
     order = np.argsort(rows["device"], kind="stable")
     edges = np.searchsorted(rows["device"][order], np.arange(len(devices) + 1))
     for number, name in enumerate(devices):
-        mine = order[edges[number] : edges[number + 1]]
-        mine = mine[dated[mine]]
+        of_device = order[edges[number] : edges[number + 1]]
+        of_device = of_device[is_dated[of_device]]
         clock = TickClock(ROBOT_HZ, ROBOT_BITS)
-        rows["time_ns"][mine] = clock.times(rows["tick"][mine], rows["time_ns"][mine])
+        rows["time_ns"][of_device] = clock.times(
+            rows["tick"][of_device], rows["time_ns"][of_device]
+        )
         if clock.restarts:
-            warnings.append(f"the clock of {name} started again {clock.restarts} times")
-    rest = "" if np.all(dated) else f" for {np.count_nonzero(dated)} sweeps, else log lines"
-    return f"robots' clocks, by the log's (UTC){rest}"
+            warnings.append(f"the clock of {name} restarted {clock.restarts} times")
+    rest = "" if np.all(is_dated) else f" for {np.count_nonzero(is_dated)} sweeps, else log lines"
+    return f"clocks of the robots, fitted to that of the log (UTC){rest}"
 
 
 def _sweeps(rows: Rows, devices: tuple[str, ...]) -> Sweeps:

@@ -1,17 +1,17 @@
-"""What libsurvive's recordings tell of devices and stations: photodiodes, poses, calibrations.
+"""Photodiodes of devices, and poses and calibrations of stations, in recordings of libsurvive.
 
-Frames, as cntools/libsurvive (MIT) has them:
+Frames, as defined in cntools/libsurvive (MIT):
 
 * ``lighthouse_config`` gives photodiodes in the axes of the device's model ("trackref").
   ``imu`` and ``head`` are poses in them, by ``plus_x``, ``plus_z`` and ``position``
   (``solve_vive_pose`` of ``survive_default_devices.c``); older devices have
   ``trackref_from_imu`` and ``trackref_from_head`` (qx qy qz qw x y z).
-* ``POSE`` is of the head, or of the imu where the option ``report-in-imu`` was set
+* ``POSE`` is of the head, or of the imu if the option ``report-in-imu`` was set
   (``survive_default_imupose_process``): photodiodes are given in those axes here, so that
   solved poses compare with recorded ones as they are.
 * Sensors of sweeps are rows of ``modelPoints``: ``channelMap`` has been applied before they
   are written (``survive_map_sensor_id``).
-* A station looks along -z, x right, y up; here x forward, y left, z up.
+* A station points along -z, x right, y up; in locatk x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -30,54 +30,58 @@ from locatk.core.lighthouse.receiver import Receiver
 
 Array = NDArray[np.float64]
 
-SENSORS = 64
-"""Devices have up to 32 photodiodes."""
+MAX_PHOTODIODES = 64
+"""Most photodiodes of a device; trackers and headsets have up to 32."""
 
-REACH_M = 10.0
-"""No photodiode is further from its device's origin."""
+MAX_OFFSET_M = 10.0
+"""Largest plausible distance of a photodiode from the origin of its device."""
+
+MIN_VECTOR_LENGTH = 1e-6
+"""Shorter vectors have no direction."""
 
 STATION_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
-"""Our axes of a station (columns: forward, left, up) in libsurvive's (right, up, back)."""
+"""Axes of a station in locatk (columns: forward, left, up) in those of libsurvive (right, up,
+back)."""
 
-STORED_LIMIT = 1 << 20
-"""Bytes of a stored configuration; sixteen stations have some 15,000."""
+MAX_CONFIGURATION_BYTES = 1 << 20
+"""Largest stored configuration; sixteen stations have about 15,000 bytes."""
 
-_STORED_NAMES = ("phase", "tilt", "curve", "gibmag", "gibpha", "ogeemag", "ogeephase")
-"""In the order of :data:`~locatk.core.lighthouse.calibration.PARAMETERS`."""
+STORED_PARAMETERS = ("phase", "tilt", "curve", "gibmag", "gibpha", "ogeemag", "ogeephase")
+"""Names in the order of :data:`~locatk.core.lighthouse.calibration.PARAMETERS`."""
 
 _BLOCK = re.compile(r'"lighthouse(\d{1,3})"\s*:\s*\{([^{}]*)\}')
 _FIELD = re.compile(r'"(\w{1,32})"\s*:\s*(?:"([^"\n]{0,64})"|\[([^\[\]]{0,512})\])')
 
 
 def read_receiver(config: bytes, in_imu: bool = False) -> Receiver:
-    """Photodiodes of a device, in the axes in which its poses are recorded.
+    """Read the photodiodes of a device, in the axes in which its poses are recorded.
 
     Parameters
     ----------
     config : bytes
         The JSON of its line ``CONFIG``.
     in_imu : bool
-        Whether poses are those of the imu, not of the head.
+        Poses are of the imu, not of the head.
 
     Raises
     ------
     FormatError
-        It is no JSON, or its points are no points.
+        The configuration is not JSON, or its points are invalid.
     """
     device = _json(config)
     light = device.get("lighthouse_config", device)
     if not isinstance(light, dict):
-        raise FormatError("the device's lighthouse_config is no object")
+        raise FormatError("the device's lighthouse_config is not an object")
     points = _vectors(light.get("modelPoints"), "modelPoints")
-    if np.abs(points).max() > REACH_M:
-        raise FormatError("the device's modelPoints are metres from it")
+    if np.abs(points).max() > MAX_OFFSET_M:
+        raise FormatError("the device's modelPoints are metres away from it")
     from_device = rigid_inverse(_pose(device, "imu" if in_imu else "head"))
     normal: Array | None = None
     if light.get("modelNormals") is not None:
         normal = _vectors(light["modelNormals"], "modelNormals")
         length = np.linalg.norm(normal, axis=1, keepdims=True)
-        if normal.shape != points.shape or length.min() < 1e-6:
-            raise FormatError("the device's modelNormals do not belong to its modelPoints")
+        if normal.shape != points.shape or length.min() < MIN_VECTOR_LENGTH:
+            raise FormatError("the device's modelNormals do not match its modelPoints")
         normal = (normal / length) @ from_device[:3, :3].T
     name = device.get("model_number")
     return Receiver(
@@ -86,7 +90,7 @@ def read_receiver(config: bytes, in_imu: bool = False) -> Receiver:
 
 
 def serial_number(config: bytes) -> str:
-    """The device's own name, "" where it has none."""
+    """Return the serial number of a device; empty if it has none."""
     try:
         name = _json(config).get("device_serial_number")
     except FormatError:
@@ -100,51 +104,51 @@ def _json(config: bytes) -> dict[str, object]:
         try:
             device = json.loads(text)
         except json.JSONDecodeError:
-            # libsurvive writes commas after the last of a list itself.
+            # libsurvive itself writes a comma after the last element of a list.
             device = json.loads(re.sub(r",(\s{0,99}[\]}])", r"\1", text))
     except (ValueError, RecursionError):
-        raise FormatError("the device's configuration is no JSON") from None
+        raise FormatError("the device's configuration is not JSON") from None
     if not isinstance(device, dict):
-        raise FormatError("the device's configuration is no object")
+        raise FormatError("the device's configuration is not an object")
     return device
 
 
 def _vectors(value: object, name: str) -> Array:
-    """A list of points (k, 3)."""
+    """Return a list of points as (k, 3)."""
     try:
         points = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise FormatError(f"the device's {name} are no points") from None
-    if points.ndim != 2 or points.shape[1] != 3 or not 0 < len(points) <= SENSORS:
-        raise FormatError(f"the device's {name} are no points")
+        raise FormatError(f"the device's {name} are not points") from None
+    if points.ndim != 2 or points.shape[1] != 3 or not 0 < len(points) <= MAX_PHOTODIODES:
+        raise FormatError(f"the device's {name} are not points")
     if not np.all(np.isfinite(points)):
-        raise FormatError(f"the device's {name} are no finite numbers")
+        raise FormatError(f"the device's {name} are not finite numbers")
     return points
 
 
 def _pose(device: dict[str, object], part: str) -> Array:
-    """Pose (4, 4) of a part in the device's axes; the identity where it is not told."""
+    """Return the pose (4, 4) of a part in the device's axes; the identity if unknown."""
     listed = device.get(f"trackref_from_{part}")
     pose = np.eye(4)
     if isinstance(listed, list) and len(listed) == 7:
         values = _numbers(listed, f"trackref_from_{part}")
-        if np.linalg.norm(values[:4]) < 1e-6:
+        if np.linalg.norm(values[:4]) < MIN_VECTOR_LENGTH:
             raise FormatError(f"the device's trackref_from_{part} has no direction")
         pose = se3(matrix_from_quaternion(values[:4]), values[4:])
     axes = device.get(part)
     if isinstance(axes, dict) and "plus_x" in axes and "plus_z" in axes:
         x, z = _numbers(axes["plus_x"], part), _numbers(axes["plus_z"], part)
         if x.shape != (3,) or z.shape != (3,):
-            raise FormatError(f"the axes of the device's {part} are no vectors")
+            raise FormatError(f"the axes of the device's {part} are not vectors")
         if np.any(x) and np.any(z):
             y = np.cross(z, x)
-            if np.linalg.norm(y) < 1e-6:
+            if np.linalg.norm(y) < MIN_VECTOR_LENGTH:
                 raise FormatError(f"the axes of the device's {part} are parallel")
             y /= np.linalg.norm(y)
             x /= np.linalg.norm(x)
             position = _numbers(axes.get("position", [0.0] * 3), part)
-            if position.shape != (3,) or np.abs(position).max() > REACH_M:
-                raise FormatError(f"the position of the device's {part} is none")
+            if position.shape != (3,) or np.abs(position).max() > MAX_OFFSET_M:
+                raise FormatError(f"the position of the device's {part} is invalid")
             pose = se3(np.stack([x, y, np.cross(x, y)], axis=1), position)
     return pose
 
@@ -153,68 +157,68 @@ def _numbers(value: object, name: str) -> Array:
     try:
         numbers = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise FormatError(f"the device's {name} is no row of numbers") from None
+        raise FormatError(f"the device's {name} is not a row of numbers") from None
     if not np.all(np.isfinite(numbers)):
         raise FormatError(f"the device's {name} has a number that is not finite")
     return numbers
 
 
 def station_rotation(quaternion_wxyz: Array) -> Array:
-    """Rotation (3, 3) station to world, in our axes, of a recorded one."""
+    """Return the rotation (3, 3) from station to world, in the axes of locatk."""
     return np.asarray(matrix_from_quaternion(np.roll(quaternion_wxyz, -1)) @ STATION_AXES)
 
 
-def read_stored(path: Path) -> dict[int, Calibration]:
-    """Factory calibrations that libsurvive has stored in its configuration.
+def read_stored_calibrations(path: Path) -> dict[int, Calibration]:
+    """Read the factory calibrations that libsurvive stored in its configuration.
 
     libsurvive writes ``config.json``, for a recording ``<recording>.json``, in a syntax of its
-    own that is no JSON (``survive_config.c``). Numbers have six decimals.
+    own that is not JSON (``survive_config.c``). Numbers have six decimals.
 
     Parameters
     ----------
     path : path
-        Of the configuration.
+        The configuration.
 
     Returns
     -------
     dict of int to Calibration
-        By the station's serial number; of those whose factory data had arrived.
+        By the station's serial number, for stations whose factory data had arrived.
 
     Raises
     ------
     MissingDataError
-        The file is not there.
+        The file is missing.
     FormatError
-        It cannot be read, has no station, or a station with a value that is none.
+        The file is not readable, has no station, or a station has an invalid value.
     """
     path = Path(path)
     try:
         with path.open("rb") as file:
-            text = file.read(STORED_LIMIT).decode("utf-8", "replace")
+            text = file.read(MAX_CONFIGURATION_BYTES).decode("utf-8", "replace")
     except FileNotFoundError:
-        raise MissingDataError("no such configuration", file=path) from None
+        raise MissingDataError("the configuration is missing", file=path) from None
     except OSError as error:
         raise FormatError(error.strerror or "cannot be read", file=path) from None
     blocks = _BLOCK.findall(text)
     if not blocks:
-        raise FormatError("no station of libsurvive's configuration", file=path)
+        raise FormatError("not a configuration of libsurvive with a station", file=path)
     stored: dict[int, Calibration] = {}
     for number, block in blocks:
-        fields = {name: one or many for name, one, many in _FIELD.findall(block)}
+        fields = {name: text or values for name, text, values in _FIELD.findall(block)}
         if fields.get("OOTXSet", "0") == "0":
             continue
         try:
             station = int(fields["id"])
-            rows = [_pair(fields[f"fcal{name}"]) for name in _STORED_NAMES]
+            rows = [_pair(fields[f"fcal{name}"]) for name in STORED_PARAMETERS]
         except (KeyError, ValueError, InputError) as error:
-            what = f"no {error.args[0]}" if isinstance(error, KeyError) else "a wrong value"
-            raise FormatError(f"lighthouse{number} has {what}", file=path) from None
+            problem = f"no {error.args[0]}" if isinstance(error, KeyError) else "a wrong value"
+            raise FormatError(f"lighthouse{number} has {problem}", file=path) from None
         stored[station] = Calibration(np.array(rows).T, "factory")
     return stored
 
 
 def _pair(text: str) -> tuple[float, float]:
-    """Values of both planes."""
+    """Return the values of both planes."""
     values = [float(part.strip().strip('"')) for part in text.split(",")]
     if len(values) != 2 or not np.all(np.isfinite(values)):
         raise ValueError(text)

@@ -141,7 +141,7 @@ def test_bad_files_are_named_and_the_rest_is_written(
     assert (answer["frames"], answer["left_out"], len(answer["warnings"])) == (10, 2, 2)
     for path in bad:
         assert f"Warning: {path}: " in result.stderr
-    assert "Incomplete: 2 of 12 files are left out." in result.stderr
+    assert "Incomplete: 2 of 12 files are excluded." in result.stderr
     (frames,) = observations.read_frames(Session.open(out))
     assert len(frames) == 10
 
@@ -153,7 +153,7 @@ def test_a_thousand_bad_files_do_not_fill_the_screen(locatk, folder: Path, tmp_p
     assert result.exit_code == 3
     assert result.stderr.count("\n") < 16
     assert "and 40 more" in result.stderr
-    assert "50 of 62 files are left out" in result.stderr
+    assert "50 of 62 files are excluded" in result.stderr
 
 
 def test_nothing_usable_leaves_nothing(locatk, tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_nothing_usable_leaves_nothing(locatk, tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
     result = locatk("import", "images", tmp_path, "-o", tmp_path / "run.mcap")
     assert result.exit_code == 1
-    assert result.stderr.startswith("Error: none of 2 files can be used")
+    assert result.stderr.startswith("Error: none of 2 files is usable")
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -170,7 +170,7 @@ def test_nothing_usable_leaves_nothing(locatk, tmp_path: Path) -> None:
     ("paths", "words"),
     [
         (["missing"], "No such file or folder in missing"),
-        (["*.png"], "no file fits the pattern in *.png"),
+        (["*.png"], "no file matches the pattern in *.png"),
         (["empty"], "no image files (1 files of other kinds) in empty"),
     ],
 )
@@ -229,7 +229,7 @@ def test_frames_of_another_camera_than_told(locatk, folder: Path, tmp_path: Path
     sheets.write_camera(lens, Camera((640, 480), 900.0, (319.5, 239.5)))
     result = locatk("import", "images", folder, "--camera", lens, "-o", tmp_path / "run.mcap")
     assert result.exit_code == 1
-    assert "188 x 120 px, where the camera has 640 x 480 px" in result.stderr
+    assert "188 x 120 px, but the camera has 640 x 480 px" in result.stderr
 
 
 @pytest.mark.slow

@@ -164,8 +164,8 @@ def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
     result = locatk("import", "landmark-csv", run, *TOLD, "--circle", 25, "-o", out, "--json")
     assert result.exit_code == 3
     assert json.loads(result.stdout)["left_out"] == 2
-    assert f"{run}:5: h4 has no number in 2 rows: left out" in result.stderr
-    assert "Incomplete: 2 of 160 readings are left out." in result.stderr
+    assert f"{run}:5: h4 has no number in 2 rows; excluded" in result.stderr
+    assert "Incomplete: 2 of 160 readings are excluded." in result.stderr
     assert len(Session.open(out).topics("/log")) == 1
 
 
@@ -178,13 +178,13 @@ def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
         ((*TOLD, "--circle", 25, "--rate", 40), 2, "--rate means nothing"),
         ((*TOLD, "--circle", 25, "--start", "noon"), 2, "not a time in UTC"),
         ((*TOLD[:4], *VOLTS[:2], "--circle", 25), 2, "Voltages need --zero-volts too"),
-        ((*TOLD[:4], "--circle", 25), 1, "voltages, and nothing tells the field"),
-        ((*TOLD[:2], *VOLTS, "--circle", 25), 1, "no unit of column 'time'"),
-        (("--columns", "t=a,t=b", "--circle", 25), 2, "t is there twice"),
+        ((*TOLD[:4], "--circle", 25), 1, "voltages without a conversion"),
+        ((*TOLD[:2], *VOLTS, "--circle", 25), 1, "the unit of column 'time' is missing"),
+        (("--columns", "t=a,t=b", "--circle", 25), 2, "t occurs twice"),
         (("--columns", "t:time", "--circle", 25), 2, "'t:time' is not KEY=NAME"),
         ((*TOLD[:4], "--volts-per-tesla", "x", "--circle", 25), 2, "'x' is not numbers"),
         ((*TOLD, "--map", "none.toml"), 1, "No such file"),
-        (("--units", "s,m,rad,t", "--circle", 25), 1, "no column for x"),
+        (("--units", "s,m,rad,t", "--circle", 25), 1, "a column for x is missing"),
         ((*TOLD, "--circle", 25, "run.csv"), 2, "takes one PATH"),
     ],
 )

@@ -103,10 +103,10 @@ def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
     assert result.exit_code == 3
     answer = json.loads(result.stdout)
     assert answer["left_out"] == 5
-    assert "at most 61 samples a second" in answer["warnings"][0]
+    assert "at most 61 samples per second" in answer["warnings"][0]
     assert f"{run}:7: sensor 2 has no number in 2 rows" in result.stderr
-    assert f"{run}:22: sensor 2 has more than an MLX90393" in result.stderr
-    assert "Incomplete: 5 of 1620 values are left out." in result.stderr
+    assert f"{run}:22: sensor 2 has a field beyond the range of an MLX90393" in result.stderr
+    assert "Incomplete: 5 of 1620 values are excluded." in result.stderr
     session = Session.open(out)
     (samples,) = observations.read_magnetometers(session)
     assert np.count_nonzero(np.isnan(samples.field_t)) == 5
@@ -121,7 +121,7 @@ def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
         (("--rate", 0, "--spacing", 20), 2, "--rate"),
         (("--rate", 40, "--spacing", 0), 2, "--spacing"),
         (("--rate", 40, "--spacing", 20, "--truth", "run.csv"), 2, "--truth means nothing"),
-        (("--rate", 5000, "--spacing", 20), 1, "no MLX90393 gives 5000 samples a second"),
+        (("--rate", 5000, "--spacing", 20), 1, "no MLX90393 gives 5000 samples per second"),
     ],
 )
 def test_wrong_use_of_the_format(

@@ -501,7 +501,7 @@ def light() -> type[Light]:
 @pytest.fixture(scope="session")
 def published(recordings: Path) -> Callable[[str], Edges]:
     """Return a published recording of light by its path; each is read once."""
-    from locatk.formats.importers.saleae.capture import read_light
+    from locatk.formats.importers.saleae.recording import read_light
 
     @cache
     def read(name: str) -> Edges:

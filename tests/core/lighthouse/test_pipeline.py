@@ -356,7 +356,7 @@ def test_a_rotor_that_wanders_within_seconds_does_not_move_a_standing_photodiode
     data: Path,
 ) -> None:
     """A sweep counts by its own bits: by the followed phase these scatter by 1.08 and 3.05."""
-    from locatk.formats.importers.saleae.capture import read_light
+    from locatk.formats.importers.saleae.recording import read_light
 
     for name, plane, limit in (("take1", 0, 0.6), ("about_4m", 1, 2.6)):
         caught = demodulate_recording(

@@ -26,7 +26,7 @@ from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
 from locatk.core.lighthouse.solver import SolveOptions, solve
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.dotbot.csv_recording import read_dotbot
+from locatk.formats.importers.dotbot.recording import read_dotbot
 
 Array = NDArray[np.float64]
 Pairs = list[tuple[Trajectory, Trajectory]]

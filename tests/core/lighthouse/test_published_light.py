@@ -269,7 +269,7 @@ def capture(data: Path) -> tuple[Edges, np.ndarray]:
     path = data / "lighthouse/benchmarks/demodulation_code/logic_analyser_capture.sal"
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    saleae = pytest.importorskip("locatk.formats.importers.saleae.capture")
+    saleae = pytest.importorskip("locatk.formats.importers.saleae.recording")
     (edges,) = saleae.read_light(path)
     apart = np.flatnonzero(np.diff(edges.tick) > 60) + 1
     first, last = np.r_[0, apart], np.r_[apart - 1, len(edges) - 1]

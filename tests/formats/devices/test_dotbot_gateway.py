@@ -29,7 +29,7 @@ from locatk.formats.devices.dotbot_gateway import (
     encode_hdlc,
     robot_address,
 )
-from locatk.formats.importers.dotbot.csv_recording import read_dotbot
+from locatk.formats.importers.dotbot.recording import read_dotbot
 
 ROBOT = 0x5037BA3E25BBDA90
 NODE = "5037ba3e25bbda90"

@@ -27,7 +27,7 @@ from locatk.formats.devices.lighthouse_deck import (
     DeckDecoder,
     encode,
 )
-from locatk.formats.importers.dotbot.csv_recording import read_dotbot
+from locatk.formats.importers.dotbot.recording import read_dotbot
 
 README = """
     1 5431ed 13d None     0 128aa

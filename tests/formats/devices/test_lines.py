@@ -21,8 +21,8 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream, Ticks
 from locatk.formats.devices.lines import decoder as lines
-from locatk.formats.devices.lines.columns import meaning, split_unit
-from locatk.formats.devices.lines.decoder import LONGEST, LineDecoder
+from locatk.formats.devices.lines.columns import interpret_columns
+from locatk.formats.devices.lines.decoder import MAX_LINE_BYTES, LineDecoder
 
 Pieces = Sequence[bytes]
 
@@ -284,14 +284,17 @@ def test_a_lone_line_is_given_at_the_end() -> None:
 def test_more_numbers_than_names_are_said_once() -> None:
     decoder, _ = decode(b"u,v\n1,2\n" + b"1,2,3\n" * 50 + b"1,2\n")
     assert decoder.counts.bad == 50
-    assert decoder.remarks == [
-        "lines of more or less numbers are left out, where 2 columns are named"
-    ]
+    assert decoder.remarks == ["lines of another length are skipped: 2 columns have names"]
 
 
 def test_the_longest_line() -> None:
-    long = b"1," * (LONGEST // 2)
-    for line, bad in ((long, 1), (long + b"1", 1), (b"x" * LONGEST, 0), (b"x" * (LONGEST + 1), 1)):
+    long = b"1," * (MAX_LINE_BYTES // 2)
+    for line, bad in (
+        (long, 1),
+        (long + b"1", 1),
+        (b"x" * MAX_LINE_BYTES, 0),
+        (b"x" * (MAX_LINE_BYTES + 1), 1),
+    ):
         data = b"u,v\n1,2\n" + line + b"\n3,4\n"
         for pieces in ([data], [data[i : i + 1000] for i in range(0, len(data), 1000)]):
             decoder, batches = decode(*pieces)
@@ -304,13 +307,13 @@ def test_memory_is_bounded() -> None:
     decoder = LineDecoder(Options())
     for _ in range(20):
         assert decoder.feed(b"7" * 100_000) == []
-    assert len(decoder._tail) <= 2 * LONGEST
+    assert len(decoder._tail) <= 2 * MAX_LINE_BYTES
     noise = np.random.default_rng(0)
     for _ in range(20):
         names = "".join(f"n{n}:1\n" for n in noise.integers(0, 10**9, 20))
         decoder.feed(names.encode() + noise.bytes(1000))
-    assert len(decoder._pairs) <= 256
-    assert len(decoder._alike._known) <= 256
+    assert len(decoder._pair_tables) <= 256
+    assert len(decoder._pair_lines._known) <= 256
 
 
 def test_after_a_restart_the_columns_stay() -> None:
@@ -497,23 +500,6 @@ def test_teleplot_pictures_and_damage() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "bare", "unit"),
-    [
-        ("b0x_ut", "b0x", "ut"),
-        ("B0X (uT)", "b0x", "ut"),
-        ("b0x[\u00b5T]", "b0x", "ut"),
-        ("heading [deg]", "heading", "deg"),
-        ("hall_left", "hall_left", ""),
-        ("x", "x", ""),
-        ("battery_v", "battery", "v"),
-        ("_m", "_m", ""),
-    ],
-)
-def test_units_in_names(name: str, bare: str, unit: str) -> None:
-    assert split_unit(name) == (bare, unit)
-
-
-@pytest.mark.parametrize(
     ("unit", "factor"), [("T", 1), ("mT", 1e-3), ("uT", 1e-6), ("nT", 1e-9), ("gauss", 1e-4)]
 )
 def test_magnetometers(unit: str, factor: float) -> None:
@@ -530,15 +516,15 @@ def test_magnetometers(unit: str, factor: float) -> None:
     ["b0x_ut,b0y_ut", "b0x_ut,b0y_ut,b0z_ut,b2x_ut,b2y_ut,b2z_ut", "b2x_ut,b2y_ut,b2z_ut"],
 )
 def test_magnetometers_that_are_not_whole_are_readings(names: str) -> None:
-    said = meaning(names.split(","))
-    assert [part.stream.kind for part in said.parts] == ["readings"]
-    assert len(said.doubts) == 1
+    layout = interpret_columns(names.split(","))
+    assert [part.stream.kind for part in layout.parts] == ["readings"]
+    assert len(layout.remarks) == 1
 
 
 def test_what_has_no_unit_is_a_reading_and_said() -> None:
     decoder, batches = decode(b"bx,by,bz,hall_left,x,t\n1,2,3,4,5,6\n")
     assert list(values(batches)) == [("bx", "by", "bz", "hall_left", "x", "t")]
-    assert decoder.remarks == ["no unit in the name of column 'bx': name it bx_ut"]
+    assert decoder.remarks == ["the unit of column 'bx' is missing: name it bx_ut"]
 
 
 def test_hall_sensors_and_slower_odometry() -> None:
@@ -558,7 +544,7 @@ def test_hall_sensors_and_slower_odometry() -> None:
 
 
 def test_hall_sensors_of_other_names_stay_as_they_come() -> None:
-    stream = meaning(["hall_b_mt", "hall_a_mt"]).parts[0].stream
+    stream = interpret_columns(["hall_b_mt", "hall_a_mt"]).parts[0].stream
     assert (stream.sensors, stream.names) == (2, ("b", "a"))
 
 
@@ -620,6 +606,7 @@ TEXT = st.lists(
 ).map(lambda lines: b"".join(line + end for line, end in lines))
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(
     data=TEXT,
@@ -637,7 +624,7 @@ def test_any_pieces_give_the_same(data: bytes, cuts: list[int], named: bool, pie
     pieces = [data[a:b] for a, b in pairwise(edges)]
     bytewise = [data[i : i + 1] for i in range(len(data))]
     for split in (pieces, bytewise, [data]):
-        with patch.object(lines, "PIECE", piece), patch.object(lines, "SOON", 2):
+        with patch.object(lines, "PIECE_BYTES", piece), patch.object(lines, "FIRST_SPAN_LINES", 2):
             decoder, batches = decode(*split, columns=columns)
         assert same(batches, expected)
         assert decoder.counts == whole.counts

@@ -19,7 +19,8 @@ import pytest
 
 from locatk.core.geometry import quaternion_from_matrix, rotation_exp
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters.kitti import write_kitti
+from locatk.formats.exporters.tum import write_tum
 
 EPOCH = 1_690_218_696_000_000_000
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
@@ -88,7 +89,7 @@ def files(folder: Path, kind: str, case: str) -> tuple[Path, Path]:
         true, mine = np.arange(0, 30, 0.02), np.arange(0.01, 30, 0.02)
     late_s = 0.35 if case == "late" else 0.0
     estimate, truth = folder / f"estimate.{kind}", folder / f"truth.{kind}"
-    write = trajectories.write_tum if kind == "tum" else trajectories.write_kitti
+    write = write_tum if kind == "tum" else write_kitti
     write(estimate, poses(mine, seed=1, scale=1.7, late_s=late_s))
     write(truth, poses(true))
     return estimate, truth
@@ -156,7 +157,7 @@ def test_orientations_are_used_as_given(locatk, evo: Evo, tmp_path: Path) -> Non
     for name, seed in (("estimate", 3), ("truth", None)):
         all_known = poses(rows, seed=seed)
         point = Trajectory.from_positions("r", "f", all_known.time_ns, all_known.position)
-        trajectories.write_tum(tmp_path / f"{name}.tum", point)
+        write_tum(tmp_path / f"{name}.tum", point)
     estimate, truth = tmp_path / "estimate.tum", tmp_path / "truth.tum"
     found = ours(locatk, estimate, truth, "--align", "se3")
     same(found["rpe"]["translation_m"], evo("rpe", "tum", truth, estimate, "-a"))

@@ -12,7 +12,9 @@ from locatk.core.errors import LocatkError, OutputExistsError
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.parquet import AXES, COVARIANCE, write_parquet
-from locatk.formats.exporters.trajectory_text import COLUMNS, format_time, read_csv, write_csv
+from locatk.formats.exporters.trajectory_csv import COLUMNS, write_csv
+from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.tables.timestamps import format_epoch_seconds
 
 START_NS = 1_700_000_000_123_456_789
 
@@ -72,7 +74,7 @@ def test_columns_are_those_of_csv_and_more(parquet, tmp_path: Path) -> None:
         rows = table.filter(np.array(table["device"].to_pylist()) == back.device)
         sigma = rows["sigma_heading_rad"].to_numpy()
         assert np.array_equal(sigma, back.sigma[:, 5], equal_nan=True)
-        text = [float(format_time(time_ns)) for time_ns in back.time_ns.tolist()]
+        text = [float(format_epoch_seconds(time_ns)) for time_ns in back.time_ns.tolist()]
         assert rows["time_s"].to_pylist() == text
 
 

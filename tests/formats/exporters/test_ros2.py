@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from locatk.core.errors import InputError, OutputExistsError
 from locatk.core.geometry import quaternion_from_matrix, rotation_exp
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
 from locatk.formats.exporters.ros2 import UNKNOWN_VARIANCE, known_covariance, ros_names, write_ros2
+from locatk.formats.exporters.tum import write_tum
 
 START_NS = 1_700_000_000_123_456_789
 
@@ -250,7 +250,7 @@ def test_evo_compares_it(tmp_path: Path) -> None:
     write_ros2(tmp_path / "poses.mcap", [truth, estimate])
     bag = evo("evo_ape", "mcap", "poses.mcap", "/pose/truth", "/pose/estimate", cwd=tmp_path)
     for each in (truth, estimate):
-        trajectories.write_tum(tmp_path / f"{each.device}.tum", each)
+        write_tum(tmp_path / f"{each.device}.tum", each)
     tum = evo("evo_ape", "tum", "truth.tum", "estimate.tum", cwd=tmp_path)
     [rmse] = re.findall(r"rmse\s+(\S+)", bag)
     assert float(rmse) == pytest.approx(0.005, abs=1e-6)

@@ -18,7 +18,7 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
 from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.dotbot.csv_recording import read_dotbot
+from locatk.formats.importers.dotbot.recording import read_dotbot
 from locatk.formats.importers.lighthouse import ImportedSession
 
 CORNERS = ("tl", "tr", "br", "bl")
@@ -334,6 +334,7 @@ def test_missing_files_and_mixed_layouts(write: Write, tmp_path: Path) -> None:
         read_dotbot([write(TWO + ROW), other])
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=300))
 def test_any_bytes_are_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, content: bytes
@@ -344,6 +345,7 @@ def test_any_bytes_are_refused_in_one_line(
         read_dotbot([file])
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(st.integers(0, 10**6), st.sampled_from("RGB"), st.integers(0, 131071)),
@@ -519,7 +521,7 @@ def test_no_markers_from_a_plane_that_is_not_of_these_counts(write: Write) -> No
     write(json.dumps({"v": SQUARE}), "calibration.json")
     session = read_dotbot([write(synthetic(1e-3)[0])])
     assert session.scene is None
-    assert "no homography of the counts" in session.warnings[0]
+    assert "not a homography of the counts" in session.warnings[0]
     still = "timestamp,x,y,c0,c1\n" + "".join(
         f"2023-07-24 17:11:{i:02d},0.5,0.5,38000,79000\n" for i in range(10)
     )

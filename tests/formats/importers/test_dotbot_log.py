@@ -79,7 +79,7 @@ def test_sweeps_that_robots_decoded(read) -> None:
         ns("2024-05-31T12:03:08.299838"),
         ns("2024-05-31T12:03:08.321186"),
     ]
-    assert found.facts["lines"] == "5, of which 4 tell of light"
+    assert found.facts["lines"] == "5, of which 4 are records of light"
     assert found.facts["without a sweep"].startswith("2 ")
     assert [(s.channel, s.sweeps) for s in found.stations] == [(1, 1), (2, 1)]
     assert (found.warnings, found.lost, found.scene) == ([], None, None)
@@ -148,7 +148,7 @@ def test_the_same_light_told_twice_is_taken_with_its_polynomial(read) -> None:
     found = read(counts("8.1", 12345, 99999) + windows("8.1", (2, 0, int(lfsr.bits_at(12345, 2)))))
     assert found.sweeps.count.tolist() == [12345]
     assert found.sweeps.channel.tolist() == [2]
-    assert "2 counts that name no station" in found.warnings[0]
+    assert "2 counts without a polynomial" in found.warnings[0]
 
 
 CONSOLE = (

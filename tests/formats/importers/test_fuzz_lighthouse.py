@@ -45,11 +45,10 @@ from locatk.formats.artifacts import receiver as receivers
 from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.exporters import crazyflie
 from locatk.formats.importers.dotbot.log import read_dotbot_log
-from locatk.formats.importers.libsurvive.device import read_stored
+from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.lighthouse import ImportedSession
-from locatk.formats.importers.saleae.capture import read_capture
-from locatk.formats.importers.saleae.session import read_saleae
+from locatk.formats.importers.saleae.recording import read_capture, read_saleae
 from locatk.formats.sessions import observations
 from locatk.formats.sessions import station_reports as heard
 from locatk.formats.sessions.reader import Session
@@ -509,7 +508,7 @@ FILES: dict[str, tuple[str, Sequence[bytes], Callable[[Path, bool], Any]]] = {
         [recording(), gzip.compress(recording(), 1)],
         importer(lambda path: read_libsurvive([path], stations=True)),
     ),
-    "libsurvive-stored": ("run.json", [STORED], lambda path, _: read_stored(path)),
+    "libsurvive-stored": ("run.json", [STORED], lambda path, _: read_stored_calibrations(path)),
     "dotbot-log": ("pydotbot.log", LOGS, importer(lambda path: read_dotbot_log([path]))),
     "crazyflie": (
         "config.yaml",
@@ -602,15 +601,17 @@ GUARDED = """
 import resource, sys
 from pathlib import Path
 from locatk.core.errors import LocatkError
-from locatk.formats import artifacts, crazyflie, receivers
+from locatk.formats.artifacts.receiver import read_receiver
+from locatk.formats.artifacts.scene import read_scene
+from locatk.formats.exporters.crazyflie import read_config
 from locatk.formats.importers.dotbot.log import read_dotbot_log
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
-from locatk.formats.importers.saleae.session import read_saleae
+from locatk.formats.importers.saleae.recording import read_saleae
 readers = {
     "sal": lambda path: read_saleae([path]), "csv": lambda path: read_saleae([path]),
     "bin": lambda path: read_saleae([path]), "gz": lambda path: read_libsurvive([path]),
-    "log": lambda path: read_dotbot_log([path]), "yaml": crazyflie.read_config,
-    "scene": artifacts.read_scene, "receiver": receivers.read_receiver,
+    "log": lambda path: read_dotbot_log([path]), "yaml": read_config,
+    "scene": read_scene, "receiver": read_receiver,
 }
 pages = int(Path("/proc/self/statm").read_text().split()[0])
 limit = pages * resource.getpagesize() + int(sys.argv[2])

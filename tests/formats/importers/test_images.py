@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError, MissingDataError
-from locatk.formats.importers.images import START_NS, ImageFiles, find_images
+from locatk.formats.importers.images import ImageFiles, find_images
 from locatk.formats.importers.video import Video, is_cut
 from locatk.formats.sessions import frames, observations
 from locatk.formats.sessions.reader import Session
+from locatk.formats.tables.timestamps import UNDATED_START_NS
 
 
 def picture(number: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
@@ -55,6 +56,7 @@ def test_any_numbers_come_in_order(numbers: list[int]) -> None:
     assert [int(path.stem[1:]) for path in paths] == sorted(numbers)
 
 
+@pytest.mark.slow
 @given(st.lists(st.text(st.characters(exclude_characters="/\0"), min_size=1), min_size=2))
 def test_any_names_can_be_ordered(names: list[str]) -> None:
     from locatk.formats.importers.images import _natural
@@ -88,7 +90,7 @@ def test_a_name_that_looks_like_a_pattern(tmp_path: Path) -> None:
     ("name", "kind", "words"),
     [
         ("none", MissingDataError, "No such file"),
-        ("*.png", MissingDataError, "no file fits the pattern"),
+        ("*.png", MissingDataError, "no file matches the pattern"),
         ("*.txt", FormatError, "no image files (1 files of other kinds)"),
         ("", FormatError, "no image files (1 files of other kinds)"),
     ],
@@ -107,7 +109,11 @@ def test_nothing_to_import(tmp_path: Path, name: str, kind: type, words: str) ->
 def test_times_names_and_values(tmp_path: Path) -> None:
     files = [save(tmp_path / f"f{n}.png", n) for n in range(3)]
     shots = list(ImageFiles(files, rate_hz=40))
-    assert [shot.time_ns for shot in shots] == [START_NS, START_NS + 25_000_000, 1_050_000_000]
+    assert [shot.time_ns for shot in shots] == [
+        UNDATED_START_NS,
+        UNDATED_START_NS + 25_000_000,
+        1_050_000_000,
+    ]
     assert [shot.name for shot in shots] == ["f0.png", "f1.png", "f2.png"]
     assert [shot.image for shot in shots] == [path.read_bytes() for path in files]
 
@@ -122,9 +128,9 @@ def test_a_bad_file_is_told_and_keeps_its_place_in_time(tmp_path: Path) -> None:
     files[1].write_bytes(files[1].read_bytes()[:60])
     files[2].write_text("hello")
     source = ImageFiles(files, rate_hz=10)
-    assert [shot.time_ns for shot in source] == [START_NS, START_NS + 300_000_000]
+    assert [shot.time_ns for shot in source] == [UNDATED_START_NS, UNDATED_START_NS + 300_000_000]
     assert [line.partition(": ")[0] for line in source.warnings] == [str(f) for f in files[1:3]]
-    assert (source.left_out, source.lost) == (2, "2 of 4 files are left out")
+    assert (source.left_out, source.lost) == (2, "2 of 4 files are excluded")
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may read everything")
@@ -139,7 +145,7 @@ def test_a_file_that_may_not_be_read(tmp_path: Path) -> None:
 def test_no_file_at_all_can_be_used(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_text("hello")
-    with pytest.raises(FormatError, match=r"none of 1 files can be used: .*not an image"):
+    with pytest.raises(FormatError, match=r"none of 1 files is usable: .*not an image"):
         list(ImageFiles([path]))
 
 
@@ -148,7 +154,7 @@ def test_frames_of_another_camera(tmp_path: Path) -> None:
     files = [save(tmp_path / "0.png"), save(tmp_path / "1.png", size=(48, 64))]
     source = ImageFiles(files, camera=camera)
     assert len(list(source)) == 1
-    assert "48 x 64 px, where the camera has 64 x 48 px" in source.warnings[0]
+    assert "48 x 64 px, but the camera has 64 x 48 px" in source.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -236,7 +242,9 @@ def matroska(path: Path, times_ms: tuple[int, ...] = TIMES_MS) -> Path:
 def test_times_of_a_video_are_kept(tmp_path: Path) -> None:
     source = Video(matroska(tmp_path / "run.mkv"))
     shots = list(source)
-    assert [shot.time_ns for shot in shots] == [START_NS + ms * 1_000_000 for ms in TIMES_MS]
+    assert [shot.time_ns for shot in shots] == [
+        UNDATED_START_NS + ms * 1_000_000 for ms in TIMES_MS
+    ]
     assert [shot.name for shot in shots] == [str(n) for n in range(10)]
     for n, shot in enumerate(shots):
         assert shot.image.shape == (48, 64)
@@ -255,7 +263,9 @@ def test_videos_of_a_fixed_rate(tmp_path: Path, name: str, fourcc: str) -> None:
     source = Video(path)
     shots = list(source)
     assert len(shots) == len(source) == 20
-    np.testing.assert_allclose([s.time_ns - START_NS for s in shots], 4e7 * np.arange(20), atol=1)
+    np.testing.assert_allclose(
+        [s.time_ns - UNDATED_START_NS for s in shots], 4e7 * np.arange(20), atol=1
+    )
     assert all(
         np.abs(s.image.astype(int) - picture(n % 10)).mean() < 4 for n, s in enumerate(shots)
     )
@@ -269,7 +279,7 @@ def test_videos_of_a_fixed_rate(tmp_path: Path, name: str, fourcc: str) -> None:
     except FormatError as error:
         assert error.file == str(path)  # noqa: PT017
     else:
-        assert "cut short after" in (source.lost or "")
+        assert "truncated after" in (source.lost or "")
 
 
 def test_a_video_that_is_cut_short(tmp_path: Path) -> None:
@@ -278,12 +288,13 @@ def test_a_video_that_is_cut_short(tmp_path: Path) -> None:
     source = Video(path)
     shots = list(source)
     assert 4 < len(shots) < 10
-    assert [shot.time_ns - START_NS for shot in shots] == [
+    assert [shot.time_ns - UNDATED_START_NS for shot in shots] == [
         ms * 1_000_000 for ms in TIMES_MS[: len(shots)]
     ]
-    assert source.lost == f"{path}: cut short after {len(shots)} frames"
+    assert source.lost == f"{path}: truncated after {len(shots)} frames"
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=300))
 def test_no_bytes_upset_the_look_for_the_end(tmp_path_factory, data: bytes) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path_factory.getbasetemp() / "any"
@@ -301,11 +312,11 @@ def test_no_bytes_upset_the_look_for_the_end(tmp_path_factory, data: bytes) -> N
 def test_what_is_no_video(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "run.mp4"
     path.write_bytes(data)
-    with pytest.raises(FormatError, match="not a video"):
+    with pytest.raises(FormatError, match="not a readable video"):
         Video(path)
 
 
 def test_a_video_of_another_camera(tmp_path: Path) -> None:
     path = matroska(tmp_path / "run.mkv")
-    with pytest.raises(InputError, match="64 x 48 px, where the camera has 188 x 120 px"):
+    with pytest.raises(InputError, match="64 x 48 px, but the camera has 188 x 120 px"):
         list(Video(path, camera=Camera((188, 120), 900.0, (93.5, 59.5))))

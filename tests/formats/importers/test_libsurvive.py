@@ -23,11 +23,11 @@ from locatk.core.lighthouse.demodulation.ootx import encode_frame
 from locatk.core.lighthouse.demodulation.tracker_syncs import fit_rotor
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.formats.importers.libsurvive import lines as libsurvive_lines
-from locatk.formats.importers.libsurvive.device import read_stored
-from locatk.formats.importers.libsurvive.lines import read_lines
+from locatk.formats.importers.libsurvive import rec_file
+from locatk.formats.importers.libsurvive.device import read_stored_calibrations
+from locatk.formats.importers.libsurvive.rec_file import read_rec_file
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
-from locatk.formats.importers.libsurvive.sweeps import hear, planes
+from locatk.formats.importers.libsurvive.sweeps import assign_planes, read_device_sweeps
 
 PUBLISHED = "lighthouse/libsurvive/tracker-cal-attempt.rec.gz"
 
@@ -224,8 +224,8 @@ def test_a_tracker_that_starts_again_and_a_timecode_of_nowhere(tmp_path: Path) -
             words[place] = str((int(words[place]) + 1_000_000_000) % (1 << 32))
         room.lines[k] = (time, " ".join(words))
     session = read_libsurvive([room.write(tmp_path)])
-    assert session.warnings == ["the counter of WM0 started again 1 times"]
-    assert session.lost == "2 lines with a timecode that does not fit its time"
+    assert session.warnings == ["the counter of WM0 restarted 1 times"]
+    assert session.lost == "2 lines with a timecode that contradicts its time"
     assert np.abs(turn_errors(room, session.sweeps)).max() < 1.0
     assert np.ptp(session.sweeps.time_ns) < 3_100_000_000
 
@@ -358,7 +358,9 @@ def test_planes_that_meet_in_the_middle() -> None:
 
     def told(*turns: float) -> list[int]:
         turn = np.repeat(turns, 200)
-        return planes(turn, np.tile(tick, len(turns)) + turn * period, period)[::200].tolist()
+        return assign_planes(turn, np.tile(tick, len(turns)) + turn * period, period)[
+            ::200
+        ].tolist()
 
     assert told(0.30, 0.65) == [0, 1]
     # Far to the right the second plane comes before half a turn, far to the left the first
@@ -370,7 +372,7 @@ def test_planes_that_meet_in_the_middle() -> None:
     assert told(0.50) == [-1]
     # A plane that was not seen for seconds tells nothing.
     turn = np.r_[0.45, 0.38, 0.75]
-    assert planes(turn, np.array([0, 400, 400]) * period, period).tolist() == [-1, 0, 1]
+    assert assign_planes(turn, np.array([0, 400, 400]) * period, period).tolist() == [-1, 0, 1]
 
 
 def test_rotors_need_four_syncs_of_one_rhythm() -> None:
@@ -460,12 +462,12 @@ def test_sweeps_of_no_photodiode_and_no_rotor_are_left_out(tmp_path: Path, room:
     ]
     session = read_libsurvive([room.write(tmp_path, *more)])
     assert session.lost == (
-        "1 sweep without a sync near, 1 sweep of photodiodes that the device's configuration lacks"
+        "1 sweep far from any sync, 1 sweep of photodiodes missing in the device's configuration"
     )
     assert set(session.sweeps.channel.tolist()) == {4, 12}
     without = read_libsurvive([room.write(tmp_path, *more, config=False)])
     assert without.receivers == {}
-    assert without.lost == "1 sweep without a sync near"
+    assert without.lost == "1 sweep far from any sync"
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -482,7 +484,7 @@ def test_recordings_that_break_off_give_what_was_read(
     session = read_libsurvive([file])
     if packed:
         assert session.lost is not None
-        assert session.lost.startswith("the archive breaks off")
+        assert session.lost.startswith("the archive is truncated")
     assert 0.3 < len(session.sweeps) / sum(" W " in line for _, line in room.lines) < 0.9
     assert np.abs(turn_errors(room, session.sweeps)).max() < 1.0
 
@@ -499,12 +501,13 @@ def test_archives_of_several_members_and_damaged_ones(tmp_path: Path, room: Room
     assert str(read_libsurvive([file]).lost).startswith("the archive is damaged")
 
 
+@pytest.mark.slow
 def test_bombs_are_read_to_a_limit(
     tmp_path: Path, room: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(libsurvive_lines, "BLOCK", 1 << 15)
-    monkeypatch.setattr(libsurvive_lines, "LONGEST", 1 << 16)
-    monkeypatch.setattr(libsurvive_lines, "LIMIT", 2 << 20)
+    monkeypatch.setattr(rec_file, "BLOCK_BYTES", 1 << 15)
+    monkeypatch.setattr(rec_file, "MAX_LINE_BYTES", 1 << 16)
+    monkeypatch.setattr(rec_file, "MAX_BYTES", 2 << 20)
     file = tmp_path / "bomb.rec.gz"
     file.write_bytes(gzip.compress(room.text() + b"x" * (8 << 20)))
     session = read_libsurvive([file])
@@ -513,11 +516,11 @@ def test_bombs_are_read_to_a_limit(
     # What packs as nothing that was measured does is not read on, nor are lines without end.
     dense = b"1.1 WM0 POSE 0 0 0 1 0 0 0\r\n" * 40_000
     file.write_bytes(gzip.compress(room.text() + dense))
-    monkeypatch.setattr(libsurvive_lines, "LINES", 20_000)
+    monkeypatch.setattr(rec_file, "MAX_LINES", 20_000)
     assert str(read_libsurvive([file]).lost).startswith("only the first 2")
-    monkeypatch.setattr(libsurvive_lines, "DENSE_FROM", 1 << 18)
-    monkeypatch.setattr(libsurvive_lines, "DENSE", 4)
-    assert "as no recording is" in str(read_libsurvive([file]).lost)
+    monkeypatch.setattr(rec_file, "MIN_COMPRESSION_CHECK_BYTES", 1 << 18)
+    monkeypatch.setattr(rec_file, "MAX_COMPRESSION_RATIO", 4)
+    assert "unlike a recording" in str(read_libsurvive([file]).lost)
 
 
 def test_what_is_no_recording(tmp_path: Path, room: Room) -> None:
@@ -528,14 +531,14 @@ def test_what_is_no_recording(tmp_path: Path, room: Room) -> None:
             read_libsurvive([file])
         assert "\n" not in str(caught.value)
 
-    refused(b"", FormatError, "no recording of libsurvive")
-    refused(b"\x1f\x8b", FormatError, "no recording of libsurvive")
-    refused(bytes(range(256)) * 50, FormatError, "no recording of libsurvive")
-    refused("a,b,c\n1,2,3\n", FormatError, "no recording of libsurvive")
+    refused(b"", FormatError, "not a recording of libsurvive")
+    refused(b"\x1f\x8b", FormatError, "not a recording of libsurvive")
+    refused(bytes(range(256)) * 50, FormatError, "not a recording of libsurvive")
+    refused("a,b,c\n1,2,3\n", FormatError, "not a recording of libsurvive")
     refused("0.1 HMD L X 3 0 123456 1234567 3000 0\n0.1 HMD C 1 2 3\n", FormatError, "V1")
     refused("0.1 OPTION v i 100\n0.2 WM0 Y 3 1 0 0\n", FormatError, "without a sweep")
     sweeps = "\n".join(line for line in room.text().decode().splitlines() if " Y " not in line)
-    refused(sweeps, InputError, "no sweep of a station whose rotor is known")
+    refused(sweeps, InputError, "no sweep of a station with a known rotor")
     with pytest.raises(MissingDataError):
         read_libsurvive([tmp_path / "absent.rec"])
     with pytest.raises(MissingDataError):
@@ -608,7 +611,7 @@ STORED = """"v":"0",
 def test_stored_calibrations(tmp_path: Path) -> None:
     file = tmp_path / "config.json"
     file.write_text(STORED)
-    stored = read_stored(file)
+    stored = read_stored_calibrations(file)
     assert list(stored) == [1083618720]
     first, second = stored[1083618720].sweeps
     expected = [0.0, -0.050262, 0.022507, -0.006107, 1.605469, 0.206665, 1.362305]
@@ -617,9 +620,9 @@ def test_stored_calibrations(tmp_path: Path) -> None:
     for wrong in ("{}", "", STORED.replace('"fcaltilt"', '"x"'), STORED.replace("0.045", "nan")):
         file.write_text(wrong)
         with pytest.raises(FormatError):
-            read_stored(file)
+            read_stored_calibrations(file)
     with pytest.raises(MissingDataError):
-        read_stored(tmp_path / "absent.json")
+        read_stored_calibrations(tmp_path / "absent.json")
 
 
 @pytest.mark.slow
@@ -660,6 +663,7 @@ def test_damage_of_any_kind_is_an_error_or_a_warning(tmp_path: Path, data: st.Da
     assert np.all(np.diff(sweeps.time_ns) >= 0)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     st.lists(
@@ -697,7 +701,7 @@ def test_stored_configurations_of_any_bytes(
     file = tmp_path_factory.getbasetemp() / "any.json"
     file.write_bytes(STORED[:at].encode() + rubbish + STORED[at:].encode())
     with suppress(LocatkError):
-        read_stored(file)
+        read_stored_calibrations(file)
 
 
 # ---- the published recording
@@ -714,7 +718,7 @@ def published(data: Path) -> Path:
 @pytest.mark.slow
 def test_published_calibrations_are_those_that_libsurvive_stored(published: Path) -> None:
     session = read_libsurvive([published])
-    stored = read_stored(published.with_name(published.name + ".json"))
+    stored = read_stored_calibrations(published.with_name(published.name + ".json"))
     assert session.lost is None
     assert session.warnings == []
     assert len(session.sweeps) == 138_259
@@ -736,18 +740,18 @@ def test_published_calibrations_are_those_that_libsurvive_stored(published: Path
 def test_published_angles_are_libsurvives_but_for_the_noise_of_single_syncs(
     published: Path,
 ) -> None:
-    recording = read_lines(published, angles=True)
-    heard = hear(recording, 0)
+    recording = read_rec_file(published, angles=True)
+    heard = read_device_sweeps(recording, 0)
     sweeps, angles = recording.sweeps.take(heard.row), recording.angles
 
-    def name(lines: libsurvive_lines.Columns) -> np.ndarray:
+    def name(lines: rec_file.Columns) -> np.ndarray:
         return (lines.channel.astype(np.int64) * 1000 + lines.sensor) * (1 << 33) + lines.timecode
 
     order = np.argsort(name(sweeps))
     found = order[np.searchsorted(name(sweeps)[order], name(angles))]
     assert np.array_equal(name(sweeps)[found], name(angles))
     assert np.array_equal(heard.plane[found], angles.flag)
-    difference = 2 * np.pi * heard.turn[found] + ROTOR_ZERO_RAD[angles.flag] - angles.angle
+    difference = 2 * np.pi * heard.revolution[found] + ROTOR_ZERO_RAD[angles.flag] - angles.angle
     # A sync is some 10 ticks from where the rotor was: 0.07 mrad.
     assert np.sqrt(np.mean(difference**2)) < 5e-5
     assert np.abs(difference).max() < 5e-4

@@ -14,10 +14,10 @@ from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.polaris.codec import capacity
 from locatk.formats.importers.polaris_csv import (
     PUBLISHED_TAGS,
-    START_NS,
     ImportedSamples,
     read_polaris,
 )
+from locatk.formats.tables.timestamps import UNDATED_START_NS
 
 NOISE = np.random.default_rng(5)
 
@@ -53,6 +53,7 @@ def read(path: Path, rate: float = 40.0) -> ImportedSamples:
     return read_polaris(path, rate_hz=rate, spacing_m=0.02)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.lists(st.floats(-4000, 4000), min_size=6, max_size=6), min_size=1, max_size=9).map(
@@ -75,7 +76,9 @@ def test_what_a_bar_is_taken_to_be(tmp_path: Path) -> None:
     # Sensor 1 is the rightmost, y is to the left.
     np.testing.assert_allclose(array.position_m, [[0, -0.02, 0], [0, 0, 0], [0, 0.02, 0]])
     np.testing.assert_allclose(array.noise_t, [0.89e-6, 0.86e-6, 1.24e-6])
-    assert imported.samples.time_ns.tolist() == [START_NS + k * 25_000_000 for k in range(5)]
+    assert imported.samples.time_ns.tolist() == [
+        UNDATED_START_NS + k * 25_000_000 for k in range(5)
+    ]
     assert capacity(PUBLISHED_TAGS) == 1 << 18
 
 
@@ -108,7 +111,7 @@ def test_dates_tell_when_it_began(tmp_path: Path) -> None:
     assert imported.samples.time_ns[[0, 1]].tolist() == [start, start + 25_000_000]
     other = read(tmp_path / "run.csv", rate=50)
     assert other.warnings == [
-        "the stamps tell 40 samples a second, not 50: the rate that was given is used"
+        "the stamps show 40 samples per second, not 50: the stated rate is used"
     ]
 
 
@@ -130,11 +133,11 @@ def test_rates_that_cannot_be(tmp_path: Path) -> None:
     for rate in (0.0, -40.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="a rate of"):
             read(path, rate)
-    with pytest.raises(InputError, match="no MLX90393 gives 5000 samples a second"):
+    with pytest.raises(InputError, match="no MLX90393 gives 5000 samples per second"):
         read(path, 5000.0)
     fast = read(path, 100.0)
     (warning,) = fast.warnings
-    assert "at most 61 samples a second" in warning
+    assert "at most 61 samples per second" in warning
     # A sensor that converts faster converts its axes closer together.
     delay = np.ptp(fast.samples.array.delay_s)
     assert delay < np.ptp(read(path).samples.array.delay_s)
@@ -150,11 +153,11 @@ def test_cells_without_numbers_are_left_out_and_named(tmp_path: Path) -> None:
     missing = np.argwhere(np.isnan(imported.samples.field_t)).tolist()
     # The y of the part is the x of the array.
     assert missing == [[4, 1, 0], [4, 1, 1], [4, 1, 2], [7, 2, 0], [9, 1, 0], [9, 1, 1], [9, 1, 2]]
-    assert imported.lost == "7 of 360 values are left out"
+    assert imported.lost == "7 of 360 values are excluded"
     path = tmp_path / "run.csv"
     assert imported.warnings == [
-        f"{path}:6: sensor 2 has no number in 2 rows: left out",
-        f"{path}:9: sensor 3 has no number in 1 rows: left out",
+        f"{path}:6: sensor 2 has no number in 2 rows; excluded",
+        f"{path}:9: sensor 3 has no number in 1 row; excluded",
     ]
 
 
@@ -166,7 +169,9 @@ def test_saturated_samples_are_left_out_and_named(tmp_path: Path) -> None:
     imported = read(write(tmp_path / "run.csv", values))
     assert np.argwhere(np.isnan(imported.samples.field_t)).tolist() == [[3, 0, 1], [5, 0, 2]]
     (warning,) = imported.warnings
-    assert warning.startswith(f"{tmp_path / 'run.csv'}:5: sensor 1 has more than an MLX90393")
+    assert warning.startswith(
+        f"{tmp_path / 'run.csv'}:5: sensor 1 has a field beyond the range of an MLX90393"
+    )
 
 
 def test_a_dead_sensor_is_left_out_and_named(tmp_path: Path) -> None:
@@ -176,9 +181,9 @@ def test_a_dead_sensor_is_left_out_and_named(tmp_path: Path) -> None:
     assert np.isnan(imported.samples.field_t[:, 1]).all()
     assert not np.isnan(imported.samples.field_t[:, [0, 2]]).any()
     assert imported.left_out == 120
-    assert "sensor 2 has the same in all rows" in imported.warnings[0]
+    assert "sensor 2 has a constant value" in imported.warnings[0]
     values[:] = 0.0
-    with pytest.raises(InputError, match=r"no value that can be used in .*run\.csv"):
+    with pytest.raises(InputError, match=r"no usable value in .*run\.csv"):
         read(write(tmp_path / "run.csv", values))
 
 
@@ -211,13 +216,14 @@ def test_a_dead_sensor_is_left_out_and_named(tmp_path: Path) -> None:
 )
 def test_a_cell_that_is_no_vector_is_named(tmp_path: Path, cell: str) -> None:
     path = write(tmp_path / "run.csv", noise(12), cells={(5, 1): cell})
-    with pytest.raises(InputError, match="no tuple of three numbers") as caught:
+    with pytest.raises(InputError, match="not a tuple of three numbers") as caught:
         read(path)
     # Of a cell of two lines the second is named.
     assert caught.value.where == (8 if "\n" in cell else 7)
     assert "'sensor 2'" in caught.value.message
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.text("0123456789.+-eEnaifNA(), |\t", max_size=24))
 def test_a_cell_is_a_vector_exactly_where_python_says_so(
@@ -249,9 +255,9 @@ def test_a_cell_is_a_vector_exactly_where_python_says_so(
 @pytest.mark.parametrize(
     ("header", "words"),
     [
-        (["", "Time Stamp", "a", "b", "c"], "no column of a sensor"),
-        (["", "Time Stamp", "Sensor 1", "Sensor 2", "Sensor 4"], "missing column 'Sensor 3'"),
-        (["", "Time Stamp", "Sensor 2", "Sensor 3", "Sensor 4"], "missing column 'Sensor 1'"),
+        (["", "Time Stamp", "a", "b", "c"], "columns of sensors are missing"),
+        (["", "Time Stamp", "Sensor 1", "Sensor 2", "Sensor 4"], "column 'Sensor 3' is missing"),
+        (["", "Time Stamp", "Sensor 2", "Sensor 3", "Sensor 4"], "column 'Sensor 1' is missing"),
         (["", "Time Stamp", "Sensor 1", "Sensor 1", "Sensor 2"], "occurs twice"),
         (["", "Time Stamp", "Sensor 1", "Sensor 2"], "5 cells in a row"),
     ],

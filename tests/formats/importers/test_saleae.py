@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import LocatkError
 from locatk.formats.importers.saleae import csv_export as saleae_csv
-from locatk.formats.importers.saleae.capture import read_capture, read_light
-from locatk.formats.importers.saleae.data_lines import LEAST_RUNS, resolution_of
+from locatk.formats.importers.saleae.digital_lines import MIN_RUNS, estimate_resolution
+from locatk.formats.importers.saleae.recording import read_capture, read_light
 
 LOGIC_1 = ("Time[s], {}, {}", "{:.15f}", ", ")
 LOGIC_2 = ("Time [s],{},{}", "{:.9f}", ",")
@@ -113,7 +113,7 @@ def test_the_edges_of_each_column(
     rows = rows_of(edges, levels, start)
     path = write(tmp_path_factory.mktemp("csv") / "run.csv", rows, style, end=end)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(saleae_csv, "BLOCK", block)
+        patch.setattr(saleae_csv, "BLOCK_BYTES", block)
         read = read_light(path, [1, 0])
     for line, want, level in zip(read, edges[::-1], levels[::-1], strict=True):
         assert line.tick.tolist() == want
@@ -174,15 +174,15 @@ def test_the_resolution_shows_in_the_times(tmp_path: Path, mhz: float) -> None:
     (edges,) = read_light(write(tmp_path / "run.csv", single(ticks)))
     assert edges.tick.tolist() == ticks.tolist()
     assert edges.resolution_hz == pytest.approx(mhz * 1e6)
-    shifted = resolution_of(ticks[5:] - 77)  # times relative to a marker
+    shifted = estimate_resolution(ticks[5:] - 77)  # times relative to a marker
     assert shifted == pytest.approx(mhz * 1e6)
 
 
 def test_the_resolution_of_few_or_random_times() -> None:
-    assert resolution_of(np.arange(LEAST_RUNS - 1) * 1000) == 1e9
+    assert estimate_resolution(np.arange(MIN_RUNS - 1) * 1000) == 1e9
     random = np.cumsum(np.random.default_rng(1).integers(50, 90, 500))
-    assert resolution_of(random) == 1e9
-    assert resolution_of(random * 2) == 5e8
+    assert estimate_resolution(random) == 1e9
+    assert estimate_resolution(random * 2) == 5e8
 
 
 @pytest.mark.parametrize("channels", [(), (0,)])
@@ -218,7 +218,7 @@ def test_no_light(tmp_path: Path) -> None:
     assert "'Channel 0': 299 edges" in str(error.hint)
     assert "'Channel 1': 0 edges" in str(error.hint)
     assert fails(path, "no line 'Channel 7'", channels=["Channel 7"]).hint == (
-        "there are 'Channel 0', 'Channel 1'"
+        "The capture has 'Channel 0', 'Channel 1'"
     )
     write(path, single(light()), names=("A", "A"))
     fails(path, "several lines 'a'", channels=["a"])
@@ -237,26 +237,26 @@ def test_no_light(tmp_path: Path) -> None:
         ("Start,Data\n0.1,0\n", "neither a capture", 1),
         ("{}\n", "neither a capture", 1),
         ('"Time [s],Channel 0\n0.1,0\n', "neither a capture", 1),
-        ("Time [s],A\n0.1,0\n0.1,1\n", "not after the one before", 3),
-        ("Time [s],A\n0.2,0\n\n0.1,1\n", "not after the one before", 4),
-        ("Time [s],A\n0.1,0\nnan,1\n", "'nan' is no number of seconds", 3),
-        ("Time [s],A\n0.1,0\n1e9,1\n", "'1e9' is no number of seconds", 3),
-        ("Time [s],A\n0.1,0\n1e999,1\n", "no number of seconds", 3),
-        ("Time [s],A\n0.1,0\n1_0,1\n", "no number of seconds", 3),
-        ("Time [s],A\n0.1,0\n1.2.3,1\n", "no number of seconds", 3),
-        ("Time [s],A\n0.1,0\n,1\n", "'' is no number of seconds", 3),
-        ("Time [s],A\n0.1,0\n0.2,nan\n", "'nan' where a level", 3),
-        ("Time [s],A\n0.1,0\n0.2,3.3\n", "'3.3' where a level", 3),
-        ("Time [s],A\n0.1,0\n0.2,2\n", "'2' where a level", 3),
-        ("Time [s],A\n0.1,0\n0.2,01\n", "'01' where a level", 3),
-        ("Time [s],A\n0.1,0\n0.2,\n", "'' where a level", 3),
+        ("Time [s],A\n0.1,0\n0.1,1\n", "does not ascend", 3),
+        ("Time [s],A\n0.2,0\n\n0.1,1\n", "does not ascend", 4),
+        ("Time [s],A\n0.1,0\nnan,1\n", "'nan' is not a number of seconds", 3),
+        ("Time [s],A\n0.1,0\n1e9,1\n", "'1e9' is not a number of seconds", 3),
+        ("Time [s],A\n0.1,0\n1e999,1\n", "not a number of seconds", 3),
+        ("Time [s],A\n0.1,0\n1_0,1\n", "not a number of seconds", 3),
+        ("Time [s],A\n0.1,0\n1.2.3,1\n", "not a number of seconds", 3),
+        ("Time [s],A\n0.1,0\n,1\n", "'' is not a number of seconds", 3),
+        ("Time [s],A\n0.1,0\n0.2,nan\n", "'nan' instead of a level", 3),
+        ("Time [s],A\n0.1,0\n0.2,3.3\n", "'3.3' instead of a level", 3),
+        ("Time [s],A\n0.1,0\n0.2,2\n", "'2' instead of a level", 3),
+        ("Time [s],A\n0.1,0\n0.2,01\n", "'01' instead of a level", 3),
+        ("Time [s],A\n0.1,0\n0.2,\n", "'' instead of a level", 3),
         ("Time [s],A\n0.1,0\n0.2\n", "1 cell in a row of 2", 3),
         ("Time [s],A\n0.1,0\n0.2,1,1\n", "3 cells in a row of 2", 3),
-        ("Time [s],A\n0.1 2,0\n,1\n", "no number of seconds", 2),
-        ("Time [s],A\n2024-03-11T17:25:20Z,0\n0.2,1\n", "no time in ISO 8601", 3),
+        ("Time [s],A\n0.1 2,0\n,1\n", "not a number of seconds", 2),
+        ("Time [s],A\n2024-03-11T17:25:20Z,0\n0.2,1\n", "not a time in ISO 8601", 3),
         ("Time [s],A\n2024-02-30T17:25:20Z,0\n", "does not exist", 2),
-        ("Time [s],A\n0.1,0\n2024-03-11T17:25:20Z,1\n", "no number of seconds", 3),
-        ("Time [s],A\n0.1,0\n0.2,\0\n", "where a level", 3),
+        ("Time [s],A\n0.1,0\n2024-03-11T17:25:20Z,1\n", "not a number of seconds", 3),
+        ("Time [s],A\n0.1,0\n0.2,\0\n", "instead of a level", 3),
         ("Time [s]," + "A," * 2000 + "A\n0.1,0\n", "a table of 2002 columns", 1),
         ("Time [s],A\n" + "0" * 200_000, "a line of more than", None),
     ],
@@ -270,7 +270,7 @@ def test_a_damaged_table_is_refused_by_line(
     where: int | None,
     block: int,
 ) -> None:
-    monkeypatch.setattr(saleae_csv, "BLOCK", block)
+    monkeypatch.setattr(saleae_csv, "BLOCK_BYTES", block)
     path = tmp_path / "run.csv"
     path.write_text(text)
     if "more than" in words and block > 10:

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.lighthouse.recording import Edges
 from locatk.formats.benchmarks.infrared import microcontroller as infrared_microcontroller
-from locatk.formats.importers.saleae import data_lines as saleae_lines
-from locatk.formats.importers.saleae.capture import read_capture, read_light
+from locatk.formats.importers.saleae import digital_lines as saleae_lines
+from locatk.formats.importers.saleae.recording import read_capture, read_light
 
 RATE = 40_000_000
 START_MS, FRACTION = 1_710_177_920_662, 0.7922
@@ -171,7 +171,7 @@ def test_every_edge_arrives_also_on_the_border_of_chunks(
     path = tmp_path_factory.mktemp("sal") / "run.sal"
     capture(path, {"light": channel(edges, borders, level=level)})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("locatk.formats.importers.saleae.binary.BATCH", batch)
+        patch.setattr("locatk.formats.importers.saleae.logic2.BATCH_BYTES", batch)
         (read,) = read_light(path, ["light"])
     assert read.tick.dtype == np.int64
     assert read.tick.tolist() == edges
@@ -239,9 +239,9 @@ def test_channels_by_number_and_name_in_the_order_asked_for(tmp_path: Path) -> N
     assert [edges.tick.tolist() for edges in read_light(path, ["5", "ONE"])] == [[4], [3]]
     assert read_light(path, [6])[0].tick.tolist() == [5]
     error = fails(path, "no line '7'", ["7"])
-    assert error.hint == "there are 'one' (channel 4), 'Two' (channel 5), 'two' (channel 6)"
+    assert error.hint == "The capture has 'one' (channel 4), 'Two' (channel 5), 'two' (channel 6)"
     fails(path, "several lines 'two'", ["two"])
-    fails(path, "asked for twice", ["one", 4])
+    fails(path, "named twice", ["one", 4])
 
 
 def test_no_light_names_the_lines_and_the_option(tmp_path: Path) -> None:
@@ -313,14 +313,14 @@ def patched(offset: int, form: str, value: float) -> bytes:
 @pytest.mark.parametrize(
     ("coded", "words"),
     [
-        (b"", "no binary file"),
+        (b"", "not a binary file"),
         (GOOD[:40], "end of file"),
         (GOOD[:-1], "end of file"),
         (GOOD + b"\0", "more bytes"),
         (patched(8, "<i", 7), "unknown version 7"),
         (patched(0x11, "<d", 0), "sampling rate"),
         (patched(0x11, "<d", float("nan")), "sampling rate"),
-        (patched(0x11, "<d", 2e7), "a second in a file of 2e+07"),
+        (patched(0x11, "<d", 2e7), "per second in a file of 2e+07"),
         (patched(0x2B, "<Q", 2**63), "end of file"),
         (patched(0x2B, "<Q", 1), "more bytes"),
         (patched(0x33, "<Q", 1), "a chunk of 250 samples from 1"),
@@ -363,7 +363,7 @@ def test_archives_that_are_none_or_lack_channels(tmp_path: Path) -> None:
     fails(archive(path, {"digital-4.bin": export([], span=(0, 1))}), "an export inside")
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as packed:
         packed.writestr("digital-4.bin", GOOD)
-    fails(path, "compressed")
+    fails(path, "compression")
     path.write_bytes(b"")
     fails(path, "empty file")
     path.write_text("Notes on my capture\n")
@@ -385,15 +385,16 @@ def test_a_bomb_takes_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     tracemalloc.start()
     try:
         fails(path, "no light")
-        monkeypatch.setattr(saleae_lines, "MOST_EDGES", 3_000_000)
+        monkeypatch.setattr(saleae_lines, "MAX_EDGES", 3_000_000)
         fails(path, "more than 3,000,000 edges", ["a"])
         assert tracemalloc.get_traced_memory()[1] < 150e6
     finally:
         tracemalloc.stop()
-    monkeypatch.setattr("locatk.formats.importers.saleae.archive.MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("locatk.formats.importers.saleae.logic2.MAX_CAPTURE_BYTES", 1 << 20)
     fails(path, "more than 1,048,576")
 
 
+@pytest.mark.slow
 def test_a_clock_that_never_ends_is_passed_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -403,8 +404,8 @@ def test_a_clock_that_never_ends_is_passed_over(
         "light": channel(edges, borders_of(edges)),
         "clock": channel(clock, borders_of(clock)),
     }
-    monkeypatch.setattr("locatk.formats.importers.saleae.binary.BATCH", 1000)
-    monkeypatch.setattr(saleae_lines, "MOST_EDGES", 5_000)
+    monkeypatch.setattr("locatk.formats.importers.saleae.logic2.BATCH_BYTES", 1000)
+    monkeypatch.setattr(saleae_lines, "MAX_EDGES", 5_000)
     members["clock"] = members["clock"][:-9]
     found = read_capture(capture(tmp_path / "run.sal", members))
     assert found.names == ("'light' (channel 4)",)
@@ -469,6 +470,7 @@ def test_a_channel_outside_its_archive(tmp_path: Path) -> None:
     assert (read.names, read.format) == (("'Channel 4'",), "saleae-binary")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.integers(1, 10**7), max_size=40), st.integers(0, 1), st.integers(-(10**12), 10**12)
@@ -491,7 +493,7 @@ def test_an_export_arrives_to_the_nanosecond(
 def test_an_export_of_version_1_with_a_gap(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times: int
 ) -> None:
-    monkeypatch.setattr("locatk.formats.importers.saleae.binary.TIMES", times)
+    monkeypatch.setattr("locatk.formats.importers.saleae.logic2.EXPORT_BATCH_EDGES", times)
 
     def chunk(level: int, begin: float, end: float, times: list[float]) -> bytes:
         head = struct.pack("<IdddQ", level, 5e7, begin, end, len(times))
@@ -513,11 +515,11 @@ def test_an_export_of_version_1_with_a_gap(
 @pytest.mark.parametrize(
     ("coded", "words"),
     [
-        (export([0.1, 0.1], span=(0, 1)), "not after what is before"),
-        (export([0.2, 0.1], span=(0, 1)), "not after what is before"),
-        (export([float("nan")], span=(0, 1)), "no number of seconds"),
-        (export([1e300], span=(0, 1)), "no number of seconds"),
-        (export([1.5], span=(0, 1)), "where the data end"),
+        (export([0.1, 0.1], span=(0, 1)), "not after the one before"),
+        (export([0.2, 0.1], span=(0, 1)), "not after the one before"),
+        (export([float("nan")], span=(0, 1)), "not a number of seconds"),
+        (export([1e300], span=(0, 1)), "not a number of seconds"),
+        (export([1.5], span=(0, 1)), "but the data end"),
         (export([], span=(1, 0)), "data from"),
         (export([], span=(0, 1), level=2), "a level of 2"),
         (export([0.1, 0.2], span=(0, 1))[:-8], "end of file"),

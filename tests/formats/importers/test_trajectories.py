@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters.kitti import write_kitti
+from locatk.formats.exporters.trajectory_csv import write_csv
+from locatk.formats.exporters.tum import write_tum
 from locatk.formats.importers import trajectories as files
 from locatk.formats.sessions.solutions import write_solution
 from locatk.formats.sessions.trajectories import truth_messages, write_streams
@@ -54,32 +56,32 @@ def test_sessions_and_solutions_both_ways(session: Path, solution: Path, role) -
 @pytest.mark.parametrize("name", ["poses.tum", "poses.txt", "poses", "poses.kitti", "a.csv"])
 def test_texts_are_known_by_their_rows(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
-    trajectories.write_tum(path, sample())
+    write_tum(path, sample())
     assert files.open_file(path).kind == "tum"
     path.write_text("# stamps x y z q\n\n" + path.read_text())
     assert files.open_file(path).kind == "tum"
-    trajectories.write_kitti(path, sample(), overwrite=True)
+    write_kitti(path, sample(), overwrite=True)
     found = files.open_file(path)
     assert found.kind == "kitti"
     assert found.trajectories[0].time_ns.tolist() == [k * 10**9 for k in range(5)]
-    trajectories.write_csv(path, [sample()], overwrite=True)
+    write_csv(path, [sample()], overwrite=True)
     assert files.open_file(path).kind == "csv"
     assert files.read(path)[0].device == "red"
 
 
 def test_kitti_only_with_kitti_of_as_many_rows(tmp_path: Path) -> None:
-    trajectories.write_kitti(tmp_path / "a.txt", sample())
-    trajectories.write_tum(tmp_path / "b.txt", sample())
+    write_kitti(tmp_path / "a.txt", sample())
+    write_tum(tmp_path / "b.txt", sample())
     kitti, tum = (files.open_file(tmp_path / name) for name in ("a.txt", "b.txt"))
     files.check_kinds(kitti, kitti)
     files.check_kinds(tum, tum)
     for pair in ((kitti, tum), (tum, kitti)):
-        with pytest.raises(InputError, match="KITTI tells no times") as caught:
+        with pytest.raises(InputError, match="KITTI has no times") as caught:
             files.check_kinds(*pair)
         assert caught.value.file == str(tmp_path / "a.txt")
     lines = (tmp_path / "a.txt").read_text().splitlines(keepends=True)
     (tmp_path / "c.txt").write_text("".join(lines[:3]))
-    with pytest.raises(InputError, match=r"3 rows, where a\.txt has 5"):
+    with pytest.raises(InputError, match=r"3 rows, but a\.txt has 5"):
         files.check_kinds(files.open_file(tmp_path / "c.txt"), kitti)
 
 
@@ -89,15 +91,15 @@ def test_kitti_only_with_kitti_of_as_many_rows(tmp_path: Path) -> None:
         ("", "empty"),
         ("# nothing\n\n", "no poses"),
         ("1 2 3\n", "3 words"),
-        ("hello\n", "one word"),
+        ("hello\n", "1 word"),
         ("t,x,y\n1,2,3\n", "time_s"),
         ("1 2 3 4 5 6 7 8\n1 2\n", "2 words"),
         ("1 0 0 0 0 1 0 0 0 0 1\n", "11 words"),
-        ("2 0 0 0 0 1 0 0 0 0 1 0\n", "no rotation"),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "no rotation"),
+        ("2 0 0 0 0 1 0 0 0 0 1 0\n", "not a rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "not a rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 x\n", "'x'"),
         ("1 0 0 nan 0 1 0 0 0 0 1 0\n", "finite"),
-        ("1e200 0 0 0 0 1 0 0 0 0 1 0\n", "no rotation"),
+        ("1e200 0 0 0 0 1 0 0 0 0 1 0\n", "not a rotation"),
     ],
 )
 def test_what_holds_no_poses(tmp_path: Path, text: str, what: str) -> None:

@@ -1,10 +1,10 @@
-"""Lines of libsurvive's recordings (``.rec``, ``.rec.gz``), read into columns.
+"""Columns of a recording of libsurvive (``.rec``, ``.rec.gz``).
 
-A line is seconds since the start, a device's code name, a kind and its values, as
-``survive_recording.h`` and ``survive_recording.c`` of cntools/libsurvive (MIT) print them:
+A line contains the seconds since the start, a device's code name, a kind and its values, as
+``survive_recording.h`` and ``survive_recording.c`` of cntools/libsurvive (MIT) write them:
 
 =================  ===========================================================  ============
-kind               values                                                       read here
+kind               values                                                       read into
 =================  ===========================================================  ============
 ``Y``              channel, timecode, OOTX bit, generation                      syncs
 ``W``              channel, sensor, timecode, half tick                         sweeps
@@ -18,8 +18,7 @@ kind               values                                                       
 =================  ===========================================================  ============
 
 Channels are counted from 0. Timecodes are of the device's 48 MHz counter, 32 bits. All other
-kinds are counted and skipped. Files are read in pieces: of what they hold only the columns
-stay in memory.
+kinds are counted and skipped. Files are read in blocks, of which only the columns stay in memory.
 """
 
 from __future__ import annotations
@@ -36,26 +35,33 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, MissingDataError
 
-LIMIT = 1 << 29
-LINES = 1 << 24
-"""Decoded bytes and lines that are read of one recording: forty minutes of a tracker under four
+MAX_BYTES = 1 << 29
+MAX_LINES = 1 << 24
+"""Decoded bytes and lines that are read of a recording: forty minutes of a tracker and four
 stations."""
 
-DENSE = 40
-DENSE_FROM = 4 << 20
-"""By so much no recording packs, from so many packed-out bytes on: published ones do 4 : 1."""
+MAX_COMPRESSION_RATIO = 40
+MIN_COMPRESSION_CHECK_BYTES = 4 << 20
+"""Largest compression of a recording after so many decoded bytes; published ones have 4 : 1."""
 
-BLOCK = 8 << 20
-LONGEST = 1 << 20
-"""Bytes of one line; configurations have some 10,000."""
+BLOCK_BYTES = 8 << 20
 
-DEVICES = 64
-OPTIONS = 4096
-KINDS = 256
-"""So many devices, options, unknown kinds and names of poses are kept at most."""
+MAX_LINE_BYTES = 1 << 20
+"""Longest line; configurations have about 10,000 bytes."""
 
-STRANGE = 100_000
-"""After so many lines that are none of libsurvive's, none are looked for."""
+MAX_DEVICES = 64
+MAX_OPTIONS = 4096
+
+MAX_KINDS = 256
+"""Most unknown kinds of lines, and most names of poses, that are kept."""
+
+MAX_UNKNOWN_LINES = 100_000
+"""Unknown lines at the beginning after which a file is not one of libsurvive."""
+
+MAX_CHANNELS = 16
+
+MAX_POSE_VALUE = 1e9
+"""Larger values of a pose are damaged."""
 
 _TIME = rb"^(\d{1,9}(?:\.\d{1,9})?) "
 _NAME = rb"([^\s]{1,32}) "
@@ -84,9 +90,9 @@ class Columns:
     Attributes
     ----------
     host_s : (n,) float64 ndarray
-        When the line was written, by the host's clock: late, in bursts.
+        Time at which the host wrote the line: late, and in bursts.
     device : (n,) int ndarray
-        Index into :attr:`Recording.devices`.
+        Index into :attr:`RecFile.devices`.
     channel : (n,) int ndarray
         From 0.
     timecode : (n,) int64 ndarray
@@ -94,9 +100,9 @@ class Columns:
     sensor : (n,) int ndarray
         Row of the device's ``modelPoints``; 0 for syncs.
     flag : (n,) int ndarray
-        OOTX bit of a sync; of a sweep whether half a tick is to be added; plane of an angle.
+        OOTX bit of a sync; 1 if a sweep is half a tick later; plane of an angle.
     angle : (n,) float64 ndarray
-        In radians, of angles; 0 for others.
+        Of angles, in radians; 0 for others.
     """
 
     host_s: NDArray[np.float64]
@@ -111,34 +117,34 @@ class Columns:
         return len(self.host_s)
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Columns:
-        """The chosen lines only."""
+        """Return the chosen lines."""
         return Columns(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
 @dataclass
-class Recording:
-    """What is in one file.
+class RecFile:
+    """Content of a recording.
 
     Attributes
     ----------
     devices : tuple of str
-        Code names of what received light, in the order in which they appear.
+        Code names of the devices that received light, in the order in which they appear.
     syncs, sweeps, angles : Columns
-        ``angles`` is empty where they were not asked for.
+        ``angles`` is empty unless they are requested.
     configs : dict of str to bytes
-        JSON by device, the last where there are several.
+        JSON by device, the last if there are several.
     options : dict of str to str
     poses : dict of (str, str) to (n, 8) float64 ndarray
         By kind and name (of a device; of a station its channel): host's seconds, x, y, z in
         metres, quaternion (w, x, y, z).
     kinds : Counter
-        Lines by kind, of those that are not read into columns.
+        Numbers of lines by kind, without those that are read into columns.
     lines : int
-        All of them.
+        Number of all lines.
     damaged : int
-        Lines that are not what they should be; they are left out.
+        Number of malformed lines, which are skipped.
     cut : str or None
-        Why the end of the file is missing, in one line.
+        Reason why the end of the file is missing, in one line.
     """
 
     devices: tuple[str, ...]
@@ -154,49 +160,49 @@ class Recording:
     cut: str | None = None
 
 
-def read_lines(path: Path, *, angles: bool = False) -> Recording:
+def read_rec_file(path: Path, *, angles: bool = False) -> RecFile:
     """Read one recording.
 
     Parameters
     ----------
     path : path
-        Packed or not: its first bytes tell.
+        Compressed or not, which is detected from the first bytes.
     angles : bool
-        Whether to read libsurvive's own angles too.
+        Also read the angles of libsurvive.
 
     Raises
     ------
     MissingDataError
-        The file is not there.
+        The file is missing.
     FormatError
-        It cannot be read, or is no recording of libsurvive.
+        The file is not readable, or is not a recording of libsurvive.
     """
     path = Path(path)
-    collected = _Collected(angles)
-    pieces = _Pieces(path)
-    for block in pieces:
-        collected.add(block)
-        if collected.recording.lines > STRANGE and not collected.known:
+    collector = ColumnCollector(angles)
+    blocks = LineBlocks(path)
+    for block in blocks:
+        collector.add(block)
+        if collector.recording.lines > MAX_UNKNOWN_LINES and not collector.known:
             break
-        if collected.recording.lines > LINES:
-            pieces.cut = f"only the first {collected.recording.lines:,} lines were read"
+        if collector.recording.lines > MAX_LINES:
+            blocks.cut = f"only the first {collector.recording.lines:,} lines were read"
             break
-    collected.damaged += pieces.overlong
-    recording = collected.finish(pieces.cut)
+    collector.damaged += blocks.overlong
+    recording = collector.finish(blocks.cut)
     if not (len(recording.syncs) or len(recording.sweeps) or recording.configs or recording.kinds):
         raise FormatError(
-            "no recording of libsurvive",
+            "not a recording of libsurvive",
             file=path,
-            hint="give a .rec or .rec.gz, as written by survive-cli --record",
+            hint="Give a .rec or .rec.gz, as written by survive-cli --record",
         )
     return recording
 
 
-class _Pieces:
-    """Whole lines of a file, some megabytes at once, unpacked where it is gzip.
+class LineBlocks:
+    """Whole lines of a file, some megabytes at once, decompressed if it is gzip.
 
-    After it has been read, ``cut`` says why the end is missing, and ``overlong`` how many
-    lines were longer than any can be.
+    After reading, ``cut`` is the reason why the end is missing, if it is, and ``overlong`` the
+    number of lines that were too long.
     """
 
     def __init__(self, path: Path) -> None:
@@ -208,11 +214,11 @@ class _Pieces:
         rest, total = b"", 0
         for piece in self._decoded():
             total += len(piece)
-            if total > LIMIT:
-                self.cut = f"only the first {LIMIT >> 20} MB were read"
+            if total > MAX_BYTES:
+                self.cut = f"only the first {MAX_BYTES >> 20} MB were read"
                 break
             end = piece.rfind(b"\n") + 1
-            if end == 0 and len(rest) + len(piece) > LONGEST:
+            if end == 0 and len(rest) + len(piece) > MAX_LINE_BYTES:
                 self.overlong += 1
                 rest = b""
             elif end == 0:
@@ -220,61 +226,62 @@ class _Pieces:
             else:
                 yield rest + piece[:end]
                 rest = piece[end:]
-        # The last line of a file that breaks off may be cut within a number.
+        # The last line of a truncated file may be cut within a number.
         if rest and self.cut is None:
             yield rest + b"\n"
 
     def _decoded(self) -> Iterator[bytes]:
         try:
             with self.path.open("rb") as file:
-                packed = file.read(2) == b"\x1f\x8b"
+                is_gzip = file.read(2) == b"\x1f\x8b"
                 file.seek(0)
-                raw = iter(lambda: file.read(BLOCK), b"")
-                yield from self._unpacked(raw) if packed else raw
+                raw = iter(lambda: file.read(BLOCK_BYTES), b"")
+                yield from self._decompressed(raw) if is_gzip else raw
         except FileNotFoundError:
-            raise MissingDataError("no such recording", file=self.path) from None
+            raise MissingDataError("the recording is missing", file=self.path) from None
         except OSError as error:
             raise FormatError(error.strerror or "cannot be read", file=self.path) from None
 
-    def _unpacked(self, packed: Iterator[bytes]) -> Iterator[bytes]:
-        unpack = zlib.decompressobj(31)
+    def _decompressed(self, compressed: Iterator[bytes]) -> Iterator[bytes]:
+        decompressor = zlib.decompressobj(31)
         taken = given = 0
-        for raw in packed:
+        for raw in compressed:
             while raw:
-                if unpack.eof:  # another member follows
-                    unpack = zlib.decompressobj(31)
+                if decompressor.eof:  # another member of the archive follows
+                    decompressor = zlib.decompressobj(31)
                 try:
-                    piece = unpack.decompress(raw, BLOCK)
+                    piece = decompressor.decompress(raw, BLOCK_BYTES)
                 except zlib.error:
-                    self.cut = "the archive is damaged, what follows is lost"
+                    self.cut = "the archive is damaged; the rest is lost"
                     return
                 yield piece
-                rest = unpack.unused_data if unpack.eof else unpack.unconsumed_tail
+                rest = (
+                    decompressor.unused_data if decompressor.eof else decompressor.unconsumed_tail
+                )
                 taken, given = taken + len(raw) - len(rest), given + len(piece)
-                if given > max(DENSE_FROM, DENSE * taken):
-                    self.cut = (
-                        f"packed {given // taken} : 1 after {given >> 20} MB, as no recording is"
-                    )
+                if given > max(MIN_COMPRESSION_CHECK_BYTES, MAX_COMPRESSION_RATIO * taken):
+                    ratio = given // taken
+                    self.cut = f"compressed {ratio} : 1 after {given >> 20} MB, unlike a recording"
                     return
                 raw = rest
-        if not unpack.eof:
-            self.cut = "the archive breaks off"
+        if not decompressor.eof:
+            self.cut = "the archive is truncated"
 
 
-class _Collected:
-    """Columns of the pieces read so far."""
+class ColumnCollector:
+    """Columns of the blocks read so far."""
 
     def __init__(self, angles: bool) -> None:
         self.angles = angles
         self.known = 0
         self.devices: dict[bytes, int] = {}
         self.parts: dict[str, list[Columns]] = {"Y": [], "W": [], "B": []}
-        self.recording = Recording((), _columns([]), _columns([]), _columns([]))
+        self.recording = RecFile((), _columns([]), _columns([]), _columns([]))
         self.damaged = 0
         self.poses: dict[tuple[bytes, bytes], list[NDArray[np.float64]]] = {}
 
     def add(self, block: bytes) -> None:
-        """Take in whole lines."""
+        """Add whole lines."""
         lines = block.count(b"\n")
         known = 0
         for kind, pattern in (("Y", _SYNC), ("W", _SWEEP), ("B", _ANGLE)):
@@ -283,42 +290,42 @@ class _Collected:
                 self.recording.kinds.update({"B": skipped} if skipped else {})
                 known += skipped
                 continue
-            found = pattern.findall(block)
-            if found:
-                known += len(found)
-                self.parts[kind].append(self._parse(kind, found))
+            matches = pattern.findall(block)
+            if matches:
+                known += len(matches)
+                self.parts[kind].append(self._parse(kind, matches))
         others: list[tuple[bytes, bytes, bytes, bytes]] = _OTHER.findall(block)
         poses: dict[tuple[bytes, bytes], list[tuple[float, ...]]] = {}
         for line in others:
             self._other(*line, poses)
         for key, values in poses.items():
-            if key in self.poses or len(self.poses) < KINDS:
+            if key in self.poses or len(self.poses) < MAX_KINDS:
                 self.poses.setdefault(key, []).append(np.array(values))
         self.known += known + len(others)
         self.recording.lines += lines
         self.damaged += max(lines - known - len(others), 0)
 
-    def _parse(self, kind: str, found: list[tuple[bytes, ...]]) -> Columns:
-        columns = list(zip(*found, strict=True))
-        n = len(found)
+    def _parse(self, kind: str, matches: list[tuple[bytes, ...]]) -> Columns:
+        columns = list(zip(*matches, strict=True))
+        n = len(matches)
         names = columns[1]
         for name in dict.fromkeys(names):
-            if len(self.devices) < DEVICES:
+            if len(self.devices) < MAX_DEVICES:
                 self.devices.setdefault(name, len(self.devices))
         device = np.fromiter((self.devices.get(name, -1) for name in names), np.int32, n)
 
-        def whole(values: tuple[bytes, ...]) -> NDArray[np.int64]:
+        def integers(values: tuple[bytes, ...]) -> NDArray[np.int64]:
             return np.array(values).astype(np.int64)
 
         host = np.array(columns[0]).astype(np.float64)
-        channel, zero = whole(columns[2]), np.zeros(n, np.int64)
+        channel, zero = integers(columns[2]), np.zeros(n, np.int64)
         if kind == "Y":
-            sensor, timecode, flag = zero, whole(columns[3]), whole(columns[4])
+            sensor, timecode, flag = zero, integers(columns[3]), integers(columns[4])
         else:
-            sensor, timecode, flag = (whole(columns[i]) for i in (3, 4, 5))
+            sensor, timecode, flag = (integers(columns[i]) for i in (3, 4, 5))
         angle = np.array(columns[6]).astype(np.float64) if kind == "B" else np.zeros(n)
-        good = (channel < 16) & (timecode < 1 << 32) & (device >= 0)
-        self.damaged += n - int(np.count_nonzero(good))
+        is_valid = (channel < MAX_CHANNELS) & (timecode < 1 << 32) & (device >= 0)
+        self.damaged += n - int(np.count_nonzero(is_valid))
         return Columns(
             host,
             device,
@@ -327,7 +334,7 @@ class _Collected:
             sensor.astype(np.int32),
             flag.astype(np.int32),
             angle,
-        ).take(good)
+        ).take(is_valid)
 
     def _other(
         self,
@@ -345,22 +352,30 @@ class _Collected:
                 values = tuple(map(float, (time, *rest.split()[:7])))
             except ValueError:
                 values = ()
-            if len(values) == 8 and values[0] >= 0 and all(abs(value) < 1e9 for value in values):
+            if (
+                len(values) == 8
+                and values[0] >= 0
+                and all(abs(value) < MAX_POSE_VALUE for value in values)
+            ):
                 poses.setdefault((kind, name), []).append(values)
             else:
                 self.damaged += 1
-        elif kind == b"CONFIG" and len(rest) < LONGEST and len(recording.configs) < DEVICES:
+        elif (
+            kind == b"CONFIG"
+            and len(rest) < MAX_LINE_BYTES
+            and len(recording.configs) < MAX_DEVICES
+        ):
             recording.configs[_text(name)] = rest
-        elif kind == b"OPTION" and len(recording.options) < OPTIONS:
+        elif kind == b"OPTION" and len(recording.options) < MAX_OPTIONS:
             words = rest.split(None, 2)
             recording.options[_text(words[0])] = _text(words[2].strip()) if words[2:] else ""
         label = _text(kind)
-        if label not in recording.kinds and len(recording.kinds) >= KINDS:
+        if label not in recording.kinds and len(recording.kinds) >= MAX_KINDS:
             label = "..."
         recording.kinds[label] += 1
 
-    def finish(self, cut: str | None) -> Recording:
-        """All that was taken in."""
+    def finish(self, cut: str | None) -> RecFile:
+        """Return the content of the file."""
         recording = self.recording
         recording.devices = tuple(map(_text, self.devices))
         recording.syncs, recording.sweeps, recording.angles = (
@@ -379,7 +394,7 @@ def _text(name: bytes) -> str:
 
 
 def _columns(parts: list[Columns]) -> Columns:
-    """Pieces put together."""
+    """Concatenate the columns of all blocks."""
     types = (np.float64, np.int32, np.int32, np.int64, np.int32, np.int32, np.float64)
     return Columns(
         *(

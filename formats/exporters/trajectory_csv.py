@@ -1,0 +1,90 @@
+"""Trajectories as CSV with uncertainties.
+
+The reader is :mod:`locatk.formats.importers.trajectory_csv`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from locatk.core.errors import InputError
+from locatk.core.trajectory import Trajectory
+from locatk.formats.output import atomic_write
+from locatk.formats.tables.timestamps import format_epoch_seconds
+
+COLUMNS = (
+    "time_s",
+    "device",
+    "x_m",
+    "y_m",
+    "z_m",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+    "sigma_x_m",
+    "sigma_y_m",
+    "sigma_z_m",
+    "sigma_heading_rad",
+)
+"""Header of the file. It is part of the contract (docs/formats.md): new columns go to the end."""
+
+SIGMA_AXES = (0, 1, 2, 5)
+"""Rows of a pose's covariance that belong to the four sigmas."""
+
+
+def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool = False) -> None:
+    """Write poses as CSV (:data:`COLUMNS`), one row a pose, device after device.
+
+    Unknown sigmas are empty cells. Numbers have the fewest digits that read back equal.
+
+    Raises
+    ------
+    InputError
+        A device has two trajectories, or see :func:`check_exportable`.
+    OutputExistsError
+        ``path`` exists and ``overwrite`` is false.
+    """
+    names = [trajectory.device for trajectory in trajectories]
+    if len(set(names)) != len(names):
+        raise InputError("a device has two trajectories", hint="Give each its own name")
+    for trajectory in trajectories:
+        check_exportable(trajectory)
+    with atomic_write(path, overwrite=overwrite, mode="w") as stream:
+        stream.write(",".join(COLUMNS) + "\n")
+        for trajectory in trajectories:
+            stream.writelines(_csv_lines(trajectory))
+
+
+def _csv_lines(trajectory: Trajectory) -> Iterator[str]:
+    device = trajectory.device
+    # The csv module of Python 3.11 leaves a carriage return unquoted and reads it as a line end.
+    if any(character in device for character in ',"\r\n'):
+        device = '"' + device.replace('"', '""') + '"'
+    poses = np.hstack([trajectory.position, trajectory.quaternion]).tolist()
+    sigmas = trajectory.sigma[:, SIGMA_AXES].tolist()
+    for time_ns, pose, sigma in zip(trajectory.time_ns.tolist(), poses, sigmas, strict=True):
+        cells = ("" if value != value else repr(value) for value in sigma)
+        yield ",".join([format_epoch_seconds(time_ns), device, *map(repr, pose), *cells]) + "\n"
+
+
+def check_exportable(trajectory: Trajectory) -> None:
+    """Refuse a trajectory that could not be read back from a text file.
+
+    Raises
+    ------
+    InputError
+        Time stamps do not ascend, or a position or orientation is not finite.
+    """
+    name = f"trajectory of device {trajectory.device!r}"
+    if np.any(trajectory.time_ns[1:] <= trajectory.time_ns[:-1]):
+        raise InputError(
+            f"time stamps do not ascend in the {name}", hint="Sort, drop repeated poses"
+        )
+    if not (
+        np.all(np.isfinite(trajectory.position)) and np.all(np.isfinite(trajectory.quaternion))
+    ):
+        raise InputError(f"poses that are not finite in the {name}", hint="Leave them out")

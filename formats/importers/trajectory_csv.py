@@ -1,0 +1,132 @@
+"""Trajectories from CSV; the writer is :mod:`locatk.formats.exporters.trajectory_csv`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.trajectory import Trajectory
+from locatk.formats.exporters.trajectory_csv import COLUMNS, SIGMA_AXES
+from locatk.formats.tables.delimited import Table, read_table
+
+Array = NDArray[np.float64]
+
+POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9], COLUMNS[9:]
+
+MAX_NORM_ERROR = 1e-2
+"""Largest deviation of a quaternion from unit length that passes for rounding by its writer."""
+
+MIN_NORM_ERROR = 1e-12
+"""Smallest deviation from unit length that is corrected; below, all digits are kept."""
+
+
+def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
+    """Read poses from CSV, one trajectory a device.
+
+    Parameters
+    ----------
+    path : path
+        Columns ``qx`` to ``qw`` and the sigmas may be missing (all four of a kind); further
+        columns are ignored.
+    frame : str
+        Name of the frame, which is not part of the file.
+
+    Returns
+    -------
+    list of Trajectory
+        In the order in which the devices appear. Covariances are diagonal: the file does
+        not hold correlations.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        The file is missing, or is not CSV with these columns.
+    InputError
+        A cell is not a number, a sigma is negative, a quaternion is far from unit length, or
+        the time stamps of a device do not ascend.
+    """
+    table = read_table(path)
+    table.require(*COLUMNS[:5])
+    n = len(table)
+    position = np.stack([table.floats(name) for name in POSITION_COLUMNS], axis=1)
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    if any(name in table.columns for name in QUATERNION_COLUMNS):
+        table.require(*QUATERNION_COLUMNS)
+        quaternion = unit_quaternions(table, QUATERNION_COLUMNS)
+    sigma = np.full((n, 4), np.nan)
+    if any(name in table.columns for name in SIGMA_COLUMNS):
+        table.require(*SIGMA_COLUMNS)
+        columns = [table.floats(name, low=0.0, allow_missing=True) for name in SIGMA_COLUMNS]
+        sigma = np.stack(columns, axis=1)
+    time_ns = table.epoch_times_ns("time_s")
+
+    trajectories = []
+    devices = np.array(table.columns["device"], object)
+    for device in dict.fromkeys(table.columns["device"]):
+        rows = np.flatnonzero(devices == device)
+        check_ascending(table, time_ns, rows)
+        covariance = _diagonal_covariance(sigma[rows])
+        trajectories.append(
+            Trajectory(device, frame, time_ns[rows], position[rows], quaternion[rows], covariance)
+        )
+    return trajectories
+
+
+def unit_quaternions(table: Table, names: Sequence[str]) -> Array:
+    """Return the quaternions (n, 4) in the columns ``names`` (x, y, z, w), normalised.
+
+    Raises
+    ------
+    InputError
+        A cell is not a number, or a quaternion is further than :data:`MAX_NORM_ERROR` from unit
+        length.
+    """
+    quaternion = np.stack([table.floats(name) for name in names], axis=1)
+    length = np.linalg.norm(quaternion, axis=1)
+    is_wrong = np.abs(length - 1) > MAX_NORM_ERROR
+    if is_wrong.any():
+        row = int(np.argmax(is_wrong))
+        table.fail(
+            row,
+            f"a quaternion of length {length[row]:.3g} instead of 1",
+            "The order is qx qy qz qw",
+        )
+    is_rounded = np.abs(length - 1) > MIN_NORM_ERROR
+    return np.where(is_rounded[:, None], quaternion / length[:, None], quaternion)
+
+
+def check_ascending(table: Table, time_ns: NDArray[np.int64], rows: NDArray[np.int64]) -> None:
+    """Refuse rows of a table whose times do not ascend strictly.
+
+    Raises
+    ------
+    InputError
+    """
+    times_ns = time_ns[rows]
+    # A difference of two times can exceed int64.
+    is_late = times_ns[1:] <= times_ns[:-1]
+    if is_late.any():
+        table.fail(
+            int(rows[np.argmax(is_late) + 1]),
+            "a time stamp that does not ascend",
+            "Sort the rows of each device by time and drop repeated ones",
+        )
+
+
+def unknown_covariance(n: int) -> Array:
+    """Return read-only covariances (n, 6, 6) of poses without uncertainty, in constant memory."""
+    return np.broadcast_to(np.nan, (n, 6, 6))
+
+
+def _diagonal_covariance(sigma: Array) -> Array:
+    """Return covariances (n, 6, 6) without correlations from four sigmas (n, 4)."""
+    sigmas = np.full((len(sigma), 6), np.nan)
+    sigmas[:, SIGMA_AXES] = sigma
+    is_known = np.isfinite(sigmas)
+    covariance = np.where(is_known[:, :, None] & is_known[:, None, :], 0.0, np.nan)
+    rows = np.arange(6)
+    covariance[:, rows, rows] = sigmas**2
+    return covariance
