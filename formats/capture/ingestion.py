@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from google.protobuf.message import Message
 
-from locatk.formats.artifacts import hall_sensors
+from locatk.formats.artifacts import maps
 from locatk.formats.capture.arrival_times import Arrivals
 from locatk.formats.capture.device_messages import SYSTEMS, Stamped, Streams
 from locatk.formats.capture.reader_thread import Arrived
@@ -118,8 +118,8 @@ class SerialIntake:
         self._opened = True
         self._last_ns: int | None = None
         self._first_ns: int | None = None
-        text = (artifacts or {}).get(hall_sensors.HALLS_FILE)
-        halls = () if text is None else hall_sensors.loads_halls(text).names
+        text = (artifacts or {}).get(maps.HALLS_FILE)
+        halls = () if text is None else maps.loads_halls(text).names
         self._streams = Streams(name, halls)
         self._arrivals = Arrivals()
         self._known: dict[tuple[str, str], Stream] = {}

@@ -204,7 +204,7 @@ def write_session(
     records = heard_stations.records_of(stations)
     scene = heard_stations.with_heard(scene, stations)
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
-    places = receiver_files.texts_of(receivers or {}, devices)
+    places = receiver_files.receiver_attachments(receivers or {}, devices)
     streams = [sweep_messages(sweeps), *known_streams(truth, odometry)]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)

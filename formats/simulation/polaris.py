@@ -17,9 +17,7 @@ from locatk.core.polaris.simulation.session import (
     usual_bar,
 )
 from locatk.formats.artifacts import tags as tag_files
-from locatk.formats.sessions import magnetometers as arrays
-from locatk.formats.simulation.config import SimulationConfig
-from locatk.formats.simulation.settings import (
+from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     FRACTION,
     FRACTION_BELOW_1,
@@ -30,9 +28,11 @@ from locatk.formats.simulation.settings import (
     Integer,
     ListOf,
     Number,
-    Setting,
     Text,
 )
+from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.simulation.config import SimulationConfig
+from locatk.formats.simulation.settings import Setting
 
 DEFAULT_CAR = "robot"
 

@@ -244,7 +244,7 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (HEAD + 'scale = "metres"', "scale", "not one of markers"),
         (HEAD + "frame = 3", "frame", "a string, not a number"),
         (HEAD + 'notes = "x"', "notes", "list of strings"),
-        (HEAD + "stations = 3", "stations", "[[stations]]"),
+        (HEAD + "stations = 3", "stations", "expected tables"),
         (HEAD + "floor_z_mm = nan", "floor_z_mm", "finite"),
         (HEAD + "floor_z_mm = 1e999", "floor_z_mm", "finite"),
         (HEAD + "floor_z_mm = 1e999999999999999999999", "floor_z_mm", "finite"),
@@ -253,7 +253,11 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (METRIC.replace("channel = 1", "channel = true"), "stations[0].channel", "1 to 16"),
         (METRIC.replace("channel = 1", "chanel = 1"), "stations[0].channel", "missing"),
         (METRIC.replace(", 2000]", "]"), "stations[0].position_mm", "list of 3 numbers"),
-        (METRIC.replace("2000", '"2"'), "stations[0].position_mm", "a number, not a string"),
+        (
+            METRIC.replace("2000", '"2"'),
+            "stations[0].position_mm[2]",
+            "a number in mm, not a string",
+        ),
         (METRIC.replace("[1, 0, 0]", "[2, 0, 0]"), "stations[0].rotation", "rotation matrix"),
         (METRIC.replace("[1, 0, 0]", "[-1, 0, 0]"), "stations[0].rotation", "rotation matrix"),
         (METRIC.replace("[1, 0, 0], ", ""), "stations[0].rotation", "3 rows of 3"),
@@ -278,7 +282,7 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (
             HEAD + MARKER + "sightings = [{ counts = { 1 = [1, -2] } }]",
             "markers[0].sightings[0].counts.1",
-            "below 0",
+            "of at least 0",
         ),
         (
             HEAD + "[[distances]]\ndistance_mm = 0\n",
@@ -303,6 +307,9 @@ def test_unknown_keys_get_a_suggestion() -> None:
     with pytest.raises(ArtifactError) as caught:
         loads_scene(HEAD + "plannar = true")
     assert caught.value.hint == "Did you mean planar?"
+    with pytest.raises(ArtifactError) as caught:
+        loads_scene(HEAD + MARKER + "sightings = 3")
+    assert caught.value.hint == "Write each one under [[markers.sightings]]"
 
 
 @pytest.mark.parametrize("text", [b"\xff\xfe", b"a = " + b"[" * 100_000, b"a = " + b"9" * 10_000])

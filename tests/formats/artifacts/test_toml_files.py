@@ -20,8 +20,7 @@ from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import maps, sheets, tags
 from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.artifacts.base import Artifact
-from locatk.formats.artifacts.hall_sensors import HALLS
+from locatk.formats.artifacts.schema import Artifact
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -38,7 +37,7 @@ ALL: dict[str, tuple[Artifact[Any], Any]] = {
     "tag.toml": (tags.TAGS, Tags(notes=(NOTE,))),
     "array.toml": (tags.ARRAY, SensorArray(bar(3, 0.008))),
     "map.toml": (maps.MAP, FloorMap(np.array([[1, HOLE_CODE], [3, 15]]), notes=(NOTE,))),
-    "halls.toml": (HALLS, HallSensors()),
+    "halls.toml": (maps.HALLS, HallSensors()),
 }
 
 every = pytest.mark.parametrize(("artifact", "value"), ALL.values(), ids=ALL)
@@ -100,12 +99,12 @@ def test_a_session_carries_it(tmp_path: Path, artifact: Artifact[Any], value: An
 
 
 def test_a_device_may_have_its_own(tmp_path: Path) -> None:
-    shared, own = (HALLS.dumps(HallSensors(position_m=circle(r))) for r in (0.025, 0.03))
+    shared, own = (maps.HALLS.dumps(HallSensors(position_m=circle(r))) for r in (0.025, 0.03))
     both = session(tmp_path / "both.mcap", halls=shared, halls_b=own)
     for device, text in (("b", own), ("a", shared), (None, shared)):
-        found = HALLS.attached_for(both, device)
+        found = maps.HALLS.attached_for(both, device)
         assert found is not None
-        assert HALLS.dumps(found) == text
-    assert HALLS.attached_for(session(tmp_path / "none.mcap"), "a") is None
+        assert maps.HALLS.dumps(found) == text
+    assert maps.HALLS.attached_for(session(tmp_path / "none.mcap"), "a") is None
     with pytest.raises(ArtifactError, match=r"bad\.mcap:halls-b\.toml"):
-        HALLS.attached_for(session(tmp_path / "bad.mcap", halls=shared, halls_b="x"), "b")
+        maps.HALLS.attached_for(session(tmp_path / "bad.mcap", halls=shared, halls_b="x"), "b")

@@ -240,19 +240,19 @@ WRONG = [
     ("  11:\n    origin", "  -1:\n    origin", "geos.-1", "0 to 15"),
     ("  11:\n    origin", "  0:\n    origin", 0, "'0' is there twice"),
     ("- -2.5\n", "- -2.5\n    - 1\n", "geos.0.origin", "3"),
-    ("- -2.5\n", "- .nan\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- .inf\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- 1e999\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- 1e99999999999999999999\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", f"- {'9' * 5000}\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- 1.0e+5\n", "geos.0.origin", "metres"),
-    ("- -2.5\n", "- here\n", "geos.0.origin", "number"),
-    ("- -2.5\n", "- '-2.5'\n", "geos.0.origin", "number"),
+    ("- -2.5\n", "- .nan\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- .inf\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- 1e999\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- 1e99999999999999999999\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", f"- {'9' * 5000}\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- 1.0e+5\n", "geos.0.origin[0]", "from -1000 to 1000"),
+    ("- -2.5\n", "- here\n", "geos.0.origin[0]", "number"),
+    ("- -2.5\n", "- '-2.5'\n", "geos.0.origin[0]", "number"),
     ("[0, 0, 1]]", "[0, 0, -1]]", "geos.11.rotation", "rotation"),
     ("[0, 0, 1]]", "[0, 0, 1.1]]", "geos.11.rotation", "rotation"),
     ("[0, 0, 1]]", "[0, 0, 1.0e+300]]", "geos.11.rotation", "rotation"),
-    ("[0, 0, 1]]", "[0, 0]]", "geos.11.rotation", "3"),
-    ("tilt: -0.047882", "tilt: 47.9", "calibs.3.sweeps[0].tilt", "beyond 10"),
+    ("[0, 0, 1]]", "[0, 0]]", "geos.11.rotation[2]", "3"),
+    ("tilt: -0.047882", "tilt: 47.9", "calibs.3.sweeps[0].tilt", "from -10 to 10"),
     ("      tilt: -0.047882\n", "", "calibs.3.sweeps[0].tilt", "missing"),
     ("uid: 282585023", "uid: 4294967296", "calibs.3.uid", "whole number"),
     ("uid: 282585023", "uid: 1.5", "calibs.3.uid", "whole number"),
@@ -340,8 +340,8 @@ def test_any_text(text: str) -> None:
         crazyflie.loads_config(text)
 
 
-def test_stations_that_were_solved_here_are_not_the_crazyflie_s() -> None:
-    """A key tells it, which other tools pass over; what is not ours is never said to be."""
+def test_scenes_solved_by_locatk_are_marked() -> None:
+    """The key ``solver`` marks them; other tools ignore it."""
     ours = crazyflie.loads_config(crazyflie.dumps_config(scene()))
     assert crazyflie.MODEL_NOTE not in ours.notes
     theirs = crazyflie.loads_config(SAMPLE)
@@ -351,3 +351,6 @@ def test_stations_that_were_solved_here_are_not_the_crazyflie_s() -> None:
     )
     assert crazyflie.MODEL_NOTE in again.notes
     assert crazyflie.MODEL_NOTE in crazyflie.loads_config(SAMPLE + "solver: other\n").notes
+    # A scene of an earlier version has another wording of the note.
+    former = dataclasses.replace(theirs, scale="markers", notes=(crazyflie.FORMER_MODEL_NOTE,))
+    assert "solver" not in crazyflie.dumps_config(former)
