@@ -452,7 +452,7 @@ class ListOf:
         if self.max_count is not None:
             count = f"{self.min_count} to {self.max_count} "
         elif self.min_count:
-            count = f"at least {self.min_count} "
+            count = "one or more " if self.min_count == 1 else f"at least {self.min_count} "
         return f"a list of {count}{self.item.plural}"
 
     @property

@@ -300,7 +300,7 @@ def _scene_table(values: Mapping[str, Any]) -> Table:
 def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
     station = Table(
         (
-            Key("channel", CHANNEL, "once each"),
+            Key("channel", CHANNEL, "channel (mode) of the station, once each"),
             Key("id", SerialNumber(), "serial number", None, "unknown"),
             Key(position, Array((3,)), "position of the rotor's centre", value_name="position"),
             Key(
@@ -372,7 +372,7 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
 _MARKER = Table(
     (
         Key("name", Text(), "name of a point that was measured by hand, once each"),
-        Key("position_mm", Array((3,)), "its position; z = 0 on the floor", value_name="position"),
+        Key("position_mm", Array((3,)), "its position; z is 0 on the floor", value_name="position"),
         Key("sightings", Tables(VISIT), default=(), value_name="visits"),
     ),
     lambda values: Marker(**values),

@@ -54,6 +54,7 @@ AREAS = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(AREAS, max_size=5))
 def test_any_areas_come_back(tmp_path_factory: pytest.TempPathFactory, areas: list[Area]) -> None:
     path = tmp_path_factory.mktemp("ledger") / LEDGER_FILE

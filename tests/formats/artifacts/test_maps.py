@@ -132,6 +132,7 @@ def sensors(draw: st.DrawFn) -> HallSensors:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(sensors())
 def test_all_halls_come_back_to_the_last_bit(halls: HallSensors) -> None:

@@ -45,6 +45,7 @@ def same(one: Receiver, other: Receiver) -> bool:
     return (one.name, normals[0], places[0]) == (other.name, normals[1], places[1])
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(receiver())
 def test_every_receiver_comes_back_to_the_last_bit(found: Receiver) -> None:
@@ -99,6 +100,7 @@ def test_what_is_wrong_is_named(
     refused(receivers.RECEIVER, text, where, words)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_damaged_text_is_refused_or_read(data: st.DataObject) -> None:

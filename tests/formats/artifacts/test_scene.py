@@ -108,6 +108,7 @@ def test_every_scene_comes_back_to_the_last_bit(scene: Scene) -> None:
     assert dumps_scene(loads_scene(text)) == text
 
 
+@pytest.mark.slow
 @given(times)
 def test_times_keep_their_nanoseconds(time_ns: int) -> None:
     assert parse_time(format_time(time_ns)) == time_ns

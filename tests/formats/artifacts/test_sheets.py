@@ -254,6 +254,7 @@ def test_what_is_wrong_with_a_camera_is_named(
     refused(sheets.CAMERA, text, where, words)
 
 
+@pytest.mark.slow
 @given(cameras())
 @settings(deadline=None)
 def test_a_camera_that_is_read_sees_every_pixel_once(camera: Camera) -> None:

@@ -115,6 +115,8 @@ def test_every_array_comes_back_to_the_last_bit(array: SensorArray) -> None:
     assert dumps_array(read) == text
 
 
+@pytest.mark.slow
+@settings(deadline=None)
 @given(st.floats(-7, 7), st.decimals(-360, 360, places=2))
 def test_degrees_stay_as_they_were_written(angle: float, degrees: Decimal) -> None:
     tags = Tags(site={0: PlanarPose(0.0, 0.0, angle)})
@@ -182,7 +184,7 @@ def test_tags_by_hand() -> None:
         (TAG + MAGNET.replace("1.45", "14500"), "magnet.remanence_t", "above 0, at most 2 in T"),
         (TAG + MAGNET.replace("1.45", "nan"), "magnet.remanence_t", "finite"),
         (TAG + MAGNET + "hight_mm = 1", "magnet.hight_mm", "unknown key"),
-        (TAG + MAGNET + FAMILY.replace("[3, 7]", "[]"), "family.ids", "at least 1 whole numbers"),
+        (TAG + MAGNET + FAMILY.replace("[3, 7]", "[]"), "family.ids", "one or more whole numbers"),
         (TAG + MAGNET + FAMILY.replace("3,", "3.0,"), "family.ids[0]", "a whole number"),
         (TAG + MAGNET + FAMILY.replace("3,", "true,"), "family.ids[0]", "a whole number"),
         (TAG + MAGNET + FAMILY.replace("3,", "-3,"), "family.ids[0]", "of at least 0"),

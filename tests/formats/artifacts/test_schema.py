@@ -1,13 +1,16 @@
-"""Artifacts as files and as attachments of sessions, whichever they are."""
+"""Schemas of artifacts: files, attachments of sessions, units, and the tables of the docs."""
 
 from __future__ import annotations
 
+import math
+import runpy
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.dots.camera import Camera
@@ -20,7 +23,8 @@ from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import maps, sheets, tags
 from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.artifacts.schema import Artifact
+from locatk.formats.artifacts.kinds import UNITS, InvalidValueError, ListOf, Number, unit_ending
+from locatk.formats.artifacts.schema import Artifact, Key, Table
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -108,3 +112,72 @@ def test_a_device_may_have_its_own(tmp_path: Path) -> None:
     assert maps.HALLS.attached_for(session(tmp_path / "none.mcap"), "a") is None
     with pytest.raises(ArtifactError, match=r"bad\.mcap:halls-b\.toml"):
         maps.HALLS.attached_for(session(tmp_path / "bad.mcap", halls=shared, halls_b="x"), "b")
+
+
+# ---- the schema
+
+
+def test_the_tables_of_the_documentation_are_up_to_date(root: Path) -> None:
+    page = (root / "docs" / "formats.md").read_text("utf-8")
+    script = runpy.run_path(str(root / ".ci" / "artifact_tables.py"))
+    assert script["updated"](page) == page, "run: python .ci/artifact_tables.py"
+    assert {artifact.file for artifact in script["ARTIFACTS"]} >= set(ALL)
+
+
+@pytest.mark.parametrize("ending", [e for e, unit in UNITS.items() if unit.si_ending])
+@settings(max_examples=40, deadline=None)
+@given(value=st.floats(allow_nan=False, allow_infinity=False).filter(lambda v: abs(v) < 1e300))
+def test_units_are_exact(ending: str, value: float) -> None:
+    unit = UNITS[ending]
+    if abs(value) < 1e-290 and value:
+        return  # a product may be below the smallest float
+    digits = unit.from_si(value)
+    assert unit.to_si(digits if isinstance(digits, Decimal) else Decimal(repr(digits))) == value
+    assert unit.to_si(1) == pytest.approx(float(unit.factor), rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("key", "attribute", "parsed"),
+    [
+        ("spacing_mm", "spacing_m", 0.04),
+        ("delay_ms", "delay_s", 0.04),
+        ("noise_ut", "noise_t", 40e-6),
+        ("heading_deg", "heading_rad", math.radians(40)),
+        ("size_px", "size_px", 40.0),
+        ("radial", "radial", 40.0),
+    ],
+)
+def test_the_ending_of_a_key_is_its_unit(key: str, attribute: str, parsed: float) -> None:
+    table = Table((Key(key, Number()),))
+    assert table.parse({key: 40}) == {attribute: parsed}
+    assert float(table.to_toml({attribute: parsed})[key]) == 40.0
+    unconverted = Table((Key(key, Number(), is_si=False),))
+    assert unconverted.parse({key: 40}) == {key: 40.0}
+
+
+def test_the_longest_ending_is_the_unit() -> None:
+    assert [unit_ending(key) for key in ("drift_deg_per_m", "a_per_m", "delay_ms", "names")] == [
+        "_deg_per_m", "_per_m", "_ms", "",
+    ]  # fmt: skip
+
+
+def test_errors_have_the_path_unit_and_hint() -> None:
+    inner = Table((Key("height_mm", Number(0, 5, hint="Measure again")),))
+    table = Table((Key("tags", ListOf(inner)),))
+    with pytest.raises(InvalidValueError, match="expected a number from 0 to 5 in mm") as caught:
+        table.parse({"tags": [{"height_mm": 1}, {"height_mm": 6}]})
+    assert (caught.value.key, caught.value.hint) == ("tags[1].height_mm", "Measure again")
+    with pytest.raises(InvalidValueError, match="missing key 'height_mm'") as caught:
+        table.parse({"tags": [{"hight_mm": 1}]})
+    assert caught.value.hint == "Is 'hight_mm' meant to be height_mm?"
+    with pytest.raises(InvalidValueError, match="unknown key 'hight_mm'") as caught:
+        table.parse({"tags": [{"height_mm": 1, "hight_mm": 1}]})
+    assert caught.value.hint == "Did you mean height_mm?"
+
+
+@every
+def test_a_typo_in_the_header_gets_the_nearest_key(artifact: Artifact[Any], value: Any) -> None:
+    text = artifact.dumps(value)
+    with pytest.raises(ArtifactError, match="unknown key 'tol_version'") as caught:
+        artifact.loads(text.replace("tool_version", "tol_version"))
+    assert caught.value.hint == "Did you mean tool_version?"
