@@ -68,15 +68,15 @@ def default(key: Key) -> str:
     return f"{float(number):g}"
 
 
-def filled(text: str, artifact: Artifact[Any]) -> str:
+def updated_table(text: str, artifact: Artifact[Any]) -> str:
     """Return the page with the table of an artifact."""
     begin, end = f"<!-- keys of {artifact.file} -->\n", f"<!-- end of {artifact.file} -->\n"
     versions = "1" if artifact.version == 1 else f"1 to {artifact.version}"
     head = {"format": f"`{artifact.format}`", "format_version": versions}
     lines = [COLUMNS]
     for key in HEADER.keys:
-        text = head.get(key.name, value(key))
-        lines.append(f"| `{key.name}` | {text} | {default(key)} | {key.meaning} |\n")
+        valid = head.get(key.name, value(key))
+        lines.append(f"| `{key.name}` | {valid} | {default(key)} | {key.meaning} |\n")
     lines += rows(artifact.table)
     before, _, rest = text.partition(begin)
     _, found, after = rest.partition(end)
@@ -88,7 +88,7 @@ def filled(text: str, artifact: Artifact[Any]) -> str:
 def updated(text: str) -> str:
     """Return the page with the tables of all artifacts."""
     for artifact in ARTIFACTS:
-        text = filled(text, artifact)
+        text = updated_table(text, artifact)
     return text
 
 
