@@ -34,7 +34,7 @@ def test_the_default_is_the_papers_tag(locatk, tmp_path: Path) -> None:
     assert "39.7 mm" in result.stdout
     assert "179 uT" in result.stdout
     assert "18.3 bits" in result.stdout
-    assert all(len(line) <= 100 for line in result.stdout.splitlines())
+    assert all(len(line) <= 80 for line in result.stdout.splitlines())
 
 
 def test_the_default_spacing_follows_the_clearance(locatk, tmp_path: Path) -> None:
