@@ -235,8 +235,8 @@ def test_a_way_in_one_direction_is_no_wall() -> None:
     [
         ("", 1, "not JSON"),
         ("{\n\n", 3, "not JSON"),
-        ("[1]", None, "no LIF"),
-        ("{}", None, "no LIF"),
+        ("[1]", None, "not LIF"),
+        ("{}", None, "not LIF"),
         ('{"layouts": 1}', "layouts", "list of objects"),
         ('{"layouts": []}', "layouts", "0 layouts"),
         (changed(lambda d: d["layouts"].append({})), "layouts", "2 layouts, expected one"),
@@ -246,7 +246,7 @@ def test_a_way_in_one_direction_is_no_wall() -> None:
         (
             changed(lambda d: d["layouts"][0]["nodes"][2].pop("nodeName")),
             "nodes[2].nodeName",
-            "node 'r1c0' names no landmark",
+            "the name of node 'r1c0' is not a landmark",
         ),
         (
             changed(lambda d: d["layouts"][0]["nodes"][2].update(nodeId="r0c0")),
