@@ -145,7 +145,7 @@ def command(
     from locatk.core.landmarks.design.analysis import analyse_landmark
     from locatk.core.landmarks.design.generation import DesignOptions
     from locatk.core.landmarks.design.proof import prove_map
-    from locatk.formats.artifacts.map_library import design
+    from locatk.formats.artifacts.map_library import design_or_crop
     from locatk.formats.artifacts.maps import write_map
 
     analysis = analyse_landmark(geometry)
@@ -163,7 +163,7 @@ def command(
         geometry=geometry,
     )
     with _search_progress() as report:
-        floor = replace(design(request, report), name=name)
+        floor = replace(design_or_crop(request, report), name=name)
     with console.working("Proving"):
         proof = prove_map(floor)
     if not proof.holds:
