@@ -83,7 +83,7 @@ def command(
     Examples:
       locatk map import map.csv -o map.toml
       locatk map import survey.csv -o map.toml --pitch 200 --like design.toml
-      locatk map import layout.json --format lif -o map.toml --alphabet 6 --window L
+      locatk map import layout.json --format lif -o map.toml --alphabet 6
     """
     from locatk.core.units import metres
     from locatk.formats.artifacts.maps import dumps_map, loads_map, read_map, write_map

@@ -16,7 +16,6 @@ from locatk.core.polaris.simulation.session import (
     simulate,
     usual_bar,
 )
-from locatk.formats.artifacts import tags as tag_files
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     FRACTION,
@@ -30,7 +29,8 @@ from locatk.formats.artifacts.kinds import (
     Number,
     Text,
 )
-from locatk.formats.sessions import magnetometers as arrays
+from locatk.formats.artifacts.tags import read_array, read_tags
+from locatk.formats.sessions import magnetometers
 from locatk.formats.simulation.config import SimulationConfig
 from locatk.formats.simulation.settings import Setting
 
@@ -409,7 +409,7 @@ def simulation_options(settings: Mapping[str, Any]) -> SimulationOptions:
     is_noise_measured = values.pop(MEASURED_NOISE, False)
     file = values.pop(ARRAY_FILE, None)
     if file is not None:
-        return SimulationOptions(array=tag_files.read_array(Path(file)), **values)
+        return SimulationOptions(array=read_array(Path(file)), **values)
     parameters = {name: values.pop(key) for key, name in ARRAY_PARAMETERS.items() if key in values}
     if is_noise_measured:
         parameters["noise_t"] = None
@@ -437,11 +437,11 @@ def write_simulation(
         A file is missing or invalid, or the settings cannot be simulated.
     """
     car = CARS[settings.get("robot.car", DEFAULT_CAR)]
-    tags = tag_files.read_tags(tag_file) if tag_file else car.tags
+    tags = read_tags(tag_file) if tag_file else car.tags
     options = simulation_options(settings)
     simulated = simulate(tags, options)
     warnings = _warnings(simulated)
-    arrays.write_session(
+    magnetometers.write_session(
         output,
         [simulated.samples],
         tags=tags,

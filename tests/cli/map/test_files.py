@@ -79,7 +79,7 @@ def test_every_format(
     assert "--overwrite" in again.stderr
 
 
-def test_the_picture_is_not_written_over(locatk, map_file: Path, tmp_path: Path) -> None:
+def test_an_existing_image_is_not_overwritten(locatk, map_file: Path, tmp_path: Path) -> None:
     (tmp_path / "floor.pgm").write_text("mine")
     result = locatk("map", "export", map_file, "-o", tmp_path / "floor.yaml")
     assert result.exit_code == 1
@@ -110,7 +110,9 @@ def test_a_layout_is_stamped_by_its_map(
 
 
 @pytest.mark.parametrize("file", ["m.csv", "m.json"])
-def test_there_and_back(locatk, map_file: Path, tmp_path: Path, file: str) -> None:
+def test_export_and_import_give_the_same_map(
+    locatk, map_file: Path, tmp_path: Path, file: str
+) -> None:
     there, back = tmp_path / file, tmp_path / "back.toml"
     assert locatk("map", "export", map_file, "-o", there).exit_code == 0
     result = locatk("map", "import", there, "-o", back, "--like", map_file, "--pitch", 200)

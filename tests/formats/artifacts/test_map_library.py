@@ -82,7 +82,7 @@ def test_every_mode_has_a_map() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.file)
-def test_cuts_hold_and_differ_by_seed(entry: LibraryMap) -> None:
+def test_cropped_maps_are_unique_and_differ_by_seed(entry: LibraryMap) -> None:
     rows, columns = max(1, min(9, entry.rows - 1)), min(7, entry.columns)
     floors = [crop_map(wanted(entry, rows, columns, seed)) for seed in range(6)]
     assert all(floor is not None and floor.shape == (rows, columns) for floor in floors)
@@ -98,7 +98,7 @@ def test_cuts_hold_and_differ_by_seed(entry: LibraryMap) -> None:
         assert set(np.unique(floor.codes)) <= set(ALPHABET_CODES[entry.alphabet])
 
 
-def test_whole_maps_are_cut_in_both_orientations() -> None:
+def test_whole_maps_are_cropped_in_both_orientations() -> None:
     (entry,) = [e for e in entries() if (e.alphabet, e.window, e.detect) == ("6", "I3", 0)]
     assert entry.rows != entry.columns
     for rows, columns in ((entry.rows, entry.columns), (entry.columns, entry.rows)):
@@ -110,8 +110,8 @@ def test_whole_maps_are_cut_in_both_orientations() -> None:
 
 @pytest.mark.parametrize("alphabet", ALPHABETS)
 @pytest.mark.parametrize("quarters", range(4))
-def test_a_turned_map_reads_as_before(alphabet: str, quarters: int) -> None:
-    """The same letters in the same order, each under the heading that turned with it."""
+def test_a_rotated_map_has_the_same_readings(alphabet: str, quarters: int) -> None:
+    """The letters have the same order, each under the rotated heading."""
     codes = np.random.default_rng(1).choice(ALPHABET_CODES[alphabet], (4, 5))
     for window in WINDOWS:
         before = window_readings(FloorMap(codes, alphabet=alphabet, window=window))
@@ -128,15 +128,15 @@ def test_a_turned_map_reads_as_before(alphabet: str, quarters: int) -> None:
         assert one == sorted(zip(after.heading, letters.tolist(), strict=True))
 
 
-def test_a_quarter_turn_by_hand() -> None:
-    """Counter-clockwise seen with y up: what was right of the origin is now above it."""
+def test_rotation_by_90_degrees() -> None:
+    """Counter-clockwise with y up: cells right of the origin are above it afterwards."""
     codes = np.array([[1, 2], [3, 4]])  # row 0 is the lower one
     assert rotated_map(codes, 1, "6").tolist() == [[3, 1], [4, 2]]
     assert rotated_map(codes, 1, "16").tolist() == [[6, 2], [8, 4]]
 
 
 @pytest.mark.parametrize("alphabet", ALPHABETS)
-def test_relabellings_keep_readings_apart(alphabet: str) -> None:
+def test_relabellings_keep_readings_different(alphabet: str) -> None:
     tables = [random_relabelling(alphabet, np.random.RandomState(seed)) for seed in range(30)]
     letters = np.array(ALPHABET_CODES[alphabet])
     for table in tables:
@@ -160,7 +160,7 @@ def test_holes_and_walls_stay() -> None:
     assert prove_map(floor).is_unique
 
 
-def test_what_is_too_large_or_not_there_is_searched_for() -> None:
+def test_maps_that_the_library_lacks_are_searched() -> None:
     corridor = DesignOptions(2, 80)
     assert crop_map(corridor) is None
     assert prove_map(map_library.design_or_crop(corridor), steps=False).is_unique
@@ -168,7 +168,7 @@ def test_what_is_too_large_or_not_there_is_searched_for() -> None:
     assert map_library.design_or_crop(DesignOptions(2, 4, window="I2", alphabet="6")).notes == ()
 
 
-def test_a_map_that_notices_more_serves_where_less_is_asked() -> None:
+def test_maps_that_detect_more_are_used_if_less_is_required() -> None:
     asked = DesignOptions(5, 5, detect=1)
     floor = crop_map(asked)
     assert floor is not None

@@ -1,4 +1,4 @@
-"""map.toml and halls.toml: exact, deterministic, and strict with what people write."""
+"""map.toml and halls.toml: exact round trips, and strict checks of edited maps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from locatk.core.landmarks.halls import HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, name
 from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, WINDOWS, AsBuiltLandmark, FloorMap
-from locatk.formats.artifacts import maps as files
+from locatk.formats.artifacts import maps
 from locatk.formats.artifacts.maps import (
     COMPASS_CODES,
     dumps_halls,
@@ -31,7 +31,7 @@ above = st.floats(1e-6, 1e3)
 
 @st.composite
 def geometries(draw: st.DrawFn) -> Geometry:
-    """Any bars that leave each other room."""
+    """Geometries whose bars do not overlap."""
     length, width = draw(above), draw(above)
     return Geometry(
         length,
@@ -57,7 +57,7 @@ def grids(draw: st.DrawFn, letters: list[int]) -> np.ndarray:
 
 @st.composite
 def builts(draw: st.DrawFn, pitch: float) -> AsBuiltLandmark:
-    """How a landmark may lie."""
+    """Landmarks as built."""
     near = st.floats(-pitch / 2, pitch / 2)
     sigma = st.floats(0, 10) | st.just(math.nan)
     return AsBuiltLandmark(
@@ -143,7 +143,7 @@ def test_all_halls_come_back_to_the_last_bit(halls: HallSensors) -> None:
     assert dumps_halls(read) == text
 
 
-def test_published_maps_are_written_as_they_were(data: Path) -> None:
+def test_published_maps_keep_their_rows(data: Path) -> None:
     """The published files hold the same digits, the first line at y = 0."""
     found = sorted((data / "landmarks").glob("or16_*.txt"))
     assert found
@@ -155,7 +155,7 @@ def test_published_maps_are_written_as_they_were(data: Path) -> None:
         np.testing.assert_array_equal(loads_map(text).codes, codes)
 
 
-# ---- what people write
+# ---- edited files
 
 MAP = """\
 format = "locatk-landmark-map"
@@ -209,7 +209,7 @@ def test_a_map_by_hand() -> None:
     assert (built.visits, built.flags) == (0, ())
 
 
-def test_the_file_says_which_row_is_which() -> None:
+def test_the_file_explains_the_order_of_rows() -> None:
     text = dumps_map(loads_map(MAP + LANDMARK))
     comment = " ".join(line[2:] for line in text.splitlines() if line.startswith("# "))
     assert "The FIRST row has the least y" in comment
@@ -290,10 +290,10 @@ def test_bars_may_touch() -> None:
         (MAP + LANDMARK + BUILT + "flags = 1", "built[0].flags", "list of strings"),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_errors_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str, words: str
 ) -> None:
-    refused(files.MAP, text, where, words)
+    refused(maps.MAP, text, where, words)
 
 
 HALLS = """\
@@ -328,7 +328,7 @@ def test_halls_by_hand() -> None:
         (HALLS + "range_t = 1", "range_t", "unknown key"),
     ],
 )
-def test_what_is_wrong_with_halls_is_named(
+def test_errors_of_halls_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str, words: str
 ) -> None:
-    refused(files.HALLS, text, where, words)
+    refused(maps.HALLS, text, where, words)

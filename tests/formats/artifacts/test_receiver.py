@@ -1,4 +1,4 @@
-"""receiver.toml: exact, strict, and found in sessions; the deck is known without being told."""
+"""receiver.toml: exact round trips, strict checks, attachments of sessions, and the deck."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_the_example_of_the_documentation(root: Path) -> None:
         (TWO + "normals = 3", "normals", "unknown key"),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_errors_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str, words: str
 ) -> None:
     refused(receivers.RECEIVER, text, where, words)
@@ -158,7 +158,7 @@ def write(path: Path, found: dict[str, Receiver], devices: tuple[str, ...]) -> S
         ({"a": DECK, "b/c": DECK, "d": DECK}, [f"receiver-{d}.toml" for d in ("a", "b/c", "d")]),
     ],
 )
-def test_each_device_gets_its_own_back(
+def test_each_device_has_its_receiver(
     tmp_path: Path, found: dict[str, Receiver], names: list[str]
 ) -> None:
     session = write(tmp_path / "run.mcap", found, ("a", "b/c"))
@@ -171,7 +171,7 @@ def test_each_device_gets_its_own_back(
         assert sorted(again) == names
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+def test_invalid_receivers_are_not_written(tmp_path: Path) -> None:
     dark = Receiver(np.zeros((1, 3)), np.zeros((1, 3)))
     with pytest.raises(ArtifactError, match="length 1") as caught:
         write(tmp_path / "run.mcap", {"a": dark}, ("a",))
@@ -192,8 +192,8 @@ def recorded(path: Path, device: str, *attached: Receiver) -> Session:
     return Session.open(path)
 
 
-def test_a_deck_is_what_it_is(tmp_path: Path) -> None:
-    """Recordings of a deck that were made before its places were attached."""
+def test_recordings_of_a_deck_have_its_receiver(tmp_path: Path) -> None:
+    """Recordings of earlier versions have no attachment."""
     old = read_receivers(recorded(tmp_path / "1.mcap", "lighthouse-deck"))
     assert [*old] == ["robot"]
     assert same(old["robot"], DECK)

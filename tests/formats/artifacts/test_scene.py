@@ -1,4 +1,4 @@
-"""scene.toml: exact, deterministic, and strict with what people write."""
+"""scene.toml: exact round trips, and strict checks of edited files."""
 
 from __future__ import annotations
 
@@ -132,12 +132,12 @@ def test_times(text: str, time_ns: int | None) -> None:
     assert parse_time(text) == time_ns
 
 
-def test_places_are_written_in_mm() -> None:
+def test_positions_are_written_in_mm() -> None:
     scene = Scene(markers=(Marker("a", np.array([0.1, 0.2, 0.0])),))
     assert "position_mm = [100.0, 200.0, 0.0]" in dumps_scene(scene)
 
 
-# ---- what people write
+# ---- edited files
 
 HEAD = 'format = "locatk-lighthouse-scene"\nformat_version = 1\n'
 
@@ -197,7 +197,7 @@ def test_the_example_of_the_documentation(root: Path) -> None:
     assert plain(loads_scene(dumps_scene(scene))) == plain(scene)
 
 
-def test_units_where_the_scale_is_not_known() -> None:
+def test_lengths_have_no_unit_if_the_scale_is_unknown() -> None:
     station = Station(1, np.array([0.5, 0, 1]), np.eye(3), Calibration(np.zeros((2, 7)), "none"))
     text = dumps_scene(Scene(stations=(station,), floor_z=0.25))
     assert "position_units = [0.5, 0.0, 1.0]" in text
@@ -220,7 +220,7 @@ source = "none"
 )
 
 
-def test_a_station_that_is_yet_to_be_solved_has_its_serial_number() -> None:
+def test_serial_numbers_of_stations_before_solving() -> None:
     scene = loads_scene(CALIBRATIONS)
     assert scene.ids == {3: 0x4CC60647}
     assert scene.calibrations[3].source == "none"
@@ -295,7 +295,7 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (HEAD + "planar = maybe\nscale = 3", "3", "not valid TOML"),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_errors_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str | int, words: str
 ) -> None:
     refused(artifacts.SCENE, text, where, words)
@@ -314,6 +314,6 @@ def test_unknown_keys_get_a_suggestion() -> None:
 
 
 @pytest.mark.parametrize("text", [b"\xff\xfe", b"a = " + b"[" * 100_000, b"a = " + b"9" * 10_000])
-def test_files_that_are_no_text(text: bytes) -> None:
+def test_files_that_are_not_text(text: bytes) -> None:
     with pytest.raises(ArtifactError):
         loads_scene(text)

@@ -22,8 +22,8 @@ from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import maps, sheets, tags
-from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.artifacts.kinds import UNITS, InvalidValueError, ListOf, Number, unit_ending
+from locatk.formats.artifacts.scene import SCENE
 from locatk.formats.artifacts.schema import Artifact, Key, Table
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
@@ -33,7 +33,7 @@ SHEET = Sheet("a", (0, 3000), (393, 555), (24, 32), (210.0, 297.0), (5.0, 7.5))
 
 ALL: dict[str, tuple[Artifact[Any], Any]] = {
     "scene.toml": (
-        artifacts.SCENE,
+        SCENE,
         Scene(markers=(Marker("a", np.array([0.1, 0.2, 0.0])),), notes=(NOTE,)),
     ),
     "sheet.toml": (sheets.MANIFEST, Manifest((SHEET,), codec="libdots", notes=(NOTE,))),
@@ -70,14 +70,12 @@ def test_any_text_is_an_artifact_or_an_error(
         artifact.loads(artifact.dumps(value) + "x" + text)
 
 
-def test_every_kind_has_a_name_of_its_own() -> None:
+def test_artifacts_have_different_file_names() -> None:
     assert [artifact.file for artifact, _ in ALL.values()] == list(ALL)
 
 
 @every
-def test_errors_name_the_artifact_where_there_is_no_file(
-    artifact: Artifact[Any], value: Any
-) -> None:
+def test_errors_name_the_artifact_if_there_is_no_file(artifact: Artifact[Any], value: Any) -> None:
     with pytest.raises(ArtifactError) as caught:
         artifact.loads(artifact.dumps(value).replace("format_version = 1", "format_version = 2"))
     assert caught.value.file == f"<{artifact.file.removesuffix('.toml')}>"
@@ -93,7 +91,9 @@ def session(path: Path, **parts: str) -> Session:
 
 
 @every
-def test_a_session_carries_it(tmp_path: Path, artifact: Artifact[Any], value: Any) -> None:
+def test_artifacts_are_attached_to_sessions(
+    tmp_path: Path, artifact: Artifact[Any], value: Any
+) -> None:
     name, text = artifact.file.removesuffix(".toml"), artifact.dumps(value)
     bearing = session(tmp_path / "run.mcap", **{name: text})
     assert artifact.dumps(artifact.attached(bearing)) == text
@@ -102,7 +102,7 @@ def test_a_session_carries_it(tmp_path: Path, artifact: Artifact[Any], value: An
         artifact.attached(session(tmp_path / "bad-run.mcap", **{name: "x"}))
 
 
-def test_a_device_may_have_its_own(tmp_path: Path) -> None:
+def test_a_device_may_have_an_artifact_of_its_own(tmp_path: Path) -> None:
     shared, own = (maps.HALLS.dumps(HallSensors(position_m=circle(r))) for r in (0.025, 0.03))
     both = session(tmp_path / "both.mcap", halls=shared, halls_b=own)
     for device, text in (("b", own), ("a", shared), (None, shared)):

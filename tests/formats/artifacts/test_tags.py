@@ -1,4 +1,4 @@
-"""tag.toml and array.toml: exact, deterministic, and strict with what people write."""
+"""tag.toml and array.toml: exact round trips, and strict checks of edited files."""
 
 from __future__ import annotations
 
@@ -14,8 +14,14 @@ from hypothesis import strategies as st
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.codec import capacity
 from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, PlanarPose, Tags
-from locatk.formats.artifacts import tags as files
-from locatk.formats.artifacts.tags import dumps_array, dumps_tags, loads_array, loads_tags
+from locatk.formats.artifacts.tags import (
+    ARRAY,
+    TAGS,
+    dumps_array,
+    dumps_tags,
+    loads_array,
+    loads_tags,
+)
 
 # ---- round trips
 
@@ -32,7 +38,7 @@ def arrays(shape: tuple[int, ...], elements: st.SearchStrategy[float]) -> st.Sea
 
 @st.composite
 def tag_sets(draw: st.DrawFn) -> Tags:
-    """Any tags, of designs that each codec takes."""
+    """Any tags, of designs of each codec."""
     codec = draw(st.sampled_from(CODECS))
     design = {
         "mosk": st.tuples(st.integers(2, 5), st.integers(3, 9), st.integers(2, 20)),
@@ -118,7 +124,7 @@ def test_every_array_comes_back_to_the_last_bit(array: SensorArray) -> None:
 @pytest.mark.slow
 @settings(deadline=None)
 @given(st.floats(-7, 7), st.decimals(-360, 360, places=2))
-def test_degrees_stay_as_they_were_written(angle: float, degrees: Decimal) -> None:
+def test_degrees_keep_their_digits(angle: float, degrees: Decimal) -> None:
     tags = Tags(site={0: PlanarPose(0.0, 0.0, angle)})
     assert loads_tags(dumps_tags(tags)).site[0].heading_rad == angle
     text = f"{dumps_tags(tags).split('heading_deg = ')[0]}heading_deg = {degrees}\n"
@@ -128,7 +134,7 @@ def test_degrees_stay_as_they_were_written(angle: float, degrees: Decimal) -> No
     assert Decimal(dumps_tags(again).split("heading_deg = ")[1]) == degrees
 
 
-# ---- what people write
+# ---- edited files
 
 TAG = """\
 format = "locatk-tag"
@@ -209,10 +215,10 @@ def test_tags_by_hand() -> None:
         (TAG.replace("mosk", "polaris-released").replace("= 8", "= 16") + MAGNET, None, "released"),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_errors_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str | None, words: str
 ) -> None:
-    refused(files.TAGS, text, where, words)
+    refused(TAGS, text, where, words)
 
 
 def test_ids_of_any_size() -> None:
@@ -220,7 +226,7 @@ def test_ids_of_any_size() -> None:
     assert loads_tags(dumps_tags(large)).ids == (10**21,)
 
 
-ARRAY = """\
+ARRAY_TEXT = """\
 format = "locatk-sensor-array"
 format_version = 1
 position_mm = [[0, -20, 0], [0, 0, 0], [0, 20, 0]]
@@ -228,12 +234,12 @@ position_mm = [[0, -20, 0], [0, 0, 0], [0, 20, 0]]
 
 
 def test_an_array_by_hand() -> None:
-    array = loads_array(ARRAY)
+    array = loads_array(ARRAY_TEXT)
     np.testing.assert_array_equal(array.position_m, bar(3, 0.02))
     assert np.isnan(array.noise_t).all()
     assert np.isinf(array.range_t).all()
     assert not array.delay_s.any()
-    known = loads_array(ARRAY + "noise_ut = [0.5, nan, 1.24]\nrange_ut = [4915, 4915, nan]\n")
+    known = loads_array(ARRAY_TEXT + "noise_ut = [0.5, nan, 1.24]\nrange_ut = [4915, 4915, nan]\n")
     np.testing.assert_array_equal(known.noise_t, [0.5e-6, np.nan, 1.24e-6])
     np.testing.assert_array_equal(known.range_t, [4915e-6, 4915e-6, np.inf])
 
@@ -241,28 +247,28 @@ def test_an_array_by_hand() -> None:
 @pytest.mark.parametrize(
     ("text", "where", "words"),
     [
-        (ARRAY.replace("sensor-array", "array"), "format", "expected"),
+        (ARRAY_TEXT.replace("sensor-array", "array"), "format", "expected"),
         (
-            ARRAY.replace("[[0, -20, 0], [0, 0, 0], [0, 20, 0]]", "[]"),
+            ARRAY_TEXT.replace("[[0, -20, 0], [0, 0, 0], [0, 20, 0]]", "[]"),
             "position_mm",
             "1 to 10000 rows of 3 numbers in mm",
         ),
         (
-            ARRAY.replace("[[0, -20, 0], [0, 0, 0], [0, 20, 0]]", "3"),
+            ARRAY_TEXT.replace("[[0, -20, 0], [0, 0, 0], [0, 20, 0]]", "3"),
             "position_mm",
             "1 to 10000 rows of 3 numbers in mm",
         ),
-        (ARRAY.replace("[0, 0, 0]", "[0, 0]"), "position_mm[1]", "list of 3 numbers"),
-        (ARRAY.replace("[0, 0, 0]", "[0, 20, 0]"), "position_mm", "position of sensor 1"),
-        (ARRAY + "noise_ut = [0.5, 0, 1]", "noise_ut[1]", "above 0 in uT"),
-        (ARRAY + "noise_ut = 0.5", "noise_ut", "list of 3"),
-        (ARRAY + "range_ut = [1, 1, -1]", "range_ut[2]", "above 0 in uT"),
-        (ARRAY + "quantum_ut = [1, 1, -1]", "quantum_ut[2]", "of at least 0"),
-        (ARRAY + "delay_ms = [0, 5, nan]", "delay_ms[2]", "finite"),
-        (ARRAY + "noise_nt = [1, 1, 1]", "noise_nt", "unknown key"),
+        (ARRAY_TEXT.replace("[0, 0, 0]", "[0, 0]"), "position_mm[1]", "list of 3 numbers"),
+        (ARRAY_TEXT.replace("[0, 0, 0]", "[0, 20, 0]"), "position_mm", "position of sensor 1"),
+        (ARRAY_TEXT + "noise_ut = [0.5, 0, 1]", "noise_ut[1]", "above 0 in uT"),
+        (ARRAY_TEXT + "noise_ut = 0.5", "noise_ut", "list of 3"),
+        (ARRAY_TEXT + "range_ut = [1, 1, -1]", "range_ut[2]", "above 0 in uT"),
+        (ARRAY_TEXT + "quantum_ut = [1, 1, -1]", "quantum_ut[2]", "of at least 0"),
+        (ARRAY_TEXT + "delay_ms = [0, 5, nan]", "delay_ms[2]", "finite"),
+        (ARRAY_TEXT + "noise_nt = [1, 1, 1]", "noise_nt", "unknown key"),
     ],
 )
-def test_what_is_wrong_with_an_array_is_named(
+def test_errors_of_an_array_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str, words: str
 ) -> None:
-    refused(files.ARRAY, text, where, words)
+    refused(ARRAY, text, where, words)

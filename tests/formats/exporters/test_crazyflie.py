@@ -108,7 +108,7 @@ def test_reads_what_cflib_writes() -> None:
     assert "generic calibration of channel 1:" in found.notes[1]
 
 
-def test_a_scene_that_was_read_is_a_scene(tmp_path: Path) -> None:
+def test_a_scene_from_a_configuration_is_a_valid_artifact(tmp_path: Path) -> None:
     from locatk.formats.artifacts.scene import dumps_scene, loads_scene
 
     found = crazyflie.loads_config(SAMPLE)
@@ -135,7 +135,7 @@ def test_the_same_after_writing_and_reading(tmp_path: Path) -> None:
     assert crazyflie.dumps_config(before) == path.read_text()
 
 
-def test_a_plain_yaml_reader_finds_floats_everywhere() -> None:
+def test_all_numbers_are_floats_for_yaml_readers() -> None:
     """cflib packs the values as they come: 1e-07 without a point would be a string there."""
     data = yaml.safe_load(crazyflie.dumps_config(scene()))
     assert (data["type"], data["version"], data["systemType"]) == (
@@ -269,7 +269,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("old", "new", "where", "message"), WRONG)
-def test_what_is_wrong_is_named(
+def test_errors_name_key_and_expected_value(
     tmp_path: Path, old: str, new: str, where: str | int, message: str
 ) -> None:
     path = tmp_path / "config.yaml"
@@ -317,6 +317,7 @@ def test_files_of_other_kinds(tmp_path: Path, content: bytes) -> None:
     assert len(str(refused.value)) < 400
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_damaged_files_give_an_error_or_a_scene(data: st.DataObject) -> None:

@@ -51,7 +51,7 @@ def pixel(picture: np.ndarray, floor: FloorMap, x: float, y: float, size: float)
     return int(picture[len(picture) - 1 - row, column])
 
 
-def test_every_pixel_lies_where_its_landmark_is() -> None:
+def test_pixels_agree_with_the_field_of_the_landmarks() -> None:
     size = 0.005
     picture = map_ros.draw_grid(FLOOR, size)
     assert picture.shape == (80, 120)
@@ -72,7 +72,7 @@ def test_every_pixel_lies_where_its_landmark_is() -> None:
     assert pixel(picture, FLOOR, *FLOOR.position((0, 0)), size) == map_ros.FREE
 
 
-def test_walls_stand_between_their_cells() -> None:
+def test_walls_are_between_their_cells() -> None:
     picture = map_ros.draw_grid(FLOOR, 0.01)
     black = picture == map_ros.OCCUPIED
     assert black.any()
@@ -86,7 +86,7 @@ def test_walls_stand_between_their_cells() -> None:
     assert pixel(picture, FLOOR, 1.1 + 1e-6, -2.7, 0.01) != map_ros.OCCUPIED
 
 
-def test_levels_mean_to_map_server_what_they_should() -> None:
+def test_grey_levels_have_the_meaning_of_map_server() -> None:
     """wiki.ros.org/map_server: p = (255 - level) / 255, free below, occupied above."""
     text = map_ros.dumps_yaml(FLOOR, 'a "b".pgm')
     values = dict(line.split(": ", 1) for line in text.splitlines())
@@ -99,7 +99,7 @@ def test_levels_mean_to_map_server_what_they_should() -> None:
     assert free < chance[map_ros.UNKNOWN] < occupied < chance[map_ros.OCCUPIED]
 
 
-def test_pgm_is_read_by_others() -> None:
+def test_pgm_is_read_by_pillow() -> None:
     from PIL import Image
 
     picture = map_ros.draw_grid(FLOOR)
@@ -186,7 +186,7 @@ def test_svg_has_true_size_and_layers() -> None:
     assert len(found["walls"]) == 2
 
 
-def test_svg_bars_lie_and_point_as_designed() -> None:
+def test_svg_bars_are_as_designed() -> None:
     """Bar 0 of NNNS is N: at the right, 25 mm from the centre, north upwards."""
     group = groups(map_svg.dumps_svg(FLOOR))["r0c0"]
     outlines, lines, _ = (path.get("d") for path in group.findall("{*}path"))
@@ -220,7 +220,7 @@ def read(text: str) -> ezdxf.document.Drawing:
     return ezdxf.read(io.StringIO(text))
 
 
-def test_dxf_is_sound_and_in_mm() -> None:
+def test_dxf_is_valid_and_in_mm() -> None:
     document = read(dumps_dxf(FLOOR))
     assert not document.audit().has_errors
     assert document.units == ezdxf.units.MM
@@ -238,7 +238,7 @@ def test_dxf_is_sound_and_in_mm() -> None:
     }
 
 
-def test_dxf_bars_lie_as_built() -> None:
+def test_dxf_bars_are_as_built() -> None:
     document = read(dumps_dxf(BUILT))
     (insert,) = document.modelspace().query("INSERT[name=='LANDMARK_NSSS']")
     bars = [e for e in insert.virtual_entities() if e.dxftype() == "LWPOLYLINE"]
@@ -254,6 +254,7 @@ def test_dxf_bars_lie_as_built() -> None:
     assert turned == pytest.approx(TURN + math.pi / 2)
 
 
+@pytest.mark.slow
 def test_dxf_is_the_same_in_every_process(tmp_path: Path) -> None:
     """Neither the time nor the order of hashes is in it, and ezdxf is left as it was."""
     assert ezdxf.options.write_fixed_meta_data_for_testing is False
