@@ -214,10 +214,10 @@ class SimulationConfig:
     def _check_combinations(self, settings: Mapping[str, Any]) -> None:
         """Raise an error for settings that cannot be combined; those that are off do not count."""
         for first, second in self.conflicts:
-            one = next((key for key in first if _is_set(settings, key)), None)
-            other = next((key for key in second if _is_set(settings, key)), None)
-            if one and other:
-                titles = f"{self.setting(one).title} or {self.setting(other).title}"
+            first_key = next((key for key in first if _is_set(settings, key)), None)
+            second_key = next((key for key in second if _is_set(settings, key)), None)
+            if first_key and second_key:
+                titles = f"{self.setting(first_key).title} or {self.setting(second_key).title}"
                 raise SettingsError(f"Give {titles}, not both")
         for need in self.requirements:
             if not _is_set(settings, need.key):

@@ -181,3 +181,22 @@ def test_a_typo_in_the_header_gets_the_nearest_key(artifact: Artifact[Any], valu
     with pytest.raises(ArtifactError, match="unknown key 'tol_version'") as caught:
         artifact.loads(text.replace("tool_version", "tol_version"))
     assert caught.value.hint == "Did you mean tool_version?"
+
+
+@pytest.mark.parametrize(
+    ("text", "absent"),
+    [
+        (SCENE.dumps(Scene()), ("notes", "stations", "planar")),
+        (tags.TAGS.dumps(Tags()), ("notes", "family", "built", "site")),
+        (
+            maps.MAP.dumps(FloorMap(np.ones((1, 1), int))),
+            ("notes", "name", "walls", "seed", "built"),
+        ),
+        (maps.HALLS.dumps(HallSensors()), ("sensor", "noise_ut", "range_mt")),
+    ],
+    ids=["scene", "tag", "map", "halls"],
+)
+def test_unknown_and_empty_values_are_not_written(text: str, absent: tuple[str, ...]) -> None:
+    keys = {line.split(" = ")[0].strip("[]") for line in text.splitlines()}
+    assert "format" in keys
+    assert keys.isdisjoint(absent)
