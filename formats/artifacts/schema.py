@@ -314,7 +314,7 @@ def refuse_repeated(values: Iterable[Any], table: str, key: str) -> None:
     for number, value in enumerate(values):
         if value in known:
             shown = list(value) if isinstance(value, tuple) else value
-            raise InvalidValueError(f"{shown!r} is there twice", f"{table}[{number}].{key}")
+            raise InvalidValueError(f"{shown!r} occurs twice", f"{table}[{number}].{key}")
         known.add(value)
 
 

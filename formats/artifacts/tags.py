@@ -83,7 +83,7 @@ def _check_ids(tags: Tags) -> None:
     if tags.ids is not None:
         number, count = Counter(tags.ids).most_common(1)[0]
         if count > 1:
-            raise InvalidValueError(f"{number} is there twice", "family.ids")
+            raise InvalidValueError(f"{number} occurs twice", "family.ids")
     members = None if tags.ids is None else frozenset(tags.ids)
     keys = [("family.ids", number) for number in tags.ids or ()]
     keys += [(f"built[{k}].id", number) for k, number in enumerate(tags.built)]

@@ -404,7 +404,7 @@ def _node(
             raise _error_at(event, file, "a key that is not a name or number")
         key = event.value
         if key in values:
-            raise _error_at(event, file, f"key {key[:60]!r} is there twice")
+            raise _error_at(event, file, f"key {key[:60]!r} occurs twice")
         values[key] = _node(next(events), events, file, depth + 1)
     return values
 

@@ -134,7 +134,7 @@ def loads_lif(
         where = f"nodes[{number}]"
         node_id = reader.text(node, "nodeId", where)
         if node_id in index:
-            raise reader.error(f"node {node_id!r} is there twice", where)
+            raise reader.error(f"node {node_id!r} occurs twice", where)
         index[node_id] = number
         codes.append(reader.code(node, where, node_id))
         poses.append((*reader.position(node, where), 0.0))

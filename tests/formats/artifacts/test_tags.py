@@ -194,7 +194,7 @@ def test_tags_by_hand() -> None:
         (TAG + MAGNET + FAMILY.replace("3,", "3.0,"), "family.ids[0]", "a whole number"),
         (TAG + MAGNET + FAMILY.replace("3,", "true,"), "family.ids[0]", "a whole number"),
         (TAG + MAGNET + FAMILY.replace("3,", "-3,"), "family.ids[0]", "of at least 0"),
-        (TAG + MAGNET + FAMILY.replace("3,", "7,"), "family.ids", "7 is there twice"),
+        (TAG + MAGNET + FAMILY.replace("3,", "7,"), "family.ids", "7 occurs twice"),
         (TAG + MAGNET + FAMILY.replace("3,", "327680,"), "family.ids", "last one is 327679"),
         (TAG + MAGNET + FAMILY.replace("= 2", "= 0"), "family.min_distance", "from 1"),
         (TAG + MAGNET + BUILT.replace("7", "327680"), "built[0].id", "not an id of this design"),

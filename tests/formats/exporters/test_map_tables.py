@@ -252,7 +252,7 @@ def test_an_edge_in_one_direction_is_not_a_wall() -> None:
         (
             changed(lambda d: d["layouts"][0]["nodes"][2].update(nodeId="r0c0")),
             "nodes[2]",
-            "node 'r0c0' is there twice",
+            "node 'r0c0' occurs twice",
         ),
         (
             changed(lambda d: d["layouts"][0]["nodes"][1]["nodePosition"].update(x="0")),
