@@ -233,8 +233,9 @@ def check_given(request: Request) -> None:
     ------
     ArtifactError
     """
-    from locatk.formats.artifacts import maps, sheets, tags, toml
+    from locatk.formats.artifacts import maps, sheets, tags
     from locatk.formats.artifacts import scene as artifacts
+    from locatk.formats.artifacts.schema import read_format
 
     readers: dict[str, Callable[[Path], Any]] = {
         artifacts.SCENE_FORMAT: artifacts.read_scene,
@@ -244,7 +245,7 @@ def check_given(request: Request) -> None:
     }
     given = request.artifact
     if given is not None and given.suffix.lower() == ".toml":
-        reader = readers.get(toml.read(given).text("format", ""))
+        reader = readers.get(read_format(given))
         if reader is not None:
             reader(given)
     if request.camera is not None:

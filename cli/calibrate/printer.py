@@ -119,7 +119,7 @@ def printer(
         files.write_printer(output, report, scale, overwrite=overwrite)
     for path, manifest in held:
         if scale is not None:
-            write_manifest(path, files.scaled(manifest, scale), overwrite=True)
+            write_manifest(path, files.with_printer_scale(manifest, scale), overwrite=True)
     console.result(_text(report, scale))
     _tell(report, output, held, scale)
     if as_json:

@@ -56,9 +56,10 @@ def command(file: Path, as_json: bool) -> None:
 
 
 def _artifact(file: Path) -> dict[str, Any]:
-    from locatk.formats.artifacts import hall_sensors, maps, sheets, tags, toml
+    from locatk.formats.artifacts import maps, sheets, tags
     from locatk.formats.artifacts import receiver as receivers
     from locatk.formats.artifacts import scene as artifacts
+    from locatk.formats.artifacts.schema import read_format
     from locatk.formats.sessions import description as describe
 
     kinds: dict[str, Callable[[], dict[str, Any]]] = {
@@ -92,7 +93,7 @@ def _artifact(file: Path) -> dict[str, Any]:
             "system": "landmarks",
             **describe.floor(maps.read_map(file)),
         },
-        hall_sensors.HALLS_FORMAT: lambda: {
+        maps.HALLS_FORMAT: lambda: {
             "kind": "halls",
             "system": "landmarks",
             "halls": [describe.hall_sensors(maps.read_halls(file))],
@@ -103,7 +104,7 @@ def _artifact(file: Path) -> dict[str, Any]:
             "receivers": [info_lighthouse.receiver(receivers.read_receiver(file))],
         },
     }
-    return kinds[toml.read(file).text("format", choices=tuple(kinds))]()
+    return kinds[read_format(file, tuple(kinds))]()
 
 
 def _recording(file: Path) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """``locatk map``: design floors of landmarks, check them, and exchange them with other tools.
 
-The group loads a command's module when the command is called (:mod:`.lazy`).
+The group loads a command's module when the command is called (:mod:`locatk.cli.lazy`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from locatk.cli.lazy import LazyGroup
 
 COMMANDS = {
     "design": ("locatk.cli.map.design", "Find a map in which every window is unique."),
-    "check": ("locatk.cli.map.check", "Prove that a map is unique, or show where not."),
+    "check": ("locatk.cli.map.check", "Prove that a map is unique, or list duplicates."),
     "export": ("locatk.cli.map.export", "Write a map for other tools."),
     "import": ("locatk.cli.map.import_", "Read a map from a table or a LIF layout."),
 }

@@ -1,4 +1,4 @@
-"""``locatk map check``: the proof of maps, for people and for scripts."""
+"""``locatk map check``: proof that maps are unique."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from locatk.cli import console, options
-from locatk.cli.map import proof_text as map_proof
+from locatk.cli.command import Command
+from locatk.cli.map import proof_text
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,25 +18,29 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.map.floor import FloorMap
 
 
-@click.command("check", short_help="Prove that a map is unique, or show where not.")
+MAX_NAMED_CELLS = 5
+"""Cells that a warning names."""
+
+
+@click.command(cls=Command)
 @options.input_argument("maps", many=True)
 @options.as_json
 @options.verbosity
 def command(maps: tuple[Path, ...], as_json: bool) -> None:
-    """Prove that a robot can tell where it is on MAPS, or show where it cannot.
+    """Prove that each reading of MAPS determines the position of a robot, or list duplicates.
 
-    Every window under every heading is read and compared: duplicates with both places, how
-    many landmarks any two readings differ in, how many a robot must visit until it knows its
-    place, and what one fault breaks. Of a map as built (`locatk calibrate map`) the bars count
-    as they lie.
+    The readings of every window under every heading are compared. The output lists duplicates with
+    both positions, the number of landmarks in which any two readings differ, the number of
+    landmarks that a robot visits until it is localised, and the effect of one fault. Of a map as
+    built (`locatk calibrate map`) the bars count as they were installed.
 
-    For scripts: the exit status is 0 where each map is unique and notices as many misread
-    landmarks as its file promises (`detect`), and 1 where one does not or cannot be read.
+    The exit status is 0 if each map is unique and detects as many misread landmarks as its file
+    states (`detect`), otherwise 1.
 
     \b
     Examples:
       locatk map check map.toml
-      locatk map check floors/*.toml -q && echo good
+      locatk map check floors/*.toml -q && echo unique
       locatk map check map.toml --json | jq '.maps[0].proof.duplicates'
     """
     from locatk.core.landmarks.design.proof import prove_map
@@ -50,7 +55,7 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
     for number, (path, floor, proof) in enumerate(proved):
         if number:
             console.result("")
-        _tell(path, floor, proof)
+        _print_proof(path, floor, proof)
     if as_json:
         console.emit_json(
             {
@@ -58,46 +63,48 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
                 "maps": [
                     {
                         "input": path,
-                        "verdict": map_proof.verdict(proof),
-                        "map": map_proof.map_entry(floor),
-                        "proof": map_proof.proof_entry(proof, floor),
+                        "verdict": proof_text.verdict(proof),
+                        "map": proof_text.map_entry(floor),
+                        "proof": proof_text.proof_entry(proof, floor),
                     }
                     for path, floor, proof in proved
                 ],
             }
         )
-    wrong = [(path, proof) for path, _, proof in proved if not proof.holds]
-    if len(wrong) == 1:
-        path, proof = wrong[0]
-        raise InputError(map_proof.verdict(proof), file=path, hint=_hint(proof))
-    if wrong:
+    failed = [(path, proof) for path, _, proof in proved if not proof.holds]
+    if len(failed) == 1:
+        path, proof = failed[0]
+        raise InputError(proof_text.verdict(proof), file=path, hint=_hint(proof))
+    if failed:
         raise InputError(
-            f"{len(wrong)} of {len(proved)} maps do not hold: "
-            + ", ".join(str(path) for path, _ in wrong)
+            f"{len(failed)} of {len(proved)} maps do not hold: "
+            + ", ".join(str(path) for path, _ in failed)
         )
 
 
-def _tell(path: Path, floor: FloorMap, proof: MapProof) -> None:
-    """The proof of one map."""
-    console.result(f"{path}: {map_proof.verdict(proof)}\n")
-    console.result(console.labelled([*map_proof.floor_lines(floor), *map_proof.proof_lines(proof)]))
+def _print_proof(path: Path, floor: FloorMap, proof: MapProof) -> None:
+    """Print the proof of one map, and warn of landmarks that differ from the design."""
+    console.result(f"{path}: {proof_text.verdict(proof)}\n")
+    console.result(
+        console.labelled([*proof_text.floor_lines(floor), *proof_text.proof_lines(proof)])
+    )
     if proof.duplicates:
-        console.result("\n" + map_proof.duplicates(proof, floor))
+        console.result("\n" + proof_text.duplicates(proof, floor))
     if proof.readings:
-        console.result("\n" + map_proof.faults(proof))
+        console.result("\n" + proof_text.faults(proof))
     console.result(f"\nSHA-256 {proof.fingerprint}")
     flagged = [cell for cell, built in sorted(floor.built.items()) if built.flags]
     if flagged:
         count = f"{len(flagged)} landmark" + "s" * (len(flagged) > 1)
-        first = ", ".join(f"{row},{column}" for row, column in flagged[:5])
-        more = " ..." if len(flagged) > 5 else ""
+        first = ", ".join(f"{row},{column}" for row, column in flagged[:MAX_NAMED_CELLS])
+        more = " ..." if len(flagged) > MAX_NAMED_CELLS else ""
         console.warn(
-            f"{count} of {path} not built as designed (at {first}{more}); the proof is of how "
-            "they lie."
+            f"{count} of {path} not built as designed (at {first}{more}); the proof is of the "
+            "floor as built."
         )
 
 
 def _hint(proof: MapProof) -> str:
     if not proof.is_unique:
-        return "design the map again, or forbid a cell of each duplicate"
-    return "lower `detect` in the file, or design the map with --detect"
+        return "Design the map again, or forbid a cell of each duplicate"
+    return "Lower `detect` in the file, or design the map with --detect"

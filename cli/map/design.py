@@ -1,4 +1,4 @@
-"""``locatk map design``: a floor of landmarks, or the tables of one landmark."""
+"""``locatk map design``: a floor of landmarks, or the analysis of one landmark."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.map import landmark_text as map_landmark
-from locatk.cli.map import proof_text as map_proof
-from locatk.cli.map.options import Cells, Size, Walls, geometry_of, geometry_options, on_floor
+from locatk.cli.command import Command, section
+from locatk.cli.map import landmark_text, proof_text
+from locatk.cli.map.options import Cells, Size, Walls, check_cells, geometry_of, geometry_options
 from locatk.cli.options import number
 from locatk.core.errors import InputError
 from locatk.core.units import metres
@@ -24,54 +24,69 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.landmark import Geometry
     from locatk.core.landmarks.map.floor import Cell, FloorMap, Wall
 
+OVERLAP_TOLERANCE_M = 1e-9
+"""Bars may touch."""
 
-@click.command("design", short_help="Find a map in which every window is unique.")
+
+@click.command(cls=Command)
 @click.argument("size", metavar="[ROWSxCOLS]", type=Size(), required=False)
 @options.output("Map to write (.toml).", required=False)
+@click.option("--name", default="", metavar="TEXT", help="Name of the map, for people.")
 @click.option(
-    "--window",
-    type=click.Choice(("L", "I2", "I3", "2x2", "3x3")),
-    default="L",
-    show_default=True,
-    help="After which landmarks a robot knows where it is: one ahead and one to the left, two or "
-    "three in a row, or a square of four or nine.",
+    "--landmark",
+    is_flag=True,
+    help="Print the analysis of a landmark of these bars instead of writing a map.",
 )
-@click.option(
-    "--alphabet",
-    type=click.Choice(("6", "16", "compass")),
-    default="16",
-    show_default=True,
-    help="What is read of a landmark: its pattern; pattern and orientation; or the same of the "
-    "three patterns that tell the heading alone.",
-)
-@click.option(
-    "--detect",
-    type=click.IntRange(0, 8),
-    default=0,
-    show_default=True,
-    metavar="N",
-    help="So many misread landmarks of a window are always noticed.",
-)
-@number("--pitch", default=200.0, metavar="MM", help="Between two landmarks.")
-@number("--seed", default=0, type=click.IntRange(0), metavar="N", help="Another one, another map.")
-@click.option(
-    "--forbid",
-    type=Cells(),
-    multiple=True,
-    metavar="CELLS",
-    help="Cells without a landmark: row,column from 0, with ranges, as in '2,3;4,0-5' "
-    "(repeatable).",
-)
-@click.option(
-    "--wall",
-    type=Walls(),
-    multiple=True,
-    metavar="CELLS:CELLS",
-    help="Between which neighbours no robot can go, as in '2,3:2,4' or '0-5,3:0-5,4' (repeatable).",
-)
-@click.option("--name", default="", metavar="TEXT", help="Of the map, for people.")
-@click.option(
-    "--landmark", is_flag=True, help="Write no map: print what a landmark of these bars is worth."
+@section(
+    "Map",
+    click.option(
+        "--window",
+        type=click.Choice(("L", "I2", "I3", "2x2", "3x3")),
+        default="L",
+        show_default=True,
+        help="Landmarks that determine the position of a robot: one ahead and one to the left, two "
+        "or three in a row, or a square of four or nine.",
+    ),
+    click.option(
+        "--alphabet",
+        type=click.Choice(("6", "16", "compass")),
+        default="16",
+        show_default=True,
+        help="Part of a landmark that is read: `6` the pattern, `16` pattern and orientation, "
+        "`compass` the same of the three patterns that determine the heading.",
+    ),
+    click.option(
+        "--detect",
+        type=click.IntRange(0, 8),
+        default=0,
+        show_default=True,
+        metavar="N",
+        help="Number of misread landmarks of a window that are always detected.",
+    ),
+    number("--pitch", default=200.0, metavar="MM", help="Distance of neighbouring landmarks."),
+    number(
+        "--seed",
+        default=0,
+        type=click.IntRange(0),
+        metavar="N",
+        help="Seed of the search; another seed gives another map.",
+    ),
+    click.option(
+        "--forbid",
+        type=Cells(),
+        multiple=True,
+        metavar="CELLS",
+        help="Cells without a landmark: row,column from 0, with ranges, as in '2,3;4,0-5'. "
+        "Repeatable.",
+    ),
+    click.option(
+        "--wall",
+        type=Walls(),
+        multiple=True,
+        metavar="CELLS:CELLS",
+        help="Neighbours between which a robot cannot drive, as in '2,3:2,4' or "
+        "'0-5,3:0-5,4'. Repeatable.",
+    ),
 )
 @geometry_options
 @options.overwrite
@@ -93,16 +108,16 @@ def command(
     as_json: bool,
     **bars: Any,
 ) -> None:
-    """Find a floor of landmarks on which a robot knows its place after a few of them.
+    """Find a floor on which a few landmarks determine the position of a robot.
 
-    Each window of the floor, read under any of four headings, is unique; the map is proved
-    before it is written. Row 0 has the least y, column 0 the least x. A size that no map
-    can have is refused with the bound. Small and tight floors take some seconds of search.
+    Each window of the floor, read under any of four headings, is unique. The map is proved before
+    it is written. Row 0 has the least y, column 0 the least x. A size that no map can have is
+    refused with the bound. The search takes some seconds for small floors close to the bound.
 
-    With --landmark no map is made: the valleys of the six patterns, r1 and r2, the heights
-    at which they can be told, the least pitch, the range of the hall sensors and tolerances
-    are printed for the bars of the options. What will not work is a warning; the map is
-    written all the same, and the exit status is 3.
+    --landmark makes no map. It prints, for the bars of the options: the valleys of the six
+    patterns, r1 and r2, the heights at which patterns are distinguishable, the least pitch, the
+    range of the hall sensors and tolerances. A requirement that is not met gives a warning; the map
+    is written nevertheless, and the exit status is 3.
 
     \b
     Examples:
@@ -116,26 +131,26 @@ def command(
     geometry, pitch_m = geometry_of(**bars), metres(pitch)
     if landmark:
         if size is not None or output is not None:
-            raise click.UsageError("--landmark makes no map: leave ROWSxCOLS and -o out.")
-        _landmark(geometry, pitch_m, as_json)
+            raise click.UsageError("--landmark makes no map: omit ROWSxCOLS and -o.")
+        _print_landmark(geometry, pitch_m, as_json)
         return
     if size is None or output is None:
         raise click.UsageError("A map needs ROWSxCOLS and -o, as in 24x24 -o map.toml.")
     forbidden = [cell for cells in forbid for cell in cells]
     walls = [pair for pairs in wall for pair in pairs]
-    on_floor(size, forbidden, "--forbid")
-    on_floor(size, [cell for pair in walls for cell in pair], "--wall")
+    check_cells(size, forbidden, "--forbid")
+    check_cells(size, [cell for pair in walls for cell in pair], "--wall")
     options.guard_output(output, overwrite=overwrite)
 
     from locatk.core.landmarks.design.analysis import analyse_landmark
     from locatk.core.landmarks.design.generation import DesignOptions
     from locatk.core.landmarks.design.proof import prove_map
-    from locatk.formats.artifacts.map_library import design
+    from locatk.formats.artifacts.map_library import design_or_crop
     from locatk.formats.artifacts.maps import write_map
 
     analysis = analyse_landmark(geometry)
     _check_pitch(geometry, pitch_m)
-    wanted = DesignOptions(
+    request = DesignOptions(
         rows=size[0],
         columns=size[1],
         window=window,
@@ -147,95 +162,97 @@ def command(
         detect=detect,
         geometry=geometry,
     )
-    with _searching() as told:
-        floor = replace(design(wanted, told), name=name)
+    with _search_progress() as report:
+        floor = replace(design_or_crop(request, report), name=name)
     with console.working("Proving"):
         proof = prove_map(floor)
     if not proof.holds:
         raise InputError(
-            f"the map that was found is wrong: {map_proof.verdict(proof)}",
-            hint="please report it, with the command",
+            f"the map of the search is not valid: {proof_text.verdict(proof)}",
+            hint="Please report the command as an error of locatk",
         )
     write_map(output, floor, overwrite=overwrite)
-    _tell(output, floor, proof, analysis, as_json)
+    _print_map(output, floor, proof, analysis, as_json)
 
 
-def _tell(
+def _print_map(
     output: Path, floor: FloorMap, proof: MapProof, analysis: LandmarkAnalysis, as_json: bool
 ) -> None:
     from locatk.core.landmarks.design.analysis import landmark_warnings, pitch_warnings
     from locatk.core.landmarks.design.materials import count_patterns
 
-    found = count_patterns(floor)
-    counts = ", ".join(f"{item.landmarks} {item.letters}" for item in found)
+    patterns = count_patterns(floor)
+    counts = ", ".join(f"{item.landmarks} {item.letters}" for item in patterns)
     bars = 4 * len(floor.cells())
     console.result(f"Wrote {output}\n")
     console.result(
         console.labelled(
             [
-                *map_proof.floor_lines(floor),
-                *map_proof.proof_lines(proof),
-                ("Bars", f"{bars} of {map_landmark.bar(floor.geometry)}"),
+                *proof_text.floor_lines(floor),
+                *proof_text.proof_lines(proof),
+                ("Bars", f"{bars} of {landmark_text.bar(floor.geometry)}"),
                 ("Patterns", counts),
                 ("SHA-256", proof.fingerprint),
             ]
         )
     )
-    said = [*landmark_warnings(analysis), *pitch_warnings(analysis, floor.pitch_m)]
+    warnings = [*landmark_warnings(analysis), *pitch_warnings(analysis, floor.pitch_m)]
     if as_json:
         console.emit_json(
             {
                 "version": 1,
                 "output": output,
-                "map": map_proof.map_entry(floor),
-                "patterns": {item.letters: item.landmarks for item in found},
-                "proof": map_proof.proof_entry(proof, floor),
-                "landmark": map_landmark.entry(analysis, floor.pitch_m),
-                "warnings": said,
+                "map": proof_text.map_entry(floor),
+                "patterns": {item.letters: item.landmarks for item in patterns},
+                "proof": proof_text.proof_entry(proof, floor),
+                "landmark": landmark_text.entry(analysis, floor.pitch_m),
+                "warnings": warnings,
             }
         )
     for note in floor.notes:
         console.detail(f"{note[0].upper()}{note[1:]}.")
-    failures.finish_with_warnings(said)
+    failures.finish_with_warnings(warnings)
 
 
-def _landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
-    """The tables of one landmark."""
+def _print_landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
+    """Print the analysis of one landmark, and finish with its warnings."""
     from locatk.core.landmarks.design.analysis import (
         analyse_landmark,
         landmark_warnings,
         pitch_warnings,
     )
 
-    found = analyse_landmark(geometry)
+    analysis = analyse_landmark(geometry)
     _check_pitch(geometry, pitch_m)
-    said = [*landmark_warnings(found), *pitch_warnings(found, pitch_m)]
-    console.result(map_landmark.text(found, pitch_m))
+    warnings = [*landmark_warnings(analysis), *pitch_warnings(analysis, pitch_m)]
+    console.result(landmark_text.text(analysis, pitch_m))
     if as_json:
-        console.emit_json({"version": 1, **map_landmark.entry(found, pitch_m), "warnings": said})
-    failures.finish_with_warnings(said)
+        console.emit_json(
+            {"version": 1, **landmark_text.entry(analysis, pitch_m), "warnings": warnings}
+        )
+    failures.finish_with_warnings(warnings)
 
 
 def _check_pitch(geometry: Geometry, pitch_m: float) -> None:
-    least = 2 * geometry.radius_m + geometry.bar_width_m
-    if not pitch_m >= least - 1e-9:
+    min_pitch_m = 2 * geometry.radius_m + geometry.bar_width_m
+    if not pitch_m >= min_pitch_m - OVERLAP_TOLERANCE_M:
         raise InputError(
             f"bars of neighbouring landmarks overlap at a pitch of {1e3 * pitch_m:g} mm",
-            hint=f"give at least {1e3 * least:g} mm",
+            hint=f"Give at least {1e3 * min_pitch_m:g} mm",
         )
 
 
 @contextmanager
-def _searching() -> Iterator[Callable[[float, int], None]]:
-    """What a search tells its progress, shown on a terminal."""
+def _search_progress() -> Iterator[Callable[[float, int], None]]:
+    """Yield the function to which a search reports its progress, with a bar on a terminal."""
     with console.progress(range(100), "Searching") as bar:
         update = getattr(bar, "update", None)
         shown = 0
 
-        def told(share: float, left: int) -> None:
+        def report(fraction: float, remaining: int) -> None:
             nonlocal shown
             if update is not None:
-                update(int(100 * share) - shown)
-                shown = int(100 * share)
+                update(int(100 * fraction) - shown)
+                shown = int(100 * fraction)
 
-        yield told
+        yield report

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -21,22 +22,23 @@ FORMATS = ("csv", "lif", "ros", "svg", "dxf")
 
 
 def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
-    """The format asked for, else that of the ending."""
+    """Return the given format, or that of the ending of the file."""
     name = given or ENDINGS.get(path.suffix.lower(), "")
     if name not in known:
-        raise click.UsageError(f"{path.name} does not tell the format; give --format.")
+        raise click.UsageError(f"The ending of {path.name} is not a known format; give --format.")
     return name
 
 
-@click.command("export", short_help="Write a map for other tools.")
+@click.command(cls=Command)
 @options.input_argument("map_file")
 @click.option(
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="[default: by the output's ending: .csv, .json (LIF), .yaml (ROS), .svg, .dxf]",
+    help="Format of the output.  [default: by its ending: .csv, .json (LIF), .yaml (ROS), .svg, "
+    ".dxf]",
 )
-@options.output("File to write; `ros` writes its picture beside it (.pgm).")
+@options.output("File to write; `ros` also writes an image with the ending .pgm.")
 @click.option(
     "--resolution",
     "resolution_mm",
@@ -44,7 +46,7 @@ def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
     default=10.0,
     show_default=True,
     metavar="MM",
-    help="Side of a pixel of `ros`.",
+    help="Side of a pixel of the format `ros`.",
 )
 @options.overwrite
 @options.as_json
@@ -57,11 +59,12 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write the landmarks of MAP_FILE for other tools, as built where the map knows that.
+    """Write the landmarks of MAP_FILE for other tools.
 
-    `csv` is the table No;Code;X mm;Y mm;Attr1;..;Attr4 of vehicle controllers (Goetting),
-    `lif` the Layout Interchange Format 1.0.0 of VDMA for master controls, `ros` the YAML and
-    PGM of map_server, `svg` and `dxf` the floor at true size in layers. Docs: file formats.
+    `csv` is the table No;Code;X mm;Y mm;Attr1;..;Attr4 of vehicle controllers (Goetting), `lif`
+    the Layout Interchange Format 1.0.0 of VDMA for master controls, `ros` the YAML and PGM of
+    map_server, `svg` and `dxf` the floor at true size in layers. Landmarks are at their positions
+    as built if the map contains these.
 
     \b
     Examples:
@@ -76,19 +79,19 @@ def command(
     format_name = format_of(output, format_name, FORMATS)
     files = [output, output.with_suffix(".pgm")] if format_name == "ros" else [output]
     if len(set(files)) < len(files):
-        raise click.UsageError("The picture of `ros` is the .pgm; end the output with .yaml.")
+        raise click.UsageError("The image of `ros` is the .pgm; end the output with .yaml.")
     for path in files:
         options.guard_output(path, overwrite=overwrite, inputs=[map_file])
     floor = read_map(map_file)
     with console.working("Drawing"):
-        written = _render(floor, format_name, files, resolution_mm, _stamp(map_file))
+        contents = _render(floor, format_name, files, resolution_mm, _stamp(map_file))
     with contextlib.ExitStack() as stack:
-        for path, data in zip(files, written, strict=True):
+        for path, data in zip(files, contents, strict=True):
             stack.enter_context(atomic_write(path, overwrite=overwrite)).write(data)
     count = len(floor.cells())
     console.result(f"Wrote {' and '.join(map(str, files))}: {count} landmarks")
     if floor.built:
-        console.say(f"{len(floor.built)} of them lie as built.")
+        console.say(f"{len(floor.built)} of them at their positions as built.")
     if as_json:
         console.emit_json(
             {
@@ -105,7 +108,7 @@ def command(
 def _render(
     floor: FloorMap, format_name: str, files: list[Path], resolution_mm: float, stamp: datetime
 ) -> list[bytes]:
-    """What each file is to hold."""
+    """Return the content of each file."""
     if format_name == "csv":
         from locatk.formats.exporters.map_csv import dumps_csv
 
@@ -117,7 +120,7 @@ def _render(
     if format_name == "svg":
         from locatk.formats.exporters import map_svg
 
-        return [map_svg.render(floor)]
+        return [map_svg.dumps_svg(floor)]
     if format_name == "dxf":
         from locatk.formats.exporters.map_dxf import dumps_dxf
 
@@ -125,14 +128,14 @@ def _render(
     from locatk.formats.exporters import map_ros
 
     pixel = resolution_mm / 1e3
-    picture = map_ros.pgm(map_ros.draw(floor, pixel))
-    return [map_ros.yaml(floor, files[1].name, pixel).encode(), picture]
+    picture = map_ros.dumps_pgm(map_ros.draw_grid(floor, pixel))
+    return [map_ros.dumps_yaml(floor, files[1].name, pixel).encode(), picture]
 
 
 def _stamp(path: Path) -> datetime:
-    """When the map was written: the same file gives the same layout.
+    """Return the time at which the map was written, so that the same file gives the same layout.
 
-    SOURCE_DATE_EPOCH, where it is set, is taken instead (reproducible-builds.org).
+    SOURCE_DATE_EPOCH takes precedence (reproducible-builds.org).
     """
     import os
     from datetime import UTC, datetime

@@ -1,4 +1,4 @@
-"""``locatk map import``: a map from the places of landmarks in another tool's file."""
+"""``locatk map import``: a map from the positions of landmarks in a file of another tool."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command, section
 from locatk.cli.map.export import format_of
 
 FORMATS = ("csv", "lif")
@@ -15,34 +16,48 @@ ALPHABETS = ("6", "16", "compass")
 WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
 
 
-@click.command("import", short_help="Read a map from a table or a LIF layout.")
+@click.command(cls=Command)
 @options.input_argument("source")
 @click.option(
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="[default: by the file's ending: .csv, .json (LIF)]",
+    help="Format of SOURCE.  [default: by its ending: .csv, .json (LIF)]",
 )
 @options.output("Map to write (.toml).")
-@click.option(
-    "--pitch",
-    "pitch_mm",
-    type=click.FloatRange(0, min_open=True),
-    metavar="MM",
-    help="Between neighbouring cells.  [default: the largest that fits the places]",
+@section(
+    "Grid",
+    click.option(
+        "--pitch",
+        "pitch_mm",
+        type=click.FloatRange(0, min_open=True),
+        metavar="MM",
+        help="Distance of neighbouring cells.  [default: the largest that fits the positions]",
+    ),
+    click.option(
+        "--tolerance",
+        "tolerance_mm",
+        type=click.FloatRange(0, min_open=True),
+        default=10.0,
+        show_default=True,
+        metavar="MM",
+        help="Largest deviation of a landmark from its cell, along x or y.",
+    ),
 )
-@click.option(
-    "--tolerance",
-    "tolerance_mm",
-    type=click.FloatRange(0, min_open=True),
-    default=10.0,
-    show_default=True,
-    metavar="MM",
-    help="How far a landmark may lie off its cell, along x or y.",
+@section(
+    "Properties that SOURCE does not contain",
+    options.input_option("--like", help="Map with the same alphabet, window and bars."),
+    click.option(
+        "--alphabet",
+        type=click.Choice(ALPHABETS),
+        help="Alphabet.  [default: that of --like, otherwise 16]",
+    ),
+    click.option(
+        "--window",
+        type=click.Choice(WINDOWS),
+        help="Window.  [default: that of --like, otherwise L]",
+    ),
 )
-@options.input_option("--like", help="Map whose alphabet, window and bars this one has.")
-@click.option("--alphabet", type=click.Choice(ALPHABETS), help="[default: as --like, else 16]")
-@click.option("--window", type=click.Choice(WINDOWS), help="[default: as --like, else L]")
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -58,21 +73,18 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Make a map of the landmarks in SOURCE: a table as of `locatk map export`, or a LIF layout.
+    """Make a map of the landmarks in SOURCE, a table as of `locatk map export` or a LIF layout.
 
-    Pitch, rows and columns are found from the places. A landmark that lies a bit off its cell
-    is kept where it is, as built; one that is off by more than the tolerance is refused. What
-    such files do not hold (alphabet, window, bars) comes from the options. Check the map
-    afterwards: `locatk map check`.
+    Pitch, rows and columns are estimated from the positions. A landmark that deviates from its cell
+    is imported as built; a deviation beyond the tolerance is refused. Alphabet, window and bars are
+    not in such files and come from the options. Check the map afterwards with `locatk map check`.
 
     \b
     Examples:
       locatk map import map.csv -o map.toml
       locatk map import survey.csv -o map.toml --pitch 200 --like design.toml
-      locatk map import layout.json --format lif -o map.toml --alphabet 6 --window L
+      locatk map import layout.json --format lif -o map.toml --alphabet 6
     """
-    import numpy as np
-
     from locatk.core.units import metres
     from locatk.formats.artifacts.maps import dumps_map, loads_map, read_map, write_map
     from locatk.formats.files import read_text
@@ -97,19 +109,22 @@ def command(
             geometry=design.geometry,
         )
     floor = replace(floor, alphabet=alphabet or floor.alphabet, window=window or floor.window)
-    loads_map(dumps_map(floor), file=source)  # as strict with it as with a map by hand
+    loads_map(dumps_map(floor), file=source)  # the checks of maps that people write
     write_map(output, floor, overwrite=overwrite)
 
     rows, columns = floor.shape
     count = len(floor.cells())
-    off = [max(abs(built.x_m), abs(built.y_m)) for built in floor.built.values()]
-    worst = float(np.max(off)) if off else 0.0
+    offsets_m = [max(abs(built.x_m), abs(built.y_m)) for built in floor.built.values()]
+    max_offset_m = max(offsets_m, default=0.0)
     console.result(
         f"Wrote {output}: {count} landmarks in {rows} rows and {columns} columns of "
         f"{1e3 * floor.pitch_m:.6g} mm"
     )
-    if off:
-        console.say(f"Off their cells or turned: {len(off)}, by {1e3 * worst:.3g} mm at most.")
+    if offsets_m:
+        console.say(
+            f"{len(offsets_m)} of them deviate from their cells, by at most "
+            f"{1e3 * max_offset_m:.3g} mm."
+        )
     if as_json:
         console.emit_json(
             {
@@ -122,7 +137,7 @@ def command(
                 "pitch_m": floor.pitch_m,
                 "origin_m": floor.origin_m,
                 "walls": len(floor.walls),
-                "as_built": len(off),
-                "largest_offset_m": worst,
+                "as_built": len(offsets_m),
+                "largest_offset_m": max_offset_m,
             }
         )

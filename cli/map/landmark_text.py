@@ -1,4 +1,4 @@
-"""What ``locatk map design --landmark`` tells of a geometry: for people and as JSON."""
+"""Text and JSON of the analysis of one landmark, by ``locatk map design --landmark``."""
 
 from __future__ import annotations
 
@@ -18,29 +18,33 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.landmark import Geometry
 
 
-def text(found: LandmarkAnalysis, pitch_m: float) -> str:
-    """The tables for people, in 100 columns."""
+ANGLES_WIDTH_CHARACTERS = 63
+"""Width of eight angles, to which all are padded so that they are aligned to the left."""
+
+
+def text(analysis: LandmarkAnalysis, pitch_m: float) -> str:
+    """Format the analysis in 80 columns."""
     return "\n\n".join(
         (
-            head(found.geometry),
+            head(analysis.geometry),
             "Valleys on the circle of the sensors, counter-clockwise from x:\n"
             + console.table(
-                ("no", "bars", "valleys", "at degrees, + where the field rises"),
-                (_valleys(pattern) for pattern in found.patterns),
+                ("no", "bars", "count", "at degrees, + if the field rises there"),
+                (_valleys(pattern) for pattern in analysis.patterns),
             ),
-            "Mountains between them, territory, and where the paper's crossing puts the centre:\n"
+            "Mountains between them, territory, error of the centre by the paper's crossing:\n"
             + console.table(
                 ("bars", "mountains mT", "r1 mm", "r2 mm", "gulfs deg", "centre off mm"),
-                (_territory(pattern) for pattern in found.patterns),
+                (_territory(pattern) for pattern in analysis.patterns),
             ),
-            "Field over the bars, along them: slope in mT/mm, zero off the bar's middle in mm, "
-            "and\nthe largest error of that line, within a quarter of the bar's length:\n"
+            "Field along the bars: slope in mT/mm, distance of its zero from the middle of\n"
+            "the bar in mm, largest error of that line within a quarter of the bar in mm:\n"
             + console.table(
                 ("bars", *(f"bar {k} at {90 * k}" for k in range(4))),
-                ((pattern.letters, *_lines(pattern)) for pattern in found.patterns),
+                ((pattern.letters, *_lines(pattern)) for pattern in analysis.patterns),
             ),
-            console.table(("needed", "", "because"), _needed(found, pitch_m)),
-            "What a deviation does to landmark 3, NNNS:\n"
+            console.table(("required", "", "reason"), _needed(analysis, pitch_m)),
+            "Effect of a deviation on landmark 3, NNNS:\n"
             + console.table(
                 ("", "r1 mm", "r2 mm", "centre off mm", "largest field mT"),
                 (
@@ -51,21 +55,21 @@ def text(found: LandmarkAnalysis, pitch_m: float) -> str:
                         _number(1e3 * row.bias_m, 2),
                         _number(1e3 * row.largest_t, 1),
                     )
-                    for row in found.tolerances
+                    for row in analysis.tolerances
                 ),
             ),
         )
     )
 
 
-def entry(found: LandmarkAnalysis, pitch_m: float) -> dict[str, Any]:
-    """The same for ``--json``: SI units, as each key says (docs/commands.md)."""
+def entry(analysis: LandmarkAnalysis, pitch_m: float) -> dict[str, Any]:
+    """Return the analysis for ``--json`` in SI units (docs/formats.md)."""
     from locatk.core.landmarks.design.territory import max_neighbour_field
 
-    one, all_eight = max_neighbour_field(found.geometry, pitch_m)
-    hall = found.hall_class
+    one, all_eight = max_neighbour_field(analysis.geometry, pitch_m)
+    hall = analysis.hall_class
     return {
-        "geometry": asdict(found.geometry),
+        "geometry": asdict(analysis.geometry),
         "patterns": [
             {
                 **_pattern_fields(pattern),
@@ -73,19 +77,19 @@ def entry(found: LandmarkAnalysis, pitch_m: float) -> dict[str, Any]:
                 "collapsed": pattern.is_collapsed,
                 "skew_rad": pattern.skew_rad,
             }
-            for pattern in found.patterns
+            for pattern in analysis.patterns
         ],
-        "sensor_heights_m": found.heights_m,
+        "sensor_heights_m": analysis.heights_m,
         "pitch_m": pitch_m,
-        "contour_pitch_m": found.contour_pitch_m,
-        "field_pitch_m": found.field_pitch_m,
+        "contour_pitch_m": analysis.contour_pitch_m,
+        "field_pitch_m": analysis.field_pitch_m,
         "neighbour_t": one,
         "all_neighbours_t": all_eight,
-        "neighbour_limit_t": found.neighbour_t,
-        "largest_t": found.largest_t,
-        "hall_range_t": found.range_t,
+        "neighbour_limit_t": analysis.neighbour_t,
+        "largest_t": analysis.largest_t,
+        "hall_range_t": analysis.range_t,
         "hall_class": hall and {"mv_per_mt": hall[0], "range_t": hall[1]},
-        "tolerances": [_tolerance(row) for row in found.tolerances],
+        "tolerances": [_tolerance(row) for row in analysis.tolerances],
     }
 
 
@@ -107,7 +111,7 @@ def _tolerance(effect: ToleranceEffect) -> dict[str, Any]:
 
 
 def head(geometry: Geometry) -> str:
-    """The landmark in two lines."""
+    """Describe the landmark in two lines."""
     g = geometry
     return console.labelled(
         (
@@ -122,7 +126,7 @@ def head(geometry: Geometry) -> str:
 
 
 def bar(geometry: Geometry) -> str:
-    """One bar in words."""
+    """Describe one bar."""
     g = geometry
     return (
         f"{1e3 * g.bar_length_m:g} x {1e3 * g.bar_width_m:g} x {_mm(g.bar_height_m)}, "
@@ -134,11 +138,11 @@ def _valleys(pattern: PatternAnalysis) -> tuple[object, ...]:
     count = str(len(pattern.valleys_rad)) + (
         f", not {pattern.expected}" if pattern.is_collapsed else ""
     )
-    at = (
+    angles = (
         f"{_clean(math.degrees(angle), 2):>6}{'+' if up else '-'}"
         for angle, up in zip(pattern.valleys_rad.tolist(), pattern.is_rising.tolist(), strict=True)
     )
-    return pattern.number, pattern.letters, count, " ".join(at).ljust(63)
+    return pattern.number, pattern.letters, count, " ".join(angles).ljust(ANGLES_WIDTH_CHARACTERS)
 
 
 def _territory(pattern: PatternAnalysis) -> tuple[str, ...]:
@@ -171,37 +175,39 @@ def _lines(pattern: PatternAnalysis) -> list[str]:
     ]
 
 
-def _needed(found: LandmarkAnalysis, pitch_m: float) -> list[tuple[str, str, str]]:
+def _needed(analysis: LandmarkAnalysis, pitch_m: float) -> list[tuple[str, str, str]]:
     from locatk.core.landmarks.design.territory import max_neighbour_field
 
-    low, high = found.heights_m
-    one, all_eight = (1e6 * float(field) for field in max_neighbour_field(found.geometry, pitch_m))
-    hall = found.hall_class
+    low, high = analysis.heights_m
+    one, all_eight = (
+        1e6 * float(field) for field in max_neighbour_field(analysis.geometry, pitch_m)
+    )
+    hall = analysis.hall_class
     return [
         (
             "height of the sensors",
             "none" if high != high else f"{1e3 * low:.1f} to {1e3 * high:.1f} mm",
-            "all six patterns have 4, 6, 6, 6, 8, 8 valleys",
+            "4, 6, 6, 6, 8, 8 valleys",
         ),
         (
             "pitch",
-            f"at least {_number(1e3 * found.contour_pitch_m, 0)} mm",
-            "2 x (r2 + circle): no sensor is in two territories",
+            f"at least {_number(1e3 * analysis.contour_pitch_m, 0)} mm",
+            "2 x (r2 + circle): no overlap",
         ),
         (
             "pitch",
-            f"at least {_number(1e3 * found.field_pitch_m, 0)} mm",
-            f"the nearest neighbour adds {1e6 * found.neighbour_t:.0f} uT at the circle",
+            f"at least {_number(1e3 * analysis.field_pitch_m, 0)} mm",
+            f"a neighbour adds {1e6 * analysis.neighbour_t:.0f} uT",
         ),
         (
             "neighbours' field",
             f"{one:.1f} uT",
-            f"one at {_mm(pitch_m)}; all eight up to {all_eight:.0f} uT, Earth 25-65 uT",
+            f"at {_mm(pitch_m)}; all eight up to {all_eight:.0f} uT",
         ),
         (
             "range of the hall sensors",
-            f"+-{1e3 * found.range_t:.1f} mT",
-            f"largest field {1e3 * found.largest_t:.1f} mT and 25 % headroom",
+            f"+-{1e3 * analysis.range_t:.1f} mT",
+            f"max field {1e3 * analysis.largest_t:.1f} mT, 25 % headroom",
         ),
         (
             "sensitivity",
@@ -220,7 +226,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def _clean(value: float, digits: int) -> str:
-    """Without the sign of what is rounded to zero."""
+    """Format a number without the sign of a rounded zero."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli.command import combine
+from locatk.cli.command import section
 from locatk.cli.options import number
 from locatk.core.units import metres
 
@@ -16,10 +16,12 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.landmark import Geometry
     from locatk.core.landmarks.map.floor import Cell, Wall
 
-LARGEST_SIDE = 2_000
+MAX_ROWS = 2_000
+"""Rows or columns of a map (:data:`locatk.formats.artifacts.maps.MAX_ROWS`)."""
 
 THRESHOLD_MT_PER_T = 2.75
-"""Of the remanence, at which the default bars have the paper's radii (facts 2.2)."""
+"""Default threshold of the territory per remanence: the default bars of 1.2 T then have the radii
+of the paper, 45 and 54 mm (section 3.1)."""
 
 _SPAN = re.compile(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?")
 
@@ -32,12 +34,12 @@ class Size(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[int, int]:
-        found = re.fullmatch(r"(\d+)[xX](\d+)", str(value).strip())
-        if found is None:
+        match = re.fullmatch(r"(\d+)[xX](\d+)", str(value).strip())
+        if match is None:
             self.fail(f"{value!r} is not rows x columns as in 24x24.", param, ctx)
-        rows, columns = int(found[1]), int(found[2])
-        if not (1 <= rows <= LARGEST_SIDE and 1 <= columns <= LARGEST_SIDE):
-            self.fail(f"{value!r} has a side outside of 1 to {LARGEST_SIDE}.", param, ctx)
+        rows, columns = int(match[1]), int(match[2])
+        if not (1 <= rows <= MAX_ROWS and 1 <= columns <= MAX_ROWS):
+            self.fail(f"{value!r} does not have 1 to {MAX_ROWS} rows and columns.", param, ctx)
         return rows, columns
 
 
@@ -83,60 +85,87 @@ class Walls(click.ParamType):
         walls: list[Wall] = []
         for item in str(value).split(";"):
             try:
-                here, there = (list(_block(side)) for side in item.split(":"))
+                first_cells, second_cells = (list(_block(side)) for side in item.split(":"))
             except ValueError:
                 self.fail(f"{item!r} is not cell:cell as in 2,3:2,4.", param, ctx)
-            if len(here) != len(there):
-                self.fail(f"{item!r} has {len(here)} and {len(there)} cells.", param, ctx)
-            for one, other in zip(here, there, strict=True):
-                if abs(one[0] - other[0]) + abs(one[1] - other[1]) != 1:
-                    self.fail(f"{_told(one)} and {_told(other)} are no neighbours.", param, ctx)
-                walls.append((min(one, other), max(one, other)))
+            if len(first_cells) != len(second_cells):
+                self.fail(
+                    f"{item!r} has {len(first_cells)} and {len(second_cells)} cells.", param, ctx
+                )
+            for first, second in zip(first_cells, second_cells, strict=True):
+                if abs(first[0] - second[0]) + abs(first[1] - second[1]) != 1:
+                    self.fail(
+                        f"{_cell_text(first)} and {_cell_text(second)} are not neighbours.",
+                        param,
+                        ctx,
+                    )
+                walls.append((min(first, second), max(first, second)))
         return tuple(walls)
 
 
 def _block(item: str) -> Iterator[Cell]:
-    """Cells of ``rows,columns``, each a number or a range; ValueError for anything else."""
+    """Yield the cells of ``rows,columns``, each a number or a range.
+
+    Raises ValueError for other texts.
+    """
     spans = [_SPAN.fullmatch(part) for part in item.split(",")]
     if len(spans) != 2 or spans[0] is None or spans[1] is None:
         raise ValueError(repr(item))
     (top, bottom), (left, right) = (
         (int(span[1]), int(span[2] or span[1])) for span in spans if span is not None
     )
-    if not (top <= bottom < LARGEST_SIDE and left <= right < LARGEST_SIDE):
+    if not (top <= bottom < MAX_ROWS and left <= right < MAX_ROWS):
         raise ValueError(repr(item))
     for row in range(top, bottom + 1):
         for column in range(left, right + 1):
             yield row, column
 
 
-def _told(cell: Cell) -> str:
+def _cell_text(cell: Cell) -> str:
     return f"{cell[0]},{cell[1]}"
 
 
-def on_floor(size: tuple[int, int], cells: list[Cell], option: str) -> None:
-    """Refuse cells that are not on the floor."""
+def check_cells(size: tuple[int, int], cells: list[Cell], option: str) -> None:
+    """Raise click.BadParameter if a cell of an option is not on the floor."""
     for row, column in cells:
         if row >= size[0] or column >= size[1]:
             raise click.BadParameter(
-                f"{row},{column} is no cell of the floor, whose last one is "
+                f"{row},{column} is not a cell of the floor, whose last one is "
                 f"{size[0] - 1},{size[1] - 1}.",
                 param_hint=f"'{option}'",
             )
 
 
-geometry_options = combine(
-    number("--bar", default="30x10x5", type=Bar(), metavar="LxWxH", help="Of each bar, in mm."),
-    number("--remanence", default=1.2, metavar="T", help="Of the bars: N35 has 1.2, ferrite 0.4."),
-    number("--radius", default=25.0, metavar="MM", help="From the middle to each bar's middle."),
-    number("--sensor-height", default=12.0, metavar="MM", help="From the bars' tops to the chips."),
-    number("--circle", default=25.0, metavar="MM", help="Radius of the hall sensors' circle."),
+geometry_options = section(
+    "Landmarks and sensors",
+    number(
+        "--bar", default="30x10x5", type=Bar(), metavar="LxWxH", help="Size of a bar magnet in mm."
+    ),
+    number(
+        "--remanence",
+        default=1.2,
+        metavar="T",
+        help="Remanence of the bars; N35 has 1.2, ferrite 0.4.",
+    ),
+    number(
+        "--radius",
+        default=25.0,
+        metavar="MM",
+        help="From the centre of a landmark to the middles of its bars.",
+    ),
+    number(
+        "--sensor-height",
+        default=12.0,
+        metavar="MM",
+        help="From the tops of the bars to the hall sensors.",
+    ),
+    number("--circle", default=25.0, metavar="MM", help="Radius of the circle of hall sensors."),
     click.option(
         "--threshold",
         type=float,
         metavar="MT",
-        help="Field at which a sensor is in a landmark's territory.  [default: 2.75 for each "
-        "tesla of the remanence]",
+        help="Field at which a sensor enters the territory of a landmark.  [default: 2.75 per "
+        "tesla of remanence]",
     ),
 )
 
@@ -149,7 +178,7 @@ def geometry_of(
     circle: float,
     threshold: float | None,
 ) -> Geometry:
-    """The landmark that the options describe."""
+    """Return the landmark that :data:`geometry_options` describe."""
     from locatk.core.landmarks.landmark import Geometry
 
     if threshold is None:

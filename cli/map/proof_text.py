@@ -1,4 +1,4 @@
-"""What ``locatk map design`` and ``map check`` tell of a map and its proof."""
+"""Text and JSON of a map and its proof, by ``locatk map design`` and ``map check``."""
 
 from __future__ import annotations
 
@@ -11,20 +11,26 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.design.proof import FaultEffects, MapProof
     from locatk.core.landmarks.map.floor import Cell, FloorMap
 
-SHOWN = 10
-"""Duplicates that are printed; all that are listed are in --json."""
+MAX_PRINTED_DUPLICATES = 10
+"""Duplicates that are printed; --json has all that the proof lists."""
 
-WINDOW_WORDS = {
+WINDOW_DESCRIPTIONS = {
     "L": "one ahead, then to the left",
     "I2": "two in a row",
     "I3": "three in a row",
-    "2x2": "four round to the left",
+    "2x2": "four in a square, to the left",
     "3x3": "nine in a square",
+}
+
+ALPHABET_DESCRIPTIONS = {
+    "6": "only the pattern is read",
+    "16": "pattern and orientation are read",
+    "compass": "one landmark determines the heading",
 }
 
 
 def verdict(proof: MapProof) -> str:
-    """In a few words: what is proved, or what fails."""
+    """Summarise a proof in a few words."""
     if not proof.is_unique:
         count = proof.duplicate_count
         return (
@@ -32,16 +38,16 @@ def verdict(proof: MapProof) -> str:
         )
     if not proof.holds:
         return (
-            f"{_misread(proof.promised)} shall be noticed, but two readings differ in only "
+            f"{_misread(proof.promised)} should be detected, but two readings differ in only "
             f"{_landmarks(proof.min_distance or 0)}"
         )
     if not proof.readings:
-        return "unique, as it has no reading"
-    return "unique" + (f", {_misread(proof.detects)} noticed" if proof.detects else "")
+        return "unique: it has no reading"
+    return "unique" + (f", {_misread(proof.detects)} detected" if proof.detects else "")
 
 
 def floor_lines(floor: FloorMap) -> list[tuple[str, str]]:
-    """The map itself: a name and what it is, line by line."""
+    """Return label and text of each line about the map."""
     rows, columns = floor.shape
     cells = floor.cells()
     holes = rows * columns - len(cells)
@@ -52,90 +58,75 @@ def floor_lines(floor: FloorMap) -> list[tuple[str, str]]:
         *([_count(holes, "hole")] if holes else []),
         *([_count(len(floor.walls), "wall")] if floor.walls else []),
     ]
-    read = {
-        "6": "alphabet 6: the pattern alone is read",
-        "16": "alphabet 16: pattern and orientation are read",
-        "compass": "alphabet compass: one landmark tells the heading",
-    }[floor.alphabet]
     return [
         ("Map", ", ".join(facts)),
-        ("Window", f"{floor.window}, {WINDOW_WORDS[floor.window]}; {read}"),
+        ("Window", f"{floor.window}: {WINDOW_DESCRIPTIONS[floor.window]}"),
+        ("Alphabet", f"{floor.alphabet}: {ALPHABET_DESCRIPTIONS[floor.alphabet]}"),
     ]
 
 
 def proof_lines(proof: MapProof) -> list[tuple[str, str]]:
-    """What holds: a name and what it is, line by line."""
-    share = f"{proof.readings / proof.words:.0%}".replace("%", " %") if proof.words else "-"
+    """Return label and text of each line about the proof."""
+    fraction = f"{proof.readings / proof.words:.0%}".replace("%", " %") if proof.words else "-"
     different = (
         "each is unique" if proof.is_unique else f"{proof.duplicate_count} repeat an earlier one"
     )
     if not proof.readings:
-        return [("Readings", "none: no window fits on the floor"), ("Localised", _steps(proof))]
+        return [("Readings", "none: no window fits on the floor"), *_localization_lines(proof)]
     lines = [
         (
             "Readings",
-            f"{proof.readings} under all headings, {share} of the {proof.words} there can be; "
+            f"{proof.readings} under all headings, {fraction} of {proof.words} possible ones; "
             f"{different}",
         )
     ]
     if proof.min_distance is not None:
-        noticed = (
-            f"; {_misread(proof.detects)} always noticed"
-            if proof.detects
-            else "; one misread may pass for another place"
-            if proof.is_unique
-            else ""
-        )
-        lines.append(
-            (
-                "Distance",
-                f"any two differ in at least {_landmarks(proof.min_distance)}{noticed}",
-            )
-        )
-    lines.append(("Localised", _steps(proof)))
-    return lines
+        lines.append(("Distance", f"any two differ in at least {_landmarks(proof.min_distance)}"))
+        if proof.detects:
+            lines.append(("Detection", f"{_misread(proof.detects)} always detected"))
+        elif proof.is_unique:
+            lines.append(("Detection", "one misread landmark may give a wrong position"))
+    return [*lines, *_localization_lines(proof)]
 
 
 def duplicates(proof: MapProof, floor: FloorMap) -> str:
-    """The first duplicates, with both places."""
+    """Format the first duplicates, with both positions."""
     table = console.table(
         ("reads", "at row,column", "heading", "and at", "heading"),
         (
             (
-                read(one.letters, floor.alphabet),
-                _cell(one.first[0]),
-                _degrees(one.first[1]),
-                _cell(one.second[0]),
-                _degrees(one.second[1]),
+                reading_text(duplicate.letters, floor.alphabet),
+                _cell(duplicate.first[0]),
+                _degrees(duplicate.first[1]),
+                _cell(duplicate.second[0]),
+                _degrees(duplicate.second[1]),
             )
-            for one in proof.duplicates[:SHOWN]
+            for duplicate in proof.duplicates[:MAX_PRINTED_DUPLICATES]
         ),
     )
-    more = proof.duplicate_count - SHOWN
+    more = proof.duplicate_count - MAX_PRINTED_DUPLICATES
     return table + (f"\n... and {more} more" if more > 0 else "")
 
 
 def faults(proof: MapProof) -> str:
-    """What one fault breaks."""
+    """Format the effects of one fault."""
     rows = [
-        _fault("flipped bar", proof.flipped_bar, "reads as another place, unnoticed"),
-        _fault("missing bar", proof.missing_bar, "may be of another place"),
-        _fault("missing landmark", proof.missing_landmark, "may be of another place"),
+        _fault("flipped bar", proof.flipped_bar, "undetected, another position"),
+        _fault("missing bar", proof.missing_bar, "may be of another position"),
+        _fault("missing landmark", proof.missing_landmark, "may be of another position"),
     ]
-    return console.table(
-        ("one fault", "harmful", "cases", "the reading", "most at row,column"), rows
-    )
+    return console.table(("one fault", "harmful", "cases", "the reading", "worst at"), rows)
 
 
-def read(letters: tuple[int, ...], alphabet: str) -> str:
-    """Letters of a reading, as bars."""
+def reading_text(letters: tuple[int, ...], alphabet: str) -> str:
+    """Return the bars of each landmark of a reading."""
     from locatk.core.landmarks.landmark import PATTERNS, name
 
     return " ".join(PATTERNS[k - 1] if alphabet == "6" else name(k) for k in letters)
 
 
 def map_entry(floor: FloorMap) -> dict[str, Any]:
-    """The map for ``--json``."""
+    """Return the map for ``--json``."""
     rows, columns = floor.shape
     cells = floor.cells()
     return {
@@ -156,7 +147,7 @@ def map_entry(floor: FloorMap) -> dict[str, Any]:
 
 
 def proof_entry(proof: MapProof, floor: FloorMap) -> dict[str, Any]:
-    """The proof for ``--json`` (docs/commands.md)."""
+    """Return the proof for ``--json`` (docs/formats.md)."""
     steps = proof.localization
     return {
         "holds": proof.holds,
@@ -166,11 +157,11 @@ def proof_entry(proof: MapProof, floor: FloorMap) -> dict[str, Any]:
         "duplicate_count": proof.duplicate_count,
         "duplicates": [
             {
-                "reads": read(one.letters, floor.alphabet).split(),
-                "one": _place(one.first),
-                "other": _place(one.second),
+                "reads": reading_text(duplicate.letters, floor.alphabet).split(),
+                "one": _start_entry(duplicate.first),
+                "other": _start_entry(duplicate.second),
             }
-            for one in proof.duplicates
+            for duplicate in proof.duplicates
         ],
         "least_distance": proof.min_distance,
         "detects": proof.detects,
@@ -183,38 +174,45 @@ def proof_entry(proof: MapProof, floor: FloorMap) -> dict[str, Any]:
             "mean": steps.mean,
             "p99": steps.p99,
             "worst": steps.worst,
-            "worst_starts": [_place(place) for place in steps.worst_starts],
+            "worst_starts": [_start_entry(start) for start in steps.worst_starts],
             "never": steps.never,
-            "never_starts": [_place(place) for place in steps.never_starts],
+            "never_starts": [_start_entry(start) for start in steps.never_starts],
         },
         "sha256": proof.fingerprint,
     }
 
 
-def _steps(proof: MapProof) -> str:
+def _localization_lines(proof: MapProof) -> list[tuple[str, str]]:
+    """Return label and text of the lines about the landmarks until a robot is localised."""
     steps = proof.localization
     if steps is None or steps.mean is None or steps.p99 is None or steps.worst is None:
-        return "never: no start can be told from all others"
-    text = f"after {steps.mean:.2g} visited in the mean, {steps.p99:.0f} for 99 % of starts, "
-    text += f"{steps.worst} at worst"
-    if steps.worst_starts:
-        (cell, heading), *_ = steps.worst_starts
-        text += f" (from {_cell(cell)} at {_degrees(heading)} deg)"
-    if steps.never:
-        (cell, heading), *_ = steps.never_starts
-        text += (
-            f";\n{'':11}never from {_count(steps.never, 'start')} (as from {_cell(cell)} at "
-            f"{_degrees(heading)} deg)"
+        return [("Localised", "never: no start differs from all others")]
+    lines = [
+        (
+            "Localised",
+            f"after {steps.mean:.2g} landmarks on average, {steps.p99:.0f} for 99 % of starts, "
+            f"{steps.worst} at most",
         )
-    return text
+    ]
+    if steps.worst_starts:
+        lines.append(("Slowest", f"from {_start(steps.worst_starts[0])}"))
+    if steps.never:
+        count = _count(steps.never, "start")
+        lines.append(("Never", f"from {count}, as from {_start(steps.never_starts[0])}"))
+    return lines
 
 
-def _fault(name: str, fault: FaultEffects, what: str) -> tuple[str, ...]:
+def _start(start: Start) -> str:
+    cell, heading = start
+    return f"{_cell(cell)} at {_degrees(heading)} deg"
+
+
+def _fault(name: str, fault: FaultEffects, effect: str) -> tuple[str, ...]:
     return (
         name,
         f"{100 * fault.harmful_fraction:.3g} %",
         str(fault.cases),
-        what if fault.harmful else "none: always noticed or right",
+        effect if fault.harmful else "none: detected or right",
         "  ".join(_cell(cell) for cell in fault.worst[:3]) or "-",
     )
 
@@ -229,8 +227,8 @@ def _fault_entry(fault: FaultEffects) -> dict[str, Any]:
     }
 
 
-def _place(place: Start) -> dict[str, Any]:
-    (row, column), heading = place
+def _start_entry(start: Start) -> dict[str, Any]:
+    (row, column), heading = start
     return {"row": row, "column": column, "heading_deg": 90 * heading}
 
 
@@ -250,5 +248,5 @@ def _misread(count: int) -> str:
     return f"{count} misread {'landmark' if count == 1 else 'landmarks'}"
 
 
-def _count(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -27,7 +27,7 @@ def command(
     \b
     Examples:
       locatk simulate dots -o run.mcap
-      locatk simulate dots -o run.mcap --sheet SHEET.toml --duration 20 --speed 0.3
+      locatk simulate dots -o run.mcap --sheet SHEET.toml --duration 20
       locatk simulate dots -o hard.mcap --path random --missing 0.05 --noise 8
       locatk simulate dots -o printed.mcap --printer-scale 1.002,0.998
       locatk simulate dots --print-config > sim.toml

@@ -26,18 +26,18 @@ def command(
     """Simulate a robot that drives over the landmarks of MAP_FILE (map.toml).
 
     Each bar is a cuboid magnet of its own strength and position; the robot is a differential drive
-    with erroneous wheels. It steers by the truth and by the errors of its aims, or, with --strategy
-    published, by its sensors and odometry alone. Errors are standard deviations. The session
+    with erroneous wheels. It is steered by the truth and by the errors of its aims; with --strategy
+    published, by its sensors and odometry only. Errors are standard deviations. The session
     contains samples, odometry, the map as designed, and as truth the poses of the robot; the errors
-    of the floor are in its facts alone. The same settings and seed give the same session.
+    of the floor are only in its facts. The same settings and seed give the same session.
 
     \b
     Examples:
       locatk simulate landmarks map.toml -o run.mcap
       locatk simulate landmarks map.toml -o tour.mcap --landmarks 12 --seed 3
       locatk simulate landmarks map.toml -o own.mcap --strategy published
-      locatk simulate landmarks map.toml -o path.mcap --strategy path --path way.csv
-      locatk simulate landmarks map.toml -o pass.mcap --strategy pass --cell 2,3 --noise 0.3
+      locatk simulate landmarks map.toml -o path.mcap --strategy path --path p.csv
+      locatk simulate landmarks map.toml -o pass.mcap --strategy pass --cell 2,3
       locatk simulate landmarks map.toml -o bad.mcap --flip 2,3:1
       locatk simulate landmarks --print-config > sim.toml
       locatk simulate landmarks map.toml --config sim.toml -o run.mcap --seed 2

@@ -26,8 +26,8 @@ def command(
     \b
     Examples:
       locatk simulate lighthouse -o run.mcap
-      locatk simulate lighthouse -o swarm.mcap --robots 20 --stations 4 --duration 60
-      locatk simulate lighthouse -o hard.mcap --3d --occlusion 0.2 --outliers 0.02 --seed 7
+      locatk simulate lighthouse -o swarm.mcap --robots 20 --stations 4
+      locatk simulate lighthouse -o hard.mcap --3d --occlusion 0.2 --seed 7
       locatk simulate lighthouse -o deck.mcap --3d --receiver deck
       locatk simulate lighthouse --robots 20 --print-config > sim.toml
       locatk simulate lighthouse --config sim.toml -o swarm.mcap --seed 2

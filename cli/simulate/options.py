@@ -18,7 +18,7 @@ from click.core import ParameterSource
 
 from locatk.cli import options
 from locatk.cli.command import Command, combine
-from locatk.formats.simulation.settings import (
+from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     Boolean,
     FilePath,
@@ -26,9 +26,9 @@ from locatk.formats.simulation.settings import (
     Kind,
     ListOf,
     Number,
-    Setting,
     Text,
 )
+from locatk.formats.simulation.settings import Setting
 
 CONFIG_FILE, PRINT_CONFIG = "config_file", "print_config"
 
@@ -224,7 +224,7 @@ class _FiniteRange(_FiniteFloat, click.FloatRange):
 class _Form(click.ParamType):
     """Text of a fixed form, as in ``2,3:1``."""
 
-    def __init__(self, kind: Kind, form: str) -> None:
+    def __init__(self, kind: Any, form: str) -> None:
         self._kind, self.name = kind, form
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:

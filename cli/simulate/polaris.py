@@ -33,7 +33,7 @@ def command(
     Examples:
       locatk simulate polaris -o run.mcap --id 262143
       locatk simulate polaris tag.toml -o run.mcap --heading 30 --measured-noise
-      locatk simulate polaris site.toml -o tour.mcap --id 3 --id 7 --id 3 --odometry
+      locatk simulate polaris site.toml -o tour.mcap --id 3 --id 7 --odometry
       locatk simulate polaris -o mini.mcap --car mini --id 77
       locatk simulate polaris --speed-wobble 0.3 --print-config > sim.toml
       locatk simulate polaris --config sim.toml -o run.mcap --seed 2

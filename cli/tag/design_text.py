@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from locatk.cli import console
+from locatk.cli import console, failures
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
@@ -15,16 +16,35 @@ if TYPE_CHECKING:
     from locatk.core.polaris.design.planning import DesignReport
     from locatk.core.polaris.tag import Tags
 
-ID_LIST_LETTERS = 60
-"""Width of the list of the ids of a family, in letters."""
+MAX_ID_LIST_CHARACTERS = 36
+"""Longest list of the ids of a family."""
+
+
+MAX_DETAIL_CHARACTERS = 44
+"""Longest line of the detail of a material."""
+
+
+def report_evaluation(
+    report: DesignReport, warnings: list[str], more: dict[str, Any], as_json: bool
+) -> None:
+    """Print the evaluation, its notes and warnings, and finish with their exit status.
+
+    ``more`` are further keys of the JSON object.
+    """
+    console.result(text(report))
+    for note in report.notes:
+        console.say(note)
+    if as_json:
+        console.emit_json({"version": 1, **more, **entry(report), "warnings": warnings})
+    failures.finish_with_warnings(warnings)
 
 
 def text(report: DesignReport) -> str:
-    """Format the evaluation of a design in 100 columns."""
+    """Format the evaluation of a design in 80 columns."""
     return "\n\n".join(
         (
             _head(report),
-            console.table(("planned", "", "limit", "from"), _limits(report)),
+            console.table(("planned", "", "limit", "by"), _limits(report)),
             console.table(
                 ("one pass, at best", "along", "across", "angle"),
                 (
@@ -34,15 +54,10 @@ def text(report: DesignReport) -> str:
                     _accuracy("tag, each step free", report.free_speed, True),
                 ),
             ),
-            console.table(
-                ("material", "count", "", "USD each"),
-                (
-                    (item.part, item.count, item.detail, item.price_usd and f"< {item.price_usd:g}")
-                    for item in report.materials
-                ),
-            ),
-            "Accuracies are what noise alone permits: the published recordings come within 2 times "
-            "of it\nin angle, 10 times in place. Prices: Polaris, sections 7.1 and 7.2.",
+            console.table(("material", "count", "", "USD each"), list(_materials(report))),
+            "Accuracies are bounds by noise alone: errors of the published recordings are at\n"
+            "most 2 times as large in angle, and 10 times in position. Prices: Polaris,\n"
+            "sections 7.1 and 7.2.",
         )
     )
 
@@ -67,10 +82,10 @@ def entry(report: DesignReport) -> dict[str, Any]:
 def members(tags: Tags) -> str:
     """Describe the ids of a family in a few words."""
     if tags.ids is None:
-        return "any id may occur"
+        return "every id may occur"
     count = "1 id: " if len(tags.ids) == 1 else f"{len(tags.ids)} ids: "
     return count + textwrap.shorten(
-        ", ".join(map(str, tags.ids)), ID_LIST_LETTERS, placeholder=" ..."
+        ", ".join(map(str, tags.ids)), MAX_ID_LIST_CHARACTERS, placeholder=" ..."
     )
 
 
@@ -90,8 +105,7 @@ def _head(report: DesignReport) -> str:
         (
             "Magnet",
             f"{magnet.diameter_m * 1e3:g} x {length_text(magnet.height_m)} {strength}, "
-            f"{magnet.moment * 1e3:.3g} mA m2, its middle {length_text(tags.clearance_m)} below "
-            "the sensors",
+            f"{magnet.moment * 1e3:.3g} mA m2, {length_text(tags.clearance_m)} below the sensors",
         ),
         (
             "Array",
@@ -121,51 +135,60 @@ def _limits(report: DesignReport) -> list[tuple[str, str, str, str]]:
         (
             "field above a magnet",
             _ut(report.peak_t),
-            f"at most {_ut(report.range_t - MAX_EARTH_FIELD_T)}",
-            "range less the Earth's field",
+            f"max {_ut(report.range_t - MAX_EARTH_FIELD_T)}",
+            "range, Earth added",
         ),
-        ("field midway between sensors", _ut(report.between_t), "", ""),
+        ("field midway of sensors", _ut(report.between_t), "", ""),
         ("noise x, y, z", f"{noise} uT", "", report.noise_from),
         (
-            "signal to noise, above, midway",
+            "signal to noise, both",
             f"{report.signal_to_noise:.0f}, {report.between_to_noise:.0f}",
-            f"at least {MIN_SIGNAL_TO_NOISE:g}",
+            f"min {MIN_SIGNAL_TO_NOISE:g}",
             "midway",
         ),
         (
             "spacing of the magnets",
             length_text(tags.spacing_m),
-            f"at least {length_text(report.compact_spacing_m)}",
-            f"`paper`: 0.8 of {length_text(report.min_spacing_m)}",
+            f"min {length_text(report.compact_spacing_m)}",
+            f"0.8 of {length_text(report.min_spacing_m)}",
         ),
-        ("error if neighbours are ignored", neighbour_errors, "", "at worst; `joint` does not"),
+        ("error without neighbours", neighbour_errors, "", "worst of `paper`"),
         (
             "sampling rate",
             f"{report.rate_hz:.1f} Hz",
-            f"at most {report.max_rate_hz:.1f} Hz",
-            f"{use.settings.conversion_s * 1e3:.2f} ms a conversion",
+            f"max {report.max_rate_hz:.1f} Hz",
+            f"{use.settings.conversion_s * 1e3:.2f} ms each",
         ),
-        ("speed", f"{use.speed_mps:g} m/s", f"at most {report.max_speed_mps:.2g} m/s", "samples"),
+        ("speed", f"{use.speed_mps:g} m/s", f"max {report.max_speed_mps:.2g} m/s", "samples"),
         (
-            "samples over a magnet's field",
+            "samples over a magnet",
             f"{report.samples:.1f}",
-            f"at least {MIN_SAMPLES_PER_FIELD:g}",
-            f"{length_text(report.step_m)} each, over {length_text(report.half_across_m)}",
+            f"min {MIN_SAMPLES_PER_FIELD:g}",
+            f"{length_text(report.step_m)} of {length_text(report.half_across_m)}",
         ),
         (
             "orientations",
             str(tags.orientations),
-            f"at most {report.max_orientations}",
-            f"laid to {math.degrees(report.placement_rad):.2g} deg rms",
+            f"max {report.max_orientations}",
+            f"{math.degrees(report.placement_rad):.2g} deg RMS error",
         ),
-        ("tags with a misread magnet", _percent(report.misread), "", "more than half a step off"),
+        ("tags that are misread", _percent(report.misread), "", "over half a step"),
         (
-            "width of the tag, at 45 deg",
+            "width, and at 45 deg",
             f"{length_text(report.tag_m)}, {length_text(report.diagonal_m)}",
-            f"at most {length_text(report.array_m)}",
-            f"array; play {length_text(report.play_m)} a side",
+            f"max {length_text(report.array_m)}",
+            f"array, {length_text(report.play_m)} free",
         ),
     ]
+
+
+def _materials(report: DesignReport) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of the bill of materials; long details take several rows."""
+    for item in report.materials:
+        first, *more = textwrap.wrap(item.detail, MAX_DETAIL_CHARACTERS) or [""]
+        yield item.part, item.count, first, item.price_usd and f"< {item.price_usd:g}"
+        for line in more:
+            yield "", "", line, ""
 
 
 def _accuracy(name: str, bound: AccuracyBound, pose: bool) -> tuple[str, ...]:

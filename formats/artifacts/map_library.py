@@ -1,6 +1,7 @@
-"""Maps that ship with locatk, found by long searches, of which floors are cut.
+"""Maps that ship with locatk, and floors that are cropped from them.
 
-Any part of a unique map is unique, with holes and walls too: they only take readings away.
+The maps were found by long searches. A part of a unique map is unique, also with holes and walls:
+these only remove readings.
 """
 
 from __future__ import annotations
@@ -14,8 +15,12 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.landmarks.design.generation import DesignOptions, empty_floor, with_codes
-from locatk.core.landmarks.design.generation import design_map as search
+from locatk.core.landmarks.design.generation import (
+    DesignOptions,
+    design_map,
+    empty_floor,
+    with_codes,
+)
 from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, PATTERNS, code_of, rotated
 from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
@@ -23,14 +28,14 @@ from locatk.core.landmarks.map.windows import ALPHABET_CODES
 
 Codes = NDArray[np.int64]
 
-NAME = re.compile(
+_FILE_NAME = re.compile(
     r"(?P<alphabet>\w+)_(?P<window>\w+)_(?P<detect>\d+)_(?P<rows>\d+)x(?P<columns>\d+)"
 )
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One map of the library: a text file, a line a row of hexadecimal codes."""
+class LibraryMap:
+    """Map of the library: a text file with one line of hexadecimal codes a row."""
 
     file: str
     alphabet: str
@@ -40,19 +45,19 @@ class Entry:
     columns: int
 
     def codes(self) -> Codes:
-        """(rows, columns) codes; the first line of the file is row 0."""
+        """Return the codes (rows, columns); the first line of the file is row 0."""
         return _codes(self.file).copy()
 
 
 @functools.cache
-def entries() -> tuple[Entry, ...]:
-    """All maps of the library, the smallest first."""
-    found = []
+def entries() -> tuple[LibraryMap, ...]:
+    """Return all maps of the library in the order of their sizes."""
+    maps = []
     for item in (resources.files("locatk.formats.artifacts") / "floors").iterdir():
-        if match := NAME.fullmatch(item.name.removesuffix(".txt")):
+        if match := _FILE_NAME.fullmatch(item.name.removesuffix(".txt")):
             numbers = (int(match[key]) for key in ("detect", "rows", "columns"))
-            found.append(Entry(item.name, match["alphabet"], match["window"], *numbers))
-    return tuple(sorted(found, key=lambda e: (e.rows * e.columns, e.file)))
+            maps.append(LibraryMap(item.name, match["alphabet"], match["window"], *numbers))
+    return tuple(sorted(maps, key=lambda e: (e.rows * e.columns, e.file)))
 
 
 @functools.cache
@@ -63,73 +68,79 @@ def _codes(file: str) -> Codes:
     return np.array([[int(digit, 16) for digit in line] for line in text.split()], np.int64)
 
 
-def crop(options: DesignOptions) -> FloorMap | None:
-    """A floor cut of a map of the library, or None where none is large enough.
+def crop_map(options: DesignOptions) -> FloorMap | None:
+    """Crop a floor from a map of the library; return None if no map is large enough.
 
-    The seed chooses where it is cut, how the map is turned, and which letters change places:
-    no two readings become the same by that (:func:`relabelling`). It is proved again.
+    The seed determines the part, the rotation of the map, and the exchange of letters, which keeps
+    different readings different (:func:`random_relabelling`). The floor is proved again.
 
     Raises
     ------
     InputError
-        The options are none.
+        The options are invalid.
     """
     blank = empty_floor(options)
-    random = np.random.RandomState(options.seed % 2**32)  # its numbers never change
+    random = np.random.RandomState(
+        options.seed % 2**32
+    )  # its sequence is the same in all versions of numpy
     size = (options.rows, options.columns)
     for entry in entries():
         if (entry.alphabet, entry.window) != (options.alphabet, options.window):
             continue
-        fitting = [turn for turn in range(4) if _fits(size, entry, turn)]
-        if entry.detect < options.detect or not fitting:
+        rotations = [quarters for quarters in range(4) if _fits(size, entry, quarters)]
+        if entry.detect < options.detect or not rotations:
             continue
-        codes = turned(entry.codes(), fitting[random.randint(len(fitting))], options.alphabet)
+        quarters = rotations[random.randint(len(rotations))]
+        codes = rotated_map(entry.codes(), quarters, options.alphabet)
         row, column = (
-            random.randint(have - want + 1) for have, want in zip(codes.shape, size, strict=True)
+            random.randint(available - required + 1)
+            for available, required in zip(codes.shape, size, strict=True)
         )
         codes = codes[row : row + options.rows, column : column + options.columns]
-        codes = relabelling(options.alphabet, random)[codes]
+        codes = random_relabelling(options.alphabet, random)[codes]
         note = f"cut of the map {entry.file.removesuffix('.txt')} of the library"
-        there = blank.codes != HOLE_CODE
-        floor = with_codes(blank, np.where(there, codes, HOLE_CODE), options.seed, (note,))
+        has_landmark = blank.codes != HOLE_CODE
+        floor = with_codes(blank, np.where(has_landmark, codes, HOLE_CODE), options.seed, (note,))
         if prove_map(floor, steps=False).holds:
             return floor
     return None
 
 
-def design(
+def design_or_crop(
     options: DesignOptions, progress: Callable[[float, int], None] | None = None
 ) -> FloorMap:
-    """A floor as wanted: cut of the library where it has a map, else searched for.
+    """Crop a floor from the library, or search one if no map of the library is large enough.
 
     Raises
     ------
     InputError, DegenerateError
         See :func:`locatk.core.landmarks.design.generation.design_map`.
     """
-    floor = crop(options)
-    return search(options, progress) if floor is None else floor
+    floor = crop_map(options)
+    return design_map(options, progress) if floor is None else floor
 
 
-def _fits(size: tuple[int, int], entry: Entry, turn: int) -> bool:
-    rows, columns = (entry.rows, entry.columns) if turn % 2 == 0 else (entry.columns, entry.rows)
+def _fits(size: tuple[int, int], entry: LibraryMap, quarters: int) -> bool:
+    rows, columns = (
+        (entry.rows, entry.columns) if quarters % 2 == 0 else (entry.columns, entry.rows)
+    )
     return size[0] <= rows and size[1] <= columns
 
 
-def turned(codes: Codes, quarters: int, alphabet: str) -> Codes:
-    """A map turned counter-clockwise as a whole, seen with y up.
+def rotated_map(codes: Codes, quarters: int, alphabet: str) -> Codes:
+    """Return a map that is rotated counter-clockwise by quarter turns.
 
-    Where the orientation of the landmarks is not free, each keeps its own.
+    In alphabets without free orientations each landmark keeps its own.
     """
-    grid = np.rot90(codes, -quarters)  # rows go up here, not down
+    grid = np.rot90(codes, -quarters)  # rows count upward, not downward
     return rotated(grid, quarters) if alphabet == "16" else np.ascontiguousarray(grid)
 
 
-def relabelling(alphabet: str, random: np.random.RandomState) -> Codes:
-    """(16,) codes that take the place of the others, drawn at random.
+def random_relabelling(alphabet: str, random: np.random.RandomState) -> Codes:
+    """Draw the codes (16,) that replace the codes 0 to 15, such that a unique map stays unique.
 
-    Letters may change places if the map as read changes them alike under each heading:
-    patterns with as many orientations for each other, and each by a turn of its own.
+    Letters are exchanged in the same way under each heading: a pattern for another one with as many
+    orientations, each rotated by an angle of its own.
     """
     table = np.arange(CODE_COUNT)
     if alphabet != "16":
@@ -138,10 +149,10 @@ def relabelling(alphabet: str, random: np.random.RandomState) -> Codes:
         return table
     orientations = np.bincount(PATTERN_OF)[1:]
     for count in (1, 2, 4):
-        same = np.flatnonzero(orientations == count)
-        for one, other in zip(same, random.permutation(same), strict=True):
-            quarter = random.randint(4)
-            for turn in range(4):
-                old = rotated(code_of(PATTERNS[one]), turn)
-                table[old] = rotated(code_of(PATTERNS[other]), turn + quarter)
+        patterns = np.flatnonzero(orientations == count)
+        for first, second in zip(patterns, random.permutation(patterns), strict=True):
+            offset = random.randint(4)
+            for quarters in range(4):
+                old = rotated(code_of(PATTERNS[first]), quarters)
+                table[old] = rotated(code_of(PATTERNS[second]), quarters + offset)
     return table

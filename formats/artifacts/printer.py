@@ -1,7 +1,4 @@
-"""What is known of a printer, ``printer.toml``, and the manifests of what it has printed.
-
-The keys are described in docs/formats.md.
-"""
+"""Result of a printer's test sheet, ``printer.toml``, and manifests in its scale."""
 
 from __future__ import annotations
 
@@ -13,14 +10,14 @@ from typing import Any
 from locatk.core.dots.calibration.printer import PrinterReport
 from locatk.core.dots.sheet import Manifest
 from locatk.formats.artifacts import toml
-from locatk.formats.artifacts.base import head
+from locatk.formats.artifacts.schema import header
 from locatk.formats.output import atomic_write
 
 PRINTER_FORMAT = "locatk-printer"
 PRINTER_VERSION = 1
 
-DIGITS = 6
-"""Of a scale; more are not measured."""
+SCALE_DECIMALS = 6
+"""Decimals of a scale; a scan does not resolve more."""
 
 
 def write_printer(
@@ -30,14 +27,14 @@ def write_printer(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write what a test sheet has told of a printer as TOML.
+    """Write the result of a test sheet as TOML.
 
     Parameters
     ----------
     path : path
     report : PrinterReport
     scale : (x, y) or None
-        Printed over nominal length, where it was measured.
+        Printed over nominal length, if it was measured.
     overwrite : bool
 
     Raises
@@ -50,11 +47,11 @@ def write_printer(
 
 
 def dumps_printer(report: PrinterReport, scale: tuple[float, float] | None) -> str:
-    """TOML text of :func:`write_printer`."""
+    """Return the TOML text of :func:`write_printer`."""
     best, sheet = report.recommended, report.sheet
     printer: dict[str, Any] = {"dpi": sheet.dpi}
     if scale is not None:
-        printer |= {"scale_x": round(scale[0], DIGITS), "scale_y": round(scale[1], DIGITS)}
+        printer |= dict(zip(("scale_x", "scale_y"), _rounded(scale), strict=True))
     if best is not None:
         printer |= {
             "field": best.name,
@@ -65,7 +62,7 @@ def dumps_printer(report: PrinterReport, scale: tuple[float, float] | None) -> s
         }
     return toml.dumps(
         {
-            **head(PRINTER_FORMAT, PRINTER_VERSION),
+            **header(PRINTER_FORMAT, PRINTER_VERSION),
             "printer": printer,
             "sheet": {"paper": sheet.paper, "dpi": sheet.dpi, "codec": sheet.codec},
             "fields": [field_row(report, number) for number in range(len(report.fields))],
@@ -74,7 +71,7 @@ def dumps_printer(report: PrinterReport, scale: tuple[float, float] | None) -> s
 
 
 def field_row(report: PrinterReport, number: int) -> dict[str, Any]:
-    """What is told of a field, in ``printer.toml`` and in JSON; no key where not known."""
+    """Return the result of one field for ``printer.toml`` and JSON; unknown keys are missing."""
     field = report.fields[number]
     row: dict[str, Any] = {
         "name": field.name,
@@ -100,17 +97,17 @@ def field_row(report: PrinterReport, number: int) -> dict[str, Any]:
     return row
 
 
-def scaled(manifest: Manifest, scale: tuple[float, float]) -> Manifest:
-    """A manifest of sheets from a printer whose test sheet has this scale.
+def with_printer_scale(manifest: Manifest, scale: tuple[float, float]) -> Manifest:
+    """Return a manifest of sheets from a printer whose test sheet has this scale.
 
-    The test sheet is upright. A printer feeds a paper of the other orientation through in
-    the same direction, so that the two scales change places; where a manifest holds both,
-    that of its first sheet counts. Tiles lie at their registration marks, which the same
-    printer has made, so that their places on the floor grow with the scale.
+    The test sheet is upright. A printer feeds a paper of the other orientation in the same
+    direction, so that the two scales are exchanged; if a manifest contains both orientations, that
+    of its first sheet counts. Tiles are aligned at their registration marks, which were printed by
+    the same printer: their positions on the floor are multiplied by the scale.
     """
-    width, height = manifest.sheets[0].page_mm
-    x, y = (round(value, DIGITS) for value in scale)
-    new = (y, x) if width > height else (x, y)
+    width_mm, height_mm = manifest.sheets[0].page_mm
+    x, y = _rounded(scale)
+    new = (y, x) if width_mm > height_mm else (x, y)
     growth = [after / before for after, before in zip(new, manifest.scale, strict=True)]
     sheets = tuple(
         sheet
@@ -122,3 +119,8 @@ def scaled(manifest: Manifest, scale: tuple[float, float]) -> Manifest:
         for sheet in manifest.sheets
     )
     return replace(manifest, scale=new, sheets=sheets)
+
+
+def _rounded(scale: tuple[float, float]) -> tuple[float, float]:
+    x, y = (round(value, SCALE_DECIMALS) for value in scale)
+    return x, y

@@ -1,8 +1,4 @@
-"""Artifact of rigid Lighthouse devices: where the photodiodes sit, ``receiver.toml``.
-
-Its keys are described in docs/formats.md. Lengths are in mm, exactly: what is written and
-read again is the same to the last bit.
-"""
+"""Artifact ``receiver.toml``: photodiodes of rigid Lighthouse devices."""
 
 from __future__ import annotations
 
@@ -12,90 +8,99 @@ from typing import Any
 import numpy as np
 
 from locatk.core.lighthouse.receiver import DECK, Receiver
-from locatk.formats.artifacts import toml
-from locatk.formats.artifacts.base import Artifact, head
-from locatk.formats.artifacts.checks import twin
-from locatk.formats.artifacts.toml import Shifted, Table
-from locatk.formats.sessions import capture_record as captured
+from locatk.formats.artifacts.kinds import InvalidValueError, Text
+from locatk.formats.artifacts.schema import (
+    Array,
+    Artifact,
+    Key,
+    Table,
+    Values,
+    refuse_equal_positions,
+)
+from locatk.formats.sessions import capture_record
 from locatk.formats.sessions.reader import Session
 
 RECEIVER_FILE = "receiver.toml"
-"""Name of the attachment that holds the receiver of a session; see
-:func:`attached_receiver`."""
+"""Name of the attachment that holds the receiver of a session."""
 
 RECEIVER_FORMAT = "locatk-lighthouse-receiver"
-VERSION = 1
 
-LARGEST_RECEIVER = 1_000
-"""Photodiodes of one device; the largest that are sold have 32."""
+MAX_PHOTODIODES = 1_000
+"""Photodiodes of one device; the largest on the market have 32."""
 
-UNIT = 1e-3
-"""By so much the length of a direction may differ from 1: people round."""
+NORMAL_LENGTH_TOLERANCE = 1e-3
+"""Largest deviation of the length of a direction from 1, for rounded numbers."""
 
-TOPIC = "/lighthouse/"
-
-_MM, _METRES = 3, -3
+LIGHTHOUSE_TOPIC = "/lighthouse/"
 
 
-def dumps_receiver(receiver: Receiver) -> str:
-    """TOML text of a receiver; the same receiver gives the same text."""
-    normal = receiver.normal
-    return toml.dumps(
-        {
-            **head(RECEIVER_FORMAT, VERSION),
-            "name": receiver.name or None,
-            "position_mm": Shifted(np.asarray(receiver.position_m, float), _MM),
-            "normal": None if normal is None else np.asarray(normal, float),
-        }
-    )
-
-
-def _receiver(table: Table) -> Receiver:
-    toml.check_format(table, RECEIVER_FORMAT, VERSION)
-    rows = table.raw("position_mm")
-    count = len(rows) if isinstance(rows, list) else 0
-    if not 1 <= count <= LARGEST_RECEIVER:
-        raise table.error(
-            "position_mm", f"expected x, y, z of 1 to {LARGEST_RECEIVER} photodiodes, a list each"
-        )
-    position = table.array("position_mm", (count, 3), shift=_METRES)
-    if (one := twin(position)) is not None:
-        raise table.error("position_mm", f"two photodiodes at the place of photodiode {one}")
-    normal = table.array("normal", (count, 3)) if "normal" in table else None
-    table.raw("normal", None)  # known also where it is missing
+def _receiver_of(values: Values) -> Receiver:
+    position, normal = values["position_m"], values["normal"]
+    refuse_equal_positions(position, "position_mm")
     if normal is not None:
-        with np.errstate(over="ignore"):
-            off = np.abs(np.linalg.norm(normal, axis=1) - 1.0) > UNIT
-        if off.any():
-            raise table.error(
-                f"normal[{int(np.flatnonzero(off)[0])}]", "expected a direction of length 1"
+        if len(normal) != len(position):
+            raise InvalidValueError(
+                f"expected a list of {len(position)} rows of 3 numbers", "normal"
             )
-    receiver = Receiver(position, normal, table.text("name", ""))
-    table.end()
-    return receiver
+        with np.errstate(over="ignore"):
+            error = np.abs(np.linalg.norm(normal, axis=1) - 1.0)
+        if (error > NORMAL_LENGTH_TOLERANCE).any():
+            index = int(np.argmax(error > NORMAL_LENGTH_TOLERANCE))
+            raise InvalidValueError("expected a direction of length 1", f"normal[{index}]")
+    return Receiver(**values)
 
 
-RECEIVER = Artifact(RECEIVER_FILE, dumps_receiver, _receiver)
-"""A receiver as a file; these are its methods."""
+_ROWS = Array((None, 3), max_rows=MAX_PHOTODIODES)
 
-write_receiver, read_receiver, loads_receiver = RECEIVER.write, RECEIVER.read, RECEIVER.loads
+RECEIVER: Artifact[Receiver] = Artifact(
+    RECEIVER_FILE,
+    RECEIVER_FORMAT,
+    Table(
+        (
+            Key("name", Text(), "name of the kind of device, for people", ""),
+            Key(
+                "position_mm",
+                _ROWS,
+                "x, y, z of each photodiode in the frame of the device, sensor 0 first; no two are "
+                "equal",
+            ),
+            Key(
+                "normal",
+                _ROWS,
+                "optical axis of each photodiode, a direction of length 1 (within 0.001); light "
+                "from behind is not received",
+                None,
+                "unknown",
+            ),
+        ),
+        _receiver_of,
+        vars,
+    ),
+)
+"""A receiver as a file."""
+
+dumps_receiver, loads_receiver = RECEIVER.dumps, RECEIVER.loads
+write_receiver, read_receiver = RECEIVER.write, RECEIVER.read
 attached_receiver, receiver_file = RECEIVER.attached_for, RECEIVER.file_for
 
 
 def deck_artifacts(stream: Any) -> dict[str, str]:
-    """``receiver.toml`` of Bitcraze's Lighthouse deck, which is built in one way only; what
-    ``locatk capture`` attaches where nothing else is given."""
+    """Return the attachment of Bitcraze's Lighthouse deck, which is built in one way only.
+
+    ``locatk capture`` attaches it if no receiver is given.
+    """
     return {RECEIVER_FILE: dumps_receiver(DECK)}
 
 
-def texts_of(receivers: Mapping[str, Receiver], devices: set[str]) -> dict[str, str]:
-    """Attachments (name to text) of ``receivers``: one file where all ``devices`` of a session
-    have the same, else one a device.
+def receiver_attachments(receivers: Mapping[str, Receiver], devices: set[str]) -> dict[str, str]:
+    """Return attachments (name to text) of ``receivers`` by device.
+
+    It is one file if all ``devices`` of a session have the same receiver, otherwise one a device.
 
     Raises
     ------
     ArtifactError
-        A receiver cannot be: it could not be read again.
+        A receiver is invalid: it could not be read again.
     """
     texts = {device: dumps_receiver(receiver) for device, receiver in receivers.items()}
     for device, text in texts.items():
@@ -106,22 +111,25 @@ def texts_of(receivers: Mapping[str, Receiver], devices: set[str]) -> dict[str, 
 
 
 def read_receivers(session: Session) -> dict[str, Receiver]:
-    """Where the photodiodes of each device of a session sit; devices of which nobody tells are
-    left out.
+    """Return the receiver of each device of a session; devices without one are left out.
 
-    What is attached comes first. A recording of a Lighthouse deck without attachment, as they
-    were made before, has the geometry of the deck.
+    Attachments take precedence. A recording of a Lighthouse deck without attachment, of an earlier
+    version, has the geometry of the deck.
 
     Raises
     ------
     FormatError, ArtifactError
-        An attachment is damaged, or no valid receiver.
+        An attachment is damaged, or not a valid receiver.
     """
     prefix = receiver_file("").removesuffix(".toml")
-    devices = {topic.removeprefix(TOPIC) for topic in session.topics(TOPIC)}
+    topics = session.topics(LIGHTHOUSE_TOPIC)
+    devices = {topic.removeprefix(LIGHTHOUSE_TOPIC) for topic in topics}
     for info in session.attachments():
         if info.name.startswith(prefix) and info.name.endswith(".toml"):
             devices.add(info.name.removeprefix(prefix).removesuffix(".toml"))
-    known = DECK if (captured.capture(session) or {}).get("device") == DECK.name else None
-    found = {device: attached_receiver(session, device) or known for device in sorted(devices)}
-    return {device: receiver for device, receiver in found.items() if receiver is not None}
+    is_deck = (capture_record.capture(session) or {}).get("device") == DECK.name
+    receivers = {
+        device: attached_receiver(session, device) or (DECK if is_deck else None)
+        for device in sorted(devices)
+    }
+    return {device: receiver for device, receiver in receivers.items() if receiver is not None}

@@ -1,311 +1,78 @@
-"""Artifacts that people edit: the lighthouse scene, ``scene.toml``.
-
-Its keys are described in docs/formats.md. Lengths are in mm, exactly: a scene that is
-written and read again is the same to the last bit.
-"""
+"""Artifact ``scene.toml``: Lighthouse stations, markers and known distances."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
-from locatk.formats.artifacts import toml
-from locatk.formats.artifacts.base import Artifact, head
-from locatk.formats.artifacts.checks import above
-from locatk.formats.artifacts.toml import Inline, Shifted, Table
+from locatk.formats.artifacts.kinds import (
+    ANY_NUMBER,
+    NO_UNIT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Boolean,
+    Integer,
+    InvalidValueError,
+    ListOf,
+    Number,
+    Row,
+    Text,
+    Unit,
+    parse_key,
+    type_name,
+)
+from locatk.formats.artifacts.schema import (
+    Array,
+    Artifact,
+    Key,
+    Table,
+    Tables,
+    Values,
+    Variant,
+    refuse_repeated,
+)
+from locatk.formats.artifacts.toml import Inline
 
 SCENE_FILE = "scene.toml"
 """Name of the attachment that holds the scene of a session or a solution."""
 
 SCENE_FORMAT = "locatk-lighthouse-scene"
-SCENE_VERSION = 1
 
 SCALES = ("markers", "distance", "odometry", "device", "unit")
 SOURCES = ("factory", "generic", "estimated", "none")
 
-ANGLES = ("phase", "tilt", "gibphase", "ogeephase")
+ANGLE_PARAMETERS = ("phase", "tilt", "gibphase", "ogeephase")
 """Calibration parameters that are angles; their keys end in ``_rad``."""
+
+ROTATION_TOLERANCE = 1e-6
+"""Largest deviation of an element of ``R R^T`` from the identity."""
+
+CHANNEL = Integer(1, 16)
 
 _TIME = re.compile(
     r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?([Zz]|[+-]\d\d:\d\d)", re.ASCII
 )
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_MM = 3
-_METRES = -3
 
 
-def dumps_scene(scene: Scene) -> str:
-    """TOML text of a scene; the same scene gives the same text."""
-    in_units = bool(scene.stations) and scene.scale == "unit"
-    table: dict[str, Any] = {
-        **head(SCENE_FORMAT, SCENE_VERSION),
-        "frame": scene.frame,
-        "scale": scene.scale,
-        "planar": scene.planar,
-    }
-    if in_units:
-        table["floor_z_units"] = float(scene.floor_z)
-    else:
-        table["floor_z_mm"] = Shifted(scene.floor_z, _MM)
-    table["notes"] = list(scene.notes) or None
-    table["stations"] = [_station_table(station, in_units) for station in scene.stations]
-    table["markers"] = [
-        {
-            "name": marker.name,
-            "position_mm": Shifted(marker.position, _MM),
-            "sightings": [_sighting_table(sighting) for sighting in marker.visits] or None,
-        }
-        for marker in scene.markers
-    ]
-    table["distances"] = [
-        {
-            "distance_mm": Shifted(distance.distance, _MM),
-            "first": _sighting_table(distance.first),
-            "second": _sighting_table(distance.second),
-        }
-        for distance in scene.distances
-    ]
-    table["calibrations"] = [
-        {
-            "channel": int(channel),
-            "id": _hexadecimal(scene.ids.get(channel)),
-            **_calibration_table(scene.calibrations.get(channel)),
-        }
-        for channel in sorted(scene.calibrations.keys() | scene.ids.keys())
-    ]
-    return toml.dumps({key: value for key, value in table.items() if value != []})
-
-
-def _station_table(station: Station, in_units: bool) -> dict[str, Any]:
-    x, y, z = station.rotation[:, 0].tolist()
-    yaw, pitch = math.degrees(math.atan2(y, x)), math.degrees(math.asin(max(-1.0, min(1.0, z))))
-    position = (
-        {"position_units": np.asarray(station.position)}
-        if in_units
-        else {"position_mm": Shifted(station.position, _MM)}
-    )
-    covariance = "covariance_units_rad" if in_units else "covariance_m_rad"
-    return {
-        "#": f"looks to yaw {yaw:.1f} deg, {abs(pitch):.1f} deg {'up' if pitch > 0 else 'down'}",
-        "channel": int(station.channel),
-        "id": _hexadecimal(station.id),
-        **position,
-        "rotation": station.rotation,
-        covariance: station.covariance,
-        "floor_map_m": station.floor_map,
-        "calibration": _calibration_table(station.calibration),
-    }
-
-
-def _hexadecimal(number: int | None) -> str | None:
-    return None if number is None else f"{number:08x}"
-
-
-def _calibration_table(calibration: Calibration | None) -> dict[str, Any]:
-    if calibration is None:
-        return {}
-    return {
-        "source": calibration.source,
-        "model": calibration.model,
-        **{
-            name: Inline(
-                {_calibration_key(p): float(v) for p, v in zip(PARAMETERS, row, strict=True)}
-            )
-            for name, row in zip(("first", "second"), calibration.sweeps, strict=True)
-        },
-    }
-
-
-def _calibration_key(parameter: str) -> str:
-    return f"{parameter}_rad" if parameter in ANGLES else parameter
-
-
-def _sighting_table(sighting: MarkerVisit) -> dict[str, Any]:
-    if sighting.counts:
-        counts = {str(c): [float(n) for n in pair] for c, pair in sighting.counts.items()}
-        return {"counts": Inline(counts)}
-    return {
-        "device": sighting.device,
-        "start": None if sighting.start_ns is None else format_time(sighting.start_ns),
-        "end": None if sighting.end_ns is None else format_time(sighting.end_ns),
-    }
-
-
-def _parse(table: Table) -> Scene:
-    toml.check_format(table, SCENE_FORMAT, SCENE_VERSION)
-    scale = table.text("scale", "unit", SCALES)
-    stations = table.tables("stations")
-    in_units = bool(stations) and scale == "unit"
-    floor_z = (
-        table.number("floor_z_units", 0.0)
-        if in_units
-        else table.number("floor_z_mm", 0.0, shift=_METRES)
-    )
-    calibrations, ids = _calibrations(table)
-    scene = Scene(
-        stations=tuple(_station(station, in_units) for station in stations),
-        markers=tuple(_marker(marker) for marker in table.tables("markers")),
-        distances=tuple(_distance(distance) for distance in table.tables("distances")),
-        planar=table.flag("planar", None),
-        floor_z=floor_z,
-        scale=scale,
-        frame=table.text("frame", "floor"),
-        notes=table.texts("notes", ()),
-        calibrations=calibrations,
-        ids=ids,
-    )
-    table.end()
-    _refuse_repeated(table, "stations", "channel", [s.channel for s in scene.stations])
-    _refuse_repeated(table, "markers", "name", [m.name for m in scene.markers])
-    return scene
-
-
-def _refuse_repeated(table: Table, key: str, name: str, values: list[Any]) -> None:
-    for number, value in enumerate(values):
-        if value in values[:number]:
-            raise table.error(f"{key}[{number}].{name}", f"{value!r} is there twice")
-
-
-def _station(table: Table, in_units: bool) -> Station:
-    channel = table.integer("channel", 1, 16)
-    number = _id(table)
-    if in_units:
-        position = table.array("position_units", (3,))
-    else:
-        position = table.array("position_mm", (3,), shift=_METRES)
-    rotation = table.array("rotation", (3, 3))
-    with np.errstate(over="ignore", invalid="ignore"):
-        turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
-        turns = turns and np.linalg.det(rotation) > 0
-    if not turns:
-        raise table.error("rotation", "expected the rows of a rotation matrix")
-    key = "covariance_units_rad" if in_units else "covariance_m_rad"
-    covariance = table.array(key, (6, 6), nan=True) if key in table else None
-    floor_map = table.array("floor_map_m", (3, 3)) if "floor_map_m" in table else None
-    for name in (key, "floor_map_m"):
-        table.raw(name, None)  # known also where it is missing
-    calibration = _calibration(table.table("calibration"))
-    table.end()
-    return Station(channel, position, rotation, calibration, number, covariance, floor_map)
-
-
-def _id(table: Table) -> int | None:
-    """A station's serial number."""
-    text = table.text("id", None)
-    if text is None:
-        return None
-    if not re.fullmatch("[0-9a-fA-F]{1,16}", text):
-        raise table.error("id", 'expected a hexadecimal number in quotes, as in "4cc60647"')
-    return int(text, 16)
-
-
-def _calibrations(table: Table) -> tuple[dict[int, Calibration], dict[int, int]]:
-    """What is known of stations that are yet to be solved: calibrations and serial numbers, by
-    channel."""
-    entries = table.tables("calibrations")
-    channels = [entry.integer("channel", 1, 16) for entry in entries]
-    _refuse_repeated(table, "calibrations", "channel", channels)
-    known: dict[int, Calibration] = {}
-    ids: dict[int, int] = {}
-    for channel, entry in zip(channels, entries, strict=True):
-        number = _id(entry)
-        if number is not None:
-            ids[channel] = number
-        if number is not None and set(entry) <= {"channel", "id"}:
-            entry.end()  # its serial number is all that is known of it
-        else:
-            known[channel] = _calibration(entry)
-    return known, ids
-
-
-def _calibration(table: Table) -> Calibration:
-    source = table.text("source", choices=SOURCES)
-    model = table.text("model", "libsurvive", choices=MODELS)
-    sweeps = np.zeros((2, len(PARAMETERS)))
-    for number, name in enumerate(("first", "second")):
-        # Without calibration there is nothing to say: all zero.
-        sweep = table.table(name, None) if source == "none" else table.table(name)
-        if sweep is not None:
-            sweeps[number] = [sweep.number(_calibration_key(p)) for p in PARAMETERS]
-            sweep.end()
-    table.end()
-    return Calibration(sweeps, source, model)
-
-
-def _marker(table: Table) -> Marker:
-    marker = Marker(
-        name=table.text("name"),
-        position=table.array("position_mm", (3,), shift=_METRES),
-        visits=tuple(_sighting(sighting) for sighting in table.tables("sightings")),
-    )
-    table.end()
-    return marker
-
-
-def _distance(table: Table) -> Distance:
-    distance = above(table, "distance_mm", shift=_METRES)
-    first, second = (_sighting(table.table(name)) for name in ("first", "second"))
-    table.end()
-    return Distance(first, second, distance)
-
-
-def _sighting(table: Table) -> MarkerVisit:
-    if "counts" in table:
-        counts = table.table("counts")
-        found = {_channel(counts, key): _pair(counts, key) for key in counts}
-        table.end()
-        return MarkerVisit(counts=found)
-    device = table.text("device")
-    start, end = (_time(table, key) for key in ("start", "end"))
-    if end < start:
-        raise table.error("end", "is before start")
-    table.raw("counts", None)
-    table.end()
-    return MarkerVisit(device, start, end)
-
-
-def _channel(table: Table, key: str) -> int:
-    if not re.fullmatch("[1-9][0-9]?", key) or int(key) > 16:
-        raise table.error(key, "expected a channel from 1 to 16 as key")
-    return int(key)
-
-
-def _pair(table: Table, key: str) -> tuple[float, float]:
-    first, second = table.array(key, (2,)).tolist()
-    if min(first, second) < 0:
-        raise table.error(key, "a count is below 0")
-    return first, second
-
-
-def _time(table: Table, key: str) -> int:
-    value = table.raw(key)
-    # TOML's own date and time without quotes is welcome; it holds microseconds.
-    text = value.isoformat() if isinstance(value, datetime) else value
-    time_ns = parse_time(text) if isinstance(text, str) else None
-    if time_ns is None:
-        raise table.error(key, 'expected a time with its zone, as in "2023-07-27T15:34:22.700963Z"')
-    return time_ns
-
-
-SCENE = Artifact(SCENE_FILE, dumps_scene, _parse)
-"""The scene as a file; these are its methods."""
-
-write_scene, read_scene = SCENE.write, SCENE.read
-loads_scene, attached_scene = SCENE.loads, SCENE.attached
+# ---- times
 
 
 def parse_time(text: str) -> int | None:
-    """Nanoseconds since the epoch of an RFC 3339 time; None where it is none."""
-    found = _TIME.fullmatch(text)
-    if found is None:
+    """Return the nanoseconds since 1970 of an RFC 3339 time, or None if it is not one."""
+    match = _TIME.fullmatch(text)
+    if match is None:
         return None
-    day, clock, fraction, zone = found.groups()
+    day, clock, fraction, zone = match.groups()
     try:
         whole = datetime.fromisoformat(f"{day}T{clock}{zone.upper().replace('Z', '+00:00')}")
         seconds = (whole - _EPOCH) // timedelta(seconds=1)
@@ -316,7 +83,338 @@ def parse_time(text: str) -> int | None:
 
 
 def format_time(time_ns: int) -> str:
-    """RFC 3339 text of nanoseconds since the epoch, in UTC, with all nine digits."""
-    seconds, nanos = divmod(int(time_ns), 1_000_000_000)
+    """Return the RFC 3339 text of nanoseconds since 1970, in UTC, with all nine digits."""
+    seconds, nanoseconds = divmod(int(time_ns), 1_000_000_000)
     whole = _EPOCH + timedelta(seconds=seconds)
-    return f"{whole:%Y-%m-%dT%H:%M:%S}.{nanos:09d}Z"
+    return f"{whole:%Y-%m-%dT%H:%M:%S}.{nanoseconds:09d}Z"
+
+
+# ---- kinds of values
+
+
+@dataclass(frozen=True)
+class Time:
+    """Time as nanoseconds since 1970; TOML's own date and time without quotes is accepted."""
+
+    expected = "an RFC 3339 time with its zone"
+    plural = "RFC 3339 times"
+
+    def parse(self, value: Any, unit: Unit = NO_UNIT) -> int:
+        text = value.isoformat() if isinstance(value, datetime) else value
+        time_ns = parse_time(text) if isinstance(text, str) else None
+        if time_ns is None:
+            raise InvalidValueError(
+                'expected a time with its zone, as in "2023-07-27T15:34:22.700963Z"'
+            )
+        return time_ns
+
+    def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> str:
+        return format_time(value)
+
+
+@dataclass(frozen=True)
+class SerialNumber:
+    """Serial number of a station, as a hexadecimal string."""
+
+    expected = "a hexadecimal number in quotes"
+    plural = "hexadecimal numbers in quotes"
+
+    def parse(self, value: Any, unit: Unit = NO_UNIT) -> int:
+        if not isinstance(value, str):
+            raise InvalidValueError(f"expected a string, not {type_name(value)}")
+        if not re.fullmatch("[0-9a-fA-F]{1,16}", value):
+            raise InvalidValueError('expected a hexadecimal number in quotes, as in "4cc60647"')
+        return int(value, 16)
+
+    def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> str:
+        return f"{value:08x}"
+
+
+@dataclass(frozen=True)
+class Counts:
+    """LFSR counts of the two sweeps by channel, as in ``{ 1 = [48333.0, 88779.0] }``."""
+
+    expected = "a table with two counts by channel"
+    plural = "tables with two counts by channel"
+
+    def parse(self, value: Any, unit: Unit = NO_UNIT) -> dict[int, tuple[float, float]]:
+        if not isinstance(value, dict):
+            raise InvalidValueError(f"expected {self.expected}, not {type_name(value)}")
+        for key in value:
+            if not re.fullmatch("[1-9]|1[0-6]", key):
+                raise InvalidValueError("expected a channel from 1 to 16 as key", key)
+        pair = Row(NOT_NEGATIVE, 2)
+        return {int(key): parse_key(key, pair, item) for key, item in value.items()}
+
+    def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> Inline:
+        return Inline({str(c): [float(count) for count in pair] for c, pair in value.items()})
+
+
+# ---- calibrations
+
+
+def _parameter_key(parameter: str) -> str:
+    return f"{parameter}_rad" if parameter in ANGLE_PARAMETERS else parameter
+
+
+_PARAMETERS = Table(
+    tuple(Key(_parameter_key(parameter), ANY_NUMBER) for parameter in PARAMETERS),
+    lambda values: [values[_parameter_key(parameter)] for parameter in PARAMETERS],
+    lambda row: dict(zip(map(_parameter_key, PARAMETERS), map(float, row), strict=True)),
+    is_inline=True,
+)
+
+
+def _calibration_keys(*, is_known: bool) -> tuple[Key, ...]:
+    required: dict[str, Any] = {} if is_known else {"default": None}
+    return (
+        Key("source", Text(SOURCES), "origin of the calibration"),
+        Key(
+            "model",
+            Text(MODELS),
+            "model of the parameters: `libsurvive` (all seven), or `crazyflie` (as its firmware "
+            "estimates them: no curve, no ogee)",
+            "libsurvive",
+        ),
+        Key(
+            "first",
+            _PARAMETERS,
+            "the seven parameters of the first sweep, as the station sends them; may be missing "
+            "if the source is `none`",
+            **required,
+        ),
+        Key("second", _PARAMETERS, "those of the second sweep", **required),
+    )
+
+
+def _calibration_of(values: Values) -> Calibration:
+    # Without calibration all parameters are zero.
+    zeros = np.zeros(len(PARAMETERS))
+    sweeps = np.array([zeros if values[k] is None else values[k] for k in ("first", "second")])
+    return Calibration(sweeps, values["source"], values["model"])
+
+
+def _calibration_values(calibration: Calibration) -> Values:
+    first, second = calibration.sweeps
+    return {
+        "source": calibration.source,
+        "model": calibration.model,
+        "first": first,
+        "second": second,
+    }
+
+
+def _calibration_table(values: Mapping[str, Any]) -> Table:
+    is_known = values.get("source") != "none"
+    return Table(_calibration_keys(is_known=is_known), _calibration_of)
+
+
+CALIBRATION = Variant(
+    _calibration_table, _calibration_table({"source": "factory"}), _calibration_values
+)
+
+
+def _known_station_table(values: Mapping[str, Any]) -> Table:
+    """Return the table of a station that has yet to be solved."""
+    keys: tuple[Key, ...] = (
+        Key("channel", CHANNEL, "channel of a station that has yet to be solved, once each"),
+        Key("id", SerialNumber(), "its serial number", None, "unknown"),
+    )
+    if "id" in values and set(values) <= {"channel", "id"}:
+        return Table(keys)  # only the serial number is known
+    keys += _calibration_keys(is_known=values.get("source") != "none")
+    return Table(keys, lambda values: {**values, "calibration": _calibration_of(values)})
+
+
+# ---- visits of markers
+
+_COUNTS = Table(
+    (Key("counts", Counts(), "counts of the two sweeps by channel, in any order"),),
+    lambda values: MarkerVisit(counts=values["counts"]),
+)
+
+
+def _timed_visit(values: Values) -> MarkerVisit:
+    if values["end"] < values["start"]:
+        raise InvalidValueError("is before start", "end")
+    return MarkerVisit(values["device"], values["start"], values["end"])
+
+
+_INTERVAL = Table(
+    (
+        Key("device", Text(), "device that rested on the marker"),
+        Key("start", Time(), "begin of its rest"),
+        Key("end", Time(), "end of its rest"),
+    ),
+    _timed_visit,
+)
+
+
+def _visit_values(visit: MarkerVisit) -> Values:
+    if visit.counts:
+        return {"counts": visit.counts}
+    return {"device": visit.device, "start": visit.start_ns, "end": visit.end_ns}
+
+
+VISIT = Variant(
+    lambda values: _COUNTS if "counts" in values else _INTERVAL,
+    Table(
+        (
+            *_INTERVAL.keys,
+            Key("counts", Counts(), "instead of the other keys: " + _COUNTS.keys[0].meaning, None),
+        )
+    ),
+    _visit_values,
+)
+
+
+# ---- the scene
+
+
+def _station_of(values: Values) -> Station:
+    rotation = values["rotation"]
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
+        if not (is_orthogonal and np.linalg.det(rotation) > 0):
+            raise InvalidValueError("expected the rows of a rotation matrix", "rotation")
+    return Station(**values)
+
+
+def _station_values(station: Station) -> Values:
+    return {"#": _view_direction(station.rotation), **vars(station)}
+
+
+def _view_direction(rotation: NDArray[np.float64]) -> str:
+    x, y, z = rotation[:, 0].tolist()
+    yaw, pitch = math.degrees(math.atan2(y, x)), math.degrees(math.asin(max(-1.0, min(1.0, z))))
+    return f"looks to yaw {yaw:.1f} deg, {abs(pitch):.1f} deg {'up' if pitch > 0 else 'down'}"
+
+
+def _scene_table(values: Mapping[str, Any]) -> Table:
+    """Return the table of a scene: lengths of stations have no unit if their scale is unknown."""
+    if values.get("stations") and values.get("scale", "unit") == "unit":
+        return _table_of_lengths("floor_z_units", "position_units", "covariance_units_rad")
+    return _table_of_lengths("floor_z_mm", "position_mm", "covariance_m_rad")
+
+
+def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
+    station = Table(
+        (
+            Key("channel", CHANNEL, "channel (mode) of the station, once each"),
+            Key("id", SerialNumber(), "serial number", None, "unknown"),
+            Key(position, Array((3,)), "position of the rotor's centre", value_name="position"),
+            Key(
+                "rotation",
+                Array((3, 3)),
+                "rows of the rotation matrix from station to frame; its columns are the station's "
+                "forward, left and up. The comment above is the direction of view",
+            ),
+            Key(
+                covariance,
+                Array((6, 6), Number(is_nan_allowed=True)),
+                "covariance of position (m) and rotation vector (rad) in the frame",
+                None,
+                "unknown",
+                value_name="covariance",
+            ),
+            Key(
+                "floor_map_m",
+                Array((3, 3)),
+                "of a single station over a floor with markers: homography from its rays (1, y, z) "
+                "to floor points (1, x, y) in m",
+                None,
+                "none",
+                value_name="floor_map",
+            ),
+            Key("calibration", CALIBRATION),
+        ),
+        _station_of,
+        _station_values,
+    )
+    return Table(
+        (
+            Key("frame", Text(), "name of the frame of all positions", "floor"),
+            Key(
+                "scale",
+                Text(SCALES),
+                "origin of the scale of the stations; `device` is a device of known size, `unit` "
+                "an unknown scale",
+                "unit",
+            ),
+            Key(
+                "planar",
+                Boolean(),
+                "true if all devices move on the plane z = `floor_z_mm`",
+                None,
+                "unknown",
+            ),
+            Key(
+                floor_z,
+                ANY_NUMBER,
+                "height of the photodiodes in a planar scene",
+                0.0,
+                value_name="floor_z",
+            ),
+            Key("notes", ListOf(Text()), "assumptions of the solution", ()),
+            Key("stations", Tables(station), default=()),
+            Key("markers", Tables(_MARKER), default=()),
+            Key("distances", Tables(_DISTANCE), default=()),
+            Key(
+                "calibrations",
+                Tables(Variant(_known_station_table, _known_station_table({}))),
+                default=(),
+            ),
+        ),
+        _scene_of,
+    )
+
+
+_MARKER = Table(
+    (
+        Key("name", Text(), "name of a point that was measured by hand, once each"),
+        Key("position_mm", Array((3,)), "its position; z is 0 on the floor", value_name="position"),
+        Key("sightings", Tables(VISIT), default=(), value_name="visits"),
+    ),
+    lambda values: Marker(**values),
+    vars,
+)
+_DISTANCE = Table(
+    (
+        Key("distance_mm", POSITIVE, "known distance between two visits", value_name="distance"),
+        Key("first", VISIT, "first visit, with the keys of `markers.sightings`"),
+        Key("second", VISIT, "second visit"),
+    ),
+    lambda values: Distance(**values),
+    vars,
+)
+
+
+def _scene_of(values: Values) -> Scene:
+    stations, markers, known = (values[k] for k in ("stations", "markers", "calibrations"))
+    refuse_repeated((entry["channel"] for entry in known), "calibrations", "channel")
+    refuse_repeated((station.channel for station in stations), "stations", "channel")
+    refuse_repeated((marker.name for marker in markers), "markers", "name")
+    calibrations = {e["channel"]: e["calibration"] for e in known if "calibration" in e}
+    ids = {entry["channel"]: entry["id"] for entry in known if entry["id"] is not None}
+    return Scene(**{**values, "calibrations": calibrations, "ids": ids})
+
+
+def _scene_values(scene: Scene) -> Values:
+    known: list[Values] = []
+    for channel in sorted(scene.calibrations.keys() | scene.ids.keys()):
+        entry: Values = {"channel": channel}
+        if channel in scene.ids:
+            entry["id"] = scene.ids[channel]
+        if channel in scene.calibrations:
+            entry |= _calibration_values(scene.calibrations[channel])
+        known.append(entry)
+    return {**vars(scene), "calibrations": known}
+
+
+SCENE: Artifact[Scene] = Artifact(
+    SCENE_FILE, SCENE_FORMAT, Variant(_scene_table, _scene_table({}), _scene_values)
+)
+"""The scene as a file."""
+
+dumps_scene, loads_scene, attached_scene = SCENE.dumps, SCENE.loads, SCENE.attached
+write_scene, read_scene = SCENE.write, SCENE.read

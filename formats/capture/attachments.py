@@ -8,9 +8,10 @@ from typing import Any
 
 from locatk.core.errors import InputError
 from locatk.formats import files
-from locatk.formats.artifacts import hall_sensors, maps, sheets, tags, toml
+from locatk.formats.artifacts import maps, sheets, tags
 from locatk.formats.artifacts import receiver as receivers
 from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.artifacts.schema import read_format
 from locatk.formats.sessions.reader import Session
 
 KINDS: dict[str, tuple[str, Callable[..., Any]]] = {
@@ -21,7 +22,7 @@ KINDS: dict[str, tuple[str, Callable[..., Any]]] = {
     tags.TAG_FORMAT: (tags.TAG_FILE, tags.loads_tags),
     tags.ARRAY_FORMAT: (tags.ARRAY_FILE, tags.loads_array),
     maps.MAP_FORMAT: (maps.MAP_FILE, maps.loads_map),
-    hall_sensors.HALLS_FORMAT: (maps.HALLS_FILE, maps.loads_halls),
+    maps.HALLS_FORMAT: (maps.HALLS_FILE, maps.loads_halls),
 }
 """Format of an artifact to the name of its attachment and the function that parses it."""
 
@@ -54,7 +55,7 @@ def attachments(paths: Iterable[Path]) -> dict[str, str]:
 def _of(path: Path) -> dict[str, str]:
     if path.suffix.lower() == ".mcap":
         return _of_session(path)
-    kind = toml.read(path).text("format", choices=tuple(KINDS))
+    kind = read_format(path, tuple(KINDS))
     name, loads = KINDS[kind]
     text = files.read_text(path)
     loads(text, file=path)

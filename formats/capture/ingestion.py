@@ -15,7 +15,7 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from locatk.core.clock_sync import TickClock
-from locatk.formats.artifacts import hall_sensors
+from locatk.formats.artifacts import maps
 from locatk.formats.capture.clocks import ArrivalTimes, DeviceClock
 from locatk.formats.capture.reader_thread import ReceivedData
 from locatk.formats.capture.statistics import CaptureStatistics
@@ -122,8 +122,8 @@ class SerialIntake:
         self._opened = True
         self._last_ns: int | None = None
         self._first_ns: int | None = None
-        text = (artifacts or {}).get(hall_sensors.HALLS_FILE)
-        halls = () if text is None else hall_sensors.loads_halls(text).names
+        text = (artifacts or {}).get(maps.HALLS_FILE)
+        halls = () if text is None else maps.loads_halls(text).names
         self._streams = MessageEncoder(name, halls)
         self._arrivals = ArrivalTimes()
         self._streams_by_device: dict[tuple[str, str], Stream] = {}

@@ -13,8 +13,7 @@ COLUMNS = ("part", "count", "detail", "price_usd", "source")
 
 
 def write_bill(path: str | os.PathLike[str], items: Sequence[BillItem], *, overwrite: bool) -> None:
-    """Write items as CSV, one a line under :data:`COLUMNS`; a price that is not known stays
-    empty.
+    """Write items as CSV with :data:`COLUMNS`, one a line; an unknown price is empty.
 
     Raises
     ------

@@ -1,18 +1,18 @@
 """System configurations of the Crazyflie: geometry and calibration of base stations (YAML).
 
-The file is what cfclient saves and cflib's ``LighthouseConfigFileManager`` reads and writes;
-ids in it are channels less one. Frames are ours: ``origin`` in
-metres, ``rotation`` from the station (x forward, y left, z up) to the room.
+cfclient saves the file, and cflib's ``LighthouseConfigFileManager`` reads and writes it. Ids in it
+are channels less one. The frames agree with those of a scene: ``origin`` is in metres, ``rotation``
+is from the station (x forward, y left, z up) to the room.
 
-Calibrations are the factory's numbers, as the stations send them. Crazyflie firmware leaves
-curve and ogee out of its model and takes the gib wave elsewhere; that is a choice of the
-firmware, not of the numbers, so that they are read for the full model
-(:mod:`locatk.core.lighthouse.calibration`). A geometry is another matter: it was estimated
-with the firmware's model, and is as good as that was. A scene that was read says so, unless
-the key ``solver`` tells that it is ours.
+Calibrations are the parameters of the factory, as the stations send them. Crazyflie firmware omits
+curve and ogee in its model and applies the gib wave to another angle, but that concerns the
+firmware, not the parameters: they are read for the full model
+(:mod:`locatk.core.lighthouse.calibration`). A geometry was estimated with the firmware's model and
+is as accurate as that; a scene that was read has a note about it, unless the key ``solver`` states
+that locatk estimated it.
 
-Only factory calibrations are written. A Crazyflie that hears a station replaces others by
-the factory's within half a minute, and a reader could not tell an estimate from it.
+Only factory calibrations are written. A Crazyflie replaces others within half a minute by the
+calibration that it receives, and a reader could not distinguish an estimate from it.
 """
 
 from __future__ import annotations
@@ -25,13 +25,20 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from locatk.core.errors import ArtifactError, InputError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, PARAMETERS, Calibration
 from locatk.core.lighthouse.channels import CHANNELS
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.formats.artifacts.toml import Table
+from locatk.formats.artifacts.kinds import (
+    Integer,
+    InvalidValueError,
+    ListOf,
+    Number,
+    parse_key,
+    type_name,
+)
+from locatk.formats.artifacts.schema import Array, Key, Table, Values, unknown_keys
 from locatk.formats.files import read_bytes
 from locatk.formats.output import atomic_write
 
@@ -40,30 +47,46 @@ VERSION = "1"
 SYSTEM_V2 = 2
 
 FRAME = "room"
-"""What the frame of a scene is called that comes from a Crazyflie."""
+"""Frame of a scene that was read from a configuration."""
 
-LARGEST_FILE = 1_000_000
-"""Bytes. Sixteen stations take 12,000."""
+MAX_FILE_BYTES = 1_000_000
+"""Sixteen stations take 12,000 bytes."""
 
-DEEPEST = 8
-"""Lists and mappings within each other; the format has five."""
+MAX_DEPTH = 8
+"""Nested lists and mappings; the format has five levels."""
 
-FARTHEST_M = 1000.0
-LARGEST_PARAMETER = 10.0
-"""Of a calibration, where the angles are at most a turn and the rest less than 1."""
+MAX_DISTANCE_M = 1000.0
+MAX_PARAMETER = 10.0
+"""Largest parameter of a calibration: angles are at most 2 pi, other parameters below 1."""
 
 ROTATION_TOLERANCE = 1e-3
-"""How far rotation matrices may be off, as those that people typed with four digits."""
+"""Largest error of a singular value of a rotation, for matrices typed with four digits."""
+
+FLOAT32_TOLERANCE = 1e-6
+"""Error of a rotation that was stored with 32 bits, as in the Crazyflie's memory."""
+
+FLOAT64_TOLERANCE = 1e-9
+"""Error up to which a rotation is used unchanged."""
+
+MAX_NAMED_KEYS = 5
+MAX_KEY_CHARACTERS = 40
+"""Limits of the note about ignored keys."""
 
 MODEL_NOTE = (
+    "the geometry of the stations was estimated by the Crazyflie, whose calibration model omits "
+    "curve and ogee: solve again for millimetre accuracy"
+)
+
+FORMER_MODEL_NOTE = (
     "stations are taken as the Crazyflie estimates them, whose calibration model leaves curve and "
     "ogee out: solve again for millimetres"
 )
+"""Wording of :data:`MODEL_NOTE` in scenes of earlier versions."""
 
-SOLVER, OURS = "solver", "locatk"
-"""A key that cfclient and cflib pass over: of stations that were solved with the full model."""
+SOLVER, OWN_SOLVER = "solver", "locatk"
+"""Key that cfclient and cflib ignore, and its value for stations solved with the full model."""
 
-HINT = "give a configuration that cfclient or cflib has saved"
+HINT = "Give a configuration that cfclient or cflib has saved"
 
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
@@ -75,9 +98,9 @@ _STANDARD_TAG = re.compile("!|tag:yaml.org,2002:(?:str|int|float|map|seq)")
 def read_config(path: str | os.PathLike[str]) -> Scene:
     """Read a system configuration as a scene.
 
-    Where geometry and calibration are known, the scene has the station; where only the
-    calibration is, the calibration and the serial number. A geometry alone gets the generic
-    calibration, and a note.
+    The scene has a station for each geometry; without a calibration in the file, its calibration is
+    generic, and there is a note. Calibrations without a geometry are in ``calibrations`` and
+    ``ids``.
 
     Raises
     ------
@@ -86,61 +109,64 @@ def read_config(path: str | os.PathLike[str]) -> Scene:
     InputError
         It cannot be read.
     ArtifactError
-        It is no system configuration of Lighthouse V2, or has a wrong value; the error names
+        It is not a system configuration of Lighthouse V2, or has a wrong value; the error names
         the key.
     """
-    return loads_config(read_bytes(path, LARGEST_FILE + 1), file=path)
+    return loads_config(read_bytes(path, MAX_FILE_BYTES + 1), file=path)
 
 
 def loads_config(text: str | bytes, *, file: str | os.PathLike[str] = "<config>") -> Scene:
-    """The scene of a system configuration's text; ``file`` is what errors call it.
+    """Parse the text of a system configuration; errors name ``file``.
 
     Raises
     ------
     ArtifactError
-        As :func:`read_config`.
+        See :func:`read_config`.
     """
-    table = Table(_mapping(text, file), file, "")
-    if table.raw("type", None) != TYPE:
-        raise table.error("type", f"expected {TYPE!r}", HINT)
-    if str(table.raw("version", None)) != VERSION:
-        raise table.error("version", f"expected {VERSION!r}, the one version that is known")
-    if table.raw("systemType", SYSTEM_V2) != SYSTEM_V2:
-        raise table.error(
-            "systemType", "not of Lighthouse V2 (2)", "stations of Lighthouse V1 are not supported"
-        )
+    data = _parse_mapping(text, file)
+    try:
+        return _scene_of(data)
+    except InvalidValueError as error:
+        raise ArtifactError(
+            error.message, file=file, where=error.key or None, hint=error.hint
+        ) from None
+
+
+def _scene_of(data: dict[str, Any]) -> Scene:
+    _check_system(data)
     notes: list[str] = []
-    unread: list[str] = []
-    geometries = {
-        channel: _geometry(below, channel, notes, unread)
-        for channel, below in _by_channel(table, "geos")
-    }
+    geometries: dict[int, dict[str, Any]] = _by_channel(data, "geos", _GEOMETRY)
     calibrations: dict[int, Calibration] = {}
     ids: dict[int, int] = {}
-    for channel, below in _by_channel(table, "calibs"):
-        calibration, uid = _calibration(below, unread)
-        if np.any(calibration.sweeps):
-            calibrations[channel] = calibration
-        if uid:
-            ids[channel] = uid
-    unread += _unread(table, ("type", "version", "systemType", SOLVER, "geos", "calibs"))
-    if unread:
-        names = ", ".join(map(repr, unread[:5])) + (", ..." if len(unread) > 5 else "")
-        notes.append(f"unknown keys of the Crazyflie's configuration were passed over: {names}")
-    if geometries and table.raw(SOLVER, None) != OURS:
+    for channel, entry in _by_channel(data, "calibs", _CALIBRATION).items():
+        sweeps = np.array([[sweep[name] for name in PARAMETERS] for sweep in entry["sweeps"]])
+        if np.any(sweeps):
+            calibrations[channel] = Calibration(sweeps, "factory")
+        if entry["uid"]:
+            ids[channel] = entry["uid"]
+    for channel, geometry in geometries.items():
+        if geometry.pop("is_rounded"):
+            notes.append(
+                f"the rotation of channel {channel} is rounded: the nearest rotation is used"
+            )
+    if ignored := _ignored_keys(data):
+        names = ", ".join(map(repr, ignored[:MAX_NAMED_KEYS]))
+        more = ", ..." if len(ignored) > MAX_NAMED_KEYS else ""
+        notes.append(f"unknown keys of the Crazyflie's configuration are ignored: {names}{more}")
+    if geometries and data.get(SOLVER) != OWN_SOLVER:
         notes.append(MODEL_NOTE)
-    unknown = sorted(set(geometries) - set(calibrations))
-    if unknown:
+    generic = sorted(set(geometries) - set(calibrations))
+    if generic:
         notes.append(
-            f"generic calibration of {_channels(unknown)}: the file tells their geometry only"
+            f"generic calibration of {_channels(generic)}: the file has their geometry only"
         )
     return Scene(
         stations=tuple(
             Station(
                 channel,
-                *geometries[channel],
-                calibrations.get(channel, GENERIC_CALIBRATION),
-                ids.get(channel),
+                **geometries[channel],
+                calibration=calibrations.get(channel, GENERIC_CALIBRATION),
+                id=ids.get(channel),
             )
             for channel in sorted(geometries)
         ),
@@ -153,8 +179,10 @@ def loads_config(text: str | bytes, *, file: str | os.PathLike[str] = "<config>"
 
 
 def dumps_config(scene: Scene) -> str:
-    """YAML text of a scene for cfclient, cflib and the Crazyflie; the same scene gives the
-    same text. What cannot be told in it stands in a comment.
+    """Return the YAML text of a scene for cfclient, cflib and the Crazyflie.
+
+    The same scene gives the same text. Comments state the frame and the calibrations that are left
+    out.
 
     Raises
     ------
@@ -163,12 +191,12 @@ def dumps_config(scene: Scene) -> str:
     """
     if not scene.stations:
         raise InputError(
-            "the scene has no stations to export", hint="solve a session first (locatk solve)"
+            "the scene has no stations to export", hint="Solve a session first (locatk solve)"
         )
     if scene.scale == "unit":
         raise InputError(
             "the scene has no scale: a Crazyflie needs metres",
-            hint="give markers or a distance to locatk solve",
+            hint="Give markers or a distance to locatk solve",
         )
     geos, calibs, left_out = {}, {}, []
     calibrations = dict(scene.calibrations) | {s.channel: s.calibration for s in scene.stations}
@@ -196,11 +224,12 @@ def dumps_config(scene: Scene) -> str:
             f"# No factory calibration of {_channels(left_out)}: "
             "the Crazyflie takes it from the light."
         )
+    is_of_crazyflie = not {MODEL_NOTE, FORMER_MODEL_NOTE}.isdisjoint(scene.notes)
     content = {
         "type": TYPE,
         "version": VERSION,
         "systemType": SYSTEM_V2,
-        **({} if MODEL_NOTE in scene.notes else {SOLVER: OURS}),
+        **({} if is_of_crazyflie else {SOLVER: OWN_SOLVER}),
         "geos": dict(sorted(geos.items())),
         "calibs": calibs,
     }
@@ -213,7 +242,7 @@ def write_config(path: str | os.PathLike[str], scene: Scene, *, overwrite: bool 
     Raises
     ------
     InputError
-        As :func:`dumps_config`.
+        See :func:`dumps_config`.
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.atomic_write`.
     """
@@ -226,62 +255,90 @@ def _channels(channels: list[int]) -> str:
     return f"channel{'s' if len(channels) > 1 else ''} " + ", ".join(map(str, channels))
 
 
-def _by_channel(table: Table, key: str) -> Iterator[tuple[int, Table]]:
-    """What stands under each id, with the channel that it means."""
-    group = table.table(key, None)
-    for name in group or ():
-        if not _ID.fullmatch(name):
-            raise group.error(name, "expected the id of a base station, 0 to 15")
-        yield int(name) + CHANNELS[0], group.table(name)
+def _check_system(data: dict[str, Any]) -> None:
+    """Refuse files that are not of Lighthouse V2."""
+    if data.get("type") != TYPE:
+        raise InvalidValueError(f"expected {TYPE!r}", "type", HINT)
+    if str(data.get("version")) != VERSION:
+        raise InvalidValueError(f"expected {VERSION!r}, the only known version", "version")
+    if data.get("systemType", SYSTEM_V2) != SYSTEM_V2:
+        raise InvalidValueError(
+            "not of Lighthouse V2 (2)",
+            "systemType",
+            "Stations of Lighthouse V1 are not supported",
+        )
 
 
-def _geometry(
-    table: Table, channel: int, notes: list[str], unread: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    origin = table.array("origin", (3,))
-    if np.abs(origin).max() > FARTHEST_M:
-        raise table.error("origin", f"expected metres, at most {FARTHEST_M:.0f} from the origin")
-    rotation = table.array("rotation", (3, 3))
-    u, sizes, v = np.linalg.svd(np.clip(rotation, -2.0, 2.0))
-    if np.abs(sizes - 1).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise table.error("rotation", "expected the rows of a rotation matrix")
-    if np.abs(sizes - 1).max() > 1e-6:
-        notes.append(f"the rotation of channel {channel} was rounded: the nearest one is taken")
-    if np.abs(sizes - 1).max() > 1e-9:  # rounded to 32 bits, as in the Crazyflie's memory
-        rotation = u @ v
-    unread += _unread(table, ("origin", "rotation"))
-    return origin, rotation
-
-
-def _calibration(table: Table, unread: list[str]) -> tuple[Calibration, int]:
-    uid = table.integer("uid", 0, 0xFFFFFFFF)
-    rows = table.raw("sweeps")
-    if not isinstance(rows, list) or len(rows) != 2 or not all(isinstance(r, dict) for r in rows):
-        raise table.error("sweeps", f"expected two mappings with {', '.join(PARAMETERS)}")
-    sweeps = np.zeros((2, len(PARAMETERS)))
-    for number, sweep in enumerate(table.tables("sweeps")):
-        sweeps[number] = [sweep.number(name) for name in PARAMETERS]
-        large = np.flatnonzero(np.abs(sweeps[number]) > LARGEST_PARAMETER)
-        if len(large):
-            raise sweep.error(
-                PARAMETERS[large[0]],
-                f"no calibration parameter is beyond {LARGEST_PARAMETER:.0f}",
-                "let the Crazyflie receive the calibration again: it has stored a damaged one",
+def _by_channel(data: dict[str, Any], key: str, table: Table) -> dict[int, Any]:
+    """Parse the tables of stations below ``key``, by channel."""
+    group = data.get(key, {})
+    if not isinstance(group, dict):
+        raise InvalidValueError(f"expected a table, not {type_name(group)}", key)
+    for station_id in group:
+        if not _ID.fullmatch(station_id):
+            raise InvalidValueError(
+                "expected the id of a base station, 0 to 15", f"{key}.{station_id}"
             )
-        unread += _unread(sweep, PARAMETERS)
-    unread += _unread(table, ("sweeps", "uid"))
-    return Calibration(sweeps, "factory"), uid
+    return {
+        int(station_id) + CHANNELS[0]: parse_key(f"{key}.{station_id}", table, entry)
+        for station_id, entry in group.items()
+    }
 
 
-def _unread(table: Table, known: tuple[str, ...]) -> list[str]:
-    return [str(table.error(key[:40], "").where) for key in table if key not in known]
+def _geometry_of(values: Values) -> dict[str, Any]:
+    """Return position and rotation of a station, and whether the rotation is rounded."""
+    rotation = values["rotation"]
+    u, sizes, v = np.linalg.svd(np.clip(rotation, -2.0, 2.0))
+    error = np.abs(sizes - 1).max()
+    if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise InvalidValueError("expected the rows of a rotation matrix", "rotation")
+    return {
+        "position": values["origin"],
+        "rotation": u @ v if error > FLOAT64_TOLERANCE else rotation,
+        "is_rounded": error > FLOAT32_TOLERANCE,
+    }
 
 
-def _mapping(text: str | bytes, file: str | os.PathLike[str]) -> dict[str, Any]:
-    """The mapping that the text is, with numbers as int and Decimal, the rest as strings."""
-    if len(text) > LARGEST_FILE:
+_GEOMETRY = Table(
+    (
+        Key(
+            "origin",
+            Array((3,), Number(-MAX_DISTANCE_M, MAX_DISTANCE_M, hint="Positions are in metres")),
+        ),
+        Key("rotation", Array((3, 3))),
+    ),
+    _geometry_of,
+    is_open=True,
+)
+_PARAMETER = Number(
+    -MAX_PARAMETER,
+    MAX_PARAMETER,
+    hint="Let the Crazyflie receive the calibration again: the stored one is damaged",
+)
+_SWEEP = Table(tuple(Key(name, _PARAMETER) for name in PARAMETERS), is_open=True)
+_CALIBRATION = Table(
+    (Key("uid", Integer(0, 0xFFFFFFFF)), Key("sweeps", ListOf(_SWEEP, 2, 2))), is_open=True
+)
+_SYSTEM_KEYS = ("type", "version", "systemType", SOLVER, "geos", "calibs")
+
+
+def _ignored_keys(data: dict[str, Any]) -> list[str]:
+    """Return the paths of keys that are not read."""
+    paths: list[str] = []
+    for key, table in (("geos", _GEOMETRY), ("calibs", _CALIBRATION)):
+        for station_id, entry in data.get(key, {}).items():
+            path = f"{key}.{station_id}"
+            for number, sweep in enumerate(entry.get("sweeps", ())[:2] if key == "calibs" else ()):
+                paths += unknown_keys(_SWEEP, sweep, f"{path}.sweeps[{number}]")
+            paths += unknown_keys(table, entry, path)
+    return [*paths, *(name[:MAX_KEY_CHARACTERS] for name in data if name not in _SYSTEM_KEYS)]
+
+
+def _parse_mapping(text: str | bytes, file: str | os.PathLike[str]) -> dict[str, Any]:
+    """Parse a YAML mapping, with numbers as int and Decimal and other scalars as strings."""
+    if len(text) > MAX_FILE_BYTES:
         raise ArtifactError(
-            f"larger than {LARGEST_FILE // 1000} kB: no Crazyflie configuration",
+            f"larger than {MAX_FILE_BYTES // 1000} kB: not a Crazyflie configuration",
             file=file,
             hint=HINT,
         )
@@ -302,23 +359,23 @@ def _mapping(text: str | bytes, file: str | os.PathLike[str]) -> dict[str, Any]:
         ) from None
     if not isinstance(root, dict):
         raise ArtifactError(
-            "no Crazyflie configuration: expected a YAML mapping", file=file, hint=HINT
+            "not a Crazyflie configuration: expected a YAML mapping", file=file, hint=HINT
         )
     return root
 
 
 def _tree(text: str, file: str | os.PathLike[str]) -> Any:
-    """What the text's one document holds, without anchors, tags and repeated keys.
+    """Parse the only document of a text; anchors, tags and repeated keys are refused.
 
-    Built from PyYAML's events: its loaders take the last of two equal keys, follow anchors
-    to exponential size, and recurse as deep as the text does.
+    It is built from PyYAML's events: its loaders take the last of two equal keys, follow anchors to
+    exponential size, and recurse as deep as the text.
     """
     events = yaml.parse(text, Loader=_SAFE_LOADER)
     root = None
     for event in events:
         if isinstance(event, yaml.NodeEvent):
             if root is not None:
-                raise _at(event, file, "more than one YAML document")
+                raise _error_at(event, file, "more than one YAML document")
             root = _node(event, events, file, 0)
     return root
 
@@ -326,16 +383,16 @@ def _tree(text: str, file: str | os.PathLike[str]) -> Any:
 def _node(
     event: yaml.Event, events: Iterator[yaml.Event], file: str | os.PathLike[str], depth: int
 ) -> Any:
-    """The value that begins with an event, taking the events to its end."""
+    """Build the value that begins with an event, and consume its events."""
     if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-        raise _at(event, file, "YAML anchors and aliases are not read")
+        raise _error_at(event, file, "YAML anchors and aliases are not read")
     tag = getattr(event, "tag", None)
     if tag is not None and not _STANDARD_TAG.fullmatch(tag):
-        raise _at(event, file, f"YAML tag {tag[:60]!r} is not read")
+        raise _error_at(event, file, f"YAML tag {tag[:60]!r} is not read")
     if isinstance(event, yaml.ScalarEvent):
         return _scalar(event)
-    if depth == DEEPEST:
-        raise _at(event, file, "lists and mappings are nested too deep")
+    if depth == MAX_DEPTH:
+        raise _error_at(event, file, "lists and mappings are nested too deep")
     if isinstance(event, yaml.SequenceStartEvent):
         items = []
         while not isinstance(event := next(events), yaml.SequenceEndEvent):
@@ -344,15 +401,15 @@ def _node(
     values: dict[str, Any] = {}
     while not isinstance(event := next(events), yaml.MappingEndEvent):
         if not isinstance(event, yaml.ScalarEvent):
-            raise _at(event, file, "a key that is no name or number")
+            raise _error_at(event, file, "a key that is not a name or number")
         key = event.value
         if key in values:
-            raise _at(event, file, f"key {key[:60]!r} is there twice")
+            raise _error_at(event, file, f"key {key[:60]!r} occurs twice")
         values[key] = _node(next(events), events, file, depth + 1)
     return values
 
 
-def _at(event: yaml.Event, file: str | os.PathLike[str], message: str) -> ArtifactError:
+def _error_at(event: yaml.Event, file: str | os.PathLike[str], message: str) -> ArtifactError:
     line = event.start_mark.line + 1 if event.start_mark else None
     return ArtifactError(message, file=file, where=line, hint=HINT)
 

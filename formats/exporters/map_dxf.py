@@ -1,36 +1,35 @@
-"""Landmark maps as DXF, for CAD: true places in mm, a block for each way to lay a landmark.
+"""Landmark maps as DXF for CAD: positions in mm, a block for each code.
 
-Layers: BARS (outlines of the bars), POLES (an arrow from south to north in each), CENTRES
-(a point each), LABELS (row, column and letters), WALLS. A landmark is an insert of the block
-``LANDMARK_<letters>``, so that CAD counts them for the bill of materials. The map's frame is
-that of the drawing. Landmarks lie as built where that is known; the bars are those of the
-design. Written with ezdxf as DXF R2010.
+Layers: BARS (outlines of the bars), POLES (an arrow from south to north in each bar), CENTRES (a
+point each), LABELS (row, column and letters), WALLS. A landmark is an insert of the block
+``LANDMARK_<letters>``, so that CAD counts them for the bill of materials. The frame of the drawing
+is that of the map. Positions are as built if that is known; the bars are those of the design.
+Written with ezdxf as DXF R2010.
 """
 
 from __future__ import annotations
 
 import io
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 from locatk.core.drawing import Line, Polygon
 from locatk.core.landmarks.drawing.landmark import bar_outlines, pole_arrow, pole_letters
 from locatk.core.landmarks.landmark import name
 from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
 
-if TYPE_CHECKING:
-    from ezdxf.document import Drawing
-
 LAYERS = {"BARS": 7, "POLES": 1, "CENTRES": 5, "LABELS": 8, "WALLS": 6}
-"""Layers and their colours, by AutoCAD's index."""
+"""Layers and their colours in AutoCAD's colour index."""
+
+MAX_LABEL_HEIGHT_MM = 8.0
 
 
 def dumps_dxf(floor: FloorMap) -> str:
-    """A DXF of a map; the same map and ezdxf give the same text."""
+    """Return the DXF text of a map; the same map and ezdxf give the same text."""
     import ezdxf
     from ezdxf import units
 
-    # Otherwise each file bears the time and two random ids.
+    # Otherwise each file contains the time and two random ids.
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
     try:
@@ -46,7 +45,7 @@ def dumps_dxf(floor: FloorMap) -> str:
     return stream.getvalue()
 
 
-def _draw(document: Drawing, floor: FloorMap) -> None:
+def _draw(document: Any, floor: FloorMap) -> None:
     from ezdxf.enums import TextEntityAlignment
 
     for layer, colour in LAYERS.items():
@@ -55,20 +54,23 @@ def _draw(document: Drawing, floor: FloorMap) -> None:
         _block(document, floor, code)
     space = document.modelspace()
     pitch = 1e3 * floor.pitch_m
-    height = min(8.0, pitch / 12)
+    height = min(MAX_LABEL_HEIGHT_MM, pitch / 12)
     below = 1e3 * (floor.geometry.radius_m + floor.geometry.bar_width_m / 2) + 0.3 * height
     for cell, (x, y, heading) in zip(floor.cells(), as_built_poses(floor).tolist(), strict=True):
         letters = name(int(floor.codes[cell]))
-        at = (1e3 * x, 1e3 * y)
-        turn = {"rotation": math.degrees(heading)} if heading else {}
-        space.add_blockref(f"LANDMARK_{letters}", at, dxfattribs={"layer": "BARS", **turn})
-        space.add_point(at, dxfattribs={"layer": "CENTRES"})
+        position = (1e3 * x, 1e3 * y)
+        rotation = {"rotation": math.degrees(heading)} if heading else {}
+        space.add_blockref(
+            f"LANDMARK_{letters}", position, dxfattribs={"layer": "BARS", **rotation}
+        )
+        space.add_point(position, dxfattribs={"layer": "CENTRES"})
         space.add_text(
             f"{cell[0]},{cell[1]} {letters}",
             height=height,
             dxfattribs={"layer": "LABELS"},
         ).set_placement(
-            (at[0], at[1] - min(below, pitch / 2 - height)), align=TextEntityAlignment.TOP_CENTER
+            (position[0], position[1] - min(below, pitch / 2 - height)),
+            align=TextEntityAlignment.TOP_CENTER,
         )
     for (row, column), (other_row, _) in sorted(floor.walls):
         x, y = floor.position((row, column))
@@ -78,8 +80,8 @@ def _draw(document: Drawing, floor: FloorMap) -> None:
     _set_extents(document, floor)
 
 
-def _block(document: Drawing, floor: FloorMap, code: int) -> None:
-    """One way to lay a landmark, about its centre."""
+def _block(document: Any, floor: FloorMap, code: int) -> None:
+    """Add the block of a code, with the centre of the landmark as its origin."""
     from ezdxf.enums import TextEntityAlignment
 
     block = document.blocks.new(f"LANDMARK_{name(code)}")
@@ -97,8 +99,8 @@ def _block(document: Drawing, floor: FloorMap, code: int) -> None:
             )
 
 
-def _set_extents(document: Drawing, floor: FloorMap) -> None:
-    """What a viewer shows first."""
+def _set_extents(document: Any, floor: FloorMap) -> None:
+    """Set the initial view."""
     rows, columns = floor.shape
     half = floor.pitch_m / 2
     x, y = floor.origin_m

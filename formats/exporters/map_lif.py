@@ -1,15 +1,15 @@
 """Landmark maps as a layout in VDMA's Layout Interchange Format, for master controls.
 
 LIF 1.0.0 (VDMA, "LIF - Layout Interchange Format", March 2024; the JSON of
-github.com/Intralogistics-2X-LIF/Layout-Interchange-Format) in metres. What it holds here:
+github.com/Intralogistics-2X-LIF/Layout-Interchange-Format) in metres:
 
-- each landmark is a node, ``r<row>c<column>``, at its place as built where that is known;
-  its ``nodeName`` are the letters of its bars, as in ``NNSN``, counter-clockwise from +x;
-- each way from a landmark to a neighbour is an edge: between two neighbours without an edge
-  in either direction is a wall;
-- there are no stations, and one type of vehicle, :data:`VEHICLE`.
+- a landmark is a node ``r<row>c<column>`` at its position, as built if that is known; its
+  ``nodeName`` is the letters of its bars, as in ``NNSN``, counter-clockwise from +x;
+- a passage from a landmark to a neighbour is an edge; neighbours without an edge in either
+  direction are separated by a wall;
+- there are no stations, and there is one type of vehicle, :data:`VEHICLE`.
 
-The alphabet, the window, the bars and the headings as built are not in it.
+The layout does not contain the alphabet, the window, the bars and the headings as built.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ LIF_VERSION = "1.0.0"
 
 VEHICLE = "locatk.landmarks"
 
-DECIMALS = 9
-"""Of metres."""
+POSITION_DECIMALS = 9
+"""Decimals of a position in metres."""
 
-FARTHEST_M = 1e4
-"""No floor is larger: what is above is in another unit."""
+MAX_COORDINATE_M = 1e4
+"""10 km, larger than any floor: larger numbers are in another unit."""
 
 
 def dumps_lif(floor: FloorMap, stamp: datetime) -> str:
-    """The layout of a map; the same map and stamp give the same text.
+    """Return the layout of a map; the same map and stamp give the same text.
 
     Parameters
     ----------
     floor : FloorMap
     stamp : datetime
-        The layout's state is of then; with its time zone.
+        Time of the layout, with its time zone.
     """
     title = floor.name or "landmarks"
     rows, columns = floor.shape
@@ -56,7 +56,7 @@ def dumps_lif(floor: FloorMap, stamp: datetime) -> str:
             "nodeDescription": f"landmark of code {floor.codes[cell]} in row {cell[0]}, "
             f"column {cell[1]}",
             "mapId": title,
-            "nodePosition": {"x": round(x, DECIMALS), "y": round(y, DECIMALS)},
+            "nodePosition": {"x": round(x, POSITION_DECIMALS), "y": round(y, POSITION_DECIMALS)},
             "vehicleTypeNodeProperties": [{"vehicleTypeId": VEHICLE}],
         }
         for cell, (x, y, _) in zip(floor.cells(), as_built_poses(floor).tolist(), strict=True)
@@ -75,7 +75,7 @@ def dumps_lif(floor: FloorMap, stamp: datetime) -> str:
                 }
             ],
         }
-        for cell, other in _ways(floor)
+        for cell, other in _passages(floor)
     ]
     layout = {
         "layoutId": title,
@@ -106,60 +106,60 @@ def loads_lif(
     pitch_m: float | None = None,
     tolerance_m: float = MAX_OFFSET_M,
 ) -> FloorMap:
-    """The map of a layout; pitch and cells are found from the places of the nodes.
+    """Parse a layout; pitch and cells are estimated from the positions of the nodes.
 
-    A way that leads in one direction only is no wall: a map that is unique with it is unique
+    An edge in one direction only is not a wall: a map that is unique with this passage is unique
     without it, too.
 
     Parameters
     ----------
     text : str
     file : path
-        Named in errors.
+        Name in errors.
     pitch_m, tolerance_m
         See :func:`locatk.core.landmarks.map.grid_fit.fit_grid`.
 
     Raises
     ------
     FormatError
-        It is no LIF, or a node names no landmark; the node or the key is named.
+        It is not LIF, or the name of a node is not a landmark; the error names the node or the key.
     InputError
-        The places lie on no grid, or one is off it: its node is named.
+        The positions are not on a grid; the error names a deviating node.
     """
-    read = _Reader(file)
-    layout = read.layout(text)
+    reader = _LayoutReader(file)
+    layout = reader.layout(text)
     codes, poses, names = [], [], []
     index: dict[str, int] = {}
-    for number, node in enumerate(read.objects(layout, "nodes")):
+    for number, node in enumerate(reader.objects(layout, "nodes")):
         where = f"nodes[{number}]"
-        node_id = read.text(node, "nodeId", where)
+        node_id = reader.text(node, "nodeId", where)
         if node_id in index:
-            raise read.error(f"node {node_id!r} is there twice", where)
+            raise reader.error(f"node {node_id!r} occurs twice", where)
         index[node_id] = number
-        codes.append(read.code(node, where, node_id))
-        poses.append((*read.place(node, where), 0.0))
+        codes.append(reader.code(node, where, node_id))
+        poses.append((*reader.position(node, where), 0.0))
         names.append(f"node {node_id!r}")
     if not codes:
-        raise read.error("a layout without nodes", "nodes")
+        raise reader.error("a layout without nodes", "nodes")
     with error_context(file):
         floor = floor_from_poses(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
-    ways = set()
-    for number, edge in enumerate(read.objects(layout, "edges")):
-        ends = [read.text(edge, key, f"edges[{number}]") for key in ("startNodeId", "endNodeId")]
+    edges = set()
+    for number, edge in enumerate(reader.objects(layout, "edges")):
+        ends = [reader.text(edge, key, f"edges[{number}]") for key in ("startNodeId", "endNodeId")]
         if all(end in index for end in ends):  # an end may be in another layout
-            ways.add(frozenset(index[end] for end in ends))
+            edges.add(frozenset(index[end] for end in ends))
     by_cell = dict(zip(_cells(floor, poses), range(len(poses)), strict=True))
     walls = {
         (cell, other)
-        for cell, other in _ways(floor)
-        if cell < other and frozenset((by_cell[cell], by_cell[other])) not in ways
+        for cell, other in _passages(floor)
+        if cell < other and frozenset((by_cell[cell], by_cell[other])) not in edges
     }
     title = layout.get("layoutName")
     return replace(floor, walls=frozenset(walls), name=title if isinstance(title, str) else "")
 
 
-class _Reader:
-    """What of the JSON is read, each checked; ``file`` is named in errors."""
+class _LayoutReader:
+    """Checked access to the JSON; errors name ``file``."""
 
     def __init__(self, file: str | os.PathLike[str]) -> None:
         self._file = file
@@ -168,7 +168,7 @@ class _Reader:
         return FormatError(message, file=self._file, where=where, hint=hint)
 
     def layout(self, text: str) -> dict[str, Any]:
-        """The only layout."""
+        """Return the only layout of the text."""
         try:
             data = json.loads(text.removeprefix("\ufeff"))
         except json.JSONDecodeError as error:
@@ -178,59 +178,64 @@ class _Reader:
         except (ValueError, RecursionError) as error:
             raise FormatError(f"not JSON ({error})", file=self._file) from None
         if not isinstance(data, dict) or "layouts" not in data:
-            raise FormatError("no LIF: expected the key 'layouts'", file=self._file)
+            raise FormatError("not LIF: expected the key 'layouts'", file=self._file)
         layouts = self.objects(data, "layouts")
         if len(layouts) != 1:
             raise self.error(
                 f"{len(layouts)} layouts, expected one",
                 "layouts",
-                "A landmark map is one floor: leave one layout in the file",
+                "A landmark map is one floor: keep one layout in the file",
             )
         return layouts[0]
 
     def objects(self, data: dict[str, Any], key: str) -> list[dict[str, Any]]:
+        """Return a list of objects."""
         value = data.get(key)
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise self.error("expected a list of objects", key)
         return value
 
     def text(self, data: dict[str, Any], key: str, where: str) -> str:
+        """Return a string that is not empty; ``where`` is the path of ``data``."""
         value = data.get(key)
         if not isinstance(value, str) or not value:
             raise self.error("expected a string", f"{where}.{key}")
         return value
 
     def code(self, node: dict[str, Any], where: str, node_id: str) -> int:
+        """Return the code of the landmark that is the name of a node."""
         letters = node.get("nodeName")
         try:
             return code_of(letters if isinstance(letters, str) else "")
         except ValueError:
             raise self.error(
-                f"node {node_id!r} names no landmark",
+                f"the name of node {node_id!r} is not a landmark",
                 f"{where}.nodeName",
-                "Name it by the letters of its bars, as in NNSN: counter-clockwise from +x",
+                "Give the letters of its bars as the name, as in NNSN: counter-clockwise from +x",
             ) from None
 
-    def place(self, node: dict[str, Any], where: str) -> tuple[float, float]:
+    def position(self, node: dict[str, Any], where: str) -> tuple[float, float]:
+        """Return the position of a node in metres."""
         position = node.get("nodePosition")
-        found = []
+        coordinates = []
         for axis in ("x", "y"):
             value = position.get(axis) if isinstance(position, dict) else None
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if value is None or not number or not abs(value) <= FARTHEST_M:
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if value is None or not is_number or not abs(value) <= MAX_COORDINATE_M:
                 raise self.error(
-                    f"expected x and y in metres, up to {FARTHEST_M:g}", f"{where}.nodePosition"
+                    f"expected x and y in metres, up to {MAX_COORDINATE_M:g}",
+                    f"{where}.nodePosition",
                 )
-            found.append(float(value))
-        return found[0], found[1]
+            coordinates.append(float(value))
+        return coordinates[0], coordinates[1]
 
 
 def _node_id(cell: Cell) -> str:
     return f"r{cell[0]}c{cell[1]}"
 
 
-def _ways(floor: FloorMap) -> Iterator[tuple[Cell, Cell]]:
-    """Cells between which a robot can go, in both directions."""
+def _passages(floor: FloorMap) -> Iterator[tuple[Cell, Cell]]:
+    """Yield the pairs of cells between which a robot can drive, in both directions."""
     for cell in floor.cells():
         for heading in range(4):
             if floor.is_passable(cell, heading):
@@ -238,8 +243,9 @@ def _ways(floor: FloorMap) -> Iterator[tuple[Cell, Cell]]:
 
 
 def _cells(floor: FloorMap, poses: list[tuple[float, float, float]]) -> list[Cell]:
-    """The cell of each place."""
+    """Return the cell of each pose."""
     x, y = floor.origin_m
     return [
-        (round((at[1] - y) / floor.pitch_m), round((at[0] - x) / floor.pitch_m)) for at in poses
+        (round((pose[1] - y) / floor.pitch_m), round((pose[0] - x) / floor.pitch_m))
+        for pose in poses
     ]

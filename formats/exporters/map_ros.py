@@ -1,11 +1,11 @@
 """Landmark maps as an occupancy grid of ROS: the YAML and PGM of ``map_server``.
 
-The format is that of wiki.ros.org/map_server and of Nav2. Free floor around landmarks is
-white, the landmarks' territories (where the field of one reaches the threshold of the map's
-bars) a light grey that ``map_server`` still takes for free, cells without a landmark the grey
-of the unknown, walls black and one pixel wide. The picture's first row is the map's greatest
-y, and ``origin`` the lower left corner of its lower left pixel: half a pitch before cell
-(0, 0). Landmarks are drawn as built where that is known.
+The format is that of wiki.ros.org/map_server and of Nav2. Free floor around landmarks is white.
+Territories of landmarks (field of at least the threshold of the map's bars) are light grey, which
+is still free for ``map_server``. Cells without a landmark are unknown; walls are black and one
+pixel wide. The first row of the image has the greatest y; ``origin`` is the lower left corner of
+the lower left pixel, half a pitch before cell (0, 0). Landmarks are drawn as built if that is
+known.
 """
 
 from __future__ import annotations
@@ -20,31 +20,32 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap, as_built_landmark
 
-RESOLUTION_M = 0.010
+DEFAULT_RESOLUTION_M = 0.010
+"""Side of a pixel."""
 
 FREE, TERRITORY, UNKNOWN, OCCUPIED = 254, 230, 205, 0
-"""Grey levels; of :data:`FREE_THRESHOLD` all from 206 are free."""
+"""Grey levels; by :data:`FREE_THRESHOLD` all from 206 are free."""
 
 FREE_THRESHOLD, OCCUPIED_THRESHOLD = 0.196, 0.65
 
-LARGEST_SIDE = 30_000
+MAX_SIDE_PX = 30_000
 
 Pixels = NDArray[np.uint8]
 
 
-def draw(floor: FloorMap, resolution_m: float = RESOLUTION_M) -> Pixels:
-    """Grey levels (height, width) of a map; the first row has the greatest y.
+def draw_grid(floor: FloorMap, resolution_m: float = DEFAULT_RESOLUTION_M) -> Pixels:
+    """Return the grey levels (height, width) of a map; the first row has the greatest y.
 
     Raises
     ------
     InputError
-        The picture would be too large, or a cell no pixel.
+        The image would be too large, or a cell smaller than four pixels.
     """
     rows, columns = floor.shape
     size = [math.ceil(count * floor.pitch_m / resolution_m - 1e-9) for count in (rows, columns)]
-    if max(size) > LARGEST_SIDE:
+    if max(size) > MAX_SIDE_PX:
         raise InputError(
-            f"a picture of {size[1]} x {size[0]} pixels, more than {LARGEST_SIDE} a side",
+            f"an image of {size[1]} x {size[0]} pixels, more than {MAX_SIDE_PX} a side",
             hint="Give a coarser --resolution",
         )
     if resolution_m > floor.pitch_m / 4:
@@ -56,11 +57,11 @@ def draw(floor: FloorMap, resolution_m: float = RESOLUTION_M) -> Pixels:
     left, bottom = _corner(floor)
     centre = [(np.arange(n) + 0.5) * resolution_m for n in size]  # from the corner: y, x
     cell = [np.floor(c / floor.pitch_m).astype(int) for c in centre]
-    known = np.full((max(cell[0][-1] + 1, rows), max(cell[1][-1] + 1, columns)), False)
-    known[:rows, :columns] = floor.codes != HOLE_CODE
-    upward = np.where(known[np.ix_(*cell)], FREE, UNKNOWN).astype(np.uint8)
-    for at in floor.cells():
-        (x, y, heading), strength = as_built_landmark(floor, at)
+    has_landmark = np.full((max(cell[0][-1] + 1, rows), max(cell[1][-1] + 1, columns)), False)
+    has_landmark[:rows, :columns] = floor.codes != HOLE_CODE
+    upward = np.where(has_landmark[np.ix_(*cell)], FREE, UNKNOWN).astype(np.uint8)
+    for position in floor.cells():
+        (x, y, heading), strength = as_built_landmark(floor, position)
         spans = []
         for middle, count in ((y - bottom, size[0]), (x - left, size[1])):
             first, last = ((middle + s * floor.pitch_m / 2) / resolution_m for s in (-1, 1))
@@ -77,14 +78,14 @@ def draw(floor: FloorMap, resolution_m: float = RESOLUTION_M) -> Pixels:
     return np.ascontiguousarray(upward[::-1])
 
 
-def pgm(pixels: Pixels) -> bytes:
-    """A binary PGM of grey levels."""
+def dumps_pgm(pixels: Pixels) -> bytes:
+    """Return a binary PGM of grey levels."""
     height, width = pixels.shape
     return b"P5\n%d %d\n255\n" % (width, height) + pixels.tobytes()
 
 
-def yaml(floor: FloorMap, image: str, resolution_m: float = RESOLUTION_M) -> str:
-    """The YAML beside a picture called ``image``."""
+def dumps_yaml(floor: FloorMap, image: str, resolution_m: float = DEFAULT_RESOLUTION_M) -> str:
+    """Return the YAML of an image whose file is ``image``."""
     left, bottom = _corner(floor)
     return (
         f"image: {json.dumps(image)}\n"
@@ -98,13 +99,13 @@ def yaml(floor: FloorMap, image: str, resolution_m: float = RESOLUTION_M) -> str
 
 
 def _corner(floor: FloorMap) -> tuple[float, float]:
-    """x and y where the picture begins."""
+    """Return x and y of the lower left corner of the image."""
     x, y = floor.origin_m
     return x - floor.pitch_m / 2, y - floor.pitch_m / 2
 
 
 def _draw_walls(upward: Pixels, floor: FloorMap, resolution_m: float) -> None:
-    """Black lines midway between cells; the first row of ``upward`` has the least y."""
+    """Draw black lines midway between cells; the first row of ``upward`` has the least y."""
 
     def pixel(cells: float, axis: int) -> int:
         return min(int(cells * floor.pitch_m / resolution_m + 1e-9), upward.shape[axis] - 1)

@@ -17,7 +17,7 @@ from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts.maps import attached_map as read_map
-from locatk.formats.artifacts.receiver import read_receivers, texts_of
+from locatk.formats.artifacts.receiver import read_receivers
 from locatk.formats.artifacts.scene import SCENE_FILE, dumps_scene
 from locatk.formats.artifacts.scene import attached_scene as read_scene
 from locatk.formats.artifacts.sheets import attached_camera as read_camera
@@ -206,7 +206,7 @@ def write_session(
     records = station_records(stations)
     scene = add_station_data(scene, stations)
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
-    receiver_texts = texts_of(receivers or {}, devices)
+    receiver_texts = receiver_attachments(receivers or {}, devices)
     streams = [sweep_messages(sweeps), *reference_streams(truth, odometry)]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)

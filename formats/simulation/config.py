@@ -22,9 +22,10 @@ from typing import Any
 
 from locatk.core.errors import InputError
 from locatk.formats.artifacts import toml
-from locatk.formats.artifacts.base import head
-from locatk.formats.artifacts.toml import Inline, Table
-from locatk.formats.simulation.settings import NO_DEFAULT, FilePath, Number, Requirement, Setting
+from locatk.formats.artifacts.kinds import FilePath, Number
+from locatk.formats.artifacts.schema import Key, Table, header, parse_document
+from locatk.formats.artifacts.toml import Inline
+from locatk.formats.simulation.settings import NO_DEFAULT, Requirement, Setting
 
 FORMAT_VERSION = 1
 """Version of the configuration files of all simulators."""
@@ -112,7 +113,7 @@ class SimulationConfig:
             f"# Settings of `locatk simulate {self.system} --config FILE`.",
             "# A key after # has its default, or an example of a value. Remove the # to set it.",
             "# Options of the command line override this file.",
-            *toml.dumps(head(self._format, FORMAT_VERSION)).splitlines(),
+            *toml.dumps(header(self._format, FORMAT_VERSION)).splitlines(),
         ]
         for table, members in self.tables.items():
             lines += ["", f"[{table}]"]
@@ -143,37 +144,48 @@ class SimulationConfig:
         ArtifactError
             It is not TOML or of another simulator, or a key is unknown or has a wrong value.
         """
-        return self._parse(toml.read(path), Path(path).parent)
+        return self._parse(toml.read(path), path, Path(path).parent)
 
     def loads(self, text: str) -> dict[str, Any]:
         """Read the settings of TOML text like :meth:`read`, relative to the working folder."""
-        return self._parse(toml.loads(text, f"<{self._format}>"), Path())
+        file = f"<{self._format}>"
+        return self._parse(toml.loads(text, file), file, Path())
 
     @property
     def _format(self) -> str:
         return f"locatk-simulation-{self.system}"
 
-    def _parse(self, table: Table, folder: Path) -> dict[str, Any]:
-        toml.check_format(table, self._format, FORMAT_VERSION)
+    def _parse(
+        self, data: dict[str, Any], file: str | os.PathLike[str], folder: Path
+    ) -> dict[str, Any]:
+        tables = parse_document(data, file, self._format, FORMAT_VERSION, self._schema)
         settings = {}
-        for name, members in self.tables.items():
-            section = table.table(name, None)
-            if section is None:
-                continue
-            for setting in members:
-                value = section.raw(setting.name, None)
-                if value is None:
-                    continue
-                try:
-                    value = setting.kind.parse(value)
-                except ValueError as error:
-                    raise section.error(setting.name, str(error)) from None
+        for setting in self.settings:
+            value = (tables[setting.table] or {}).get(setting.name)
+            if value is not None:
                 if isinstance(setting.kind, FilePath):
                     value = setting.kind.resolve(value, folder)
                 settings[setting.key] = value
-            section.end()
-        table.end()
         return settings
+
+    @property
+    def _schema(self) -> Table:
+        """Tables of the file; values stay in its units."""
+        return Table(
+            tuple(
+                Key(
+                    name,
+                    Table(
+                        tuple(
+                            Key(s.name, s.kind, default=None, is_si=False, value_name=s.name)
+                            for s in members
+                        )
+                    ),
+                    default=None,
+                )
+                for name, members in self.tables.items()
+            )
+        )
 
     # ---- settings
 
@@ -202,10 +214,10 @@ class SimulationConfig:
     def _check_combinations(self, settings: Mapping[str, Any]) -> None:
         """Raise an error for settings that cannot be combined; those that are off do not count."""
         for first, second in self.conflicts:
-            one = next((key for key in first if _is_set(settings, key)), None)
-            other = next((key for key in second if _is_set(settings, key)), None)
-            if one and other:
-                titles = f"{self.setting(one).title} or {self.setting(other).title}"
+            first_key = next((key for key in first if _is_set(settings, key)), None)
+            second_key = next((key for key in second if _is_set(settings, key)), None)
+            if first_key and second_key:
+                titles = f"{self.setting(first_key).title} or {self.setting(second_key).title}"
                 raise SettingsError(f"Give {titles}, not both")
         for need in self.requirements:
             if not _is_set(settings, need.key):

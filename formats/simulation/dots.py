@@ -14,9 +14,7 @@ from locatk.core.dots.simulation import session as simulation
 from locatk.core.dots.simulation.paths import PATHS
 from locatk.core.dots.simulation.session import SimulationOptions
 from locatk.formats.artifacts import sheets
-from locatk.formats.sessions.frames import Shot, write_shots
-from locatk.formats.simulation.config import SettingsError, SimulationConfig
-from locatk.formats.simulation.settings import (
+from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     FRACTION,
     NOT_NEGATIVE,
@@ -25,11 +23,12 @@ from locatk.formats.simulation.settings import (
     FilePath,
     Integer,
     Number,
-    Requirement,
     Row,
-    Setting,
     Text,
 )
+from locatk.formats.sessions.frames import Shot, write_shots
+from locatk.formats.simulation.config import SettingsError, SimulationConfig
+from locatk.formats.simulation.settings import Requirement, Setting
 
 CODECS = ("anoto", "libdots", "microdots")
 

@@ -21,10 +21,7 @@ from locatk.core.landmarks.simulation.session import (
     simulate,
 )
 from locatk.formats.artifacts import maps
-from locatk.formats.files import read_text
-from locatk.formats.sessions import field_samples
-from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
-from locatk.formats.simulation.settings import (
+from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     CELL,
     FRACTION,
@@ -35,11 +32,13 @@ from locatk.formats.simulation.settings import (
     ListOf,
     Number,
     Record,
-    Requirement,
     Row,
-    Setting,
     Text,
 )
+from locatk.formats.files import read_text
+from locatk.formats.sessions import field_samples
+from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
+from locatk.formats.simulation.settings import Requirement, Setting
 
 STRATEGY = "robot.strategy"
 START, PATH_FILE, CELLS = "robot.start", "robot.path_file", "robot.cells"

@@ -10,18 +10,18 @@ from typing import Any
 
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
-from locatk.formats.artifacts.receiver import read_receiver
-from locatk.formats.sessions import observations
-from locatk.formats.simulation.config import SimulationConfig
-from locatk.formats.simulation.settings import (
+from locatk.formats.artifacts.kinds import (
     FRACTION_BELOW_1,
     NOT_NEGATIVE,
     POSITIVE,
     Boolean,
     FilePath,
     Integer,
-    Setting,
 )
+from locatk.formats.artifacts.receiver import read_receiver
+from locatk.formats.sessions import observations
+from locatk.formats.simulation.config import SimulationConfig
+from locatk.formats.simulation.settings import Setting
 
 DECK_NAME = "deck"
 """Name of Bitcraze's Lighthouse deck as a receiver."""

@@ -16,10 +16,7 @@ from locatk.core.polaris.simulation.session import (
     simulate,
     usual_bar,
 )
-from locatk.formats.artifacts import tags as tag_files
-from locatk.formats.sessions import field_samples
-from locatk.formats.simulation.config import SimulationConfig
-from locatk.formats.simulation.settings import (
+from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     FRACTION,
     FRACTION_BELOW_1,
@@ -30,9 +27,12 @@ from locatk.formats.simulation.settings import (
     Integer,
     ListOf,
     Number,
-    Setting,
     Text,
 )
+from locatk.formats.artifacts.tags import read_array, read_tags
+from locatk.formats.sessions import field_samples
+from locatk.formats.simulation.config import SimulationConfig
+from locatk.formats.simulation.settings import Setting
 
 DEFAULT_CAR = "robot"
 
@@ -409,7 +409,7 @@ def simulation_options(settings: Mapping[str, Any]) -> SimulationOptions:
     is_noise_measured = values.pop(MEASURED_NOISE, False)
     file = values.pop(ARRAY_FILE, None)
     if file is not None:
-        return SimulationOptions(array=tag_files.read_array(Path(file)), **values)
+        return SimulationOptions(array=read_array(Path(file)), **values)
     parameters = {name: values.pop(key) for key, name in ARRAY_PARAMETERS.items() if key in values}
     if is_noise_measured:
         parameters["noise_t"] = None
@@ -437,7 +437,7 @@ def write_simulation(
         A file is missing or invalid, or the settings cannot be simulated.
     """
     car = CARS[settings.get("robot.car", DEFAULT_CAR)]
-    tags = tag_files.read_tags(tag_file) if tag_file else car.tags
+    tags = read_tags(tag_file) if tag_file else car.tags
     options = simulation_options(settings)
     simulated = simulate(tags, options)
     warnings = _warnings(simulated)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from locatk.core.errors import ArtifactError
-from locatk.formats.artifacts.base import Artifact
+from locatk.formats.artifacts.schema import Artifact
 
 
 @pytest.fixture

@@ -24,8 +24,7 @@ from locatk.core.landmarks.preprocessing import preprocess, segment_visits
 from locatk.core.landmarks.simulation.options import SimulationOptions
 from locatk.core.landmarks.simulation.session import simulate
 from locatk.core.landmarks.solver import solve
-from locatk.formats.artifacts.map_library import design as design_or_crop
-from locatk.formats.artifacts.map_library import entries
+from locatk.formats.artifacts.map_library import design_or_crop, entries
 from locatk.formats.artifacts.maps import dumps_map, loads_map
 from locatk.formats.benchmarks import Figure
 from locatk.formats.benchmarks.landmarks.global_localization import PUBLISHED, SIDE, read_published

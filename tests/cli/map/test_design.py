@@ -57,7 +57,7 @@ def bad(made: Path, path: Path) -> Path:
 # ---- design
 
 
-def test_a_map_is_written_and_told(locatk, tmp_path: Path) -> None:
+def test_design_writes_and_prints_a_map(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     result = locatk("map", "design", "6x7", "-o", path, "--name", "hall", "--seed", 5)
     assert result.exit_code == 0, result.stderr
@@ -72,7 +72,7 @@ def test_a_map_is_written_and_told(locatk, tmp_path: Path) -> None:
     assert "6 x 7 at 200 mm" in result.stdout
     assert f"Readings   {len(words)} under all headings" in result.stdout
     assert "Bars       168 of 30 x 10 x 5 mm, 1.2 T" in result.stdout
-    assert all(len(line) <= 100 for line in result.stdout.splitlines()[2:])
+    assert all(len(line) <= 80 for line in result.stdout.splitlines()[2:])
     # The same seed gives the same file, another one another map.
     again, other = tmp_path / "again.toml", tmp_path / "other.toml"
     locatk("map", "design", "6x7", "-o", again, "--name", "hall", "--seed", 5)
@@ -88,7 +88,7 @@ def test_patterns_alone(locatk, tmp_path: Path) -> None:
     assert len(words) == len(set(words)) == 64
 
 
-def test_holes_and_walls_are_where_they_were_asked_for(locatk, tmp_path: Path) -> None:
+def test_holes_and_walls_are_at_the_requested_cells(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     result = locatk(
         "map", "design", "6x7", "--forbid", "2,3;4,0-2", "--forbid", "0-1,6",
@@ -104,11 +104,11 @@ def test_holes_and_walls_are_where_they_were_asked_for(locatk, tmp_path: Path) -
     assert "6 holes, 7 walls" in result.stdout
 
 
-def test_one_misread_is_noticed(locatk, tmp_path: Path) -> None:
+def test_one_misread_landmark_is_detected(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     result = locatk("map", "design", "5x5", "--detect", 1, "-o", path)
     assert result.exit_code == 0, result.stderr
-    assert "1 misread landmark always noticed" in result.stdout
+    assert "1 misread landmark always detected" in result.stdout
     words = np.array(readings_by_hand(read_map(path)))
     differ = (words[:, None] != words[None]).sum(axis=-1)
     assert differ[~np.eye(len(words), dtype=bool)].min() >= 2
@@ -136,7 +136,7 @@ def test_the_geometry_is_kept(locatk, tmp_path: Path) -> None:
     assert floor.pitch_m == 0.2333
 
 
-def test_json_is_all_that_is_printed(locatk, tmp_path: Path) -> None:
+def test_stdout_is_one_json_object(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     result = locatk("map", "design", "5x6", "--pitch", 150, "-o", path, "--json")
     assert result.exit_code == 3, result.stderr
@@ -157,7 +157,7 @@ def test_json_is_all_that_is_printed(locatk, tmp_path: Path) -> None:
     assert checked["map"] == told["map"]
 
 
-def test_nothing_is_overwritten_unasked(locatk, made: Path) -> None:
+def test_outputs_are_not_overwritten_without_the_option(locatk, made: Path) -> None:
     before = made.read_bytes()
     result = locatk("map", "design", "5x5", "-o", made)
     assert result.exit_code == 1
@@ -199,7 +199,7 @@ def test_nothing_is_overwritten_unasked(locatk, made: Path) -> None:
     ],
     ids=str,
 )
-def test_designs_that_cannot_be(
+def test_impossible_designs_are_refused(
     locatk, tmp_path: Path, options: list[object], status: int, said: str
 ) -> None:
     result = locatk("map", "design", *options, "-o", tmp_path / "map.toml")
@@ -216,7 +216,7 @@ def test_landmark_prints_the_tables(locatk) -> None:
     result = locatk("map", "design", "--landmark")
     assert result.exit_code == 0, result.stderr
     assert result.stderr == ""
-    assert all(len(line) <= 100 for line in result.stdout.splitlines())
+    assert all(len(line) <= 80 for line in result.stdout.splitlines())
     rows = [line.split() for line in result.stdout.splitlines()]
     (nnns,) = [row for row in rows if row[:3] == ["3", "NNNS", "6"]]
     assert nnns[3:] == ["6.02+", "44.23-", "90.00+", "135.77-", "173.98+", "270.00-"]
@@ -274,10 +274,10 @@ def test_check_proves_a_map(locatk, made: Path) -> None:
     assert "each is unique" in result.stdout
     for fault in ("flipped bar", "missing bar", "missing landmark"):
         assert fault in result.stdout
-    assert all(len(line) <= 100 for line in result.stdout.splitlines()[1:])
+    assert all(len(line) <= 80 for line in result.stdout.splitlines()[1:])
 
 
-def test_check_shows_duplicates_with_both_places(locatk, made: Path, tmp_path: Path) -> None:
+def test_check_shows_duplicates_with_both_positions(locatk, made: Path, tmp_path: Path) -> None:
     path = bad(made, tmp_path / "bad.toml")
     result = locatk("map", "check", path)
     assert result.exit_code == 1
@@ -301,19 +301,21 @@ def test_check_shows_duplicates_with_both_places(locatk, made: Path, tmp_path: P
     assert word(first["one"]) == word(first["other"])
 
 
-def test_check_holds_a_map_to_its_promise(locatk, made: Path, tmp_path: Path) -> None:
+def test_check_compares_with_the_stated_detection(locatk, made: Path, tmp_path: Path) -> None:
     path = tmp_path / "promise.toml"
     write_map(path, replace(read_map(made), detect=2))
     result = locatk("map", "check", path)
     assert result.exit_code == 1
-    assert "2 misread landmarks shall be noticed" in result.stderr
+    assert "2 misread landmarks should be detected" in result.stderr
     both = locatk("map", "check", path, made, bad(made, tmp_path / "bad.toml"), "-q")
     assert both.exit_code == 1
     assert "2 of 3 maps do not hold" in both.stderr
     assert locatk("map", "check", made, made).exit_code == 0
 
 
-def test_check_says_what_was_built_otherwise(locatk, made: Path, tmp_path: Path) -> None:
+def test_check_warns_of_landmarks_that_differ_from_the_design(
+    locatk, made: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "built.toml"
     built = AsBuiltLandmark(
         0, 0, 0, np.array([1.0, -1, 1, 0]), np.full(7, np.nan), 1, ("missing:3",)
@@ -325,7 +327,7 @@ def test_check_says_what_was_built_otherwise(locatk, made: Path, tmp_path: Path)
     assert "at 1,2" in result.stderr
 
 
-def test_check_refuses_what_is_no_map(locatk, tmp_path: Path) -> None:
+def test_check_refuses_other_files(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     path.write_text("format = 'locatk-tag'\nformat_version = 1\n")
     assert locatk("map", "check", path).exit_code == 1

@@ -78,7 +78,7 @@ def test_a_switch_of_the_file_is_turned_off(locatk, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("system", "missing"), [("landmarks", "'MAP_FILE'"), ("polaris", "'-o' / '--output'")]
 )
-def test_what_a_simulation_needs_is_demanded(locatk, system: str, missing: str) -> None:
+def test_required_arguments_are_named(locatk, system: str, missing: str) -> None:
     result = locatk("simulate", system)
     assert result.exit_code == 2
     assert missing in result.stderr

@@ -126,7 +126,7 @@ def test_each_option_reaches_the_frames(locatk, tmp_path: Path) -> None:
     assert sheets.attached_camera(session) is None
 
 
-def test_a_scale_that_nobody_measured_stays_out_of_the_manifest(locatk, tmp_path: Path) -> None:
+def test_an_unknown_scale_is_not_in_the_manifest(locatk, tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
     options = ("--frames", 1, "--printer-scale", "1.002,0.999")
     assert locatk("simulate", "dots", "-o", out, *options).exit_code == 0
@@ -148,7 +148,7 @@ def test_a_scale_that_nobody_measured_stays_out_of_the_manifest(locatk, tmp_path
         (("--rate", 10000), 1, "exposure_s"),
     ],
 )
-def test_what_cannot_be_is_one_line(
+def test_impossible_settings_give_one_line(
     locatk, tmp_path: Path, options: tuple[object, ...], status: int, said: str
 ) -> None:
     result = locatk("simulate", "dots", "-o", tmp_path / "run.mcap", *options)
@@ -175,7 +175,7 @@ def test_a_wrong_setting_is_one_line(locatk, tmp_path: Path, text: str, said: st
     assert not out.exists()
 
 
-def test_nothing_is_overwritten_unasked(locatk, tmp_path: Path) -> None:
+def test_outputs_are_not_overwritten_without_the_option(locatk, tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
     out.write_text("mine")
     assert locatk("simulate", "dots", "-o", out, "--frames", 1).exit_code == 1

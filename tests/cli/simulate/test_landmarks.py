@@ -251,6 +251,7 @@ def test_a_path_from_a_file(locatk, floor: Path) -> None:
     assert "way.csv:3" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_path_of_cells_and_a_pass_with_other_sensors(locatk, floor: Path) -> None:
     out, file = floor.with_name("run.mcap"), floor.with_name("halls.toml")
     cells = ("--cell", "0,0", "--cell", "0,3", "--cell", "1,3")
@@ -275,7 +276,7 @@ def test_a_path_of_cells_and_a_pass_with_other_sensors(locatk, floor: Path) -> N
     holds(out, simulate(FloorMap(CODES), options))
 
 
-def test_what_was_hardly_meant_is_warned_of(locatk, floor: Path) -> None:
+def test_unusual_settings_give_warnings(locatk, floor: Path) -> None:
     out, way = floor.with_name("run.mcap"), floor.with_name("way.csv")
     way.write_text("x_mm,y_mm\n0,-500\n400,-500\n")
     result = locatk("simulate", "landmarks", floor, "-o", out, "--strategy", "path", "--path", way)
@@ -302,7 +303,7 @@ def test_what_was_hardly_meant_is_warned_of(locatk, floor: Path) -> None:
         (("--dead", "rear"), 2, "dead_sensors in [faults]"),
     ],
 )
-def test_what_cannot_be_is_one_line(
+def test_impossible_settings_give_one_line(
     locatk, floor: Path, given: tuple[object, ...], status: int, said: str
 ) -> None:
     result = locatk("simulate", "landmarks", floor, "-o", floor.with_name("run.mcap"), *given)
@@ -353,7 +354,7 @@ def test_a_wrong_setting_is_one_line(
     assert not out.exists()
 
 
-def test_a_map_must_be_one(locatk, floor: Path) -> None:
+def test_other_files_than_maps_are_refused(locatk, floor: Path) -> None:
     out = floor.with_name("run.mcap")
     result = locatk("simulate", "landmarks", floor.with_name("nowhere.toml"), "-o", out)
     assert result.exit_code == 1
@@ -364,6 +365,7 @@ def test_a_map_must_be_one(locatk, floor: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_robot_drives_by_the_published_method(locatk, floor: Path) -> None:
     out = floor.with_name("own.mcap")
     given = ("--strategy", "published", "--landmarks", 1, "--rate", 100, "--seed", 2)

@@ -214,7 +214,7 @@ def test_another_bar_and_the_measured_noise(locatk, tmp_path: Path) -> None:
     assert samples.array.noise_t == pytest.approx([0.89e-6, 0.86e-6, 1.24e-6])
 
 
-def test_what_was_hardly_meant_is_warned_of(locatk, tmp_path: Path) -> None:
+def test_unusual_settings_give_warnings(locatk, tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
     result = locatk("simulate", "polaris", "-o", out, "--lateral", 500)
     assert result.exit_code == 0
@@ -243,7 +243,7 @@ def test_what_was_hardly_meant_is_warned_of(locatk, tmp_path: Path) -> None:
         (("--car", "truck"), 2, "mini"),
     ],
 )
-def test_what_cannot_be_is_one_line(
+def test_impossible_settings_give_one_line(
     locatk, tmp_path: Path, given: tuple[object, ...], status: int, said: str
 ) -> None:
     result = locatk("simulate", "polaris", "-o", tmp_path / "run.mcap", *given)
@@ -290,7 +290,7 @@ def test_an_array_of_the_command_line_replaces_the_sensors_of_the_file(
     assert len(samples.array) == 5
 
 
-def test_nothing_is_overwritten_unasked(locatk, tmp_path: Path) -> None:
+def test_outputs_are_not_overwritten_without_the_option(locatk, tmp_path: Path) -> None:
     out, tag = tmp_path / "run.mcap", tmp_path / "tag.toml"
     out.write_text("mine")
     assert locatk("simulate", "polaris", "-o", out).exit_code == 1
@@ -301,7 +301,7 @@ def test_nothing_is_overwritten_unasked(locatk, tmp_path: Path) -> None:
     assert artifacts.read_tags(tag) == SITE
 
 
-def test_options_of_a_simulation_are_told_if_asked(locatk, tmp_path: Path) -> None:
+def test_options_of_a_simulation_are_shown_with_verbose(locatk, tmp_path: Path) -> None:
     path = tmp_path / "sim.mcap"
     assert locatk("simulate", "polaris", "-o", path).exit_code == 0
     told = locatk("info", path).stdout

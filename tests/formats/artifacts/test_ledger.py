@@ -54,6 +54,7 @@ AREAS = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(AREAS, max_size=5))
 def test_any_areas_come_back(tmp_path_factory: pytest.TempPathFactory, areas: list[Area]) -> None:
     path = tmp_path_factory.mktemp("ledger") / LEDGER_FILE
@@ -78,7 +79,7 @@ def test_any_areas_come_back(tmp_path_factory: pytest.TempPathFactory, areas: li
         ("[[areas]]", "[[areas", "areas"),
     ],
 )
-def test_a_damaged_ledger_is_told_and_left_alone(
+def test_a_damaged_ledger_is_refused_and_not_changed(
     tmp_path: Path, find: str, put: str, where: str
 ) -> None:
     path = tmp_path / LEDGER_FILE
@@ -94,7 +95,7 @@ def test_a_damaged_ledger_is_told_and_left_alone(
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00\xff\x12", b"format = ", b"%PDF-1.6\n"])
-def test_what_is_no_ledger_is_left_alone(tmp_path: Path, content: bytes) -> None:
+def test_other_files_are_refused_and_not_changed(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / LEDGER_FILE
     path.write_bytes(content)
     with pytest.raises(ArtifactError), open_ledger(path):
@@ -102,7 +103,7 @@ def test_what_is_no_ledger_is_left_alone(tmp_path: Path, content: bytes) -> None
     assert path.read_bytes() == content
 
 
-def test_places_that_hold_no_ledger(tmp_path: Path) -> None:
+def test_folders_without_a_ledger(tmp_path: Path) -> None:
     with pytest.raises(MissingDataError), open_ledger(tmp_path / "none" / LEDGER_FILE):
         pass
     with pytest.raises(OutputExistsError), open_ledger(tmp_path):
@@ -121,7 +122,7 @@ def test_a_ledger_that_changed_meanwhile_is_not_overwritten(tmp_path: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="locks of POSIX")
-def test_runs_at_once_take_different_areas(tmp_path: Path) -> None:
+def test_simultaneous_runs_take_different_areas(tmp_path: Path) -> None:
     code = (
         "import sys, time\n"
         "from pathlib import Path\n"
@@ -203,7 +204,7 @@ def test_no_sheet_appears_before_its_area(tmp_path: Path, monkeypatch: pytest.Mo
     ]
 
 
-def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
+def test_existing_sheets_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "out1").write_bytes(b"mine")
     writers: list[Callable[[IO[bytes]], object]] = [lambda stream: stream.write(b"one")] * 2
     with pytest.raises(OutputExistsError):

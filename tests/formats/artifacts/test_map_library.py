@@ -15,7 +15,13 @@ from locatk.core.landmarks.landmark import CODE_COUNT, PATTERN_OF, rotated
 from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, WINDOWS, FloorMap
 from locatk.core.landmarks.map.windows import ALPHABET_CODES, window_readings
 from locatk.formats.artifacts import map_library
-from locatk.formats.artifacts.map_library import Entry, crop, entries, relabelling, turned
+from locatk.formats.artifacts.map_library import (
+    LibraryMap,
+    crop_map,
+    entries,
+    random_relabelling,
+    rotated_map,
+)
 
 LEAST = {
     ("6", "L", 0): 7,
@@ -35,7 +41,7 @@ LEAST = {
 """Side of the square floor that is there at least: as large as annealing reached, or larger."""
 
 
-def wanted(entry: Entry, rows: int, columns: int, seed: int = 0) -> DesignOptions:
+def wanted(entry: LibraryMap, rows: int, columns: int, seed: int = 0) -> DesignOptions:
     return DesignOptions(
         rows, columns, entry.window, entry.alphabet, seed=seed, detect=entry.detect
     )
@@ -43,7 +49,7 @@ def wanted(entry: Entry, rows: int, columns: int, seed: int = 0) -> DesignOption
 
 @pytest.mark.slow
 @pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.file)
-def test_maps_of_the_library_hold(entry: Entry) -> None:
+def test_maps_of_the_library_hold(entry: LibraryMap) -> None:
     """By a count of words that shares nothing with the prover."""
     codes = entry.codes()
     assert codes.shape == (entry.rows, entry.columns)
@@ -63,7 +69,7 @@ def test_maps_of_the_library_hold(entry: Entry) -> None:
 
 
 @pytest.mark.parametrize("mode", LEAST, ids=str)
-def test_sizes_of_the_facts_are_there(mode: tuple[str, str, int]) -> None:
+def test_maps_are_at_least_as_large_as_promised(mode: tuple[str, str, int]) -> None:
     sides = [min(e.rows, e.columns) for e in entries() if (e.alphabet, e.window, e.detect) == mode]
     assert max(sides) >= LEAST[mode]
 
@@ -76,13 +82,13 @@ def test_every_mode_has_a_map() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.file)
-def test_cuts_hold_and_differ_by_seed(entry: Entry) -> None:
+def test_cropped_maps_are_unique_and_differ_by_seed(entry: LibraryMap) -> None:
     rows, columns = max(1, min(9, entry.rows - 1)), min(7, entry.columns)
-    floors = [crop(wanted(entry, rows, columns, seed)) for seed in range(6)]
+    floors = [crop_map(wanted(entry, rows, columns, seed)) for seed in range(6)]
     assert all(floor is not None and floor.shape == (rows, columns) for floor in floors)
     assert all(prove_map(floor, steps=False).holds for floor in floors if floor)
     assert len({floor.codes.tobytes() for floor in floors if floor}) >= 3
-    again = crop(wanted(entry, rows, columns, 3))
+    again = crop_map(wanted(entry, rows, columns, 3))
     assert again is not None
     assert floors[3] is not None
     assert (again.codes == floors[3].codes).all()
@@ -92,25 +98,25 @@ def test_cuts_hold_and_differ_by_seed(entry: Entry) -> None:
         assert set(np.unique(floor.codes)) <= set(ALPHABET_CODES[entry.alphabet])
 
 
-def test_whole_maps_are_cut_in_both_orientations() -> None:
+def test_whole_maps_are_cropped_in_both_orientations() -> None:
     (entry,) = [e for e in entries() if (e.alphabet, e.window, e.detect) == ("6", "I3", 0)]
     assert entry.rows != entry.columns
     for rows, columns in ((entry.rows, entry.columns), (entry.columns, entry.rows)):
         for seed in range(8):
-            floor = crop(wanted(entry, rows, columns, seed))
+            floor = crop_map(wanted(entry, rows, columns, seed))
             assert floor is not None
             assert prove_map(floor, steps=False).is_unique
 
 
 @pytest.mark.parametrize("alphabet", ALPHABETS)
 @pytest.mark.parametrize("quarters", range(4))
-def test_a_turned_map_reads_as_before(alphabet: str, quarters: int) -> None:
-    """The same letters in the same order, each under the heading that turned with it."""
+def test_a_rotated_map_has_the_same_readings(alphabet: str, quarters: int) -> None:
+    """The letters have the same order, each under the rotated heading."""
     codes = np.random.default_rng(1).choice(ALPHABET_CODES[alphabet], (4, 5))
     for window in WINDOWS:
         before = window_readings(FloorMap(codes, alphabet=alphabet, window=window))
         after = window_readings(
-            FloorMap(turned(codes, quarters, alphabet), alphabet=alphabet, window=window)
+            FloorMap(rotated_map(codes, quarters, alphabet), alphabet=alphabet, window=window)
         )
         letters = after.letters
         if alphabet == "compass":  # landmarks stay as they lie: seen in the map's frame
@@ -122,16 +128,16 @@ def test_a_turned_map_reads_as_before(alphabet: str, quarters: int) -> None:
         assert one == sorted(zip(after.heading, letters.tolist(), strict=True))
 
 
-def test_a_quarter_turn_by_hand() -> None:
-    """Counter-clockwise seen with y up: what was right of the origin is now above it."""
+def test_rotation_by_90_degrees() -> None:
+    """Counter-clockwise with y up: cells right of the origin are above it afterwards."""
     codes = np.array([[1, 2], [3, 4]])  # row 0 is the lower one
-    assert turned(codes, 1, "6").tolist() == [[3, 1], [4, 2]]
-    assert turned(codes, 1, "16").tolist() == [[6, 2], [8, 4]]
+    assert rotated_map(codes, 1, "6").tolist() == [[3, 1], [4, 2]]
+    assert rotated_map(codes, 1, "16").tolist() == [[6, 2], [8, 4]]
 
 
 @pytest.mark.parametrize("alphabet", ALPHABETS)
-def test_relabellings_keep_readings_apart(alphabet: str) -> None:
-    tables = [relabelling(alphabet, np.random.RandomState(seed)) for seed in range(30)]
+def test_relabellings_keep_readings_different(alphabet: str) -> None:
+    tables = [random_relabelling(alphabet, np.random.RandomState(seed)) for seed in range(30)]
     letters = np.array(ALPHABET_CODES[alphabet])
     for table in tables:
         assert sorted(table[letters]) == sorted(letters)
@@ -147,31 +153,31 @@ def test_relabellings_keep_readings_apart(alphabet: str) -> None:
 def test_holes_and_walls_stay() -> None:
     forbidden = frozenset({(0, 3), (5, 5)})
     walls = frozenset({((1, 1), (1, 2))})
-    floor = crop(DesignOptions(8, 8, forbidden=forbidden, walls=walls, pitch_m=0.3, seed=4))
+    floor = crop_map(DesignOptions(8, 8, forbidden=forbidden, walls=walls, pitch_m=0.3, seed=4))
     assert floor is not None
     assert {tuple(cell) for cell in np.argwhere(floor.codes == HOLE_CODE).tolist()} == forbidden
     assert (floor.walls, floor.pitch_m, floor.seed) == (walls, 0.3, 4)
     assert prove_map(floor).is_unique
 
 
-def test_what_is_too_large_or_not_there_is_searched_for() -> None:
+def test_maps_that_the_library_lacks_are_searched() -> None:
     corridor = DesignOptions(2, 80)
-    assert crop(corridor) is None
-    assert prove_map(map_library.design(corridor), steps=False).is_unique
-    assert map_library.design(DesignOptions(6, 6)).notes != ()
-    assert map_library.design(DesignOptions(2, 4, window="I2", alphabet="6")).notes == ()
+    assert crop_map(corridor) is None
+    assert prove_map(map_library.design_or_crop(corridor), steps=False).is_unique
+    assert map_library.design_or_crop(DesignOptions(6, 6)).notes != ()
+    assert map_library.design_or_crop(DesignOptions(2, 4, window="I2", alphabet="6")).notes == ()
 
 
-def test_a_map_that_notices_more_serves_where_less_is_asked() -> None:
+def test_maps_that_detect_more_are_used_if_less_is_required() -> None:
     asked = DesignOptions(5, 5, detect=1)
-    floor = crop(asked)
+    floor = crop_map(asked)
     assert floor is not None
     assert prove_map(floor, steps=False).detects >= 1
-    assert crop(replace(asked, detect=2)) is None
+    assert crop_map(replace(asked, detect=2)) is None
 
 
 def test_beyond_the_bound_is_refused() -> None:
     with pytest.raises(InputError, match="only 4096"):
-        map_library.design(DesignOptions(34, 34))
+        map_library.design_or_crop(DesignOptions(34, 34))
     with pytest.raises(InputError, match="window"):
-        crop(DesignOptions(3, 3, window="5x5"))
+        crop_map(DesignOptions(3, 3, window="5x5"))

@@ -1,4 +1,4 @@
-"""receiver.toml: exact, strict, and found in sessions; the deck is known without being told."""
+"""receiver.toml: exact round trips, strict checks, attachments of sessions, and the deck."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ def same(one: Receiver, other: Receiver) -> bool:
     return (one.name, normals[0], places[0]) == (other.name, normals[1], places[1])
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(receiver())
 def test_every_receiver_comes_back_to_the_last_bit(found: Receiver) -> None:
@@ -75,12 +76,16 @@ def test_the_example_of_the_documentation(root: Path) -> None:
     [
         (TWO.replace("receiver", "deck"), "format", "expected 'locatk-lighthouse-receiver'"),
         (HEAD, "position_mm", "missing"),
-        (HEAD + "position_mm = []", "position_mm", "1 to 1000 photodiodes"),
-        (HEAD + "position_mm = 3", "position_mm", "1 to 1000 photodiodes"),
-        (HEAD + f"position_mm = [{'[1, 2, 3],' * 1001}]", "position_mm", "1 to 1000 photodiodes"),
-        (TWO.replace(", 5.5", ""), "position_mm", "list of 3 numbers"),
-        (HEAD + "position_mm = [[0, 0, nan]]", "position_mm", "finite"),
-        (TWO.replace("30, 0, 5.5", "0.0, 0, 0"), "position_mm", "place of photodiode 0"),
+        (HEAD + "position_mm = []", "position_mm", "1 to 1000 rows of 3 numbers in mm"),
+        (HEAD + "position_mm = 3", "position_mm", "1 to 1000 rows of 3 numbers in mm"),
+        (
+            HEAD + f"position_mm = [{'[1, 2, 3],' * 1001}]",
+            "position_mm",
+            "1 to 1000 rows of 3 numbers in mm",
+        ),
+        (TWO.replace(", 5.5", ""), "position_mm[1]", "list of 3 numbers"),
+        (HEAD + "position_mm = [[0, 0, nan]]", "position_mm[0][2]", "finite"),
+        (TWO.replace("30, 0, 5.5", "0.0, 0, 0"), "position_mm", "position of sensor 0"),
         (TWO + "normal = [[0, 0, 1]]", "normal", "2 rows of 3"),
         (TWO + "normal = [[0, 0, 1], [0, 1, 1]]", "normal[1]", "length 1"),
         (TWO + "normal = [[0, 0, 0], [0, 1, 1]]", "normal[0]", "length 1"),
@@ -89,12 +94,13 @@ def test_the_example_of_the_documentation(root: Path) -> None:
         (TWO + "normals = 3", "normals", "unknown key"),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_errors_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str, words: str
 ) -> None:
     refused(receivers.RECEIVER, text, where, words)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_damaged_text_is_refused_or_read(data: st.DataObject) -> None:
@@ -152,7 +158,7 @@ def write(path: Path, found: dict[str, Receiver], devices: tuple[str, ...]) -> S
         ({"a": DECK, "b/c": DECK, "d": DECK}, [f"receiver-{d}.toml" for d in ("a", "b/c", "d")]),
     ],
 )
-def test_each_device_gets_its_own_back(
+def test_each_device_has_its_receiver(
     tmp_path: Path, found: dict[str, Receiver], names: list[str]
 ) -> None:
     session = write(tmp_path / "run.mcap", found, ("a", "b/c"))
@@ -165,7 +171,7 @@ def test_each_device_gets_its_own_back(
         assert sorted(again) == names
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+def test_invalid_receivers_are_not_written(tmp_path: Path) -> None:
     dark = Receiver(np.zeros((1, 3)), np.zeros((1, 3)))
     with pytest.raises(ArtifactError, match="length 1") as caught:
         write(tmp_path / "run.mcap", {"a": dark}, ("a",))
@@ -186,8 +192,8 @@ def recorded(path: Path, device: str, *attached: Receiver) -> Session:
     return Session.open(path)
 
 
-def test_a_deck_is_what_it_is(tmp_path: Path) -> None:
-    """Recordings of a deck that were made before its places were attached."""
+def test_recordings_of_a_deck_have_its_receiver(tmp_path: Path) -> None:
+    """Recordings of earlier versions have no attachment."""
     old = read_receivers(recorded(tmp_path / "1.mcap", "lighthouse-deck"))
     assert [*old] == ["robot"]
     assert same(old["robot"], DECK)

@@ -15,7 +15,7 @@ from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
-from locatk.formats.artifacts import hall_sensors, maps, sheets, tags
+from locatk.formats.artifacts import maps, sheets, tags
 from locatk.formats.artifacts import receiver as receivers
 from locatk.formats.artifacts import scene as scenes
 from locatk.formats.capture.attachments import ATTACHED, KINDS, attachments
@@ -25,7 +25,7 @@ SCENE = scenes.dumps_scene(Scene(markers=(Marker("corner", np.zeros(3)),)))
 TAG = tags.dumps_tags(Tags(ids=(3, 5), min_distance=2))
 ARRAY = tags.dumps_array(SensorArray(bar(9, 0.02)))
 MAP = maps.dumps_map(FloorMap(np.array([[7, 1, -1], [3, 15, 0]]), name="lab"))
-HALLS = hall_sensors.dumps_halls(HallSensors(("a", "b"), np.array([[0.0, 0.02], [0.0, -0.02]])))
+HALLS = maps.dumps_halls(HallSensors(("a", "b"), np.array([[0.0, 0.02], [0.0, -0.02]])))
 TEXTS = {
     "scene.toml": SCENE,
     "tag.toml": TAG,
@@ -62,7 +62,7 @@ def test_all_kinds_that_solvers_read_are_known() -> None:
         tags.TAG_FORMAT,
         tags.ARRAY_FORMAT,
         maps.MAP_FORMAT,
-        hall_sensors.HALLS_FORMAT,
+        maps.HALLS_FORMAT,
         receivers.RECEIVER_FORMAT,
     }
     assert set(ATTACHED) == {*TEXTS, sheets.SHEET_FILE, sheets.CAMERA_FILE}

@@ -108,7 +108,7 @@ def test_reads_what_cflib_writes() -> None:
     assert "generic calibration of channel 1:" in found.notes[1]
 
 
-def test_a_scene_that_was_read_is_a_scene(tmp_path: Path) -> None:
+def test_a_scene_from_a_configuration_is_a_valid_artifact(tmp_path: Path) -> None:
     from locatk.formats.artifacts.scene import dumps_scene, loads_scene
 
     found = crazyflie.loads_config(SAMPLE)
@@ -135,7 +135,7 @@ def test_the_same_after_writing_and_reading(tmp_path: Path) -> None:
     assert crazyflie.dumps_config(before) == path.read_text()
 
 
-def test_a_plain_yaml_reader_finds_floats_everywhere() -> None:
+def test_all_numbers_are_floats_for_yaml_readers() -> None:
     """cflib packs the values as they come: 1e-07 without a point would be a string there."""
     data = yaml.safe_load(crazyflie.dumps_config(scene()))
     assert (data["type"], data["version"], data["systemType"]) == (
@@ -238,25 +238,25 @@ WRONG = [
     ("systemType: 2", "systemType: 1", "systemType", "V2"),
     ("  11:\n    origin", "  16:\n    origin", "geos.16", "0 to 15"),
     ("  11:\n    origin", "  -1:\n    origin", "geos.-1", "0 to 15"),
-    ("  11:\n    origin", "  0:\n    origin", 0, "'0' is there twice"),
+    ("  11:\n    origin", "  0:\n    origin", 0, "'0' occurs twice"),
     ("- -2.5\n", "- -2.5\n    - 1\n", "geos.0.origin", "3"),
-    ("- -2.5\n", "- .nan\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- .inf\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- 1e999\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- 1e99999999999999999999\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", f"- {'9' * 5000}\n", "geos.0.origin", "finite"),
-    ("- -2.5\n", "- 1.0e+5\n", "geos.0.origin", "metres"),
-    ("- -2.5\n", "- here\n", "geos.0.origin", "number"),
-    ("- -2.5\n", "- '-2.5'\n", "geos.0.origin", "number"),
+    ("- -2.5\n", "- .nan\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- .inf\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- 1e999\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- 1e99999999999999999999\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", f"- {'9' * 5000}\n", "geos.0.origin[0]", "finite"),
+    ("- -2.5\n", "- 1.0e+5\n", "geos.0.origin[0]", "from -1000 to 1000"),
+    ("- -2.5\n", "- here\n", "geos.0.origin[0]", "number"),
+    ("- -2.5\n", "- '-2.5'\n", "geos.0.origin[0]", "number"),
     ("[0, 0, 1]]", "[0, 0, -1]]", "geos.11.rotation", "rotation"),
     ("[0, 0, 1]]", "[0, 0, 1.1]]", "geos.11.rotation", "rotation"),
     ("[0, 0, 1]]", "[0, 0, 1.0e+300]]", "geos.11.rotation", "rotation"),
-    ("[0, 0, 1]]", "[0, 0]]", "geos.11.rotation", "3"),
-    ("tilt: -0.047882", "tilt: 47.9", "calibs.3.sweeps[0].tilt", "beyond 10"),
+    ("[0, 0, 1]]", "[0, 0]]", "geos.11.rotation[2]", "3"),
+    ("tilt: -0.047882", "tilt: 47.9", "calibs.3.sweeps[0].tilt", "from -10 to 10"),
     ("      tilt: -0.047882\n", "", "calibs.3.sweeps[0].tilt", "missing"),
     ("uid: 282585023", "uid: 4294967296", "calibs.3.uid", "whole number"),
     ("uid: 282585023", "uid: 1.5", "calibs.3.uid", "whole number"),
-    ("    - curve: 0.348877", "      curve: 0.348877", 0, "there twice"),
+    ("    - curve: 0.348877", "      curve: 0.348877", 0, "occurs twice"),
     ("geos:\n", "geos: &a\n", 0, "anchors"),
     ("systemType: 2", "systemType: *a", 0, "anchors"),
     ("systemType: 2", "systemType: !!python/name:os.system 2", 0, "tag"),
@@ -269,7 +269,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("old", "new", "where", "message"), WRONG)
-def test_what_is_wrong_is_named(
+def test_errors_name_key_and_expected_value(
     tmp_path: Path, old: str, new: str, where: str | int, message: str
 ) -> None:
     path = tmp_path / "config.yaml"
@@ -317,6 +317,7 @@ def test_files_of_other_kinds(tmp_path: Path, content: bytes) -> None:
     assert len(str(refused.value)) < 400
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_damaged_files_give_an_error_or_a_scene(data: st.DataObject) -> None:
@@ -340,8 +341,8 @@ def test_any_text(text: str) -> None:
         crazyflie.loads_config(text)
 
 
-def test_stations_that_were_solved_here_are_not_the_crazyflie_s() -> None:
-    """A key tells it, which other tools pass over; what is not ours is never said to be."""
+def test_scenes_solved_by_locatk_are_marked() -> None:
+    """The key ``solver`` marks them; other tools ignore it."""
     ours = crazyflie.loads_config(crazyflie.dumps_config(scene()))
     assert crazyflie.MODEL_NOTE not in ours.notes
     theirs = crazyflie.loads_config(SAMPLE)
@@ -351,3 +352,6 @@ def test_stations_that_were_solved_here_are_not_the_crazyflie_s() -> None:
     )
     assert crazyflie.MODEL_NOTE in again.notes
     assert crazyflie.MODEL_NOTE in crazyflie.loads_config(SAMPLE + "solver: other\n").notes
+    # A scene of an earlier version has another wording of the note.
+    former = dataclasses.replace(theirs, scale="markers", notes=(crazyflie.FORMER_MODEL_NOTE,))
+    assert "solver" not in crazyflie.dumps_config(former)

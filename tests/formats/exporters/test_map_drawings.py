@@ -45,15 +45,15 @@ BUILT = FloorMap(
 
 def pixel(picture: np.ndarray, floor: FloorMap, x: float, y: float, size: float) -> int:
     """Grey level at a place, by what map_server says of origin and rows."""
-    text = map_ros.yaml(floor, "m.pgm", size)
+    text = map_ros.dumps_yaml(floor, "m.pgm", size)
     left, bottom = map(float, re.search(r"origin: \[(.*?), (.*?),", text).groups())
     column, row = math.floor((x - left) / size), math.floor((y - bottom) / size)
     return int(picture[len(picture) - 1 - row, column])
 
 
-def test_every_pixel_lies_where_its_landmark_is() -> None:
+def test_pixels_agree_with_the_field_of_the_landmarks() -> None:
     size = 0.005
-    picture = map_ros.draw(FLOOR, size)
+    picture = map_ros.draw_grid(FLOOR, size)
     assert picture.shape == (80, 120)
     rng = np.random.default_rng(0)
     for cell in FLOOR.cells():
@@ -72,8 +72,8 @@ def test_every_pixel_lies_where_its_landmark_is() -> None:
     assert pixel(picture, FLOOR, *FLOOR.position((0, 0)), size) == map_ros.FREE
 
 
-def test_walls_stand_between_their_cells() -> None:
-    picture = map_ros.draw(FLOOR, 0.01)
+def test_walls_are_between_their_cells() -> None:
+    picture = map_ros.draw_grid(FLOOR, 0.01)
     black = picture == map_ros.OCCUPIED
     assert black.any()
     for (row, column), (other, _) in FLOOR.walls:
@@ -86,9 +86,9 @@ def test_walls_stand_between_their_cells() -> None:
     assert pixel(picture, FLOOR, 1.1 + 1e-6, -2.7, 0.01) != map_ros.OCCUPIED
 
 
-def test_levels_mean_to_map_server_what_they_should() -> None:
+def test_grey_levels_have_the_meaning_of_map_server() -> None:
     """wiki.ros.org/map_server: p = (255 - level) / 255, free below, occupied above."""
-    text = map_ros.yaml(FLOOR, 'a "b".pgm')
+    text = map_ros.dumps_yaml(FLOOR, 'a "b".pgm')
     values = dict(line.split(": ", 1) for line in text.splitlines())
     assert values["image"] == '"a \\"b\\".pgm"'
     assert values["negate"] == "0"
@@ -99,18 +99,18 @@ def test_levels_mean_to_map_server_what_they_should() -> None:
     assert free < chance[map_ros.UNKNOWN] < occupied < chance[map_ros.OCCUPIED]
 
 
-def test_pgm_is_read_by_others() -> None:
+def test_pgm_is_read_by_pillow() -> None:
     from PIL import Image
 
-    picture = map_ros.draw(FLOOR)
-    read = np.asarray(Image.open(io.BytesIO(map_ros.pgm(picture))))
+    picture = map_ros.draw_grid(FLOOR)
+    read = np.asarray(Image.open(io.BytesIO(map_ros.dumps_pgm(picture))))
     np.testing.assert_array_equal(read, picture)
 
 
 def test_territories_are_as_built() -> None:
     size = 0.002
-    picture = map_ros.draw(BUILT, size)
-    designed = map_ros.draw(FloorMap(BUILT.codes), size)
+    picture = map_ros.draw_grid(BUILT, size)
+    designed = map_ros.draw_grid(FloorMap(BUILT.codes), size)
     ours = np.argwhere(picture[:, 100:] == map_ros.TERRITORY).mean(0)
     theirs = np.argwhere(designed[:, 100:] == map_ros.TERRITORY).mean(0)
     np.testing.assert_array_equal(picture[:, :100], designed[:, :100])
@@ -123,19 +123,19 @@ def test_territories_are_as_built() -> None:
         BUILT.codes,
         built={(0, 1): AsBuiltLandmark(0, 0, 0, np.zeros(4), NONE)},
     )
-    assert not (map_ros.draw(missing, size)[:, 100:] == map_ros.TERRITORY).any()
+    assert not (map_ros.draw_grid(missing, size)[:, 100:] == map_ros.TERRITORY).any()
 
 
 def test_odd_pitches_and_wrong_resolutions() -> None:
     odd = FloorMap(np.array([[5, HOLE_CODE]]), pitch_m=0.1234)
-    picture = map_ros.draw(odd, 0.01)
+    picture = map_ros.draw_grid(odd, 0.01)
     assert picture.shape == (13, 25)
     assert (picture[0] == map_ros.UNKNOWN).all()  # beyond the map
     assert (picture[1:, 13:] == map_ros.UNKNOWN).all()
     with pytest.raises(InputError, match="too coarse"):
-        map_ros.draw(odd, 0.05)
+        map_ros.draw_grid(odd, 0.05)
     with pytest.raises(InputError, match="pixels, more than"):
-        map_ros.draw(odd, 1e-6)
+        map_ros.draw_grid(odd, 1e-6)
 
 
 # ---- SVG
@@ -159,8 +159,8 @@ def groups(svg: bytes) -> dict[str, Xml.Element]:
 
 
 def test_svg_has_true_size_and_layers() -> None:
-    svg = map_svg.render(FLOOR)
-    assert svg == map_svg.render(FLOOR)
+    svg = map_svg.dumps_svg(FLOOR)
+    assert svg == map_svg.dumps_svg(FLOOR)
     root = Xml.fromstring(svg)
     assert (root.get("width"), root.get("height")) == ("600mm", "400mm")
     assert root.get("viewBox") == "0 0 600 400"
@@ -186,9 +186,9 @@ def test_svg_has_true_size_and_layers() -> None:
     assert len(found["walls"]) == 2
 
 
-def test_svg_bars_lie_and_point_as_designed() -> None:
+def test_svg_bars_are_as_designed() -> None:
     """Bar 0 of NNNS is N: at the right, 25 mm from the centre, north upwards."""
-    group = groups(map_svg.render(FLOOR))["r0c0"]
+    group = groups(map_svg.dumps_svg(FLOOR))["r0c0"]
     outlines, lines, _ = (path.get("d") for path in group.findall("{*}path"))
     centre = np.array([100.0, 300.0])  # half a pitch from the left, the lower row below
     bars = subpaths(outlines)
@@ -206,7 +206,7 @@ def test_svg_bars_lie_and_point_as_designed() -> None:
 
 
 def test_svg_is_as_built() -> None:
-    group = groups(map_svg.render(BUILT))["r0c1"]
+    group = groups(map_svg.dumps_svg(BUILT))["r0c1"]
     bar = subpaths(group.find("{*}path").get("d"))[0].mean(0)
     centre = np.array([300 + 4, 100 + 3])
     wanted = centre + 25 * np.array([math.cos(TURN), -math.sin(TURN)])
@@ -220,7 +220,7 @@ def read(text: str) -> ezdxf.document.Drawing:
     return ezdxf.read(io.StringIO(text))
 
 
-def test_dxf_is_sound_and_in_mm() -> None:
+def test_dxf_is_valid_and_in_mm() -> None:
     document = read(dumps_dxf(FLOOR))
     assert not document.audit().has_errors
     assert document.units == ezdxf.units.MM
@@ -238,7 +238,7 @@ def test_dxf_is_sound_and_in_mm() -> None:
     }
 
 
-def test_dxf_bars_lie_as_built() -> None:
+def test_dxf_bars_are_as_built() -> None:
     document = read(dumps_dxf(BUILT))
     (insert,) = document.modelspace().query("INSERT[name=='LANDMARK_NSSS']")
     bars = [e for e in insert.virtual_entities() if e.dxftype() == "LWPOLYLINE"]
@@ -254,6 +254,7 @@ def test_dxf_bars_lie_as_built() -> None:
     assert turned == pytest.approx(TURN + math.pi / 2)
 
 
+@pytest.mark.slow
 def test_dxf_is_the_same_in_every_process(tmp_path: Path) -> None:
     """Neither the time nor the order of hashes is in it, and ezdxf is left as it was."""
     assert ezdxf.options.write_fixed_meta_data_for_testing is False

@@ -70,7 +70,7 @@ def test_a_map_as_designed_comes_back(floor: FloorMap) -> None:
 @pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(placed_floors(), st.data())
-def test_landmarks_as_built_come_back_where_they_lie(floor: FloorMap, data: st.DataObject) -> None:
+def test_landmarks_as_built_keep_their_positions(floor: FloorMap, data: st.DataObject) -> None:
     """Which part of a place is the grid's cannot be known; the places are the same."""
     offset = st.sampled_from([-0.004, -1e-4, 0.0, 2e-5, 0.003])
     cells = data.draw(st.lists(st.sampled_from(floor.cells()), max_size=3, unique=True))
@@ -98,7 +98,7 @@ def test_landmarks_as_built_come_back_where_they_lie(floor: FloorMap, data: st.D
 # ---- CSV
 
 
-def test_the_table_is_that_of_controllers() -> None:
+def test_the_table_has_the_columns_of_controllers() -> None:
     floor = FloorMap(
         np.array([[7, HOLE_CODE], [0, 15]]),
         origin_m=(-2.48, 0.0125),
@@ -112,7 +112,7 @@ def test_the_table_is_that_of_controllers() -> None:
     )
 
 
-def test_tables_of_others() -> None:
+def test_tables_of_other_programs() -> None:
     """Other orders of columns, no header, a comma in decimals, attributes that are missing
     and a start transponder, whose attribute is the heading of vehicles."""
     wanted = FloorMap(np.array([[3, 9]]), pitch_m=0.2005, origin_m=(1.0, -2.0))
@@ -147,7 +147,7 @@ def test_tables_of_others() -> None:
         ("0;1;0;0\n1;1;200;0\n2;1;311;0\n", None, "on no grid"),
     ],
 )
-def test_what_is_wrong_in_a_table_is_named(text: str, where: int | None, words: str) -> None:
+def test_errors_of_a_table_name_the_line(text: str, where: int | None, words: str) -> None:
     with pytest.raises(InputError) as caught:
         loads_csv(text, file="map.csv")
     assert words in caught.value.message
@@ -162,6 +162,7 @@ def is_map_or_error(load: Callable[[], object]) -> bool:
         return error.file == "map.csv"
 
 
+@pytest.mark.slow
 @given(st.text(alphabet='0123456789;,.-\n"ex Code', max_size=60))
 def test_any_table_is_a_map_or_an_error(text: str) -> None:
     for head in ("", ";".join(HEADER) + "\n0;1;0;0\n1;2;200;0\n"):
@@ -225,7 +226,7 @@ def changed(change: Callable[[dict[str, Any]], object]) -> str:
     return json.dumps(data)
 
 
-def test_a_way_in_one_direction_is_no_wall() -> None:
+def test_an_edge_in_one_direction_is_not_a_wall() -> None:
     text = changed(lambda data: data["layouts"][0]["edges"].pop(0))
     assert loads_lif(text, file="map.json").walls == FLOOR.walls
 
@@ -235,8 +236,8 @@ def test_a_way_in_one_direction_is_no_wall() -> None:
     [
         ("", 1, "not JSON"),
         ("{\n\n", 3, "not JSON"),
-        ("[1]", None, "no LIF"),
-        ("{}", None, "no LIF"),
+        ("[1]", None, "not LIF"),
+        ("{}", None, "not LIF"),
         ('{"layouts": 1}', "layouts", "list of objects"),
         ('{"layouts": []}', "layouts", "0 layouts"),
         (changed(lambda d: d["layouts"].append({})), "layouts", "2 layouts, expected one"),
@@ -246,12 +247,12 @@ def test_a_way_in_one_direction_is_no_wall() -> None:
         (
             changed(lambda d: d["layouts"][0]["nodes"][2].pop("nodeName")),
             "nodes[2].nodeName",
-            "node 'r1c0' names no landmark",
+            "the name of node 'r1c0' is not a landmark",
         ),
         (
             changed(lambda d: d["layouts"][0]["nodes"][2].update(nodeId="r0c0")),
             "nodes[2]",
-            "node 'r0c0' is there twice",
+            "node 'r0c0' occurs twice",
         ),
         (
             changed(lambda d: d["layouts"][0]["nodes"][1]["nodePosition"].update(x="0")),
@@ -270,7 +271,7 @@ def test_a_way_in_one_direction_is_no_wall() -> None:
         ),
     ],
 )
-def test_what_is_wrong_in_a_layout_is_named(text: str, where: object, words: str) -> None:
+def test_errors_of_a_layout_name_the_key(text: str, where: object, words: str) -> None:
     with pytest.raises(FormatError) as caught:
         loads_lif(text, file="map.json")
     assert words in caught.value.message
@@ -291,6 +292,7 @@ json_values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(
     st.sampled_from(["layouts", "nodes", "edges", "nodeId", "nodePosition", "x", "endNodeId"]),

@@ -13,9 +13,7 @@ import pytest
 
 from locatk.core.dots.simulation.session import sheet
 from locatk.core.errors import ArtifactError, MissingDataError
-from locatk.formats.simulation import dots, landmarks, lighthouse, polaris
-from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
-from locatk.formats.simulation.settings import (
+from locatk.formats.artifacts.kinds import (
     Boolean,
     FilePath,
     Integer,
@@ -24,9 +22,12 @@ from locatk.formats.simulation.settings import (
     Record,
     Row,
 )
+from locatk.formats.simulation import dots, landmarks, lighthouse, polaris
+from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
 
 CONFIGS = [module.CONFIG for module in (dots, landmarks, lighthouse, polaris)]
 IDS = [config.system for config in CONFIGS]
+FLIPPED = "[faults]\nflipped_bars"
 
 
 def text_of(config: SimulationConfig, body: str) -> str:
@@ -117,21 +118,21 @@ def test_keys_fields_and_options_are_unique(config: SimulationConfig) -> None:
         ("[robot]\nspeed_mps = 0", "robot.speed_mps", "a number above 0"),
         ("[robot]\nspeed_mps = true", "robot.speed_mps", "a number above 0"),
         ('[robot]\nspeed_mps = "fast"', "robot.speed_mps", "a number above 0"),
-        ("[robot]\nspeed_mps = inf", "robot.speed_mps", "a number above 0"),
+        ("[robot]\nspeed_mps = inf", "robot.speed_mps", "a finite number above 0"),
         ("[robot]\nlandmarks = 2.0", "robot.landmarks", "a whole number of at least 1"),
         ("[robot]\nlandmarks = 0", "robot.landmarks", "a whole number of at least 1"),
         ("[errors]\nnoise_mt = -0.1", "errors.noise_mt", "a number of at least 0"),
         ("[errors]\nbar_strength_fraction = 0.3", "bar_strength_fraction", "from 0 to 0.2"),
-        ("[errors]\nearth_ut = nan", "errors.earth_ut", "a number"),
+        ("[errors]\nearth_ut = nan", "errors.earth_ut", "a finite number"),
         ('[robot]\nstrategy = "walk"', "robot.strategy", "'walk' is not one of paper"),
         ("[robot]\nstrategy = 1", "robot.strategy", "a string"),
         ("[robot]\npath_file = 1", "robot.path_file", "the name of a file"),
-        ("[robot]\ncells = [1, 2]", "robot.cells", "a list of 2"),
+        ("[robot]\ncells = [1, 2]", "robot.cells[0]", "a list of 2"),
         ("[robot]\ncells = 1", "robot.cells", "a list"),
-        ("[faults]\nflipped_bars = [[1, 2]]", "faults.flipped_bars", "keys cell, bar"),
-        ("[faults]\nflipped_bars = [{ cell = [1, 2], bars = 1 }]", "flipped_bars", "mean bar?"),
-        ("[faults]\nflipped_bars = [{ cell = [1, 2] }]", "flipped_bars", "missing key 'bar'"),
-        ("[faults]\nflipped_bars = [{ cell = [1, 2], bar = -1 }]", "flipped_bars", "bar: expected"),
+        (f"{FLIPPED} = [[1, 2]]", "flipped_bars[0]", "keys cell, bar"),
+        (f"{FLIPPED} = [{{ cell = [1, 2], bars = 1 }}]", "flipped_bars[0].bars", "unknown key"),
+        (f"{FLIPPED} = [{{ cell = [1, 2] }}]", "flipped_bars[0].bar", "missing key 'bar'"),
+        (f"{FLIPPED} = [{{ cell = [1, 2], bar = -1 }}]", "flipped_bars[0].bar", "of at least 0"),
         ("robot = 3", "robot", "expected a table"),
     ],
 )
