@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.command import Command
 
 if TYPE_CHECKING:
     from locatk.core.lighthouse.scene import Scene
@@ -23,7 +24,7 @@ CONFIG = "crazyflie-config"
 STDOUT = Path("-")
 
 
-@click.command(short_help="Write poses for other tools.")
+@click.command(cls=Command, short_help="Write poses for other tools.")
 @options.input_argument("solution")
 @click.option("--format", "format_name", type=click.Choice((*FORMATS, CONFIG)), required=True)
 @options.output(

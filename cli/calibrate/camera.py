@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.command import Command
 from locatk.core.errors import InputError, LocatkError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from locatk.formats.sessions.reader import Session
 
 
-@click.command(short_help="Fit focal length, centre and lens of a camera.")
+@click.command("camera", cls=Command, short_help="Fit focal length, centre and lens of a camera.")
 @options.input_argument("session")
 @options.output("Camera to write (.toml).")
 @options.artifact
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 @options.overwrite
 @options.as_json
 @options.verbosity
-def camera(
+def command(
     session: Path,
     output: Path,
     artifact: Path | None,

@@ -10,6 +10,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.calibrate import recordings
+from locatk.cli.command import Command
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,14 +22,14 @@ MOST_LANDMARKS = 40
 """Of more than these, only flagged landmarks are listed for people."""
 
 
-@click.command("map", short_help="Fit how the landmarks of a floor really lie.")
+@click.command("map", cls=Command, short_help="Fit the landmarks of a floor as built.")
 @options.sessions
 @options.output("Map to write (.toml), with the landmarks as built.")
 @options.artifact
 @options.overwrite
 @options.as_json
 @options.verbosity
-def map_(
+def command(
     sessions: tuple[Path, ...],
     output: Path,
     artifact: Path | None,

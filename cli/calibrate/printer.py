@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.command import Command
 from locatk.core.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ RULER_MM = 100.0
 LENGTH = click.FloatRange(50.0, 150.0)
 
 
-@click.command(short_help="Find the best dots of a printer, and its true scale.")
+@click.command("printer", cls=Command, short_help="Find the best dots and the scale of a printer.")
 @options.input_argument("scan")
 @options.output("What was found, as TOML.", required=False)
 @click.option(
@@ -53,7 +54,7 @@ LENGTH = click.FloatRange(50.0, 150.0)
 @options.overwrite
 @options.as_json
 @options.verbosity
-def printer(
+def command(
     scan: Path,
     output: Path | None,
     scan_dpi: float | None,

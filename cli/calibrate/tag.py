@@ -10,6 +10,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.calibrate import recordings
+from locatk.cli.command import Command
 from locatk.cli.solve.command import speed_option
 from locatk.core.errors import InputError
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from locatk.core.polaris.tag import Tags
 
 
-@click.command(short_help="Fit how the magnets of a tag really lie.")
+@click.command("tag", cls=Command, short_help="Fit the magnets of tags as built.")
 @options.sessions
 @options.output("Tags to write (.toml), with the magnets as built.")
 @options.artifact
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 @options.overwrite
 @options.as_json
 @options.verbosity
-def tag(
+def command(
     sessions: tuple[Path, ...],
     output: Path,
     artifact: Path | None,

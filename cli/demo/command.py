@@ -12,13 +12,14 @@ from typing import Any
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command
 
 SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
 
 REPORT = "report.html"
 
 
-@click.command(short_help="Simulate, solve and evaluate, to see that all works.")
+@click.command(cls=Command, short_help="Simulate, solve and evaluate, without hardware.")
 @click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
 @options.output(
     f"Report to write (.html).  [default: {REPORT}, in the folder of --keep if given]",
@@ -148,10 +149,9 @@ def whole_way(
     """Simulate, solve and evaluate one system in ``folder``: its row of the table, and what
     the report tells of it."""
     from locatk.cli.demo.sessions import MAKERS, SPEED_MPS
-    from locatk.cli.solve.jobs import command_line
-    from locatk.cli.systems import Request, solve_session
     from locatk.core.evaluation import evaluate, pair_devices
-    from locatk.formats.pipeline.provenance import source_facts
+    from locatk.formats.pipeline import SolveRequest, solve_session
+    from locatk.formats.pipeline.provenance import command_line, source_facts
     from locatk.formats.plots.solution import plot_solution
     from locatk.formats.plots.time_axis import origin_ns
     from locatk.formats.report import subjects
@@ -161,10 +161,10 @@ def whole_way(
     with console.working(f"Simulating {system}"):
         truths = MAKERS[system](folder, seed, overwrite)
     with console.working(f"Solving {system}"):
-        solved = solve_session(session, Request())
+        solved = solve_session(session, SolveRequest())
         speed = SPEED_MPS if system == "polaris" else None
-        paper = solve_session(session, Request(method="paper", speed=speed))
-        facts = {**source_facts(session), "command": command_line(session.name, Request())}
+        paper = solve_session(session, SolveRequest(method="paper", speed=speed))
+        facts = {**source_facts(session), "command": command_line(session.name, SolveRequest())}
         solutions.write_solution(
             solution, solved.solution, source=session, facts=facts, overwrite=overwrite
         )

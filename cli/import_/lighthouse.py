@@ -130,6 +130,7 @@ def import_scene(
     """Import the stations of another tool's configuration as ``scene.toml``; returns as
     :func:`import_sweeps`."""
     from locatk.formats.artifacts import scene as artifacts
+    from locatk.formats.sessions import lighthouse_description
 
     if output.suffix.lower() != ".toml":
         raise click.UsageError(
@@ -137,7 +138,7 @@ def import_scene(
         )
     scene = read(path)
     artifacts.write_scene(output, scene, overwrite=overwrite)
-    found = info_lighthouse.scene(scene)
+    found = lighthouse_description.scene(scene)
     stations = [{key: each[key] for key in SCENE_KEYS} for each in found["stations"]]
     warnings = list(scene.notes)
     if stations:
@@ -171,4 +172,6 @@ def _some(devices: Sequence[str], most: int = 8) -> str:
 
 
 def _stations(heard: Sequence[StationReport]) -> list[dict[str, Any]]:
-    return [info_lighthouse.told(station, station.channel) for station in heard]
+    from locatk.formats.sessions import lighthouse_description
+
+    return [lighthouse_description.station(station, station.channel) for station in heard]

@@ -165,7 +165,7 @@ def failing(error: BaseException) -> Callable[..., Result]:
             ZeroDivisionError("division by zero"),
             1,
             "Error: internal error, ZeroDivisionError: division by zero. Hint: Please report "
-            "it, with the traceback that -v shows.\n",
+            "it, with the traceback from -v.\n",
         ),
         (
             failures.Incomplete("2 sessions are unsolved"),
@@ -176,7 +176,7 @@ def failing(error: BaseException) -> Callable[..., Result]:
         (
             click.UsageError("Two are too many."),
             2,
-            "Error: Two are too many. Hint: `locatk broken --help` shows how to use it.\n",
+            "Error: Two are too many. Hint: See `locatk broken --help`.\n",
         ),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
@@ -206,7 +206,7 @@ def test_wrong_usage_is_one_line(locatk: Run) -> None:
         assert result.exit_code == 2, args
         assert result.stderr.startswith("Error: ")
         assert len(result.stderr.splitlines()) == 1
-        assert "--help` shows" in result.stderr
+        assert "Hint: See `locatk " in result.stderr
 
 
 def test_no_arguments_show_help(locatk: Run) -> None:

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 from numpy.typing import NDArray
 from PIL import Image
 
-from locatk.cli.calibrate.printer import printer
+from locatk.cli.calibrate.printer import command as printer
 from locatk.core.dots.codec import DOT_DIRECTIONS, codec
 from locatk.core.dots.drawing.test_sheet import printer_sheet
 from locatk.core.dots.sheet import Manifest, Sheet
