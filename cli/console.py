@@ -137,7 +137,7 @@ def table(
         total = sum(widths[i] + 2 for i in (*block, index)) - 2
         is_last_text = index == len(columns) - 1 and not _is_numeric(columns[index])
         room = max_width - (total - widths[index])
-        if total > max_width and is_last_text and room >= MIN_TEXT_COLUMNS:
+        if total > max_width and is_last_text and room >= _longest_word(columns[index]):
             widths[index] = room
         elif total > max_width and len(block) > 1:
             blocks.append(block)
@@ -149,6 +149,11 @@ def table(
                       [widths[i] for i in block])
         for block in blocks
     )  # fmt: skip
+
+
+def _longest_word(texts: Iterable[str]) -> int:
+    """Return the number of characters of the longest word."""
+    return max((len(word) for text in texts for word in text.split()), default=0)
 
 
 def _wrap_titles(columns: Sequence[Sequence[str]], max_width: int) -> list[list[str]]:

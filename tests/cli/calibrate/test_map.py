@@ -80,7 +80,7 @@ def test_sessions_in_a_map_as_built_out(locatk, runs: list[Path], tmp_path: Path
     lines = result.stdout.splitlines()
     assert lines[0] == "6 landmarks as built against their design, 2 flagged:"
     table = [line.split() for line in lines[2:9]]  # Two lines of titles.
-    assert table[0][0] == "landmark"
+    assert table[0][0] == "cell"
     assert [row[0] for row in table[1:]] == ["0,0", "0,1", "0,2", "1,0", "1,1", "1,2"]
     built = floor.built[0, 2]
     assert table[3][1:4] == ["2", f"{1e3 * built.x_m:+.2f}", f"{1e3 * built.y_m:+.2f}"]
@@ -148,7 +148,7 @@ def test_recordings_that_cannot_be_used_are_named(
     assert left_out == {
         str(quiet): "no landmark was detected",
         str(lost): "no odometry of robot",
-        str(strange): "another map than in the first session",
+        str(strange): "the map differs from that of the first session",
     }
     for path in left_out:
         assert path in result.stderr
@@ -162,7 +162,7 @@ def test_the_map_may_be_given_and_must_be_there(
     bare, out = write(tmp_path / "bare.mcap", sound, floor=None), tmp_path / "built.toml"
     result = locatk("calibrate", "map", bare, "-o", out)
     assert result.exit_code == 1
-    assert f"Error: no map in {bare}" in result.stderr
+    assert f"Error: the session has no map in {bare}" in result.stderr
     assert "--artifact" in result.stderr
     assert not out.exists()
     given = tmp_path / "map.toml"

@@ -537,7 +537,7 @@ def test_one_pass_is_too_few(locatk, solver: Solver, tmp_path: Path) -> None:
     for seen, words in (
         (passes(1)[0], "the only one over tag"),
         ([detection(TAGS, None, (0, 0, 0))], "not read: magnet missing"),
-        ([], "no tag was seen"),
+        ([], "no tag was detected"),
     ):
         solver.seen = [seen]
         result = locatk("calibrate", "tag", session, "-o", out)
@@ -572,5 +572,5 @@ def test_tags_of_two_designs_are_not_mixed(locatk, solver: Solver, tmp_path: Pat
     sessions.append(record(tmp_path / "other.mcap", replace(TAGS, spacing_m=0.03)))
     result = locatk("calibrate", "tag", *sessions, "-o", tmp_path / "built.toml")
     assert result.exit_code == 3
-    assert "other.mcap: tags of another spacing than in the first session" in result.stderr
+    assert "other.mcap: the spacing of the tags differs from that of the first" in result.stderr
     assert tags.read_tags(tmp_path / "built.toml").built[ID].passes == 3
