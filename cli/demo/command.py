@@ -111,7 +111,9 @@ def command(
     console.say("error: mean distance from the truth, without alignment")
     console.result(f"Wrote {report} in {took_s:.0f} s: open it in a browser")
     if files:
-        console.result(console.labelled([(str(path), words) for path, words in files]))
+        width = max(len(str(path)) for path, _ in files)
+        for path, words in files:
+            console.result(f"{path!s:<{width}}  {words}")
 
 
 def table(rows: list[dict[str, Any]]) -> str:

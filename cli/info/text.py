@@ -180,19 +180,29 @@ def text(facts: dict[str, Any]) -> str:
         ("attachment", "type", "bytes"),
         [(a["name"], a["media_type"], a["bytes"]) for a in facts.get("attachments", ())],
     )
-    others = [
-        (name, key, value)
-        for name, record in facts.get("metadata", {}).items()
-        for key, value in record.items()
-        if (name, key) not in KNOWN_METADATA
-        and not info_capture.is_shown(name, key)
-        and not info_lighthouse.is_shown(name, key)
-    ]
-    shown = [row for row in others if console.verbose() or not row[1].startswith(SIMULATION_PREFIX)]
-    section(("metadata", "key", "value"), shown)
-    if len(shown) < len(others):
-        lines.append(f"... and {len(others) - len(shown)} options of the simulation: see -v")
+    lines += _metadata(facts.get("metadata", {}))
     return "\n".join(lines)
+
+
+def _metadata(records: dict[str, dict[str, Any]]) -> list[str]:
+    """Format the metadata that the lines above do not show, a block for each record."""
+    lines, simulation_options = [], 0
+    for name, record in records.items():
+        entries = []
+        for key, value in record.items():
+            if (name, key) in KNOWN_METADATA or info_capture.is_shown(name, key):
+                continue
+            if info_lighthouse.is_shown(name, key):
+                continue
+            if key.startswith(SIMULATION_PREFIX) and not console.verbose():
+                simulation_options += 1
+            else:
+                entries.append((key, str(value)))
+        if entries:
+            lines += ["", f"metadata {name}", console.labelled(entries)]
+    if simulation_options:
+        lines.append(f"... and {simulation_options} options of the simulation: see -v")
+    return lines
 
 
 def _unread(unread: int | None) -> str | None:
