@@ -25,9 +25,9 @@ HEAD = """\
 
 <!-- Made by `python .ci/commands.py` from the commands' own help; do not edit. -->
 
-Results are on stdout; messages and progress on stderr. `--json` prints one object on stdout, with a
-`version`, instead of text. No command replaces a file without `--overwrite`. An error is one line
-with a hint. A misspelled command or option gets a suggestion.
+Results are on stdout; messages and progress on stderr. `--json` prints one object with a
+`version` on stdout instead of text. No command replaces a file without `--overwrite`. An error
+is one line with a hint. A misspelled command or option gets a suggestion.
 
 | exit status | meaning |
 |---|---|
@@ -36,7 +36,8 @@ with a hint. A misspelled command or option gets a suggestion.
 | 2 | usage error |
 | 3 | finished with losses or unsolved parts, which are listed |
 
-Without `NO_COLOR`, terminals show colours. Completion for bash: `eval "$(_LOCATK_COMPLETE=bash_source locatk)"`
+Terminals show colours unless `NO_COLOR` is set. Completion for bash:
+`eval "$(_LOCATK_COMPLETE=bash_source locatk)"`
 (also `zsh_source`, `fish_source`).
 """
 
