@@ -30,7 +30,7 @@ from concurrent.futures import (
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from typing import Any, TypeVar
 
 from locatk.core.errors import InputError, LocatkError
@@ -278,19 +278,17 @@ def _open_processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
 
 
 def _start_forkserver() -> None:
-    """Start the fork server so that it ignores Ctrl-C.
+    """Start the fork server with Ctrl-C blocked, in the server and for the moment here.
 
     A terminal sends Ctrl-C to all processes, and the server would print a traceback if it is
-    still importing.
+    still importing. A Ctrl-C that arrives meanwhile takes effect at the end.
     """
-    if threading.current_thread() is not threading.main_thread():
-        forkserver.ensure_running()
-        return
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource_tracker.ensure_running()  # Its start would unblock the signal.
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
     finally:
-        signal.signal(signal.SIGINT, previous)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
 
 
 def _kill_forkserver() -> None:
