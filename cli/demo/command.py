@@ -86,9 +86,9 @@ def command(
     folder: AbstractContextManager[str | Path] = (
         TemporaryDirectory(prefix="locatk-demo-") if keep is None else nullcontext(keep)
     )
-    with folder as path:
+    with folder as root:
         results = [
-            run_system(Path(path), name, seed, keep is not None, overwrite) for name in chosen
+            run_system(Path(root), name, seed, keep is not None, overwrite) for name in chosen
         ]
         with console.working("Reporting"):
             write_report(report, [subject for _, subject in results], overwrite=overwrite)

@@ -18,7 +18,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from locatk.cli import app as app_module
-from locatk.cli import console, failures
+from locatk.cli import calibrate, console, failures
 from locatk.cli.app import COMMANDS, app
 from locatk.core import errors
 
@@ -70,10 +70,18 @@ def test_examples_are_valid_usage(path: tuple[str, ...], monkeypatch: pytest.Mon
     console.reset()
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_table_agrees_with_commands(name: str) -> None:
-    module, short = COMMANDS[name]
-    assert importlib.import_module(module).command.short_help == short
+TABLES = [
+    (name, module, short)
+    for table in (COMMANDS, calibrate.COMMANDS)
+    for name, (module, short) in table.items()
+]
+
+
+@pytest.mark.parametrize(("name", "module", "short"), TABLES, ids=[row[0] for row in TABLES])
+def test_table_agrees_with_commands(name: str, module: str, short: str) -> None:
+    command = importlib.import_module(module).command
+    assert command.short_help == short
+    assert name in (command.name, module.rsplit(".", 1)[-1].rstrip("_"), module.split(".")[2])
 
 
 @pytest.mark.slow

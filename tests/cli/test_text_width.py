@@ -99,7 +99,9 @@ def test_a_typo_of_a_command_gets_a_suggestion(name: str) -> None:
         assert "Did you mean" not in result.stderr
 
 
-@pytest.mark.parametrize("args", [("calibrate", "printr"), ("simulate", "polris"), ("map", "chek")])
+@pytest.mark.parametrize(
+    "args", [("calibrate", "printr"), ("simulate", "polris"), ("map", "chek"), ("print", "patern")]
+)
 def test_a_typo_of_a_subcommand_gets_a_suggestion(args: tuple[str, str]) -> None:
     result = run(*args)
     assert result.exit_code == 2
